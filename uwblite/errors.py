@@ -1,0 +1,45 @@
+"""Every exception that uwblite raises on purpose. The message says what is wrong, where, and how to mend it."""
+
+
+class UwbliteError(Exception):
+    """Base of all errors of this package; the command line shows its text as one line and exits with 1."""
+
+
+class ConfigError(UwbliteError):
+    """A setting is unknown, of the wrong type or out of its range."""
+
+
+class FormatError(UwbliteError):
+    """A file or stream is not what it should be.
+
+    Parameters
+    ----------
+    problem : what is wrong and how to mend it.
+    path : name of the file, as the user gave it.
+    line : 1-based line number, where there is one.
+    """
+
+    def __init__(self, problem: str, path: str = "", line: int | None = None) -> None:
+        self.problem, self.path, self.line = problem, path, line
+        where = f"{path}:{line}: " if path and line else f"{path}: " if path else f"line {line}: " if line else ""
+        super().__init__(where + problem)
+
+
+class DataError(UwbliteError):
+    """Measurements are well-formed but cannot be used: wrong shapes, no motion, a sensor that never spoke."""
+
+
+class ProtocolError(UwbliteError):
+    """A device driver was asked for something its protocol does not allow."""
+
+
+class DeviceError(UwbliteError):
+    """A device could not be opened, answered with a fault, or fell silent."""
+
+
+class SolverError(UwbliteError):
+    """The least-squares problem is ill-posed: no free variable, not finite, or not connected."""
+
+
+class Cancelled(UwbliteError):
+    """The caller's progress callback asked to stop."""

@@ -1,0 +1,140 @@
+"""Planar poses as (..., 3) arrays of x, y, theta; every function broadcasts over the leading axes.
+
+Laws, up to rounding, for all poses a, b, c and points p (angles compared modulo 2 pi)::
+
+    compose(a, compose(b, c)) == compose(compose(a, b), c)
+    compose(a, inverse(a)) == 0 == compose(inverse(a), a)
+    between(a, b) == compose(inverse(a), b)          compose(a, between(a, b)) == b
+    transform(compose(a, b), p) == transform(a, transform(b, p))
+    exp(log(a)) == a      log(exp(xi)) == xi for |xi_theta| < pi
+    interpolate(a, b, 0) == a      interpolate(a, b, 1) == b
+
+Angles are kept in (-pi, pi].
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+_SERIES_BELOW = 1e-2
+"""Angle below which the series replace sin(t)/t and its kin; both branches agree to rounding there."""
+
+
+def wrap_angle(angle: ArrayLike) -> Floats:
+    """Return the angle, rad, moved into (-pi, pi]."""
+    angle = np.asarray(angle, dtype=np.float64)
+    wrapped = np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
+    return np.where(wrapped == -np.pi, np.pi, wrapped)
+
+
+def rotate(theta: ArrayLike, vectors: ArrayLike) -> Floats:
+    """Turn vectors (..., 2) by theta (...), rad."""
+    c, s = np.cos(theta), np.sin(theta)
+    vectors = np.asarray(vectors, dtype=np.float64)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def transform(pose: ArrayLike, points: ArrayLike) -> Floats:
+    """Express points (..., 2), given in the frame of pose (..., 3), in the frame the pose is given in."""
+    pose = np.asarray(pose, dtype=np.float64)
+    return rotate(pose[..., 2], points) + pose[..., :2]
+
+
+def compose(a: ArrayLike, b: ArrayLike) -> Floats:
+    """Return T_a_c from T_a_b and T_b_c."""
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    xy = transform(a, b[..., :2])
+    return np.concatenate([xy, wrap_angle(a[..., 2] + b[..., 2])[..., None]], axis=-1)
+
+
+def inverse(a: ArrayLike) -> Floats:
+    """Return T_b_a from T_a_b."""
+    a = np.asarray(a, dtype=np.float64)
+    return np.concatenate([-rotate(-a[..., 2], a[..., :2]), wrap_angle(-a[..., 2])[..., None]], axis=-1)
+
+
+def between(a: ArrayLike, b: ArrayLike) -> Floats:
+    """Return T_a_b from T_w_a and T_w_b: b as seen from a."""
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    xy = rotate(-a[..., 2], b[..., :2] - a[..., :2])
+    return np.concatenate([xy, wrap_angle(b[..., 2] - a[..., 2])[..., None]], axis=-1)
+
+
+def _sine_terms(theta: Floats) -> tuple[Floats, Floats]:
+    """Return sin(t)/t and (1 - cos t)/t."""
+    small = np.abs(theta) < _SERIES_BELOW
+    t = np.where(small, 1.0, theta)
+    t2 = theta * theta
+    a = np.where(small, 1.0 - t2 / 6.0 * (1.0 - t2 / 20.0 * (1.0 - t2 / 42.0)), np.sin(t) / t)
+    b = np.where(small, theta / 2.0 * (1.0 - t2 / 12.0 * (1.0 - t2 / 30.0)), 2.0 * np.sin(t / 2.0) ** 2 / t)
+    return a, b
+
+
+def exp(xi: ArrayLike) -> Floats:
+    """Return the pose reached by the constant twist xi (..., 3) = vx, vy, omega in unit time."""
+    xi = np.asarray(xi, dtype=np.float64)
+    a, b = _sine_terms(xi[..., 2])
+    x, y = xi[..., 0], xi[..., 1]
+    return np.stack([a * x - b * y, b * x + a * y, wrap_angle(xi[..., 2])], axis=-1)
+
+
+def log(pose: ArrayLike) -> Floats:
+    """Return the twist whose exp is the pose; its angle lies in (-pi, pi]."""
+    pose = np.asarray(pose, dtype=np.float64)
+    theta = wrap_angle(pose[..., 2])
+    a, b = _sine_terms(theta)
+    norm = a * a + b * b
+    x, y = pose[..., 0], pose[..., 1]
+    return np.stack([(a * x + b * y) / norm, (a * y - b * x) / norm, theta], axis=-1)
+
+
+def interpolate(a: ArrayLike, b: ArrayLike, fraction: ArrayLike) -> Floats:
+    """Return the pose a fraction (...) of the way from a to b along the arc of constant twist."""
+    fraction = np.asarray(fraction, dtype=np.float64)[..., None]
+    return compose(a, exp(fraction * log(between(a, b))))
+
+
+def interpolate_trajectory(stamps: Floats, poses: Floats, query: ArrayLike) -> Floats:
+    """Return poses (..., 3) at the query times (...) of a trajectory with non-decreasing stamps (n,) and poses (n, 3).
+
+    Outside the recorded time the nearest end pose holds; between equal stamps the later pose holds.
+    """
+    query = np.asarray(query, dtype=np.float64)
+    if len(stamps) == 1:
+        return np.broadcast_to(poses[0], (*query.shape, 3)).copy()
+    left = np.clip(np.searchsorted(stamps, query, side="right") - 1, 0, len(stamps) - 2)
+    span = stamps[left + 1] - stamps[left]
+    fraction = np.clip((query - stamps[left]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
+    return interpolate(poses[left], poses[left + 1], fraction)
+
+
+def compose_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
+    """Return the Jacobians (..., 3, 3) of compose(a, b) by the coordinates of a and of b."""
+    a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    da = np.zeros((*a.shape[:-1], 3, 3))
+    da[..., 0, 0] = da[..., 1, 1] = da[..., 2, 2] = 1.0
+    da[..., 0, 2] = -s * b[..., 0] - c * b[..., 1]
+    da[..., 1, 2] = c * b[..., 0] - s * b[..., 1]
+    db = np.zeros_like(da)
+    db[..., 0, 0] = db[..., 1, 1] = c
+    db[..., 0, 1], db[..., 1, 0] = -s, s
+    db[..., 2, 2] = 1.0
+    return da, db
+
+
+def between_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
+    """Return the Jacobians (..., 3, 3) of between(a, b) by the coordinates of a and of b."""
+    a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    d = rotate(-a[..., 2], b[..., :2] - a[..., :2])
+    db = np.zeros((*a.shape[:-1], 3, 3))
+    db[..., 0, 0] = db[..., 1, 1] = c
+    db[..., 0, 1], db[..., 1, 0] = s, -s
+    db[..., 2, 2] = 1.0
+    da = -db
+    da[..., 0, 2] = d[..., 1]
+    da[..., 1, 2] = -d[..., 0]
+    return da, db

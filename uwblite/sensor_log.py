@@ -1,0 +1,165 @@
+"""What was measured: one recording as arrays, checked once when it enters.
+
+Every array is time-ordered. Times are seconds of one clock (the log's ipc_timestamp); lengths metres; angles radians.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import DataError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Wheel odometry: poses of the base in the drifting odom frame."""
+
+    stamps: Floats
+    """(n,) s, non-decreasing."""
+    poses: Floats
+    """(n, 3) x, y, theta of T_odom_base; m, m, rad."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UwbRanges:
+    """Distances between the tag on the robot and fixed anchors."""
+
+    stamps: Floats
+    """(m,) s, non-decreasing."""
+    anchor: Ints
+    """(m,) index into anchor_ids."""
+    ranges: Floats
+    """(m,) m, as the radio said them: zeros, spikes and biases included."""
+    quality: Floats
+    """(m,) 0..100 as the radio said it; 100 where it says nothing."""
+    anchor_ids: tuple[str, ...]
+    """Names of the anchors, sorted; each has at least one range."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserScans:
+    """2D scans with the field names of sensor_msgs/LaserScan; all scans share one geometry."""
+
+    stamps: Floats
+    """(k,) s, time of the first ray, non-decreasing."""
+    ranges: NDArray[np.float32]
+    """(k, b) m; +inf = nothing seen up to range_max, nan = invalid (REP-117)."""
+    angle_min: float
+    """Angle of ray 0 in the laser frame, rad, counter-clockwise."""
+    angle_increment: float
+    """Angle between rays, rad."""
+    time_increment: float
+    """Time between rays, s (0: the scan is a snapshot)."""
+    range_min: float
+    range_max: float
+    """m; a reading outside [range_min, range_max] is not an obstacle."""
+
+    @property
+    def angles(self) -> Floats:
+        """(b,) angle of each ray in the laser frame, rad."""
+        return self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorMounting:
+    """Where the sensors sit on the base."""
+
+    T_base_laser: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) x, y, theta of the laser on the base."""
+    laser_flipped: bool = False
+    """Laser mounted upside down: its rays run clockwise."""
+    tag_position: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) x, y, z of the tag on the base; z is the height above the floor."""
+    anchor_height: float | None = None
+    """Height of the anchors above the floor, m; None = not told (taken as the tag's height)."""
+    anchor_heights: dict[str, float] = field(default_factory=dict)
+    """Heights of single anchors above the floor, m, by id; they win over anchor_height."""
+
+    def height_difference(self, anchor_id: str) -> float | None:
+        """Height of an anchor above the tag, m; None where nobody told."""
+        height = self.anchor_heights.get(anchor_id, self.anchor_height)
+        return None if height is None else height - float(self.tag_position[2])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogNotes:
+    """What the reader saw besides the data: counts that must not vanish silently."""
+
+    source: str = ""
+    """Name of the file(s), as given."""
+    sha256: str = ""
+    """Hash of the bytes read."""
+    lines: int = 0
+    broken_lines: tuple[tuple[int, str], ...] = ()
+    """First broken lines as (line number, why); `broken` counts all."""
+    broken: int = 0
+    skipped: dict[str, int] = field(default_factory=dict)
+    """Messages that are known and not used, by name."""
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorLog:
+    """One recording. `ranges` and `scans` are None when the sensor was not there."""
+
+    odometry: Odometry
+    ranges: UwbRanges | None = None
+    scans: LaserScans | None = None
+    mounting: SensorMounting = field(default_factory=SensorMounting)
+    notes: LogNotes = field(default_factory=LogNotes)
+
+    def __post_init__(self) -> None:
+        _check(self.odometry.stamps, "odometry.stamps", (None,), ordered=True)
+        _check(self.odometry.poses, "odometry.poses", (len(self.odometry.stamps), 3))
+        if len(self.odometry.stamps) == 0:
+            raise DataError("the log has no odometry; uwblite needs ODOM messages (or ROBOTLASER1 with robot poses)")
+        if self.ranges is not None:
+            m = len(self.ranges.stamps)
+            _check(self.ranges.stamps, "ranges.stamps", (None,), ordered=True)
+            _check(self.ranges.ranges, "ranges.ranges", (m,))
+            _check(self.ranges.quality, "ranges.quality", (m,))
+            if self.ranges.anchor.shape != (m,):
+                raise DataError(f"ranges.anchor has shape {self.ranges.anchor.shape}, expected ({m},)")
+            if m and not 0 <= self.ranges.anchor.min() <= self.ranges.anchor.max() < len(self.ranges.anchor_ids):
+                raise DataError("ranges.anchor holds an index outside anchor_ids")
+        if self.scans is not None:
+            _check(self.scans.stamps, "scans.stamps", (None,), ordered=True)
+            if self.scans.ranges.ndim != 2 or len(self.scans.ranges) != len(self.scans.stamps):
+                raise DataError(f"scans.ranges has shape {self.scans.ranges.shape}, expected ({len(self.scans.stamps)}, beams)")
+
+    def without(self, *, uwb: bool = False, lidar: bool = False) -> "SensorLog":
+        """Return the same recording with a sensor left out."""
+        return replace(self, ranges=None if uwb else self.ranges, scans=None if lidar else self.scans)
+
+    def crop(self, start: float = -np.inf, end: float = np.inf) -> "SensorLog":
+        """Return the part of the recording with start <= stamp <= end, s."""
+
+        def part(stamps: Floats) -> slice:
+            return slice(int(np.searchsorted(stamps, start, "left")), int(np.searchsorted(stamps, end, "right")))
+
+        odometry, ranges, scans = self.odometry, self.ranges, self.scans
+        cut = part(odometry.stamps)
+        odometry = Odometry(odometry.stamps[cut], odometry.poses[cut])
+        if ranges is not None:
+            cut = part(ranges.stamps)
+            used, anchor = np.unique(ranges.anchor[cut], return_inverse=True)
+            ids = tuple(ranges.anchor_ids[i] for i in used)
+            ranges = UwbRanges(ranges.stamps[cut], anchor.astype(np.int64), ranges.ranges[cut], ranges.quality[cut], ids)
+        if scans is not None:
+            cut = part(scans.stamps)
+            scans = replace(scans, stamps=scans.stamps[cut], ranges=scans.ranges[cut])
+        return replace(self, odometry=odometry, ranges=ranges, scans=scans)
+
+
+def _check(values: Floats, name: str, shape: tuple[int | None, ...], ordered: bool = False) -> None:
+    if values.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, values.shape, strict=True)):
+        raise DataError(f"{name} has shape {values.shape}, expected {shape}")
+    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+    if len(bad):
+        raise DataError(f"{name}[{bad[0]}] is not finite ({len(bad)} such rows)")
+    if ordered and np.any(np.diff(values) < 0):
+        raise DataError(f"{name} runs backwards at index {int(np.argmax(np.diff(values) < 0)) + 1}; sort by time first")
