@@ -61,7 +61,7 @@ class LaserScans:
     @property
     def angles(self) -> Floats:
         """(b,) angle of each ray in the laser frame, rad."""
-        return self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1])
+        return np.asarray(self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1]), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
