@@ -1,0 +1,119 @@
+"""What a run of the mapper gives back: estimates, how sure they are, and the story of how they came about."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .graph import Graph
+from .occupancy_grid import OccupancyGrid
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnchorEstimate:
+    """One anchor as the map has it."""
+
+    id: str
+    position: Floats
+    """(2,) m, map frame; nan where the anchor could not be placed."""
+    covariance: Floats
+    """(2, 2) m^2."""
+    ranges: int
+    """Ranges in the recording."""
+    used_share: float
+    """Mean weight of its ranges in the final optimisation, 0..1; the rest was held to be outliers or NLOS."""
+    bias: float
+    """m, added to every range of this anchor."""
+    bias_sigma: float
+    """m."""
+    residual_rms: float
+    """Robust standard deviation of its range residuals, m."""
+    status: str
+    """'ok', 'mirror-ambiguous', 'unplaced' or 'distrusted'."""
+    reason: str = ""
+    """Why the status is not 'ok', in words."""
+    alternative: Floats | None = None
+    """(2,) the mirrored position, m, where the status is 'mirror-ambiguous'."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationEstimate:
+    """One calibration value that the recording was asked for."""
+
+    name: str
+    value: float
+    sigma: float
+    """Standard deviation, same unit."""
+    unit: str
+    meaning: str
+    state: str
+    """'estimated', 'prior' (the recording cannot show it) or 'off'."""
+    reason: str = ""
+    """Why it stayed at the prior."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """One candidate pair of sub-maps or keyframes and what became of it."""
+
+    i: int
+    """Keyframe index of the target."""
+    j: int
+    """Keyframe index of the source."""
+    T_i_j: Floats
+    """(3,) measured pose of j in i."""
+    information: Floats
+    """(3, 3) in the chart e = Z^-1 (Xi^-1 Xj)."""
+    fitness: float
+    """Root mean square distance of matched points, m."""
+    overlap: float
+    """Share of source points that found a match, 0..1."""
+    accepted: bool
+    reason: str
+    """Why it was accepted or rejected, in words."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StageSummary:
+    """One stage of the walk: what it was given, what it made of it."""
+
+    name: str
+    seconds: float
+    """Wall time; filled in by the caller's clock, 0 where no clock was given."""
+    figures: dict[str, Any] = field(default_factory=dict)
+    """Named counts and figures (JSON-ready)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapResult:
+    """The map of one or more recordings."""
+
+    stamps: Floats
+    """(n,) s, one per odometry stamp."""
+    trajectory: Floats
+    """(n, 3) T_map_base at the stamps."""
+    session: Ints
+    """(n,) which recording each stamp belongs to (all 0 for one recording)."""
+    keyframe_stamps: Floats
+    """(k,) s."""
+    keyframe_covariances: Floats
+    """(k, 3, 3) marginal covariance of each keyframe, map frame (relative to the first pose)."""
+    graph: Graph
+    """Final graph: poses are the keyframes."""
+    anchors: tuple[AnchorEstimate, ...]
+    calibration: tuple[CalibrationEstimate, ...]
+    closures: tuple[LoopClosure, ...]
+    """Accepted and rejected."""
+    range_table: dict[str, Floats]
+    """Per range: stamp, anchor (index into anchors), range, residual (m), weight (0..1); for reports."""
+    grid: OccupancyGrid | None
+    """None without lidar."""
+    stages: tuple[StageSummary, ...]
+    warnings: tuple[str, ...]
+    """Things the user should know, in words."""
+    doubts: tuple[str, ...]
+    """Named reasons not to trust the result; non-empty means exit code 3."""
