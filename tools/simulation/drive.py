@@ -1,0 +1,150 @@
+"""Where the robot goes: goals that cover the place again and again, roads between them, and a differential drive on them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+from .floorplans import FloorPlan
+
+Floats = NDArray[np.float64]
+
+_CELL = 0.2
+"""Cell of the road map, m."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """True motion: knots of constant twist, so linear interpolation of x, y and unwrapped theta is exact to 0.1 mm."""
+
+    stamps: Floats
+    """(n,) s, evenly spaced."""
+    poses: Floats
+    """(n, 3) T_map_base; theta is unwrapped."""
+
+    def at(self, times: Floats) -> Floats:
+        """Return the true poses (..., 3) at the times (...); theta unwrapped."""
+        return np.stack([np.interp(times, self.stamps, self.poses[:, k]) for k in range(3)], axis=-1)
+
+
+class RoadMap:
+    """The cells of a plan at least `clearance` m from every obstacle, as a graph."""
+
+    def __init__(self, plan: FloorPlan, clearance: float) -> None:
+        shape = np.ceil(np.asarray(plan.size) / _CELL).astype(int) + 1
+        fine = 4
+        blocked = np.zeros(shape * fine, dtype=bool)
+        _draw(plan, blocked, _CELL / fine)
+        distance = ndimage.distance_transform_edt(~blocked)[::fine, ::fine] * (_CELL / fine)
+        self.shape = shape
+        self.free = distance >= clearance
+        label, _ = ndimage.label(self.free)
+        start = self.cell(np.array(plan.start[:2]))
+        self.free = label == label[tuple(start)] if label[tuple(start)] else self.free
+        self.cells = np.argwhere(self.free)
+        self.graph = self._graph(np.clip(clearance / np.maximum(distance, 1e-3), 0.2, 1.0))
+
+    def cell(self, point: Floats) -> NDArray[np.int64]:
+        """Return the free cell nearest to a point."""
+        if not hasattr(self, "cells"):
+            index: NDArray[np.int64] = np.argwhere(self.free)
+        else:
+            index = self.cells
+        return index[np.argmin(((index * _CELL - point) ** 2).sum(axis=1))]
+
+    def _graph(self, dear: Floats) -> sparse.csr_array:
+        number = np.arange(self.free.size).reshape(self.free.shape)
+        rows, cols, cost = [], [], []
+        for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)):
+            a = (slice(0, self.shape[0] - dx), slice(max(0, -dy), self.shape[1] - max(0, dy)))
+            b = (slice(dx, None), slice(max(0, dy), self.shape[1] + min(0, dy)))
+            both = self.free[a] & self.free[b]
+            rows.append(number[a][both])
+            cols.append(number[b][both])
+            cost.append(np.hypot(dx, dy) * (1.0 + dear[a][both] + dear[b][both]))
+        entries = (np.concatenate(cost), (np.concatenate(rows), np.concatenate(cols)))
+        return sparse.csr_array(entries, shape=(self.free.size,) * 2)
+
+    def road(self, start: Floats, goals: Floats) -> list[Floats]:
+        """Return the cheapest road (k, 2) from the start to each goal."""
+        source = int(np.ravel_multi_index(tuple(self.cell(start)), self.free.shape))
+        _, before = csgraph.dijkstra(self.graph, directed=False, indices=source, return_predecessors=True)
+        roads = []
+        for goal in goals:
+            node = int(np.ravel_multi_index(tuple(self.cell(goal)), self.free.shape))
+            nodes = [node]
+            while node != source:
+                node = int(before[node])
+                nodes.append(node)
+            roads.append(np.stack(np.unravel_index(nodes[::-1], self.free.shape), axis=1) * _CELL)
+        return roads
+
+
+def _draw(plan: FloorPlan, blocked: NDArray[np.bool_], cell: float) -> None:
+    for x1, y1, x2, y2 in plan.walls:
+        n = int(np.hypot(x2 - x1, y2 - y1) / cell * 2) + 2
+        blocked[np.rint(np.linspace(x1, x2, n) / cell).astype(int), np.rint(np.linspace(y1, y2, n) / cell).astype(int)] = True
+    gx, gy = np.meshgrid(*(np.arange(n) * cell for n in blocked.shape), indexing="ij")
+    for x, y, radius in plan.columns:
+        blocked[np.hypot(gx - x, gy - y) <= radius + cell] = True
+
+
+def wander(plan: FloorPlan, rng: np.random.Generator, length: float, clearance: float = 0.5, start: Floats | None = None) -> Floats:
+    """Return a dense polyline (k, 2), at least `length` m long, that keeps going where it has been least."""
+    roads = RoadMap(plan, clearance)
+    here = np.asarray(plan.start[:2] if start is None else start, dtype=np.float64)
+    visits = np.zeros(len(roads.cells))
+    track, travelled = [here[None]], 0.0
+    stride = 0.35 * min(plan.size)
+    while travelled < length:
+        far = np.flatnonzero(np.hypot(*(roads.cells * _CELL - here).T) > stride)
+        choice = rng.choice(far, size=min(24, len(far)), replace=False)
+        goal = roads.cells[choice[np.argmin(visits[choice] + rng.uniform(0, 0.5, len(choice)))]] * _CELL
+        road = _smooth(roads.road(here, goal[None])[0])
+        near = (((roads.cells[:, None] * _CELL - road[None, ::10]) ** 2).sum(axis=2) < 1.5**2).sum(axis=1)
+        visits += near
+        travelled += np.hypot(*np.diff(road, axis=0).T).sum()
+        track.append(road[1:])
+        here = road[-1]
+    return np.concatenate(track)
+
+
+def _smooth(road: Floats) -> Floats:
+    """Resample a road of cells every 5 cm and round its corners by a moving mean over 1.2 m."""
+    s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(road, axis=0).T))])
+    if s[-1] == 0.0:
+        return road
+    at = np.arange(0.0, s[-1] + 0.05, 0.05)
+    dense = np.stack([np.interp(at, s, road[:, k]) for k in range(2)], axis=1)
+    smooth = ndimage.uniform_filter1d(ndimage.uniform_filter1d(dense, 13, axis=0, mode="nearest"), 13, axis=0, mode="nearest")
+    smooth[0], smooth[-1] = dense[0], dense[-1]
+    return smooth
+
+
+def follow(track: Floats, heading: float, speed: float, seconds: float, step: float = 0.05) -> Motion:
+    """Drive along a track by pure pursuit with bounded accelerations; two seconds of rest at either end."""
+    look, max_turn, gain = max(0.35, 1.5 * speed), 0.8, 2.5
+    accel, turn_accel = 0.3 * step, 2.0 * step
+    x, y, theta = float(track[0, 0]), float(track[0, 1]), heading
+    v = w = 0.0
+    n = int(round(seconds / step)) + 1
+    poses = np.empty((n, 3))
+    px, py = track[:, 0].tolist(), track[:, 1].tolist()
+    target, last, rest = 0, len(track) - 1, int(2.0 / step)
+    for k in range(n):
+        poses[k] = x, y, theta
+        while target < last and (px[target] - x) ** 2 + (py[target] - y) ** 2 < look * look:
+            target += 1
+        error = (np.arctan2(py[target] - y, px[target] - x) - theta + np.pi) % (2 * np.pi) - np.pi
+        moving = rest <= k < n - rest
+        want_v = speed * max(0.0, np.cos(error)) if moving and abs(error) < 1.0 else 0.0
+        want_w = np.clip(gain * error, -max_turn, max_turn) if moving else 0.0
+        v += np.clip(want_v - v, -accel, accel)
+        w += np.clip(want_w - w, -turn_accel, turn_accel)
+        half = 0.5 * w * step
+        x += v * step * np.cos(theta + half)
+        y += v * step * np.sin(theta + half)
+        theta += w * step
+    return Motion(np.arange(n) * step, poses)

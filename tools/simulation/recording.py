@@ -1,0 +1,348 @@
+"""One drive through one building: every sensor's part, then the files."""
+
+import gzip
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import drive, laser, radio, wheels
+from .floorplans import ANCHOR_IDS, PLANS, FloorPlan
+from .laser import LaserModel
+from .radio import RadioModel
+
+Floats = NDArray[np.float64]
+
+_CHUNK = 8
+"""Scans cast together; they share the walls that are near."""
+
+
+@dataclass(frozen=True)
+class Lie:
+    """A stretch in which one anchor is wrong by the same amount."""
+
+    anchor: int
+    """Number of the anchor, from 1."""
+    start: float
+    seconds: float
+    metres: float
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is simulated; seconds, metres, radians."""
+
+    world: str = "hall"
+    seed: int = 0
+    minutes: float | None = None
+    """None: as long as the plan says."""
+    speed: float = 0.2
+    odometry_rate: float = 20.0
+    odometry_scale: float = 1.0
+    """All odometry errors times this."""
+    slips: int = 0
+    scan_rate: float = 10.0
+    """At most 10 Hz; less keeps every n-th sweep of the scanner."""
+    uwb_rate: float = 0.5
+    """Ranging epochs per second, each with up to four anchors."""
+    anchors: int | None = None
+    """How many, at random places; None: as in the plan."""
+    radio: RadioModel = field(default_factory=RadioModel)
+    laser: LaserModel = field(default_factory=LaserModel)
+    nlos: str = "normal"
+    nlos_anchors: tuple[int, ...] = ()
+    """Anchors (from 1) to which nlos applies, the others being normal; empty: all."""
+    outliers: float = 0.0
+    """Share of ranges that are nonsense of either sign."""
+    zeros: float = 0.0
+    """Share of ranges that are 0."""
+    lies: tuple[Lie, ...] = ()
+    anchor_height: float = 0.6
+    tag_height: float = 0.6
+    tell_heights: bool = False
+    tag: tuple[float, float] = (-0.05, 0.0)
+    laser_pose: tuple[float, float, float] = (0.10, 0.0, 0.0)
+    """Mounting of the laser that the log tells."""
+    laser_error: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """True mounting minus told mounting."""
+    laser_flipped: bool = False
+    uwb_delay: float = 0.0
+    """Stamp of a range minus its true time on the odometry's clock."""
+    laser_delay: float = 0.0
+    people: int = 0
+    without: tuple[str, ...] = ()
+    """Sensors that are missing: uwb, laser."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What the robot recorded, and the truth."""
+
+    settings: Settings
+    plan: FloorPlan
+    anchors: Floats
+    """(a, 2) true places."""
+    stamps: Floats
+    """(n,) of the odometry."""
+    odometry: Floats
+    """(n, 3)."""
+    truth: Floats
+    """(n, 3) true poses of the base at the stamps; theta unwrapped."""
+    scan_stamps: Floats
+    """(k,) first ray, on the laser's clock."""
+    scan_poses: Floats
+    """(k, 3) odometry pose written into the scan."""
+    scans: NDArray[np.int64]
+    """(k, beams) mm."""
+    range_stamps: Floats
+    """(m,) on the radio's clock."""
+    range_anchors: NDArray[np.int64]
+    """(m,) index into anchors."""
+    ranges: Floats
+    """(m,) m, as reported."""
+    calibration: dict[str, Any]
+    """True values of everything an estimator might want to know."""
+
+
+def _rng(settings: Settings, part: int) -> np.random.Generator:
+    # A generator per part: switching one option leaves the other sensors' random numbers as they were.
+    return np.random.default_rng([settings.seed, part])
+
+
+def simulate(settings: Settings) -> Recording:
+    """Simulate a drive."""
+    plan = PLANS[settings.world]()
+    seconds = 60.0 * (settings.minutes or plan.minutes)
+    track = drive.wander(plan, _rng(settings, 0), settings.speed * seconds + 5.0)
+    motion = drive.follow(track, plan.start[2], settings.speed, seconds)
+    anchors = _place_anchors(settings, plan)
+    stamps = np.round(np.arange(int(seconds * settings.odometry_rate) + 1) / settings.odometry_rate, 6)
+    faults = wheels.draw_errors(_rng(settings, 1), settings.odometry_scale)
+    slips = wheels.draw_slips(motion, _rng(settings, 2), settings.slips)
+    said = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3))
+    crowd = _people(settings, plan, seconds)
+    scan_stamps, scans = _scan(settings, plan, motion, crowd)
+    told = scan_stamps + settings.laser_delay
+    range_stamps, range_anchors, ranges, truth_uwb = _range(settings, plan, motion, anchors, crowd)
+    scan_poses = np.stack([np.interp(told, stamps, said[:, k]) for k in range(3)], axis=1)
+    mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
+    calibration = {
+        "settings": asdict(settings), "odometry": asdict(faults), "slips": slips, "uwb": truth_uwb,
+        "laser": {"x": mounting[0], "y": mounting[1], "theta": mounting[2], "flipped": settings.laser_flipped},
+        "tag": [*settings.tag, settings.tag_height],
+        "clock": {"uwb_delay": settings.uwb_delay, "laser_delay": settings.laser_delay},
+    }
+    return Recording(
+        settings, plan, anchors, stamps, said, motion.at(stamps), told, scan_poses, scans, range_stamps, range_anchors,
+        ranges, calibration,
+    )
+
+
+def _place_anchors(settings: Settings, plan: FloorPlan) -> Floats:
+    if settings.anchors is None:
+        return plan.anchors
+    rng = _rng(settings, 4)
+    cells = drive.RoadMap(plan, 0.4).cells * 0.2
+    places = [cells[rng.integers(len(cells))]]
+    while len(places) < settings.anchors:
+        # The farthest of a few keeps random anchors apart without making them regular.
+        tries = cells[rng.integers(len(cells), size=4)]
+        gaps = np.hypot(*(tries[:, None] - np.array(places)[None]).transpose(2, 0, 1)).min(axis=1)
+        places.append(tries[np.argmax(gaps)])
+    return np.array(places) + rng.uniform(-0.1, 0.1, (len(places), 2))
+
+
+def _people(settings: Settings, plan: FloorPlan, seconds: float) -> list[drive.Motion]:
+    """Return the walks of the people: 1 m/s between goals of their own."""
+    walks = []
+    for k in range(settings.people):
+        rng = _rng(settings, 100 + k)
+        cells = drive.RoadMap(plan, 0.4).cells * 0.2
+        begin = cells[rng.integers(len(cells))]
+        track = drive.wander(plan, rng, float(rng.uniform(0.7, 1.2)) * seconds, 0.4, begin)
+        at = np.linspace(0.0, seconds, len(track))
+        walks.append(drive.Motion(at, np.column_stack([track, np.zeros(len(track))])))
+    return walks
+
+
+def _bodies(crowd: list[drive.Motion], times: Floats, robot: Floats) -> Floats:
+    """Return the circles (n, p, 3) that people are at the times (n,); one that would touch the robot is not there."""
+    if not crowd:
+        return np.empty((len(times), 0, 3))
+    xy = np.stack([walk.at(times)[:, :2] for walk in crowd], axis=1)
+    radius = np.where(np.hypot(*(xy - robot[:, None, :2]).transpose(2, 0, 1)) < 0.6, 0.0, 0.18)
+    return np.concatenate([xy, radius[..., None]], axis=2)
+
+
+def _scan(settings: Settings, plan: FloorPlan, motion: drive.Motion, crowd: list[drive.Motion]) -> tuple[Floats, NDArray[np.int64]]:
+    """Return stamps (k,) on the odometry's clock and ranges (k, beams), mm."""
+    model = settings.laser
+    if "laser" in settings.without:
+        return np.empty(0), np.empty((0, model.beams), dtype=np.int64)
+    rng = _rng(settings, 5)
+    every = max(1, round(10.0 / settings.scan_rate))
+    stamps = np.round(np.arange(0.037, motion.stamps[-1] - 0.1, 0.1 * every), 6)
+    mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
+    angles = mounting[2] + (-model.angles if settings.laser_flipped else model.angles)
+    colour = model.surface_sd * rng.standard_normal(len(plan.walls) + len(plan.columns) + len(crowd))
+    out = np.empty((len(stamps), model.beams), dtype=np.int64)
+    for first in range(0, len(stamps), _CHUNK):
+        chunk = stamps[first : first + _CHUNK]
+        times = (chunk[:, None] + model.time_increment * np.arange(model.beams)).ravel()
+        pose = motion.at(times)
+        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        origin = pose[:, :2] + np.stack([c * mounting[0] - s * mounting[1], s * mounting[0] + c * mounting[1]], axis=1)
+        walls, columns = laser.near(plan.walls, plan.columns, origin.mean(axis=0), model.max_range + 0.5)
+        still = np.broadcast_to(plan.columns[columns], (len(times), len(columns), 3))
+        round_things = np.concatenate([still, _bodies(crowd, times, pose)], axis=1)
+        ids = np.concatenate([walls, len(plan.walls) + columns, len(plan.walls) + len(plan.columns) + np.arange(len(crowd)), [-1]])
+        heading = pose[:, 2] + np.tile(angles, len(chunk))
+        true, cosine, surface = laser.cast(origin, heading, plan.walls[walls], round_things, model.max_range)
+        shape = (len(chunk), model.beams)
+        surfaces = ids[surface].reshape(shape)
+        out[first : first + len(chunk)] = laser.disturb(true.reshape(shape), cosine.reshape(shape), surfaces, model, colour, rng)
+    return stamps, out
+
+
+def _range(
+    settings: Settings, plan: FloorPlan, motion: drive.Motion, anchors: Floats, crowd: list[drive.Motion]
+) -> tuple[Floats, NDArray[np.int64], Floats, dict[str, Any]]:
+    """Return stamps (m,), anchor indices (m,), ranges (m,) and what is true of the radio."""
+    model, count = settings.radio, len(anchors)
+    bias = model.bias_sd * _rng(settings, 6).standard_normal(count)
+    truth: dict[str, Any] = {
+        "bias": dict(zip(ANCHOR_IDS, bias.tolist(), strict=False)), "scale": model.scale,
+        "anchor_height": settings.anchor_height, "tag_height": settings.tag_height,
+    }
+    if "uwb" in settings.without or count == 0:
+        return np.empty(0), np.empty(0, dtype=np.int64), np.empty(0), truth
+    times = np.round(np.arange(0.213, motion.stamps[-1], 1.0 / settings.uwb_rate), 6)
+    pose = motion.at(times)
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    tag = pose[:, :2] + np.stack([c * settings.tag[0] - s * settings.tag[1], s * settings.tag[0] + c * settings.tag[1]], axis=1)
+    bodies = _bodies(crowd, times, pose)
+    ranges, heard, effort = (np.empty((len(times), count)) for _ in range(3))
+    pattern = _rng(settings, 7).integers(2**31)
+    for a, place in enumerate(anchors):
+        rng = _rng(settings, 200 + a)
+        ray = place - tag
+        distance = np.sqrt((ray * ray).sum(axis=1) + (settings.anchor_height - settings.tag_height) ** 2)
+        bearing = np.arctan2(ray[:, 1], ray[:, 0])
+        # One antenna on the robot: every anchor meets the same pattern; each anchor has one of its own besides.
+        antenna = radio.antenna_pattern(np.random.default_rng(pattern), bearing - pose[:, 2])
+        antenna = (antenna + radio.antenna_pattern(rng, bearing)) / np.sqrt(2.0)
+        field_ = radio.smooth_field(rng, tag, model.multipath_length)
+        shadow = plan.opacity * radio.crossings(tag, place, plan.walls, plan.columns)
+        shadow += 0.5 * (radio.crossings(tag, place, np.empty((0, 4)), bodies) > 0)
+        level = settings.nlos if not settings.nlos_anchors or a + 1 in settings.nlos_anchors else "normal"
+        extra, lost = radio.excess(shadow, tag, level, rng)
+        noise = model.noise_sd * rng.standard_normal(len(times))
+        ranges[:, a] = model.scale * distance + bias[a] + model.multipath_sd * field_ + model.antenna_sd * antenna + extra + noise
+        heard[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < model.max_range)
+        effort[:, a] = distance + 6.0 * shadow
+    rng = _rng(settings, 8)
+    rank = np.argsort(np.argsort(effort + rng.uniform(0, 3, effort.shape), axis=1), axis=1)
+    epoch, anchor = np.nonzero((heard > 0) & (rank < model.per_epoch))
+    stamps, values = times[epoch], np.maximum(ranges[epoch, anchor], 0.0)
+    values = _spoil(settings, stamps, anchor, values, rng, max(plan.size))
+    return stamps + settings.uwb_delay, anchor, np.round(values, 3), truth
+
+
+def _spoil(
+    settings: Settings, stamps: Floats, anchor: NDArray[np.int64], values: Floats, rng: np.random.Generator, size: float
+) -> Floats:
+    for lie in settings.lies:
+        during = (anchor == lie.anchor - 1) & (stamps >= lie.start) & (stamps < lie.start + lie.seconds)
+        values = np.where(during, np.maximum(values + lie.metres, 0.0), values)
+    kind, wild = rng.random(len(values)), rng.uniform(0.0, 1.5 * size, len(values))
+    values = np.where(kind < settings.outliers, wild, values)
+    return np.where(kind > 1.0 - settings.zeros, 0.0, values)
+
+
+def write(recording: Recording, directory: Path, compress: bool = False) -> None:
+    """Write run.log(.gz) and the truth files."""
+    directory.mkdir(parents=True, exist_ok=True)
+    text = log_text(recording)
+    if compress:
+        (directory / "run.log.gz").write_bytes(gzip.compress(text, 6, mtime=0))
+    else:
+        (directory / "run.log").write_bytes(text)
+    plan, truth = recording.plan, recording.truth
+    half = 0.5 * truth[:, 2]
+    rows = np.column_stack([recording.stamps, truth[:, :2], np.sin(half), np.cos(half)])
+    _lines(directory / "truth.tum", "", (f"{t:.6f} {x:.5f} {y:.5f} 0 0 0 {z:.8f} {w:.8f}" for t, x, y, z, w in rows.tolist()))
+    anchors = zip(ANCHOR_IDS, recording.anchors.tolist(), strict=False)
+    height = recording.settings.anchor_height
+    _lines(directory / "truth_anchors.csv", "id,x,y,height", (f"{i},{x:.4f},{y:.4f},{height:.3f}" for i, (x, y) in anchors))
+    named = zip(plan.landmarks, plan.columns.tolist(), strict=False)
+    _lines(directory / "columns.csv", "name,x,y,radius", (f"{n},{x:.4f},{y:.4f},{r:.3f}" for n, (x, y, r) in named))
+    _lines(directory / "pairs.csv", "a,b", (f"{a},{b}" for a, b in plan.pairs)) if plan.pairs else None
+    _lines(directory / "walls.csv", "x1,y1,x2,y2", (",".join(f"{v:.4f}" for v in w) for w in plan.walls.tolist()))
+    _lines(directory / "posts.csv", "x,y,radius", (",".join(f"{v:.4f}" for v in c) for c in plan.columns.tolist()))
+    (directory / "truth_calibration.json").write_text(json.dumps(recording.calibration, indent=1, sort_keys=True) + "\n")
+
+
+def _lines(path: Path, header: str, rows: Any) -> None:
+    path.write_text("".join(line + "\n" for line in ([header] if header else []) + list(rows)))
+
+
+def log_text(recording: Recording) -> bytes:
+    """Return the recording as a CARMEN log, in the order in which a logger would have written it."""
+    settings = recording.settings
+    params = {
+        "laser_time_increment": f"{settings.laser.time_increment:.8f}",
+        "uwb_tag_offset_x": f"{settings.tag[0]:.3f}", "uwb_tag_offset_y": f"{settings.tag[1]:.3f}",
+    }
+    if settings.tell_heights:
+        params |= {"uwb_tag_height": f"{settings.tag_height:.3f}", "uwb_anchor_height": f"{settings.anchor_height:.3f}"}
+    lines = [b"# CARMEN Logfile\n", f"# simulated {settings.world}, seed {settings.seed}\n".encode()]
+    lines += [f"PARAM {name} {value} 0 sim 0\n".encode() for name, value in params.items()]
+    # A logger writes what has arrived: a scan after its sweep, a range after its slot. Stamps therefore run out of order.
+    written = np.concatenate([recording.stamps + 0.002, recording.scan_stamps + 0.102, recording.range_stamps + 0.03])
+    messages = _odometry_lines(recording) + _scan_lines(recording) + _range_lines(recording)
+    lines += [messages[i] for i in np.argsort(written, kind="stable")]
+    return b"".join(lines)
+
+
+def _wrap(theta: Floats) -> Floats:
+    return (theta + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def _odometry_lines(r: Recording) -> list[bytes]:
+    t, pose = r.stamps, r.odometry
+    step = np.diff(pose, axis=0, append=pose[-1:]) * r.settings.odometry_rate
+    forward = step[:, 0] * np.cos(pose[:, 2]) + step[:, 1] * np.sin(pose[:, 2])
+    rows = np.column_stack([pose[:, :2], _wrap(pose[:, 2]), forward, step[:, 2], t, t + 0.002]).tolist()
+    return [f"ODOM {x:.6f} {y:.6f} {a:.6f} {v:.4f} {w:.4f} 0 {s:.6f} sim {u:.6f}\n".encode() for x, y, a, v, w, s, u in rows]
+
+
+def _scan_lines(r: Recording) -> list[bytes]:
+    model, (mx, my, mt) = r.settings.laser, r.settings.laser_pose
+    span = (model.beams - 1) * model.increment
+    head = f"ROBOTLASER1 2 {model.angles[0]:.9f} {span:.9f} {model.increment:.9f} {model.max_range:.3f} 0.01 0 {model.beams} "
+    words = np.frombuffer("".join(f"{mm / 1000:.3f} " for mm in range(int(model.max_range * 1000) + 1)).encode(), dtype="S6")
+    c, s = np.cos(r.scan_poses[:, 2]), np.sin(r.scan_poses[:, 2])
+    x, y = r.scan_poses[:, 0], r.scan_poses[:, 1]
+    where = np.column_stack(
+        [x + c * mx - s * my, y + s * mx + c * my, _wrap(r.scan_poses[:, 2] + mt), x, y, _wrap(r.scan_poses[:, 2])]
+    )
+    start = head.encode()
+    return [
+        start + words[scan].tobytes() + (
+            "0 " + " ".join(f"{v:.6f}" for v in pose) + f" 0 0 0 0 0 {t:.6f} sim {t + 0.102:.6f}\n"
+        ).encode()
+        for scan, pose, t in zip(r.scans, where.tolist(), r.scan_stamps.tolist(), strict=True)
+    ]
+
+
+def _range_lines(r: Recording) -> list[bytes]:
+    rows = zip(r.range_anchors.tolist(), r.ranges.tolist(), r.range_stamps.tolist(), strict=True)
+    return [f"UWB {ANCHOR_IDS[a]} {d:.3f} 100 {t:.6f} sim {t + 0.03:.6f}\n".encode() for a, d, t in rows]
+
+
+def with_overrides(settings: Settings, **values: Any) -> Settings:
+    """Return the settings with the values that are not None put in."""
+    return replace(settings, **{k: v for k, v in values.items() if v is not None})
