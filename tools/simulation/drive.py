@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from .fields import smooth_field
 from .floorplans import FloorPlan
 
 Floats = NDArray[np.float64]
@@ -44,7 +45,7 @@ class RoadMap:
         start = self.cell(np.array(plan.start[:2]))
         self.free = label == label[tuple(start)] if label[tuple(start)] else self.free
         self.cells = np.argwhere(self.free)
-        self.graph = self._graph(np.clip(clearance / np.maximum(distance, 1e-3), 0.2, 1.0))
+        self.edges = self._edges(np.clip(clearance / np.maximum(distance, 1e-3), 0.2, 1.0))
 
     def cell(self, point: Floats) -> NDArray[np.int64]:
         """Return the free cell nearest to a point."""
@@ -54,7 +55,7 @@ class RoadMap:
             index = self.cells
         return index[np.argmin(((index * _CELL - point) ** 2).sum(axis=1))]
 
-    def _graph(self, dear: Floats) -> sparse.csr_array:
+    def _edges(self, dear: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
         number = np.arange(self.free.size).reshape(self.free.shape)
         rows, cols, cost = [], [], []
         for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)):
@@ -64,20 +65,21 @@ class RoadMap:
             rows.append(number[a][both])
             cols.append(number[b][both])
             cost.append(np.hypot(dx, dy) * (1.0 + dear[a][both] + dear[b][both]))
-        entries = (np.concatenate(cost), (np.concatenate(rows), np.concatenate(cols)))
-        return sparse.csr_array(entries, shape=(self.free.size,) * 2)
+        return np.concatenate(rows), np.concatenate(cols), np.concatenate(cost)
 
-    def road(self, start: Floats, goals: Floats) -> list[Floats]:
-        """Return the cheapest road (k, 2) from the start to each goal."""
+    def roads(self, start: Floats, goals: NDArray[np.int64], taste: Floats) -> list[Floats]:
+        """Return the cheapest road (k, 2) from the start to each goal cell; taste (cells,) makes places dear or cheap."""
         source = int(np.ravel_multi_index(tuple(self.cell(start)), self.free.shape))
-        _, before = csgraph.dijkstra(self.graph, directed=False, indices=source, return_predecessors=True)
+        liking = np.ones(self.free.size)
+        liking[np.ravel_multi_index(tuple(self.cells.T), self.free.shape)] = taste
+        rows, cols, cost = self.edges
+        graph = sparse.csr_array((cost * (liking[rows] + liking[cols]), (rows, cols)), shape=(self.free.size,) * 2)
+        _, before = csgraph.dijkstra(graph, directed=False, indices=source, return_predecessors=True)
         roads = []
         for goal in goals:
-            node = int(np.ravel_multi_index(tuple(self.cell(goal)), self.free.shape))
-            nodes = [node]
-            while node != source:
-                node = int(before[node])
-                nodes.append(node)
+            nodes = [int(np.ravel_multi_index(tuple(goal), self.free.shape))]
+            while nodes[-1] != source:
+                nodes.append(int(before[nodes[-1]]))
             roads.append(np.stack(np.unravel_index(nodes[::-1], self.free.shape), axis=1) * _CELL)
         return roads
 
@@ -92,35 +94,43 @@ def _draw(plan: FloorPlan, blocked: NDArray[np.bool_], cell: float) -> None:
 
 
 def wander(plan: FloorPlan, rng: np.random.Generator, length: float, clearance: float = 0.5, start: Floats | None = None) -> Floats:
-    """Return a dense polyline (k, 2), at least `length` m long, that keeps going where it has been least."""
+    """Return a dense polyline (k, 2), at least `length` m long, that keeps going where it has been least.
+
+    Every leg has a taste of its own for places, so that legs between the same ends differ; turning back is avoided.
+    """
     roads = RoadMap(plan, clearance)
+    places = roads.cells * _CELL
     here = np.asarray(plan.start[:2] if start is None else start, dtype=np.float64)
-    visits = np.zeros(len(roads.cells))
-    track, travelled = [here[None]], 0.0
+    course = np.array([np.cos(plan.start[2]), np.sin(plan.start[2])])
+    visits, travelled, track = np.zeros(len(places)), 0.0, [here[None]]
     stride = 0.35 * min(plan.size)
     while travelled < length:
-        far = np.flatnonzero(np.hypot(*(roads.cells * _CELL - here).T) > stride)
+        taste = np.exp(0.7 * smooth_field(rng, places, 3.0))
+        far = np.flatnonzero(np.hypot(*(places - here).T) > stride)
         choice = rng.choice(far, size=min(24, len(far)), replace=False)
-        goal = roads.cells[choice[np.argmin(visits[choice] + rng.uniform(0, 0.5, len(choice)))]] * _CELL
-        road = _smooth(roads.road(here, goal[None])[0])
-        near = (((roads.cells[:, None] * _CELL - road[None, ::10]) ** 2).sum(axis=2) < 1.5**2).sum(axis=1)
-        visits += near
-        travelled += np.hypot(*np.diff(road, axis=0).T).sum()
-        track.append(road[1:])
-        here = road[-1]
-    return np.concatenate(track)
+        legs = roads.roads(here, roads.cells[choice], taste)
+        ahead = np.array([_unit(leg[min(5, len(leg) - 1)] - leg[0]) @ course for leg in legs])
+        typical = visits.mean() + 1.0
+        best = int(np.argmin(visits[choice] / typical - 0.7 * ahead + rng.uniform(0, 0.5, len(choice))))
+        leg = legs[best]
+        visits += (((places[:, None] - leg[None, ::4]) ** 2).sum(axis=2) < 1.5**2).sum(axis=1)
+        travelled += np.hypot(*np.diff(leg, axis=0).T).sum()
+        track.append(leg[1:])
+        course, here = _unit(leg[-1] - leg[max(0, len(leg) - 6)]), leg[-1]
+    return _smooth(np.concatenate(track))
+
+
+def _unit(vector: Floats) -> Floats:
+    return vector / max(1e-9, float(np.hypot(*vector)))
 
 
 def _smooth(road: Floats) -> Floats:
-    """Resample a road of cells every 5 cm and round its corners by a moving mean over 1.2 m."""
+    """Resample a road of cells every 5 cm and round its corners by two moving means over 0.65 m."""
     s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(road, axis=0).T))])
-    if s[-1] == 0.0:
-        return road
     at = np.arange(0.0, s[-1] + 0.05, 0.05)
     dense = np.stack([np.interp(at, s, road[:, k]) for k in range(2)], axis=1)
-    smooth = ndimage.uniform_filter1d(ndimage.uniform_filter1d(dense, 13, axis=0, mode="nearest"), 13, axis=0, mode="nearest")
-    smooth[0], smooth[-1] = dense[0], dense[-1]
-    return smooth
+    once = ndimage.uniform_filter1d(dense, 13, axis=0, mode="nearest")
+    return ndimage.uniform_filter1d(once, 13, axis=0, mode="nearest")
 
 
 def follow(track: Floats, heading: float, speed: float, seconds: float, step: float = 0.05) -> Motion:

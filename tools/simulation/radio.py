@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from .fields import smooth_field
+
 Floats = NDArray[np.float64]
 
 NLOS_LEVELS: dict[str, tuple[float, float, float]] = {
@@ -41,13 +43,6 @@ class RadioModel:
     """The most anchors a tag ranges to at once."""
     max_range: float = 60.0
     """m."""
-
-
-def smooth_field(rng: np.random.Generator, points: Floats, length: float, waves: int = 48) -> Floats:
-    """Return a Gaussian random field (n,) of unit variance at points (n, 2), correlated over `length` m."""
-    k = rng.standard_normal((waves, 2)) / length
-    phase = rng.uniform(0.0, 2.0 * np.pi, waves)
-    return np.sqrt(2.0 / waves) * np.cos(points @ k.T + phase).sum(axis=1)
 
 
 def antenna_pattern(rng: np.random.Generator, angle: Floats) -> Floats:
