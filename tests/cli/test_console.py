@@ -1,0 +1,83 @@
+"""The console: what goes where, the bar on a terminal only, readers that leave early."""
+
+import io
+
+import pytest
+
+from uwblite.cli import console
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture(autouse=True)
+def _quiet_afterwards():
+    yield
+    console.set_up()
+
+
+def test_say_and_note_go_to_their_streams(capsys):
+    console.set_up()
+    console.say("result")
+    console.note("beside")
+    assert capsys.readouterr() == ("result\n", "beside\n")
+
+
+def test_quiet_drops_notes_only(capsys):
+    console.set_up(quiet=True)
+    console.say("result")
+    console.note("beside")
+    assert capsys.readouterr() == ("result\n", "")
+
+
+def test_an_error_is_one_line(capsys):
+    assert console.fail("first\nsecond", 1) == 1
+    assert capsys.readouterr().err == "uwblite: error: first second\n"
+
+
+def test_progress_is_silent_off_a_terminal():
+    stream = io.StringIO()
+    progress = console.Progress(stream)
+    progress("closures", 1, 2)
+    assert stream.getvalue() == ""
+
+
+def test_progress_draws_time_left_and_is_wiped():
+    now = iter([0.0, 10.0, 20.0])
+    stream = Terminal()
+    progress = console.Progress(stream, clock=lambda: next(now))
+    progress("closures", 0, 4)
+    progress("closures", 1, 4)
+    assert "25 %  30.0 s left" in stream.getvalue()
+    progress.close()
+    assert stream.getvalue().endswith("\r")
+
+
+@pytest.mark.parametrize(
+    ("done", "total", "text"),
+    [
+        (0, 0, "grid ..."),
+        (1, 5, f"grid             [####{' ' * 16}]  20 %  12.0 s left"),
+        (7, 5, f"grid             [{'#' * 20}] 100 %"),
+    ],
+)
+def test_progress_line(done, total, text):
+    assert console.progress_line("grid", done, total, 3.0) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.04, "0.0 s"), (59.96, "1 min 00 s"), (245, "4 min 05 s"), (3720, "1 h 02 min")]
+)
+def test_durations(seconds, text):
+    assert console.duration(seconds) == text
+
+
+def test_operating_system_errors_say_the_way_out():
+    assert console.os_error_text(OSError(28, "No space left on device", "map.pgm")) == (
+        "map.pgm: No space left on device; free some space, or write to another disk with --out"
+    )
+    assert console.os_error_text(FileNotFoundError(2, "No such file or directory", "x.log")) == (
+        "x.log: No such file or directory; check the spelling"
+    )

@@ -1,0 +1,133 @@
+"""The command line: one module per verb, loaded when its verb is asked for.
+
+A verb module offers ``HELP`` (one line), ``EPILOG`` (examples), ``add_arguments(parser)`` and ``run(args) -> int``. Its
+top level imports nothing heavy: numpy, scipy and serial are imported inside ``run``, so that ``--help`` and usage
+errors answer at once on a small computer. This package alone prints, and this file alone turns errors into exit codes.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
+from importlib import import_module
+from typing import Any
+
+from .. import __version__
+from ..errors import UwbliteError
+
+VERBS = ("map", "check", "record", "devices", "convert", "evaluate", "optimize", "config")
+"""In the order in which a user meets them; `uwblite VERB` is the module of the same name."""
+
+_DESCRIPTION = """\
+Maps from wheel odometry, ultra-wideband ranges to unknown anchors and a short-range 2D lidar.
+
+examples:
+  uwblite check run.log                 is the recording fit to be mapped?
+  uwblite map run.log --out map/        map it
+  uwblite evaluate map/ --truth t.tum   compare with the truth
+"""
+
+_OUT_OF_MEMORY = "out of memory; a coarser --resolution, --crop or a shorter recording needs less"
+
+_EXIT_CODES = """\
+exit codes:
+  0    done
+  1    error; one line on stderr says what, where and how to mend it
+  2    wrong usage of the command line
+  3    files are written, but the result should not be trusted; the reasons are named
+  130  interrupted (Ctrl-C)
+
+`uwblite VERB --help` shows the options of a verb, examples first.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Parameters
+    ----------
+    argv : arguments without the program's name; None = those of this process.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    verb = next((word for word in words if not word.startswith("-")), None)
+    if verb is None:
+        return _without_verb(words)
+    if verb not in VERBS:
+        return _usage_error(f"unknown command {verb!r}{_did_you_mean(verb)}")
+    words.remove(verb)
+    module = import_module(f".{verb}", __name__)
+    try:
+        args = _verb_parser(verb, module).parse_args(words)
+    except SystemExit as leave:
+        return int(leave.code or 0)
+    return _run(module, args)
+
+
+def _without_verb(words: list[str]) -> int:
+    if "--version" in words:
+        sys.stdout.write(f"uwblite {__version__}\n")
+        return 0
+    parser = _overview()
+    if not words or "-h" in words or "--help" in words:
+        (sys.stdout if words else sys.stderr).write(parser.format_help())
+        return 0 if words else 2
+    return _usage_error(f"{words[0]} needs a command before or after it")
+
+
+def _overview() -> argparse.ArgumentParser:
+    width = max(map(len, VERBS))
+    lines = [f"  {verb:<{width}}  {import_module(f'.{verb}', __name__).HELP}" for verb in VERBS]
+    return argparse.ArgumentParser(
+        prog="uwblite",
+        usage="uwblite VERB [options]   (uwblite --version, uwblite --help)",
+        description=_DESCRIPTION,
+        epilog="commands:\n" + "\n".join(lines) + "\n\n" + _EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        add_help=False,
+    )
+
+
+def _verb_parser(verb: str, module: Any) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"uwblite {verb}",
+        description=f"{module.HELP}\n\n{module.EPILOG.strip()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    module.add_arguments(parser)
+    common = parser.add_argument_group("common options")
+    common.add_argument("-q", "--quiet", action="store_true", help="no progress and no notes on stderr")
+    common.add_argument("-v", "--verbose", action="count", default=0, help="say more on stderr; -vv for debugging")
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    common.add_argument("--version", action="version", version=f"uwblite {__version__}")
+    return parser
+
+
+def _run(module: Any, args: argparse.Namespace) -> int:
+    from . import console
+
+    console.set_up(quiet=args.quiet, verbose=args.verbose)
+    try:
+        code = int(module.run(args))
+    except KeyboardInterrupt:
+        return console.fail("interrupted", 130)
+    except UwbliteError as error:
+        return console.fail(str(error), 1, trace=args.debug)
+    except MemoryError:
+        return console.fail(_OUT_OF_MEMORY, 1, trace=args.debug)
+    except OSError as error:
+        return console.fail(console.os_error_text(error), 1, trace=args.debug)
+    except Exception as error:
+        text = f"internal error: {type(error).__name__}: {error} (please report it; --debug shows where)"
+        return console.fail(text, 1, trace=args.debug)
+    return code if console.flush() else 1
+
+
+def _usage_error(text: str) -> int:
+    sys.stderr.write(f"uwblite: error: {text}\nuwblite --help lists the commands\n")
+    return 2
+
+
+def _did_you_mean(verb: str) -> str:
+    near = get_close_matches(verb, VERBS, n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""

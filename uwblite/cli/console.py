@@ -1,0 +1,185 @@
+"""What the command line says: results on stdout, everything else on stderr, a progress bar on a terminal.
+
+A reader that leaves early (``uwblite map ... | head -1``) does not stop the work: what it no longer reads is dropped.
+"""
+
+import logging
+import os
+import sys
+import time
+import traceback
+from typing import Any, TextIO
+
+_LOGGER = logging.getLogger("uwblite")
+
+
+class _Console:
+    """The one place that holds the state of this process's output."""
+
+    def __init__(self) -> None:
+        self.quiet = False
+        self.bar: Progress | None = None
+
+
+_CONSOLE = _Console()
+
+
+def set_up(*, quiet: bool = False, verbose: int = 0) -> None:
+    """Choose how much is said; log records of the package go to stderr."""
+    _CONSOLE.quiet = quiet
+    level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("uwblite: %(message)s"))
+    _LOGGER.handlers[:] = [handler]
+    _LOGGER.setLevel(level)
+
+
+def say(text: str = "") -> None:
+    """Write one line of the result to stdout."""
+    _clear_bar()
+    _write(sys.stdout, text + "\n")
+
+
+def note(text: str) -> None:
+    """Write one line beside the result to stderr; --quiet drops it."""
+    if not _CONSOLE.quiet:
+        _clear_bar()
+        _write(sys.stderr, text + "\n")
+
+
+def fail(text: str, code: int, *, trace: bool = False) -> int:
+    """Write one line about what went wrong to stderr and return the exit code."""
+    _clear_bar()
+    if trace:
+        _write(sys.stderr, traceback.format_exc())
+    _write(sys.stderr, "uwblite: error: " + " ".join(text.split()) + "\n" if code != 130 else f"uwblite: {text}\n")
+    flush()
+    return code
+
+
+def os_error_text(error: OSError) -> str:
+    """Return one line about an error of the operating system, with the way out where it is known."""
+    reason = error.strerror or str(error) or type(error).__name__
+    where = f"{error.filename}: " if error.filename else ""
+    hint = {
+        "ENOSPC": "; free some space, or write to another disk with --out",
+        "EACCES": "; check who owns it, or choose another place",
+        "EROFS": "; choose a place that can be written to",
+        "ENOENT": "; check the spelling",
+    }.get(_name_of(error.errno), "")
+    return f"{where}{reason}{hint}"
+
+
+def _name_of(number: int | None) -> str:
+    import errno
+
+    return errno.errorcode.get(number or 0, "")
+
+
+def flush() -> bool:
+    """Push out what was said; False where stdout could not take it (disk full, not a closed pipe)."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _drop(sys.stdout)
+    except OSError as error:
+        _drop(sys.stdout)
+        _write(sys.stderr, f"uwblite: error: stdout: {os_error_text(error)}\n")
+        return False
+    return True
+
+
+def _write(stream: TextIO, text: str) -> None:
+    try:
+        stream.write(text)
+    except UnicodeEncodeError:
+        stream.write(text.encode(stream.encoding or "ascii", "replace").decode(stream.encoding or "ascii"))
+    except BrokenPipeError:
+        _drop(stream)
+
+
+def _drop(stream: TextIO) -> None:
+    """Send the rest of a stream that nobody reads to nowhere."""
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    except (OSError, ValueError):
+        return
+
+
+def _clear_bar() -> None:
+    if _CONSOLE.bar is not None:
+        _CONSOLE.bar.clear()
+
+
+class Progress:
+    """A progress bar on stderr, with the time left in the present stage; silent where stderr is not a terminal.
+
+    Call it as ``progress(stage, done, total)``: the signature that ``build_map`` asks for.
+    """
+
+    def __init__(self, stream: TextIO | None = None, clock: Any = time.monotonic) -> None:
+        self.stream = sys.stderr if stream is None else stream
+        self.clock = clock
+        self.active = self.stream.isatty() and not _CONSOLE.quiet
+        self.stage, self.began, self.shown = "", 0.0, -1.0
+        self.width = 0
+        if self.active:
+            _CONSOLE.bar = self
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Show that `done` of `total` steps of a stage are behind us."""
+        if not self.active:
+            return
+        now = self.clock()
+        if stage != self.stage:
+            self.clear()
+            self.stage, self.began, self.shown = stage, now, -1.0
+        if now - self.shown < 0.1 and done < total:
+            return
+        self.shown = now
+        self._draw(progress_line(stage, done, total, now - self.began))
+
+    def _draw(self, line: str) -> None:
+        line = line[: self._columns() - 1]
+        _write(self.stream, "\r" + line + " " * (self.width - len(line)))
+        self.stream.flush()
+        self.width = len(line)
+
+    def _columns(self) -> int:
+        try:
+            return os.get_terminal_size(self.stream.fileno()).columns or 80
+        except (OSError, ValueError):
+            return 80
+
+    def clear(self) -> None:
+        """Wipe the bar, so that a line can be written in its place."""
+        if self.active and self.width:
+            _write(self.stream, "\r" + " " * self.width + "\r")
+            self.stream.flush()
+            self.width = 0
+
+    def close(self) -> None:
+        """Wipe the bar for good."""
+        self.clear()
+        if _CONSOLE.bar is self:
+            _CONSOLE.bar = None
+
+
+def progress_line(stage: str, done: int, total: int, elapsed: float) -> str:
+    """Return the text of a progress bar; elapsed is the time since the stage began, s."""
+    if total <= 0:
+        return f"{stage} ..."
+    share = min(max(done / total, 0.0), 1.0)
+    bar = "#" * int(20 * share)
+    left = f"  {duration(elapsed * (1.0 - share) / share)} left" if 0.0 < share < 1.0 and elapsed > 1.0 else ""
+    return f"{stage:<16} [{bar:<20}] {100 * share:3.0f} %{left}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time span in words, such as 3.2 s, 4 min 05 s or 1 h 02 min."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"

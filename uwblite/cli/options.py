@@ -1,0 +1,88 @@
+"""Options that several verbs share: the settings of the mapper, and how the sensors are mounted."""
+
+import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..mapping import MappingConfig
+    from ..sensor_log import SensorLog
+
+
+def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare --preset, --config and --set."""
+    group = parser.add_argument_group("settings (a later one wins: preset, file, --set)")
+    group.add_argument("--preset", metavar="NAME", help="start from a preset: `uwblite config --preset help` lists them")
+    group.add_argument("--config", metavar="FILE.toml", help="read settings from a file, as `uwblite config` prints it")
+    example = "change one setting, e.g. icp.max_iterations=30; repeatable"
+    group.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=example)
+
+
+def effective_config(args: argparse.Namespace) -> "MappingConfig":
+    """Return the settings that --preset, --config and --set amount to."""
+    from ..config import merge, override, parse_toml
+    from ..mapping import MappingConfig, preset
+
+    config = preset(args.preset) if args.preset else MappingConfig()
+    if args.config:
+        config = merge(config, parse_toml(read_text(args.config), args.config))
+    return override(config, args.set)
+
+
+def read_text(path: str) -> str:
+    """Return the text of a small file of settings; anything else is one clear error."""
+    from ..errors import FormatError
+
+    with open(path, "rb") as file:
+        data = file.read(_LARGEST_SETTINGS + 1)
+    if len(data) > _LARGEST_SETTINGS:
+        raise FormatError("far too long for a file of settings", path)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise FormatError("not a text file (UTF-8)", path) from None
+
+
+_LARGEST_SETTINGS = 1 << 20
+
+
+def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare how the sensors are mounted; the log's own PARAM lines hold where these are not given."""
+    group = parser.add_argument_group("mounting (what the log says is overridden)")
+    group.add_argument("--laser-pose", metavar="X,Y,THETA", type=_numbers(3), help="laser on the base: m, m, rad")
+    group.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
+    group.add_argument("--tag", metavar="X,Y,Z", type=_numbers(3), help="UWB tag on the base, z above the floor: m")
+    group.add_argument("--anchor-height", metavar="H", type=float, help="height of all anchors above the floor, m")
+
+
+def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    def parse(text: str) -> tuple[float, ...]:
+        import math
+
+        try:
+            values = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {count} numbers separated by commas")
+        return values
+
+    return parse
+
+
+def apply_mounting(log: "SensorLog", args: argparse.Namespace) -> "SensorLog":
+    """Return the log with the mounting of the command line in place of its own."""
+    import dataclasses
+
+    import numpy as np
+
+    mounting = log.mounting
+    if args.laser_pose is not None:
+        mounting = dataclasses.replace(mounting, T_base_laser=np.array(args.laser_pose))
+    if args.laser_flipped:
+        mounting = dataclasses.replace(mounting, laser_flipped=True)
+    if args.tag is not None:
+        mounting = dataclasses.replace(mounting, tag_position=np.array(args.tag))
+    if args.anchor_height is not None:
+        mounting = dataclasses.replace(mounting, anchor_height=args.anchor_height, anchor_heights={})
+    return dataclasses.replace(log, mounting=mounting)

@@ -1,0 +1,320 @@
+"""Settings: nested frozen dataclasses to and from dicts and TOML, checked strictly. Knows nothing of mapping.
+
+A settings class is a frozen dataclass whose fields have a type, a default and, on the line below, a docstring (unit,
+meaning, when to change it). Fields are bool, int, float, str, a Literal of strings, a tuple or dict of these, one of
+these or None, or another settings class. A number whose default is not negative must not be negative; ``setting`` says
+other ranges. TOML has no null: None is written "none".
+
+Laws: ``from_dict(type(c), to_dict(c))`` and ``from_dict(type(c), parse_toml(to_toml(c)))`` give a c of equal values.
+"""
+
+import ast
+import dataclasses
+import math
+import sys
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from difflib import get_close_matches
+from itertools import pairwise
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+from .errors import ConfigError
+
+Settings = TypeVar("Settings")
+
+_RANGE = "uwblite range"
+
+
+def setting(
+    default: Any,
+    *,
+    above: float | None = None,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    below: float | None = None,
+) -> Any:
+    """Return a dataclass field with a default and a permitted range: above < value < below, minimum <= value <= maximum."""
+    limits = {"above": above, "minimum": minimum, "maximum": maximum, "below": below}
+    return dataclasses.field(default=default, metadata={_RANGE: {k: v for k, v in limits.items() if v is not None}})
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Return the settings as nested dicts of plain values, in the order of the fields."""
+    return {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return to_dict(value)
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    return value
+
+
+def from_dict(cls: type[Settings], data: Mapping[str, Any]) -> Settings:
+    """Return settings of a class from nested dicts; what is not named keeps its default.
+
+    Raises
+    ------
+    ConfigError : a name is unknown (with the nearest known one), a value has the wrong type or is out of its range.
+    """
+    return cast(Settings, _merge(cls(), data, (), cls))
+
+
+def merge(config: Settings, data: Mapping[str, Any]) -> Settings:
+    """Return the settings with those named in nested dicts replaced; errors as in from_dict."""
+    return cast(Settings, _merge(config, data, (), type(config)))
+
+
+def override(config: Settings, assignments: Iterable[str]) -> Settings:
+    """Return the settings with assignments such as 'icp.max_iterations=30' carried out; values are TOML or bare words."""
+    for text in assignments:
+        name, equals, value = text.partition("=")
+        if not equals or not name.strip():
+            raise ConfigError(f"--set {text}: write it as table.name=value, e.g. --set icp.max_iterations=30")
+        nested: Any = _parse_value(value.strip())
+        for part in reversed(name.strip().split(".")):
+            nested = {part: nested}
+        config = merge(config, nested)
+    return config
+
+
+def _parse_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def parse_toml(text: str, path: str = "") -> dict[str, Any]:
+    """Return the nested dicts of a TOML text; path is its name for error messages."""
+    try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path or 'TOML'}: not valid TOML: {error or 'nested too deeply'}") from None
+
+
+def leaves(cls: type) -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and default of every setting of a class, nested ones included."""
+    yield from _flatten("", to_dict(cls()))
+
+
+def _flatten(prefix: str, data: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in data.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flatten(f"{prefix}{name}.", value)
+        else:
+            yield prefix + name, value
+
+
+def _merge(config: Any, data: Any, path: tuple[str, ...], root: type) -> Any:
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{'.'.join(path)} is a table of settings, not {_shown(data)}")
+    fields = {f.name: f for f in dataclasses.fields(config)}
+    hints = get_type_hints(type(config))
+    changes = {}
+    for name, value in data.items():
+        where = (*path, str(name))
+        if name not in fields:
+            raise ConfigError(f"unknown setting {'.'.join(where)!r}{_did_you_mean(where, root)}")
+        old = getattr(config, name)
+        if dataclasses.is_dataclass(old):
+            changes[name] = _merge(old, value, where, root)
+        else:
+            changes[name] = _check_range(_convert(value, hints[name], where), _limits(fields[name]), where)
+    try:
+        return dataclasses.replace(config, **changes)
+    except ConfigError as error:
+        raise ConfigError(f"[{'.'.join(path)}] {error}" if path else str(error)) from None
+
+
+def _did_you_mean(where: tuple[str, ...], root: type) -> str:
+    known = [name for name, _ in leaves(root)]
+    known += sorted({name.rpartition(".")[0] for name in known} - {""})
+    wanted = ".".join(where)
+    ends = [name for name in known if name.rpartition(".")[2] == where[-1]]
+    near = ends or get_close_matches(wanted, known, n=1, cutoff=0.75)
+    if not near:
+        by_end = {name.rpartition(".")[2]: name for name in reversed(known)}
+        near = [by_end[end] for end in get_close_matches(where[-1], by_end, n=1, cutoff=0.7)]
+    return f"; did you mean {near[0]!r}?" if near else "; `uwblite config` lists all settings"
+
+
+def _convert(value: Any, hint: Any, where: tuple[str, ...]) -> Any:
+    """Return the value as the type of the hint, or raise ConfigError."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        if value is None or value == "none":
+            return None
+        return _convert(value, next(a for a in args if a is not NoneType), where)
+    if origin is Literal:
+        if value not in args:
+            near = get_close_matches(str(value), [str(a) for a in args], n=1)
+            hint_text = f"; did you mean {near[0]!r}?" if near else ""
+            raise ConfigError(f"{'.'.join(where)} must be one of {', '.join(map(str, args))}, not {_shown(value)}{hint_text}")
+        return value
+    if origin is tuple:
+        return _convert_tuple(value, args, where)
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{'.'.join(where)} must be a table, not {_shown(value)}")
+        return {str(k): _convert(v, args[1], (*where, str(k))) for k, v in value.items()}
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not hint:
+        raise ConfigError(f"{'.'.join(where)} must be {_TYPE_NAMES.get(hint, str(hint))}, not {_shown(value)}")
+    if hint is float and math.isnan(value):
+        raise ConfigError(f"{'.'.join(where)} must be a number, not nan")
+    return value
+
+
+def _convert_tuple(value: Any, args: tuple[Any, ...], where: tuple[str, ...]) -> tuple[Any, ...]:
+    if not isinstance(value, list | tuple):
+        raise ConfigError(f"{'.'.join(where)} must be a list, not {_shown(value)}")
+    if len(args) == 2 and args[1] is Ellipsis:
+        args = (args[0],) * len(value)
+    if len(value) != len(args):
+        raise ConfigError(f"{'.'.join(where)} must have {len(args)} values, not {len(value)}")
+    return tuple(_convert(v, a, where) for v, a in zip(value, args, strict=True))
+
+
+def _limits(field: "dataclasses.Field[Any]") -> Mapping[str, float]:
+    default = field.default
+    quantity = isinstance(default, int | float) and not isinstance(default, bool) and default >= 0
+    return field.metadata.get(_RANGE, {"minimum": 0.0} if quantity else {})
+
+
+def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]) -> Any:
+    if not limits:
+        return value
+    for v in value if isinstance(value, tuple) else (value,):
+        if v is None:
+            continue
+        inside = (
+            v > limits.get("above", -math.inf) or "above" not in limits,
+            v >= limits.get("minimum", -math.inf),
+            v <= limits.get("maximum", math.inf),
+            v < limits.get("below", math.inf) or "below" not in limits,
+        )
+        if not all(inside):
+            raise ConfigError(f"{'.'.join(where)} = {_shown(v)} is out of range; it must be {range_text(limits)}")
+    return value
+
+
+def range_text(limits: Mapping[str, float]) -> str:
+    """Return a permitted range in words, such as '> 0 and <= 1'."""
+    signs = {"above": ">", "minimum": ">=", "maximum": "<=", "below": "<"}
+    return " and ".join(f"{signs[k]} {v:g}" for k, v in limits.items())
+
+
+_TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def field_docs(cls: type) -> dict[str, str]:
+    """Return the docstring under each field of a settings class, by name; empty where the source is not at hand.
+
+    `inspect` asks the module's loader where there is no file, so that the source is found in a zip too.
+    """
+    import inspect
+
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[cls.__module__]))
+    except OSError:
+        return {}
+    body = next((node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls.__name__), [])
+    docs = {}
+    for node, below in pairwise([*body, ast.Pass()]):
+        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
+            continue
+        constant = below.value if isinstance(below, ast.Expr) else None
+        text = constant.value if isinstance(constant, ast.Constant) else None
+        docs[node.target.id] = " ".join(text.split()) if isinstance(text, str) else ""
+    return docs
+
+
+def to_toml(config: Any, *, comments: bool = False, header: str = "") -> str:
+    """Return the settings as TOML, with the meaning of each setting as a comment where asked for.
+
+    Parameters
+    ----------
+    config : settings.
+    comments : write each field's docstring, permitted range and choices above it.
+    header : text for the first lines, written as comments.
+    """
+    lines = [f"# {line}".rstrip() for line in header.splitlines()]
+    _write_table(lines, config, (), comments)
+    return "\n".join(lines).strip("\n") + "\n"
+
+
+def _write_table(lines: list[str], config: Any, path: tuple[str, ...], comments: bool) -> None:
+    docs = field_docs(type(config)) if comments else {}
+    hints = get_type_hints(type(config))
+    tables = []
+    if path:
+        lines += ["", *(_wrapped(_first_sentence(type(config))) if comments else []), f"[{'.'.join(path)}]"]
+    for f in dataclasses.fields(config):
+        value = getattr(config, f.name)
+        if dataclasses.is_dataclass(value):
+            tables.append((f.name, value))
+            continue
+        if comments:
+            lines += _wrapped(" ".join(filter(None, (docs.get(f.name, ""), permitted(f, hints[f.name])))))
+        lines.append(f"{f.name} = {toml_value(value)}")
+    for name, value in tables:
+        _write_table(lines, value, (*path, name), comments)
+
+
+def permitted(field: "dataclasses.Field[Any]", hint: Any) -> str:
+    """Return what values a field takes beyond its type, in brackets; empty where nothing is to be said."""
+    parts = []
+    literal = next((h for h in (hint, *get_args(hint)) if get_origin(h) is Literal), None)
+    if literal is not None:
+        parts.append(", ".join(map(str, get_args(literal))))
+    if field.metadata.get(_RANGE):
+        parts.append(range_text(field.metadata[_RANGE]))
+    if NoneType in get_args(hint):
+        parts.append('or "none"')
+    return f"({'; '.join(parts)})" if parts else ""
+
+
+def _first_sentence(cls: type) -> str:
+    return (cls.__doc__ or "").strip().split("\n\n")[0]
+
+
+def _wrapped(text: str) -> list[str]:
+    from textwrap import wrap
+
+    return [f"# {line}" for line in wrap(" ".join(text.split()), 116)]
+
+
+def toml_value(value: Any) -> str:
+    """Return a plain value as TOML; None becomes the text "none"."""
+    if value is None:
+        return '"none"'
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return repr(value)
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, str):
+        return _toml_text(value)
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(toml_value(v) for v in value) + "]"
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_toml_text(str(k))} = {toml_value(v)}" for k, v in value.items()) + " }" if value else "{}"
+    raise ConfigError(f"cannot write a {type(value).__name__} as TOML")
+
+
+def _toml_text(text: str) -> str:
+    escapes = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\r": "\\r", "\t": "\\t", "\b": "\\b", "\f": "\\f"}
+    safe = (escapes.get(c, c if c.isprintable() else f"\\U{ord(c):08X}") for c in text)
+    return '"' + "".join(safe) + '"'
