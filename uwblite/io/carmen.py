@@ -1,0 +1,227 @@
+"""CARMEN logs, the text form of a recording: one message a line, metres, radians, seconds.
+
+``NAME contents ipc_timestamp ipc_hostname logger_timestamp``, with the messages
+
+| message | contents |
+|---|---|
+| PARAM | name value |
+| ODOM | x y theta tv rv accel |
+| ROBOTLASER1 | laser_type start_angle fov angular_resolution maximum_range accuracy remission_mode num_readings [readings] num_remissions [remissions] laser_x laser_y laser_theta robot_x robot_y robot_theta laser_tv laser_rv forward_safety side_safety turn_axis |
+| RAWLASER1 | as ROBOTLASER1 up to the remissions |
+| FLASER | num_readings [readings] x y theta odom_x odom_y odom_theta |
+| UWB | anchor_id range quality(0..100) |
+
+UWB is uwblite's own; other CARMEN readers skip it. ROBOTLASER1 exists with and without num_remissions and turn_axis,
+and some published logs leave out ipc_timestamp: both are accepted, and then the logger's time counts.
+A reading at or above the maximum range saw nothing (+inf); a reading below range_min is an error code (nan).
+"""  # noqa: E501
+
+import os
+from array import array
+from collections.abc import Callable
+
+import numpy as np
+
+from ..errors import FormatError
+from ..sensor_log import LogNotes, Odometry, SensorLog, UwbRanges
+from .carmen_laser import LaserMessages
+from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
+from .carmen_params import Params
+from .carmen_writer import write_log
+from .source import OVERLONG_LINE, TextSource, open_source
+
+__all__ = ["read_log", "write_log"]
+
+BROKEN_LINES_KEPT = 20
+"""Broken lines reported one by one; all are counted."""
+_UNUSED = frozenset(
+    b"SYNC COMMENT TRUEPOS RLASER RAWLASER2 RAWLASER3 RAWLASER4 RAWLASER5 ROBOTLASER2 ROBOTLASER3 ROBOTLASER4 ROBOTLASER5 "
+    b"LASER3 LASER4 LASER5 REMISSIONFLASER REMISSIONRLASER POS GPS NMEAGGA NMEARMC NMEA-GGA NMEA-RMC SONAR BUMPER IMU "
+    b"VECTORMOVE ROBOTVELOCITY FOLLOWTRAJECTORY BASEVELOCITY SCANMARK PANTILT VISION".split()
+)
+"""Messages of CARMEN that carry nothing uwblite uses."""
+_NAMES_COUNTED = 100
+"""Distinct names of foreign messages counted one by one."""
+_HOPELESS = 20_000
+"""Broken lines after which reading stops early when nearly all lines are broken."""
+
+
+def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broken_share: float = 0.05) -> SensorLog:
+    """Read one CARMEN log, plain or gzip; ``-`` reads standard input.
+
+    Memory grows with what is kept (four bytes a reading), not with the text.
+
+    Parameters
+    ----------
+    path : the file.
+    every_nth_scan : keep every n-th laser scan; the others are counted and never decoded.
+    max_broken_share : share of the messages that may be broken (0..1); each is skipped and counted in the notes.
+
+    Returns
+    -------
+    SensorLog with messages sorted by time (equal stamps keep their order) and counts of all oddities in `notes`.
+
+    Raises
+    ------
+    FormatError : the file cannot be read, is no CARMEN log, has no odometry, or too many of its lines are broken.
+    """
+    if every_nth_scan < 1:
+        raise FormatError(f"every_nth_scan is {every_nth_scan}; it must be 1 or more")
+    with open_source(path) as source:
+        reader = _Reader(source.path, every_nth_scan, max_broken_share)
+        for block in source.blocks():
+            reader.feed(block)
+        return reader.finish(source)
+
+
+class _Reader:
+    """Collects the messages of one log."""
+
+    def __init__(self, path: str, every_nth_scan: int, max_broken_share: float) -> None:
+        self.path, self.max_broken_share = path, max_broken_share
+        self.params = Params()
+        self.laser = LaserMessages(every_nth_scan)
+        self.odometry = array("d")
+        self.uwb = array("d")
+        self.uwb_ids: dict[bytes, int] = {}
+        self.skipped: dict[str, int] = {}
+        self.lines = self.messages = self.broken = 0
+        self.broken_lines: list[tuple[int, str]] = []
+        self.ends_broken = False
+        self.handlers: dict[bytes, Callable[[list[bytes]], None]] = {
+            b"ODOM": self._odom,
+            b"UWB": self._uwb,
+            b"PARAM": self.params.take,
+        }
+
+    def feed(self, block: bytes) -> None:
+        """Take a block of whole lines."""
+        text = np.frombuffer(block + b"\n" * (-len(block) % 8), dtype=np.uint8)
+        gaps = np.flatnonzero(text[: len(block)] <= 32)
+        ends = np.flatnonzero(text[: len(block)] == 10)
+        starts = np.concatenate([[0], ends[:-1] + 1])
+        first_gap = np.searchsorted(gaps, starts)
+        name_ends = gaps[first_gap]
+        self.laser.begin(block, text, gaps)
+        broken: list[tuple[int, str]] = []
+        rows = zip(starts.tolist(), name_ends.tolist(), ends.tolist(), first_gap.tolist(), strict=True)
+        for number, (start, name_end, end, gap) in enumerate(rows, self.lines + 1):
+            name = block[start:name_end]
+            try:
+                handler = self.handlers.get(name)
+                if handler is not None:
+                    handler(block[start:end].split())
+                elif self.laser.wants(name):
+                    self.laser.take(name, number, start, end, gap)
+                elif not self._unused(name, block, start, end):
+                    continue
+            except (BrokenLine, ValueError) as error:
+                broken.append((number, why_broken(error)))
+            self.messages += 1
+        self.lines += len(starts)
+        broken += [(number, why_broken(error)) for number, error in self.laser.decode()]
+        self._count_broken(broken)
+
+    def _unused(self, name: bytes, block: bytes, start: int, end: int) -> bool:
+        """Count a message that is not used; return False for blank lines and comments."""
+        if not name:
+            name = block[start:end].strip().split(maxsplit=1)[0] if block[start:end].strip() else b""
+            if name and not name.startswith(b"#"):
+                raise BrokenLine("begins with a blank")
+        if not name or name.startswith(b"#"):
+            return False
+        if name.startswith(OVERLONG_LINE):
+            raise BrokenLine("longer than a megabyte")
+        if name not in _UNUSED and not is_message_name(name):
+            raise BrokenLine("is no CARMEN message")
+        key = name.decode()
+        if key not in self.skipped and len(self.skipped) >= _NAMES_COUNTED:
+            key = "others"
+        self.skipped[key] = self.skipped.get(key, 0) + 1
+        return True
+
+    def _odom(self, tokens: list[bytes]) -> None:
+        x, y, theta = numbers(tokens[1:4], "ODOM", 3)
+        self.odometry.extend((self._stamp(tokens, 7, "ODOM"), x, y, theta))
+
+    def _uwb(self, tokens: list[bytes]) -> None:
+        stamp = self._stamp(tokens, 4, "UWB")
+        distance, quality = numbers(tokens[2:4], "UWB", 2)
+        anchor = self.uwb_ids.get(tokens[1])
+        if anchor is None:
+            name = tokens[1].decode()
+            if len(name) > 64 or not name.isprintable():
+                raise BrokenLine("UWB anchor_id is longer than 64 characters or not printable")
+            anchor = self.uwb_ids.setdefault(tokens[1], len(self.uwb_ids))
+        self.uwb.extend((stamp, anchor, distance, quality))
+
+    def _stamp(self, tokens: list[bytes], fields: int, name: str) -> float:
+        """Return ipc_timestamp behind the name and contents (`fields` tokens); logger_timestamp where it is left out."""
+        if len(tokens) not in (fields + 2, fields + 3):
+            raise BrokenLine(f"{name} has {len(tokens)} fields, expected {fields + 3}")
+        if len(tokens) == fields + 2:
+            self.laser.ipc_left_out = True
+        return stamp_of(tokens[fields:])
+
+    def _count_broken(self, broken: list[tuple[int, str]]) -> None:
+        broken.sort()
+        self.broken += len(broken)
+        self.broken_lines += broken[: BROKEN_LINES_KEPT - len(self.broken_lines)]
+        self.ends_broken = bool(broken) and broken[-1][0] == self.lines
+        if self.broken > _HOPELESS and self.broken > 0.9 * self.messages:
+            self._refuse()
+
+    def _refuse(self) -> None:
+        number, why = self.broken_lines[0]
+        raise FormatError(
+            f"{self.broken} of {self.messages} messages are broken (allowed: {self.max_broken_share:.0%}); "
+            f"the first: {why}. Is this a CARMEN log?",
+            self.path,
+            number,
+        )
+
+    def finish(self, source: TextSource) -> SensorLog:
+        """Return what was collected, sorted by time."""
+        # A recorder that is switched off leaves half a line at the end: that one says nothing about the rest.
+        if self.broken - self.ends_broken > self.max_broken_share * self.messages:
+            self._refuse()
+        warnings: list[str] = []
+        odometry = self._finish_odometry(warnings)
+        ranges = self._finish_ranges(warnings)
+        scans, T_base_laser = self.laser.finish(self.params, self.skipped, warnings)
+        notes = LogNotes(
+            source=self.path,
+            sha256=source.sha256(),
+            lines=self.lines,
+            broken_lines=tuple(self.broken_lines),
+            broken=self.broken,
+            skipped=dict(sorted(self.skipped.items())),
+            warnings=tuple(warnings),
+        )
+        return SensorLog(odometry, ranges, scans, self.params.mounting(T_base_laser), notes)
+
+    def _finish_odometry(self, warnings: list[str]) -> Odometry:
+        rows = np.array(self.odometry).reshape(-1, 4)
+        if len(rows) == 0:
+            rows = self.laser.robot_poses()
+            if len(rows) == 0:
+                raise FormatError(
+                    f"no odometry in {self.lines} lines: neither ODOM messages nor ROBOTLASER1 with robot poses. "
+                    "Is this a CARMEN log?",
+                    self.path,
+                )
+            warnings.append("no ODOM messages: the robot poses of the laser messages serve as odometry")
+        order = time_order(rows[:, 0], "odometry", warnings)
+        return Odometry(rows[order, 0], rows[order, 1:])
+
+    def _finish_ranges(self, warnings: list[str]) -> UwbRanges | None:
+        if not self.uwb:
+            return None
+        rows = np.array(self.uwb).reshape(-1, 4)
+        names = [name.decode() for name in self.uwb_ids]
+        ids = sorted(names)
+        place = {name: i for i, name in enumerate(ids)}
+        rank = np.array([place[name] for name in names], dtype=np.int64)
+        order = time_order(rows[:, 0], "UWB", warnings)
+        rows = rows[order]
+        return UwbRanges(rows[:, 0], rank[rows[:, 1].astype(np.int64)], rows[:, 2], rows[:, 3], tuple(ids))

@@ -1,0 +1,326 @@
+"""The laser messages of a CARMEN log: found line by line, decoded in bulk."""
+
+import math
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..sensor_log import LaserScans
+from .carmen_messages import BrokenLine, numbers, stamp_of, time_order
+from .carmen_params import Params
+from .decimal_text import decode_fixed_point
+
+Floats = NDArray[np.float64]
+
+DEFAULT_RANGE_MIN = 0.02
+"""m; what a scanner reports below is an error code (URG-04LX: 0..19 mm). PARAM laser_range_min wins."""
+DEFAULT_RANGE_MAX = 80.0
+"""m; reach of the scanners whose logs (FLASER) do not tell it. PARAM robot_front_laser_max wins."""
+MAX_BEAMS = 100_000
+"""A message that claims more readings is broken."""
+POSE_TOLERANCE = 0.01
+"""m or rad; a laser whose pose on the robot varies more than this is reported."""
+
+_RANK = {b"RAWLASER1": 0, b"FLASER": 1, b"ROBOTLASER1": 2}
+"""Messages that may carry the same scans; only those of the highest rank in the log are used."""
+_HEAD = {b"RAWLASER1": 9, b"FLASER": 2, b"ROBOTLASER1": 9}
+"""Words before the readings."""
+_LAYOUTS_KEPT = 1000
+_URG_PERIOD = 0.1
+"""s; time of one turn of a URG-04LX."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Geometry that a message tells; messages with equal layout go into one array."""
+
+    beams: int
+    angle_min: float = 0.0
+    angle_increment: float = 0.0
+    range_max: float = 0.0
+    """m; 0 where the message does not tell it."""
+
+
+@dataclass(slots=True, eq=False)
+class _Pending:
+    """One message of the block at hand, parsed but for its readings."""
+
+    number: int
+    first: int
+    """Index into the gaps of the gap behind the first reading."""
+    readings: Floats | None
+    """Readings, where they were read the general way."""
+    stamp: float
+
+
+@dataclass(slots=True, eq=False)
+class _Scans:
+    """All scans of one layout."""
+
+    blocks: list[NDArray[np.float32]] = field(default_factory=list)
+    stamps: "array[float]" = field(default_factory=lambda: array("d"))
+    seen: int = 0
+    pending: list[_Pending] = field(default_factory=list)
+
+
+class LaserMessages:
+    """Collects the scans of one log; `begin` a block, `take` its lines, `decode` the block, `finish` the log."""
+
+    def __init__(self, every_nth_scan: int) -> None:
+        self.ipc_left_out = False
+        """Whether the log leaves out ipc_timestamp; decides where a line alone does not."""
+        self._every_nth = every_nth_scan
+        self._kind = b""
+        self._counts = dict.fromkeys(_RANK, 0)
+        self._layouts: dict[bytes, _Layout] = {}
+        self._scans: dict[_Layout, _Scans] = {}
+        self._poses = array("d")
+        """stamp, laser pose (3), robot pose (3) of every message that tells them."""
+
+    def begin(self, block: bytes, text: NDArray[np.uint8], gaps: NDArray[np.int64]) -> None:
+        """Start a block: its bytes, the same as an array padded to a multiple of 8, and where its blanks are."""
+        self._block, self._text, self._gaps = block, text, gaps
+
+    def wants(self, name: bytes) -> bool:
+        """Tell whether a message is one of the laser messages read here."""
+        return name in _RANK
+
+    def take(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
+        """Take line `number`, block[start:end], whose name ends at gaps[gap]."""
+        self._counts[name] += 1
+        if name != self._kind:
+            if self._kind and _RANK[name] < _RANK[self._kind]:
+                return
+            self._kind = name
+            self._scans, self._poses, self._layouts = {}, array("d"), {}
+        try:
+            self._take_evenly_spaced(name, number, start, end, gap)
+        except ValueError:
+            self._take_any(name, number, self._block[start:end].split())
+
+    def _take_evenly_spaced(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
+        """Take a line whose words are parted by single blanks, leaving the readings undecoded."""
+        gaps, head = self._gaps, gap + _HEAD[name] - 1
+        if head >= len(gaps) or gaps[head] >= end:
+            raise BrokenLine("too short")
+        layout = self._layout(name, self._block[start : gaps[head]])
+        last = head + layout.beams
+        if last >= len(gaps) or gaps[last] >= end:
+            raise BrokenLine("too short")
+        stamp = self._tail(name, self._block[gaps[last] + 1 : end].split())
+        self._queue(layout, _Pending(number, head + 1, None, stamp))
+
+    def _take_any(self, name: bytes, number: int, tokens: list[bytes]) -> None:
+        """Take a line the general way."""
+        what, head = name.decode(), _HEAD[name]
+        if len(tokens) < head:
+            raise BrokenLine(f"{what} has {len(tokens)} fields, far too few")
+        layout = self._layout(name, b" ".join(tokens[:head]))
+        if len(tokens) <= head + layout.beams:
+            raise BrokenLine(f"{what} says {layout.beams} readings but the line is too short for them")
+        readings = np.array(tokens[head : head + layout.beams], dtype=np.float64)
+        stamp = self._tail(name, tokens[head + layout.beams :])
+        self._queue(layout, _Pending(number, 0, readings, stamp))
+
+    def _queue(self, layout: _Layout, pending: _Pending) -> None:
+        scans = self._scans.setdefault(layout, _Scans())
+        if scans.seen % self._every_nth == 0:
+            scans.pending.append(pending)
+        scans.seen += 1
+
+    def _layout(self, name: bytes, head: bytes) -> _Layout:
+        layout = self._layouts.get(head)
+        if layout is None:
+            layout = _parse_head(name, head.split())
+            if len(self._layouts) < _LAYOUTS_KEPT:
+                self._layouts[head] = layout
+        return layout
+
+    def _tail(self, name: bytes, tail: list[bytes]) -> float:
+        """Read what follows the readings; remember the poses, return the stamp."""
+        if name == b"FLASER":
+            if len(tail) not in (8, 9):
+                raise BrokenLine(f"FLASER has {len(tail)} fields behind its readings, expected 9")
+            poses, rest = numbers(tail[:6], "FLASER", 6), tail[6:]
+        else:
+            rest = tail[1 + int(tail[0]) :] if tail[0].isdigit() else tail
+            if name == b"RAWLASER1":
+                rest = rest if len(rest) in (2, 3) else tail
+                if len(rest) not in (2, 3):
+                    raise BrokenLine(f"RAWLASER1 has {len(tail)} fields behind its readings, expected 4 + remissions")
+                return stamp_of(rest)
+            rest = rest if 12 <= len(rest) <= 14 else tail
+            if not 12 <= len(rest) <= 14:
+                raise BrokenLine(f"ROBOTLASER1 has {len(tail)} fields behind its readings, expected 15 + remissions")
+            poses = numbers(rest[:6], "ROBOTLASER1", 6)
+            # 14 = with turn_axis and ipc_timestamp, 12 = with neither; 13 is one of them.
+            has_ipc = len(rest) == 14 or (len(rest) == 13 and not self.ipc_left_out)
+            rest = rest[-3:] if has_ipc else rest[-2:]
+        stamp = stamp_of(rest)
+        self._poses.extend((stamp, *poses))
+        return stamp
+
+    def decode(self) -> Iterator[tuple[int, ValueError]]:
+        """Decode the readings of the block; yield (line number, error) of lines whose readings are broken."""
+        for layout, scans in self._scans.items():
+            if scans.pending:
+                pending, scans.pending = scans.pending, []
+                values, errors = self._decode_rows(layout.beams, pending)
+                keep = np.array([e is None for e in errors])
+                scans.blocks.append(values if keep.all() else values[keep])
+                scans.stamps.extend(p.stamp for p, error in zip(pending, errors, strict=True) if error is None)
+                yield from ((p.number, e) for p, e in zip(pending, errors, strict=True) if e is not None)
+
+    def _decode_rows(
+        self, beams: int, pending: list[_Pending]
+    ) -> tuple[NDArray[np.float32], list[ValueError | None]]:
+        values = np.empty((len(pending), beams), dtype=np.float32)
+        errors: list[ValueError | None] = [None] * len(pending)
+        first = np.array([p.first for p in pending], dtype=np.int64)
+        index = first[:, None] + np.arange(beams)
+        ends, begins = self._gaps[index], self._gaps[np.maximum(index - 1, 0)] + 1
+        plain = self._decode_plain(values, begins, ends, np.array([p.readings is None for p in pending]))
+        for row in np.flatnonzero(~plain):
+            readings = pending[row].readings
+            try:
+                if readings is None:
+                    words = self._block[begins[row, 0] : ends[row, -1]].split()
+                    readings = np.array(words, dtype=np.float64)
+                    if len(readings) != beams:
+                        raise BrokenLine("readings are parted unevenly")
+                values[row] = np.clip(readings, -1.0, 1e30)
+            except ValueError as error:
+                errors[row] = error
+        return values, errors
+
+    def _decode_plain(
+        self,
+        values: NDArray[np.float32],
+        begins: NDArray[np.int64],
+        ends: NDArray[np.int64],
+        rows: NDArray[np.bool_],
+    ) -> NDArray[np.bool_]:
+        """Fill the rows that are written plainly, digits.digits; return which."""
+        if not rows.any() or values.shape[1] == 0:
+            return rows & (values.shape[1] == 0)
+        which = int(np.argmax(rows))
+        token = self._block[begins[which, 0] : ends[which, 0]]
+        decimals = len(token) - 1 - token.find(b".")
+        if b"." not in token or not 1 <= decimals <= 6:
+            return np.zeros(len(rows), dtype=np.bool_)
+        decoded, plain = decode_fixed_point(self._text, ends, begins, decimals)
+        plain &= rows
+        values[plain] = decoded[plain]
+        return plain
+
+    def robot_poses(self) -> Floats:
+        """Return (k, 4) stamp and pose of the robot of every message that tells them."""
+        return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]]
+
+    def finish(
+        self, params: Params, skipped: dict[str, int], warnings: list[str]
+    ) -> tuple[LaserScans | None, Floats | None]:
+        """Return the scans of the commonest layout, sorted by time, and T_base_laser where the messages tell it."""
+        for name, count in self._counts.items():
+            if count and name != self._kind:
+                skipped[name.decode()] = count
+        kept = max(self._scans, key=lambda layout: self._scans[layout].seen, default=None)
+        if kept is None or not len(self._scans[kept].stamps):
+            return None, None
+        what = self._kind.decode()
+        others = sum(scans.seen for layout, scans in self._scans.items() if layout != kept)
+        scans = self._scans[kept]
+        self._scans = {}
+        if others:
+            skipped[f"{what} of another geometry"] = others
+            warnings.append(f"{others} {what} messages have another geometry than the commonest and are not used")
+        if scans.seen > len(scans.stamps) and self._every_nth > 1:
+            skipped[f"{what} thinned out"] = scans.seen - len(scans.stamps)
+        stamps = np.array(scans.stamps)
+        order = time_order(stamps, what, warnings)
+        angle_min, increment = (kept.angle_min, kept.angle_increment) if what != "FLASER" else params.guess_scanner(kept.beams)
+        told = params.get("robot_front_laser_max", "laser_front_laser_max_range")
+        range_max = kept.range_max or told or DEFAULT_RANGE_MAX
+        range_min = params.get("laser_range_min")
+        range_min = DEFAULT_RANGE_MIN if range_min is None else range_min
+        time_increment = params.get("laser_time_increment")
+        if time_increment is None:
+            time_increment = _sweep_of_urg(kept.beams, increment, range_max, stamps[order] * 1.0, self._every_nth)
+        ranges = _joined(scans.blocks, order, kept.beams, range_min, range_max)
+        laser = LaserScans(stamps[order], ranges, angle_min, increment, time_increment, range_min, range_max)
+        return laser, self._mounting(what, warnings)
+
+    def _mounting(self, what: str, warnings: list[str]) -> Floats | None:
+        rows = np.array(self._poses).reshape(-1, 7)
+        if len(rows) == 0:
+            return None
+        T = se2.between(rows[:, 4:7], rows[:, 1:4])
+        T[:, 2] = T[0, 2] + se2.wrap_angle(T[:, 2] - T[0, 2])
+        middle = np.median(T, axis=0)
+        middle[2] = se2.wrap_angle(middle[2])
+        off = np.abs(T - np.median(T, axis=0)).max(axis=1) > POSE_TOLERANCE
+        if what == "FLASER" and (off.mean() > 0.1 or np.hypot(middle[0], middle[1]) > 2.0):
+            warnings.append(
+                "FLASER: laser and odometry poses do not fit together (a corrected log?); the laser's place on the robot "
+                "is unknown, taken from PARAM robot_frontlaser_offset or as the robot's middle"
+            )
+            return None
+        if off.any():
+            warnings.append(
+                f"the laser's pose on the robot varies in {off.sum()} of {len(off)} {what} messages; the median is used"
+            )
+        # The poses are written to the micrometre; more digits would be noise.
+        return np.round(middle, 6)
+
+
+def _parse_head(name: bytes, tokens: list[bytes]) -> _Layout:
+    """Read the words before the readings."""
+    what = name.decode()
+    if len(tokens) != _HEAD[name]:
+        raise BrokenLine(f"{what}: fields are parted unevenly")
+    beams = int(tokens[-1])
+    if not 1 <= beams <= MAX_BEAMS:
+        raise BrokenLine(f"{what} says {beams} readings")
+    if name == b"FLASER":
+        return _Layout(beams)
+    angle_min, fov, increment, range_max = numbers(tokens[2:6], what, 4)
+    if increment == 0.0:
+        increment = fov / max(beams - 1, 1)
+    if abs(increment) * (beams - 1) > 2.1 * math.pi or abs(angle_min) > 2.1 * math.pi:
+        raise BrokenLine(f"{what}: {beams} readings {increment:g} rad apart are more than a turn")
+    return _Layout(beams, angle_min, increment, max(range_max, 0.0))
+
+
+def _joined(
+    blocks: list[NDArray[np.float32]], order: NDArray[np.int64], beams: int, range_min: float, range_max: float
+) -> NDArray[np.float32]:
+    """Return all blocks as one array in the given order; each block is let go when copied."""
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    ranges = np.empty((len(order), beams), dtype=np.float32)
+    start = 0
+    blocks.reverse()
+    while blocks:
+        block = blocks.pop()
+        nothing = block >= np.float32(range_max)
+        block[~(block >= np.float32(range_min))] = np.nan
+        block[nothing] = np.inf
+        ranges[place[start : start + len(block)]] = block
+        start += len(block)
+    return ranges
+
+
+def _sweep_of_urg(beams: int, increment: float, range_max: float, stamps: Floats, every_nth: int) -> float:
+    """Return the time between rays, s: that of a URG-04LX where the scans look like one's, otherwise 0 (snapshot).
+
+    A URG-04LX turns once in 0.1 s, sees 240 degrees of it in up to 683 steps and reaches 5.6 m.
+    """
+    fov = math.degrees(abs(increment) * max(beams - 1, 0))
+    if not (238.0 < fov < 242.0 and 680 <= beams <= 684 and range_max < 6.0 and len(stamps) > 1):
+        return 0.0
+    period = float(np.median(np.diff(stamps))) / every_nth
+    return _URG_PERIOD / 1024 if period > 0.9 * _URG_PERIOD else 0.0

@@ -1,0 +1,51 @@
+"""What all CARMEN messages share: numbers, stamps, time order, and lines that are broken."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class BrokenLine(ValueError):
+    """One line cannot be used; the text says why. It never leaves the reader."""
+
+
+def numbers(tokens: list[bytes], what: str, count: int) -> list[float]:
+    """Return exactly `count` finite numbers."""
+    if len(tokens) != count:
+        raise BrokenLine(f"{what} has too few fields")
+    values = [float(token) for token in tokens]
+    if not math.isfinite(sum(values)):
+        raise BrokenLine(f"{what} holds a number that is not finite")
+    return values
+
+
+def stamp_of(tokens: list[bytes]) -> float:
+    """Return the time of a message, s, from `ipc_timestamp host logger_timestamp` or `host logger_timestamp`."""
+    stamp = float(tokens[0] if len(tokens) == 3 else tokens[1])
+    if not math.isfinite(stamp):
+        raise BrokenLine("the stamp is not finite")
+    return stamp
+
+
+def is_message_name(name: bytes) -> bool:
+    """Tell whether a word could be the name of a message of some CARMEN module: capitals, digits, _ and -."""
+    plain = name.replace(b"_", b"").replace(b"-", b"")
+    return 2 <= len(name) <= 40 and plain.isalnum() and plain.isupper() and plain[:1].isalpha()
+
+
+def why_broken(error: ValueError) -> str:
+    """Return one short printable line about a broken line."""
+    text = str(error).replace("could not convert string to float", "not a number")
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= 100 else text[:97] + "..."
+
+
+def time_order(stamps: Floats, what: str, warnings: list[str]) -> NDArray[np.int64]:
+    """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when it is not the order given."""
+    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps)))
+    if late:
+        warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
+    return np.argsort(stamps, kind="stable")

@@ -1,0 +1,101 @@
+"""PARAM lines of a CARMEN log: where the sensors sit and what the laser does not say of itself."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sensor_log import SensorMounting
+from .carmen_messages import BrokenLine, numbers
+
+Floats = NDArray[np.float64]
+
+_ANCHOR_HEIGHT = "uwb_anchor_height_"
+_NUMBERS = frozenset(
+    [
+        "uwb_tag_offset_x",
+        "uwb_tag_offset_y",
+        "uwb_tag_height",
+        "uwb_anchor_height",
+        "robot_frontlaser_offset",
+        "robot_frontlaser_side_offset",
+        "robot_frontlaser_angular_offset",
+        "robot_front_laser_max",
+        "laser_front_laser_max_range",
+        "laser_front_laser_resolution",
+        "laser_time_increment",
+        "laser_range_min",
+    ]
+)
+_FLIPPED = ("laser_flipped", "laser_front_laser_flipped", "laser_laser1_flipped", "robot_frontlaser_flipped")
+_TRUE = {b"1": True, b"on": True, b"true": True, b"yes": True, b"0": False, b"off": False, b"false": False, b"no": False}
+
+
+class Params:
+    """The PARAM lines seen so far; a later line wins."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, float] = {}
+        self._flipped = False
+
+    def take(self, tokens: list[bytes]) -> None:
+        """Take one line `PARAM name value ...`; names that mean nothing here are ignored."""
+        if len(tokens) < 3:
+            raise BrokenLine("PARAM needs a name and a value")
+        name = tokens[1].decode()
+        if name in _FLIPPED:
+            if tokens[2].lower() not in _TRUE:
+                raise BrokenLine(f"PARAM {name} must be on or off")
+            self._flipped = _TRUE[tokens[2].lower()]
+        elif name in _NUMBERS or name.startswith(_ANCHOR_HEIGHT):
+            (self._numbers[name],) = numbers(tokens[2:3], f"PARAM {name[:40]}", 1)
+
+    def get(self, *names: str) -> float | None:
+        """Return the first of these numbers that was told."""
+        return next((self._numbers[name] for name in names if name in self._numbers), None)
+
+    def mounting(self, T_base_laser: Floats | None) -> SensorMounting:
+        """Return the mounting; where the laser messages tell no pose of the laser, CARMEN's robot_frontlaser_* count."""
+        told = self._numbers
+        if T_base_laser is None:
+            offsets = ("robot_frontlaser_offset", "robot_frontlaser_side_offset", "robot_frontlaser_angular_offset")
+            T_base_laser = np.array([told.get(name, 0.0) for name in offsets])
+        return SensorMounting(
+            T_base_laser=T_base_laser,
+            laser_flipped=self._flipped,
+            tag_position=np.array(
+                [told.get(f"uwb_tag_{name}", 0.0) for name in ("offset_x", "offset_y", "height")], dtype=np.float64
+            ),
+            anchor_height=told.get("uwb_anchor_height"),
+            anchor_heights={
+                name.removeprefix(_ANCHOR_HEIGHT): height
+                for name, height in sorted(told.items())
+                if name.startswith(_ANCHOR_HEIGHT)
+            },
+        )
+
+    def guess_scanner(self, beams: int) -> tuple[float, float]:
+        """Return angle_min and angle_increment, rad, of an FLASER message, which tells only its number of readings.
+
+        The usual conventions: SICK LMS with 180/181 readings of 1 degree, 360/361 of half a degree, 401 of a quarter
+        (100 degrees); 0.5 and 0.25 degrees over 270 (541, 1081); 682/683 steps of 1/1024 turn (URG-04LX); otherwise
+        180 degrees over all readings. PARAM laser_front_laser_resolution (degrees) wins.
+        """
+        resolution = self.get("laser_front_laser_resolution")
+        if resolution is not None and 0.0 < abs(resolution) <= 180.0:
+            increment = math.radians(resolution)
+        elif beams in _USUAL_DEGREES:
+            increment = math.radians(_USUAL_DEGREES[beams])
+        else:
+            increment = math.pi / max(beams - 1, 1)
+        # 180 readings of 1 degree begin at -90 degrees as 181 do; the last one is missing.
+        rays = beams + 1 if beams in (180, 360, 400, 720) else beams
+        return -0.5 * increment * (rays - 1), increment
+
+
+_USUAL_DEGREES = {
+    **dict.fromkeys((180, 181), 1.0),
+    **dict.fromkeys((360, 361, 541), 0.5),
+    **dict.fromkeys((400, 401, 720, 721, 1081), 0.25),
+    **dict.fromkeys((682, 683), 360.0 / 1024),
+}

@@ -1,0 +1,111 @@
+"""Write a recording as a CARMEN log."""
+
+import os
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..sensor_log import LaserScans, SensorLog
+from .decimal_text import encode_fixed_point
+from .files import replacing
+
+Floats = NDArray[np.float64]
+
+HOST = "uwblite"
+_SCANS_AT_A_TIME = 256
+_LASER_TYPE = 2
+"""CARMEN's number for a Hokuyo URG; readers take the geometry from the fields that follow."""
+
+
+def write_log(path: str | os.PathLike[str], log: SensorLog) -> None:
+    """Write a recording as a CARMEN log, compressed where the name ends in ``.gz``.
+
+    Stamps are written to the microsecond, odometry to the micrometre and microradian, UWB ranges to 0.1 mm and laser
+    readings to the millimetre. An invalid reading is written as 0, "saw nothing" as the maximum range. Messages stand
+    in time order; at equal stamps odometry comes first and the laser last.
+
+    Parameters
+    ----------
+    path : the file; replaced only when the new one is complete.
+    log : the recording.
+
+    Raises
+    ------
+    OSError : the file cannot be written.
+    """
+    with replacing(path) as stream:
+        stream.write(b"# CARMEN Logfile\n")
+        for name, value in _params(log):
+            stream.write(f"PARAM {name} {value} 0 {HOST} 0\n".encode())
+        sources = [_odometry_lines(log), _range_lines(log), _scan_lines(log)]
+        none = np.zeros(0)
+        stamps = [log.odometry.stamps, log.ranges.stamps if log.ranges else none, log.scans.stamps if log.scans else none]
+        kind = np.repeat(np.arange(3), [len(s) for s in stamps])
+        order = np.argsort(np.concatenate(stamps), kind="stable")
+        for source in kind[order].tolist():
+            stream.write(next(sources[source]))
+
+
+def _params(log: SensorLog) -> Iterator[tuple[str, str]]:
+    """Yield the names and values of the PARAM lines."""
+    mounting = log.mounting
+    if log.ranges is not None:
+        x, y, z = mounting.tag_position
+        yield from (("uwb_tag_offset_x", f"{x:.6f}"), ("uwb_tag_offset_y", f"{y:.6f}"), ("uwb_tag_height", f"{z:.6f}"))
+        if mounting.anchor_height is not None:
+            yield "uwb_anchor_height", f"{mounting.anchor_height:.6f}"
+        for anchor, height in sorted(mounting.anchor_heights.items()):
+            yield f"uwb_anchor_height_{anchor}", f"{height:.6f}"
+    if log.scans is not None:
+        yield "laser_flipped", "on" if mounting.laser_flipped else "off"
+        yield "laser_time_increment", f"{log.scans.time_increment:.9g}"
+        yield "laser_range_min", f"{log.scans.range_min:.6g}"
+
+
+def _odometry_lines(log: SensorLog) -> Iterator[bytes]:
+    for stamp, (x, y, theta) in zip(log.odometry.stamps.tolist(), log.odometry.poses.tolist(), strict=True):
+        yield f"ODOM {x:.6f} {y:.6f} {theta:.6f} 0 0 0 {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
+
+
+def _range_lines(log: SensorLog) -> Iterator[bytes]:
+    if log.ranges is None:
+        return
+    names = [log.ranges.anchor_ids[i] for i in log.ranges.anchor.tolist()]
+    columns = (log.ranges.stamps, log.ranges.ranges, log.ranges.quality)
+    for name, stamp, distance, quality in zip(names, *(c.tolist() for c in columns), strict=True):
+        yield f"UWB {name} {distance:.4f} {quality:g} {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
+
+
+def _scan_lines(log: SensorLog) -> Iterator[bytes]:
+    scans = log.scans
+    if scans is None:
+        return
+    robot = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps)
+    robot = np.round(robot, 6)
+    laser = se2.compose(robot, log.mounting.T_base_laser)
+    beams = scans.ranges.shape[1]
+    fov = scans.angle_increment * max(beams - 1, 0)
+    head = (
+        f"ROBOTLASER1 {_LASER_TYPE} {scans.angle_min:.9f} {fov:.9f} {scans.angle_increment:.9f} "
+        f"{scans.range_max:g} 0.01 0 {beams} "
+    ).encode()
+    for start in range(0, len(scans.stamps), _SCANS_AT_A_TIME):
+        part = slice(start, start + _SCANS_AT_A_TIME)
+        readings = encode_fixed_point(_without_signs(scans, part), 3)
+        rows = zip(readings, laser[part].tolist(), robot[part].tolist(), scans.stamps[part].tolist(), strict=True)
+        for text, l, r, stamp in rows:
+            yield head + text + (
+                f" 0 {l[0]:.9f} {l[1]:.9f} {l[2]:.9f} {r[0]:.6f} {r[1]:.6f} {r[2]:.6f} 0 0 0 0 0 "
+                f"{stamp:.6f} {HOST} {stamp:.6f}\n"
+            ).encode()
+
+
+def _without_signs(scans: LaserScans, part: slice) -> NDArray[np.float32]:
+    """Return readings as CARMEN writes them: 0 for invalid, the maximum range for nothing seen."""
+    ranges = scans.ranges[part]
+    # A reading that rounds up to the maximum range would turn into "nothing seen".
+    seen = np.clip(ranges, 0.0, scans.range_max - 0.001)
+    invalid = ~(ranges >= scans.range_min)
+    return np.where(np.isposinf(ranges), scans.range_max, np.where(invalid, 0.0, seen)).astype(np.float32)

@@ -1,0 +1,65 @@
+"""Writing files so that a full disk, a crash or a pulled plug leaves the previous file whole."""
+
+import gzip
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import BinaryIO
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a file for writing that takes the place of `path` only when the block ends without an error.
+
+    The data goes to a temporary name in the same folder, is forced to the disk and then renamed, which is atomic: a
+    reader sees the old file or the new one. A name ending in ``.gz`` is compressed, with the same bytes every time.
+    Devices and pipes (``/dev/null``) are written directly.
+
+    Raises
+    ------
+    OSError : the disk is full, the folder is missing or may not be written; the previous file is untouched.
+    """
+    target = os.path.realpath(os.fspath(path))
+    if os.path.exists(target) and not os.path.isfile(target):
+        with open(target, "wb") as stream:
+            yield stream
+        return
+    folder, name = os.path.split(target)
+    temporary = os.path.join(folder, f".{name[:100]}.{secrets.token_hex(4)}.part")
+    try:
+        with open(temporary, "xb") as stream:
+            if name.endswith(".gz"):
+                with gzip.GzipFile(filename="", mode="wb", compresslevel=6, fileobj=stream, mtime=0) as packed:
+                    yield packed  # type: ignore[misc]
+            else:
+                yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, target)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)
+        raise
+    _sync_folder(folder)
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a whole file, or leave the previous one untouched (see `replacing`)."""
+    with replacing(path) as stream:
+        stream.write(data)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a whole UTF-8 file with Unix line ends, or leave the previous one untouched (see `replacing`)."""
+    write_bytes(path, text.encode())
+
+
+def _sync_folder(folder: str) -> None:
+    """Force the new name to the disk, where the file system allows it."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,133 @@
+"""Reading text files of any size and any manners: plain or gzip, from a path or standard input, in blocks of lines."""
+
+import gzip
+import hashlib
+import io
+import os
+import sys
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import BinaryIO
+
+from ..errors import FormatError
+
+BLOCK_BYTES = 1 << 18
+"""Bytes decoded at a time: arrays of this size stay in a processor's second-level cache."""
+MAX_LINE_BYTES = 1 << 20
+"""A longer line is not read into memory."""
+OVERLONG_LINE = b"\xfe"
+"""Stands in a block in place of a line longer than MAX_LINE_BYTES."""
+
+_GZIP = b"\x1f\x8b"
+_OTHER_FORMATS = (
+    (b"#ROSBAG", "this is a ROS 1 bag; turn it into a log first: uwblite convert"),
+    (b"\x89MCAP", "this is an MCAP bag; turn it into a log first: uwblite convert"),
+    (b"SQLite format 3", "this is an SQLite file (ROS 2 bag?); turn it into a log first: uwblite convert"),
+    (b"PK\x03\x04", "this is a zip archive; unpack it first"),
+    (b"\x28\xb5\x2f\xfd", "this is zstd-compressed; unpack it first (only gzip is read directly)"),
+    (b"BZh", "this is bzip2-compressed; unpack it first (only gzip is read directly)"),
+    (b"\xfd7zXZ", "this is xz-compressed; unpack it first (only gzip is read directly)"),
+    (b"\xff\xfe", "this is UTF-16 text; save it as UTF-8 or plain ASCII"),
+)
+
+
+class _HashingReader(io.RawIOBase):
+    """Pass bytes on and hash them on the way."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self.hash = hashlib.sha256()
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        data = self._stream.read(len(buffer))
+        self.hash.update(data)
+        buffer[: len(data)] = data
+        return len(data)
+
+
+class TextSource:
+    """An open text file: `blocks()` gives its lines, `sha256()` the hash of the bytes as stored."""
+
+    def __init__(self, stream: BinaryIO, path: str) -> None:
+        self.path = path
+        self._hashing = _HashingReader(stream)
+        self._buffered = io.BufferedReader(self._hashing, BLOCK_BYTES)
+        start = self._buffered.peek(16)
+        for magic, problem in _OTHER_FORMATS:
+            if start.startswith(magic):
+                raise FormatError(problem, path)
+        packed = start.startswith(_GZIP)
+        self._text: BinaryIO = gzip.GzipFile(fileobj=self._buffered) if packed else self._buffered  # type: ignore[assignment]
+
+    def sha256(self) -> str:
+        """Read what is left and return the hash of all bytes of the file, hexadecimal."""
+        while self._buffered.read(BLOCK_BYTES):
+            pass
+        return self._hashing.hash.hexdigest()
+
+    def blocks(self, size: int = BLOCK_BYTES) -> Iterator[bytes]:
+        """Yield the text in blocks of whole lines, each block ending with a newline.
+
+        A last line without newline gets one. Lines longer than MAX_LINE_BYTES are replaced by OVERLONG_LINE, so that
+        line numbers stay true and memory stays bounded.
+        """
+        carry, overlong, first = b"", False, True
+        while data := self._text.read(size):
+            if first:
+                data, first = _checked_start(data, self.path), False
+            if overlong:
+                cut = data.find(b"\n")
+                if cut < 0:
+                    continue
+                data, overlong = OVERLONG_LINE + data[cut:], False
+            text = carry + data
+            cut = text.rfind(b"\n") + 1
+            if cut:
+                yield text[:cut]
+            carry = text[cut:]
+            if len(carry) > MAX_LINE_BYTES:
+                carry, overlong = b"", True
+        if first:
+            raise FormatError("the file is empty", self.path)
+        if overlong:
+            carry = OVERLONG_LINE
+        if carry:
+            yield carry + b"\n"
+
+
+@contextmanager
+def open_source(path: str | os.PathLike[str]) -> Iterator[TextSource]:
+    """Open a text file, gzip or not (told by its content), or standard input for ``-``.
+
+    Raises
+    ------
+    FormatError : the file cannot be read: missing, a directory, damaged or cut-off gzip, or binary.
+    """
+    name = os.fspath(path)
+    try:
+        stream = sys.stdin.buffer if name == "-" else open(name, "rb")  # noqa: SIM115
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise FormatError(f"cannot be opened: {reason}", name) from None
+    try:
+        yield TextSource(stream, "stdin" if name == "-" else name)
+    except EOFError:
+        raise FormatError("the gzip data is cut off; copy the file again, or save what zcat can read", name) from None
+    except (gzip.BadGzipFile, zlib.error) as error:
+        raise FormatError(f"the gzip data is damaged ({error})", name) from None
+    except OSError as error:
+        raise FormatError(f"cannot be read: {error.strerror or error}", name) from None
+    finally:
+        if name != "-":
+            stream.close()
+
+
+def _checked_start(data: bytes, path: str) -> bytes:
+    """Refuse binary data; drop a UTF-8 byte order mark."""
+    if b"\0" in data[:4096]:
+        raise FormatError("this is binary data, not a text file", path)
+    return data.removeprefix(b"\xef\xbb\xbf")
