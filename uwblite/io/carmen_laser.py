@@ -61,7 +61,8 @@ class _Pending:
 class _Scans:
     """All scans of one layout."""
 
-    blocks: list[NDArray[np.float32]] = field(default_factory=list)
+    ranges: "array[float]" = field(default_factory=lambda: array("f"))
+    """Readings of all scans, one behind the other; an array grows in place where blocks would have to be joined."""
     stamps: "array[float]" = field(default_factory=lambda: array("d"))
     seen: int = 0
     pending: list[_Pending] = field(default_factory=list)
@@ -171,7 +172,7 @@ class LaserMessages:
                 pending, scans.pending = scans.pending, []
                 values, errors = self._decode_rows(layout.beams, pending)
                 keep = np.array([e is None for e in errors])
-                scans.blocks.append(values if keep.all() else values[keep])
+                scans.ranges.frombytes(memoryview(values if keep.all() else values[keep]).cast("B"))
                 scans.stamps.extend(p.stamp for p, error in zip(pending, errors, strict=True) if error is None)
                 yield from ((p.number, e) for p, e in zip(pending, errors, strict=True) if e is not None)
 
@@ -250,7 +251,9 @@ class LaserMessages:
         time_increment = params.get("laser_time_increment")
         if time_increment is None:
             time_increment = _sweep_of_urg(kept.beams, increment, range_max, stamps[order] * 1.0, self._every_nth)
-        ranges = _joined(scans.blocks, order, kept.beams, range_min, range_max)
+        ranges = _cleaned(scans.ranges, kept.beams, range_min, range_max)
+        if np.any(np.diff(order) != 1):
+            ranges = ranges[order]
         laser = LaserScans(stamps[order], ranges, angle_min, increment, time_increment, range_min, range_max)
         return laser, self._mounting(what, warnings)
 
@@ -295,22 +298,14 @@ def _parse_head(name: bytes, tokens: list[bytes]) -> _Layout:
     return _Layout(beams, angle_min, increment, max(range_max, 0.0))
 
 
-def _joined(
-    blocks: list[NDArray[np.float32]], order: NDArray[np.int64], beams: int, range_min: float, range_max: float
-) -> NDArray[np.float32]:
-    """Return all blocks as one array in the given order; each block is let go when copied."""
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    ranges = np.empty((len(order), beams), dtype=np.float32)
-    start = 0
-    blocks.reverse()
-    while blocks:
-        block = blocks.pop()
-        nothing = block >= np.float32(range_max)
-        block[~(block >= np.float32(range_min))] = np.nan
-        block[nothing] = np.inf
-        ranges[place[start : start + len(block)]] = block
-        start += len(block)
+def _cleaned(readings: "array[float]", beams: int, range_min: float, range_max: float) -> NDArray[np.float32]:
+    """Return readings (k, beams) with +inf for nothing seen and nan for error codes, in the memory given."""
+    ranges = np.frombuffer(readings, dtype=np.float32).reshape(-1, beams)
+    for start in range(0, len(ranges), 256):
+        part = ranges[start : start + 256]
+        nothing = part >= np.float32(range_max)
+        part[~(part >= np.float32(range_min))] = np.nan
+        part[nothing] = np.inf
     return ranges
 
 
