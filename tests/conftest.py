@@ -1,0 +1,48 @@
+"""What all tests share: the slow marker, one BLAS thread, hypothesis without clocks, recordings kept elsewhere."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
+"""Real recordings under other licences; they are no part of this repository."""
+
+settings.register_profile("uwblite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("uwblite")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--slow", action="store_true", help="run the slow tests too")
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.getoption("--slow"):
+        return
+    for item in items:
+        if "slow" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason="slow; run with --slow"))
+
+
+@pytest.fixture(scope="session")
+def shared_data():
+    """Folder with real recordings; the test is skipped where it is absent."""
+    if not SHARED.is_dir():
+        pytest.skip(f"real recordings absent: {SHARED}")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def room_log():
+    """Path of the small simulated recording that lives in this repository."""
+    return ROOT / "tests" / "data" / "room.log.gz"
+
+
+def pytest_terminal_summary(terminalreporter):
+    skipped = [report for report in terminalreporter.stats.get("skipped", []) if "absent" in str(report.longrepr)]
+    if skipped:
+        terminalreporter.write_sep("!", f"{len(skipped)} tests on real recordings SKIPPED: {SHARED} is absent", yellow=True)

@@ -1,0 +1,48 @@
+#!/usr/bin/env python3
+"""All checks behind one command: ruff, mypy --strict, pytest. Options it does not know go to pytest.
+
+examples:
+  python tools/check.py                     lint, types and the fast tests
+  python tools/check.py --slow              the slow tests too
+  python tools/check.py --tests -k icp      only tests, and only some
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def main() -> int:
+    """Run the checks and return 0 where all of them passed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--slow", action="store_true", help="run the slow tests too")
+    parser.add_argument("--lint", action="store_true", help="ruff and mypy only")
+    parser.add_argument("--tests", action="store_true", help="pytest only")
+    args, pytest_args = parser.parse_known_args()
+    steps = []
+    if not args.tests:
+        steps += [("ruff", ["ruff", "check", "."]), ("mypy --strict", ["mypy"])]
+    if not args.lint:
+        steps += [("pytest", ["pytest", *(["--slow"] if args.slow else []), *pytest_args])]
+    results = [(name, _run(name, command)) for name, command in steps]
+    failed = [name for name, code in results if code]
+    print("checks: " + ("all passed" if not failed else "FAILED: " + ", ".join(failed)))
+    return 1 if failed else 0
+
+
+def _run(name: str, command: list[str]) -> int:
+    print(f"== {name}", flush=True)
+    began = time.monotonic()
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": os.environ.get("OPENBLAS_NUM_THREADS", "1")}
+    code = subprocess.run([sys.executable, "-m", *command], cwd=ROOT, env=environment, check=False).returncode
+    print(f"== {name}: {'ok' if code == 0 else f'exit {code}'}, {time.monotonic() - began:.0f} s\n", flush=True)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
