@@ -17,8 +17,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from simulation.floorplans import PLANS
+from simulation.logfile import write
 from simulation.radio import NLOS_LEVELS, RadioModel
-from simulation.recording import Lie, Settings, simulate, with_overrides, write
+from simulation.recording import Lie, Settings, simulate, with_overrides
 
 
 def numbers(text: str) -> tuple[float, ...]:
@@ -61,7 +62,13 @@ def parser() -> argparse.ArgumentParser:
     add("--nlos-anchors", type=whole_numbers, metavar="I,J", help="anchors, from 1, that --nlos is meant for; default all")
     add("--outliers", type=float, help="share of nonsense ranges (0)")
     add("--zeros", type=float, help="share of ranges that are zero (0)")
-    add("--lie", type=lie, action="append", metavar="ANCHOR:START:SECONDS:METRES", help="anchor is wrong for a while; repeatable")
+    add(
+        "--lie",
+        type=lie,
+        action="append",
+        metavar="ANCHOR:START:SECONDS:METRES",
+        help="anchor is wrong for a while; repeatable",
+    )
     add("--laser-pose", type=numbers, metavar="X,Y,THETA", help="mounting of the laser (0.1,0,0)")
     add("--laser-error", type=numbers, metavar="X,Y,THETA", help="true mounting minus the one in the log (0,0,0)")
     add("--laser-flipped", action="store_true", help="laser upside down, and the log does not say so")
@@ -71,8 +78,14 @@ def parser() -> argparse.ArgumentParser:
     add("--without", action="append", choices=["uwb", "laser"], help="leave a sensor out; repeatable")
     radio = p.add_argument_group("radio")
     for name, unit in (
-        ("noise-sd", "m"), ("bias-sd", "m"), ("multipath-sd", "m"), ("multipath-length", "m"), ("antenna-sd", "m"),
-        ("loss", "share"), ("scale", "range said / distance"), ("max-range", "m"),
+        ("noise-sd", "m"),
+        ("bias-sd", "m"),
+        ("multipath-sd", "m"),
+        ("multipath-length", "m"),
+        ("antenna-sd", "m"),
+        ("loss", "share"),
+        ("scale", "range said / distance"),
+        ("max-range", "m"),
     ):
         default = getattr(RadioModel(), name.replace("-", "_"))
         radio.add_argument(f"--range-{name}", type=float, help=f"{unit} ({default:g})")

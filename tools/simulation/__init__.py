@@ -3,5 +3,5 @@
 It shares no code with uwblite on purpose: a sign error common to both would go unseen. Poses are (..., 3) arrays of
 x, y, theta; metres, radians, seconds. Every random draw comes from one seeded generator, so a seed names a recording.
 
-Reading order: floorplans, drive, wheels, laser, radio, recording.
+Reading order: floorplans, drive, wheels, laser, radio, recording, logfile.
 """

@@ -42,18 +42,15 @@ class RoadMap:
         self.shape = shape
         self.free = distance >= clearance
         label, _ = ndimage.label(self.free)
-        start = self.cell(np.array(plan.start[:2]))
-        self.free = label == label[tuple(start)] if label[tuple(start)] else self.free
+        self.cells = np.argwhere(self.free)
+        self.free = label == label[tuple(self.cell(np.array(plan.start[:2])))]
         self.cells = np.argwhere(self.free)
         self.edges = self._edges(np.clip(clearance / np.maximum(distance, 1e-3), 0.2, 1.0))
 
     def cell(self, point: Floats) -> NDArray[np.int64]:
         """Return the free cell nearest to a point."""
-        if not hasattr(self, "cells"):
-            index: NDArray[np.int64] = np.argwhere(self.free)
-        else:
-            index = self.cells
-        return index[np.argmin(((index * _CELL - point) ** 2).sum(axis=1))]
+        nearest: NDArray[np.int64] = self.cells[np.argmin(((self.cells * _CELL - point) ** 2).sum(axis=1))]
+        return nearest
 
     def _edges(self, dear: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
         number = np.arange(self.free.size).reshape(self.free.shape)
@@ -93,7 +90,9 @@ def _draw(plan: FloorPlan, blocked: NDArray[np.bool_], cell: float) -> None:
         blocked[np.hypot(gx - x, gy - y) <= radius + cell] = True
 
 
-def wander(plan: FloorPlan, rng: np.random.Generator, length: float, clearance: float = 0.5, start: Floats | None = None) -> Floats:
+def wander(
+    plan: FloorPlan, rng: np.random.Generator, length: float, clearance: float = 0.5, start: Floats | None = None
+) -> Floats:
     """Return a dense polyline (k, 2), at least `length` m long, that keeps going where it has been least.
 
     Every leg has a taste of its own for places, so that legs between the same ends differ; turning back is avoided.
@@ -139,7 +138,7 @@ def follow(track: Floats, heading: float, speed: float, seconds: float, step: fl
     accel, turn_accel = 0.3 * step, 2.0 * step
     x, y, theta = float(track[0, 0]), float(track[0, 1]), heading
     v = w = 0.0
-    n = int(round(seconds / step)) + 1
+    n = round(seconds / step) + 1
     poses = np.empty((n, 3))
     px, py = track[:, 0].tolist(), track[:, 1].tolist()
     target, last, rest = 0, len(track) - 1, int(2.0 / step)

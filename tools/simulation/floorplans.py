@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +49,15 @@ def hall() -> FloorPlan:
     rows = [(f"C{i}", f"C{i + 1}") for i in (1, 2, 3, 5, 6, 7)]
     across = [(f"C{i}", f"C{i + 4}") for i in (1, 2, 3, 4)]
     return FloorPlan(
-        name="hall", size=(20.0, 20.0), walls=np.array(box(0, 0, 20, 20)), columns=np.array(columns),
+        name="hall",
+        size=(20.0, 20.0),
+        walls=np.array(box(0, 0, 20, 20)),
+        columns=np.array(columns),
         anchors=np.array([[1.2, 2.0], [18.4, 1.1], [17.7, 18.6], [2.1, 17.5]]),
-        landmarks=tuple(f"C{i}" for i in range(1, 9)), start=(10.0, 3.0, 0.0), minutes=31.0, pairs=tuple(rows + across),
+        landmarks=tuple(f"C{i}" for i in range(1, 9)),
+        start=(10.0, 3.0, 0.0),
+        minutes=31.0,
+        pairs=tuple(rows + across),
     )
 
 
@@ -62,9 +69,14 @@ def corridor() -> FloorPlan:
     walls += niches(9.6, 2.4, 2.4, 2.4, at=(2.2,), deep=0.25) + niches(2.4, 23.6, 9.6, 23.6, at=(4.4,), deep=0.25)
     bins = [[0.45, 4.3], [11.5, 8.9], [0.5, 18.1], [11.55, 20.6], [5.2, 0.5], [7.3, 25.45]]
     return FloorPlan(
-        name="corridor", size=(12.0, 26.0), walls=np.array(walls), columns=np.array([[x, y, 0.22] for x, y in bins]),
+        name="corridor",
+        size=(12.0, 26.0),
+        walls=np.array(walls),
+        columns=np.array([[x, y, 0.22] for x, y in bins]),
         anchors=np.array([[0.4, 0.9], [11.6, 1.6], [11.3, 25.2], [0.7, 24.6]]),
-        landmarks=tuple(f"B{i}" for i in range(1, 7)), start=(1.2, 3.0, np.pi / 2), minutes=20.0,
+        landmarks=tuple(f"B{i}" for i in range(1, 7)),
+        start=(1.2, 3.0, np.pi / 2),
+        minutes=20.0,
     )
 
 
@@ -78,26 +90,35 @@ def niches(x1: float, y1: float, x2: float, y2: float, at: tuple[float, ...], de
         a, b = start + (s - 0.45) * along, start + (s + 0.45) * along
         points += [a, a + into, b + into, b]
     points.append(end)
-    return [[*p, *q] for p, q in zip(points[:-1], points[1:], strict=True)]
+    return [[*p, *q] for p, q in pairwise(points)]
 
 
 def lab() -> FloorPlan:
     """15 x 20 m, cluttered: half walls, cabinets, table legs, four pillars."""
     walls = box(0, 0, 15, 20)
     walls += [[0, 8.2, 4.6, 8.2], [6.4, 8.2, 10.3, 8.2], [9.0, 8.2, 9.0, 4.9], [9.4, 13.1, 15, 13.1], [5.2, 20, 5.2, 15.8]]
+    # fmt: off
     for x, y, width, depth in (
-        (0.05, 1.2, 0.5, 2.4), (3.2, 0.05, 1.8, 0.6), (7.3, 0.05, 1.0, 0.45), (14.3, 2.3, 0.65, 1.7), (14.45, 7.0, 0.5, 2.9),
-        (0.05, 10.0, 0.6, 1.2), (0.05, 14.1, 0.45, 2.6), (2.0, 19.2, 1.6, 0.75), (7.6, 19.4, 2.2, 0.55), (12.1, 19.0, 0.9, 0.95),
-        (10.9, 13.15, 1.2, 0.5), (2.3, 4.6, 1.4, 0.7), (11.6, 10.1, 0.8, 0.8), (6.9, 11.2, 0.6, 1.5), (2.4, 11.6, 1.2, 0.6),
+        (0.05, 1.2, 0.5, 2.4), (3.2, 0.05, 1.8, 0.6), (7.3, 0.05, 1.0, 0.45), (14.3, 2.3, 0.65, 1.7),
+        (14.45, 7.0, 0.5, 2.9), (0.05, 10.0, 0.6, 1.2), (0.05, 14.1, 0.45, 2.6), (2.0, 19.2, 1.6, 0.75), (7.6, 19.4, 2.2, 0.55),
+        (12.1, 19.0, 0.9, 0.95), (10.9, 13.15, 1.2, 0.5), (2.3, 4.6, 1.4, 0.7), (11.6, 10.1, 0.8, 0.8),
+        (6.9, 11.2, 0.6, 1.5), (2.4, 11.6, 1.2, 0.6),
         (11.4, 4.4, 0.7, 1.3), (8.4, 16.6, 1.3, 0.6),
     ):
         walls += box(x, y, width, depth)
+    # fmt: on
     pillars = [[5.6, 4.4, 0.25], [11.2, 7.0, 0.25], [4.6, 13.6, 0.25], [11.7, 16.2, 0.25]]
     legs = [[x + dx, y + dy, 0.03] for x, y in ((6.4, 2.3), (12.5, 15.0), (1.3, 6.6)) for dx in (0, 1.4) for dy in (0, 0.7)]
     return FloorPlan(
-        name="lab", size=(15.0, 20.0), walls=np.array(walls), columns=np.array(pillars + legs),
+        name="lab",
+        size=(15.0, 20.0),
+        walls=np.array(walls),
+        columns=np.array(pillars + legs),
         anchors=np.array([[0.9, 0.6], [14.2, 1.3], [14.1, 18.4], [0.8, 18.9]]),
-        landmarks=("P1", "P2", "P3", "P4"), start=(4.4, 6.4, 0.0), minutes=20.0, opacity=0.6,
+        landmarks=("P1", "P2", "P3", "P4"),
+        start=(4.4, 6.4, 0.0),
+        minutes=20.0,
+        opacity=0.6,
     )
 
 
@@ -107,11 +128,18 @@ def warehouse() -> FloorPlan:
     for x in (4.0, 23.0, 42.0):
         for y in (4.0, 9.8, 15.6, 21.4, 27.2, 33.0):
             walls += box(x, y, 14.0, 2.6)
+    anchors = [[0.8, 1.0], [30.5, 0.6], [59.1, 1.4], [59.3, 21.5], [58.8, 39.2], [29.2, 39.4], [1.1, 38.7], [0.7, 18.1]]
     pillars = [[20.5, 8.1], [39.5, 8.1], [20.5, 19.8], [39.5, 19.8], [20.5, 31.4], [39.5, 31.4], [1.6, 19.8], [58.4, 19.8]]
     return FloorPlan(
-        name="warehouse", size=(60.0, 40.0), walls=np.array(walls), columns=np.array([[x, y, 0.3] for x, y in pillars]),
-        anchors=np.array([[0.8, 1.0], [30.5, 0.6], [59.1, 1.4], [59.3, 21.5], [58.8, 39.2], [29.2, 39.4], [1.1, 38.7], [0.7, 18.1]]),
-        landmarks=tuple(f"P{i}" for i in range(1, 9)), start=(2.0, 2.0, 0.0), minutes=60.0, opacity=0.3,
+        name="warehouse",
+        size=(60.0, 40.0),
+        walls=np.array(walls),
+        columns=np.array([[x, y, 0.3] for x, y in pillars]),
+        anchors=np.array(anchors),
+        landmarks=tuple(f"P{i}" for i in range(1, 9)),
+        start=(2.0, 2.0, 0.0),
+        minutes=60.0,
+        opacity=0.3,
     )
 
 
@@ -120,9 +148,14 @@ def room() -> FloorPlan:
     walls = box(0, 0, 7, 6) + box(5.4, 4.9, 1.55, 1.05) + box(0.05, 2.2, 0.5, 1.4) + [[3.4, 6.0, 3.4, 4.9]]
     columns = [[2.1, 1.7, 0.15], [4.9, 2.4, 0.2], [2.0, 4.3, 0.15]]
     return FloorPlan(
-        name="room", size=(7.0, 6.0), walls=np.array(walls), columns=np.array(columns),
+        name="room",
+        size=(7.0, 6.0),
+        walls=np.array(walls),
+        columns=np.array(columns),
         anchors=np.array([[0.3, 0.4], [6.7, 0.5], [6.6, 4.6], [0.5, 5.6]]),
-        landmarks=("C1", "C2", "C3"), start=(3.5, 1.0, 0.0), minutes=4.0,
+        landmarks=("C1", "C2", "C3"),
+        start=(3.5, 1.0, 0.0),
+        minutes=4.0,
     )
 
 

@@ -73,7 +73,7 @@ def cast(
         t = along - np.sqrt(np.maximum(depth2, 0.0))
         hit = (depth2 > 0.0) & (t > 0.0) & (t < best)
         best[hit] = t[hit]
-        cosine[hit] = (np.sqrt(np.maximum(depth2, 0.0)) / radius)[hit]
+        cosine[hit] = np.sqrt(depth2[hit]) / np.broadcast_to(radius, t.shape)[hit]
         surface[hit] = len(walls) + k
     beyond = best > reach
     best[beyond], surface[beyond] = np.inf, -1

@@ -16,7 +16,10 @@ from .fields import smooth_field
 Floats = NDArray[np.float64]
 
 NLOS_LEVELS: dict[str, tuple[float, float, float]] = {
-    "off": (0.0, 0.0, 0.0), "light": (0.10, 0.0, 0.1), "normal": (0.30, 0.0, 0.3), "heavy": (0.80, 0.6, 0.4),
+    "off": (0.0, 0.0, 0.0),
+    "light": (0.10, 0.0, 0.1),
+    "normal": (0.30, 0.0, 0.3),
+    "heavy": (0.80, 0.6, 0.4),
 }
 """Mean excess behind an obstacle, m; share of the floor that is shadowed by unseen things; share of shadowed ranges lost."""
 
@@ -70,9 +73,7 @@ def crossings(tags: Floats, anchor: Floats, walls: Floats, columns: Floats) -> F
     return count
 
 
-def excess(
-    shadow: Floats, points: Floats, level: str, rng: np.random.Generator
-) -> tuple[Floats, NDArray[np.bool_]]:
+def excess(shadow: Floats, points: Floats, level: str, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the extra length (n,), m, of shadowed ranges and which of them are lost.
 
     The excess is exponentially distributed and mostly the same for a slow robot behind the same obstacle.

@@ -1,15 +1,13 @@
-"""One drive through one building: every sensor's part, then the files."""
+"""One drive through one building: every sensor's part."""
 
-import gzip
-import json
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import drive, laser, radio, wheels
+from .fields import smooth_field
 from .floorplans import ANCHOR_IDS, PLANS, FloorPlan
 from .laser import LaserModel
 from .radio import RadioModel
@@ -130,14 +128,28 @@ def simulate(settings: Settings) -> Recording:
     scan_poses = np.stack([np.interp(told, stamps, said[:, k]) for k in range(3)], axis=1)
     mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
     calibration = {
-        "settings": asdict(settings), "odometry": asdict(faults), "slips": slips, "uwb": truth_uwb,
+        "settings": asdict(settings),
+        "odometry": asdict(faults),
+        "slips": slips,
+        "uwb": truth_uwb,
         "laser": {"x": mounting[0], "y": mounting[1], "theta": mounting[2], "flipped": settings.laser_flipped},
         "tag": [*settings.tag, settings.tag_height],
         "clock": {"uwb_delay": settings.uwb_delay, "laser_delay": settings.laser_delay},
     }
     return Recording(
-        settings, plan, anchors, stamps, said, motion.at(stamps), told, scan_poses, scans, range_stamps, range_anchors,
-        ranges, calibration,
+        settings,
+        plan,
+        anchors,
+        stamps,
+        said,
+        motion.at(stamps),
+        told,
+        scan_poses,
+        scans,
+        range_stamps,
+        range_anchors,
+        ranges,
+        calibration,
     )
 
 
@@ -177,7 +189,9 @@ def _bodies(crowd: list[drive.Motion], times: Floats, robot: Floats) -> Floats:
     return np.concatenate([xy, radius[..., None]], axis=2)
 
 
-def _scan(settings: Settings, plan: FloorPlan, motion: drive.Motion, crowd: list[drive.Motion]) -> tuple[Floats, NDArray[np.int64]]:
+def _scan(
+    settings: Settings, plan: FloorPlan, motion: drive.Motion, crowd: list[drive.Motion]
+) -> tuple[Floats, NDArray[np.int64]]:
     """Return stamps (k,) on the odometry's clock and ranges (k, beams), mm."""
     model = settings.laser
     if "laser" in settings.without:
@@ -198,12 +212,13 @@ def _scan(settings: Settings, plan: FloorPlan, motion: drive.Motion, crowd: list
         walls, columns = laser.near(plan.walls, plan.columns, origin.mean(axis=0), model.max_range + 0.5)
         still = np.broadcast_to(plan.columns[columns], (len(times), len(columns), 3))
         round_things = np.concatenate([still, _bodies(crowd, times, pose)], axis=1)
-        ids = np.concatenate([walls, len(plan.walls) + columns, len(plan.walls) + len(plan.columns) + np.arange(len(crowd)), [-1]])
+        bodies = len(plan.walls) + len(plan.columns) + np.arange(len(crowd))
+        ids = np.concatenate([walls, len(plan.walls) + columns, bodies, [-1]])
         heading = pose[:, 2] + np.tile(angles, len(chunk))
         true, cosine, surface = laser.cast(origin, heading, plan.walls[walls], round_things, model.max_range)
         shape = (len(chunk), model.beams)
-        surfaces = ids[surface].reshape(shape)
-        out[first : first + len(chunk)] = laser.disturb(true.reshape(shape), cosine.reshape(shape), surfaces, model, colour, rng)
+        true, cosine, surface = true.reshape(shape), cosine.reshape(shape), ids[surface].reshape(shape)
+        out[first : first + len(chunk)] = laser.disturb(true, cosine, surface, model, colour, rng)
     return stamps, out
 
 
@@ -214,8 +229,10 @@ def _range(
     model, count = settings.radio, len(anchors)
     bias = model.bias_sd * _rng(settings, 6).standard_normal(count)
     truth: dict[str, Any] = {
-        "bias": dict(zip(ANCHOR_IDS, bias.tolist(), strict=False)), "scale": model.scale,
-        "anchor_height": settings.anchor_height, "tag_height": settings.tag_height,
+        "bias": dict(zip(ANCHOR_IDS, bias.tolist(), strict=False)),
+        "scale": model.scale,
+        "anchor_height": settings.anchor_height,
+        "tag_height": settings.tag_height,
     }
     if "uwb" in settings.without or count == 0:
         return np.empty(0), np.empty(0, dtype=np.int64), np.empty(0), truth
@@ -234,13 +251,14 @@ def _range(
         # One antenna on the robot: every anchor meets the same pattern; each anchor has one of its own besides.
         antenna = radio.antenna_pattern(np.random.default_rng(pattern), bearing - pose[:, 2])
         antenna = (antenna + radio.antenna_pattern(rng, bearing)) / np.sqrt(2.0)
-        field_ = radio.smooth_field(rng, tag, model.multipath_length)
+        field_ = smooth_field(rng, tag, model.multipath_length)
         shadow = plan.opacity * radio.crossings(tag, place, plan.walls, plan.columns)
         shadow += 0.5 * (radio.crossings(tag, place, np.empty((0, 4)), bodies) > 0)
         level = settings.nlos if not settings.nlos_anchors or a + 1 in settings.nlos_anchors else "normal"
         extra, lost = radio.excess(shadow, tag, level, rng)
         noise = model.noise_sd * rng.standard_normal(len(times))
-        ranges[:, a] = model.scale * distance + bias[a] + model.multipath_sd * field_ + model.antenna_sd * antenna + extra + noise
+        smooth = bias[a] + model.multipath_sd * field_ + model.antenna_sd * antenna
+        ranges[:, a] = model.scale * distance + smooth + extra + noise
         heard[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < model.max_range)
         effort[:, a] = distance + 6.0 * shadow
     rng = _rng(settings, 8)
@@ -260,87 +278,6 @@ def _spoil(
     kind, wild = rng.random(len(values)), rng.uniform(0.0, 1.5 * size, len(values))
     values = np.where(kind < settings.outliers, wild, values)
     return np.where(kind > 1.0 - settings.zeros, 0.0, values)
-
-
-def write(recording: Recording, directory: Path, compress: bool = False) -> None:
-    """Write run.log(.gz) and the truth files."""
-    directory.mkdir(parents=True, exist_ok=True)
-    text = log_text(recording)
-    if compress:
-        (directory / "run.log.gz").write_bytes(gzip.compress(text, 6, mtime=0))
-    else:
-        (directory / "run.log").write_bytes(text)
-    plan, truth = recording.plan, recording.truth
-    half = 0.5 * truth[:, 2]
-    rows = np.column_stack([recording.stamps, truth[:, :2], np.sin(half), np.cos(half)])
-    _lines(directory / "truth.tum", "", (f"{t:.6f} {x:.5f} {y:.5f} 0 0 0 {z:.8f} {w:.8f}" for t, x, y, z, w in rows.tolist()))
-    anchors = zip(ANCHOR_IDS, recording.anchors.tolist(), strict=False)
-    height = recording.settings.anchor_height
-    _lines(directory / "truth_anchors.csv", "id,x,y,height", (f"{i},{x:.4f},{y:.4f},{height:.3f}" for i, (x, y) in anchors))
-    named = zip(plan.landmarks, plan.columns.tolist(), strict=False)
-    _lines(directory / "columns.csv", "name,x,y,radius", (f"{n},{x:.4f},{y:.4f},{r:.3f}" for n, (x, y, r) in named))
-    _lines(directory / "pairs.csv", "a,b", (f"{a},{b}" for a, b in plan.pairs)) if plan.pairs else None
-    _lines(directory / "walls.csv", "x1,y1,x2,y2", (",".join(f"{v:.4f}" for v in w) for w in plan.walls.tolist()))
-    _lines(directory / "posts.csv", "x,y,radius", (",".join(f"{v:.4f}" for v in c) for c in plan.columns.tolist()))
-    (directory / "truth_calibration.json").write_text(json.dumps(recording.calibration, indent=1, sort_keys=True) + "\n")
-
-
-def _lines(path: Path, header: str, rows: Any) -> None:
-    path.write_text("".join(line + "\n" for line in ([header] if header else []) + list(rows)))
-
-
-def log_text(recording: Recording) -> bytes:
-    """Return the recording as a CARMEN log, in the order in which a logger would have written it."""
-    settings = recording.settings
-    params = {
-        "laser_time_increment": f"{settings.laser.time_increment:.8f}",
-        "uwb_tag_offset_x": f"{settings.tag[0]:.3f}", "uwb_tag_offset_y": f"{settings.tag[1]:.3f}",
-    }
-    if settings.tell_heights:
-        params |= {"uwb_tag_height": f"{settings.tag_height:.3f}", "uwb_anchor_height": f"{settings.anchor_height:.3f}"}
-    lines = [b"# CARMEN Logfile\n", f"# simulated {settings.world}, seed {settings.seed}\n".encode()]
-    lines += [f"PARAM {name} {value} 0 sim 0\n".encode() for name, value in params.items()]
-    # A logger writes what has arrived: a scan after its sweep, a range after its slot. Stamps therefore run out of order.
-    written = np.concatenate([recording.stamps + 0.002, recording.scan_stamps + 0.102, recording.range_stamps + 0.03])
-    messages = _odometry_lines(recording) + _scan_lines(recording) + _range_lines(recording)
-    lines += [messages[i] for i in np.argsort(written, kind="stable")]
-    return b"".join(lines)
-
-
-def _wrap(theta: Floats) -> Floats:
-    return (theta + np.pi) % (2.0 * np.pi) - np.pi
-
-
-def _odometry_lines(r: Recording) -> list[bytes]:
-    t, pose = r.stamps, r.odometry
-    step = np.diff(pose, axis=0, append=pose[-1:]) * r.settings.odometry_rate
-    forward = step[:, 0] * np.cos(pose[:, 2]) + step[:, 1] * np.sin(pose[:, 2])
-    rows = np.column_stack([pose[:, :2], _wrap(pose[:, 2]), forward, step[:, 2], t, t + 0.002]).tolist()
-    return [f"ODOM {x:.6f} {y:.6f} {a:.6f} {v:.4f} {w:.4f} 0 {s:.6f} sim {u:.6f}\n".encode() for x, y, a, v, w, s, u in rows]
-
-
-def _scan_lines(r: Recording) -> list[bytes]:
-    model, (mx, my, mt) = r.settings.laser, r.settings.laser_pose
-    span = (model.beams - 1) * model.increment
-    head = f"ROBOTLASER1 2 {model.angles[0]:.9f} {span:.9f} {model.increment:.9f} {model.max_range:.3f} 0.01 0 {model.beams} "
-    words = np.frombuffer("".join(f"{mm / 1000:.3f} " for mm in range(int(model.max_range * 1000) + 1)).encode(), dtype="S6")
-    c, s = np.cos(r.scan_poses[:, 2]), np.sin(r.scan_poses[:, 2])
-    x, y = r.scan_poses[:, 0], r.scan_poses[:, 1]
-    where = np.column_stack(
-        [x + c * mx - s * my, y + s * mx + c * my, _wrap(r.scan_poses[:, 2] + mt), x, y, _wrap(r.scan_poses[:, 2])]
-    )
-    start = head.encode()
-    return [
-        start + words[scan].tobytes() + (
-            "0 " + " ".join(f"{v:.6f}" for v in pose) + f" 0 0 0 0 0 {t:.6f} sim {t + 0.102:.6f}\n"
-        ).encode()
-        for scan, pose, t in zip(r.scans, where.tolist(), r.scan_stamps.tolist(), strict=True)
-    ]
-
-
-def _range_lines(r: Recording) -> list[bytes]:
-    rows = zip(r.range_anchors.tolist(), r.ranges.tolist(), r.range_stamps.tolist(), strict=True)
-    return [f"UWB {ANCHOR_IDS[a]} {d:.3f} 100 {t:.6f} sim {t + 0.03:.6f}\n".encode() for a, d, t in rows]
 
 
 def with_overrides(settings: Settings, **values: Any) -> Settings:

@@ -35,8 +35,12 @@ def draw_errors(rng: np.random.Generator, scale: float) -> WheelErrors:
         return float(scale * value * rng.uniform(0.75, 1.25) * rng.choice([-1.0, 1.0]))
 
     return WheelErrors(
-        distance_scale=1.0 + about(0.02), heading_scale=1.0 + about(0.015), drift=about(0.0038),
-        distance_noise=0.02 * scale, heading_noise_travel=0.02 * scale, heading_noise_turn=0.02 * scale,
+        distance_scale=1.0 + about(0.02),
+        heading_scale=1.0 + about(0.015),
+        drift=about(0.0038),
+        distance_noise=0.02 * scale,
+        heading_noise_travel=0.02 * scale,
+        heading_noise_turn=0.02 * scale,
     )
 
 

@@ -1,0 +1,97 @@
+"""The files of a recording: the CARMEN log, and the truth beside it."""
+
+import gzip
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .floorplans import ANCHOR_IDS
+from .recording import Recording
+
+Floats = NDArray[np.float64]
+
+
+def write(recording: Recording, directory: Path, compress: bool = False) -> None:
+    """Write run.log(.gz) and the truth files."""
+    directory.mkdir(parents=True, exist_ok=True)
+    text = log_text(recording)
+    if compress:
+        (directory / "run.log.gz").write_bytes(gzip.compress(text, 6, mtime=0))
+    else:
+        (directory / "run.log").write_bytes(text)
+    plan, truth = recording.plan, recording.truth
+    half = 0.5 * truth[:, 2]
+    rows = np.column_stack([recording.stamps, truth[:, :2], np.sin(half), np.cos(half)])
+    _lines(directory / "truth.tum", "", (f"{t:.6f} {x:.5f} {y:.5f} 0 0 0 {z:.8f} {w:.8f}" for t, x, y, z, w in rows.tolist()))
+    anchors = zip(ANCHOR_IDS, recording.anchors.tolist(), strict=False)
+    height = recording.settings.anchor_height
+    _lines(directory / "truth_anchors.csv", "id,x,y,height", (f"{i},{x:.4f},{y:.4f},{height:.3f}" for i, (x, y) in anchors))
+    named = zip(plan.landmarks, plan.columns.tolist(), strict=False)
+    _lines(directory / "columns.csv", "name,x,y,radius", (f"{n},{x:.4f},{y:.4f},{r:.3f}" for n, (x, y, r) in named))
+    if plan.pairs:
+        _lines(directory / "pairs.csv", "a,b", (f"{a},{b}" for a, b in plan.pairs))
+    _lines(directory / "walls.csv", "x1,y1,x2,y2", (",".join(f"{v:.4f}" for v in w) for w in plan.walls.tolist()))
+    _lines(directory / "posts.csv", "x,y,radius", (",".join(f"{v:.4f}" for v in c) for c in plan.columns.tolist()))
+    (directory / "truth_calibration.json").write_text(json.dumps(recording.calibration, indent=1, sort_keys=True) + "\n")
+
+
+def _lines(path: Path, header: str, rows: Iterable[str]) -> None:
+    path.write_text("".join(line + "\n" for line in ([header] if header else []) + list(rows)))
+
+
+def log_text(recording: Recording) -> bytes:
+    """Return the recording as a CARMEN log, in the order in which a logger would have written it."""
+    settings = recording.settings
+    params = {
+        "laser_time_increment": f"{settings.laser.time_increment:.8f}",
+        "uwb_tag_offset_x": f"{settings.tag[0]:.3f}",
+        "uwb_tag_offset_y": f"{settings.tag[1]:.3f}",
+    }
+    if settings.tell_heights:
+        params |= {"uwb_tag_height": f"{settings.tag_height:.3f}", "uwb_anchor_height": f"{settings.anchor_height:.3f}"}
+    lines = [b"# CARMEN Logfile\n", f"# simulated {settings.world}, seed {settings.seed}\n".encode()]
+    lines += [f"PARAM {name} {value} 0 sim 0\n".encode() for name, value in params.items()]
+    # A logger writes what has arrived: a scan after its sweep, a range after its slot. Stamps therefore run out of order.
+    written = np.concatenate([recording.stamps + 0.002, recording.scan_stamps + 0.102, recording.range_stamps + 0.03])
+    messages = _odometry_lines(recording) + _scan_lines(recording) + _range_lines(recording)
+    lines += [messages[i] for i in np.argsort(written, kind="stable")]
+    return b"".join(lines)
+
+
+def _wrap(theta: Floats) -> Floats:
+    return (theta + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def _odometry_lines(r: Recording) -> list[bytes]:
+    t, pose = r.stamps, r.odometry
+    step = np.diff(pose, axis=0, append=pose[-1:]) * r.settings.odometry_rate
+    forward = step[:, 0] * np.cos(pose[:, 2]) + step[:, 1] * np.sin(pose[:, 2])
+    rows = np.column_stack([pose[:, :2], _wrap(pose[:, 2]), forward, step[:, 2], t, t + 0.002]).tolist()
+    return [f"ODOM {x:.6f} {y:.6f} {a:.6f} {v:.4f} {w:.4f} 0 {s:.6f} sim {u:.6f}\n".encode() for x, y, a, v, w, s, u in rows]
+
+
+def _scan_lines(r: Recording) -> list[bytes]:
+    model, (mx, my, mt) = r.settings.laser, r.settings.laser_pose
+    span = (model.beams - 1) * model.increment
+    head = f"ROBOTLASER1 2 {model.angles[0]:.9f} {span:.9f} {model.increment:.9f} {model.max_range:.3f} 0.01 0 {model.beams} "
+    words = np.frombuffer("".join(f"{mm / 1000:.3f} " for mm in range(int(model.max_range * 1000) + 1)).encode(), dtype="S6")
+    c, s = np.cos(r.scan_poses[:, 2]), np.sin(r.scan_poses[:, 2])
+    x, y = r.scan_poses[:, 0], r.scan_poses[:, 1]
+    where = np.column_stack(
+        [x + c * mx - s * my, y + s * mx + c * my, _wrap(r.scan_poses[:, 2] + mt), x, y, _wrap(r.scan_poses[:, 2])]
+    )
+    start = head.encode()
+    return [
+        start
+        + words[scan].tobytes()
+        + ("0 " + " ".join(f"{v:.6f}" for v in pose) + f" 0 0 0 0 0 {t:.6f} sim {t + 0.102:.6f}\n").encode()
+        for scan, pose, t in zip(r.scans, where.tolist(), r.scan_stamps.tolist(), strict=True)
+    ]
+
+
+def _range_lines(r: Recording) -> list[bytes]:
+    rows = zip(r.range_anchors.tolist(), r.ranges.tolist(), r.range_stamps.tolist(), strict=True)
+    return [f"UWB {ANCHOR_IDS[a]} {d:.3f} 100 {t:.6f} sim {t + 0.03:.6f}\n".encode() for a, d, t in rows]
