@@ -1,0 +1,169 @@
+"""What drivers say. Events are frozen and compared by ``==``; noise is an event, misuse is an exception.
+
+A *protocol* turns bytes into events (``feed(data, stamp)``). A *session* owns a protocol and the start-up and recovery
+of one device: it turns bytes and time into *actions*, that is measurements to log and bytes to send. Neither opens a
+port nor reads a clock: the caller brings ``now``, seconds of a monotonic clock.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Corrupt:
+    """Bytes that are no frame of the protocol."""
+
+    raw: bytes
+    """The bytes, at most 64 of them."""
+    why: str
+    """One clause for the counters: what did not fit."""
+
+
+def corrupt(raw: bytes, why: str) -> Corrupt:
+    """Return a Corrupt event that keeps at most the first 64 bytes.
+
+    Parameters
+    ----------
+    raw : the bytes that did not fit.
+    why : one clause.
+
+    Returns
+    -------
+    Corrupt
+    """
+    return Corrupt(bytes(raw[:64]), why)
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Write these bytes to the device, in one write."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class SetBaud:
+    """Change the speed of the port, bit/s; ports without a speed ignore it."""
+
+    rate: int
+
+
+@dataclass(frozen=True, slots=True)
+class Param:
+    """A fact about the device for the head of the log."""
+
+    name: str
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something a person must know; becomes a COMMENT in the log and a line on the terminal."""
+
+    level: str
+    """"info", "warning" or "error"."""
+    name: str
+    """Short stable name, for example ``stationary-detection``."""
+    text: str
+    """What, and how to mend it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reopen:
+    """The device does not answer any more: close the port and open it again after a pause."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class RangeReading:
+    """One distance from the tag to an anchor."""
+
+    anchor_id: str
+    """Four upper-case hexadecimal digits, the anchor's short address."""
+    range: float
+    """m."""
+    quality: int
+    """0..100; 100 where the device says nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class RangeEpoch:
+    """The distances of one ranging round."""
+
+    stamp: float
+    """s, host clock."""
+    readings: tuple[RangeReading, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LaserScan:
+    """One sweep; field names of sensor_msgs/LaserScan."""
+
+    stamp: float
+    """s, host clock, time of the first ray."""
+    ranges: tuple[float, ...]
+    """m; +inf = nothing seen, nan = invalid (REP-117)."""
+    angle_min: float
+    """rad, counter-clockwise, 0 = ahead."""
+    angle_increment: float
+    """rad."""
+    time_increment: float
+    """s between rays."""
+    range_max: float
+    """m."""
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryPose:
+    """Pose of the base in the drifting odom frame."""
+
+    stamp: float
+    """s, host clock."""
+    x: float
+    y: float
+    """m."""
+    theta: float
+    """rad."""
+    speed: float = 0.0
+    """m/s, forward."""
+    turn_rate: float = 0.0
+    """rad/s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The device numbers or times its frames, and some are missing."""
+
+    stamp: float
+    """s, host clock, of the first frame after the gap."""
+    count: int
+    """Frames missing."""
+
+
+Action = (
+    Corrupt | Send | SetBaud | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | Lost
+)
+Measurement = RangeEpoch | LaserScan | OdometryPose
+
+
+class Session(Protocol):
+    """Start-up, running and recovery of one device, without a port."""
+
+    baud: int
+    """bit/s to open the port with."""
+
+    def start(self, now: float) -> list[Action]:
+        """Begin, or begin again after a reconnect, at time `now`, s."""
+
+    def feed(self, data: bytes, now: float) -> list[Action]:
+        """Take bytes that arrived at time `now`, s."""
+
+    def tick(self, now: float) -> list[Action]:
+        """Do what is due at time `now`, s."""
+
+    def deadline(self) -> float | None:
+        """Return the time at which `tick` wants to be called, s; None = when bytes come."""
+
+    def stop(self) -> list[Action]:
+        """Return what to send so that the device falls quiet."""

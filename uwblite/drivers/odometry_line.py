@@ -1,0 +1,213 @@
+"""Odometry of other bases: one text line per sample, columns by configuration. Sans-I/O.
+
+There is no standard for what hobby controllers print, so the columns are told: ``t,x,y,theta`` or ``t,left,right``
+(encoder ticks) in any order, ``-`` for a column to skip. A line that does not fit is Corrupt.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+
+from ..errors import ConfigError
+from .events import Corrupt, OdometryPose, corrupt
+
+MAX_LINE = 256
+COLUMNS = ("t", "x", "y", "theta", "left", "right", "speed", "turn_rate", "-")
+
+
+@dataclass(frozen=True, slots=True)
+class LineFormat:
+    """How to read a line; see `parse_format` for the text form."""
+
+    columns: tuple[str, ...] = ("t", "x", "y", "theta")
+    """Names from COLUMNS, in the order printed. ``t`` may be missing: then the arrival stamps the sample."""
+    time_unit: float = 1.0
+    """s per unit of column t (0.001 for milliseconds)."""
+    length_unit: float = 1.0
+    """m per unit of x and y."""
+    angle_unit: float = 1.0
+    """rad per unit of theta (0.017453 for degrees)."""
+    tick: float = 0.0
+    """m of wheel travel per encoder tick; needed with left and right."""
+    wheel_base: float = 0.0
+    """m between the wheels; needed with left and right, unless theta is printed as well."""
+    tick_modulus: int = 0
+    """The tick counters wrap at this number; 0 = they do not wrap."""
+    prefix: str = ""
+    """Text at the start of the lines to read; others are ignored."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One good line."""
+
+    stamp: float
+    """s, arrival of its first byte."""
+    values: tuple[tuple[str, float], ...]
+    """(column, number) in the order printed, units as printed."""
+
+
+def parse_format(options: dict[str, str]) -> LineFormat:
+    """Build a LineFormat from text options.
+
+    Parameters
+    ----------
+    options : for example ``{"columns": "t,left,right", "tick": "1.2e-4", "wheel_base": "0.23"}``.
+
+    Returns
+    -------
+    LineFormat
+
+    Raises
+    ------
+    ConfigError : an unknown name, a bad number, or columns that make no pose.
+    """
+    values: dict[str, object] = {}
+    for name, text in options.items():
+        try:
+            if name == "columns":
+                values[name] = tuple(column.strip() for column in text.split(","))
+            elif name == "prefix":
+                values[name] = text
+            elif name == "tick_modulus":
+                values[name] = int(text)
+            elif name in ("time_unit", "length_unit", "angle_unit", "tick", "wheel_base"):
+                values[name] = float(text)
+            else:
+                known = "columns, prefix, time_unit, length_unit, angle_unit, tick, wheel_base, tick_modulus"
+                raise ConfigError(f"odometry line: unknown option {name!r}; known are {known}")
+        except ValueError:
+            raise ConfigError(f"odometry line: {name}={text!r} is not a number") from None
+    spec = LineFormat(**values)  # type: ignore[arg-type]
+    names = [column for column in spec.columns if column != "-"]
+    unknown = [column for column in names if column not in COLUMNS]
+    if unknown or len(set(names)) < len(names):
+        raise ConfigError(f"odometry line: columns {spec.columns} must be different names of {', '.join(COLUMNS)}")
+    ticks = {"left", "right"} <= set(names)
+    if not ticks and not {"x", "y", "theta"} <= set(names):
+        raise ConfigError("odometry line: columns must hold x,y,theta or left,right")
+    if ticks and (spec.tick <= 0 or (spec.wheel_base <= 0 and "theta" not in names)):
+        raise ConfigError("odometry line: left,right need tick=<m per tick> and wheel_base=<m>")
+    return spec
+
+
+class OdometryLineProtocol:
+    """Bytes in, Sample and Corrupt out. Holds at most one line of MAX_LINE bytes.
+
+    Parameters
+    ----------
+    line_format : columns and units.
+    """
+
+    def __init__(self, line_format: LineFormat) -> None:
+        self._format = line_format
+        self._line = bytearray()
+        self._stamp = 0.0
+
+    def feed(self, data: bytes, stamp: float) -> list[Sample | Corrupt]:
+        """Take bytes that arrived at `stamp` s and return the events they complete.
+
+        Parameters
+        ----------
+        data : bytes from the port.
+        stamp : arrival, s, clock of the host.
+
+        Returns
+        -------
+        list of Sample or Corrupt.
+        """
+        events: list[Sample | Corrupt] = []
+        for piece in data.splitlines(keepends=True):
+            if not self._line:
+                self._stamp = stamp
+            self._line += piece
+            if piece[-1:] in (b"\n", b"\r"):
+                line = bytes(self._line).strip()
+                self._line.clear()
+                if line:
+                    events += self._take_line(line)
+            while len(self._line) > MAX_LINE:
+                events.append(corrupt(bytes(self._line[:MAX_LINE]), "line too long"))
+                del self._line[:MAX_LINE]
+        return events
+
+    def _take_line(self, line: bytes) -> list[Sample | Corrupt]:
+        text = line.decode("ascii", "replace")
+        prefix = self._format.prefix
+        if prefix:
+            at = text.rfind(prefix)
+            if at < 0:
+                return []
+            text = text[at + len(prefix) :]
+        fields = re.split(r"[,;\s]+", text.strip(" ,;\t"))
+        if len(fields) != len(self._format.columns):
+            return [corrupt(line, f"{len(fields)} columns instead of {len(self._format.columns)}")]
+        values = []
+        for name, field in zip(self._format.columns, fields, strict=True):
+            if name == "-":
+                continue
+            if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", field) or not math.isfinite(float(field)):
+                return [corrupt(line, f"column {name} is not a number")]
+            values.append((name, float(field)))
+        return [Sample(self._stamp, tuple(values))]
+
+
+class LineOdometer:
+    """Turn Samples into poses.
+
+    Parameters
+    ----------
+    line_format : columns and units.
+    start : pose at the first sample when it is made from ticks; m, m, rad.
+    """
+
+    def __init__(self, line_format: LineFormat, start: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        self._format = line_format
+        self._x, self._y, self._theta = start
+        self._last: dict[str, float] | None = None
+
+    def update(self, sample: Sample) -> OdometryPose:
+        """Take one sample; its stamp is the arrival (map ``device_time`` to the host's clock first if there is one).
+
+        Parameters
+        ----------
+        sample : from OdometryLineProtocol.
+
+        Returns
+        -------
+        OdometryPose
+        """
+        spec, values = self._format, dict(sample.values)
+        theta = values["theta"] * spec.angle_unit if "theta" in values else None
+        if "left" in values:
+            self._from_ticks(values, theta)
+        else:
+            assert theta is not None
+            self._x, self._y = values["x"] * spec.length_unit, values["y"] * spec.length_unit
+            self._theta = math.remainder(theta, 2 * math.pi)
+        self._last = values
+        speed = values.get("speed", 0.0) * spec.length_unit
+        return OdometryPose(
+            sample.stamp, self._x, self._y, self._theta, speed, values.get("turn_rate", 0.0) * spec.angle_unit
+        )
+
+    def device_time(self, sample: Sample) -> float | None:
+        """Return the base's own time of a sample, s, or None where the line has none."""
+        time = dict(sample.values).get("t")
+        return None if time is None else time * self._format.time_unit
+
+    def _from_ticks(self, values: dict[str, float], theta: float | None) -> None:
+        spec, last = self._format, self._last
+        if last is None:
+            self._theta = self._theta if theta is None else theta
+            return
+        left, right = (self._difference(values[name] - last[name]) * spec.tick for name in ("left", "right"))
+        turn = (right - left) / spec.wheel_base if theta is None else math.remainder(theta - self._theta, 2 * math.pi)
+        middle = self._theta + turn / 2
+        self._x += (left + right) / 2 * math.cos(middle)
+        self._y += (left + right) / 2 * math.sin(middle)
+        self._theta = math.remainder(self._theta + turn, 2 * math.pi)
+
+    def _difference(self, ticks: float) -> float:
+        wrap = self._format.tick_modulus
+        return (ticks + wrap / 2) % wrap - wrap / 2 if wrap else ticks
