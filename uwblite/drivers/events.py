@@ -141,9 +141,7 @@ class Lost:
     """Frames missing."""
 
 
-Action = (
-    Corrupt | Send | SetBaud | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | Lost
-)
+Action = Corrupt | Send | SetBaud | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | Lost
 Measurement = RangeEpoch | LaserScan | OdometryPose
 
 

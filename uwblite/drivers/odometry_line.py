@@ -187,9 +187,7 @@ class LineOdometer:
             self._theta = math.remainder(theta, 2 * math.pi)
         self._last = values
         speed = values.get("speed", 0.0) * spec.length_unit
-        return OdometryPose(
-            sample.stamp, self._x, self._y, self._theta, speed, values.get("turn_rate", 0.0) * spec.angle_unit
-        )
+        return OdometryPose(sample.stamp, self._x, self._y, self._theta, speed, values.get("turn_rate", 0.0) * spec.angle_unit)
 
     def device_time(self, sample: Sample) -> float | None:
         """Return the base's own time of a sample, s, or None where the line has none."""

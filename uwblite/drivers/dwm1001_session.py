@@ -1,0 +1,446 @@
+"""Start-up, polling and recovery of a DWM1001 tag, without a port: what to send next, given answers and time.
+
+Two ways to read it. *TLV* (default): status_get until a fix is ready, then loc_get; distances to 1 mm. *Shell*: the
+stream of ``lec``; distances to 1 cm. Either way a module left in the other mode, or streaming for a host that died, is
+brought round. The module carries no clock, so a fix is stamped between the last "not ready" and the first "ready";
+to keep that short without polling all the time, polls are dense only around the moment the next fix is due.
+TLV has no checksum: on a link that has shown damage, and when an anchor is new, a fix is read twice and must agree.
+"""
+
+from .dwm1001 import (
+    BAUD,
+    ERRORS,
+    LOC_GET,
+    STATUS_GET,
+    Answer,
+    Distances,
+    NodeConfig,
+    Status,
+    TlvProtocol,
+    UpdateRate,
+    Value,
+    request,
+    short_id,
+)
+from .dwm1001 import Event as TlvEvent
+from .dwm1001_shell import (
+    ENTER,
+    NodeInfo,
+    PositionLine,
+    Prompt,
+    RangeLine,
+    ShellProtocol,
+    TextLine,
+    parse_node_info,
+    shell_command,
+)
+from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, RangeReading, Reopen, Send
+
+DRAIN = 0.25
+PATIENCE = 0.25
+"""s to wait for an answer during start-up."""
+ANSWER = 0.060
+"""s to wait for an answer while polling; the longest takes 9 ms, and USB and a busy computer add some."""
+BROKEN_ANSWER = 0.015
+"""s to wait for the rest of an answer once part of it was damaged."""
+DENSE, SPARSE, IDLE = 0.004, 0.010, 0.050
+"""s between polls: when a fix is due; when it is late; when none has come for a while."""
+LEAD = 0.010
+"""s before a fix is due at which polling begins."""
+DISTRUST = 5.0
+"""s for which a link counts as damaged after a corrupt byte."""
+MAX_ROUNDS = 8
+QUERIES = ("ver_get", "nodeid_get", "panid_get", "cfg_get", "upd_rate_get")
+
+
+class Dwm1001Session:
+    """One DWM1001 tag; see `events.Session` for the methods.
+
+    Parameters
+    ----------
+    shell : read the text stream instead of polling TLV.
+    stream : False: stop after the queries (for a look at what is plugged in).
+    """
+
+    def __init__(self, *, shell: bool = False, stream: bool = True) -> None:
+        self.baud = BAUD
+        self.config: NodeConfig | None = None
+        self.rate: UpdateRate | None = None
+        self.values: dict[str, int] = {}
+        self.info = NodeInfo()
+        self.joined: bool | None = None
+        self.ready = False
+        self._shell, self._stream = shell, stream
+        self._told: set[str] = set()
+        self._known: set[str] = set()
+        self._rounds = 0
+        self._distrust = -1.0
+        self._reset(0.0)
+
+    def _reset(self, now: float) -> None:
+        self._tlv, self._lines = TlvProtocol(), ShellProtocol()
+        self._step, self._sent, self._tries = "drain", now, 0
+        self._due: float | None = now + DRAIN
+        self._text_mode = False
+        self._streaming = ""
+        self._query = 0
+        self._texts: list[str] = []
+        self._error = 0
+        self._not_ready: float | None = None
+        self._fix_stamp: float | None = None
+        self._last_fix = now
+        self._pending: tuple[RangeReading, ...] | None = None
+        self._latest: tuple[RangeReading, ...] | None = None
+        self._reads = 0
+        self._damaged = self._guess = False
+
+    @property
+    def period(self) -> float:
+        """Expected time between fixes, s."""
+        return max(0.1, self.rate.normal) if self.rate else 0.1
+
+    # ---- the session interface
+
+    def start(self, now: float) -> list[Action]:
+        """Begin, or begin again after a reconnect, at time `now`, s."""
+        self._reset(now)
+        return []
+
+    def deadline(self) -> float | None:
+        """Return when `tick` is due, s."""
+        return self._due
+
+    def stop(self) -> list[Action]:
+        """Return what ends a stream; polling ends by itself."""
+        return [Send(shell_command("lec"))] if self._step == "lines" else []
+
+    def feed(self, data: bytes, now: float) -> list[Action]:
+        """Take bytes that arrived at time `now`, s."""
+        actions: list[Action] = []
+        if self._step in ("drain", "probe") or self._text_mode:
+            for event in self._lines.feed(data, now):
+                if isinstance(event, Corrupt):
+                    actions += [event] if self._text_mode else []
+                else:
+                    actions += self._text(event, now)
+        if not self._text_mode:
+            for answer in self._tlv.feed(data, now):
+                if isinstance(answer, Corrupt):
+                    self._distrust = now + DISTRUST
+                    actions += [answer] if self._step not in ("drain", "probe") else []
+                    if self._step in ("status", "loc") and self._due is not None:
+                        self._due = min(self._due, now + BROKEN_ANSWER)
+                else:
+                    actions += self._answer(answer, now)
+        return actions
+
+    def tick(self, now: float) -> list[Action]:
+        """Do what is due."""
+        if self._due is None or now < self._due:
+            return []
+        if self._step == "drain":
+            return self._after_drain(now)
+        if self._step == "poll":
+            return self._poll(now)
+        if self._step in ("status", "loc"):
+            return self._lost_answer(now)
+        if self._step == "query":
+            return self._after_query(now)
+        if self._step == "lines":
+            return self._lines_stopped(now)
+        return self._step_failed(now)
+
+    # ---- finding out the mode
+
+    def _say(self, step: str, data: bytes, now: float, wait: float = PATIENCE) -> list[Action]:
+        self._step, self._due, self._sent = step, now + wait, now
+        return [Send(data)]
+
+    def _after_drain(self, now: float) -> list[Action]:
+        if self._streaming:
+            # A dead host left a stream running: the same command again stops it.
+            command, self._streaming = self._streaming, ""
+            self._text_mode = True
+            text = f"uwb: a {command} stream was left running; stopped it"
+            return [*self._tell("info", "uwb-stream-left", text), *self._say("quiet", shell_command(command), now, 0.5)]
+        self._tlv.reset()
+        return self._say("probe", STATUS_GET, now)
+
+    def _step_failed(self, now: float) -> list[Action]:
+        """Nothing, or nothing fitting, came in time."""
+        self._tries += 1
+        step = self._step
+        if step == "quiet":
+            if self._streaming:
+                return self._after_drain(now)
+            return self._leave_or_use_shell(now)
+        if step == "probe":
+            if self._text_mode:
+                # It echoed: a shell. The two bytes typed are not a command; CR gets a prompt.
+                return self._say("prompt", b"\r", now, 0.5)
+            if self._tries == 2:
+                return self._say("probe", ENTER, now, 0.6)  # wakes a sleeping tag; opens the shell otherwise
+            if self._tries < 5:
+                return self._say("probe", STATUS_GET, now)
+        if step == "prompt" and self._tries < 5:
+            return self._leave_or_use_shell(now) if self._text_mode else self._say("prompt", b"\r", now, 1.0)
+        if step == "enter" and self._tries < 5:
+            return self._say("enter", ENTER if self._tries % 2 == 0 else b"\r", now, 1.2)
+        if step == "leave":
+            self._text_mode = False
+            self._tlv.reset()
+            if self._tries < 6:
+                return self._say("probe", STATUS_GET, now)
+        if step == "info":
+            return self._start_lines(now)
+        return self._give_up(now)
+
+    def _give_up(self, now: float) -> list[Action]:
+        self._rounds += 1
+        text = (
+            "uwb: no answer. The USB bridge of the DEV board can hang: unplug it and plug it in again;"
+            " check that the port is the DWM1001's and that no other program has it"
+        )
+        note = self._tell("error", "uwb-silent", text)
+        self._reset(now)
+        return [*note, Reopen("no answer")]
+
+    def _tell(self, level: str, name: str, text: str) -> list[Action]:
+        """Say a thing once."""
+        if name in self._told:
+            return []
+        self._told.add(name)
+        return [Note(level, name, text)]
+
+    def _leave_or_use_shell(self, now: float) -> list[Action]:
+        if self._shell:
+            return self._start_info(now)
+        return self._say("leave", shell_command("quit"), now, 0.3)
+
+    # ---- shell
+
+    def _text(self, event: Prompt | RangeLine | PositionLine | TextLine, now: float) -> list[Action]:
+        if isinstance(event, TextLine):
+            if self._step == "info":
+                self._texts.append(event.text)
+            elif self._step == "probe" and event.text.startswith("DWM1001"):
+                self._text_mode = True
+            return []
+        if isinstance(event, Prompt):
+            if self._step in ("probe", "prompt", "enter"):
+                self._text_mode = True
+                return self._leave_or_use_shell(now)
+            if self._step == "info" and self._texts:
+                return self._start_lines(now)
+            return []
+        source = "lep" if isinstance(event, PositionLine) else event.source
+        if self._step != "lines":
+            self._streaming, self._text_mode = source, True
+            if self._step == "probe":
+                return self._after_drain(now)
+            return []
+        if isinstance(event, PositionLine):
+            return []
+        self._due = now + max(3.0, 3 * self.period)
+        return self._epoch(event.readings, event.stamp)
+
+    def _start_info(self, now: float) -> list[Action]:
+        self._texts, self._tries = [], 0
+        return self._say("info", shell_command("si"), now, 1.0)
+
+    def _start_lines(self, now: float) -> list[Action]:
+        self.info = parse_node_info(self._texts)
+        settings = dict(self.info.settings)
+        notes = self._advise(
+            tag=self.info.mode in ("tn", ""), active=self.info.activity in ("act", ""),
+            stationary=settings.get("stat_det") == "1", joined=self.info.connected,
+            low_power=settings.get("lp") == "1", period=int(settings.get("upd_rate_norm", "1")) / 10,
+        )  # fmt: skip
+        params = [Param("uwb_tag_id", self.info.short_id)] if self.info.short_id else []
+        if self.info.firmware:
+            params.append(Param("uwb_tag_firmware", self.info.firmware))
+        self.ready, self.joined = True, self.info.connected
+        if not self._stream:
+            self._step, self._due = "done", None
+            return [*params, *notes]
+        self._tries = 0
+        return [*params, *notes, *self._say("lines", shell_command("lec"), now, max(1.0, 3 * self.period))]
+
+    def _lines_stopped(self, now: float) -> list[Action]:
+        self._tries += 1
+        if self._tries > 4:
+            return self._give_up(now)
+        # The command toggles: if the last one switched a stream off that had been running, this one switches it on.
+        return self._say("lines", shell_command("lec"), now, max(2.0, 3 * self.period))
+
+    # ---- TLV
+
+    def _answer(self, event: TlvEvent, now: float) -> list[Action]:
+        if isinstance(event, Answer):
+            self._error = event.error
+            if event.error and self._step == "query":
+                return self._after_query(now)
+            if event.error and self._step in ("status", "loc"):
+                self._step, self._due = "poll", now + SPARSE
+                text = f"uwb: the module answers error {event.error}, {ERRORS[event.error]}"
+                return self._tell("warning", f"uwb-error-{event.error}", text)
+            if event.error and self._step == "probe" and now - self._sent < PATIENCE:
+                self._due = min(self._due or now, now + 0.05)
+            return []
+        if isinstance(event, Status):
+            return self._status(event, now)
+        if isinstance(event, Distances):
+            return self._fix(event, now)
+        if isinstance(event, NodeConfig):
+            self.config = event
+        elif isinstance(event, UpdateRate):
+            self.rate = event
+        elif isinstance(event, Value):
+            self.values[event.name] = event.value
+        wanted = {"ver_get": "hardware", "nodeid_get": "node_id", "panid_get": "pan_id"}
+        if self._step == "query":
+            name = QUERIES[self._query]
+            done = isinstance(event, Value) and event.name == wanted.get(name)
+            done |= isinstance(event, NodeConfig) and name == "cfg_get"
+            done |= isinstance(event, UpdateRate) and name == "upd_rate_get"
+            if done:
+                return self._after_query(now)
+        return []
+
+    def _status(self, status: Status, now: float) -> list[Action]:
+        self.joined = status.joined
+        if self._step == "probe":
+            self._text_mode, self._tries = False, 0
+            if self._shell:
+                return self._say("enter", ENTER, now, 1.2)
+            self._query = 0
+            return self._say("query", request(QUERIES[0]), now)
+        if self._step != "status":
+            return []
+        self._tries = self._rounds = 0
+        if not status.location_ready:
+            self._not_ready = self._sent
+            return self._wait(now)
+        before = self._not_ready if self._not_ready is not None else -1.0
+        self._fix_stamp = (before + now) / 2 if now - before < 4 * SPARSE else now
+        self._guess = False
+        return self._read_fix(now)
+
+    def _read_fix(self, now: float) -> list[Action]:
+        self._not_ready, self._pending, self._reads = None, None, 0
+        return self._say("loc", LOC_GET, now, ANSWER)
+
+    def _wait(self, now: float) -> list[Action]:
+        """Choose when to poll next."""
+        due = self._last_fix + self.period - LEAD
+        late = now - due
+        wait = DENSE if late < 2 * LEAD else SPARSE if late < 1.0 else IDLE
+        self._step, self._due = "poll", max(now + wait, due)
+        if now - self._last_fix > 3.0 and self.joined is False:
+            text = (
+                "uwb: the tag has not joined a network: one anchor must be the initiator and on, all nodes need the same"
+                " network id, and none may be in firmware-update mode"
+            )
+            return self._tell("warning", "not-joined", text)
+        return []
+
+    def _poll(self, now: float) -> list[Action]:
+        return self._say("status", STATUS_GET, now, ANSWER)
+
+    def _fix(self, event: Distances, now: float) -> list[Action]:
+        if self._step != "loc" or self._fix_stamp is None:
+            return []
+        readings = event.readings
+        self._reads += 1
+        self._tries = 0
+        fresh = {reading.anchor_id for reading in readings} - self._known
+        doubtful = now < self._distrust or bool(fresh)
+        if doubtful and readings != self._pending:
+            self._pending = readings
+            if self._reads < 5:
+                return self._say("loc", LOC_GET, now, ANSWER)
+            self._damaged, self._fix_stamp = True, None
+            return [Corrupt(b"", "a fix read five times never came twice alike"), *self._wait(now)]
+        stamp, self._fix_stamp, self._pending = self._fix_stamp, None, None
+        if self._guess and readings == self._latest:
+            return self._wait(now)
+        gap, damaged, self._damaged = stamp - self._last_fix, self._damaged, False
+        self._last_fix, self._latest = stamp, readings
+        lost = [Lost(stamp, round(gap / self.period) - 1)] if damaged and gap > 1.6 * self.period else []
+        return [*lost, *self._epoch(readings, stamp), *self._wait(now)]
+
+    def _lost_answer(self, now: float) -> list[Action]:
+        """An answer did not come: damaged on the way, or the module is gone."""
+        self._tries += 1
+        self._tlv.reset()
+        self._distrust = now + DISTRUST
+        self._damaged = True
+        if self._tries > 40:
+            rounds = self._rounds + 1
+            self._reset(now)
+            self._rounds = rounds
+            if rounds > MAX_ROUNDS:
+                return self._give_up(now)
+            return [Note("warning", "uwb-restart", "uwb: no answer for 2 s; starting the module again")]
+        lost = Corrupt(b"", "no answer in time")
+        if self._step == "loc":
+            return [lost, *self._say("loc", LOC_GET, now, ANSWER)]
+        # Reading the status clears it, so the answer that was lost may have announced a fix: look for one.
+        self._fix_stamp, self._guess = self._sent, True
+        return [lost, *self._read_fix(now)]
+
+    def _after_query(self, now: float) -> list[Action]:
+        self._query += 1
+        if self._query < len(QUERIES):
+            return self._say("query", request(QUERIES[self._query]), now)
+        self.ready, self._tries = True, 0
+        actions: list[Action] = []
+        for name, key, form in (
+            ("uwb_tag_id", "node_id", short_id),
+            ("uwb_pan_id", "pan_id", short_id),
+            ("uwb_tag_firmware", "firmware", lambda v: ".".join(str(b) for b in v.to_bytes(4, "big"))),
+        ):
+            if key in self.values:
+                actions.append(Param(name, form(self.values[key])))
+        config = self.config
+        if config is not None:
+            actions += self._advise(
+                tag=not config.anchor, active=config.uwb_mode == 2, stationary=config.stationary_detection,
+                joined=None, low_power=config.low_power, period=self.period,
+            )  # fmt: skip
+        if not self._stream:
+            self._step, self._due = "done", None
+            return actions
+        self._last_fix, self._not_ready = now, None
+        return [*actions, *self._poll(now)]
+
+    # ---- both
+
+    def _epoch(self, readings: tuple[RangeReading, ...], stamp: float) -> list[Action]:
+        self._rounds = self._tries = 0
+        self._known |= {reading.anchor_id for reading in readings}
+        return [RangeEpoch(stamp, readings)] if readings else []
+
+    def _advise(
+        self, *, tag: bool, active: bool, stationary: bool, joined: bool | None, low_power: bool, period: float
+    ) -> list[Action]:
+        """Name every setting that makes ranges rare or absent, and how to mend it."""
+        shell = "open a terminal on the port at 115200 bit/s, press Enter twice quickly"
+        notes: list[Action] = []
+        if not tag:
+            notes += self._tell("error", "not-a-tag", f"uwb: this node is an anchor: {shell}, type `nmt` (it restarts)")
+        if tag and not active:
+            notes += self._tell("error", "uwb-off", f"uwb: the tag's radio is off or passive: {shell}, type `nmt`")
+        if stationary:
+            text = f"uwb: stationary detection is on: the rate falls to once in 10 s at rest: {shell}, `acts` shows its"
+            text += " arguments; set accel_en to 0, then `reset` (or set `aurs 1 1` to keep 10 Hz at rest)"
+            notes += self._tell("warning", "stationary-detection", text)
+        if low_power:
+            notes += self._tell("warning", "low-power", f"uwb: low-power mode makes ranges come in bursts: {shell}, `nmt`")
+        if period > 0.1:
+            text = f"uwb: a fix only every {period:.1f} s: {shell}, type `aurs 1 1` for ten a second"
+            notes += self._tell("warning", "slow-update-rate", text)
+        if joined is False:
+            text = "uwb: not joined to a network: one anchor must be the initiator and on, all need the same network id"
+            notes += self._tell("warning", "not-joined", text)
+        return notes

@@ -1,0 +1,214 @@
+"""The log on disk: CARMEN text, appended line by line so that a crash costs at most the line being written.
+
+Lines reach the kernel at once (unbuffered), so ``kill -9`` loses at most the last one, and a second thread asks the disk
+to keep them every `sync` seconds, so a power cut loses at most that. When the file has grown to `rotate` bytes the next
+part begins, with the PARAM lines repeated, so that each part can be read alone.
+"""
+
+import contextlib
+import math
+import os
+import re
+import shutil
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from ..errors import DataError
+from .events import LaserScan, OdometryPose, RangeEpoch
+
+_MILLIMETRES = tuple(f"{mm / 1000:.3f}" for mm in range(8192))
+TAIL = 1 << 18
+
+
+def metre_text(value: float, limit: float) -> str:
+    """Write a range: nothing seen (+inf) as the maximum range, invalid (nan) as 0.000."""
+    if math.isnan(value):
+        return "0.000"
+    millimetres = round(min(value, limit) * 1000)
+    return _MILLIMETRES[millimetres] if 0 <= millimetres < 8192 else f"{millimetres / 1000:.3f}"
+
+
+def number_text(value: float) -> str:
+    """Write a number with six decimals, without minus zero."""
+    text = f"{value:.6f}"
+    return text[1:] if text.startswith("-0.") and not text.strip("-0.") else text
+
+
+def pose_line(pose: OdometryPose, tail: str) -> str:
+    """Write ODOM x y theta tv rv accel."""
+    fields = (pose.x, pose.y, pose.theta, pose.speed, pose.turn_rate, 0.0)
+    return f"ODOM {' '.join(number_text(field) for field in fields)} {tail}"
+
+
+def range_lines(epoch: RangeEpoch, tail: str) -> list[str]:
+    """Write one UWB line per reading."""
+    return [f"UWB {r.anchor_id} {r.range:.3f} {r.quality} {tail}" for r in epoch.readings]
+
+
+def scan_line(scan: LaserScan, laser: tuple[float, float, float], robot: OdometryPose | None, tail: str) -> str:
+    """Write ROBOTLASER1.
+
+    Parameters
+    ----------
+    scan : the sweep.
+    laser : x, y, theta of the laser on the base; m, m, rad.
+    robot : latest odometry, None = origin. The reader interpolates odometry itself; this is for other readers.
+    tail : ipc timestamp, host and logger timestamp.
+
+    Returns
+    -------
+    str, without a line end.
+    """
+    count = len(scan.ranges)
+    readings = " ".join([metre_text(value, scan.range_max) for value in scan.ranges])
+    x, y, theta = (robot.x, robot.y, robot.theta) if robot else (0.0, 0.0, 0.0)
+    cos, sin = math.cos(theta), math.sin(theta)
+    laser_pose = (x + cos * laser[0] - sin * laser[1], y + sin * laser[0] + cos * laser[1],
+                  math.remainder(theta + laser[2], 2 * math.pi))  # fmt: skip
+    poses = " ".join(number_text(v) for v in (*laser_pose, x, y, theta))
+    velocity = f"{number_text(robot.speed)} {number_text(robot.turn_rate)}" if robot else "0.000000 0.000000"
+    return (
+        f"ROBOTLASER1 0 {scan.angle_min:.9f} {scan.angle_increment * (count - 1):.9f} {scan.angle_increment:.9f}"
+        f" {scan.range_max:.3f} 0.010 0 {count} {readings} 0 {poses} {velocity} 0.0 0.0 0.0 {tail}"
+    )
+
+
+class LogFile:
+    """The file, its parts and its syncing.
+
+    Parameters
+    ----------
+    path : first part; further ones are named ``run.2.log``, ``run.3.log`` and so on.
+    append : go on with a file that exists (after a crash); otherwise an existing file is an error.
+    rotate : bytes per part, 0 = one part.
+    sync : s between requests to the disk; 0 = after every write.
+    """
+
+    def __init__(self, path: Path, *, append: bool = False, rotate: int = 0, sync: float = 1.0) -> None:
+        self.first, self.path, self.part = path, path, 1
+        self.bytes = 0
+        self.error = ""
+        self._rotate, self._interval = rotate, sync
+        self.head: list[str] = []
+        """Lines to repeat at the head of each part."""
+        if append:
+            while self._name(self.part + 1).exists():
+                self.part += 1
+            self.path = self._name(self.part)
+        elif path.exists():
+            raise DataError(f"{path} exists; choose another name, or --append to go on with it after a crash")
+        try:
+            self._fd = self._open(self.path)
+        except OSError as error:
+            raise DataError(f"{self.path}: cannot write ({error.strerror})") from None
+        self._closing, self._dirty = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._keep_syncing, name="uwblite-sync", daemon=True)
+        self._thread.start()
+
+    def _name(self, part: int) -> Path:
+        return self.first if part == 1 else self.first.with_suffix(f".{part}{self.first.suffix}")
+
+    def _open(self, path: Path) -> int:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        self._size = os.fstat(fd).st_size
+        if self._size and os.pread(fd, 1, self._size - 1) != b"\n":
+            os.write(fd, b"\n")  # the line at which the last recorder died stays one broken line
+        return fd
+
+    def write(self, lines: list[str]) -> None:
+        """Append lines in one write.
+
+        Parameters
+        ----------
+        lines : without line ends.
+
+        Raises
+        ------
+        DataError : the disk is full or gone.
+        """
+        if not lines:
+            return
+        data = ("\n".join(lines) + "\n").encode("ascii", "replace")
+        try:
+            done = os.write(self._fd, data)
+            while done < len(data):
+                done += os.write(self._fd, data[done:])
+            if self._interval == 0:
+                os.fdatasync(self._fd)
+        except OSError as error:
+            raise DataError(f"{self.path}: cannot write ({error.strerror}); free some space on the disk") from None
+        self._size += len(data)
+        self.bytes += len(data)
+        self._dirty.set()
+        if self._rotate and self._size >= self._rotate:
+            self._next_part()
+
+    def _next_part(self) -> None:
+        following = self._name(self.part + 1)
+        os.write(self._fd, f"COMMENT continued in {following.name}\n".encode())
+        old, self._fd = self._fd, -1
+        os.fdatasync(old)
+        os.close(old)
+        self.part, self.path = self.part + 1, following
+        self._fd = self._open(following)
+        head = "\n".join(self.head) + "\n" if self.head else ""
+        text = f"{head}COMMENT part {self.part}, continues {self._name(self.part - 1).name}\n"
+        os.write(self._fd, text.encode("ascii", "replace"))
+        self._size += len(text)
+
+    def _keep_syncing(self) -> None:
+        while not self._closing.wait(self._interval or 60.0):
+            if self._dirty.is_set():
+                self._dirty.clear()
+                with contextlib.suppress(OSError):
+                    os.fdatasync(self._fd)
+
+    def free_bytes(self) -> int:
+        """Return the space left on the disk."""
+        return shutil.disk_usage(self.path.parent).free
+
+    def close(self) -> None:
+        """Sync and close."""
+        self._closing.set()
+        self._thread.join(timeout=10.0)
+        with contextlib.suppress(OSError):
+            os.fdatasync(self._fd)
+        os.close(self._fd)
+
+
+def last_state(path: Path) -> tuple[float | None, tuple[float, float, float]]:
+    """Read where a log broke off.
+
+    Parameters
+    ----------
+    path : a log of ours, possibly with a broken last line.
+
+    Returns
+    -------
+    stamp : largest ipc timestamp near the end, s; None where there is none.
+    pose : last odometry x, y, theta; m, m, rad; zero where there is none.
+    """
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - TAIL))
+        lines = file.read().decode("ascii", "replace").split("\n")[:-1]
+    stamp, pose = None, (0.0, 0.0, 0.0)
+    for line in lines:
+        fields = line.split()
+        if not fields or fields[0] not in ("ODOM", "ROBOTLASER1", "UWB"):
+            continue
+        number = _number(fields[-3]) if len(fields) > 4 else None
+        if number is not None:
+            stamp = number if stamp is None else max(stamp, number)
+        if fields[0] == "ODOM" and len(fields) == 10:
+            values = [_number(field) for field in fields[1:4]]
+            if None not in values:
+                pose = (values[0] or 0.0, values[1] or 0.0, values[2] or 0.0)
+    return stamp, pose
+
+
+def _number(text: str) -> float | None:
+    return float(text) if re.fullmatch(r"-?\d+(\.\d+)?", text) else None
+
+
+Writer = Callable[[list[str]], None]
