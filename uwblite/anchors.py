@@ -1,0 +1,150 @@
+"""First positions of anchors that nobody surveyed, from ranges along a path alone.
+
+An anchor's circle intersections are searched, not linearised: every cell of a coarse raster is scored by how many
+ranges agree with it up to one common bias (their median), so up to almost half of the ranges may lie. The best
+cells are refined one by one. A straight path leaves two mirrored positions of equal worth; both come back.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorConfig:
+    """Search for anchor positions."""
+
+    raster: int = 40
+    """Cells along the longer side of the searched area."""
+    samples: int = 100
+    """Ranges used for the search, spread evenly over the path."""
+    min_ranges: int = 8
+    """An anchor with fewer usable ranges is not placed."""
+    max_range: float = 200.0
+    """Longer readings are no ranges of such a radio, m."""
+    bias_sigma: float = 0.6
+    """Plausible size of one anchor's constant error, m."""
+    outlier: float = 3.0
+    """Standard deviations beyond which a range counts as an outlier when hypotheses are compared."""
+    ambiguity: float = 0.2
+    """A second hypothesis within this share of the ranges' total cost makes the anchor ambiguous."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnchorHypothesis:
+    """One possible place of an anchor."""
+
+    position: Floats
+    """(2,) m, frame of the path."""
+    bias: float
+    """m."""
+    sigma: float
+    """Robust standard deviation of the ranges about it, m."""
+    cost: float
+    """Mean truncated squared residual, in units of the best hypothesis' variance; 0 perfect, outlier^2 hopeless."""
+    position_sigma: float
+    """Larger standard deviation of the position were the errors independent, m."""
+
+
+def usable(ranges: Floats, config: AnchorConfig) -> NDArray[np.bool_]:
+    """Tell which readings (m,) can be distances at all: positive, finite, below max_range."""
+    return np.isfinite(ranges) & (ranges > 0.02) & (ranges < config.max_range)
+
+
+def locate(path: Floats, ranges: Floats, config: AnchorConfig, drift: float = 0.0) -> list[AnchorHypothesis]:
+    """Find where an anchor may stand.
+
+    Parameters
+    ----------
+    path : (m, 2) positions of the tag at the ranges, m.
+    ranges : (m,) m, usable ones.
+    config : search settings.
+    drift : expected error of the path within this stretch, m; ranges are not trusted below it.
+
+    Returns
+    -------
+    Hypotheses, best first; empty where there are fewer than min_ranges ranges.
+    """
+    if len(ranges) < config.min_ranges:
+        return []
+    pick = np.unique(np.linspace(0, len(ranges) - 1, config.samples).astype(np.int64))
+    path, ranges = path[pick], ranges[pick]
+    starts, step = _raster_search(path, ranges, config)
+    refined = [_refine(path, ranges, start, step, drift, config) for start in starts]
+    floor = max(min(fit[3] for fit in refined), 0.5 * drift, 0.02)
+    scored = sorted((_score(path, ranges, fit, floor, config) for fit in refined), key=lambda h: h.cost)
+    distinct: list[AnchorHypothesis] = []
+    for hypothesis in scored:
+        apart = [np.hypot(*(hypothesis.position - other.position)) for other in distinct]
+        if all(a > max(3.0 * floor, 0.5 * step) for a in apart):
+            distinct.append(hypothesis)
+    return distinct
+
+
+def ambiguous(hypotheses: list[AnchorHypothesis], config: AnchorConfig) -> bool:
+    """Tell whether the second hypothesis explains the ranges about as well as the first."""
+    return len(hypotheses) > 1 and hypotheses[1].cost - hypotheses[0].cost < config.ambiguity
+
+
+def _raster_search(path: Floats, ranges: Floats, config: AnchorConfig) -> tuple[Floats, float]:
+    """Return the best raster cells (s, 2) and the cell size, m."""
+    reach = float(np.quantile(ranges, 0.9)) + config.bias_sigma
+    low, high = path.min(axis=0) - reach, path.max(axis=0) + reach
+    step = float(np.max(high - low)) / config.raster
+    axes = [np.arange(low[k] + step / 2, high[k] + step / 2, step) for k in (0, 1)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    distance = np.sqrt(((cells[:, None, :] - path[None, :, :]) ** 2).sum(axis=2))
+    error = ranges - distance
+    bias = np.clip(np.median(error, axis=1), -config.bias_sigma - step, 3.0 * config.bias_sigma + step)
+    cost = np.minimum(((error - bias[:, None]) / (0.7 * step)) ** 2, 1.0).mean(axis=1)
+    cost += 0.05 * (bias / (config.bias_sigma + step)) ** 2
+    best: list[int] = []
+    for cell in np.argsort(cost, kind="stable")[:200]:
+        if all(np.abs(cells[cell] - cells[other]).max() > 1.5 * step for other in best):
+            best.append(int(cell))
+        if len(best) == 10:
+            break
+    return cells[best], step
+
+
+def _refine(
+    path: Floats, ranges: Floats, start: Floats, step: float, drift: float, config: AnchorConfig
+) -> tuple[Floats, float, Floats, float]:
+    """Return position, bias, covariance (3, 3) for unit sigma and robust sigma after Gauss-Newton with a shrinking kernel."""
+    state = np.array([*start, 0.0])
+    scale = 1.5 * step
+    normal = np.eye(3)
+    error = np.zeros_like(ranges)
+    for _ in range(25):
+        offset = state[:2] - path
+        distance = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
+        error = ranges - distance - state[2]
+        weight = 1.0 / (1.0 + (error / scale) ** 2) ** 2
+        jacobian = np.concatenate([offset / distance[:, None], np.ones((len(ranges), 1))], axis=1)
+        normal = (jacobian * weight[:, None]).T @ jacobian
+        gradient = jacobian.T @ (weight * error)
+        prior = (scale / config.bias_sigma) ** 2
+        normal[2, 2] += prior
+        gradient[2] -= prior * state[2]
+        normal += 1e-3 * np.diag(np.diag(normal)) + 1e-9 * np.eye(3)
+        delta = np.linalg.solve(normal, gradient)
+        state = state + delta * min(1.0, 2.0 * step / max(np.hypot(delta[0], delta[1]), 1e-12))
+        robust = 1.4826 * float(np.median(np.abs(error)))
+        tight = max(2.0 * robust, drift, 0.05)
+        if scale <= tight * 1.01 and np.abs(delta).max() < 1e-3:
+            break
+        scale = max(0.7 * scale, tight)
+    return state[:2], float(state[2]), np.linalg.inv(normal), max(1.4826 * float(np.median(np.abs(error))), 1e-3)
+
+
+def _score(
+    path: Floats, ranges: Floats, fit: tuple[Floats, float, Floats, float], sigma: float, config: AnchorConfig
+) -> AnchorHypothesis:
+    position, bias, covariance, own = fit
+    error = ranges - np.hypot(*(position - path).T) - bias
+    cost = float(np.minimum((error / sigma) ** 2, config.outlier**2).mean()) + (bias / config.bias_sigma) ** 2 / len(ranges)
+    spread = own * float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))
+    return AnchorHypothesis(position, bias, own, cost, spread)
