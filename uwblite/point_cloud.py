@@ -1,0 +1,258 @@
+"""Planar point clouds (n, 2): filters, normals, and the cloud that registration works on.
+
+Points are finite, in metres, in any one frame. The three filters run in the paper's order: voxel, statistical,
+radius. Every function is pure and keeps a fixed order of points.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .nearest import NearestRaster, make_raster
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_DENSE_CELLS_PER_POINT = 16
+"""A voxel grid of at most so many cells per point (plus a few thousand) is counted densely instead of sorted."""
+
+_NOWHERE = 1e9
+"""m; coordinate of the partner of a point that has none."""
+
+
+def make_tree(points: Floats) -> cKDTree:
+    """Return a kd-tree of points (n, 2) with the quick build: sliding midpoint splits, loose boxes."""
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+
+def voxel_labels(points: Floats, size: float) -> tuple[Ints, int]:
+    """Number the occupied square cells of a grid through the frame's origin.
+
+    Parameters
+    ----------
+    points : (n, 2), m.
+    size : edge of a cell, m.
+
+    Returns
+    -------
+    labels : (n,) number of each point's cell; cells are numbered by column (x), then row (y).
+    count : how many cells are occupied.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.int64), 0
+    cells = np.floor(points / size)
+    low = cells.min(axis=0)
+    extent = cells.max(axis=0) - low + 1.0
+    if extent[0] * extent[1] >= 2.0**62:
+        _, labels = np.unique(cells, axis=0, return_inverse=True)
+        labels = labels.reshape(-1).astype(np.int64)
+        return labels, int(labels.max()) + 1
+    keys = ((cells[:, 0] - low[0]) * extent[1] + (cells[:, 1] - low[1])).astype(np.int64)
+    if extent[0] * extent[1] > _DENSE_CELLS_PER_POINT * len(points) + 4096:
+        found, labels = np.unique(keys, return_inverse=True)
+        return labels.astype(np.int64), len(found)
+    number = np.cumsum(np.bincount(keys) > 0)
+    return number[keys] - 1, int(number[-1])
+
+
+def voxel_means(points: Floats, size: float, values: Floats) -> tuple[Floats, Ints]:
+    """Average values over the points of each occupied voxel.
+
+    Parameters
+    ----------
+    points : (n, 2), m.
+    size : edge of a voxel, m.
+    values : (n, k), anything that goes with the points: the points themselves, viewpoints, stamps.
+
+    Returns
+    -------
+    means : (m, k), ordered by voxel column (x), then row (y).
+    counts : (m,) how many points each voxel holds.
+    """
+    labels, count = voxel_labels(points, size)
+    counts = np.bincount(labels, minlength=count)
+    sums = [np.bincount(labels, weights=column, minlength=count) for column in values.T]
+    return np.stack(sums, axis=-1) / counts[:, None], counts
+
+
+def voxel_filter(points: Floats, size: float) -> Floats:
+    """Return the centroid (m, 2) of the points in each occupied voxel of edge size, m; see voxel_means."""
+    return voxel_means(points, size, points)[0]
+
+
+def statistical_outlier_filter(
+    points: Floats, neighbours: int, std_ratio: float, tree: cKDTree | None = None
+) -> Bools:
+    """Tell which points are not unusually far from their nearest neighbours.
+
+    A point stays if its mean distance to its nearest neighbours is at most mean + std_ratio * standard deviation of
+    that distance over the whole cloud.
+
+    Parameters
+    ----------
+    points : (n, 2), m.
+    neighbours : how many nearest neighbours; a smaller cloud uses all it has.
+    std_ratio : in standard deviations.
+    tree : kd-tree of the points, where there is one.
+
+    Returns
+    -------
+    (n,) True where the point stays.
+    """
+    k = min(neighbours, len(points) - 1)
+    if k < 1:
+        return np.ones(len(points), bool)
+    tree = make_tree(points) if tree is None else tree
+    mean = tree.query(points, k=np.arange(2, k + 2))[0].mean(axis=1)
+    return np.asarray(mean <= mean.mean() + std_ratio * mean.std())
+
+
+def radius_outlier_filter(points: Floats, radius: float, min_neighbours: int, tree: cKDTree | None = None) -> Bools:
+    """Tell which points have at least min_neighbours other points within the radius (m, inclusive).
+
+    Parameters
+    ----------
+    points : (n, 2), m.
+    radius : m.
+    min_neighbours : how many others a point needs to stay.
+    tree : kd-tree of the points, where there is one.
+
+    Returns
+    -------
+    (n,) True where the point stays.
+    """
+    if min_neighbours < 1 or len(points) == 0:
+        return np.ones(len(points), bool)
+    tree = make_tree(points) if tree is None else tree
+    bound = np.nextafter(radius, np.inf)
+    farthest = tree.query(points, k=[min_neighbours + 1], distance_upper_bound=bound)[0]
+    return np.asarray(farthest[:, 0] <= radius)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """The straight line fitted to the surroundings of each point."""
+
+    centers: Floats
+    """(n, 2) m, mean of the point and its neighbours."""
+    normals: Floats
+    """(n, 2) unit vectors across the line; their sign is arbitrary. Zero where there is no line."""
+    linearity: Floats
+    """(n,) 1 - smaller / larger eigenvalue of the neighbourhood's covariance: 1 a line, 0 a round blob or a lone point."""
+    neighbours: Ints
+    """(n,) points in the neighbourhood, the point itself included."""
+    normal_variance: Floats
+    """(n,) rad^2, variance of the normal's angle by the scatter about the line; 0 where there is no line."""
+
+
+def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbours: int = 2) -> Lines:
+    """Fit a line to the neighbours of every point: principal axes of the 2x2 covariance, in closed form.
+
+    With the covariance [[a, b], [b, c]] the line's direction is atan2(2 b, a - c) / 2 and the eigenvalues are
+    ((a + c) +- hypot(a - c, 2 b)) / 2. A least-squares line through k points has an angle of variance
+    small / ((k - 2) large) in these eigenvalues.
+
+    Parameters
+    ----------
+    points : (n, 2), m.
+    tree : kd-tree of the points.
+    radius : of the neighbourhood, m.
+    min_neighbours : other points a neighbourhood needs to give a line.
+    """
+    n = len(points)
+    pairs = tree.query_pairs(radius, output_type="ndarray")
+    i, j = pairs[:, 0], pairs[:, 1]
+    dx, dy = (points[:, 0][j] - points[:, 0][i], points[:, 1][j] - points[:, 1][i])
+    both = np.bincount(i, minlength=n) + np.bincount(j, minlength=n)
+    count = both + 1.0
+    mx = (np.bincount(i, dx, n) - np.bincount(j, dx, n)) / count
+    my = (np.bincount(i, dy, n) - np.bincount(j, dy, n)) / count
+    xx, xy, yy = dx * dx, dx * dy, dy * dy
+    a = (np.bincount(i, xx, n) + np.bincount(j, xx, n)) / count - mx * mx
+    b = (np.bincount(i, xy, n) + np.bincount(j, xy, n)) / count - mx * my
+    c = (np.bincount(i, yy, n) + np.bincount(j, yy, n)) / count - my * my
+    trace, gap = a + c, np.hypot(a - c, 2.0 * b)
+    large, small = 0.5 * (trace + gap), np.maximum(0.5 * (trace - gap), 0.0)
+    valid = (both >= min_neighbours) & (large > 0.0)
+    ratio = np.divide(small, large, out=np.ones(n), where=valid)
+    angle = 0.5 * np.arctan2(2.0 * b, a - c)
+    normals = np.where(valid, np.stack([-np.sin(angle), np.cos(angle)]), 0.0).T
+    return Lines(
+        centers=points + np.stack([mx, my], axis=-1),
+        normals=normals,
+        linearity=1.0 - ratio,
+        neighbours=both + 1,
+        normal_variance=np.where(valid, ratio / np.maximum(count - 2.0, 1.0), 0.0),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointCloud:
+    """Points with everything registration derives from them, computed once and reused over all pairs."""
+
+    points: Floats
+    """(n, 2) m, frame of the cloud."""
+    tree: cKDTree
+    """Of the points."""
+    centers: Floats
+    """(n, 2) m, mean of each point's neighbourhood."""
+    normals: Floats
+    """(n, 2) unit vectors across the local line, towards the viewpoint where known; zero where there is no line."""
+    linearity: Floats
+    """(n,) see Lines."""
+    neighbours: Ints
+    """(n,) see Lines."""
+    oriented: bool
+    """The normals point to the side the surface was seen from."""
+    surface: Floats
+    """(7, n + 1) normal x, y; distance of the line from the origin, m; center x, y, m; variance of the normal, rad^2;
+    1 where there is a line. Points without a line have a zero normal: they pull at nothing. Column n stands for no
+    point, far from everything."""
+    rasters: dict[tuple[float, int], NearestRaster] = field(default_factory=dict, repr=False)
+    """Tables of nearest centers by (reach, stride); filled on first use by raster()."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def raster(self, reach: float, stride: int = 1) -> NearestRaster:
+        """Return the table of nearest centers within reach, m; made on first use."""
+        key = (reach, stride)
+        if key not in self.rasters:
+            self.rasters[key] = make_raster(self.centers, reach, stride)
+        return self.rasters[key]
+
+
+def make_cloud(
+    points: Floats, viewpoints: Floats | None = None, normal_radius: float = 0.2, min_linearity: float = 0.6
+) -> PointCloud:
+    """Prepare points for registration: kd-tree, lines, normals towards the sensor.
+
+    Parameters
+    ----------
+    points : (n, 2), m; thin them to an even density first (voxel_filter).
+    viewpoints : (n, 2) or (2,), where the sensor stood when it saw each point, m, same frame. None: not known;
+        then walls match from both sides.
+    normal_radius : neighbourhood of the lines, m; a few times the distance between points.
+    min_linearity : a neighbourhood that is less straight gives no line.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+    tree = make_tree(points)
+    lines = estimate_normals(points, tree, normal_radius)
+    straight = lines.linearity >= min_linearity
+    normals = np.where(straight[:, None], lines.normals, 0.0)
+    if viewpoints is not None:
+        towards = ((viewpoints - points) * normals).sum(axis=1)
+        normals = np.where(towards[:, None] < 0.0, -normals, normals)
+    surface = np.zeros((7, len(points) + 1))
+    surface[:2, :-1] = normals.T
+    surface[2, :-1] = (normals * lines.centers).sum(axis=1)
+    surface[3:5, :-1] = lines.centers.T
+    surface[3:5, -1] = _NOWHERE
+    surface[5, :-1] = np.where(straight, lines.normal_variance, 0.0)
+    surface[6, :-1] = straight
+    return PointCloud(
+        points, tree, lines.centers, normals, lines.linearity, lines.neighbours, viewpoints is not None, surface
+    )
