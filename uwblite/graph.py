@@ -255,11 +255,14 @@ class ScanEdges:
         by_delay = _whiten(s_by_x_moved, _whiten(by_moved, rate))
         return se2.compose(x_moved, correction), s_by_x_moved @ by_x, s_by_correction, by_delay
 
+    def relative(self, graph: Graph) -> Floats:
+        """Return the pose (e, 3) of cloud j in cloud i at the present estimates."""
+        si = self._sensor_poses(graph, self.i, self.twist_i)[0]
+        return se2.between(si, self._sensor_poses(graph, self.j, self.twist_j)[0])
+
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
-        si = self._sensor_poses(graph, self.i, self.twist_i)[0]
-        sj = self._sensor_poses(graph, self.j, self.twist_j)[0]
-        return _whiten(self.sqrt_information, se2.between(self.T_i_j, se2.between(si, sj)))
+        return _whiten(self.sqrt_information, se2.between(self.T_i_j, self.relative(graph)))
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses and the calibration in use."""

@@ -1,0 +1,198 @@
+"""Point-to-line matching of many pairs of clouds at once.
+
+Nearest neighbours come from one raster per cloud, painted so that each cell names the nearest point: looking up a
+million points is a handful of array operations and no tree. A pair's matches are condensed into the quadratic form
+of its relative pose (3 x 3), which is all that the graph needs to know of them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import se2
+from .clouds import Clouds
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NearestRaster:
+    """For every cell around every cloud: which of its points is nearest."""
+
+    cell: float
+    """m."""
+    origin: Floats
+    """(k, 2) lower corner of each cloud's raster in its own frame, m."""
+    shape: Ints
+    """(k, 2) cells in x and y."""
+    start: Ints
+    """(k,) first cell of each raster in `nearest`."""
+    nearest: NDArray[np.int32]
+    """(cells,) row of the nearest point in the clouds' arrays, -1 = none within reach."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairFactors:
+    """Matches of pairs (e) of clouds, condensed about their relative poses."""
+
+    hessian: Floats
+    """(e, 3, 3) sum of w J^T J of the point-to-line distances by T_i_j (x, y, theta), 1/m^2-like, unscaled by noise."""
+    gradient: Floats
+    """(e, 3) sum of w J^T r."""
+    matched: Ints
+    """(e,) points with a match."""
+    asked: Ints
+    """(e,) points that were looked up."""
+    squared: Floats
+    """(e,) sum of w r^2, m^2."""
+    weight: Floats
+    """(e,) sum of w."""
+
+
+def paint(clouds: Clouds, cell: float, reach: float) -> NearestRaster:
+    """Build the rasters: each point with a normal claims the cells within reach, nearer cells last.
+
+    Parameters
+    ----------
+    cell, reach : cell size and distance up to which a point is a neighbour, m.
+    """
+    usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
+    owner, points = clouds.owner[usable], clouds.points[usable]
+    margin = reach + cell
+    low = np.full((len(clouds), 2), np.inf)
+    high = np.full((len(clouds), 2), -np.inf)
+    np.minimum.at(low, owner, points)
+    np.maximum.at(high, owner, points)
+    some = np.isfinite(low[:, 0])
+    low = np.where(some[:, None], low - margin, 0.0)
+    shape = np.where(some[:, None], np.ceil((high + margin - low) / cell), 0.0).astype(np.int64) + some[:, None]
+    size = shape[:, 0] * shape[:, 1]
+    start = np.concatenate([[0], np.cumsum(size)[:-1]])
+    nearest = np.full(int(size.sum()), -1, dtype=np.int32)
+    at = ((points - low[owner]) / cell).astype(np.int64)
+    base = start[owner] + at[:, 0] * shape[owner, 1] + at[:, 1]
+    steps = int(np.floor(reach / cell))
+    offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
+    offsets = [o for o in offsets if np.hypot(*o) * cell <= reach]
+    stride = shape[owner, 1]
+    rows = usable.astype(np.int32)
+    for dx, dy in sorted(offsets, key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o)):
+        nearest[base + dx * stride + dy] = rows
+    return NearestRaster(cell, low, shape, start, nearest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairPoints:
+    """The points that pairs look up: those of cloud j with a normal, thinned, pair after pair."""
+
+    first: Ints
+    """(e,) first row of each pair."""
+    pair: Ints
+    """(q,) pair of each row."""
+    row: Ints
+    """(q,) row in the clouds' arrays."""
+
+
+def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
+    """List up to `limit` evenly spaced points with normals of the source cloud j (e,) of each pair."""
+    usable = np.any(clouds.normals != 0.0, axis=1)
+    ranks = np.concatenate([[0], np.cumsum(usable)])
+    rows = np.flatnonzero(usable)
+    begin, end = ranks[clouds.offsets[j]], ranks[clouds.offsets[j + 1]]
+    take = np.minimum(end - begin, limit)
+    first = np.concatenate([[0], np.cumsum(take)[:-1]]).astype(np.int64) if len(j) else np.zeros(0, dtype=np.int64)
+    pair = np.repeat(np.arange(len(j)), take)
+    rank = np.arange(len(pair)) - first[pair]
+    picked = begin[pair] + (rank * (end - begin)[pair]) // np.maximum(take[pair], 1)
+    return PairPoints(first, pair, rows[picked])
+
+
+def match(
+    clouds: Clouds, raster: NearestRaster, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float
+) -> PairFactors:
+    """Match the listed points of each pair's source cloud to lines of its target cloud i.
+
+    Parameters
+    ----------
+    i : (e,) target clouds. T_i_j : (e, 3) present relative poses.
+    points : what to look up, see pair_points.
+    gate : matches farther apart, and with normals more than 45 degrees apart, do not count, m.
+    scale : width of the Geman-McClure kernel on the point-to-line distance, m.
+
+    Returns
+    -------
+    PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
+    """
+    pairs = len(i)
+    pair, row = points.pair, points.row
+    c, s = np.cos(T_i_j[:, 2])[pair], np.sin(T_i_j[:, 2])[pair]
+    px, py = clouds.points[row, 0], clouds.points[row, 1]
+    rx, ry = c * px - s * py, s * px + c * py
+    x, y = rx + T_i_j[pair, 0], ry + T_i_j[pair, 1]
+    target = i[pair]
+    cx = np.floor((x - raster.origin[target, 0]) / raster.cell).astype(np.int64)
+    cy = np.floor((y - raster.origin[target, 1]) / raster.cell).astype(np.int64)
+    wide, high = raster.shape[target, 0], raster.shape[target, 1]
+    inside = np.flatnonzero((cx >= 0) & (cy >= 0) & (cx < wide) & (cy < high))
+    found = raster.nearest[raster.start[target[inside]] + cx[inside] * high[inside] + cy[inside]]
+    inside, found = inside[found >= 0], found[found >= 0]
+    nx, ny = clouds.normals[found, 0], clouds.normals[found, 1]
+    dx, dy = x[inside] - clouds.points[found, 0], y[inside] - clouds.points[found, 1]
+    sx, sy = clouds.normals[row[inside], 0], clouds.normals[row[inside], 1]
+    agree = nx * (c[inside] * sx - s[inside] * sy) + ny * (s[inside] * sx + c[inside] * sy)
+    r = nx * dx + ny * dy
+    good = (dx * dx + dy * dy <= gate * gate) & (agree > np.sqrt(0.5))
+    inside, nx, ny, r = inside[good], nx[good], ny[good], r[good]
+    turn = ny * rx[inside] - nx * ry[inside]
+    w = 1.0 / (1.0 + (r / scale) ** 2) ** 2
+    owner = pair[inside]
+
+    def total(values: Floats) -> Floats:
+        return np.bincount(owner, values, pairs)
+
+    wx, wy, wt = w * nx, w * ny, w * turn
+    hessian = np.empty((pairs, 3, 3))
+    hessian[:, 0, 0], hessian[:, 1, 1], hessian[:, 2, 2] = total(wx * nx), total(wy * ny), total(wt * turn)
+    hessian[:, 0, 1] = hessian[:, 1, 0] = total(wx * ny)
+    hessian[:, 0, 2] = hessian[:, 2, 0] = total(wx * turn)
+    hessian[:, 1, 2] = hessian[:, 2, 1] = total(wy * turn)
+    gradient = np.stack([total(wx * r), total(wy * r), total(wt * r)], axis=1)
+    asked = np.bincount(pair, minlength=pairs)
+    return PairFactors(hessian, gradient, np.bincount(owner, minlength=pairs), asked, total(w * r * r), total(w))
+
+
+def measured(factors: PairFactors, T_i_j: Floats, variance: Floats, floor: float = 1e-3) -> tuple[Floats, Floats]:
+    """Turn factors into relative-pose measurements.
+
+    Parameters
+    ----------
+    T_i_j : (e, 3) poses about which the factors were made.
+    variance : (e,) m^2, variance of one match.
+    floor : eigenvalues of the Hessian below this share of the largest are directions the clouds cannot see.
+
+    Returns
+    -------
+    Z (e, 3) and sqrt_information (e, 3, 3) in the chart e = Z^-1 T; zero along what cannot be seen.
+    """
+    # Turning acts on points metres away: eigenvectors are compared in metres by scaling theta with the clouds' radius.
+    arm = np.sqrt(factors.hessian[:, 2, 2] / np.maximum(factors.hessian[:, 0, 0] + factors.hessian[:, 1, 1], 1e-12))
+    arm = np.clip(arm, 0.3, None)
+    unit = np.ones((len(arm), 3))
+    unit[:, 2] = 1.0 / arm
+    scaled = factors.hessian * unit[:, :, None] * unit[:, None, :]
+    values, vectors = np.linalg.eigh(scaled)
+    seen = values > np.maximum(floor * values[:, -1:], 1e-9)
+    inverse = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
+    step = -np.einsum("eij,ej,ekj,ek->ei", vectors, inverse, vectors, factors.gradient * unit) * unit
+    z = T_i_j + step
+    z[:, 2] = se2.wrap_angle(z[:, 2])
+    root = np.sqrt(np.where(seen, values, 0.0) / variance[:, None])
+    sqrt_information = root[:, :, None] * np.swapaxes(vectors, 1, 2) / unit[:, None, :]
+    c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
+    turn = np.zeros((len(z), 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = c
+    turn[:, 0, 1], turn[:, 1, 0] = -s, s
+    turn[:, 2, 2] = 1.0
+    return z, sqrt_information @ turn

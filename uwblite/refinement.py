@@ -1,0 +1,179 @@
+"""Joint refinement: all overlapping clouds pull on all poses at once.
+
+Every round looks up matches of every pair of clouds that see the same surfaces, condenses each pair into one
+relative-pose edge and solves the whole graph again, wheels, radio and calibration included; the gate shrinks from
+round to round. Both poses of a pair are free, so errors spread over the loop instead of piling up in one scan.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from . import se2
+from .calibration import scan_indices
+from .clouds import Clouds, in_map
+from .graph import Graph, ScanEdges
+from .pair_matching import NearestRaster, PairFactors, match, measured, pair_points
+from .robust import Kernel
+from .solver import SolverConfig, SolverSummary, optimize
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class RefinementConfig:
+    """Matching of clouds in the joint refinement."""
+
+    rounds: int = 12
+    """Most rounds of matching and solving."""
+    first_gate: float = 0.5
+    """Farthest match in the first round, m."""
+    last_gate: float = 0.12
+    """Farthest match in the last rounds, m."""
+    shrink: float = 0.75
+    """Gate of a round as a share of the one before."""
+    partners: int = 8
+    """Clouds from other times that each cloud is matched with."""
+    epoch: float = 2.0
+    """Travelled distance within which only the best partner counts, m."""
+    neighbours: tuple[int, ...] = (1, 2, 4)
+    """Following keyframes that each cloud is matched with."""
+    points: int = 100
+    """Points looked up per pair."""
+    min_matches: int = 20
+    """Pairs with fewer matches do not count."""
+    min_share: float = 0.3
+    """Pairs that match a smaller share of the points looked up do not count."""
+    sigma: float = 0.02
+    """Standard deviation of a point-to-line distance before it is learnt, m."""
+    correlation: float = 4.0
+    """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
+    settled: float = 0.002
+    """Rounds end early when no pose moves by more than this at the last gate, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """Result of the joint refinement."""
+
+    graph: Graph
+    """With the scan edges of the last round."""
+    i: Ints
+    j: Ints
+    factors: PairFactors
+    used: NDArray[np.bool_]
+    """(e,) pairs that counted in the last round."""
+    sigma: float
+    """Learnt standard deviation of a point-to-line distance, m."""
+    rounds: int
+    moved: float
+    """Largest move of a pose in the last round, m."""
+    summary: SolverSummary
+
+
+def surface_cells(clouds: Clouds, poses: Floats, size: float = 0.5) -> sparse.csr_matrix:
+    """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of 8 facings."""
+    points, normals = in_map(clouds, poses)
+    usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
+    cell = np.floor(points[usable] / size).astype(np.int64)
+    facing = np.floor(np.arctan2(normals[usable, 1], normals[usable, 0]) * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
+    cell -= cell.min(axis=0, initial=0)
+    key = (cell[:, 0] * (cell[:, 1].max(initial=0) + 1) + cell[:, 1]) * 8 + facing
+    _, column = np.unique(key, return_inverse=True)
+    shape = (len(clouds), int(column.max(initial=-1)) + 1)
+    seen = sparse.csr_matrix((np.ones(len(column)), (clouds.owner[usable], column)), shape=shape)
+    seen.data[:] = 1.0
+    return seen
+
+
+def choose_pairs(
+    clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: RefinementConfig
+) -> tuple[Ints, Ints]:
+    """Choose the pairs (i < j) of clouds to be matched: following keyframes, and the best views from other times.
+
+    Parameters
+    ----------
+    poses : (k, 3). path : (k,) travelled distance, m. session : (k,) recording of each keyframe.
+    """
+    k = len(clouds)
+    near_i = np.concatenate([np.arange(k - n) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
+    near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
+    joined = (session[near_i] == session[near_j]) & (path[near_j] - path[near_i] < 3.0)
+    near_i, near_j = near_i[joined], near_j[joined]
+    seen = surface_cells(clouds, poses)
+    common = (seen @ seen.T).tocoo()
+    size = np.maximum(np.diff(seen.indptr), 1)
+    share = common.data / np.minimum(size[common.row], size[common.col])
+    far = np.abs(path[common.row] - path[common.col]) > config.epoch
+    kept = np.flatnonzero(far & (share > config.min_share) & (common.data >= 4))
+    i, j, share = common.row[kept].astype(np.int64), common.col[kept].astype(np.int64), share[kept]
+    order = np.lexsort((j, -share, (path[j] / config.epoch).astype(np.int64), session[j], i))
+    i, j, share = i[order], j[order], share[order]
+    epoch = (path[j] / config.epoch).astype(np.int64)
+    fresh = np.concatenate([[True], (np.diff(i) != 0) | (np.diff(epoch) != 0) | (np.diff(session[j]) != 0)])[: len(i)]
+    i, j, share = i[fresh], j[fresh], share[fresh]
+    order = np.lexsort((j, -share, i))
+    i, j = i[order], j[order]
+    rank = np.arange(len(i)) - np.searchsorted(i, i)
+    i, j = i[rank < config.partners], j[rank < config.partners]
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    pairs = np.unique(np.concatenate([low, near_i]) * k + np.concatenate([high, near_j]))
+    return pairs // k, pairs % k
+
+
+def refine(
+    graph: Graph,
+    clouds: Clouds,
+    raster: NearestRaster,
+    twist: Floats,
+    i: Ints,
+    j: Ints,
+    config: RefinementConfig,
+    solver: SolverConfig,
+    on_round: Callable[[int, int], None] | None = None,
+) -> Refined:
+    """Match all pairs and solve the graph, round by round.
+
+    Parameters
+    ----------
+    graph : wheels, radio, priors and other edges; scan edges come from here.
+    clouds, raster : see clouds.build and pair_matching.paint; the raster's reach bounds the gate.
+    twist : (k, 3) velocity of the base at each keyframe.
+    i, j : (e,) pairs, see choose_pairs.
+    on_round : called with (round, rounds).
+    """
+    points = pair_points(clouds, j, config.points)
+    names = scan_indices(graph.calibration)
+    gate, sigma, moved, rounds = config.first_gate, config.sigma, np.inf, 0
+    empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names)
+    while True:
+        probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j])
+        T_i_j = probe.relative(graph)
+        factors = match(clouds, raster, i, T_i_j, points, gate, max(gate / 3.0, 2.5 * sigma))
+        used = (factors.matched >= config.min_matches) & (factors.matched >= config.min_share * factors.asked)
+        if used.any() and gate < 0.25:
+            sigma = float(np.sqrt(factors.squared[used].sum() / max(factors.weight[used].sum(), 1.0)))
+            sigma = max(sigma, 0.25 * config.sigma)
+        degree = np.bincount(i[used], minlength=len(clouds)) + np.bincount(j[used], minlength=len(clouds))
+        shared = 0.5 * (degree[i[used]] + degree[j[used]])
+        variance = sigma**2 * config.correlation * np.maximum(shared / 2.0, 1.0)
+        part = PairFactors(*(getattr(factors, f)[used] for f in PairFactors.__slots__))
+        z, sqrt_information = measured(part, T_i_j[used], variance)
+        edges = replace(
+            probe, i=i[used], j=j[used], T_i_j=z, sqrt_information=sqrt_information,
+            twist_i=twist[i[used]], twist_j=twist[j[used]], kernel=Kernel("cauchy", 5.0),
+        )
+        solved, summary = optimize(graph.with_edges(edges), replace(solver, max_iterations=6, relative_decrease=1e-4))
+        moved = float(np.hypot(*(solved.poses - graph.poses)[:, :2].T).max(initial=0.0))
+        graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
+        rounds += 1
+        if on_round is not None:
+            on_round(rounds, config.rounds)
+        last = gate <= config.last_gate * 1.001
+        if rounds >= config.rounds or (last and moved < config.settled):
+            return Refined(solved, i, j, factors, used, sigma, rounds, moved, summary)
+        gate = max(gate * config.shrink, config.last_gate)
