@@ -111,6 +111,7 @@ class LaserScan:
     time_increment: float
     """s between rays."""
     range_max: float
+    range_min: float = 0.02
     """m."""
 
 

@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import DataError
@@ -209,6 +208,3 @@ def last_state(path: Path) -> tuple[float | None, tuple[float, float, float]]:
 
 def _number(text: str) -> float | None:
     return float(text) if re.fullmatch(r"-?\d+(\.\d+)?", text) else None
-
-
-Writer = Callable[[list[str]], None]

@@ -36,6 +36,8 @@ PATIENCE = 0.4
 TIME_READS = 8
 LATENCY_LEARNING = 10.0
 """s of streaming during which the delay of a scan is measured; device and host clocks drift less than 1 ms in it."""
+NOISE_PATIENCE = 10.0
+"""s of nothing but damaged scans after which the laser is started again all the same."""
 MAX_ROUNDS = 3
 """Full start-ups without an answer before the port is opened anew."""
 
@@ -70,7 +72,7 @@ class ScipSession:
         self._protocol = ScipProtocol()
         self._step, self._sent, self._tries, self._rounds = "drain", now, 0, 0
         self._due: float | None = now + DRAIN
-        self._rate_index, self._faults = 0, 0
+        self._rate_index, self._faults, self._good = 0, 0, now
         self._tm_reads: list[tuple[float, float]] = []
         self._tm_count = 0
         self._new_clock()
@@ -124,6 +126,9 @@ class ScipSession:
         for event in self._protocol.feed(data, now):
             if isinstance(event, Corrupt):
                 actions.append(event)
+                if self._step == "stream" and self._due is not None:
+                    # Scans come, but damaged: starting the laser again would only lose more of them.
+                    self._due = max(self._due, min(now + 1.0, self._good + NOISE_PATIENCE))
             elif isinstance(event, Distances):
                 actions += self._scan(event)
             else:
@@ -298,6 +303,7 @@ class ScipSession:
         device, reset = self._clock.unwrap(scan.time, scan.stamp)
         device += 0.0005
         period = self.geometry.period * (self._skip + 1)
+        self._good = scan.stamp
         self._step, self._due, self._rounds = "stream", scan.stamp + max(1.0, 5 * period), 0
         actions: list[Action] = []
         if reset:
@@ -340,4 +346,5 @@ class ScipSession:
             unit.step_angle * scan.cluster,
             unit.step_time * scan.cluster,
             min(unit.distance_max, limit or unit.distance_max) / 1000,
+            unit.distance_min / 1000,
         )

@@ -1,0 +1,276 @@
+"""``uwblite record``: read the tag, the lidar and the base, and write a log."""
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .console import note, say, say_json
+
+if TYPE_CHECKING:
+    from ..drivers.events import Note, Session
+    from ..drivers.recorder import Link, Recorder
+
+HELP = "record a run: UWB tag, lidar and odometry into a log that `uwblite map` reads"
+EPILOG = """
+examples:
+  uwblite devices                                     what is plugged in, and is it set up?
+  uwblite record --uwb /dev/serial/by-id/usb-SEGGER... --lidar /dev/serial/by-id/usb-Hokuyo... \\
+                 --odometry kobuki:/dev/kobuki --out run.log
+  uwblite record --odometry "line:/dev/ttyUSB0?columns=t,left,right&tick=1.2e-4&wheel_base=0.3&time_unit=0.001" \\
+                 --uwb shell:/dev/ttyACM0 --out run.log --duration 600
+  uwblite record --lidar socket://robot.local:2001 --odometry kobuki:socket://robot.local:2002 --out run.log
+  uwblite record ... --out run.log --append           go on after a crash
+
+devices (a path, a by-id path, socket://host:port or any other pyserial URL):
+  --uwb       [tlv:|shell:]PORT     DWM1001 tag with PANS R2; tlv (default) gives 1 mm, shell 1 cm
+  --lidar     PORT                  URG-04LX, SCIP 1.1 or 2.0
+  --odometry  kobuki:PORT | line:PORT?columns=...&baud=115200
+              line options: columns (t,x,y,theta | t,left,right | speed, turn_rate, - to skip), tick (m), wheel_base (m),
+              tick_modulus, time_unit (s), length_unit (m), angle_unit (rad), prefix, baud
+
+The log is CARMEN text. Each line is with the kernel as soon as it is written, so a crash loses at most the last one, and
+with the disk after --sync seconds. Losses, reconnects and warnings stand in it as COMMENT lines. A recording ends with
+--duration, Ctrl-C (exit code 130) or SIGTERM (0); exit code 3: written, but a device was silent or lost much.
+PARAM lines written besides the mounting: laser_time_increment (s between rays), laser_range_min (m), laser_product,
+laser_firmware, laser_serial, uwb_tag_id, uwb_pan_id, uwb_tag_firmware, host_monotonic_zero (log time minus the
+computer's monotonic clock, s).
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    devices = parser.add_argument_group("devices")
+    devices.add_argument("--uwb", metavar="[tlv:|shell:]PORT", help="DWM1001 tag")
+    devices.add_argument("--lidar", metavar="PORT", help="URG-04LX")
+    devices.add_argument("--odometry", metavar="KIND:PORT", help="kobuki:PORT or line:PORT?columns=t,x,y,theta")
+    output = parser.add_argument_group("output")
+    output.add_argument("--out", metavar="FILE", required=True, help="the log; must not exist unless --append")
+    output.add_argument("--append", action="store_true", help="go on with a log that broke off")
+    output.add_argument("--rotate", metavar="SIZE", type=_size, default=0, help="begin a new part at this size, e.g. 500M")
+    output.add_argument("--duration", metavar="S", type=float, help="stop after so many seconds")
+    output.add_argument("--sync", metavar="S", type=float, default=1.0, help="s between syncs to the disk (1; 0 = each write)")
+    output.add_argument("--json", action="store_true", help="summary as one JSON object on stdout")
+    laser = parser.add_argument_group("lidar")
+    laser.add_argument("--lidar-steps", metavar="A:B", type=_steps, help="first and last step, e.g. 128:640 (all: 44:725)")
+    laser.add_argument("--lidar-cluster", metavar="N", type=int, default=1, help="steps merged into one reading (1)")
+    laser.add_argument("--lidar-skip", metavar="N", type=int, default=0, help="scans left out between two (0)")
+    laser.add_argument("--lidar-narrow", action="store_true", help="2-character readings up to 4.095 m, for slow RS-232")
+    laser.add_argument("--lidar-baud", metavar="N", type=int, default=115200, help="bit/s to try first on RS-232 (115200)")
+    mounting = parser.add_argument_group("mounting, for the log")
+    mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=_three, help="laser on the base: m, m, rad")
+    mounting.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
+    mounting.add_argument("--tag", metavar="X,Y,Z", type=_three, help="UWB tag on the base, z above the floor: m")
+    mounting.add_argument("--anchor-height", metavar="H", type=float, help="height of the anchors above the floor, m")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Record until the time is over or somebody says stop."""
+    import signal
+    import socket
+    import time
+
+    from ..drivers.log_file import LogFile, last_state
+    from ..drivers.recorder import Mounting, Recorder
+
+    if not (args.uwb or args.lidar or args.odometry):
+        note("uwblite: error: name at least one of --uwb, --lidar, --odometry; `uwblite devices` lists what is there")
+        return 2
+    path = Path(args.out)
+    offset = time.time() - time.monotonic()
+    pose, remark = (0.0, 0.0, 0.0), ""
+    if args.append and path.exists():
+        last, pose = last_state(_last_part(path))
+        remark = "goes on with a log that broke off; motion meanwhile is unknown, the odometry goes on from its last pose"
+        if last is not None and last > time.monotonic() + offset:
+            # A Raspberry Pi without a network wakes with an old clock.
+            remark += f"; this computer's clock is {last - time.monotonic() - offset:.0f} s behind the log and was moved"
+            offset = last + 1.0 - time.monotonic()
+    links = _links(args, pose)
+    log = LogFile(path, append=args.append, rotate=args.rotate, sync=args.sync)
+    mounting = Mounting(args.laser_pose or (0.0, 0.0, 0.0), tuple(_mounting_params(args, offset)))
+    stopped: list[int] = []
+    recorder = Recorder(
+        links, log, monotonic=time.monotonic, wall_offset=offset, host=re.sub(r"\s+", "_", socket.gethostname()) or "host",
+        mounting=mounting, on_note=_show_note,
+    )  # fmt: skip
+    before = {number: signal.signal(number, lambda n, _f: stopped.append(n)) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        recorder.begin(_head(args, remark))
+        _suggest_names(links)
+        recorder.run(duration=args.duration, stopping=lambda: bool(stopped), on_status=_status_line(recorder))
+    finally:
+        log.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return _finish(recorder, args.json, bool(stopped) and stopped[0] == signal.SIGINT)
+
+
+def _finish(recorder: "Recorder", as_json: bool, interrupted: bool) -> int:
+    doubts = recorder.doubts()
+    if as_json:
+        say_json(_summary(recorder, doubts))
+    else:
+        for line in recorder.summary():
+            say(line)
+        if not doubts:
+            say(f"next: uwblite check {recorder.log.first}")
+    for doubt in doubts:
+        note(f"uwblite: warning: {doubt}")
+    return 130 if interrupted else 3 if doubts else 0
+
+
+def _summary(recorder: "Recorder", doubts: list[str]) -> dict[str, Any]:
+    return {
+        "log": str(recorder.log.first),
+        "parts": recorder.log.part,
+        "seconds": recorder.end - recorder.start,
+        "bytes": recorder.log.bytes,
+        "doubts": doubts,
+        "devices": {
+            link.name: {
+                "messages": link.counts.messages,
+                "lost": link.counts.lost,
+                "corrupt": dict(link.counts.corrupt),
+                "connects": link.counts.connects,
+                "silent_seconds": link.counts.silent_time,
+                "anchors": dict(sorted(link.counts.anchors.items())),
+            }
+            for link in recorder.links
+        },
+    }
+
+
+def _last_part(path: Path) -> Path:
+    part = 2
+    while (following := path.with_suffix(f".{part}{path.suffix}")).exists():
+        path, part = following, part + 1
+    return path
+
+
+def _links(args: argparse.Namespace, pose: tuple[float, float, float]) -> list["Link"]:
+    from ..drivers.recorder import Link
+
+    links = []
+    if args.odometry:
+        session, url = odometry_session(args.odometry, pose)
+        links.append(Link("odometry", url, session))
+    if args.lidar:
+        from ..drivers.scip_session import ScipSession
+
+        start, end = args.lidar_steps or (None, None)
+        lidar = ScipSession(
+            start, end, cluster=args.lidar_cluster, skip=args.lidar_skip, wide=not args.lidar_narrow, baud=args.lidar_baud
+        )
+        links.append(Link("lidar", args.lidar.removeprefix("scip:"), lidar))
+    if args.uwb:
+        from ..drivers.dwm1001_session import Dwm1001Session
+
+        kind, _, url = args.uwb.partition(":") if re.match(r"(tlv|shell|dwm1001):", args.uwb) else ("tlv", "", args.uwb)
+        links.append(Link("uwb", url, Dwm1001Session(shell=kind == "shell")))
+    return links
+
+
+def odometry_session(spec: str, pose: tuple[float, float, float]) -> tuple["Session", str]:
+    """Return the session and the port that ``kobuki:PORT`` or ``line:PORT?options`` names."""
+    from urllib.parse import parse_qsl
+
+    from ..drivers.odometry_line import parse_format
+    from ..drivers.odometry_session import KobukiSession, LineSession
+    from ..errors import ConfigError
+
+    kind, _, rest = spec.partition(":")
+    if kind == "kobuki" and rest:
+        return KobukiSession(pose), rest
+    if kind == "line" and rest:
+        url, _, query = rest.partition("?")
+        options = dict(parse_qsl(query, keep_blank_values=True))
+        baud = options.pop("baud", "115200")
+        if not baud.isdigit():
+            raise ConfigError(f"--odometry: baud={baud!r} is not a number")
+        return LineSession(parse_format(options), int(baud), pose), url
+    raise ConfigError(f"--odometry {spec}: say kobuki:PORT, or line:PORT?columns=t,x,y,theta")
+
+
+def _mounting_params(args: argparse.Namespace, offset: float) -> list[tuple[str, str]]:
+    params = [("host_monotonic_zero", f"{offset:.6f}")]
+    if args.tag:
+        names = ("uwb_tag_offset_x", "uwb_tag_offset_y", "uwb_tag_height")
+        params += [(name, f"{value:.6f}") for name, value in zip(names, args.tag, strict=True)]
+    if args.anchor_height is not None:
+        params.append(("uwb_anchor_height", f"{args.anchor_height:.6f}"))
+    if args.laser_flipped:
+        params.append(("laser_flipped", "on"))
+    return params
+
+
+def _head(args: argparse.Namespace, remark: str) -> list[str]:
+    from .. import __version__
+
+    devices = ", ".join(f"{name} {value}" for name in ("uwb", "lidar", "odometry") if (value := getattr(args, name)))
+    return [f"recorded by uwblite {__version__}: {devices}", *([remark] if remark else [])]
+
+
+def _suggest_names(links: list["Link"]) -> None:
+    from ..drivers.transport import stable_name
+
+    for link in links:
+        better = stable_name(link.url)
+        if better:
+            note(f"{link.name}: {link.url} may change its number; better {better}")
+
+
+def _show_note(seconds: float, message: "Note") -> None:
+    note(f"[{seconds:8.1f} s] {message.level}: {message.text}")
+
+
+def _status_line(recorder: "Recorder") -> Any:
+    """Return what draws the status line; on a terminal only."""
+    from .console import Progress
+
+    bar = Progress()
+
+    def show() -> None:
+        if bar.active:
+            bar.status(status_text(recorder)) if hasattr(bar, "status") else bar._draw(status_text(recorder))
+
+    return show
+
+
+def status_text(recorder: "Recorder") -> str:
+    """Return rates, anchors, damage and disk in one line."""
+    parts = []
+    for link in recorder.links:
+        counts = link.counts
+        state = f"{link.rate:.1f}/s" if link.port is not None and not link.quiet else "SILENT"
+        text = f"{link.name} {state}"
+        if counts.anchors:
+            text += f" ({len(counts.anchors)} anchors)"
+        damage = sum(counts.corrupt.values())
+        if counts.lost or damage:
+            text += f" lost {counts.lost} corrupt {damage}"
+        parts.append(text)
+    free = recorder.log.free_bytes() / 1e9
+    return f"{recorder.log.bytes / 1e6:.1f} MB | {' | '.join(parts)} | disk {free:.1f} GB left"
+
+
+def _size(text: str) -> int:
+    match = re.fullmatch(r"(\d+)([kMG]?)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 500M")
+    return int(match[1]) * {"": 1, "k": 1000, "M": 10**6, "G": 10**9}[match[2]]
+
+
+def _steps(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+):(\d+)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"{text!r} is not two steps such as 128:640")
+    return int(match[1]), int(match[2])
+
+
+def _three(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers separated by commas") from None
+    return x, y, z

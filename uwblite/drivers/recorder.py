@@ -1,0 +1,409 @@
+"""The recorder: several devices, one loop, one log.
+
+One thread waits on all ports at once. Each port has a session that says what to send and what was measured; the
+recorder writes measurements as log lines, reconnects devices that vanish, says when one falls silent, and counts what
+was lost. It reads no clock of its own: the caller hands in `monotonic`, and stamps become wall time by one offset fixed
+at the start, so that a clock set by NTP in mid-run moves nothing.
+"""
+
+import selectors
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from ..errors import DeviceError
+from .events import (
+    Action,
+    Corrupt,
+    LaserScan,
+    Lost,
+    Note,
+    OdometryPose,
+    Param,
+    RangeEpoch,
+    Reopen,
+    Send,
+    Session,
+    SetBaud,
+)
+from .log_file import LogFile, number_text, pose_line, range_lines, scan_line
+from .transport import Port
+
+SILENCE = 3.0
+"""s without a measurement before it is said."""
+HANG = 10.0
+"""s without a measurement before the port is opened anew."""
+BACK_OFF = (0.25, 0.5, 1.0, 2.0, 5.0)
+"""s between attempts to open a port that is gone; the last one repeats."""
+HOUSEKEEPING = 0.25
+"""s between looks at silent devices and the status line."""
+POLL = 0.005
+"""s between reads of a port that cannot be waited on."""
+
+
+@dataclass(slots=True)
+class Counts:
+    """What one device did."""
+
+    messages: int = 0
+    """Measurements written: scans, ranging rounds, poses."""
+    lost: int = 0
+    """Measurements that the device made and that did not arrive, by its own clock."""
+    corrupt: Counter[str] = field(default_factory=Counter)
+    """Damaged frames and noise, by reason."""
+    bytes: int = 0
+    connects: int = 0
+    silences: int = 0
+    silent_time: float = 0.0
+    """s, sum of the pauses longer than SILENCE."""
+    anchors: Counter[str] = field(default_factory=Counter)
+    """Ranges by anchor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """Where the sensors sit; written to the log for the mapper."""
+
+    laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """x, y, theta on the base; m, m, rad."""
+    params: tuple[tuple[str, str], ...] = ()
+    """PARAM name, value."""
+
+
+class Link:
+    """One device: its port, session and counts.
+
+    Parameters
+    ----------
+    name : "uwb", "lidar" or "odometry".
+    url : of the port.
+    session : start-up, running and recovery.
+    """
+
+    def __init__(self, name: str, url: str, session: Session) -> None:
+        self.name, self.url, self.session = name, url, session
+        self.counts = Counts()
+        self.port: Port | None = None
+        self.retry_at = 0.0
+        self.attempt = 0
+        self.last_data = self.last_message = self.opened = 0.0
+        self.quiet = False
+        self.new_lost = self.new_corrupt = 0
+        self.rate = 0.0
+        self._rate_base = (0.0, 0)
+        self.why_down = ""
+
+    def update_rate(self, now: float) -> None:
+        """Refresh `rate`, messages per second over the last two seconds."""
+        since, count = self._rate_base
+        if now - since >= 2.0:
+            self.rate = (self.counts.messages - count) / (now - since)
+            self._rate_base = (now, self.counts.messages)
+
+
+class Recorder:
+    """Record until told to stop.
+
+    Parameters
+    ----------
+    links : the devices.
+    log : where to write.
+    monotonic : s, a clock that never leaps.
+    wall_offset : s to add to `monotonic` for the log's timestamps.
+    host : name of this computer, for the log.
+    mounting : sensors on the base.
+    on_note : told (seconds since start, Note) for each thing a person must know.
+    open_port : (url, baud) -> Port.
+    """
+
+    def __init__(
+        self, links: list[Link], log: LogFile, *, monotonic: Callable[[], float], wall_offset: float, host: str,
+        mounting: Mounting | None = None, on_note: Callable[[float, Note], None] | None = None,
+        open_port: Callable[[str, int], Port] = Port,
+    ) -> None:  # fmt: skip
+        self.links, self.log = links, log
+        self._now, self._offset, self._host = monotonic, wall_offset, host
+        self._mounting = mounting or Mounting()
+        self._on_note = on_note or (lambda _t, _n: None)
+        self._open_port = open_port
+        self._selector = selectors.DefaultSelector()
+        self._pose: OdometryPose | None = None
+        self._params: dict[str, str] = {}
+        self._lines: list[str] = []
+        self.start = monotonic()
+        self.end = self.start
+
+    # ---- running
+
+    def run(self, *, duration: float | None, stopping: Callable[[], bool], on_status: Callable[[], None] | None = None) -> None:
+        """Record.
+
+        Parameters
+        ----------
+        duration : s; None = until `stopping`.
+        stopping : asked several times a second.
+        on_status : called a few times a second.
+
+        Raises
+        ------
+        DataError : the log cannot be written any more.
+        """
+        until = None if duration is None else self.start + duration
+        next_look = self.start
+        try:
+            while not stopping():
+                now = self._now()
+                if until is not None and now >= until:
+                    break
+                if now >= next_look:
+                    next_look = now + HOUSEKEEPING
+                    self._housekeeping(now)
+                    if on_status:
+                        on_status()
+                self._wait(next_look if until is None else min(next_look, until))
+                self.log.write(self._lines)
+                self._lines = []
+        finally:
+            self.end = self._now()
+            self._finish()
+
+    def _wait(self, until: float) -> None:
+        """Wait for bytes or the next deadline, and serve whatever is due."""
+        blind = [link for link in self.links if link.port is not None and link.port.fileno() is None]
+        deadlines = [d for link in self.links if link.port and (d := link.session.deadline()) is not None]
+        now = self._now()
+        timeout = max(0.0, min([until, *deadlines]) - now)
+        if blind:
+            timeout = min(timeout, POLL)
+        ready = [key.data for key, _ in self._selector.select(timeout)]
+        for link in [*ready, *blind]:
+            self._read(link)
+        now = self._now()
+        for link in self.links:
+            if link.port is not None:
+                deadline = link.session.deadline()
+                if deadline is not None and deadline <= now:
+                    self._do(link, link.session.tick(now), now)
+
+    def _read(self, link: Link) -> None:
+        if link.port is None:
+            return
+        try:
+            data = link.port.read()
+        except DeviceError as error:
+            self._down(link, str(error))
+            return
+        if data:
+            now = self._now()
+            link.last_data = now
+            link.counts.bytes += len(data)
+            self._do(link, link.session.feed(data, now), now)
+
+    def _do(self, link: Link, actions: list[Action], now: float) -> None:
+        counts = link.counts
+        for action in actions:
+            if isinstance(action, LaserScan | RangeEpoch | OdometryPose):
+                self._message(link, now)
+                self._write(action, counts)
+            elif isinstance(action, Send | SetBaud):
+                if not self._send(link, action):
+                    return
+            elif isinstance(action, Corrupt):
+                counts.corrupt[action.why] += 1
+                link.new_corrupt += 1
+            elif isinstance(action, Lost):
+                counts.lost += action.count
+                link.new_lost += action.count
+            elif isinstance(action, Note):
+                self.note(action)
+            elif isinstance(action, Param):
+                self.param(action.name, action.value)
+            elif isinstance(action, Reopen):
+                self._down(link, action.why)
+                return
+
+    def _send(self, link: Link, action: Send | SetBaud) -> bool:
+        if link.port is None:
+            return False
+        try:
+            if isinstance(action, Send):
+                link.port.write(action.data)
+            else:
+                link.port.set_baud(action.rate)
+        except DeviceError as error:
+            self._down(link, str(error))
+            return False
+        return True
+
+    def _message(self, link: Link, now: float) -> None:
+        link.counts.messages += 1
+        if link.quiet:
+            link.quiet = False
+            pause = now - link.last_message
+            link.counts.silent_time += pause
+            self.note(Note("info", "data-again", f"{link.name}: data again after {pause:.1f} s"))
+        link.last_message = now
+
+    def _write(self, measured: LaserScan | RangeEpoch | OdometryPose, counts: Counts) -> None:
+        tail = self._tail(measured.stamp)
+        if isinstance(measured, OdometryPose):
+            self._pose = measured
+            self._lines.append(pose_line(measured, tail))
+        elif isinstance(measured, RangeEpoch):
+            self._lines += range_lines(measured, tail)
+            counts.anchors.update(reading.anchor_id for reading in measured.readings)
+        else:
+            self.param("laser_time_increment", f"{measured.time_increment:.9f}")
+            self.param("laser_range_min", f"{measured.range_min:.3f}")
+            self._lines.append(scan_line(measured, self._mounting.laser, self._pose, tail))
+
+    # ---- the log
+
+    def _tail(self, stamp: float) -> str:
+        return f"{stamp + self._offset:.6f} {self._host} {max(0.0, self._now() - self.start):.6f}"
+
+    def begin(self, lines: list[str]) -> None:
+        """Write the head of the log.
+
+        Parameters
+        ----------
+        lines : comments, without the word COMMENT.
+        """
+        self.log.head.append("# CARMEN Logfile")
+        self._lines.append("# CARMEN Logfile")
+        for line in lines:
+            self.comment(line)
+        for name, value in self._mounting.params:
+            self.param(name, value)
+
+    def comment(self, text: str) -> None:
+        """Write a COMMENT with the time since the start."""
+        clean = " ".join(text.split())
+        self._lines.append(f"COMMENT {number_text(max(0.0, self._now() - self.start))[:-3]} {clean}")
+
+    def param(self, name: str, value: str) -> None:
+        """Write a PARAM unless it stands there already."""
+        if self._params.get(name) != value:
+            self._params[name] = value
+            line = f"PARAM {name} {value} {self._tail(self._now())}"
+            self._lines.append(line)
+            self.log.head.append(line)
+
+    def note(self, note: Note) -> None:
+        """Write a Note as COMMENT and tell the caller."""
+        self.comment(f"{note.level} {note.name}: {note.text}")
+        self._on_note(self._now() - self.start, note)
+
+    # ---- devices that come and go
+
+    def _housekeeping(self, now: float) -> None:
+        for link in self.links:
+            link.update_rate(now)
+            if link.port is None:
+                if now >= link.retry_at:
+                    self._up(link, now)
+            else:
+                self._watch(link, now)
+            if link.new_lost or link.new_corrupt:
+                self.comment(f"{link.name}: lost {link.new_lost}, corrupt {link.new_corrupt} since the last such line")
+                link.new_lost = link.new_corrupt = 0
+
+    def _watch(self, link: Link, now: float) -> None:
+        silent = now - max(link.last_message, link.opened)
+        if silent > SILENCE and not link.quiet:
+            link.quiet = True
+            link.counts.silences += 1
+            link.last_message = max(link.last_message, link.opened)
+            if now - link.last_data < SILENCE:
+                why = "bytes come, but no good frame: wrong bit rate, wrong device or a bad cable"
+            else:
+                why = "check power and cable; unplug it and plug it in again"
+            self.note(Note("warning", f"{link.name}-no-data", f"{link.name}: no data for {silent:.0f} s; {why}"))
+        if silent > HANG and now - link.last_data > HANG:
+            self._down(link, "silent")
+
+    def _up(self, link: Link, now: float) -> None:
+        try:
+            link.port = self._open_port(link.url, link.session.baud)
+        except DeviceError as error:
+            wait = BACK_OFF[min(link.attempt, len(BACK_OFF) - 1)]
+            if str(error) != link.why_down:
+                link.why_down = str(error)
+                self.note(Note("error", f"{link.name}-cannot-open", f"{link.name}: {error}; trying again"))
+            link.attempt += 1
+            link.retry_at = now + wait
+            return
+        link.attempt, link.why_down = 0, ""
+        link.counts.connects += 1
+        link.opened = link.last_data = now
+        fileno = link.port.fileno()
+        if fileno is not None:
+            self._selector.register(fileno, selectors.EVENT_READ, link)
+        self.note(Note("info", f"{link.name}-connected", f"{link.name}: {link.url} open"))
+        self._do(link, link.session.start(now), now)
+
+    def _down(self, link: Link, why: str) -> None:
+        if link.port is None:
+            return
+        fileno = link.port.fileno()
+        if fileno is not None:
+            self._selector.unregister(fileno)
+        link.port.close()
+        link.port = None
+        link.retry_at = self._now() + BACK_OFF[min(link.attempt, len(BACK_OFF) - 1)]
+        link.attempt += 1
+        if not link.quiet:
+            link.quiet = True
+            link.last_message = max(link.last_message, link.opened)
+        self.note(Note("warning", f"{link.name}-gone", f"{link.name}: {why}; opening it again"))
+
+    # ---- the end
+
+    def summary(self) -> list[str]:
+        """Return one line per device for people."""
+        seconds = self.end - self.start
+        lines = [f"recorded {seconds:.1f} s, {self.log.bytes / 1e6:.2f} MB in {self.log.path}"]
+        for link in self.links:
+            counts = link.counts
+            silent = counts.silent_time + (self.end - link.last_message if link.quiet else 0.0)
+            text = (
+                f"{link.name}: {counts.messages} messages ({counts.messages / max(seconds, 1e-9):.2f}/s),"
+                f" lost {counts.lost}, corrupt {sum(counts.corrupt.values())}, connected {counts.connects} times,"
+                f" silent {silent:.1f} s"
+            )
+            if counts.anchors:
+                text += "; anchors " + ", ".join(f"{name} {count}" for name, count in sorted(counts.anchors.items()))
+            lines.append(text)
+            lines += [f"{link.name}: corrupt {count} times: {why}" for why, count in counts.corrupt.most_common(8)]
+        return lines
+
+    def doubts(self) -> list[str]:
+        """Return why the recording should not be trusted; empty when it can be."""
+        seconds = max(self.end - self.start, 1e-9)
+        found = []
+        for link in self.links:
+            counts = link.counts
+            silent = counts.silent_time + (self.end - link.last_message if link.quiet else 0.0)
+            total = counts.messages + counts.lost
+            if not counts.messages:
+                found.append(f"{link.name}: no data at all")
+            elif silent > 0.1 * seconds:
+                found.append(f"{link.name}: silent for {silent:.0f} s of {seconds:.0f} s")
+            elif counts.lost > 0.1 * total:
+                found.append(f"{link.name}: lost {counts.lost} of {total}")
+        return found
+
+    def _finish(self) -> None:
+        for link in self.links:
+            if link.port is not None:
+                for action in link.session.stop():
+                    if isinstance(action, Send):
+                        self._send(link, action)
+            if link.port is not None:
+                link.port.close()
+                link.port = None
+        self._selector.close()
+        for line in self.summary():
+            self.comment(line)
+        self.log.write(self._lines)
+        self._lines = []
