@@ -20,7 +20,7 @@ FLOORS = (
     ("graph", "point_cloud", "nearest", "line_factor", "range_noise", "occupancy_grid", "drivers/*"),
     ("keyframes", "calibration", "linear", "icp", "map_picture", "io/*"),
     ("solver", "marginals", "anchors", "submaps", "map_result", "drivers/transport"),
-    ("first_estimate", "loop_closure", "evaluate", "diagnostics", "drivers/recorder"),
+    ("first_estimate", "loop_closure", "evaluate", "evaluate_map", "diagnostics", "drivers/recorder"),
     ("mapping", "report", "localize"),
     ("io/results",),
     ("cli/*", "__main__"),
