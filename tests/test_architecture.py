@@ -17,7 +17,8 @@ MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACK
 FLOORS = (
     ("errors", "se2", "robust"),
     ("sensor_log", "config", "decimal_text", "drivers/events"),
-    ("graph", "point_cloud", "nearest", "line_factor", "range_noise", "occupancy_grid", "drivers/*"),
+    ("graph", "point_cloud", "nearest", "line_factor", "range_noise", "drivers/*",
+     "bresenham", "grid_geometry", "scan_rays", "ray_counter", "occupancy_grid"),
     ("keyframes", "calibration", "linear", "icp", "map_picture", "io/*"),
     ("solver", "marginals", "anchors", "submaps", "map_result", "drivers/transport"),
     ("first_estimate", "loop_closure", "evaluate", "evaluate_map", "diagnostics", "drivers/recorder"),
