@@ -6,7 +6,7 @@
 
 DIR/run.log or run.log.gz            what the robot recorded
 DIR/truth.tum                        true poses of the base at the odometry's stamps
-DIR/truth_anchors.csv  columns.csv   true places of anchors and named columns (pairs.csv: the pairs to judge)
+DIR/truth_anchors.csv  columns.csv   true places of anchors and named columns
 DIR/walls.csv  posts.csv             the building
 DIR/truth_calibration.json           true biases, scales, delays, mounting and all settings
 """

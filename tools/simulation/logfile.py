@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .floorplans import ANCHOR_IDS
+from .floorplans import ANCHOR_IDS, FloorPlan
 from .recording import Recording
 
 Floats = NDArray[np.float64]
@@ -29,13 +29,18 @@ def write(recording: Recording, directory: Path, compress: bool = False) -> None
     anchors = zip(ANCHOR_IDS, recording.anchors.tolist(), strict=False)
     height = recording.settings.anchor_height
     _lines(directory / "truth_anchors.csv", "id,x,y,height", (f"{i},{x:.4f},{y:.4f},{height:.3f}" for i, (x, y) in anchors))
-    named = zip(plan.landmarks, plan.columns.tolist(), strict=False)
-    _lines(directory / "columns.csv", "name,x,y,radius", (f"{n},{x:.4f},{y:.4f},{r:.3f}" for n, (x, y, r) in named))
-    if plan.pairs:
-        _lines(directory / "pairs.csv", "a,b", (f"{a},{b}" for a, b in plan.pairs))
+    _lines(directory / "columns.csv", "name,x,y,radius,neighbours", _column_rows(plan))
     _lines(directory / "walls.csv", "x1,y1,x2,y2", (",".join(f"{v:.4f}" for v in w) for w in plan.walls.tolist()))
     _lines(directory / "posts.csv", "x,y,radius", (",".join(f"{v:.4f}" for v in c) for c in plan.columns.tolist()))
     (directory / "truth_calibration.json").write_text(json.dumps(recording.calibration, indent=1, sort_keys=True) + "\n")
+
+
+def _column_rows(plan: FloorPlan) -> list[str]:
+    rows = []
+    for name, (x, y, radius) in zip(plan.landmarks, plan.columns.tolist(), strict=False):
+        neighbours = " ".join(b for a, b in plan.pairs if a == name)
+        rows.append(f"{name},{x:.4f},{y:.4f},{radius:.3f},{neighbours}")
+    return rows
 
 
 def _lines(path: Path, header: str, rows: Iterable[str]) -> None:

@@ -1,0 +1,223 @@
+"""`uwblite evaluate`: compare a result with the truth."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..evaluate import AnchorErrors, ErrorStatistics, TrajectoryErrors
+    from ..evaluate_map import LandmarkErrors, Landmarks, WallErrors
+
+HELP = "compare a map, its trajectory and anchors with the truth"
+EPILOG = """\
+examples:
+  uwblite evaluate map/ --truth truth.tum
+  uwblite evaluate map/ --truth truth.tum --anchors truth_anchors.csv --landmarks columns.csv
+  uwblite evaluate map/ --truth truth.tum --json
+
+The trajectory is laid over the truth by the best rigid motion, without scale; ATE and RPE are those of evo_ape -a and
+evo_rpe. Columns are searched in the map; the distances between them are what is judged.
+
+files (lengths in metres):
+  --truth      stamp x y z qx qy qz qw        identity quaternions throughout = the heading is not known
+  --anchors    id,x,y
+  --landmarks  name,x,y,radius[,neighbours]   neighbours: names separated by blanks; only these distances are judged
+  --walls      x1,y1,x2,y2
+"""
+
+DEFAULT_RADIUS = 0.3
+"""m, of a column whose radius is not told."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the verb."""
+    parser.add_argument("dir", help="folder that uwblite map wrote: trajectory.tum, anchors.csv, map.yaml")
+    parser.add_argument("--truth", metavar="FILE.tum", required=True, help="true poses")
+    parser.add_argument("--anchors", metavar="FILE.csv", help="true anchors")
+    parser.add_argument("--landmarks", metavar="FILE.csv", help="true columns")
+    parser.add_argument("--walls", metavar="FILE.csv", help="true walls")
+    parser.add_argument("--delta", type=float, default=1.0, metavar="M", help="m of path per stretch of the RPE (1)")
+    parser.add_argument("--max-gap", type=float, default=1.0, metavar="S", help="leave out truth in longer gaps, s (1)")
+    parser.add_argument("--search-radius", type=float, default=1.0, metavar="M", help="m around a column's place (1)")
+    parser.add_argument("--tolerance", type=float, default=0.1, metavar="M", help="m from a wall that count as on it (0.1)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the verb."""
+    from ..errors import ConfigError
+    from . import console
+
+    for name in ("delta", "max_gap", "search_radius", "tolerance"):
+        if not getattr(args, name) > 0:
+            raise ConfigError(f"--{name.replace('_', '-')} must be positive, not {getattr(args, name):g}")
+    summary, lines = evaluate(args)
+    if args.json:
+        console.say_json(summary)
+    else:
+        for line in lines:
+            console.say(line)
+    return 0
+
+
+def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+    """Return what is compared as a JSON-ready summary and as lines of text."""
+    import numpy as np
+
+    from .. import se2
+    from ..evaluate import evaluate_trajectory
+    from ..evaluate_map import landmark_errors_along
+    from ..io.tum import read_tum
+
+    folder = Path(args.dir)
+    stamps, poses = read_tum(folder / "trajectory.tum")
+    true_stamps, true_poses = read_tum(args.truth)
+    trajectory = evaluate_trajectory(stamps, poses, true_stamps, true_poses, max_gap=args.max_gap, rpe_delta=args.delta)
+    summary: dict[str, Any] = {"trajectory": _trajectory_summary(trajectory, len(true_stamps))}
+    lines = _trajectory_lines(trajectory, len(true_stamps))
+    if args.anchors:
+        anchors = _anchors(folder / "anchors.csv", args.anchors, trajectory.T_truth_map)
+        summary["anchors"] = {**_plain(anchors), "errors": dict(zip(anchors.ids, anchors.distances.tolist(), strict=True))}
+        lines += _anchor_lines(anchors)
+    occupied = _occupied(folder / "map.yaml", trajectory.T_truth_map) if args.landmarks or args.walls else None
+    truth, pairs = read_landmarks(args.landmarks) if args.landmarks else (None, None)
+    if truth is not None:
+        if occupied is not None:
+            found = _landmarks_in_map(occupied, truth, pairs, args.search_radius)
+            summary["landmarks"] = _landmark_summary(found)
+            lines += _landmark_lines(found, "columns in the map")
+        if trajectory.heading is not None:
+            seen = true_poses[trajectory.matched]
+            estimate = se2.interpolate_trajectory(stamps, poses, true_stamps[trajectory.matched])
+            drawn = landmark_errors_along(truth, seen, estimate, pairs)
+            summary["landmarks_along_trajectory"] = _landmark_summary(drawn)
+            lines += _landmark_lines(drawn, "columns as the trajectory draws them")[:1]
+    if args.walls and occupied is not None:
+        posts = np.empty((0, 3)) if truth is None else np.column_stack([truth.positions, truth.radii])
+        walls = _walls(args.walls, posts, occupied, true_poses[trajectory.matched, :2], args.tolerance)
+        summary["walls"] = _plain(walls)
+        lines += [
+            f"walls: {100 * walls.precision:.1f} % of the occupied cells lie within {walls.tolerance:g} m of a true surface, "
+            f"{100 * walls.recall:.1f} % of what was in sight is drawn"
+        ]
+    if occupied is None and (args.landmarks or args.walls):
+        lines.append("no map.yaml in the folder: columns and walls are not judged")
+    return summary, lines
+
+
+def _anchors(path: Path, truth: str, T_truth_map: "NDArray[np.float64]") -> "AnchorErrors":
+    from ..evaluate import evaluate_anchors
+    from ..io.csv_table import read_csv
+
+    estimate, true = read_csv(path), read_csv(truth)
+    true_places = true.numbers("x", "y")
+    return evaluate_anchors(
+        estimate.texts("id"), estimate.numbers("x", "y", default=float("nan")), true.texts("id"), true_places, T_truth_map
+    )
+
+
+def read_landmarks(path: str) -> "tuple[Landmarks, tuple[tuple[str, str], ...] | None]":
+    """Return the columns of a table, and the pairs it wants judged (None = all)."""
+    from ..evaluate_map import Landmarks
+    from ..io.csv_table import read_csv
+
+    table = read_csv(path)
+    names = table.texts("name")
+    radii = table.numbers("radius", default=DEFAULT_RADIUS)[:, 0]
+    neighbours = [text.split() for text in table.texts("neighbours")]
+    pairs = tuple((a, b) for a, others in zip(names, neighbours, strict=True) for b in others)
+    return Landmarks(names, table.numbers("x", "y"), radii), pairs or None
+
+
+def _occupied(path: Path, T_truth_map: "NDArray[np.float64]") -> "NDArray[np.float64] | None":
+    """Return the centres of the occupied cells in the frame of the truth; None where there is no map."""
+    from .. import se2
+    from ..io.map_server import read_map
+
+    return se2.transform(T_truth_map, read_map(path).occupied_points()) if path.exists() else None
+
+
+def _landmarks_in_map(
+    occupied: "NDArray[np.float64]", truth: "Landmarks", pairs: tuple[tuple[str, str], ...] | None, search_radius: float
+) -> "LandmarkErrors":
+    from ..evaluate_map import find_columns, landmark_errors
+
+    return landmark_errors(find_columns(occupied, truth, search_radius=search_radius), truth, pairs)
+
+
+def _walls(
+    path: str,
+    posts: "NDArray[np.float64]",
+    occupied: "NDArray[np.float64]",
+    viewpoints: "NDArray[np.float64]",
+    tolerance: float,
+) -> "WallErrors":
+    from ..evaluate_map import wall_errors
+    from ..io.csv_table import read_csv
+
+    return wall_errors(occupied, read_csv(path).numbers("x1", "y1", "x2", "y2"), posts, viewpoints, tolerance=tolerance)
+
+
+def _plain(figures: Any) -> dict[str, Any]:
+    """Return the plain numbers and names of a dataclass; arrays are left out."""
+    import dataclasses
+
+    plain = {f.name: getattr(figures, f.name) for f in dataclasses.fields(figures)}
+    return {k: v for k, v in plain.items() if isinstance(v, float | int | str | tuple)}
+
+
+def _trajectory_summary(t: "TrajectoryErrors", true_count: int) -> dict[str, Any]:
+    named = {"ate": t.ate, "heading": t.heading, "rpe_position": t.rpe_position, "rpe_heading": t.rpe_heading}
+    figures: dict[str, Any] = {k: None if v is None else _plain(v) for k, v in named.items()}
+    return {
+        "true_poses": true_count,
+        "compared": len(t.matched),
+        "rpe_delta": t.rpe_delta,
+        "T_truth_map": t.T_truth_map.tolist(),
+        **figures,
+    }
+
+
+def _trajectory_lines(t: "TrajectoryErrors", true_count: int) -> list[str]:
+    import math
+
+    def row(name: str, s: "ErrorStatistics", unit: str, scale: float = 1.0) -> str:
+        numbers = "".join(f"{scale * v:11.4f}" for v in (s.rmse, s.mean, s.median, s.max))
+        return f"{name:<24}{numbers}  {unit}"
+
+    head = f"{'trajectory':<24}{'rmse':>11}{'mean':>11}{'median':>11}{'max':>11}"
+    lines = [head, row("  position (ATE)", t.ate, "m")]
+    if t.heading is not None:
+        lines.append(row("  heading", t.heading, "deg", math.degrees(1.0)))
+    if t.rpe_position is not None and t.rpe_heading is not None:
+        per = f"per {t.rpe_delta:g} m"
+        lines += [
+            row("  relative (RPE)", t.rpe_position, f"m {per}"),
+            row("  relative heading", t.rpe_heading, f"deg {per}", math.degrees(1.0)),
+        ]
+    if t.heading is None:
+        lines.append("  the truth has no heading: positions only")
+    lines.append(f"  {len(t.matched)} of {true_count} true poses compared")
+    return lines
+
+
+def _anchor_lines(a: "AnchorErrors") -> list[str]:
+    lines = [f"anchors: rmse {a.rmse:.3f} m over {len(a.ids)}"] if a.ids else ["anchors: none could be compared"]
+    lines += [f"  {name:<8} {distance:8.3f} m" for name, distance in zip(a.ids, a.distances.tolist(), strict=True)]
+    return lines + ([f"  without an estimate: {', '.join(a.missing)}"] if a.missing else [])
+
+
+def _landmark_summary(e: "LandmarkErrors") -> dict[str, Any]:
+    rows = zip(e.pairs, e.true_distances.tolist(), e.distances.tolist(), e.errors.tolist(), strict=True)
+    pairs = [{"a": a, "b": b, "true": t, "found": d, "error": x} for (a, b), t, d, x in rows]
+    return {"mean": e.mean if e.pairs else None, "pairs": pairs, "missing": list(e.missing)}
+
+
+def _landmark_lines(e: "LandmarkErrors", title: str) -> list[str]:
+    lines = [f"{title}: mean distance error {e.mean:.4f} m over {len(e.pairs)} pairs" if e.pairs else f"{title}: none found"]
+    rows = zip(e.pairs, e.true_distances.tolist(), e.distances.tolist(), e.errors.tolist(), strict=True)
+    lines += [f"  {a + ' - ' + b:<14} true {t:8.3f}   found {d:8.3f}   error {x:7.4f} m" for (a, b), t, d, x in rows]
+    return lines + ([f"  not found: {', '.join(e.missing)}"] if e.missing else [])

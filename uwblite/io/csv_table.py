@@ -1,0 +1,87 @@
+"""Small tables with a header line: truth and results as comma-separated text, columns found by name."""
+
+import csv
+import math
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from .source import open_source
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CsvTable:
+    """A table read from a file."""
+
+    path: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    lines: tuple[int, ...]
+    """1-based line number of each row."""
+
+    def texts(self, column: str) -> tuple[str, ...]:
+        """Return a column as text; one that is absent is empty text throughout."""
+        if column not in self.header:
+            return ("",) * len(self.rows)
+        at = self.header.index(column)
+        return tuple(row[at] for row in self.rows)
+
+    def numbers(self, *columns: str, default: float | None = None) -> Floats:
+        """Return columns as numbers (rows, columns).
+
+        Parameters
+        ----------
+        columns : names.
+        default : value of a column that is absent or a field that is empty; None = it must be there.
+
+        Raises
+        ------
+        FormatError : a column is absent, or a field is not a number.
+        """
+        missing = [c for c in columns if c not in self.header]
+        if missing and default is None:
+            raise FormatError(f"has no column {missing[0]!r}; its header is {','.join(self.header)!r}", self.path, 1)
+        values = [self._column(c, default) for c in columns]
+        return np.array(values, dtype=np.float64).reshape(len(columns), len(self.rows)).T
+
+    def _column(self, column: str, default: float | None) -> list[float]:
+        numbers = []
+        for text, line in zip(self.texts(column), self.lines, strict=True):
+            try:
+                number = float(text) if text or default is None else default
+            except ValueError:
+                number = math.inf
+            if math.isinf(number):
+                raise FormatError(f"{column} is {text!r}, not a number", self.path, line)
+            numbers.append(number)
+        return numbers
+
+
+def read_csv(path: str | os.PathLike[str]) -> CsvTable:
+    """Read a comma-separated table whose first line names the columns; empty lines and # lines are skipped.
+
+    Raises
+    ------
+    FormatError : unreadable, not text, or a row has another number of fields than the header.
+    """
+    name = os.fspath(path)
+    with open_source(name) as source:
+        data = b"".join(source.blocks())
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        raise FormatError("not UTF-8 text", name) from None
+    kept = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
+    if not kept:
+        raise FormatError("holds no table; its first line must name the columns", name)
+    fields = [tuple(f.strip() for f in row) for row in csv.reader(line for _, line in kept)]
+    header, rows, lines = fields[0], fields[1:], tuple(k for k, _ in kept[1:])
+    for row, line in zip(rows, lines, strict=True):
+        if len(row) != len(header):
+            raise FormatError(f"has {len(row)} fields where the header names {len(header)}", name, line)
+    return CsvTable(name, header, tuple(rows), lines)
