@@ -1,120 +1,181 @@
-"""Normal equations of a graph: the sparsity pattern analysed once, filled often, factorised by structure."""
+"""Normal equations of a graph: where every product of Jacobians lands is analysed once, the values are filled often.
+
+A *node* is one free unknown: a pose (3 scalars), an anchor (2) or a calibration value (1). The lower triangle of
+H = J^T W J is kept as one array: the blocks between nodes that share an edge, one after the other, then the *border*,
+full rows for the calibration values, which touch nearly every pose and therefore take no part in the ordering. Scalars
+are numbered in the order of elimination, so that vectors need no permutation.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
-from .errors import SolverError
+from .factorization import BandedLayout, Factor, Layout, SparseLayout, choose_ordering
 from .graph import Graph, Linearization
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-BLOCKS = (("poses", 3), ("anchors", 2), ("calibration", 1))
-"""Blocks of unknowns in the order of the stacked vector, and the scalars of one unknown."""
+WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
+"""Blocks of unknowns, and the scalars of one unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknowns:
-    """Where each scalar of the graph stands in the vector of free unknowns."""
+    """Where each free scalar of a graph stands in the vector of unknowns."""
 
     number: dict[str, Ints]
     """By block (unknowns, scalars): position in the vector, -1 = held fixed."""
     size: int
     """Length of the vector."""
 
-    @staticmethod
-    def of(graph: Graph) -> "Unknowns":
-        """Number the free scalars of a graph, poses first."""
-        fixed_poses = graph.fixed_poses
-        if fixed_poses is None:
-            fixed_poses = np.arange(len(graph.poses)) == 0
-        counts = (len(graph.poses), len(graph.anchors), len(graph.calibration.values))
-        masks = (fixed_poses, graph.fixed_anchors, graph.fixed_calibration)
-        number, size = {}, 0
-        for (name, width), count, fixed in zip(BLOCKS, counts, masks, strict=True):
-            free = np.ones(count, dtype=bool) if fixed is None else ~fixed
-            first = size + width * (np.cumsum(free) - 1)
-            number[name] = np.where(free[:, None], first[:, None] + np.arange(width), -1).astype(np.int64)
-            size += width * int(free.sum())
-        return Unknowns(number, size)
-
     def spread(self, name: str, vector: Floats) -> Floats:
         """Return the part of a vector that belongs to a block, (unknowns, scalars), 0 where held fixed."""
         return np.append(vector, 0.0)[self.number[name]]
 
-    def moved(self, graph: Graph, step: Floats) -> Graph:
-        """Return the graph moved by a step, headings wrapped into (-pi, pi]."""
-        poses = graph.poses + self.spread("poses", step)
-        poses[:, 2] = np.pi - np.mod(np.pi - poses[:, 2], 2.0 * np.pi)
-        calibration = graph.calibration.values + self.spread("calibration", step)[:, 0]
-        return graph.updated(poses, graph.anchors + self.spread("anchors", step), calibration)
+
+def free_unknowns(graph: Graph) -> dict[str, NDArray[np.bool_]]:
+    """Return by block which unknowns are not held fixed."""
+    held = {"poses": graph.fixed_poses, "anchors": graph.fixed_anchors, "calibration": graph.fixed_calibration}
+    counts = {"poses": len(graph.poses), "anchors": len(graph.anchors), "calibration": len(graph.calibration.values)}
+    free = {name: np.ones(count, dtype=bool) if held[name] is None else ~held[name] for name, count in counts.items()}
+    if graph.fixed_poses is None:
+        free["poses"][:1] = False
+    return free
 
 
 class NormalEquations:
-    """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free unknowns."""
+    """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free scalars."""
 
-    def __init__(self, unknowns: Unknowns, linearized: Sequence[Linearization]) -> None:
-        """Analyse where every product of two Jacobians lands."""
-        n = unknowns.size
-        self.size = n
-        numbers = [[unknowns.number[name][index] for name, index, _ in lin.blocks] for lin in linearized]
-        keys = [np.arange(n) * (n + 1)]
-        twice = []
-        for rows in numbers:
-            for p, row in enumerate(rows):
-                for q, other in enumerate(rows[: p + 1]):
-                    r, c = np.broadcast_arrays(row[:, :, None], other[:, None, :])
-                    kept = (r >= 0) & (c >= 0)
-                    if p == q:
-                        kept = kept & (r >= c)
-                    keys.append(np.where(kept, np.minimum(r, c) * n + np.maximum(r, c), n * n).ravel())
-                    twice.append(np.where((p != q) & (r == c), 2.0, 1.0).ravel())
-        self._twice = np.concatenate(twice) if twice else np.zeros(0)
-        unique, position = np.unique(np.concatenate(keys), return_inverse=True)
-        if not len(unique) or unique[-1] != n * n:
-            unique = np.append(unique, n * n)
-        self._slots = len(unique)
-        self._diagonal, self._position = position[:n], position[n:]
-        self._gradient_rows = [np.where(row >= 0, row, n).ravel() for rows in numbers for row in rows]
-        upper, lower = np.divmod(unique[:-1], n)
-        strict = np.nonzero(upper != lower)[0]
-        order = np.arange(len(unique) - 1)
-        full = sparse.csc_matrix(
-            (np.r_[order, order[strict]] + 1.0, (np.r_[upper, lower[strict]], np.r_[lower, upper[strict]])), shape=(n, n)
+    def __init__(self, graph: Graph, linearized: Sequence[Linearization], banded: bool = True) -> None:
+        """Number the unknowns and find where every product lands.
+
+        Parameters
+        ----------
+        graph : what is free.
+        linearized : of every kind of edges; only the indices and shapes of its blocks are read.
+        banded : allow the banded factorisation where it is the faster.
+        """
+        free = free_unknowns(graph)
+        counts = [int(mask.sum()) for mask in free.values()]
+        self._inner = counts[0] + counts[1]
+        width = np.repeat(list(WIDTHS.values()), counts)
+        node, first = {}, 0
+        for (name, mask), count in zip(free.items(), counts, strict=True):
+            node[name] = np.where(mask, first + np.cumsum(mask) - 1, -1)
+            first += count
+        touched = [[node[name][index] for name, index, _ in lin.blocks] for lin in linearized]
+        pairs, which = self._pairs(touched)
+        ordering = choose_ordering(pairs, counts[0], self._inner, counts[2], banded)
+        order = np.concatenate([ordering.order, np.arange(self._inner, len(width))])
+        corner = np.full(len(width) + 1, -1)
+        corner[order] = np.cumsum(width[order]) - width[order]
+        scalars = {
+            name: np.where(node[name] >= 0, corner[node[name]] + np.arange(w)[:, None], -1) for name, w in WIDTHS.items()
+        }
+        self.unknowns = Unknowns({name: s.T for name, s in scalars.items()}, int(width.sum()))
+        rows, columns = self._place_blocks(pairs, corner, width)
+        self._place_products(linearized, touched, which, scalars)
+        if ordering.in_band:
+            in_band = int(width[ordering.order[: ordering.in_band]].sum())
+            self._layout: Layout = BandedLayout(rows, columns, self.unknowns.size, in_band)
+        else:
+            self._layout = SparseLayout(rows, columns, self.unknowns.size)
+        self.values: Floats = np.zeros(self._trash + 1)
+        self.gradient: Floats = np.zeros(self.unknowns.size)
+
+    def _pairs(self, touched: list[list[Ints]]) -> tuple[Ints, list[Ints]]:
+        """Return the pairs (b, 2) of inner nodes that share an edge, every node with itself first; and each edge's pair."""
+        m = self._inner
+        keys = [np.array([m * m])]
+        for nodes in touched:
+            for p, a in enumerate(nodes):
+                for b in nodes[:p]:
+                    low, high = np.minimum(a, b), np.maximum(a, b)
+                    keys.append(np.where((low >= 0) & (high < m) & (low < high), low * m + high, m * m))
+        unique, which = np.unique(np.concatenate(keys), return_inverse=True)
+        apart = np.stack(np.divmod(unique[:-1], max(m, 1)), axis=1)
+        pairs = np.concatenate([np.repeat(np.arange(m), 2).reshape(m, 2), apart])
+        ends = np.cumsum([len(k) for k in keys])
+        return pairs, [which[a:b] + m for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+    def _place_blocks(self, pairs: Ints, corner: Ints, width: Ints) -> tuple[Ints, Ints]:
+        """Lay the blocks out in the array of values; return row and column of every value."""
+        swap = corner[pairs[:, 0]] < corner[pairs[:, 1]]
+        lower, left = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
+        size = width[lower] * width[left]
+        start = np.cumsum(size) - size
+        self._stride = np.append(width[left], 0)
+        self._base = np.append(start - corner[lower] * width[left] - corner[left], 0)
+        block = np.repeat(np.arange(len(pairs)), size)
+        row, column = np.divmod(np.arange(len(block)) - start[block], width[left][block])
+        n = self.unknowns.size
+        self._border_row = n - (len(width) - self._inner)
+        self._border_base = len(block) - self._border_row * n
+        self._trash = self._border_base + n * n
+        border = np.divmod(np.arange(self._border_row * n, n * n), n)
+        rows = np.concatenate([row + corner[lower][block], border[0]])
+        columns = np.concatenate([column + corner[left][block], border[1]])
+        each = np.arange(n)
+        node = np.repeat(np.argsort(corner[:-1]), width[np.argsort(corner[:-1])])
+        inner = each < self._border_row
+        self._diagonal = np.where(
+            inner,
+            self._base[np.where(inner, node, 0)] + each * (np.where(inner, width[node], n) + 1),
+            self._border_base + each * (n + 1),
         )
-        full.sort_indices()
-        self._source = full.data.astype(np.int64) - 1
-        self._indices, self._indptr = full.indices, full.indptr
-        self.values: Floats = np.zeros(self._slots)
-        self.gradient: Floats = np.zeros(n)
+        return rows, columns
+
+    def _place_products(
+        self, linearized: Sequence[Linearization], touched: list[list[Ints]], which: list[Ints], scalars: dict[str, Ints]
+    ) -> None:
+        """Find the place of every product of two Jacobian columns of one edge."""
+        n, following = self.unknowns.size, iter(which)
+        self._gradient_rows, self._positions, self._twice = [], [], []
+        for lin, nodes in zip(linearized, touched, strict=True):
+            stacked = np.concatenate([scalars[name][:, index] for name, index, _ in lin.blocks])
+            owner = np.repeat(np.arange(len(nodes)), [jac.shape[2] for _, _, jac in lin.blocks])
+            pair = {}
+            for p, a in enumerate(nodes):
+                for q, b in enumerate(nodes[:p]):
+                    pair[p, q] = np.where(a == b, a, next(following))
+                pair[p, p] = a
+            k, l = np.tril_indices(len(stacked))
+            low, high = np.minimum(stacked[k], stacked[l]), np.maximum(stacked[k], stacked[l])
+            block = np.stack([pair[p, q] for p, q in zip(owner[k], owner[l], strict=True)])
+            inner = high < self._border_row
+            block = np.where(inner, block, 0)
+            place = np.where(inner, self._base[block] + high * self._stride[block], self._border_base + high * n) + low
+            self._positions.append(np.where(low >= 0, place, self._trash).ravel())
+            self._gradient_rows.append(np.where(stacked >= 0, stacked, n).ravel())
+            self._twice.append(np.nonzero(((k != l)[:, None] & (low == high) & (low >= 0)).ravel())[0])
 
     def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
         """Fill H and g from whitened Jacobians and a weight per edge."""
-        products, gradient = [], np.zeros(self.size + 1)
-        slot = 0
-        for lin, weight in zip(linearized, weights, strict=True):
-            jacobians = [jac for _, _, jac in lin.blocks]
-            weighted = jacobians if weight is None else [jac * weight[:, None, None] for jac in jacobians]
-            for p, left in enumerate(weighted):
-                by = np.einsum("edk,ed->ek", left, lin.residuals)
-                gradient += np.bincount(self._gradient_rows[slot], by.ravel(), self.size + 1)
-                slot += 1
-                products += [np.einsum("edk,edl->ekl", left, jac).ravel() for jac in jacobians[: p + 1]]
-        stacked = np.concatenate(products) if products else np.zeros(0)
-        self.values = np.bincount(self._position, stacked * self._twice, self._slots)
-        self.gradient = np.asarray(gradient[:-1])
+        n = self.unknowns.size
+        gradient, values = np.zeros(n + 1), np.zeros(self._trash + 1)
+        for lin, weight, rows, place, twice in zip(
+            linearized, weights, self._gradient_rows, self._positions, self._twice, strict=True
+        ):
+            jacobian = np.concatenate([jac.transpose(1, 2, 0) for _, _, jac in lin.blocks], axis=1)
+            weighted = jacobian if weight is None else jacobian * weight
+            gradient += np.bincount(rows, _contract(weighted, lin.residuals.T[:, None]).ravel(), n + 1)
+            products = np.concatenate(
+                [_contract(weighted[:, k : k + 1], jacobian[:, : k + 1]) for k in range(jacobian.shape[1])]
+            )
+            products = products.ravel()
+            products[twice] *= 2.0
+            values += np.bincount(place, products, len(values))
+        self.values, self.gradient = values, gradient[:-1]
 
     @property
     def diagonal(self) -> Floats:
         """The diagonal of H."""
         return self.values[self._diagonal]
 
-    def factor(self, damping: Floats | None = None) -> "Factor":
+    def factor(self, damping: Floats) -> Factor:
         """Factorise H + diag(damping).
 
         Raises
@@ -122,20 +183,10 @@ class NormalEquations:
         SolverError : the matrix is not positive definite to working precision.
         """
         values = self.values.copy()
-        if damping is not None:
-            values[self._diagonal] += damping
-        return Factor(sparse.csc_matrix((values[self._source], self._indices, self._indptr), shape=(self.size, self.size)))
+        values[self._diagonal] += damping
+        return self._layout.factor(values)
 
 
-class Factor:
-    """A factorised symmetric positive definite matrix."""
-
-    def __init__(self, matrix: sparse.csc_matrix) -> None:
-        try:
-            self._lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        except RuntimeError as problem:
-            raise SolverError(f"the normal equations are singular ({problem}); add a prior or more measurements") from None
-
-    def solve(self, right: Floats) -> Floats:
-        """Solve for right-hand sides (n,) or (n, m)."""
-        return self._lu.solve(right)
+def _contract(a: Floats, b: Floats) -> Floats:
+    """Return the sum over the first axis of a b."""
+    return a[0] * b[0] if len(a) == 1 else np.add.reduce(a * b, axis=0)

@@ -5,7 +5,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import se2
 from .graph import Graph
-from .linear import Factor, NormalEquations, Unknowns
+from .factorization import Factor
+from .linear import NormalEquations, Unknowns
 from .solver import edge_weights
 
 Floats = NDArray[np.float64]
@@ -56,8 +57,7 @@ class Marginals:
 
 def marginals(graph: Graph) -> Marginals:
     """Return the marginal covariances at the graph's estimates, (J^T W J)^-1 with the robust weights as they stand."""
-    unknowns = Unknowns.of(graph)
     linearized = [edges.linearize(graph) for edges in graph.edges]
-    normal = NormalEquations(unknowns, linearized)
+    normal = NormalEquations(graph, linearized, banded=False)
     normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
-    return Marginals(graph, unknowns, normal.factor(1e-12 * np.where(normal.diagonal > 0, normal.diagonal, 1.0)))
+    return Marginals(graph, normal.unknowns, normal.factor(1e-12 * np.where(normal.diagonal > 0, normal.diagonal, 1.0)))

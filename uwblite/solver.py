@@ -27,9 +27,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from . import se2
 from .errors import ConfigError, SolverError
 from .graph import Edges, Graph, Linearization, edge_cost
-from .linear import BLOCKS, NormalEquations, Unknowns
+from .linear import NormalEquations, Unknowns, free_unknowns
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -49,7 +50,7 @@ class SolverConfig:
     """Stop when no gradient component exceeds this, in standard deviations: max |g_i| / sqrt(H_ii)."""
     step_tolerance: float = 1e-10
     """Stop when no unknown moves by more than this, m or rad."""
-    initial_damping: float = 1e-6
+    initial_damping: float = 1e-10
     """First lambda; small = trust the starting values."""
 
     def __post_init__(self) -> None:
@@ -91,6 +92,21 @@ class SolverSummary:
         return self.chi2 / self.dof if self.dof > 0 else float("nan")
 
 
+def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
+    """Return the graph moved by a step: poses along the arc of a constant twist, the rest straight.
+
+    With the turn w of a pose and its shift t in the map frame, x -> x + V(w) t: to first order addition, and the shift
+    turns with the pose. Long bent chains need about two iterations fewer than with plain addition.
+    """
+    shift = unknowns.spread("poses", step)
+    arc = se2.exp(shift)
+    poses = np.empty_like(graph.poses)
+    poses[:, :2] = graph.poses[:, :2] + arc[:, :2]
+    poses[:, 2] = se2.wrap_angle(graph.poses[:, 2] + shift[:, 2])
+    calibration = graph.calibration.values + unknowns.spread("calibration", step)[:, 0]
+    return graph.updated(poses, graph.anchors + unknowns.spread("anchors", step), calibration)
+
+
 def edge_weights(edges: Edges, graph: Graph) -> Floats:
     """Return each edge's share (e,) in the normal equations at these estimates: its own weight times the kernel's."""
     return _weights(edges, edges.residuals(graph))
@@ -120,10 +136,9 @@ def optimize(
     ------
     SolverError : nothing is free, there is no edge, or estimates or measurements are not finite.
     """
-    unknowns = Unknowns.of(graph)
-    _check(graph, unknowns)
+    _check(graph)
     linearized = _linearize(graph)
-    normal = NormalEquations(unknowns, linearized)
+    normal = NormalEquations(graph, linearized)
     chi2 = chi2_initial = _cost(graph, linearized)
     if not np.isfinite(chi2):
         raise SolverError(_what_is_not_finite(graph, linearized))
@@ -148,7 +163,7 @@ def optimize(
             break
         damping_history.append(damping)
         step, promised = _step(normal, damping * scale)
-        trial = unknowns.moved(graph, step)
+        trial = moved(graph, normal.unknowns, step)
         trial_linearized = _linearize(trial)
         trial_chi2 = _cost(trial, trial_linearized)
         chi2_history.append(trial_chi2)
@@ -174,11 +189,11 @@ def optimize(
         len(chi2_history),
         chi2_initial,
         chi2,
-        _independent_residuals(graph, linearized) - unknowns.size,
+        _independent_residuals(graph, linearized) - normal.unknowns.size,
         damping,
         np.array(chi2_history),
         np.array(damping_history),
-        _unobserved(unknowns, normal.diagonal),
+        _unobserved(normal.unknowns, normal.diagonal),
     )
     return graph, summary
 
@@ -191,7 +206,7 @@ def _step(normal: NormalEquations, damping: Floats) -> tuple[Floats, float]:
     try:
         step = normal.factor(damping).solve(-normal.gradient)
     except SolverError:
-        return np.zeros(normal.size), -1.0
+        return np.zeros(len(damping)), -1.0
     return step, float(step @ (damping * step - normal.gradient))
 
 
@@ -203,8 +218,8 @@ def _cost(graph: Graph, linearized: list[Linearization]) -> float:
     return sum(edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True))
 
 
-def _check(graph: Graph, unknowns: Unknowns) -> None:
-    if unknowns.size == 0:
+def _check(graph: Graph) -> None:
+    if not any(mask.any() for mask in free_unknowns(graph).values()):
         raise SolverError("nothing to optimise: every pose, anchor and calibration value is held fixed")
     if not sum(len(edges) for edges in graph.edges):
         raise SolverError("nothing to optimise: the graph has no edges")
@@ -242,4 +257,4 @@ def _independent_residuals(graph: Graph, linearized: list[Linearization]) -> int
 
 def _unobserved(unknowns: Unknowns, diagonal: Floats) -> dict[str, Ints]:
     zero = np.append(diagonal <= 0, False)
-    return {name: np.nonzero(zero[unknowns.number[name]].any(axis=1))[0] for name, _ in BLOCKS}
+    return {name: np.nonzero(zero[number].any(axis=1))[0] for name, number in unknowns.number.items()}
