@@ -32,6 +32,8 @@ _COARSE_TOLERANCE = 10.0
 """The coarse stage hands over at steps so many times the tolerance."""
 _GATE_SHRINK = 0.7
 """Per iteration of the coarse stage."""
+_LEAST_REACH = 0.2
+"""m; a finer table of nearest points is larger and no better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +42,7 @@ class IcpConfig:
 
     method: Literal["point_to_line", "point_to_point"] = "point_to_line"
     """point_to_point is the paper's; it knows neither lines nor corridors."""
-    max_correspondence_distance: float = 0.2
+    max_correspondence_distance: float = 0.15
     """m; points farther apart are no pair (the paper's d)."""
     max_iterations: int = 50
     """Of all stages together."""
@@ -48,20 +50,21 @@ class IcpConfig:
     """m; a smaller step in both senses ends the iteration."""
     tolerance_rotation: float = 2.5e-4
     """rad."""
-    coarse_distance: float = 0.6
+    coarse_distance: float = 1.0
     """m; gate of the first iteration of point_to_line, from which it shrinks to max_correspondence_distance: about the
     error of the initial guess. No larger than that distance = no coarse stage."""
     coarse_stride: int = 4
     """The coarse stage takes every so-many-th point."""
-    sigma: float = 0.03
-    """m, standard deviation of a point about a line by the noise of both clouds; scale of the kernel."""
+    sigma: float = 0.02
+    """m, standard deviation of a point about a line by the noise of both clouds; scale of the kernel. (The coarse
+    stage widens it with the gate.)"""
     min_sigma: float = 0.01
     """m; residuals smaller than that do not make the result more certain."""
     kernel: Kernel = CAUCHY
     """On residual / sigma; point_to_line only."""
     max_normal_angle: float = 0.8
     """rad; points whose normals differ by more are no pair, nor are the two sides of a wall; point_to_line only."""
-    degeneracy: float = 4.0
+    degeneracy: float = 2.0
     """Multiple of the information feigned by scattering normals that a direction must exceed to be measured;
     point_to_line only."""
     min_matches: int = 10
@@ -166,11 +169,13 @@ def _descend(
     gate: float, stride: int, tolerance: float, budget: int,
 ) -> _Descent:
     """Iterate associate, linearise, step; the gate shrinks to max_correspondence_distance."""
-    raster, last = target.raster(gate, stride), config.max_correspondence_distance
+    raster, last = target.raster(max(gate, _LEAST_REACH), stride), config.max_correspondence_distance
     rows = np.ascontiguousarray(rows[:, ::stride])
     for iteration in range(1, budget + 1):
         final = gate <= last
-        settings = LineFactorConfig(gate, config.sigma, config.kernel, config.max_normal_angle, config.degeneracy)
+        # What lies far off before the clouds meet is not yet an outlier: the kernel widens with the gate.
+        sigma = config.sigma * max(1.0, gate / last)
+        settings = LineFactorConfig(gate, sigma, config.kernel, config.max_normal_angle, config.degeneracy)
         cos_sin_xy = (np.cos(pose[2]), np.sin(pose[2]), pose[0], pose[1])
         matched = line_rows(target, raster, rows, cos_sin_xy, settings, two_sided)
         system, feigned = line_system(matched, settings)
@@ -199,13 +204,14 @@ def _align_lines(target: PointCloud, source: PointCloud, guess: Floats, config: 
         budget=max(1, config.max_iterations - used),
     )
     matches, used, pose = int(end.system.matched), used + end.iterations, _wrapped(end.pose)
-    if matches < config.min_matches:
+    weight = float(np.sum(end.rows.weight))
+    if matches < config.min_matches or weight == 0.0:
         return _no_overlap(pose, source, used, matches)
     trusted, _ = trusted_part(end.system.information, end.feigned, config.degeneracy)
     square = end.rows.residual**2
     # Neighbouring means share their noise: so many of them tell as much as one point.
     shared = float(np.sum(end.rows.matched * source.neighbours)) / matches
-    variance = float(np.sum(end.rows.weight * square) / np.sum(end.rows.weight)) * shared
+    variance = float(np.sum(end.rows.weight * square)) / weight * shared
     information = trusted * config.sigma**2 / max(variance, config.min_sigma**2)
     fitness = fitness_score(target, source.points[:: config.coarse_stride], pose)
     rmse = float(np.sqrt(np.sum(square) / matches))

@@ -44,14 +44,14 @@ class LineFactorConfig:
 
     gate: float = 0.3
     """m; points farther apart are no pair."""
-    sigma: float = 0.03
+    sigma: float = 0.02
     """m, standard deviation of a raw point about a line by the noise of both clouds. (The residuals of means are
     smaller, but neighbouring ones share their noise: in sum they tell as much as raw points do.)"""
     kernel: Kernel = CAUCHY
     """On residual / sigma."""
     max_normal_angle: float = 0.8
     """rad; points whose normals differ by more are no pair; nor are the two sides of a wall."""
-    degeneracy: float = 4.0
+    degeneracy: float = 2.0
     """Multiple of the information feigned by the scatter of the normals that a direction must exceed; 0 trusts all."""
 
 

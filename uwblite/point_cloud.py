@@ -226,7 +226,7 @@ class PointCloud:
 
 
 def make_cloud(
-    points: Floats, viewpoints: Floats | None = None, normal_radius: float = 0.2, min_linearity: float = 0.6
+    points: Floats, viewpoints: Floats | None = None, normal_radius: float = 0.25, min_linearity: float = 0.6
 ) -> PointCloud:
     """Prepare points for registration: kd-tree, lines, normals towards the sensor.
 
