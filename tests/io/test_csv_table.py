@@ -22,7 +22,7 @@ def test_columns_are_found_by_name(table_of):
     assert table.texts("id") == ("DD07", "1E05")
     np.testing.assert_array_equal(table.numbers("y", "x"), [[-2.0, 1.5], [30.0, 0.25]])
     assert table.texts("note") == ("", "a, b")
-    assert table.texts("absent") == ("", "")
+    assert table.texts("absent", default="-") == ("-", "-")
     np.testing.assert_array_equal(table.numbers("radius", default=0.3), [[0.3], [0.3]])
     np.testing.assert_array_equal(table.numbers("height", default=0.6), [[0.6], [2.0]])
 

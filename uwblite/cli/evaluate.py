@@ -69,12 +69,12 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
 
     from .. import se2
     from ..evaluate import evaluate_trajectory
-    from ..evaluate_map import landmark_errors_along
+    from ..evaluate_map import find_columns, landmark_errors, landmark_errors_along
     from ..io.tum import read_tum
 
     folder = Path(args.dir)
-    stamps, poses = read_tum(folder / "trajectory.tum")
-    true_stamps, true_poses = read_tum(args.truth)
+    stamps, poses = in_order(*read_tum(folder / "trajectory.tum"))
+    true_stamps, true_poses = in_order(*read_tum(args.truth))
     trajectory = evaluate_trajectory(stamps, poses, true_stamps, true_poses, max_gap=args.max_gap, rpe_delta=args.delta)
     summary: dict[str, Any] = {"trajectory": _trajectory_summary(trajectory, len(true_stamps))}
     lines = _trajectory_lines(trajectory, len(true_stamps))
@@ -82,11 +82,12 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
         anchors = _anchors(folder / "anchors.csv", args.anchors, trajectory.T_truth_map)
         summary["anchors"] = {**_plain(anchors), "errors": dict(zip(anchors.ids, anchors.distances.tolist(), strict=True))}
         lines += _anchor_lines(anchors)
-    occupied = _occupied(folder / "map.yaml", trajectory.T_truth_map) if args.landmarks or args.walls else None
+    judge_map = (folder / "map.yaml").exists() and (args.landmarks or args.walls)
+    occupied, cell = _occupied(folder / "map.yaml", trajectory.T_truth_map) if judge_map else (None, 0.0)
     truth, pairs = read_landmarks(args.landmarks) if args.landmarks else (None, None)
     if truth is not None:
         if occupied is not None:
-            found = _landmarks_in_map(occupied, truth, pairs, args.search_radius)
+            found = landmark_errors(find_columns(occupied, truth, search_radius=args.search_radius, cell=cell), truth, pairs)
             summary["landmarks"] = _landmark_summary(found)
             lines += _landmark_lines(found, "columns in the map")
         if trajectory.heading is not None:
@@ -108,6 +109,14 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     return summary, lines
 
 
+def in_order(stamps: "NDArray[np.float64]", poses: "NDArray[np.float64]") -> "tuple[NDArray[np.float64], NDArray[np.float64]]":
+    """Return a trajectory with its stamps in order."""
+    import numpy as np
+
+    order = np.argsort(stamps, kind="stable")
+    return stamps[order], poses[order]
+
+
 def _anchors(path: Path, truth: str, T_truth_map: "NDArray[np.float64]") -> "AnchorErrors":
     from ..evaluate import evaluate_anchors
     from ..io.csv_table import read_csv
@@ -127,25 +136,18 @@ def read_landmarks(path: str) -> "tuple[Landmarks, tuple[tuple[str, str], ...] |
     table = read_csv(path)
     names = table.texts("name")
     radii = table.numbers("radius", default=DEFAULT_RADIUS)[:, 0]
-    neighbours = [text.split() for text in table.texts("neighbours")]
+    neighbours = [text.split() for text in table.texts("neighbours", default="")]
     pairs = tuple((a, b) for a, others in zip(names, neighbours, strict=True) for b in others)
     return Landmarks(names, table.numbers("x", "y"), radii), pairs or None
 
 
-def _occupied(path: Path, T_truth_map: "NDArray[np.float64]") -> "NDArray[np.float64] | None":
-    """Return the centres of the occupied cells in the frame of the truth; None where there is no map."""
+def _occupied(path: Path, T_truth_map: "NDArray[np.float64]") -> "tuple[NDArray[np.float64], float]":
+    """Return the centres of the occupied cells in the frame of the truth, and the size of a cell, m."""
     from .. import se2
     from ..io.map_server import read_map
 
-    return se2.transform(T_truth_map, read_map(path).occupied_points()) if path.exists() else None
-
-
-def _landmarks_in_map(
-    occupied: "NDArray[np.float64]", truth: "Landmarks", pairs: tuple[tuple[str, str], ...] | None, search_radius: float
-) -> "LandmarkErrors":
-    from ..evaluate_map import find_columns, landmark_errors
-
-    return landmark_errors(find_columns(occupied, truth, search_radius=search_radius), truth, pairs)
+    grid = read_map(path)
+    return se2.transform(T_truth_map, grid.occupied_points()), grid.geometry.resolution
 
 
 def _walls(

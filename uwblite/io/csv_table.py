@@ -24,12 +24,14 @@ class CsvTable:
     lines: tuple[int, ...]
     """1-based line number of each row."""
 
-    def texts(self, column: str) -> tuple[str, ...]:
-        """Return a column as text; one that is absent is empty text throughout."""
-        if column not in self.header:
-            return ("",) * len(self.rows)
-        at = self.header.index(column)
-        return tuple(row[at] for row in self.rows)
+    def texts(self, column: str, *, default: str | None = None) -> tuple[str, ...]:
+        """Return a column as text; `default` stands for one that is absent, None = it must be there."""
+        if column in self.header:
+            at = self.header.index(column)
+            return tuple(row[at] for row in self.rows)
+        if default is None:
+            raise FormatError(f"has no column {column!r}; its header is {','.join(self.header)!r}", self.path, 1)
+        return (default,) * len(self.rows)
 
     def numbers(self, *columns: str, default: float | None = None) -> Floats:
         """Return columns as numbers (rows, columns).
@@ -43,15 +45,13 @@ class CsvTable:
         ------
         FormatError : a column is absent, or a field is not a number.
         """
-        missing = [c for c in columns if c not in self.header]
-        if missing and default is None:
-            raise FormatError(f"has no column {missing[0]!r}; its header is {','.join(self.header)!r}", self.path, 1)
         values = [self._column(c, default) for c in columns]
         return np.array(values, dtype=np.float64).reshape(len(columns), len(self.rows)).T
 
     def _column(self, column: str, default: float | None) -> list[float]:
         numbers = []
-        for text, line in zip(self.texts(column), self.lines, strict=True):
+        texts = self.texts(column, default=None if default is None else "")
+        for text, line in zip(texts, self.lines, strict=True):
             try:
                 number = float(text) if text or default is None else default
             except ValueError:
