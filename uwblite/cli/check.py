@@ -1,0 +1,155 @@
+"""`uwblite check`: is a recording fit to be mapped, and what is to be done about it."""
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from .options import add_mounting_arguments
+
+if TYPE_CHECKING:
+    from ..diagnostics import Diagnosis
+    from ..sensor_log import SensorLog
+
+HELP = "say what is wrong with a recording and what to do about it, before mapping it"
+EPILOG = """\
+examples:
+  uwblite check run.log                    findings, worst first; exit code 3 where one spoils the map
+  uwblite check run.log.gz --json          the same for a script
+  uwblite check run.log --laser-flipped    does the laser agree with the wheels that way?
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the verb."""
+    parser.add_argument("log", help="CARMEN log, plain or .gz; - reads standard input")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    parser.add_argument("--quick", action="store_true", help="leave out what needs a trial map from wheels and radio")
+    add_mounting_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the verb."""
+    from ..diagnostics import diagnose
+    from ..io.carmen import read_log
+    from . import console
+    from .options import apply_mounting
+
+    log = apply_mounting(read_log(args.log), args)
+    anchors, calibration, problem = ((), (), "") if args.quick else _trial_map(log)
+    diagnosis = diagnose(log, anchors=anchors, calibration=calibration)
+    cost = expected_cost(log)
+    if args.json:
+        console.say_json(_summary(args.log, diagnosis, cost, problem))
+    else:
+        for line in report_lines(args.log, diagnosis, cost, problem):
+            console.say(line)
+    return 3 if diagnosis.serious else 0
+
+
+def _trial_map(log: "SensorLog") -> tuple[Any, Any, str]:
+    """Map from wheels and radio alone: it tells scales, clocks and biases. Returns also why it could not be made."""
+    from ..errors import UwbliteError
+    from ..mapping import build_map
+
+    if log.ranges is None or len(log.ranges.stamps) == 0:
+        return (), (), ""
+    try:
+        result = build_map(log.without(lidar=True))
+    except UwbliteError as error:
+        return (), (), str(error)
+    return result.anchors, result.calibration, ""
+
+
+def expected_cost(log: "SensorLog") -> dict[str, float]:
+    """Return the time and memory that `uwblite map` is expected to need on this computer, and the size of the map."""
+    import numpy as np
+
+    from ..mapping import MappingConfig
+    from .cost import expected_megabytes, expected_seconds
+
+    resolution = MappingConfig().grid.resolution
+    reach = 0.0 if log.scans is None else min(log.scans.range_max, 30.0)
+    size = np.ptp(log.odometry.poses[:, :2], axis=0) + 2.0 * reach
+    cells = 0 if log.scans is None else int(np.prod(size / resolution))
+    scans = 0 if log.scans is None else len(log.scans.stamps)
+    beams = 0 if log.scans is None else log.scans.ranges.shape[1]
+    path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
+    ranges = 0 if log.ranges is None else len(log.ranges.stamps)
+    return {
+        "seconds": round(expected_seconds(path, ranges, scans, beams), 1),
+        "megabytes": round(expected_megabytes(path, scans, beams, cells), 0),
+        "map width m": round(float(size[0]), 1) if cells else 0.0,
+        "map height m": round(float(size[1]), 1) if cells else 0.0,
+        "map cells": cells,
+    }
+
+
+def _summary(name: str, diagnosis: "Diagnosis", cost: dict[str, float], problem: str) -> dict[str, Any]:
+    import dataclasses
+
+    return {
+        "log": name,
+        "findings": [dataclasses.asdict(f) for f in diagnosis.findings],
+        "figures": diagnosis.figures,
+        "trial map": problem or "ok",
+        "expected cost of map": cost,
+        "exit code": 3 if diagnosis.serious else 0,
+    }
+
+
+def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], problem: str) -> list[str]:
+    """Return the findings and figures as lines of text."""
+    lines = [f"{name}: {_counts(diagnosis.figures)}", ""]
+    for finding in diagnosis.findings:
+        lines += [f"{finding.rank.upper():<8} {finding.topic}: {finding.what}", f"         -> {finding.advice}"]
+    if problem:
+        lines += ["NOTE     radio: no trial map from wheels and radio alone", f"         -> {problem}"]
+    if not diagnosis.findings:
+        lines.append("nothing to complain about")
+    lines += ["", *_anchor_lines(diagnosis.figures), *_calibration_lines(diagnosis.figures)]
+    grid = f", a map of {cost['map width m']:.0f} x {cost['map height m']:.0f} m" if cost["map cells"] else ""
+    lines.append(f"expected cost here: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
+    serious = len(diagnosis.serious)
+    lines.append(
+        f"mend the {serious} serious finding{'s' if serious > 1 else ''} first"
+        if serious
+        else f"next: uwblite map {name} --out map/"
+    )
+    return lines
+
+
+def _counts(figures: dict[str, Any]) -> str:
+    odometry = figures["odometry"]
+    parts = [f"{odometry['duration s']:.0f} s, {odometry['path m']:.1f} m by {odometry['count']} odometry readings"]
+    parts[0] += f" ({odometry['rate Hz']:.1f} Hz)"
+    if "uwb" in figures:
+        parts.append(f"{figures['uwb']['count']} ranges to {len(figures['uwb']['anchors'])} anchors")
+    if "lidar" in figures:
+        lidar = figures["lidar"]
+        parts.append(
+            f"{lidar['count']} scans of {lidar['beams']} beams over {lidar['field of view deg']:.0f} deg"
+            f" ({lidar['rate Hz']:.1f} Hz, {100 * lidar['share of beams that hit']:.0f} % hit)"
+        )
+    return ", ".join(parts)
+
+
+def _anchor_lines(figures: dict[str, Any]) -> list[str]:
+    lines = []
+    guesses = figures.get("radio calibration", {}).get("bias guess m", {})
+    for anchor_id, a in figures.get("uwb", {}).get("anchors", {}).items():
+        line = f"anchor {anchor_id}: {a['count']} ranges"
+        if "noise m" in a:
+            line += (
+                f" ({a['rate Hz']:.2f} Hz) of {a['nearest m']:.2f} to {a['farthest m']:.2f} m, noise {a['noise m']:.3f} m,"
+                f" {a['zeros']} zero, {a['absurd']} absurd, {a['spikes']} spikes"
+            )
+        if anchor_id in guesses:
+            line += f", bias guess {guesses[anchor_id]['bias']:+.2f} \u00b1{guesses[anchor_id]['sigma']:.2f} m"
+        lines.append(line)
+    if coverage := figures.get("uwb", {}).get("coverage"):
+        lines.append("heard at a time: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in coverage.items()))
+    return lines
+
+
+def _calibration_lines(figures: dict[str, Any]) -> list[str]:
+    values = {k: v for k, v in figures.get("radio calibration", {}).items() if "value" in v and ":" not in k}
+    return [f"{name}: {v['value']:+.4f} \u00b1{v['sigma']:.4f} {v['unit']}".rstrip(" 1") for name, v in values.items()]

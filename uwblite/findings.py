@@ -1,0 +1,94 @@
+"""The list that the checks of a recording write to."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+RANKS = ("serious", "warning", "note")
+"""Worst first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that a user should know about a recording."""
+
+    rank: str
+    """One of RANKS."""
+    topic: str
+    """'log', 'odometry', 'radio' or 'lidar'."""
+    what: str
+    """What was found, with figures and units."""
+    advice: str
+    """What to do about it."""
+
+
+class Findings:
+    """Findings in the order in which they are made."""
+
+    def __init__(self) -> None:
+        self._found: list[Finding] = []
+
+    def add(self, rank: str, topic: str, what: str, advice: str) -> None:
+        """Note a finding."""
+        self._found.append(Finding(rank, topic, what, advice))
+
+    def serious(self, topic: str, what: str, advice: str) -> None:
+        """Note what spoils the map or stops it."""
+        self.add("serious", topic, what, advice)
+
+    def warning(self, topic: str, what: str, advice: str) -> None:
+        """Note what costs accuracy."""
+        self.add("warning", topic, what, advice)
+
+    def note(self, topic: str, what: str, advice: str) -> None:
+        """Note what is good to know."""
+        self.add("note", topic, what, advice)
+
+    def ranked(self) -> tuple[Finding, ...]:
+        """Return the findings, worst first, otherwise in the order in which they were made."""
+        return tuple(sorted(self._found, key=lambda f: RANKS.index(f.rank)))
+
+
+def timing(stamps: Floats, topic: str, found: Findings, *, expected_gap: float) -> dict[str, float]:
+    """Check the rhythm of a sensor: rate, gaps, equal stamps.
+
+    Parameters
+    ----------
+    stamps : (n,) s, non-decreasing.
+    topic : sensor.
+    found : takes the findings.
+    expected_gap : a silence longer than this is a gap, s (or five periods, where that is longer).
+    """
+    steps = np.diff(stamps)
+    period = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+    duration = float(stamps[-1] - stamps[0])
+    gap = max(expected_gap, 5.0 * period)
+    gaps = np.flatnonzero(steps > gap)
+    equal = float(np.mean(steps == 0)) if len(steps) else 0.0
+    if len(gaps):
+        worst = gaps[np.argmax(steps[gaps])]
+        found.add(
+            "warning" if steps[gaps].sum() > 0.02 * duration or steps[worst] > 5.0 else "note",
+            topic,
+            f"{len(gaps)} silences longer than {gap:.1f} s; the longest is {steps[worst]:.1f} s"
+            f" at t = {stamps[worst] - stamps[0]:.1f} s",
+            "check cable, power and processor load at these times",
+        )
+    if equal > 0.02:
+        found.add(
+            "warning" if topic != "radio" else "note",
+            topic,
+            f"{100 * equal:.0f} % of the stamps equal the one before",
+            "stamps of low resolution, or readings that arrived in one piece: stamp each reading when it is made",
+        )
+    return {
+        "count": len(stamps),
+        "duration s": round(duration, 3),
+        "rate Hz": round(1.0 / period, 3) if period else 0.0,
+        "longest gap s": round(float(steps.max(initial=0.0)), 3),
+        "gaps": len(gaps),
+        "share of equal stamps": round(equal, 4),
+    }

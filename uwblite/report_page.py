@@ -1,0 +1,122 @@
+"""The frame of the HTML report: page, style, and the script that zooms the map."""
+
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'">
+<meta name="color-scheme" content="light dark">
+<link rel="icon" href="data:,">
+<title>{title} \u2013 uwblite</title>
+<style>{style}</style></head>
+<body><main>{body}</main><script>{script}</script></body></html>
+"""
+
+STYLE = """
+:root{--bg:#fff;--fg:#1b1f24;--dim:#667;--line:#d5d9de;--path:#1769aa;--anchor:#b3261e;--kept:#2e7d32;--rej:#d81b60;
+--good:#e7f5e9;--warn:#fff4d6;--bad:#fde4e1;--nlos:#d81b60}
+@media (prefers-color-scheme:dark){:root{--bg:#15181c;--fg:#e4e7eb;--dim:#9aa3ad;--line:#3a4049;--path:#4aa3ff;
+--anchor:#ff7a70;--kept:#5fce67;--rej:#ff6aa5;--good:#17301b;--warn:#3a2f10;--bad:#451c19;--nlos:#ff6aa5}#map-view{filter:brightness(.85)}}
+*{box-sizing:border-box}
+body{margin:0;background:var(--bg);color:var(--fg);font:16px/1.45 system-ui,sans-serif}
+main{max-width:70rem;margin:0 auto;padding:1rem}
+h1{font-size:1.5rem;overflow-wrap:anywhere}h2{font-size:1.15rem;margin:1.6rem 0 .5rem}
+.scroll{overflow-x:auto}
+table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.9rem}
+th,td{text-align:left;padding:.2rem .6rem;border-bottom:1px solid var(--line);vertical-align:top}
+.facts th{font-weight:500;color:var(--dim);white-space:nowrap}.facts td{overflow-wrap:anywhere}
+.box{padding:.6rem .9rem;border-radius:.4rem;margin:.6rem 0}.box ul{margin:.3rem 0;padding-left:1.2rem}
+.good{background:var(--good)}.warn{background:var(--warn)}.bad{background:var(--bad)}
+.hint{color:var(--dim);font-size:.85rem}.nlos-text{color:var(--nlos)}
+pre{background:var(--warn);padding:.6rem;border-radius:.4rem;white-space:pre-wrap;overflow-wrap:anywhere}
+.controls{display:flex;flex-wrap:wrap;gap:.3rem .9rem;align-items:center;margin-bottom:.4rem}
+.controls label{white-space:nowrap;padding:.2rem 0}button{font:inherit;min-width:2.2rem;min-height:2.2rem}
+.mapbox{border:1px solid var(--line);border-radius:.4rem;overflow:hidden}
+#map-view{display:block;width:100%;max-height:80vh;touch-action:none;cursor:grab;background:#cdcdcd}
+image.grid{image-rendering:pixelated}
+.trajectory polyline{fill:none;stroke:#1769aa;stroke-width:calc(var(--s)*2px);stroke-linejoin:round}
+.trajectory .s1{stroke:#8e24aa}.trajectory .s2{stroke:#00838f}.trajectory .s3{stroke:#ef6c00}.trajectory .s4{stroke:#5d4037}
+.trajectory .s5{stroke:#455a64}
+.start{fill:#1769aa;stroke:#fff;r:calc(var(--s)*5px);stroke-width:calc(var(--s)*1px)}
+.anchor path{fill:#b3261e;stroke:#fff;stroke-width:1px;transform:scale(var(--s))}
+.anchor text{transform:translateX(calc(var(--s)*10px))}
+.anchor.doubt path{fill:#ef6c00}
+.anchor ellipse{fill:#b3261e33;stroke:#b3261e;stroke-width:calc(var(--s)*1px)}
+.anchor .mirror{fill:none;stroke:#ef6c00;r:calc(var(--s)*8px);stroke-width:calc(var(--s)*2px);
+stroke-dasharray:calc(var(--s)*4px)}
+.anchor text,.bar text{font-size:calc(var(--s)*14px);fill:#1b1f24;paint-order:stroke;
+stroke:#fff;stroke-width:calc(var(--s)*4px)}
+.bar path{stroke:#1b1f24;stroke-width:calc(var(--s)*3px)}
+.closure path{fill:none;stroke-width:calc(var(--s)*1.5px);stroke-linecap:round}
+.closure path:hover{stroke-width:calc(var(--s)*6px)}
+.kept path{stroke:#2e7d32}.rejected path{stroke:#d81b60;stroke-dasharray:calc(var(--s)*5px)}
+.hidden{display:none}
+figure{margin:.6rem 0}figcaption{font-weight:600}
+.residuals{display:block;width:100%;height:7rem;border:1px solid var(--line);border-radius:.3rem}
+.residuals path{fill:none;stroke-width:3;stroke-linecap:round;vector-effect:non-scaling-stroke}
+.residuals .axis{stroke:var(--line);stroke-width:1}.residuals .los{stroke:var(--path)}.residuals .nlos{stroke:var(--nlos)}
+@media (max-width:40rem){main{padding:.6rem}body{font-size:15px}}
+"""
+
+SCRIPT = """
+(function () {
+  'use strict';
+  document.querySelectorAll('[data-layer]').forEach(function (box) {
+    box.addEventListener('change', function () {
+      document.querySelectorAll('#map-view .' + box.dataset.layer).forEach(function (layer) {
+        layer.classList.toggle('hidden', !box.checked);
+      });
+    });
+  });
+  var svg = document.getElementById('map-view'), all = svg.viewBox.baseVal;
+  var whole = [all.x, all.y, all.width, all.height], pointers = new Map();
+  function rescale() { svg.style.setProperty('--s', 1 / svg.getScreenCTM().a); }
+  window.addEventListener('resize', rescale);
+  rescale();
+  function point(event) {
+    return new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+  }
+  function zoom(at, factor) {
+    var width = all.width * factor;
+    if (width > whole[2] * 3 || width < whole[2] / 400) { return; }
+    all.x = at.x - (at.x - all.x) * factor;
+    all.y = at.y - (at.y - all.y) * factor;
+    all.width = width;
+    all.height *= factor;
+    rescale();
+  }
+  function middle() { return {x: all.x + all.width / 2, y: all.y + all.height / 2}; }
+  svg.addEventListener('wheel', function (event) {
+    event.preventDefault();
+    zoom(point(event), event.deltaY > 0 ? 1.2 : 1 / 1.2);
+  }, {passive: false});
+  svg.addEventListener('pointerdown', function (event) {
+    svg.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, event);
+  });
+  svg.addEventListener('pointermove', function (event) {
+    var before = pointers.get(event.pointerId);
+    if (!before) { return; }
+    if (pointers.size === 2) {
+      var other = Array.from(pointers.values()).find(function (p) { return p.pointerId !== event.pointerId; });
+      var was = Math.hypot(before.clientX - other.clientX, before.clientY - other.clientY);
+      var is = Math.hypot(event.clientX - other.clientX, event.clientY - other.clientY);
+      if (was > 0 && is > 0) { zoom(point(other), was / is); }
+    } else {
+      var a = point(before), b = point(event);
+      all.x += a.x - b.x;
+      all.y += a.y - b.y;
+    }
+    pointers.set(event.pointerId, event);
+  });
+  ['pointerup', 'pointercancel'].forEach(function (name) {
+    svg.addEventListener(name, function (event) { pointers.delete(event.pointerId); });
+  });
+  document.getElementById('zoom-in').addEventListener('click', function () { zoom(middle(), 1 / 1.5); });
+  document.getElementById('zoom-out').addEventListener('click', function () { zoom(middle(), 1.5); });
+  document.getElementById('zoom-all').addEventListener('click', function () {
+    all.x = whole[0]; all.y = whole[1]; all.width = whole[2]; all.height = whole[3];
+    rescale();
+  });
+}());
+"""
