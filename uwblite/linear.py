@@ -40,7 +40,7 @@ def free_unknowns(graph: Graph) -> dict[str, NDArray[np.bool_]]:
     """Return by block which unknowns are not held fixed."""
     held = {"poses": graph.fixed_poses, "anchors": graph.fixed_anchors, "calibration": graph.fixed_calibration}
     counts = {"poses": len(graph.poses), "anchors": len(graph.anchors), "calibration": len(graph.calibration.values)}
-    free = {name: np.ones(count, dtype=bool) if held[name] is None else ~held[name] for name, count in counts.items()}
+    free = {name: np.ones(counts[name], dtype=bool) if mask is None else ~mask for name, mask in held.items()}
     if graph.fixed_poses is None:
         free["poses"][:1] = False
     return free
@@ -99,7 +99,7 @@ class NormalEquations:
         apart = np.stack(np.divmod(unique[:-1], max(m, 1)), axis=1)
         pairs = np.concatenate([np.repeat(np.arange(m), 2).reshape(m, 2), apart])
         ends = np.cumsum([len(k) for k in keys])
-        return pairs, [which[a:b] + m for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return pairs, [part + m for part in np.split(which, ends)[1:-1]]
 
     def _place_blocks(self, pairs: Ints, corner: Ints, width: Ints) -> tuple[Ints, Ints]:
         """Lay the blocks out in the array of values; return row and column of every value."""
@@ -133,7 +133,7 @@ class NormalEquations:
     ) -> None:
         """Find the place of every product of two Jacobian columns of one edge."""
         n, following = self.unknowns.size, iter(which)
-        self._gradient_rows, self._positions, self._twice = [], [], []
+        gradient_rows, positions, twice = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0, bool)]
         for lin, nodes in zip(linearized, touched, strict=True):
             stacked = np.concatenate([scalars[name][:, index] for name, index, _ in lin.blocks])
             owner = np.repeat(np.arange(len(nodes)), [jac.shape[2] for _, _, jac in lin.blocks])
@@ -142,33 +142,34 @@ class NormalEquations:
                 for q, b in enumerate(nodes[:p]):
                     pair[p, q] = np.where(a == b, a, next(following))
                 pair[p, p] = a
-            k, l = np.tril_indices(len(stacked))
-            low, high = np.minimum(stacked[k], stacked[l]), np.maximum(stacked[k], stacked[l])
-            block = np.stack([pair[p, q] for p, q in zip(owner[k], owner[l], strict=True)])
-            inner = high < self._border_row
-            block = np.where(inner, block, 0)
-            place = np.where(inner, self._base[block] + high * self._stride[block], self._border_base + high * n) + low
-            self._positions.append(np.where(low >= 0, place, self._trash).ravel())
-            self._gradient_rows.append(np.where(stacked >= 0, stacked, n).ravel())
-            self._twice.append(np.nonzero(((k != l)[:, None] & (low == high) & (low >= 0)).ravel())[0])
+            gradient_rows.append(np.where(stacked >= 0, stacked, n).ravel())
+            for k, l in zip(*np.tril_indices(len(stacked)), strict=True):
+                low, high = np.minimum(stacked[k], stacked[l]), np.maximum(stacked[k], stacked[l])
+                inner = high < self._border_row
+                block = np.where(inner, pair[owner[k], owner[l]], 0)
+                place = np.where(inner, self._base[block] + high * self._stride[block], self._border_base + high * n) + low
+                positions.append(np.where(low >= 0, place, self._trash))
+                twice.append((low == high) & (low >= 0) if k != l else np.zeros(len(low), bool))
+        self._gradient_rows, self._positions = np.concatenate(gradient_rows), np.concatenate(positions)
+        self._twice = np.nonzero(np.concatenate(twice))[0]
 
     def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
         """Fill H and g from whitened Jacobians and a weight per edge."""
-        n = self.unknowns.size
-        gradient, values = np.zeros(n + 1), np.zeros(self._trash + 1)
-        for lin, weight, rows, place, twice in zip(
-            linearized, weights, self._gradient_rows, self._positions, self._twice, strict=True
-        ):
-            jacobian = np.concatenate([jac.transpose(1, 2, 0) for _, _, jac in lin.blocks], axis=1)
+        products, slopes = np.empty(len(self._positions)), np.empty(len(self._gradient_rows))
+        at = slope_at = 0
+        for lin, weight in zip(linearized, weights, strict=True):
+            jacobian = _stacked(lin)
             weighted = jacobian if weight is None else jacobian * weight
-            gradient += np.bincount(rows, _contract(weighted, lin.residuals.T[:, None]).ravel(), n + 1)
-            products = np.concatenate(
-                [_contract(weighted[:, k : k + 1], jacobian[:, : k + 1]) for k in range(jacobian.shape[1])]
-            )
-            products = products.ravel()
-            products[twice] *= 2.0
-            values += np.bincount(place, products, len(values))
-        self.values, self.gradient = values, gradient[:-1]
+            _, k, e = jacobian.shape
+            _contract(weighted, lin.residuals.T[:, None], slopes[slope_at : slope_at + k * e].reshape(k, e))
+            slope_at += k * e
+            for row in range(k):
+                block = products[at : at + (row + 1) * e].reshape(row + 1, e)
+                _contract(weighted[:, row : row + 1], jacobian[:, : row + 1], block)
+                at += (row + 1) * e
+        products[self._twice] *= 2.0
+        self.values = np.bincount(self._positions, products, self._trash + 1).astype(np.float64, copy=False)
+        self.gradient = np.bincount(self._gradient_rows, slopes, self.unknowns.size + 1)[:-1].astype(np.float64, copy=False)
 
     @property
     def diagonal(self) -> Floats:
@@ -187,6 +188,19 @@ class NormalEquations:
         return self._layout.factor(values)
 
 
-def _contract(a: Floats, b: Floats) -> Floats:
-    """Return the sum over the first axis of a b."""
-    return a[0] * b[0] if len(a) == 1 else np.add.reduce(a * b, axis=0)
+def _stacked(lin: Linearization) -> Floats:
+    """Return the Jacobians of one kind side by side, (d, k, e): the edges, over which everything runs, come last."""
+    d = lin.residuals.shape[1]
+    stacked = np.empty((d, sum(jac.shape[2] for _, _, jac in lin.blocks), len(lin.residuals)))
+    first = 0
+    for _, _, jac in lin.blocks:
+        stacked[:, first : first + jac.shape[2]] = jac.transpose(1, 2, 0)
+        first += jac.shape[2]
+    return stacked
+
+
+def _contract(a: Floats, b: Floats, out: Floats) -> None:
+    """Put the sum over the first axis of a b into out."""
+    np.multiply(a[0], b[0], out=out)
+    for left, right in zip(a[1:], b[1:], strict=True):
+        out += left * right

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import se2
-from .graph import Graph
 from .factorization import Factor
+from .graph import Graph
 from .linear import NormalEquations, Unknowns
 from .solver import edge_weights
 
