@@ -1,0 +1,150 @@
+import contextlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwblite.errors import FormatError
+from uwblite.io.map_server import read_map, write_map
+from uwblite.io.png import decode_png, encode_png
+from uwblite.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridGeometry, OccupancyGrid
+
+
+def sample(rows=7, cols=11, seed=0, origin=(-12.345678, 3.05)):
+    rng = np.random.default_rng(seed)
+    log_odds = rng.choice([0.0, -5.0, -0.5, 0.3, 0.5, 6.0], (rows, cols)).astype(np.float32)
+    return OccupancyGrid(GridGeometry(0.05, np.array(origin), rows, cols), log_odds)
+
+
+def load_like_nav2(yaml_path):
+    """The rules of nav2's map_io: required keys, thresholds with strict comparisons, row order, origin."""
+    yaml = pytest.importorskip("yaml")
+    doc = yaml.safe_load(yaml_path.read_text())
+    image_file = yaml_path.parent / doc["image"]
+    mode = doc.get("mode", "trinary")
+    resolution, origin = float(doc["resolution"]), doc["origin"]
+    occupied, free, negate = float(doc["occupied_thresh"]), float(doc["free_thresh"]), bool(doc["negate"])
+    assert len(origin) == 3
+    data = image_file.read_bytes()
+    if data.startswith(b"P5"):
+        magic, size, depth, pixels = data.split(b"\n", 3)
+        assert (magic, depth) == (b"P5", b"255")
+        width, height = map(int, size.split())
+        image = np.frombuffer(pixels, np.uint8).reshape(height, width, 1)
+    else:
+        image = decode_png(data)
+    height, width, channels = image.shape
+    cells = np.empty((height, width), int)
+    for y in range(height):
+        for x in range(width):
+            alpha = image[y, x, -1] if channels in (2, 4) else 255
+            shade = image[y, x, 0] / 255.0
+            p = shade if negate else 1.0 - shade
+            if mode == "trinary":
+                value = OCCUPIED if occupied < p else FREE if p < free else UNKNOWN
+            elif mode == "scale":
+                if alpha != 255:
+                    value = UNKNOWN
+                elif occupied < p:
+                    value = OCCUPIED
+                elif p < free:
+                    value = FREE
+                else:
+                    value = round((p - free) / (occupied - free) * 100)
+            cells[height - y - 1, x] = value
+    return cells, resolution, origin
+
+
+def test_nav2_reads_the_same_cells(tmp_path):
+    grid = sample()
+    image, yaml = write_map(tmp_path, grid)
+    cells, resolution, origin = load_like_nav2(yaml)
+    np.testing.assert_array_equal(cells, grid.states())
+    assert resolution == 0.05
+    assert origin == [-12.345678, 3.05, 0]
+    assert image.name == "map.pgm"
+    assert "free_thresh: 0.196\n" in yaml.read_text()
+    assert set(np.unique(np.frombuffer(image.read_bytes()[-77:], np.uint8))) == {0, 205, 254}
+
+
+def test_nav2_reads_probabilities_in_scale_mode(tmp_path):
+    grid = sample()
+    _, yaml = write_map(tmp_path, grid, mode="scale")
+    cells, _, _ = load_like_nav2(yaml)
+    p = grid.probability()
+    expected = np.where(p > 0.65, 100, np.where(p < 0.196, 0, (p - 0.196) / (0.65 - 0.196) * 100))
+    np.testing.assert_allclose(cells[grid.log_odds != 0], expected[grid.log_odds != 0], atol=1.0)
+    assert (cells[grid.log_odds == 0] == UNKNOWN).all()
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale"])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_written_is_read(tmp_path, mode, seed):
+    grid = sample(rows=1 + seed, seed=seed)
+    _, yaml = write_map(tmp_path, grid, name="a", mode=mode)
+    back = read_map(yaml)
+    np.testing.assert_array_equal(back.states(), grid.states())
+    np.testing.assert_allclose(back.geometry.origin, grid.geometry.origin, atol=1e-8)
+    assert back.geometry.resolution == grid.geometry.resolution
+
+
+def test_the_lower_left_corner_is_the_origin(tmp_path):
+    log_odds = np.zeros((4, 6), np.float32)
+    log_odds[0, 0] = 5.0
+    _, yaml = write_map(tmp_path, OccupancyGrid(GridGeometry(0.5, np.array([10.0, 20.0]), 4, 6), log_odds))
+    np.testing.assert_allclose(read_map(yaml).occupied_points(), [[10.25, 20.25]])
+
+
+def test_maps_of_other_writers_are_read(tmp_path):
+    (tmp_path / "m.pgm").write_bytes(b"P5\n# CREATOR: map_saver 0.05 m/pix\n2 2\n255\n" + bytes([0, 254, 205, 254]))
+    (tmp_path / "m.yaml").write_text(
+        'image: "m.pgm"  # a comment\nresolution: 0.050000\norigin:\n  - -1.5\n  - 2\n  - 0.0\n'
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n\n"
+    )
+    grid = read_map(tmp_path / "m.yaml")
+    np.testing.assert_array_equal(grid.states(), [[UNKNOWN, FREE], [OCCUPIED, FREE]])
+    np.testing.assert_allclose(grid.geometry.origin, [-1.5, 2.0])
+    (tmp_path / "m.pgm").write_bytes(b"P2 2 2 100\n100 0\n0 100\n")
+    np.testing.assert_array_equal(read_map(tmp_path / "m.yaml").states(), [[OCCUPIED, FREE], [FREE, OCCUPIED]])
+    (tmp_path / "m.pgm").write_bytes(encode_png(np.array([[[0, 0, 0, 255], [0, 0, 0, 0]]], np.uint8)))
+    np.testing.assert_array_equal(read_map(tmp_path / "m.yaml").states(), [[OCCUPIED, UNKNOWN]])
+
+
+GOOD = {"image": "map.pgm", "resolution": "0.05", "origin": "[0, 0, 0]", "occupied_thresh": "0.65", "free_thresh": "0.196"}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"image": ""}, "image is missing"),
+        ({"image": "none.pgm"}, "cannot be read"),
+        ({"image": "."}, "cannot be read"),
+        ({"resolution": "x"}, "resolution: 'x' is not a number"),
+        ({"resolution": "0"}, "positive"),
+        ({"origin": "[0, 0]"}, "origin"),
+        ({"origin": "3"}, "origin must be a list"),
+        ({"origin": "[0, 0, 0.5]"}, "yaw 0"),
+        ({"free_thresh": "nan"}, "free_thresh"),
+        ({"mode": "raw"}, "mode raw"),
+        ({"? strange": ""}, "not 'key: value'"),
+    ],
+)
+def test_wrong_maps_are_named(tmp_path, change, says):
+    write_map(tmp_path, sample())
+    text = "".join(f"{key}: {value}\n" for key, value in (GOOD | change).items())
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(FormatError, match=says):
+        read_map(tmp_path / "bad.yaml")
+
+
+@given(st.binary(max_size=80), st.text("imageresoluton: []-0123\n#'", max_size=80))
+def test_anything_else_is_a_format_error(tmp_path_factory, image, extra):
+    folder = tmp_path_factory.mktemp("map")
+    (folder / "map.pgm").write_bytes(image)
+    (folder / "map.yaml").write_text("".join(f"{key}: {value}\n" for key, value in GOOD.items()) + extra)
+    with pytest.raises(FormatError):
+        read_map(folder / "map.yaml")
+    (folder / "map.pgm").write_bytes(b"P5 2 2 255\n" + image)
+    with contextlib.suppress(FormatError):
+        read_map(folder / "map.yaml")

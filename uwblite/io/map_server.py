@@ -1,0 +1,213 @@
+"""Maps as ROS map_server and nav2 exchange them: ``map.yaml`` beside ``map.pgm`` (or a PNG).
+
+Image row 0 is the top, that is the largest y; ``origin`` is the pose of the lower left corner. A pixel x stands for
+the probability p = (255 - x) / 255 of being occupied. On loading, p > occupied_thresh is occupied, p < free_thresh is free
+and the rest unknown. The usual pixels 0, 254 and 205 give p = 1, 0.004 and 0.19608, so free_thresh must not
+exceed 0.196 or everything unknown becomes free.
+"""
+
+import math
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..grid_geometry import GridGeometry
+from ..occupancy_grid import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_ABOVE, OccupancyGrid
+from .files import replacing, write_text
+from .png import SIGNATURE, decode_png, encode_png
+
+Image = NDArray[np.uint8]
+
+PIXEL_OCCUPIED, PIXEL_UNKNOWN, PIXEL_FREE = 0, 205, 254
+_MOST_BYTES = 1 << 28
+"""Largest image read."""
+_READ_ODDS = 4.0
+"""Log-odds given to occupied and free cells of a map that was read; three states carry no more."""
+
+
+def write_map(
+    folder: str | os.PathLike[str], grid: OccupancyGrid, *, name: str = "map", mode: str = "trinary"
+) -> tuple[Path, Path]:
+    """Write a map as an image and a YAML file beside it.
+
+    Parameters
+    ----------
+    folder : existing folder.
+    grid : the map.
+    name : name of both files without ending.
+    mode : 'trinary' writes a binary PGM of occupied, free and unknown; 'scale' a PNG of probabilities with unknown
+        cells transparent.
+
+    Returns
+    -------
+    Paths of the image and of the YAML file.
+
+    Raises
+    ------
+    OSError : a file cannot be written.
+    """
+    image = Path(folder) / (f"{name}.png" if mode == "scale" else f"{name}.pgm")
+    yaml = Path(folder) / f"{name}.yaml"
+    data = encode_png(scale_image(grid)) if mode == "scale" else encode_pgm(trinary_image(grid))
+    with replacing(image) as stream:
+        stream.write(data)
+    x, y = grid.geometry.origin.tolist()
+    write_text(
+        yaml,
+        f"image: {image.name}\nmode: {mode}\nresolution: {grid.geometry.resolution:.9g}\n"
+        f"origin: [{x + 0.0:.9g}, {y + 0.0:.9g}, 0]\nnegate: 0\n"
+        f"occupied_thresh: {OCCUPIED_ABOVE}\nfree_thresh: {FREE_BELOW}\n",
+    )
+    return image, yaml
+
+
+def trinary_image(grid: OccupancyGrid) -> Image:
+    """Return the map as pixels 0 (occupied), 254 (free) and 205 (unknown), largest y on top."""
+    states = grid.states()[::-1]
+    pixels = np.full(states.shape, PIXEL_UNKNOWN, dtype=np.uint8)
+    pixels[states == OCCUPIED] = PIXEL_OCCUPIED
+    pixels[states == FREE] = PIXEL_FREE
+    return pixels
+
+
+def scale_image(grid: OccupancyGrid) -> Image:
+    """Return the map as grey = 1 - p and alpha (rows, cols, 2), unknown cells transparent, largest y on top."""
+    grey = np.rint(255.0 * (1.0 - grid.probability()[::-1])).astype(np.uint8)
+    alpha = np.where(grid.log_odds[::-1] != 0.0, 255, 0).astype(np.uint8)
+    return np.stack([grey, alpha], axis=-1)
+
+
+def encode_pgm(image: Image) -> bytes:
+    """Return a grey image (height, width) as binary PGM."""
+    height, width = image.shape
+    return f"P5\n{width} {height}\n255\n".encode() + image.tobytes()
+
+
+def read_map(path: str | os.PathLike[str]) -> OccupancyGrid:
+    """Read a map from its YAML file and the image named there (PGM or PNG).
+
+    Modes trinary (the default) and scale are read, by the rules of map_server. Occupied and free cells get fixed
+    log-odds: the file holds no more than the three states.
+
+    Raises
+    ------
+    FormatError : a file is missing or is not what it should be.
+    """
+    name = os.fspath(path)
+    settings = _parse_yaml(_read(name).decode(errors="replace"), name)
+    image = _text(settings, "image", name)
+    image_path = os.path.join(os.path.dirname(name), image)
+    data = _read(image_path)
+    pixels = decode_png(data, image_path) if data.startswith(SIGNATURE) else _decode_pgm(data, image_path)[:, :, None]
+    resolution = _number(settings, "resolution", name)
+    origin = _numbers(settings, "origin", name)
+    occupied, free = _number(settings, "occupied_thresh", name), _number(settings, "free_thresh", name)
+    if not resolution > 0 or len(origin) != 3:
+        raise FormatError("resolution must be positive and origin must be [x, y, yaw]", name)
+    if origin[2] != 0.0:
+        raise FormatError(f"origin is turned by {origin[2]} rad; only maps with yaw 0 are read", name)
+    mode = str(settings.get("mode", "trinary"))
+    if mode not in ("trinary", "scale"):
+        raise FormatError(f"mode {mode} is not read; use trinary or scale", name)
+    colours = 3 if pixels.shape[2] >= 3 else 1
+    grey = pixels[:, :, :colours].mean(axis=2)
+    negate = str(settings.get("negate", "0")).lower() in ("1", "true")
+    p = (grey if negate else 255.0 - grey) / 255.0
+    odds = np.where(p > occupied, _READ_ODDS, np.where(p < free, -_READ_ODDS, 0.0))
+    if pixels.shape[2] in (2, 4):
+        odds[pixels[:, :, -1] == 0] = 0.0
+    rows, cols = grey.shape
+    geometry = GridGeometry(resolution, np.array(origin[:2]), rows, cols)
+    return OccupancyGrid(geometry, np.ascontiguousarray(odds[::-1], dtype=np.float32))
+
+
+def _read(path: str) -> bytes:
+    try:
+        with open(path, "rb") as stream:
+            data = stream.read(_MOST_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise FormatError(f"cannot be read: {reason}", path) from None
+    if len(data) > _MOST_BYTES:
+        raise FormatError("the file is too large for a map", path)
+    return data
+
+
+def _parse_yaml(text: str, path: str) -> dict[str, str | list[str]]:
+    """Read the flat YAML of a map: ``key: value``, lists in brackets or as ``- item`` lines, comments, quotes."""
+    settings: dict[str, str | list[str]] = {}
+    key = ""
+    for number, line in enumerate(text.splitlines(), 1):
+        line = re.sub(r"(^|\s)#.*", "", line).rstrip()
+        if not line or line in ("---", "...") or line.startswith("%"):
+            continue
+        if match := re.match(r"\s*-\s+(.*)", line):
+            items = settings.get(key) or []
+            if not key or isinstance(items, str):
+                raise FormatError("a list item without a key", path, number)
+            settings[key] = [*items, match[1].strip()]
+            continue
+        match = re.match(r"([A-Za-z_]+)\s*:(?:\s+(.*))?$", line)
+        if not match:
+            raise FormatError("is not 'key: value'", path, number)
+        key, value = match[1], (match[2] or "").strip()
+        if value.startswith("["):
+            settings[key] = [item.strip() for item in value.strip("[]").split(",")]
+        else:
+            settings[key] = value[1:-1] if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"" else value
+    return settings
+
+
+def _text(settings: dict[str, str | list[str]], key: str, path: str) -> str:
+    value = settings.get(key)
+    if not isinstance(value, str) or not value:
+        raise FormatError(f"{key} is missing; needed are image, resolution, origin, occupied_thresh and free_thresh", path)
+    return value
+
+
+def _number(settings: dict[str, str | list[str]], key: str, path: str) -> float:
+    return _finite(_text(settings, key, path), key, path)
+
+
+def _numbers(settings: dict[str, str | list[str]], key: str, path: str) -> list[float]:
+    value = settings.get(key)
+    if not isinstance(value, list):
+        raise FormatError(f"{key} must be a list of numbers", path)
+    return [_finite(item, key, path) for item in value]
+
+
+def _finite(text: str, key: str, path: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise FormatError(f"{key}: {text[:40]!r} is not a number", path)
+    return value
+
+
+def _decode_pgm(data: bytes, path: str) -> Image:
+    """Return the pixels of a PGM with values up to 255, binary (P5) or text (P2)."""
+    header = re.match(rb"(P[25])" + 3 * rb"(?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})" + rb"\s", data)
+    if not header:
+        raise FormatError("this is neither a PGM nor a PNG picture", path)
+    width, height, highest = (int(header[i]) for i in (2, 3, 4))
+    if not 0 < highest <= 255 or not 0 < width * height <= _MOST_BYTES:
+        raise FormatError(f"a PGM of {width} x {height} pixels with values up to {highest} is not read", path)
+    body = data[header.end() :]
+    if header[1] == b"P2":
+        try:
+            pixels = np.array(body.split()[: width * height], dtype=np.uint8)
+        except (ValueError, OverflowError):
+            raise FormatError("the PGM's pixels are damaged", path) from None
+    else:
+        pixels = np.frombuffer(body[: width * height], dtype=np.uint8)
+    if len(pixels) < width * height:
+        raise FormatError("the PGM is cut off", path)
+    if highest != 255:
+        pixels = (np.minimum(pixels, highest) * (255.0 / highest)).astype(np.uint8)
+    return pixels.reshape(height, width)

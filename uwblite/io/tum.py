@@ -1,0 +1,87 @@
+"""Trajectories as TUM text, as evo reads it: ``timestamp tx ty tz qx qy qz qw``, seconds and metres, one pose a line."""
+
+import os
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from .files import write_bytes
+from .source import open_source
+
+Floats = NDArray[np.float64]
+
+
+def write_tum(path: str | os.PathLike[str], stamps: Floats, poses: Floats) -> None:
+    """Write planar poses; the previous file stays whole until the new one is complete.
+
+    Parameters
+    ----------
+    path : the file.
+    stamps : (n,) s, written to the microsecond.
+    poses : (n, 3) x, y, theta; m, rad; written to the micrometre and 1e-9 of the quaternion.
+    """
+    half = 0.5 * poses[:, 2]
+    columns = (stamps, poses[:, 0], poses[:, 1], np.sin(half), np.cos(half))
+    rows = zip(*(c.tolist() for c in columns), strict=True)
+    # + 0.0 turns a negative zero into zero, so that equal poses look equal.
+    text = "".join(f"{t:.6f} {x + 0.0:.6f} {y + 0.0:.6f} 0 0 0 {s + 0.0:.9f} {c:.9f}\n" for t, x, y, s, c in rows)
+    write_bytes(path, text.encode())
+
+
+def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
+    """Read a TUM trajectory; roll, pitch and height are dropped.
+
+    Parameters
+    ----------
+    path : the file, plain or gzip; ``-`` = standard input. Blank lines and lines beginning with ``#`` are skipped.
+
+    Returns
+    -------
+    stamps : (n,) s, in the order of the file.
+    poses : (n, 3) x, y and yaw; m, rad.
+
+    Raises
+    ------
+    FormatError : a line has not eight finite numbers, or there is no pose.
+    """
+    parts: list[Floats] = []
+    with open_source(path) as source:
+        number = 0
+        for block in source.blocks():
+            lines = block.split(b"\n")[:-1]
+            rows = [(number + i, line.split()) for i, line in enumerate(lines, 1) if not line.lstrip().startswith(b"#")]
+            rows = [(n, tokens) for n, tokens in rows if tokens]
+            parts.append(_numbers(rows, source.path))
+            number += len(lines)
+        table = np.concatenate(parts) if parts else np.zeros((0, 8))
+        if len(table) == 0:
+            raise FormatError("no poses in it", source.path)
+    qx, qy, qz, qw = table[:, 4:].T
+    norm = qx * qx + qy * qy + qz * qz + qw * qw
+    # Files without orientation write four zeros: heading 0.
+    yaw = np.arctan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy * qy + qz * qz))
+    return table[:, 0].copy(), np.stack([table[:, 1], table[:, 2], np.where(norm > 0, yaw, 0.0)], axis=1)
+
+
+def _numbers(rows: list[tuple[int, list[bytes]]], path: str) -> Floats:
+    """Return (n, 8) finite numbers."""
+    for number, tokens in rows:
+        if len(tokens) != 8:
+            raise FormatError(f"{len(tokens)} columns, expected 8: timestamp tx ty tz qx qy qz qw", path, number)
+    try:
+        table = np.array([tokens for _, tokens in rows], dtype=np.float64).reshape(-1, 8)
+    except ValueError:
+        table = np.array([[_number(token, path, n) for token in tokens] for n, tokens in rows]).reshape(-1, 8)
+    # Squares of the quaternion must stay finite too.
+    bad = np.flatnonzero(~(np.abs(table) < 1e100).all(axis=1))
+    if len(bad):
+        raise FormatError("a number is not finite", path, rows[bad[0]][0])
+    return table
+
+
+def _number(token: bytes, path: str, line: int) -> float:
+    try:
+        return float(token)
+    except ValueError:
+        raise FormatError(f"{token[:30]!r} is not a number", path, line) from None
