@@ -1,0 +1,97 @@
+"""An emulated Kobuki base: fifty feedback packets a second, wheels and gyro from a played odometry."""
+
+import math
+import struct
+from collections.abc import Iterator
+
+from .world import Feed, Pose, WorldClock
+
+PERIOD = 0.020
+METRES_PER_TICK = 0.0024369168713639 * 0.035
+WHEEL_BASE = 0.230
+
+
+class KobukiDevice:
+    """The base.
+
+    Parameters
+    ----------
+    poses : odometry to play; before the first and after the last the base stands.
+    clock : world time.
+    clock_start : ms on its clock at power-up.
+    clock_skew : relative error of its crystal.
+    on_packet : called with (host time, x, y, theta) of each packet sent.
+    """
+
+    def __init__(
+        self, poses: Iterator[Pose], clock: WorldClock, *, clock_start: int = 0, clock_skew: float = 0.0, on_packet=None
+    ) -> None:
+        self._feed, self._clock = Feed(poses), clock
+        self._from = self._feed.pop()
+        self._ms, self._skew = clock_start, clock_skew
+        self._on_packet = on_packet or (lambda *_: None)
+        self._left = self._right = 0.0
+        self._travelled = self._from
+        self._sent = 0
+        self._began: float | None = None
+
+    def power_up(self, now: float) -> None:
+        """USB was unplugged; the base itself stays on and counts on."""
+
+    def next_time(self, now: float) -> float:
+        """Return when the next packet is due, host s."""
+        if self._began is None:
+            self._began = now
+        return self._began + self._sent * PERIOD
+
+    def receive(self, data: bytes, now: float) -> bytes:
+        """Take commands; there are no motors."""
+        return b""
+
+    def advance(self, now: float) -> bytes:
+        """Return the packets due up to host time `now`."""
+        out = b""
+        while (due := self.next_time(now)) <= now:
+            self._sent += 1
+            out += self._packet(due)
+        return out
+
+    def _pose(self, time: float) -> Pose:
+        while self._feed.head is not None and self._feed.head.time <= time:
+            self._from = self._feed.pop()
+        a, b = self._from, self._feed.head
+        if b is None or time <= a.time:
+            return Pose(time, a.x, a.y, a.theta)
+        u = (time - a.time) / (b.time - a.time)
+        turn = math.remainder(b.theta - a.theta, 2 * math.pi)
+        return Pose(time, a.x + u * (b.x - a.x), a.y + u * (b.y - a.y), a.theta + u * turn)
+
+    def _packet(self, due: float) -> bytes:
+        pose = self._pose(max(0.0, self._clock.world(due)))
+        before, self._travelled = self._travelled, pose
+        dx, dy = pose.x - before.x, pose.y - before.y
+        turn = math.remainder(pose.theta - before.theta, 2 * math.pi)
+        middle = before.theta + turn / 2
+        travel = math.cos(middle) * dx + math.sin(middle) * dy
+        self._left += (travel - turn * WHEEL_BASE / 2) / METRES_PER_TICK
+        self._right += (travel + turn * WHEEL_BASE / 2) / METRES_PER_TICK
+        self._on_packet(due, pose.x, pose.y, pose.theta)
+        assert self._began is not None
+        ms = (self._ms + math.floor((due - self._began) * 1000 * (1 + self._skew))) & 0xFFFF
+        angle = round(math.degrees(math.remainder(pose.theta, 2 * math.pi)) * 100)
+        rate = max(-32768, min(32767, round(math.degrees(turn / PERIOD) * 100)))
+        left, right = round(self._left) & 0xFFFF, round(self._right) & 0xFFFF
+        subs = [
+            (0x01, struct.pack("<HBBBHHbbBBBB", ms, 0, 0, 0, left, right, 0, 0, 0, 0, 160, 0)),
+            (0x03, b"\0\0\0"),
+            (0x04, struct.pack("<hh3x", max(-32768, min(32767, angle)), rate)),
+            (0x05, struct.pack("<HHH", 2000, 2000, 2000)),
+            (0x06, b"\x05\x05"),
+            (0x0D, struct.pack("<BB6h", self._sent & 0xFF, 6, 0, 0, rate, 0, 0, rate)),
+            (0x10, struct.pack("<H4H6x", 0, 4095, 4095, 4095, 4095)),
+        ]
+        payload = b"".join(bytes((kind, len(data))) + data for kind, data in subs)
+        total = len(payload)
+        for byte in payload:
+            total ^= byte
+        return b"\xaa\x55" + bytes([len(payload)]) + payload + bytes([total])

@@ -1,0 +1,213 @@
+"""What emulated sensors measure: a CARMEN log played back, or a built-in room. Times in s since the world's start."""
+
+import gzip
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+FIRST_STEP, LAST_STEP, FRONT_STEP, RESOLUTION = 44, 725, 384, 1024
+STEPS = LAST_STEP - FIRST_STEP + 1
+MAX_MM = 5600
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One sweep."""
+
+    time: float
+    """s, first ray."""
+    values: list[int]
+    """mm per step 44..725; 0 = nothing seen, 7 = invalid."""
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """One ranging round."""
+
+    time: float
+    readings: list[tuple[int, int, int]]
+    """(short address, mm, quality) of at most four anchors."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Odometry of the base."""
+
+    time: float
+    x: float
+    y: float
+    theta: float
+
+
+class LogWorld:
+    """Plays a CARMEN log; each kind of message is read by its own pass over the file, so memory stays small.
+
+    Parameters
+    ----------
+    path : run.log or run.log.gz.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        first = islice(self._lines("ODOM", "ROBOTLASER1", "UWB"), 50)
+        self._zero = min(float(line.split()[-3]) for line in first)
+
+    def _lines(self, *names: str) -> Iterator[str]:
+        opener = gzip.open if self._path.suffix == ".gz" else open
+        with opener(self._path, "rt", encoding="ascii", errors="replace") as file:
+            for line in file:
+                if line.startswith(names):
+                    yield line
+
+    def scans(self) -> Iterator[Scan]:
+        """Yield the scans, resampled to the steps of a URG-04LX."""
+        for line in self._lines("ROBOTLASER1 "):
+            fields = line.split()
+            count = int(fields[8])
+            start, step, limit = float(fields[2]), float(fields[4]), float(fields[5])
+            yield Scan(float(fields[-3]) - self._zero, _to_steps(fields[9 : 9 + count], start, step, limit))
+
+    def epochs(self) -> Iterator[Epoch]:
+        """Yield the ranges, those within 20 ms together, at most four at a time as a DWM1001 has it."""
+        time, readings = -1.0, []
+        for line in self._lines("UWB "):
+            fields = line.split()
+            stamp = float(fields[-3]) - self._zero
+            reading = (_address(fields[1]), max(0, round(1000 * float(fields[2]))), round(float(fields[3])))
+            full = len(readings) == 4 or reading[0] in [r[0] for r in readings]
+            if readings and (full or stamp - time > 0.020):
+                yield Epoch(time, readings)
+                readings = []
+            if not readings:
+                time = stamp
+            readings.append(reading)
+        if readings:
+            yield Epoch(time, readings)
+
+    def poses(self) -> Iterator[Pose]:
+        """Yield the odometry."""
+        for line in self._lines("ODOM "):
+            fields = line.split()
+            yield Pose(float(fields[-3]) - self._zero, *(float(field) for field in fields[1:4]))
+
+    def length(self) -> float:
+        """Return the time of the last message, s."""
+        return max(float(line.split()[-3]) for line in self._lines("ODOM", "UWB")) - self._zero
+
+
+def _to_steps(texts: list[str], start: float, step: float, limit: float) -> list[int]:
+    """Convert readings in metres at `start` + i `step` rad to mm per step of the URG-04LX."""
+    values = []
+    for text in texts:
+        millimetres = round(1000 * float(text))
+        seen = 20 <= millimetres < min(1000 * limit, MAX_MM)
+        values.append(millimetres if seen else 0 if millimetres >= 20 else 7)
+    turn = 2 * math.pi / RESOLUTION
+    if len(values) == STEPS and abs(start - (FIRST_STEP - FRONT_STEP) * turn) < turn / 2 and abs(step - turn) < 1e-6:
+        return values
+    indices = [round(((FIRST_STEP + i - FRONT_STEP) * turn - start) / step) for i in range(STEPS)]
+    return [values[i] if 0 <= i < len(values) else 19 for i in indices]
+
+
+def _address(name: str) -> int:
+    """Return a short address for an anchor's name; names that are not hexadecimal get one made of their letters."""
+    try:
+        return int(name, 16) & 0xFFFF
+    except ValueError:
+        return sum((i + 1) * 251 * ord(c) for i, c in enumerate(name)) & 0xFFFF
+
+
+class RoomWorld:
+    """A room of 8 x 6 m with four anchors; the robot drives a circle of 1.5 m radius at 0.2 m/s, for ever."""
+
+    WALLS = (-4.0, -3.0, 4.0, 3.0)
+    ANCHORS = ((0xC0DE, -3.9, -2.9), (0x1A2B, 3.9, -2.9), (0x0D05, 3.9, 2.9), (0x9F3C, -3.9, 2.9))
+    RADIUS, SPEED = 1.5, 0.2
+
+    def pose(self, time: float) -> Pose:
+        """Return where the robot is."""
+        angle = max(0.0, time) * self.SPEED / self.RADIUS
+        x, y = self.RADIUS * math.sin(angle), -self.RADIUS * math.cos(angle)
+        return Pose(time, x, y, math.remainder(angle, 2 * math.pi))
+
+    def scans(self) -> Iterator[Scan]:
+        """Yield ten sweeps a second."""
+        turn, step_time = 2 * math.pi / RESOLUTION, 0.1 / RESOLUTION
+        k = 0
+        while True:
+            time = 0.1 * k
+            values = []
+            for i in range(STEPS):
+                pose = self.pose(time + i * step_time)
+                angle = pose.theta + (FIRST_STEP + i - FRONT_STEP) * turn
+                values.append(min(MAX_MM, round(1000 * self._distance(pose.x, pose.y, math.cos(angle), math.sin(angle)))))
+            yield Scan(time, [value if value < MAX_MM else 0 for value in values])
+            k += 1
+
+    def _distance(self, x: float, y: float, cos: float, sin: float) -> float:
+        left, bottom, right, top = self.WALLS
+        along_x = ((right if cos > 0 else left) - x) / cos if cos else math.inf
+        along_y = ((top if sin > 0 else bottom) - y) / sin if sin else math.inf
+        return min(along_x, along_y)
+
+    def epochs(self) -> Iterator[Epoch]:
+        """Yield ten rounds a second."""
+        k = 0
+        while True:
+            pose = self.pose(0.1 * k)
+            readings = [(a, round(1000 * math.hypot(x - pose.x, y - pose.y)), 100) for a, x, y in self.ANCHORS]
+            yield Epoch(0.1 * k + 0.037, readings)
+            k += 1
+
+    def poses(self) -> Iterator[Pose]:
+        """Yield odometry twenty times a second."""
+        k = 0
+        while True:
+            yield self.pose(0.05 * k)
+            k += 1
+
+
+class Feed:
+    """An iterator with a look ahead.
+
+    Parameters
+    ----------
+    items : anything with a `time`, in order of time.
+    """
+
+    def __init__(self, items: Iterator) -> None:
+        self._items = items
+        self.head = next(items, None)
+
+    def pop(self):
+        """Return the next item and move on."""
+        item, self.head = self.head, next(self._items, None)
+        return item
+
+
+class WorldClock:
+    """World time from host time: it stands still at zero until started, then runs at `speed`.
+
+    Parameters
+    ----------
+    speed : world seconds per host second.
+    """
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self.speed = speed
+        self.origin: float | None = None
+
+    def start(self, now: float) -> None:
+        """Let the world run from host time `now`, s."""
+        if self.origin is None:
+            self.origin = now
+
+    def world(self, now: float) -> float:
+        """Return world time at host time `now`; below zero before the start."""
+        return -1.0 if self.origin is None else (now - self.origin) * self.speed
+
+    def host(self, time: float) -> float:
+        """Return the host time of world time `time`; infinite before the start."""
+        return math.inf if self.origin is None else self.origin + time / self.speed
