@@ -74,7 +74,8 @@ def test_a_kill_while_writing_leaves_the_previous_file(tmp_path):
     write_bytes(tmp_path / "a", b"old")
     code = (
         "import os, signal, sys\nfrom uwblite.io.files import replacing\n"
-        "with replacing(sys.argv[1]) as s:\n    s.write(b'x' * 1000000)\n    s.flush()\n    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "with replacing(sys.argv[1]) as s:\n    s.write(b'x' * 1000000)\n    s.flush()\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     assert run(code, tmp_path).returncode == -signal.SIGKILL
     assert (tmp_path / "a").read_bytes() == b"old"
