@@ -132,7 +132,7 @@ class BandedLayout:
         band[self._to_band] = values[self._from_band]
         border = np.zeros(self._border * (self._band + self._border))
         border[self._to_border] = values[self._from_border]
-        return BandedFactor(band.reshape(self._band, self._half), border.reshape(self._border, -1))
+        return BandedFactor(band.reshape(self._band, self._half), border.reshape(self._border, self._band + self._border))
 
 
 class BandedFactor:
