@@ -35,6 +35,8 @@ class GrowthConfig:
     """All poses so far are solved again when their number has grown by this factor."""
     range_sigma: float = 0.15
     """Assumed standard deviation of ranges until it is learnt, m."""
+    least_sigma: float = 0.05
+    """Ranges are not trusted below this while it grows, m."""
     drift: float = 0.015
     """Assumed drift of the odometry per travelled metre, m/m."""
     heading_scales: tuple[float, ...] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
@@ -330,6 +332,7 @@ def pick_ranges(ranges: RangeEdges, which: Bools | Ints) -> RangeEdges:
         turn=ranges.turn[which],
         velocity=ranges.velocity[which],
         height=ranges.height[which],
+        stamps=ranges.stamps[which],
         calibration=ranges.calibration[which],
         weights=None if ranges.weights is None else ranges.weights[which],
     )

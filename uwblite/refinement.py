@@ -29,7 +29,11 @@ class RefinementConfig:
     """Matching of clouds in the joint refinement."""
 
     rounds: int = 12
-    """Most rounds of matching and solving."""
+    """Most rounds of matching and solving; 0 = no joint refinement (the paper)."""
+    track_rounds: int = 12
+    """Most rounds of matching neighbouring clouds before loops are sought."""
+    selections: int = 2
+    """How often the pairs are chosen anew and refined."""
     first_gate: float = 0.5
     """Farthest match in the first round, m."""
     last_gate: float = 0.12
@@ -61,7 +65,9 @@ class Refined:
     """Result of the joint refinement."""
 
     graph: Graph
-    """With the scan edges of the last round."""
+    """Solved."""
+    edges: ScanEdges
+    """The scan edges of the last round."""
     i: Ints
     j: Ints
     factors: PairFactors
@@ -175,5 +181,5 @@ def refine(
             on_round(rounds, config.rounds)
         last = gate <= config.last_gate * 1.001
         if rounds >= config.rounds or (last and moved < config.settled):
-            return Refined(solved, i, j, factors, used, sigma, rounds, moved, summary)
+            return Refined(graph, edges, i, j, factors, used, sigma, rounds, moved, summary)
         gate = max(gate * config.shrink, config.last_gate)

@@ -1,0 +1,337 @@
+"""Loop closures: which sub-maps show the same place, and what that says of their poses.
+
+Candidates come from where the graph believes the sub-maps to lie, widened by its own marginal covariance. Where that
+is small, matching starts from the graph's guess; where it is large, a correlative search over the whole uncertainty
+comes first. A match then has to explain enough points, closely enough, agree with the graph's own uncertainty, be the
+only good one, see through no wall, and finally live in peace with all other closures in the second optimisation.
+Every candidate is kept, with the reason for its fate.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import se2
+from .clouds import Clouds
+from .graph import Graph, RelativePoseEdges
+from .map_result import LoopClosure
+from .marginals import Marginals
+from .pair_matching import NearestRaster, PairFactors, PairPoints, match, measured, paint, pair_points
+from .refinement import surface_cells
+from .point_cloud import PointCloud, make_cloud
+from .robust import Kernel
+from .scan_search import SearchConfig, search
+from .solver import SolverConfig, optimize
+from .submaps import Submaps
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosureConfig:
+    """Search and acceptance of loop closures."""
+
+    partners: int = 4
+    """Candidates per sub-map and round, best expected overlap first."""
+    rounds: int = 4
+    """Most rounds of searching and solving; ends early when a round finds nothing new."""
+    direct: float = 0.5
+    """Matching starts from the graph's guess when its uncertainty (3 sigma) is below this, m; else a search comes first."""
+    reach: float = 6.0
+    """Sub-maps whose middles lie farther apart than this, after the uncertainty is taken off, are no candidates, m."""
+    search_limit: float = 8.0
+    """Largest half-width of a search, m."""
+    search_angle: float = 0.7
+    """Largest half-width of a search, rad."""
+    gate: float = 0.15
+    """Outlier distance d of the final matching, m (the paper uses 0.1)."""
+    sigma: float = 0.05
+    """Fitness: greatest root mean square distance of matched points, m."""
+    overlap: float = 0.4
+    """Least share of points with a match when the graph's guess was good."""
+    overlap_after_search: float = 0.55
+    """Least share of points with a match after a search, which can be fooled."""
+    uniqueness: float = 0.85
+    """A second place that matches this share as well as the first makes a search ambiguous."""
+    consistency: float = 16.0
+    """Largest squared Mahalanobis distance between match and graph (3 degrees of freedom; 16 = 0.1 %)."""
+    points: int = 250
+    """Points looked up per pair."""
+    match_sigma: float = 0.03
+    """Standard deviation of a match, m."""
+    correlation: float = 8.0
+    """Matches that together weigh as one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closures:
+    """Closures found so far: accepted edges between keyframes, and every candidate's story."""
+
+    edges: RelativePoseEdges
+    candidates: tuple[LoopClosure, ...]
+
+
+def no_closures() -> Closures:
+    """Return the empty collection."""
+    none = np.zeros(0, dtype=np.int64)
+    return Closures(RelativePoseEdges(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3))), ())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Pairs of sub-maps to try."""
+
+    target: Ints
+    source: Ints
+    guess: Floats
+    """(c, 3) relative pose of the reference keyframes by the graph."""
+    covariance: Floats
+    """(c, 3, 3) of the guess."""
+    spread: Floats
+    """(c,) 3 sigma of its position, m."""
+
+    def names(self, config: LoopClosureConfig) -> set[tuple[int, int, bool]]:
+        """Return (target, source, searched) of each, to remember what was tried."""
+        doubtful = self.spread > config.direct
+        return {(int(a), int(b), bool(d)) for a, b, d in zip(self.target, self.source, doubtful, strict=True)}
+
+
+def propose(
+    graph: Graph, marginals: Marginals, submaps: Submaps, session: Ints, tried: set[tuple[int, int, bool]],
+    config: LoopClosureConfig,
+) -> Candidates:
+    """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
+
+    Parameters
+    ----------
+    graph, marginals : present estimates and their uncertainty.
+    session : (k,) recording of each keyframe.
+    tried : (target, source, searched) of earlier rounds; not proposed again.
+    """
+    s = len(submaps)
+    reference = submaps.reference
+    a, b = np.triu_indices(s, 1)
+    apart = (b - a > 1) | (session[reference[a]] != session[reference[b]])
+    a, b = a[apart], b[apart]
+    poses = graph.poses[reference]
+    distance = np.hypot(*(poses[a, :2] - poses[b, :2]).T)
+    near = distance < config.reach + config.search_limit
+    a, b, distance = a[near], b[near], distance[near]
+    if not len(a):
+        return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
+    covariance = marginals.relative(reference[a], reference[b])
+    spread = 3.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
+    seen = surface_cells(submaps.clouds, poses)
+    common = np.asarray((seen @ seen.T).todense())[a, b]
+    size = np.maximum(np.diff(seen.indptr), 1)
+    expected = common / np.minimum(size[a], size[b])
+    doubtful = spread > config.direct
+    worth = np.where(doubtful, 1.0 - distance / (config.reach + np.minimum(spread, config.search_limit)), expected)
+    possible = np.where(doubtful, worth > 0.0, expected > 0.25) & (size[a] > 5) & (size[b] > 5)
+    fresh = np.array([(int(x), int(y), bool(d)) not in tried for x, y, d in zip(a, b, doubtful, strict=True)])
+    kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
+    a, b = a[kept], b[kept]
+    return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept])
+
+
+def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
+    """Return rows such that every sub-map keeps its `limit` best partners; rows with worth <= 0 never."""
+    kept: set[int] = set()
+    for one in (a, b):
+        order = np.lexsort((-worth, one))
+        rank = np.arange(len(order)) - np.searchsorted(one[order], one[order])
+        kept.update(order[(rank < limit) & (worth[order] > 0.0)].tolist())
+    return np.array(sorted(kept), dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Matched:
+    """Outcome of matching pairs."""
+
+    pose: Floats
+    factors: PairFactors
+
+    @property
+    def share(self) -> Floats:
+        return self.factors.matched / np.maximum(self.factors.asked, 1)
+
+    @property
+    def rms(self) -> Floats:
+        return np.sqrt(self.factors.squared / np.maximum(self.factors.weight, 1e-9))
+
+
+def align_pairs(
+    clouds: Clouds, raster: NearestRaster, i: Ints, j: Ints, guess: Floats, points: PairPoints, first_gate: float,
+    last_gate: float, iterations: int = 20,
+) -> _Matched:
+    """Align many pairs of clouds at once, each on its own: point-to-line ICP with a shrinking gate.
+
+    Parameters
+    ----------
+    i, j : (e,) target and source clouds. guess : (e, 3) start poses.
+    points : see pair_points. first_gate, last_gate : farthest match in the first and last iteration, m.
+    """
+    pose, gate = guess.copy(), first_gate
+    for _ in range(iterations):
+        factors = match(clouds, raster, i, pose, points, gate, gate / 2.0)
+        damping = np.zeros((len(i), 3, 3))
+        damping[:, [0, 1, 2], [0, 1, 2]] = 1e-3 * np.maximum(np.einsum("eii->ei", factors.hessian), 1.0)
+        step = -np.linalg.solve(factors.hessian + damping, factors.gradient[:, :, None])[:, :, 0]
+        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / 0.3, np.abs(step[:, 2]) / 0.15)
+        pose += step / np.maximum(reach, 1.0)[:, None]
+        pose[:, 2] = se2.wrap_angle(pose[:, 2])
+        if gate <= last_gate and np.abs(step).max(initial=0.0) < 1e-4:
+            break
+        gate = max(0.8 * gate, last_gate)
+    return _Matched(pose, match(clouds, raster, i, pose, points, last_gate, last_gate / 2.0))
+
+
+def find(
+    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: SearchConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> Closures:
+    """Match candidates and judge each on its own.
+
+    Parameters
+    ----------
+    candidates : see propose. submaps : their clouds.
+    progress : called with (done, total).
+    """
+    if not len(candidates.target):
+        return no_closures()
+    searched = candidates.spread > config.direct
+    guess, second, found = _search_guesses(candidates, submaps, searched, config, search_config, progress)
+    clouds = submaps.clouds
+    raster = paint(clouds, 0.1, 0.5)
+    points = pair_points(clouds, candidates.source, config.points)
+    result = align_pairs(clouds, raster, candidates.target, candidates.source, guess, points, 0.5, config.gate)
+    variance = np.full(len(guess), config.match_sigma**2 * config.correlation)
+    z, sqrt_information = measured(result.factors, result.pose, variance)
+    why = _judge(candidates, searched, found, second, result, z, sqrt_information, config)
+    return _collect(candidates, submaps, result, z, sqrt_information, why)
+
+
+def _search_guesses(
+    candidates: Candidates, submaps: Submaps, searched: Bools, config: LoopClosureConfig, search_config: SearchConfig,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Floats, Floats, Bools]:
+    """Return start poses (c, 3), the relative score of the second best place (c,), and whether a search found any (c,)."""
+    guess, second, found = candidates.guess.copy(), np.zeros(len(searched)), np.ones(len(searched), dtype=bool)
+    rows = np.flatnonzero(searched)
+    prepared: dict[int, PointCloud] = {}
+    for done, row in enumerate(rows):
+        half_width = float(np.minimum(candidates.spread[row], config.search_limit))
+        turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[row, 2, 2]), 0.1, config.search_angle))
+        pair = [_prepare(submaps, int(k[row]), prepared) for k in (candidates.target, candidates.source)]
+        places = search(pair[0], pair[1], guess[row], (half_width, half_width, turn), search_config)
+        found[row] = len(places.poses) > 0
+        if found[row]:
+            guess[row], second[row] = places.poses[0], places.ambiguity
+        if progress is not None:
+            progress(done + 1, len(rows))
+    return guess, second, found
+
+
+def _prepare(submaps: Submaps, k: int, prepared: dict[int, PointCloud]) -> PointCloud:
+    """Return one sub-map's cloud ready for the search; its normals tell from which side it was seen."""
+    if k not in prepared:
+        points, normals = submaps.clouds.cloud(k)
+        prepared[k] = make_cloud(points, points + normals)
+    return prepared[k]
+
+
+def _judge(
+    candidates: Candidates, searched: Bools, found: Bools, second: Floats, result: _Matched, z: Floats,
+    sqrt_information: Floats, config: LoopClosureConfig,
+) -> list[str]:
+    """Return why each candidate is rejected; '' = accepted so far."""
+    error = se2.between(z, candidates.guess)
+    information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
+    seen = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+    # Only directions that the match can see are compared: project the error onto them.
+    onto = seen @ information
+    visible = np.einsum("eij,ej->ei", onto, error)
+    joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
+    distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), visible)
+    strength = np.linalg.eigvalsh(information)[:, 1]
+    why: list[str] = []
+    for k in range(len(z)):
+        least = config.overlap_after_search if searched[k] else config.overlap
+        if not found[k]:
+            text = "the search found no place for it"
+        elif result.share[k] < least:
+            text = f"only {result.share[k]:.0%} of its points match (least {least:.0%})"
+        elif result.rms[k] > config.sigma:
+            text = f"matches lie {result.rms[k]:.3f} m apart (most {config.sigma:g} m)"
+        elif strength[k] < 1.0:
+            text = "the surfaces fix neither position nor heading"
+        elif searched[k] and second[k] > config.uniqueness:
+            text = f"another place matches {second[k]:.0%} as well"
+        elif distance[k] > config.consistency:
+            text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {config.consistency:g})"
+        else:
+            text = ""
+        why.append(text)
+    return why
+
+
+def _collect(
+    candidates: Candidates, submaps: Submaps, result: _Matched, z: Floats, sqrt_information: Floats, why: list[str]
+) -> Closures:
+    i, j = submaps.reference[candidates.target], submaps.reference[candidates.source]
+    information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
+    story = tuple(
+        LoopClosure(
+            int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), not why[k],
+            why[k] or f"{result.share[k]:.0%} of its points match within {result.rms[k]:.3f} m",
+        )
+        for k in range(len(z))
+    )
+    good = np.array([not text for text in why], dtype=bool)
+    return Closures(RelativePoseEdges(i[good], j[good], z[good], sqrt_information[good]), story)
+
+
+def merged(one: Closures, other: Closures) -> Closures:
+    """Return both collections as one."""
+    a, b = one.edges, other.edges
+    edges = RelativePoseEdges(
+        np.concatenate([a.i, b.i]),
+        np.concatenate([a.j, b.j]),
+        np.concatenate([a.T_i_j, b.T_i_j]),
+        np.concatenate([a.sqrt_information, b.sqrt_information]),
+        b.kernel,
+    )
+    return Closures(edges, one.candidates + other.candidates)
+
+
+def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:
+    """Solve the graph with its closures under a kernel that tightens (graduated non-convexity) and drop those at odds.
+
+    Returns
+    -------
+    The solved graph (without the closure edges) and the closures that remain; the others carry the reason.
+    """
+    if not len(closures.edges):
+        return graph, closures
+    solved = graph
+    for scale in (30.0, 10.0, 4.0):
+        edges = replace(closures.edges, kernel=Kernel("geman-mcclure", scale))
+        solved = optimize(solved.with_edges(edges), replace(solver, relative_decrease=1e-5))[0]
+        solved = replace(solved, edges=graph.edges)
+    residuals = closures.edges.residuals(solved)
+    squared = np.einsum("ed,ed->e", residuals, residuals)
+    kept = squared < config.consistency
+    e = closures.edges
+    left = RelativePoseEdges(e.i[kept], e.j[kept], e.T_i_j[kept], e.sqrt_information[kept], Kernel("cauchy", 3.0))
+    dropped = {(int(a), int(b)): float(s) for a, b, s in zip(e.i[~kept], e.j[~kept], squared[~kept], strict=True)}
+    story = tuple(
+        replace(c, accepted=False, reason=f"contradicts the other closures: chi2 {dropped[c.i, c.j]:.0f}")
+        if c.accepted and (c.i, c.j) in dropped
+        else c
+        for c in closures.candidates
+    )
+    return solved, Closures(left, story)

@@ -1,0 +1,373 @@
+"""The page that is the algorithm: from a recording to trajectory, anchors and map.
+
+``build_map`` reads as the paper does: keyframes and edges, first optimisation with wheels and radio, sub-maps and
+loop closures, second optimisation with lidar edges, occupancy grid. Beyond the paper stand the calibration in the same
+least squares, noise learnt from the data, tracking between neighbouring clouds and the joint refinement of all of them.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import calibration, clouds, first_estimate, keyframes, loop_closure, occupancy_grid, pair_matching, refinement, submaps
+from . import se2, summary
+from .anchors import AnchorConfig
+from .calibration import CalibrationConfig
+from .clouds import CloudConfig, Clouds
+from .errors import Cancelled, DataError
+from .first_estimate import FirstEstimate, GrowthConfig
+from .graph import Edges, Graph, OdometryEdges, RangeEdges
+from .keyframes import KeyframeConfig, Keyframes
+from .loop_closure import Closures, LoopClosureConfig
+from .map_result import MapResult, StageSummary
+from .marginals import marginals
+from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_edges
+from .occupancy_grid import GridConfig, OccupancyGrid
+from .pair_matching import NearestRaster
+from .range_noise import RangeNoiseConfig, short_term_sigma
+from .refinement import RefinementConfig, Refined
+from .robust import Kernel
+from .scan_search import SearchConfig
+from .sensor_log import SensorLog
+from .solver import SolverConfig, SolverSummary, optimize
+from .submaps import SubmapConfig
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Progress = Callable[[str, int, int], object]
+"""progress(stage, done, total); returning False asks to stop, see errors.Cancelled."""
+
+
+@dataclass(frozen=True, slots=True)
+class MappingConfig:
+    """All settings, a group per stage."""
+
+    use_uwb: bool = True
+    """Use the ranges."""
+    use_lidar: bool = True
+    """Use the scans."""
+    use_loops: bool = True
+    """Search loop closures and match clouds of different times."""
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
+    ranges: RangeNoiseConfig = field(default_factory=RangeNoiseConfig)
+    anchors: AnchorConfig = field(default_factory=AnchorConfig)
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    clouds: CloudConfig = field(default_factory=CloudConfig)
+    submaps: SubmapConfig = field(default_factory=SubmapConfig)
+    loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    grid: GridConfig = field(default_factory=GridConfig)
+
+
+class Stages:
+    """Stage summaries in the making: names, figures, the caller's clock and progress callback."""
+
+    def __init__(self, progress: Progress | None, clock: Callable[[], float] | None) -> None:
+        self._progress, self._clock = progress, clock
+        self._since = clock() if clock else 0.0
+        self.done: list[StageSummary] = []
+        self.warnings: list[str] = []
+
+    def tell(self, stage: str, done: int, total: int) -> None:
+        """Report progress; raises Cancelled where the callback returns False."""
+        if self._progress is not None and self._progress(stage, done, total) is False:
+            raise Cancelled(f"stopped by the caller during {stage}")
+
+    def end(self, stage: str, **figures: object) -> None:
+        """Close a stage."""
+        now = self._clock() if self._clock else 0.0
+        self.done.append(StageSummary(stage, now - self._since, figures))
+        self._since = now
+        self.tell(stage, 1, 1)
+
+    def teller(self, stage: str) -> Callable[[int, int], None]:
+        """Return a callback (done, total) for one stage."""
+        return lambda done, total: self.tell(stage, done, total)
+
+
+def build_map(
+    log: SensorLog,
+    config: MappingConfig | None = None,
+    *,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
+    clock: Callable[[], float] | None = None,
+) -> MapResult:
+    """Compute trajectory, anchors and map of a recording.
+
+    Parameters
+    ----------
+    log : the recording; ranges or scans may be missing.
+    config : settings; None = defaults.
+    progress : called as progress(stage, done, total); returning False raises Cancelled.
+    executor : any concurrent.futures executor; the result does not depend on it.
+    clock : seconds, for the stages' timings; None = no timings.
+
+    Raises
+    ------
+    DataError : the recording holds nothing to map. Cancelled : the callback asked to stop.
+    """
+    config = config or MappingConfig()
+    stages = Stages(progress, clock)
+    log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
+
+    frames = keyframes.select(log.odometry, config.keyframes)
+    stages.end("keyframes", keyframes=len(frames), travelled=round(float(frames.path.sum()), 3))
+
+    graph, wheels, radio, path = _measurements(log, frames, config)
+    stages.end("edges", odometry=len(wheels), ranges=0 if radio is None else len(radio))
+
+    first: FirstEstimate | None = None
+    if radio is not None:
+        first, graph, radio, solved = _first_optimisation(graph, wheels, radio, path, config, stages)
+        stages.end("first optimisation", placed=int(first.placed.sum()), **_solver_figures(solved))
+    edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
+
+    scans = _Scans.of(log, frames, config)
+    closures = loop_closure.no_closures()
+    refined: Refined | None = None
+    if scans is not None:
+        stages.end("clouds", points=len(scans.clouds.points))
+        graph = _free(graph, "laser_x", "laser_y", "laser_theta", "laser_delay")
+        graph, refined = _track(graph, edges, scans, path, config, stages)
+        if config.use_loops:
+            graph, closures, shown = _close_loops(graph, edges, refined, scans, path, config, stages)
+            graph, radio, refined, closures = _refine_jointly(graph, wheels, radio, closures, scans, path, config, stages)
+    graph = _final_graph(graph, wheels, radio, closures, refined)
+
+    grid = _grid(log, frames, graph, config, executor, stages)
+    uncertainty = marginals(graph)
+    result = summary.summarise(
+        log, frames, graph, uncertainty, first, radio, closures, refined, grid, config.calibration, stages.done, stages.warnings
+    )
+    stages.end("summary")
+    return replace(result, stages=tuple(stages.done))
+
+
+def _measurements(
+    log: SensorLog, frames: Keyframes, config: MappingConfig
+) -> tuple[Graph, OdometryEdges, RangeEdges | None, Floats]:
+    """Return the graph by dead reckoning with its calibration priors, the wheels' and the radio's edges and the path (k,)."""
+    ids = log.ranges.anchor_ids if log.ranges is not None else ()
+    told = np.array([log.mounting.height_difference(a) is not None for a in ids], dtype=bool)
+    listed = calibration.unknowns(config.calibration, ids, told)
+    block = calibration.block(listed)
+    graph = Graph(frames.odometry.copy(), np.zeros((len(ids), 2)), (), block)
+    graph = graph.with_edges(calibration.prior_edges(listed))
+    graph = _free(replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool)), *_WHEELS, "bias", "range_scale")
+    wheels = wheel_edges(frames, 0, config.odometry, block)
+    path = np.concatenate([[0.0], np.cumsum(frames.path)])
+    if log.ranges is None:
+        return graph, wheels, None, path
+    attached = keyframes.attach_ranges(log.ranges, log.odometry, frames, log.mounting)
+    radio = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.anchors)
+    return graph, wheels, radio if np.any(radio.weights) else None, path
+
+
+_WHEELS = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
+_LASER = ("laser_x", "laser_y", "laser_theta", "laser_delay")
+_RADIO = ("height2", "tag_x", "tag_y", "range_delay")
+
+
+def _free(graph: Graph, *names: str) -> Graph:
+    """Return the graph with calibration unknowns of these names (an anchor's own by their stem) set free."""
+    assert graph.fixed_calibration is not None
+    held = [not (fixed is False or name.split(":")[0] in names) for fixed, name in zip(graph.fixed_calibration.tolist(), graph.calibration.names, strict=True)]
+    return replace(graph, fixed_calibration=np.array(held, dtype=bool))
+
+
+def _estimates(graph: Graph, solved: Graph) -> Graph:
+    """Return the graph with the estimates of another, its own edges kept."""
+    return graph.updated(solved.poses, solved.anchors, solved.calibration.values)
+
+
+def _first_optimisation(
+    graph: Graph, wheels: OdometryEdges, radio: RangeEdges, path: Floats, config: MappingConfig, stages: Stages
+) -> tuple[FirstEstimate, Graph, RangeEdges, SolverSummary]:
+    """Grow trajectory and anchors from nothing, then optimise wheels and radio together (paper: first optimisation)."""
+    alive = np.asarray(radio.weights) > 0
+    sigma = short_term_sigma(radio.stamps[alive], radio.anchor[alive], radio.ranges[alive], config.ranges)
+    growth = replace(config.growth, range_sigma=max(1.5 * sigma, config.growth.least_sigma))
+    first = first_estimate.grow(graph, wheels, radio, path, growth, config.anchors)
+    stages.end("first estimate", range_sigma=round(sigma, 4), placed=int(first.placed.sum()))
+    graph = replace(_estimates(graph, first.graph), fixed_anchors=~first.placed)
+    radio = replace(radio, weights=radio.weights * first.placed[radio.anchor], sigma=np.full(len(radio), growth.range_sigma))
+    for lap in range(3):
+        radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges, held=False)
+        if lap == 2:
+            graph = _free(graph, *_RADIO)
+        solved, result = optimize(graph.with_edges(wheels, radio), config.solver)
+        graph = _hold_negative_heights(_estimates(graph, solved))
+        stages.tell("first optimisation", lap + 1, 3)
+    return first, graph, radio, result
+
+
+def _hold_negative_heights(graph: Graph) -> Graph:
+    """Return the graph with squared heights that came out negative put back to 0 and held."""
+    names, values = graph.calibration.names, graph.calibration.values.copy()
+    below = np.array([n.startswith("height2:") for n in names], dtype=bool) & (values < 0.0)
+    values[below] = 0.0
+    fixed = np.asarray(graph.fixed_calibration) | below
+    return replace(graph.updated(graph.poses, graph.anchors, values), fixed_calibration=fixed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scans:
+    """Lidar of a run, ready for matching."""
+
+    clouds: Clouds
+    raster: NearestRaster
+    twist: Floats
+
+    @classmethod
+    def of(cls, log: SensorLog, frames: Keyframes, config: MappingConfig) -> "_Scans | None":
+        if log.scans is None or not len(log.scans.stamps):
+            return None
+        owner, chosen = keyframes.choose_scans(log.scans, frames, config.keyframes)
+        rays = keyframes.scan_points(log, frames, owner, chosen, config.clouds.range_max)
+        built = clouds.build(rays, len(frames), config.clouds)
+        reach = max(config.refinement.first_gate, 0.2)
+        return cls(built, pair_matching.paint(built, 0.2 * reach, reach), frames.twist)
+
+
+def _match_round(
+    graph: Graph, edges: tuple[Edges, ...], scans: _Scans, i: Ints, j: Ints, settings: RefinementConfig,
+    config: MappingConfig, stages: Stages, stage: str,
+) -> tuple[Graph, Refined]:
+    refined = refinement.refine(
+        graph.with_edges(*edges), scans.clouds, scans.raster, scans.twist, i, j, settings, config.solver, stages.teller(stage)
+    )
+    return _estimates(graph, refined.graph), refined
+
+
+def _track(
+    graph: Graph, edges: tuple[Edges, ...], scans: _Scans, path: Floats, config: MappingConfig, stages: Stages
+) -> tuple[Graph, Refined]:
+    """Match each cloud with those just before and after it, so that sub-maps are stiff."""
+    settings = replace(config.refinement, partners=0, rounds=config.refinement.track_rounds)
+    session = np.zeros(len(path), dtype=np.int64)
+    i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, settings)
+    graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "tracking")
+    stages.end("tracking", pairs=len(i), used=int(refined.used.sum()), sigma=round(refined.sigma, 4), rounds=refined.rounds)
+    return graph, refined
+
+
+def _close_loops(
+    graph: Graph, edges: tuple[Edges, ...], tracked: Refined, scans: _Scans, path: Floats, config: MappingConfig,
+    stages: Stages,
+) -> tuple[Graph, Closures, int]:
+    """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
+    session = np.zeros(len(path), dtype=np.int64)
+    base = graph.with_edges(*edges, tracked.edges)
+    found = loop_closure.no_closures()
+    tried: set[tuple[int, int, bool]] = set()
+    for lap in range(config.loops.rounds):
+        pieces = submaps.build(scans.clouds, base.poses, path, session, config.submaps)
+        known = marginals(base.with_edges(found.edges))
+        candidates = loop_closure.propose(base, known, pieces, session, tried, config.loops)
+        tried |= candidates.names(config.loops)
+        new = loop_closure.find(candidates, pieces, config.loops, config.search, stages.teller("loop closure"))
+        found = loop_closure.merged(found, new)
+        base, found = loop_closure.reconcile(base, found, config.loops, config.solver)
+        stages.end(
+            f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(candidates.target),
+            accepted=len(new.edges), standing=len(found.edges),
+        )
+        if not len(new.edges):
+            break
+    return _estimates(graph, base), found, len(tried)
+
+
+def _refine_jointly(
+    graph: Graph, wheels: OdometryEdges, radio: RangeEdges | None, closures: Closures, scans: _Scans, path: Floats,
+    config: MappingConfig, stages: Stages,
+) -> tuple[Graph, RangeEdges | None, Refined | None, Closures]:
+    """Let all overlapping clouds pull on all poses; what the ranges weigh is learnt anew from where the lidar puts them."""
+    if config.refinement.rounds == 0:
+        return graph, radio, None, closures
+    session = np.zeros(len(path), dtype=np.int64)
+    graph = _free(graph, *_RADIO) if radio is not None else graph
+    refined: Refined | None = None
+    for lap in range(config.refinement.selections):
+        edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
+        i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, config.refinement)
+        gate = config.refinement.first_gate if lap == 0 else max(0.4 * config.refinement.first_gate, config.refinement.last_gate)
+        settings = replace(config.refinement, first_gate=gate)
+        graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "joint refinement")
+        graph = _hold_negative_heights(graph)
+        if radio is not None:
+            radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges, held=True)
+        stages.end(
+            f"joint refinement {lap + 1}", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
+            sigma=round(refined.sigma, 4), moved=round(refined.moved, 5), **_solver_figures(refined.summary),
+        )
+    return graph, radio, refined, closures
+
+
+def _final_graph(
+    graph: Graph, wheels: OdometryEdges, radio: RangeEdges | None, closures: Closures, refined: Refined | None
+) -> Graph:
+    """Return the graph with every measurement that holds it."""
+    edges: list[Edges] = [wheels]
+    if radio is not None:
+        edges.append(radio)
+    if refined is not None:
+        edges.append(refined.edges)
+    else:
+        edges.append(closures.edges)
+    return graph.with_edges(*edges)
+
+
+def _grid(
+    log: SensorLog, frames: Keyframes, graph: Graph, config: MappingConfig, executor: Executor | None, stages: Stages
+) -> OccupancyGrid | None:
+    """Trace every scan from where the laser was at its first and last ray (paper: Bresenham, binary Bayes filter)."""
+    if log.scans is None or not len(log.scans.stamps):
+        return None
+    cal = graph.calibration
+    correction = np.array([cal.get("laser_x"), cal.get("laser_y"), cal.get("laser_theta")])
+    mount = se2.compose(correction, log.mounting.T_base_laser)
+    first = log.scans.stamps + cal.get("laser_delay")
+    last = first + log.scans.time_increment * (log.scans.ranges.shape[1] - 1)
+    ends = [se2.compose(keyframes.dense_trajectory(log.odometry, frames, graph.poses, t), mount) for t in (first, last)]
+    grid = occupancy_grid.from_scans(
+        ends[0], log.scans, config.grid, last=ends[1], flipped=log.mounting.laser_flipped, executor=executor,
+        progress=stages.teller("occupancy grid"),
+    )
+    stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)
+    return grid
+
+
+def _solver_figures(result: SolverSummary) -> dict[str, object]:
+    return {
+        "converged": result.converged,
+        "reason": result.reason,
+        "iterations": result.iterations,
+        "chi2": round(result.chi2, 4),
+        "dof": result.dof,
+        "chi2_per_dof": round(result.chi2_per_dof, 4),
+    }
+
+
+def preset(name: str) -> MappingConfig:
+    """Return the settings of a preset.
+
+    ``default``: what is best. ``paper``: the paper's plain choices: point-to-point ICP between sub-maps of 9 m with
+    outlier distance 0.1 m, fitness 0.1, 300 iterations; no robust kernels, no calibration, no refinement.
+    """
+    if name == "default":
+        return MappingConfig()
+    if name == "paper":
+        return MappingConfig(
+            submaps=SubmapConfig(epsilon=9.0),
+            loops=LoopClosureConfig(),
+        )
+    raise DataError(f"unknown preset {name!r}; choose default or paper")

@@ -1,0 +1,109 @@
+"""Sub-maps: the trajectory cut by travelled distance, each piece's clouds merged in the frame of its middle keyframe.
+
+(Paper, section on sub-maps: scans gathered while the travelled distance stays below epsilon, then filtered.)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import se2
+from .clouds import Clouds
+from .point_cloud import radius_outlier_filter, statistical_outlier_filter
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class SubmapConfig:
+    """Size and cleaning of sub-maps."""
+
+    epsilon: float = 5.0
+    """Travelled distance of one sub-map, m (the paper's epsilon; it uses 9)."""
+    voxel: float = 0.08
+    """Cell over which points are averaged, m."""
+    neighbours: int = 8
+    """Statistical filter: nearest neighbours looked at."""
+    std_ratio: float = 3.0
+    """Statistical filter: a point whose neighbours lie farther than the mean by so many standard deviations goes."""
+    radius: float = 0.25
+    """Radius filter: m."""
+    min_neighbours: int = 2
+    """Radius filter: a point with fewer neighbours within the radius goes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Submaps:
+    """All sub-maps of a run."""
+
+    first: Ints
+    """(s,) first keyframe of each."""
+    last: Ints
+    """(s,) one past its last keyframe."""
+    reference: Ints
+    """(s,) keyframe in whose frame its points stand."""
+    clouds: Clouds
+    """s clouds, in the frames of the reference keyframes."""
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+def cut(path: Floats, session: Ints, epsilon: float) -> tuple[Ints, Ints]:
+    """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording.
+
+    Returns
+    -------
+    first (s,) and one past the last keyframe (s,) of each piece.
+    """
+    piece = np.floor((path - path[0]) / max(epsilon, 1e-9)).astype(np.int64) if epsilon > 0 else np.arange(len(path))
+    change = np.concatenate([[True], (np.diff(piece) != 0) | (np.diff(session) != 0)])
+    first = np.flatnonzero(change)
+    return first, np.append(first[1:], len(path))
+
+
+def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: SubmapConfig) -> Submaps:
+    """Merge the clouds of each piece of the trajectory and filter them: voxel, statistical, radius.
+
+    Parameters
+    ----------
+    clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. session : (k,).
+    """
+    first, last = cut(path, session, config.epsilon)
+    reference = (first + last - 1) // 2
+    piece = np.repeat(np.arange(len(first)), last - first)
+    middle = reference[piece]
+    relative = se2.between(poses[middle], poses)[clouds.owner]
+    points = se2.transform(relative, clouds.points)
+    normals = se2.rotate(relative[:, 2], clouds.normals)
+    owner, points, normals = _merge(piece[clouds.owner], points, normals, config.voxel)
+    kept = np.ones(len(owner), dtype=bool)
+    offsets = np.searchsorted(owner, np.arange(len(first) + 1))
+    for a, b in zip(offsets[:-1], offsets[1:], strict=True):
+        if b > a:
+            kept[a:b] = statistical_outlier_filter(points[a:b], config.neighbours, config.std_ratio)
+            inner = np.flatnonzero(kept[a:b]) + a
+            kept[inner] = radius_outlier_filter(points[inner], config.radius, config.min_neighbours)
+    owner, points, normals = owner[kept], points[kept], normals[kept]
+    offsets = np.searchsorted(owner, np.arange(len(first) + 1)).astype(np.int64)
+    return Submaps(first, last, reference, Clouds(offsets, points, normals, owner))
+
+
+def _merge(owner: Ints, points: Floats, normals: Floats, size: float) -> tuple[Ints, Floats, Floats]:
+    """Average points and normals of each cell; the two sides of a wall stay apart by the normal's half plane."""
+    cell = np.floor(points / size).astype(np.int64)
+    cell -= cell.min(axis=0, initial=0)
+    side = (normals[:, 0] + 1e-3 * normals[:, 1] > 0).astype(np.int64)
+    wide, high = cell.max(axis=0, initial=0) + 1
+    key = ((owner * wide + cell[:, 0]) * high + cell[:, 1]) * 2 + side
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) > 0]))[: len(key)]
+    both = np.concatenate([points, normals], axis=1)[order]
+    count = np.diff(np.append(first, len(key)))[:, None]
+    mean = np.add.reduceat(both, first, axis=0) / count if len(key) else both
+    length = np.hypot(mean[:, 2], mean[:, 3])
+    clear = length > 0.5
+    normal = np.where(clear[:, None], mean[:, 2:] / np.where(clear, length, 1.0)[:, None], 0.0)
+    return owner[order][first], mean[:, :2], normal

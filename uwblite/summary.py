@@ -1,0 +1,135 @@
+"""From the optimised graph to the result: anchors, calibration, doubts, in the user's words."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .calibration import CalibrationConfig, Unknown, unknowns
+from .first_estimate import FirstEstimate
+from .graph import Graph, RangeEdges
+from .keyframes import Keyframes, dense_trajectory
+from .loop_closure import Closures
+from .map_result import AnchorEstimate, CalibrationEstimate, MapResult, StageSummary
+from .marginals import Marginals
+from .occupancy_grid import OccupancyGrid
+from .refinement import Refined
+from .sensor_log import SensorLog
+
+Floats = NDArray[np.float64]
+
+_SHOWN = 0.7
+"""A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
+
+
+def summarise(
+    log: SensorLog, frames: Keyframes, graph: Graph, known: Marginals, first: FirstEstimate | None,
+    radio: RangeEdges | None, closures: Closures, refined: Refined | None, grid: OccupancyGrid | None,
+    config: CalibrationConfig, stages: Sequence[StageSummary], warnings: Sequence[str],
+) -> MapResult:
+    """Gather the result of a run; see MapResult."""
+    residuals, weights = _range_residuals(graph, radio)
+    ids = log.ranges.anchor_ids if log.ranges is not None else ()
+    anchors = tuple(_anchor(k, ids, log, graph, known, first, radio, residuals, weights) for k in range(len(ids)))
+    told = np.array([log.mounting.height_difference(a) is not None for a in ids], dtype=bool)
+    listed = unknowns(config, ids, told)
+    calibrated = tuple(_calibration(k, u, graph, known) for k, u in enumerate(listed))
+    table = {} if radio is None or log.ranges is None else {
+        "stamp": log.ranges.stamps, "anchor": radio.anchor.astype(np.float64), "range": radio.ranges,
+        "residual": residuals, "weight": weights,
+    }
+    more, doubts = _doubts(log, anchors, radio, closures, refined, grid)
+    return MapResult(
+        stamps=log.odometry.stamps,
+        trajectory=dense_trajectory(log.odometry, frames, graph.poses),
+        session=np.zeros(len(log.odometry.stamps), dtype=np.int64),
+        keyframe_stamps=frames.stamps,
+        keyframe_covariances=known.poses,
+        graph=graph,
+        anchors=anchors,
+        calibration=calibrated,
+        closures=closures.candidates,
+        range_table=table,
+        grid=grid,
+        stages=tuple(stages),
+        warnings=tuple([*warnings, *more]),
+        doubts=tuple(doubts),
+    )
+
+
+def _range_residuals(graph: Graph, radio: RangeEdges | None) -> tuple[Floats, Floats]:
+    """Return residuals (m,), m, and final weights (m,) of all ranges."""
+    if radio is None:
+        return np.zeros(0), np.zeros(0)
+    whitened = radio.residuals(graph)[:, 0]
+    own = np.ones(len(radio)) if radio.weights is None else radio.weights
+    return whitened * radio.sigma, own * radio.kernel.weight(whitened**2)
+
+
+def _anchor(
+    k: int, ids: tuple[str, ...], log: SensorLog, graph: Graph, known: Marginals, first: FirstEstimate | None,
+    radio: RangeEdges | None, residuals: Floats, weights: Floats,
+) -> AnchorEstimate:
+    assert log.ranges is not None
+    count = int(np.sum(log.ranges.anchor == k))
+    if first is None or radio is None or not first.placed[k]:
+        reason = f"its {count} ranges were too few or did not agree on a place"
+        nowhere = np.full(2, np.nan)
+        return AnchorEstimate(ids[k], nowhere, np.full((2, 2), np.nan), count, 0.0, np.nan, np.nan, np.nan, "unplaced", reason)
+    own = radio.anchor == k
+    spread = 1.4826 * float(np.median(np.abs(residuals[own] - np.median(residuals[own]))))
+    # A share by distance from the bulk, not by kernel weight: effective sigmas are wide where ranges repeat each other.
+    used = float(np.mean(np.abs(residuals[own] - np.median(residuals[own])) < 3.0 * max(spread, 0.05)))
+    bias_at = graph.calibration.index(f"bias:{ids[k]}")
+    bias = float(graph.calibration.values[bias_at]) if bias_at >= 0 else 0.0
+    bias_sigma = float(known.calibration[bias_at]) if bias_at >= 0 else 0.0
+    status, reason, alternative = "ok", "", None
+    if first.ambiguous[k] and len(first.hypotheses[k]) > 1:
+        status, alternative = "mirror-ambiguous", first.hypotheses[k][1].position
+        reason = "the path past it is too straight: a mirrored place explains its ranges about as well"
+    elif used < 0.5:
+        status, reason = "distrusted", f"only {used:.0%} of its ranges agree with the map"
+    return AnchorEstimate(
+        ids[k], graph.anchors[k], known.anchors[k], count, used, bias, bias_sigma, spread, status, reason, alternative
+    )
+
+
+def _calibration(k: int, unknown: Unknown, graph: Graph, known: Marginals) -> CalibrationEstimate:
+    value, fixed = float(graph.calibration.values[k]), graph.fixed_calibration
+    if fixed is not None and fixed[k]:
+        why = "this recording has no measurement of it" if value == 0.0 else "held"
+        return CalibrationEstimate(unknown.name, value, unknown.sigma, unknown.unit, unknown.meaning, "prior", why)
+    sigma = float(known.calibration[k])
+    if sigma > _SHOWN * unknown.sigma:
+        why = "the recording does not show it better than the prior"
+        return CalibrationEstimate(unknown.name, value, sigma, unknown.unit, unknown.meaning, "prior", why)
+    return CalibrationEstimate(unknown.name, value, sigma, unknown.unit, unknown.meaning, "estimated")
+
+
+def _doubts(
+    log: SensorLog, anchors: tuple[AnchorEstimate, ...], radio: RangeEdges | None, closures: Closures,
+    refined: Refined | None, grid: OccupancyGrid | None,
+) -> tuple[list[str], list[str]]:
+    """Return warnings and reasons not to trust the result."""
+    warnings: list[str] = []
+    doubts: list[str] = []
+    for anchor in anchors:
+        if anchor.status != "ok":
+            (doubts if anchor.status == "mirror-ambiguous" else warnings).append(
+                f"anchor {anchor.id} is {anchor.status}: {anchor.reason}"
+            )
+    placed = [a for a in anchors if a.status != "unplaced"]
+    if anchors and not placed:
+        doubts.append("no anchor could be placed: the trajectory rests on odometry and lidar alone")
+    if log.ranges is None:
+        warnings.append("no UWB ranges in use: the map rests on odometry and lidar")
+    if grid is None:
+        warnings.append("no lidar in use: trajectory and anchors only, no map")
+    accepted = sum(c.accepted for c in closures.candidates)
+    if grid is not None and closures.candidates and accepted == 0:
+        text = "no loop closure was accepted"
+        (doubts if not placed else warnings).append(text)
+    contradicted = sum("contradicts" in c.reason and not c.accepted for c in closures.candidates)
+    if contradicted > max(accepted, 4):
+        doubts.append(f"{contradicted} loop closures contradict the rest, {accepted} agree")
+    return warnings, doubts
