@@ -18,7 +18,7 @@ FLOORS = (
     ("errors", "se2", "robust"),
     ("sensor_log", "config", "decimal_text", "drivers/events"),
     ("graph", "point_cloud", "nearest", "line_factor", "range_noise", "drivers/*",
-     "bresenham", "grid_geometry", "scan_rays", "ray_counter", "occupancy_grid"),
+     "bresenham", "grid_geometry", "scan_rays", "ray_counter", "occupancy_grid", "bitmap_font", "drawing"),
     ("keyframes", "calibration", "linear", "icp", "scan_search", "free_space", "map_picture", "io/*"),
     ("solver", "marginals", "anchors", "submaps", "map_result", "drivers/transport"),
     ("first_estimate", "loop_closure", "evaluate", "evaluate_map", "diagnostics", "drivers/recorder"),

@@ -274,7 +274,7 @@ def test_scan_by_scan_insertion_makes_the_same_map():
 
 
 def test_log_odds_are_bayes():
-    config = GridConfig(clamp=100.0)
+    config = GridConfig(p_hit=0.7, p_miss=0.4, clamp=100.0)
     counter = RayCounter(geometry_of(5), 0.25)
     counter.hits[1, 1], counter.misses[1, 1] = 3, 7 * WEIGHT_UNIT
     odds = (0.7 / 0.3) ** 3 * (0.4 / 0.6) ** 7

@@ -25,6 +25,8 @@ INK: Colour = (52, 58, 68)
 
 _MARGIN = 0.8
 """m; free border around what is drawn."""
+_SMALLEST = 240
+"""Pixels; the picture is at least this wide and high, so that the strip below has room."""
 _FOOT = 44
 """Pixels of the strip below the map with scale and caption."""
 
@@ -64,13 +66,13 @@ def draw_map(
     -------
     (height, width, 3) red, green, blue; row 0 on top, largest y on top.
     """
-    path = trajectory[:, :2]
+    path, size = trajectory[:, :2], max(size, _SMALLEST)
     placed = [a for a in anchors if np.isfinite(a.position).all()]
     low, high = _extent(grid, path, placed)
     resolution = grid.geometry.resolution if grid is not None else max(float((high - low).max()) / size, 1e-3)
     scale = _pixels_per_metre(float((high - low).max()), resolution, size)
     low = np.floor(low / resolution) * resolution
-    width, height = (np.maximum(np.ceil((high - low) * scale), 240).astype(int)).tolist()
+    width, height = (np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int)).tolist()
     image = np.empty((height + _FOOT, width, 3), dtype=np.uint8)
     image[:] = PAPER
     if grid is not None:

@@ -52,9 +52,9 @@ class GridConfig:
 
     resolution: float = 0.05
     """Edge of a cell, m. Halving it takes four times the memory and twice the time."""
-    p_hit: float = 0.7
+    p_hit: float = 0.6
     """Probability that a cell in which a ray ended is occupied, 0.5..1. Lower: more scans needed to draw a wall."""
-    p_miss: float = 0.4
+    p_miss: float = 0.45
     """Probability that a cell through which a ray passed is occupied, 0..0.5. Lower: moving things vanish sooner."""
     clamp: float = 12.0
     """Largest absolute log-odds of a cell."""
@@ -64,7 +64,7 @@ class GridConfig:
     """Beams that saw nothing clear space up to this distance, m; 0 = they clear nothing."""
     clear_run: int = 5
     """Least number of adjacent beams that saw nothing before they clear space."""
-    clear_weight: float = 0.25
+    clear_weight: float = 0.5
     """Weight of a beam that saw nothing against one that passed through to a hit, 0..1 (in steps of 1/16)."""
     move_distance: float = 0.1
     """A scan is traced when the laser has moved this far since the last traced one, m; 0 = every scan."""

@@ -29,7 +29,7 @@ class RayCounter:
     clear_weight : weight of a ray without a hit against one with a hit, 0..1, rounded to 1 / WEIGHT_UNIT.
     """
 
-    def __init__(self, geometry: GridGeometry, clear_weight: float = 0.25) -> None:
+    def __init__(self, geometry: GridGeometry, clear_weight: float = 0.5) -> None:
         self.geometry = geometry
         self._weak = round(clear_weight * WEIGHT_UNIT)
         self.hits: Counts = np.zeros((geometry.rows, geometry.cols), dtype=np.int32)
