@@ -3,7 +3,8 @@
 Two ways to read it. *TLV* (default): status_get until a fix is ready, then loc_get; distances to 1 mm. *Shell*: the
 stream of ``lec``; distances to 1 cm. Either way a module left in the other mode, or streaming for a host that died, is
 brought round. The module carries no clock, so a fix is stamped between the last "not ready" and the first "ready";
-to keep that short without polling all the time, polls are dense only around the moment the next fix is due.
+to keep that short without polling all the time, polls are dense only around the moment the next fix is due, and the
+regular beat of the fixes narrows it further.
 TLV has no checksum: on a link that has shown damage, and when an anchor is new, a fix is read twice and must agree.
 """
 
@@ -43,10 +44,12 @@ ANSWER = 0.060
 """s to wait for an answer while polling; the longest takes 9 ms, and USB and a busy computer add some."""
 BROKEN_ANSWER = 0.015
 """s to wait for the rest of an answer once part of it was damaged."""
-DENSE, SPARSE, IDLE = 0.004, 0.010, 0.050
+DENSE, SPARSE, IDLE = 0.004, 0.008, 0.020
 """s between polls: when a fix is due; when it is late; when none has come for a while."""
 LEAD = 0.010
 """s before a fix is due at which polling begins."""
+GRID_SLACK = 0.0001
+"""s per period by which the grid of the fixes may wander: clocks of host and network, 1e-3 at worst."""
 DISTRUST = 5.0
 """s for which a link counts as damaged after a corrupt byte."""
 MAX_ROUNDS = 8
@@ -88,6 +91,7 @@ class Dwm1001Session:
         self._error = 0
         self._not_ready: float | None = None
         self._fix_stamp: float | None = None
+        self._interval: tuple[float, float] | None = None
         self._last_fix = now
         self._pending: tuple[RangeReading, ...] | None = None
         self._latest: tuple[RangeReading, ...] | None = None
@@ -321,10 +325,30 @@ class Dwm1001Session:
         if not status.location_ready:
             self._not_ready = self._sent
             return self._wait(now)
-        before = self._not_ready if self._not_ready is not None else -1.0
-        self._fix_stamp = (before + now) / 2 if now - before < 4 * SPARSE else now
+        self._fix_stamp = self._fix_time(now)
         self._guess = False
         return self._read_fix(now)
+
+    def _fix_time(self, now: float) -> float:
+        """Return when the fix that was found ready at `now` was made.
+
+        It lies between the last poll that found none and now. Rounds follow each other on the grid of the network's
+        superframes, so the interval of the last fix, shifted by whole periods, narrows that down; where the two do not
+        overlap the tag does not keep the grid, and the new interval stands alone.
+        """
+        low = self._not_ready if self._not_ready is not None else now - 10.0
+        high = now
+        if self._interval is not None:
+            old_low, old_high = self._interval
+            turns = max(1, round((high - old_high) / self.period))
+            shift, slack = turns * self.period, turns * GRID_SLACK
+            narrow_low, narrow_high = max(low, old_low + shift - slack), min(high, old_high + shift + slack)
+            if narrow_low < narrow_high:
+                low, high = narrow_low, narrow_high
+        if high - low > 4 * SPARSE:
+            return now
+        self._interval = (low, high)
+        return (low + high) / 2
 
     def _read_fix(self, now: float) -> list[Action]:
         self._not_ready, self._pending, self._reads = None, None, 0
@@ -334,7 +358,7 @@ class Dwm1001Session:
         """Choose when to poll next."""
         due = self._last_fix + self.period - LEAD
         late = now - due
-        wait = DENSE if late < 2 * LEAD else SPARSE if late < 1.0 else IDLE
+        wait = DENSE if late < 2 * LEAD else SPARSE if late < 10.0 else IDLE
         self._step, self._due = "poll", max(now + wait, due)
         if now - self._last_fix > 3.0 and self.joined is False:
             text = (

@@ -365,7 +365,7 @@ class Recorder:
         lines = [f"recorded {seconds:.1f} s, {self.log.bytes / 1e6:.2f} MB in {self.log.path}"]
         for link in self.links:
             counts = link.counts
-            silent = counts.silent_time + (self.end - link.last_message if link.quiet else 0.0)
+            silent = self._silent_time(link)
             text = (
                 f"{link.name}: {counts.messages} messages ({counts.messages / max(seconds, 1e-9):.2f}/s),"
                 f" lost {counts.lost}, corrupt {sum(counts.corrupt.values())}, connected {counts.connects} times,"
@@ -377,13 +377,18 @@ class Recorder:
             lines += [f"{link.name}: corrupt {count} times: {why}" for why, count in counts.corrupt.most_common(8)]
         return lines
 
+    def _silent_time(self, link: Link) -> float:
+        if not link.counts.messages:
+            return self.end - self.start
+        return link.counts.silent_time + (self.end - link.last_message if link.quiet else 0.0)
+
     def doubts(self) -> list[str]:
         """Return why the recording should not be trusted; empty when it can be."""
         seconds = max(self.end - self.start, 1e-9)
         found = []
         for link in self.links:
             counts = link.counts
-            silent = counts.silent_time + (self.end - link.last_message if link.quiet else 0.0)
+            silent = self._silent_time(link)
             total = counts.messages + counts.lost
             if not counts.messages:
                 found.append(f"{link.name}: no data at all")

@@ -217,6 +217,9 @@ class ScipSession:
             return self._stream_status(reply, kind, text, now)
         if reply.command != self._step:
             return self._late_lines(reply)
+        if kind == "scip1" and reply.command == "SCIP2.0":
+            text = "lidar: it speaks SCIP 1.1 only; its firmware (before 3.0) needs the maker's update to SCIP 2.0"
+            return [*self._tell("error", "lidar-scip1-only", text), Reopen("SCIP 1.1 only")]
         if kind == "scip1":
             note = self._tell("info", "lidar-scip1", "lidar: it woke in SCIP 1.1; switched to SCIP 2.0")
             return [*note, *self._say("SCIP2.0", now)]

@@ -77,9 +77,17 @@ class Port:
             return b""
         except (*self._errors, TypeError) as error:
             raise DeviceError(f"{self.url}: unplugged or gone ({error})") from None
-        if not data:
-            raise DeviceError(f"{self.url}: unplugged or gone (end of file)")
+        if not data and self._hung_up():
+            raise DeviceError(f"{self.url}: unplugged or gone (hung up)")
         return data
+
+    def _hung_up(self) -> bool:
+        """Tell a terminal that has nothing to say from one that is gone: both read as nothing."""
+        import select
+
+        poller = select.poll()
+        poller.register(self._serial.fileno(), select.POLLIN)
+        return any(flags & ~select.POLLIN for _, flags in poller.poll(0))
 
     def _read_socket(self) -> bytes:
         data: bytes = self._serial._socket.recv(CHUNK)
