@@ -43,33 +43,33 @@ class Layout(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ordering:
-    """Order of elimination of a graph's nodes."""
+    """Order of elimination of a graph's poses."""
 
     order: Ints
-    """(m,) nodes, first eliminated first."""
+    """(m,) poses, first eliminated first."""
     in_band: int
-    """How many of them, from the start, form a narrow band; 0 = the matrix is to be treated as sparse."""
+    """How many of them form a narrow band: all or none; none = the matrix is to be treated as sparse."""
 
 
-def choose_ordering(pairs: Ints, poses: int, nodes: int, border: int, banded: bool = True) -> Ordering:
-    """Choose how to eliminate nodes 0..nodes-1, the first `poses` of them poses, the others anchors.
+def choose_ordering(pairs: Ints, poses: int, others: int, banded: bool = True) -> Ordering:
+    """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
 
     Parameters
     ----------
-    pairs : (b, 2) nodes that share an edge.
-    border : scalars that stay last whatever is chosen.
+    pairs : (b, 2) poses that share an edge.
+    poses : how many there are.
+    others : scalars that come after the poses.
     banded : allow the banded form.
     """
-    if banded and 2 * (nodes - poses) + border <= _WIDEST_BORDER and poses:
-        among = pairs[(pairs < poses).all(axis=1)]
-        order = reverse_cuthill_mckee(_adjacency(among, poses).tocsr(), symmetric_mode=True).astype(np.int64)
+    if poses < 2:
+        return Ordering(np.arange(poses), 0)
+    if banded and others <= _WIDEST_BORDER:
+        order = reverse_cuthill_mckee(_adjacency(pairs, poses).tocsr(), symmetric_mode=True).astype(np.int64)
         position = np.empty(poses, dtype=np.int64)
         position[order] = np.arange(poses)
-        if np.max(np.abs(position[among[:, 0]] - position[among[:, 1]]), initial=0) <= _WIDEST_BAND:
-            return Ordering(np.concatenate([order, np.arange(poses, nodes)]), poses)
-    if nodes < 2:
-        return Ordering(np.arange(nodes), 0)
-    return Ordering(np.argsort(_superlu(_adjacency(pairs, nodes), "MMD_AT_PLUS_A").perm_c).astype(np.int64), 0)
+        if np.max(np.abs(position[pairs[:, 0]] - position[pairs[:, 1]]), initial=0) <= _WIDEST_BAND:
+            return Ordering(order, poses)
+    return Ordering(np.argsort(_superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A").perm_c).astype(np.int64), 0)
 
 
 def _adjacency(pairs: Ints, nodes: int) -> sparse.csc_matrix:
@@ -88,20 +88,104 @@ def _superlu(matrix: sparse.csc_matrix, order: str) -> SuperLU:
     return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=2, panel_size=1, options=options)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """The lower triangle of a symmetric matrix as one array: blocks row by row, then full rows at the end."""
+
+    row: Ints
+    """(b,) first row of each block; a block on the diagonal is square and only its lower triangle counts."""
+    column: Ints
+    """(b,) first column."""
+    height: Ints
+    """(b,) rows, at most 3."""
+    width: Ints
+    """(b,) columns, at most 3."""
+    size: int
+    """Rows of the matrix."""
+    full: int
+    """How many of them, the last, are full."""
+
+    @property
+    def start(self) -> Ints:
+        """Place (b,) of each block's first value."""
+        size = self.height * self.width
+        return np.cumsum(size) - size
+
+    @property
+    def full_start(self) -> int:
+        """Place of the first value of the full rows."""
+        return int(np.sum(self.height * self.width))
+
+    def full_entries(self) -> tuple[Ints, Ints, Ints]:
+        """Return row, column and place of every value of the full rows in the lower triangle."""
+        row, column = np.divmod(np.arange(self.full * self.size), self.size)
+        inside = column <= row + self.size - self.full
+        return row[inside] + self.size - self.full, column[inside], self.full_start + np.nonzero(inside)[0]
+
+    def entries(self) -> tuple[Ints, Ints, Ints]:
+        """Return row, column and place of every value in the lower triangle."""
+        start, found = self.start, [self.full_entries()]
+        for i, j in np.ndindex(3, 3):
+            has = (i < self.height) & (j < self.width) & (self.row + i >= self.column + j)
+            found.append((self.row[has] + i, self.column[has] + j, start[has] + i * self.width[has] + j))
+        rows, columns, places = (np.concatenate(part) for part in zip(*found, strict=True))
+        return rows, columns, places
+
+
+_SHAPES = ((3, 3), (2, 3), (3, 2), (2, 2))
+"""Shapes of blocks between poses and anchors."""
+
+
+def _both_triangles(blocks: Blocks) -> tuple[Ints, ...]:
+    """Return row, column, height, width, start and step down and across of the blocks of both triangles, by column."""
+    apart = blocks.row != blocks.column
+    one, start = np.ones_like(blocks.row), blocks.start
+    lower = (blocks.row, blocks.column, blocks.height, blocks.width, start, blocks.width, one)
+    upper = (blocks.column, blocks.row, blocks.width, blocks.height, start, one, blocks.width)
+    both = [np.concatenate([a, b[apart]]) for a, b in zip(lower, upper, strict=True)]
+    order = np.argsort(both[1] * blocks.size + both[0])
+    return tuple(a[order] for a in both)
+
+
 class SparseLayout:
     """Both triangles in compressed columns."""
 
-    def __init__(self, rows: Ints, columns: Ints, size: int) -> None:
-        """Analyse a lower triangle given by its entries; entries above the diagonal are ignored."""
-        source = np.nonzero(rows >= columns)[0]
-        r, c = rows[source], columns[source]
-        strict = np.nonzero(r > c)[0]
-        data = np.concatenate([source, source[strict]]) + 1.0
-        where = (np.concatenate([r, c[strict]]), np.concatenate([c, r[strict]]))
-        matrix = sparse.csc_matrix((data, where), shape=(size, size))
-        matrix.sort_indices()
-        self._source = matrix.data.astype(np.int64) - 1
-        self._matrix = matrix
+    def __init__(self, blocks: Blocks) -> None:
+        """Find for every entry of the compressed columns its place among the values."""
+        n, inner = blocks.size, blocks.size - blocks.full
+        row, column, height, width, start, down, across = _both_triangles(blocks)
+        own = row == column
+        above = np.cumsum(height) - height
+        above -= np.maximum.accumulate(np.where(np.diff(column, prepend=-1) > 0, above, 0))
+        in_blocks = np.bincount(column, height, n).astype(np.int64)
+        tall = np.full(n, n)
+        for k in range(3):
+            has = own & (k < width)
+            tall[column[has] + k] = in_blocks[column[has]] + blocks.full
+        indptr = np.concatenate([[0], np.cumsum(tall)])
+        indices, source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.int64)
+        for h, w in _SHAPES:
+            some = np.nonzero((height == h) & (width == w))[0]
+            r, own_some, at_column = row[some], own[some], column[some]
+            for i, j in np.ndindex(h, w):
+                at = indptr[at_column + j] + (above[some] + i)
+                indices[at] = r + i
+                place = start[some] + (i * down[some] + j * across[some])
+                if i < j:
+                    place = np.where(own_some, start[some] + (j * down[some] + i * across[some]), place)
+                source[at] = place
+        full = blocks.full_start + np.arange(blocks.full)[:, None] * n
+        each = np.arange(n)
+        for f in range(blocks.full):
+            at = indptr[1 : inner + 1] - blocks.full + f
+            indices[at], source[at] = inner + f, full[f] + each[:inner]
+            at = indptr[inner + f] + each
+            indices[at], source[at] = (
+                each,
+                np.where(each <= inner + f, full[f] + each, full[np.maximum(each - inner, 0), 0] + inner + f),
+            )
+        self._source = source
+        self._matrix = sparse.csc_matrix((np.zeros(len(indices)), indices, indptr), shape=(n, n))
 
     def factor(self, values: Floats) -> SuperLU:
         """Factorise the matrix with these values; it is used up by the next call."""
@@ -115,16 +199,16 @@ class SparseLayout:
 class BandedLayout:
     """A band, a border that is full, and the corner between them."""
 
-    def __init__(self, rows: Ints, columns: Ints, size: int, in_band: int) -> None:
-        """Analyse a lower triangle given by its entries, of which the first `in_band` rows form the band."""
+    def __init__(self, blocks: Blocks, in_band: int) -> None:
+        """Find where the values go; the first `in_band` rows form the band."""
+        rows, columns, places = blocks.entries()
+        size = blocks.size
         self._band, self._border = in_band, size - in_band
-        inside = (rows < in_band) & (rows >= columns)
+        inside = rows < in_band
         self._half = int(np.max((rows - columns)[inside], initial=0)) + 1
-        self._from_band = np.nonzero(inside)[0]
+        self._from_band, self._from_border = places[inside], places[~inside]
         self._to_band = (rows - columns)[inside] + columns[inside] * self._half
-        below = (rows >= in_band) & (rows >= columns)
-        self._from_border = np.nonzero(below)[0]
-        self._to_border = columns[below] + (rows[below] - in_band) * size
+        self._to_border = columns[~inside] + (rows[~inside] - in_band) * size
 
     def factor(self, values: Floats) -> "BandedFactor":
         """Factorise the matrix with these values."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .factorization import BandedLayout, Factor, Layout, SparseLayout, choose_ordering
+from .factorization import BandedLayout, Blocks, Factor, Layout, SparseLayout, choose_ordering
 from .graph import Graph, Linearization
 
 Floats = NDArray[np.float64]
@@ -68,21 +68,19 @@ class NormalEquations:
             first += count
         touched = [[node[name][index] for name, index, _ in lin.blocks] for lin in linearized]
         pairs, which = self._pairs(touched)
-        ordering = choose_ordering(pairs, counts[0], self._inner, counts[2], banded)
-        order = np.concatenate([ordering.order, np.arange(self._inner, len(width))])
+        among_poses = pairs[(pairs < counts[0]).all(axis=1)]
+        ordering = choose_ordering(among_poses, counts[0], int(width[counts[0] :].sum()), banded)
+        order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
         corner = np.full(len(width) + 1, -1)
         corner[order] = np.cumsum(width[order]) - width[order]
         scalars = {
             name: np.where(node[name] >= 0, corner[node[name]] + np.arange(w)[:, None], -1) for name, w in WIDTHS.items()
         }
         self.unknowns = Unknowns({name: s.T for name, s in scalars.items()}, int(width.sum()))
-        rows, columns = self._place_blocks(pairs, corner, width)
-        self._place_products(linearized, touched, which, scalars)
-        if ordering.in_band:
-            in_band = int(width[ordering.order[: ordering.in_band]].sum())
-            self._layout: Layout = BandedLayout(rows, columns, self.unknowns.size, in_band)
-        else:
-            self._layout = SparseLayout(rows, columns, self.unknowns.size)
+        blocks = self._place_blocks(pairs, corner, width)
+        self._place_products(linearized, touched, which, corner)
+        in_band = int(width[ordering.order[: ordering.in_band]].sum())
+        self._layout: Layout = BandedLayout(blocks, in_band) if in_band else SparseLayout(blocks)
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
 
@@ -101,57 +99,61 @@ class NormalEquations:
         ends = np.cumsum([len(k) for k in keys])
         return pairs, [part + m for part in np.split(which, ends)[1:-1]]
 
-    def _place_blocks(self, pairs: Ints, corner: Ints, width: Ints) -> tuple[Ints, Ints]:
-        """Lay the blocks out in the array of values; return row and column of every value."""
+    def _place_blocks(self, pairs: Ints, corner: Ints, width: Ints) -> Blocks:
+        """Lay the blocks out in the array of values."""
         swap = corner[pairs[:, 0]] < corner[pairs[:, 1]]
         lower, left = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
-        size = width[lower] * width[left]
-        start = np.cumsum(size) - size
-        self._stride = np.append(width[left], 0)
-        self._base = np.append(start - corner[lower] * width[left] - corner[left], 0)
-        block = np.repeat(np.arange(len(pairs)), size)
-        row, column = np.divmod(np.arange(len(block)) - start[block], width[left][block])
-        n = self.unknowns.size
-        self._border_row = n - (len(width) - self._inner)
-        self._border_base = len(block) - self._border_row * n
-        self._trash = self._border_base + n * n
-        border = np.divmod(np.arange(self._border_row * n, n * n), n)
-        rows = np.concatenate([row + corner[lower][block], border[0]])
-        columns = np.concatenate([column + corner[left][block], border[1]])
-        each = np.arange(n)
-        node = np.repeat(np.argsort(corner[:-1]), width[np.argsort(corner[:-1])])
-        inner = each < self._border_row
-        self._diagonal = np.where(
-            inner,
-            self._base[np.where(inner, node, 0)] + each * (np.where(inner, width[node], n) + 1),
-            self._border_base + each * (n + 1),
+        blocks = Blocks(corner[lower], corner[left], width[lower], width[left], int(width.sum()), len(width) - self._inner)
+        first_full = blocks.size - blocks.full
+        self._base = np.append(
+            blocks.start - blocks.row * blocks.width - blocks.column, blocks.full_start - first_full * blocks.size
         )
-        return rows, columns
+        self._stride = np.append(blocks.width, blocks.size)
+        self._trash = blocks.full_start + blocks.full * blocks.size
+        each = np.repeat(np.arange(len(width)), width)
+        scalar = np.repeat(corner[:-1] - np.cumsum(width) + width, width) + np.arange(blocks.size)
+        block = np.where(each < self._inner, each, len(pairs))
+        self._diagonal = np.empty(blocks.size, dtype=np.int64)
+        self._diagonal[scalar] = self._base[block] + scalar * (self._stride[block] + 1)
+        return blocks
 
     def _place_products(
-        self, linearized: Sequence[Linearization], touched: list[list[Ints]], which: list[Ints], scalars: dict[str, Ints]
+        self, linearized: Sequence[Linearization], touched: list[list[Ints]], which: list[Ints], corner: Ints
     ) -> None:
-        """Find the place of every product of two Jacobian columns of one edge."""
-        n, following = self.unknowns.size, iter(which)
+        """Find the place of every product of two Jacobian columns of one edge.
+
+        The product of column i of node a and column j of node b lands at ``base + row stride + column`` of their
+        block, that is at a start plus i and j times a step; the lower triangle decides which of them is the row.
+        """
+        full, following = len(self._base) - 1, iter(which)
         gradient_rows, positions, twice = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0, bool)]
         for lin, nodes in zip(linearized, touched, strict=True):
-            stacked = np.concatenate([scalars[name][:, index] for name, index, _ in lin.blocks])
-            owner = np.repeat(np.arange(len(nodes)), [jac.shape[2] for _, _, jac in lin.blocks])
-            pair = {}
+            widths = [jac.shape[2] for _, _, jac in lin.blocks]
             for p, a in enumerate(nodes):
-                for q, b in enumerate(nodes[:p]):
-                    pair[p, q] = np.where(a == b, a, next(following))
-                pair[p, p] = a
-            gradient_rows.append(np.where(stacked >= 0, stacked, n).ravel())
-            for k, l in zip(*np.tril_indices(len(stacked)), strict=True):
-                low, high = np.minimum(stacked[k], stacked[l]), np.maximum(stacked[k], stacked[l])
-                inner = high < self._border_row
-                block = np.where(inner, pair[owner[k], owner[l]], 0)
-                place = np.where(inner, self._base[block] + high * self._stride[block], self._border_base + high * n) + low
-                positions.append(np.where(low >= 0, place, self._trash))
-                twice.append((low == high) & (low >= 0) if k != l else np.zeros(len(low), bool))
+                places = []
+                for b in nodes[: p + 1]:
+                    pair = a if b is a else np.where(a == b, a, next(following))
+                    pair = np.where((a < self._inner) & (b < self._inner), pair, full)
+                    start, by_a, by_b = self._steps(corner[a], corner[b], pair)
+                    places.append((start, by_a, by_b, (a == b) & (a >= 0)))
+                for i in range(widths[p]):
+                    gradient_rows.append(np.where(a >= 0, corner[a] + i, self.unknowns.size))
+                    for q, (start, by_a, by_b, same) in enumerate(places):
+                        for j in range(widths[q] if q < p else i + 1):
+                            place = start + i * by_a + j * by_b
+                            if q < p and i < j and same.any():
+                                place = np.where(same, start + j * by_a + i * by_b, place)
+                            positions.append(place)
+                            twice.append(same if q < p and i == j else np.zeros(len(a), dtype=bool))
         self._gradient_rows, self._positions = np.concatenate(gradient_rows), np.concatenate(positions)
         self._twice = np.nonzero(np.concatenate(twice))[0]
+
+    def _steps(self, a: Ints, b: Ints, block: Ints) -> tuple[Ints, Ints, Ints]:
+        """Return place of the first product of nodes with first scalars a, b, and its steps along either."""
+        low, high, stride = np.minimum(a, b), np.maximum(a, b), self._stride[block]
+        free = low >= 0
+        start = np.where(free, self._base[block] + high * stride + low, self._trash)
+        return start, np.where(a >= b, stride, 1) * free, np.where(a >= b, 1, stride) * free
 
     def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
         """Fill H and g from whitened Jacobians and a weight per edge."""

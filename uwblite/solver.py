@@ -17,8 +17,11 @@ lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dro
 nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05; K. Madsen, H. B. Nielsen,
 O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
 
-The search ends, and says why, when the promise or the decrease falls below a fraction of F, when every component of
-the gradient, in units of its own curvature, is negligible, when the step is, or when the iterations are used up.
+The search ends, and says why, when the decrease still to come is a negligible fraction of F, when every component of
+the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up. The
+decrease to come is extrapolated from the last two as a geometric series: exact where convergence is linear (robust
+kernels, large residuals), far on the safe side where it is quadratic; there it spares the last iteration or two that
+would only confirm.
 """
 
 from collections.abc import Callable
@@ -45,18 +48,16 @@ class SolverConfig:
     max_iterations: int = 100
     """Most linear systems solved."""
     relative_decrease: float = 1e-7
-    """Stop when a step decreases chi2 by less than this fraction of it."""
-    gradient_tolerance: float = 1e-8
+    """Stop when chi2 is about to decrease by no more than this fraction of it."""
+    gradient_tolerance: float = 1e-9
     """Stop when no gradient component exceeds this, in standard deviations: max |g_i| / sqrt(H_ii)."""
-    step_tolerance: float = 1e-10
-    """Stop when no unknown moves by more than this, m or rad."""
     initial_damping: float = 1e-10
-    """First lambda; small = trust the starting values."""
+    """First lambda; 1e-10 starts with a Gauss-Newton step, 1e-3 distrusts the starting values."""
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
             raise ConfigError(f"max_iterations must be at least 1, not {self.max_iterations}")
-        for name in ("relative_decrease", "gradient_tolerance", "step_tolerance", "initial_damping"):
+        for name in ("relative_decrease", "gradient_tolerance", "initial_damping"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
 
@@ -136,69 +137,92 @@ def optimize(
     ------
     SolverError : nothing is free, there is no edge, or estimates or measurements are not finite.
     """
-    _check(graph)
-    linearized = _linearize(graph)
-    normal = NormalEquations(graph, linearized)
+    check(graph)
+    linearized = linearize(graph)
+    return minimise(graph, linearized, NormalEquations(graph, linearized), config, progress)
+
+
+def minimise(
+    graph: Graph,
+    linearized: list[Linearization],
+    normal: NormalEquations,
+    config: SolverConfig,
+    progress: Progress | None = None,
+) -> tuple[Graph, SolverSummary]:
+    """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
     chi2 = chi2_initial = _cost(graph, linearized)
     if not np.isfinite(chi2):
         raise SolverError(_what_is_not_finite(graph, linearized))
-    damping, growth = config.initial_damping, 2.0
-    chi2_history: list[float] = []
-    damping_history: list[float] = []
-    reason, converged, fresh = "", False, False
+    damping, growth, last_decrease = config.initial_damping, 2.0, np.inf
+    history: list[tuple[float, float]] = []
+    reason, improved = "", True
     while not reason:
-        if not fresh:
+        if improved:
             normal.fill(linearized, [_or_none(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
             diagonal = normal.diagonal
             scale = np.where(diagonal > 0, diagonal, 1.0)
-            fresh = True
             if np.max(np.abs(normal.gradient) / np.sqrt(scale)) <= config.gradient_tolerance:
-                reason, converged = "gradient negligible", True
+                reason = GRADIENT
                 break
-        if len(chi2_history) == config.max_iterations:
-            reason = "iterations used up"
+        if len(history) == config.max_iterations:
+            reason = USED_UP
             break
-        if damping > _MOST_DAMPING:
-            reason = "no step decreases chi2"
-            break
-        damping_history.append(damping)
         step, promised = _step(normal, damping * scale)
         trial = moved(graph, normal.unknowns, step)
-        trial_linearized = _linearize(trial)
+        trial_linearized = linearize(trial)
         trial_chi2 = _cost(trial, trial_linearized)
-        chi2_history.append(trial_chi2)
+        history.append((trial_chi2, damping))
         if progress is not None:
-            progress(len(chi2_history), config.max_iterations)
+            progress(len(history), config.max_iterations)
         decrease = chi2 - trial_chi2
-        if np.isfinite(trial_chi2) and decrease >= 0 and promised > 0:
-            if max(decrease, promised) <= config.relative_decrease * chi2:
-                reason, converged = "chi2 no longer decreases", True
-            elif np.max(np.abs(step)) <= config.step_tolerance:
-                reason, converged = "step negligible", True
-            graph, linearized, chi2, fresh = trial, trial_linearized, trial_chi2, False
+        improved = promised > 0 and decrease >= 0
+        negligible = config.relative_decrease * chi2 + _NOTHING
+        if improved:
+            if _to_come(decrease, last_decrease, promised) <= negligible and damping <= _FREE:
+                reason = SETTLED
+            graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3)
             growth = 2.0
-        elif 0 < promised <= 1e-3 * config.relative_decrease * chi2:
-            reason, converged = "chi2 no longer decreases", True
+        elif 0 < promised <= 1e-3 * negligible and damping <= _FREE:
+            reason = SETTLED
         else:
-            damping *= growth
-            growth *= 2.0
-    summary = SolverSummary(
-        converged,
-        reason,
-        len(chi2_history),
-        chi2_initial,
-        chi2,
-        _independent_residuals(graph, linearized) - normal.unknowns.size,
-        damping,
-        np.array(chi2_history),
-        np.array(damping_history),
-        _unobserved(normal.unknowns, normal.diagonal),
+            damping, growth = max(damping * growth, _FIRST_BRAKE), growth * 2.0
+            if damping > _MOST_DAMPING:
+                reason = STUCK
+    chi2_history, damping_history = np.array(history).reshape(-1, 2).T
+    return graph, SolverSummary(
+        converged=reason in (SETTLED, GRADIENT),
+        reason=reason,
+        iterations=len(history),
+        chi2_initial=chi2_initial,
+        chi2=chi2,
+        dof=_independent_residuals(graph, linearized) - normal.unknowns.size,
+        damping=damping,
+        chi2_history=chi2_history,
+        damping_history=damping_history,
+        unobserved=_unobserved(normal.unknowns, normal.diagonal),
     )
-    return graph, summary
 
 
+SETTLED = "chi2 no longer decreases"
+GRADIENT = "gradient negligible"
+STUCK = "no step decreases chi2"
+USED_UP = "iterations used up"
+
+_NOTHING = 1e-12
+"""chi2, in standard deviations squared, that never matters."""
+_FREE = 1e-2
+"""lambda up to which small steps mean a minimum and not just a strong brake."""
+_FIRST_BRAKE = 1e-7
+"""Least lambda after a step that failed."""
 _MOST_DAMPING = 1e12
+
+
+def _to_come(decrease: float, last: float, promised: float) -> float:
+    """Extrapolate the decrease after the present one; before there are two to compare, it may be as large again."""
+    if not np.isfinite(last):
+        return max(decrease, promised)
+    return decrease**2 / (last - decrease) if decrease < last else np.inf
 
 
 def _step(normal: NormalEquations, damping: Floats) -> tuple[Floats, float]:
@@ -210,7 +234,8 @@ def _step(normal: NormalEquations, damping: Floats) -> tuple[Floats, float]:
     return step, float(step @ (damping * step - normal.gradient))
 
 
-def _linearize(graph: Graph) -> list[Linearization]:
+def linearize(graph: Graph) -> list[Linearization]:
+    """Linearise every kind of edges."""
     return [edges.linearize(graph) for edges in graph.edges]
 
 
@@ -218,7 +243,8 @@ def _cost(graph: Graph, linearized: list[Linearization]) -> float:
     return sum(edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True))
 
 
-def _check(graph: Graph) -> None:
+def check(graph: Graph) -> None:
+    """Raise SolverError where nothing is free, nothing is measured, or a starting value is not finite."""
     if not any(mask.any() for mask in free_unknowns(graph).values()):
         raise SolverError("nothing to optimise: every pose, anchor and calibration value is held fixed")
     if not sum(len(edges) for edges in graph.edges):
@@ -248,10 +274,10 @@ def _independent_residuals(graph: Graph, linearized: list[Linearization]) -> int
     for edges, lin in zip(graph.edges, linearized, strict=True):
         used = slice(None) if edges.weights is None else edges.weights > 0
         jacobians = np.concatenate([jac for _, _, jac in lin.blocks], axis=2)[used]
-        if jacobians.shape[1] == 1:
-            total += int(np.any(jacobians != 0, axis=(1, 2)).sum())
-        else:
-            total += int(np.linalg.matrix_rank(jacobians @ jacobians.transpose(0, 2, 1), hermitian=True).sum())
+        gram = jacobians @ jacobians.transpose(0, 2, 1)
+        total += gram.shape[0] * gram.shape[1]
+        doubtful = gram[np.abs(np.linalg.det(gram)) <= 1e-12 * np.prod(np.einsum("eii->ei", gram), axis=1)]
+        total -= int(np.sum(gram.shape[1] - np.linalg.matrix_rank(doubtful, hermitian=True)))
     return total
 
 
