@@ -1,5 +1,7 @@
 """Filters against brute force, normals against known walls."""
 
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -156,6 +158,13 @@ def test_a_cloud_is_the_same_whatever_is_asked_of_it_first():
     one.raster(0.3, 2)
     np.testing.assert_array_equal(one.raster(0.2).table, two.raster(0.2).table)
     assert one.raster(0.2) is one.raster(0.2)
+
+
+def test_a_cloud_goes_to_another_process_and_back():
+    cloud = make_cloud(np.random.default_rng(5).uniform(0.0, 3.0, (100, 2)), np.ones(2))
+    copy = pickle.loads(pickle.dumps(cloud))
+    np.testing.assert_array_equal(copy.surface, cloud.surface)
+    np.testing.assert_array_equal(copy.tree.query(cloud.points, k=3)[1], cloud.tree.query(cloud.points, k=3)[1])
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import se2
+from .config import setting
 from .line_factor import (
     CAUCHY,
     LineFactor,
@@ -30,7 +31,7 @@ Floats = NDArray[np.float64]
 
 _COARSE_TOLERANCE = 10.0
 """The coarse stage hands over at steps so many times the tolerance."""
-_GATE_SHRINK = 0.7
+_GATE_SHRINK = 0.6
 """Per iteration of the coarse stage."""
 _LEAST_REACH = 0.2
 """m; a finer table of nearest points is larger and no better."""
@@ -42,9 +43,9 @@ class IcpConfig:
 
     method: Literal["point_to_line", "point_to_point"] = "point_to_line"
     """point_to_point is the paper's; it knows neither lines nor corridors."""
-    max_correspondence_distance: float = 0.15
+    max_correspondence_distance: float = setting(0.15, above=0.0)
     """m; points farther apart are no pair (the paper's d)."""
-    max_iterations: int = 50
+    max_iterations: int = setting(50, minimum=1)
     """Of all stages together."""
     tolerance_translation: float = 5e-4
     """m; a smaller step in both senses ends the iteration."""
@@ -53,9 +54,9 @@ class IcpConfig:
     coarse_distance: float = 1.0
     """m; gate of the first iteration of point_to_line, from which it shrinks to max_correspondence_distance: about the
     error of the initial guess. No larger than that distance = no coarse stage."""
-    coarse_stride: int = 4
+    coarse_stride: int = setting(4, minimum=1)
     """The coarse stage takes every so-many-th point."""
-    sigma: float = 0.02
+    sigma: float = setting(0.02, above=0.0)
     """m, standard deviation of a point about a line by the noise of both clouds; scale of the kernel. (The coarse
     stage widens it with the gate.)"""
     min_sigma: float = 0.01
@@ -67,7 +68,7 @@ class IcpConfig:
     degeneracy: float = 2.0
     """Multiple of the information feigned by scattering normals that a direction must exceed to be measured;
     point_to_line only."""
-    min_matches: int = 10
+    min_matches: int = setting(10, minimum=1)
     """Fewer pairs are no registration."""
     fitness_sigma: float = float("inf")
     """m^2; a fitness score above it is no registration (the paper's sigma)."""

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .config import setting
 from .nearest import NearestRaster
 from .point_cloud import PointCloud
 from .robust import Kernel
@@ -42,9 +43,9 @@ _TINY = 1e-30
 class LineFactorConfig:
     """Which pairs count and how much."""
 
-    gate: float = 0.3
+    gate: float = setting(0.3, above=0.0)
     """m; points farther apart are no pair."""
-    sigma: float = 0.02
+    sigma: float = setting(0.02, above=0.0)
     """m, standard deviation of a raw point about a line by the noise of both clouds. (The residuals of means are
     smaller, but neighbouring ones share their noise: in sum they tell as much as raw points do.)"""
     kernel: Kernel = CAUCHY

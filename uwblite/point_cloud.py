@@ -106,7 +106,7 @@ def statistical_outlier_filter(
     if k < 1:
         return np.ones(len(points), bool)
     tree = make_tree(points) if tree is None else tree
-    mean = tree.query(points, k=np.arange(2, k + 2))[0].mean(axis=1)
+    mean = tree.query(points, k=list(range(2, k + 2)))[0].mean(axis=1)
     return np.asarray(mean <= mean.mean() + std_ratio * mean.std())
 
 
@@ -163,9 +163,8 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
     min_neighbours : other points a neighbourhood needs to give a line.
     """
     n = len(points)
-    pairs = tree.query_pairs(radius, output_type="ndarray")
-    i, j = pairs[:, 0], pairs[:, 1]
-    dx, dy = (points[:, 0][j] - points[:, 0][i], points[:, 1][j] - points[:, 1][i])
+    i, j = np.ascontiguousarray(tree.query_pairs(radius, output_type="ndarray").T)
+    dx, dy = (column.take(j) - column.take(i) for column in np.ascontiguousarray(points.T))
     both = np.bincount(i, minlength=n) + np.bincount(j, minlength=n)
     count = both + 1.0
     mx = (np.bincount(i, dx, n) - np.bincount(j, dx, n)) / count

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from . import se2
+from .config import setting
 from .point_cloud import PointCloud
 
 Floats = NDArray[np.float64]
@@ -29,13 +30,13 @@ _CELLS_PER_REACH = 4
 class SearchConfig:
     """Grid of poses and what is made of its scores."""
 
-    resolution: float = 0.15
+    resolution: float = setting(0.15, above=0.0)
     """Step of x and y, m; time goes with its inverse square."""
-    angle_step: float = 0.03
+    angle_step: float = setting(0.03, above=0.0)
     """Step of the heading, rad; at the source's far points about the resolution."""
-    spread: float = 0.12
+    spread: float = setting(0.12, above=0.0)
     """Standard deviation of a point about the target's surface, m; about the resolution."""
-    candidates: int = 5
+    candidates: int = setting(5, minimum=1)
     """Most poses that are returned."""
     separation: float = 0.5
     """m; poses closer than that and than separation_angle are one candidate."""
