@@ -1,0 +1,208 @@
+"""Pose graphs in g2o's text format, planar part, and TORO's older form of it.
+
+| line | fields |
+|---|---|
+| VERTEX_SE2 | id x y theta |
+| VERTEX_XY | id x y |
+| EDGE_SE2 | id_i id_j dx dy dtheta I11 I12 I13 I22 I23 I33 |
+| EDGE_SE2_XY | id_pose id_landmark dx dy I11 I12 I22 |
+| EDGE_PRIOR_SE2 | id x y theta I11 I12 I13 I22 I23 I33 |
+| EDGE_PRIOR_XY | id x y I11 I12 I22 |
+| FIX | id |
+| EDGE_RANGE_SE2_XY | id_pose id_landmark range I11 (not part of g2o; seen in other projects) |
+| VERTEX2 | id x y theta (TORO) |
+| EDGE2 | id_i id_j dx dy dtheta I11 I12 I22 I33 I13 I23 (TORO: another order) |
+
+I is the upper triangle of the information matrix in the chart e = Z^-1 (Xi^-1 Xj), the one of uwblite's edges.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..graph import Graph
+from .files import replacing
+from .graph_file import GraphFile, PlainEdges, assembled, plain_edges, read_matrices, told_places, upper_triangle
+from .records import Layout, RecordFile, Records, read_records
+from .source import open_source
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_LAYOUTS = {
+    "VERTEX_SE2": Layout(1, 3),
+    "VERTEX_XY": Layout(1, 2),
+    "EDGE_SE2": Layout(2, 9),
+    "EDGE_SE2_XY": Layout(2, 5),
+    "EDGE_PRIOR_SE2": Layout(1, 9),
+    "EDGE_PRIOR_XY": Layout(1, 5),
+    "FIX": Layout(1, 0),
+    "EDGE_RANGE_SE2_XY": Layout(2, 2),
+    "VERTEX2": Layout(1, 3),
+    "EDGE2": Layout(2, 9),
+}
+_FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
+"""Where dx dy dtheta I11 I12 I13 I22 I23 I33 stand among the numbers of an EDGE2."""
+_SPATIAL = ("VERTEX_SE3", "EDGE_SE3", "VERTEX_TRACKXYZ", "VERTEX3", "EDGE3")
+
+
+def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
+    """Read a planar pose graph, g2o or TORO, plain or gzip; ``-`` = standard input.
+
+    Poses without a VERTEX line are reached from the others along edges; in a file without any, the first pose is the
+    origin. Landmarks without one are placed by the first edge that sees them, or stay nan.
+
+    Parameters
+    ----------
+    path : the file.
+    from_odometry : forget the vertices' places and start from the edges between successive poses.
+
+    Raises
+    ------
+    FormatError : a line is wrong, the graph is not planar, or a pose cannot be reached.
+    """
+    with open_source(path) as source:
+        content = read_records(source, _LAYOUTS)
+    records = content.records
+    for tag in content.skipped:
+        if tag.startswith(_SPATIAL):
+            raise content.error(f"holds {tag}: the graph is three-dimensional; only planar graphs are read")
+    toro = records["EDGE2"]
+    toro = Records(toro.lines, toro.stamps, toro.names, toro.numbers[:, _FROM_TORO])
+    steps = _together(records["EDGE_SE2"], toro)
+    vertices = _together(records["VERTEX_SE2"], records["VERTEX2"])
+    seen, ranged = records["EDGE_SE2_XY"], records["EDGE_RANGE_SE2_XY"]
+    pinned, surveyed = records["EDGE_PRIOR_SE2"], records["EDGE_PRIOR_XY"]
+    ids = _ids(content)
+    pose_names = (vertices.names, steps.names, seen.names[:, :1], ranged.names[:, :1], pinned.names)
+    pose_ids, pose_of = _numbered(ids, pose_names)
+    landmark_names = (records["VERTEX_XY"].names, seen.names[:, 1:], ranged.names[:, 1:], surveyed.names)
+    landmark_ids, landmark_of = _numbered(ids, landmark_names)
+    _check(content, pose_ids, landmark_ids, pose_of[steps.names], steps.lines, ranged)
+
+    def matrices(of: Records, size: int, first: int) -> Floats:
+        return read_matrices(of.numbers[:, first:], size, of.lines, content.path, "information")
+
+    plain = PlainEdges(
+        pose_of[steps.names[:, 0]],
+        pose_of[steps.names[:, 1]],
+        steps.numbers[:, :3],
+        matrices(steps, 3, 3),
+        (pose_of[seen.names[:, 0]], landmark_of[seen.names[:, 1]], seen.numbers[:, :2], matrices(seen, 2, 2)),
+        (
+            pose_of[ranged.names[:, 0]],
+            landmark_of[ranged.names[:, 1]],
+            ranged.numbers[:, 0],
+            1.0 / np.sqrt(ranged.numbers[:, 1]),
+        ),
+        (pose_of[pinned.names[:, 0]], pinned.numbers[:, :3], matrices(pinned, 3, 3)),
+        (landmark_of[surveyed.names[:, 0]], surveyed.numbers[:, :2], matrices(surveyed, 2, 2)),
+    )
+    poses = told_places(vertices, pose_of, len(pose_ids), content, from_odometry)
+    anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
+    held = records["FIX"].names[:, 0]
+    graph = assembled(plain, poses, anchors, *(index[held][index[held] >= 0] for index in (pose_of, landmark_of)))
+    return GraphFile.checked(
+        graph,
+        tuple(map(str, pose_ids.tolist())),
+        tuple(map(str, landmark_ids.tolist())),
+        np.arange(len(pose_ids), dtype=np.float64),
+        content,
+    )
+
+
+def write_g2o(
+    path: str | os.PathLike[str], graph: Graph, anchor_ids: Sequence[str] = (), *, ranges: bool = False
+) -> None:
+    """Write a graph for g2o and its kin: poses, anchors, edges between poses, and what is held fixed.
+
+    Poses are vertices 0..n-1 and anchors follow. Calibration and lever arms are worked in at the present estimate
+    (see graph_file.plain_edges); robust kernels are not written.
+
+    Parameters
+    ----------
+    path : the file, compressed where its name ends in ``.gz``.
+    graph : the graph; anchors that are not finite are left out with their ranges.
+    anchor_ids : (a,) names of the anchors; a comment tells which vertex is which.
+    ranges : also write EDGE_RANGE_SE2_XY, which stock g2o does not know.
+
+    Raises
+    ------
+    OSError : the file cannot be written.
+    """
+    with replacing(path) as stream:
+        for vertex, name in enumerate(anchor_ids, len(graph.poses)):
+            stream.write(f"# vertex {vertex} is anchor {name}\n".encode())
+        for line in _lines(graph, ranges):
+            stream.write(line.encode())
+
+
+def _lines(graph: Graph, ranges: bool) -> Iterator[str]:
+    plain, n = plain_edges(graph), len(graph.poses)
+    placed = np.isfinite(graph.anchors).all(axis=1)
+    yield from _rows("VERTEX_SE2", [np.arange(n)], graph.poses)
+    yield from _rows("VERTEX_XY", [n + np.flatnonzero(placed)], graph.anchors[placed])
+    held = np.zeros(1, dtype=np.int64) if graph.fixed_poses is None else np.flatnonzero(graph.fixed_poses)
+    if graph.fixed_anchors is not None:
+        held = np.concatenate([held, n + np.flatnonzero(graph.fixed_anchors & placed)])
+    yield from _rows("FIX", [held], np.zeros((len(held), 0)))
+    yield from _rows("EDGE_SE2", [plain.i, plain.j], plain.T_i_j, upper_triangle(plain.information))
+    pose, anchor, position, information = plain.sightings
+    yield from _rows("EDGE_SE2_XY", [pose, n + anchor], position, upper_triangle(information))
+    pose, value, information = plain.pose_priors
+    yield from _rows("EDGE_PRIOR_SE2", [pose], value, upper_triangle(information))
+    anchor, value, information = plain.landmark_priors
+    yield from _rows("EDGE_PRIOR_XY", [n + anchor], value, upper_triangle(information))
+    if ranges:
+        pose, anchor, distance, sigma = plain.ranges
+        yield from _rows("EDGE_RANGE_SE2_XY", [pose, n + anchor], np.stack([distance, 1.0 / sigma**2], axis=1))
+
+
+def _rows(tag: str, ids: Sequence[Ints], *columns: Floats) -> Iterator[str]:
+    """Yield lines of one tag: whole numbers, then numbers, written so that they read back as they were."""
+    numbers = np.concatenate(columns, axis=1)
+    names = zip(*(column.tolist() for column in ids), strict=True)
+    for vertex, row in zip(names, numbers.tolist(), strict=True):
+        yield " ".join([tag, *map(str, vertex), *(repr(value + 0.0) for value in row)]) + "\n"
+
+
+def _together(a: Records, b: Records) -> Records:
+    """Return the lines of both kinds in the order of the file."""
+    order = np.argsort(np.concatenate([a.lines, b.lines]), kind="stable")
+    columns = zip((a.lines, a.stamps, a.names, a.numbers), (b.lines, b.stamps, b.names, b.numbers), strict=True)
+    return Records(*(np.concatenate(pair)[order] for pair in columns))
+
+
+def _ids(content: RecordFile) -> Ints:
+    """Return the vertex id that each name of the file stands for."""
+    try:
+        return np.array([int(name) for name in content.names], dtype=np.int64)
+    except (ValueError, OverflowError):
+        wrong = next(n for n in content.names if len(n) > 18 or not n.lstrip(b"-").isdigit())
+        raise content.error(f"{wrong[:30].decode(errors='replace')!r} is not a vertex id, a whole number") from None
+
+
+def _numbered(ids: Ints, names: Sequence[Ints]) -> tuple[Ints, Ints]:
+    """Return the ids (n,) among these names in order, and for every name of the file its place there, -1 = none."""
+    used = np.unique(np.concatenate([n.reshape(-1) for n in names]))
+    listed, place = np.unique(ids[used], return_inverse=True)
+    index = np.full(len(ids), -1, dtype=np.int64)
+    index[used] = place.reshape(-1)
+    return listed, index
+
+
+def _check(content: RecordFile, pose_ids: Ints, landmark_ids: Ints, ends: Ints, lines: Ints, ranged: Records) -> None:
+    """Raise FormatError where the records make no graph."""
+    if len(pose_ids) == 0:
+        raise content.error("holds no poses; is this a g2o file?")
+    both = np.intersect1d(pose_ids, landmark_ids)
+    if len(both):
+        raise content.error(f"vertex {both[0]} is used as a pose and as a landmark")
+    loops = np.flatnonzero(ends[:, 0] == ends[:, 1])
+    if len(loops):
+        raise content.error("an edge leads from a pose to itself", int(lines[loops[0]]))
+    bad = np.flatnonzero(~(ranged.numbers[:, 1] > 0))
+    if len(bad):
+        raise content.error("the information of a range must be positive", int(ranged.lines[bad[0]]))

@@ -1,0 +1,214 @@
+"""Range-aided pose graphs in PyFactorGraph's text format, as CORA reads it; planar part.
+
+| line | fields |
+|---|---|
+| VERTEX_SE2 | stamp A0 x y theta |
+| VERTEX_XY | L0 x y |
+| VERTEX_SE2:PRIOR | stamp A0 x y theta c11 c12 c13 c22 c23 c33 |
+| VERTEX_XY:PRIOR | stamp L0 x y c11 c12 c22 |
+| EDGE_SE2 | stamp A0 A1 dx dy dtheta c11 c12 c13 c22 c23 c33 |
+| EDGE_SE2_XY | stamp A2 L0 dx dy c11 c12 c22 |
+| EDGE_RANGE | stamp A2 L0 range variance |
+
+A name is a letter and a number; L is a landmark. c is the upper triangle of a covariance matrix. Others' files often hold
+the true poses as vertices: see `from_odometry`.
+"""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..graph import Graph
+from .files import replacing
+from .graph_file import GraphFile, PlainEdges, assembled, plain_edges, read_matrices, told_places, upper_triangle
+from .records import Layout, RecordFile, Records, read_records
+from .source import open_source
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_LAYOUTS = {
+    "VERTEX_SE2": Layout(1, 3, stamped=True),
+    "VERTEX_XY": Layout(1, 2),
+    "VERTEX_SE2:PRIOR": Layout(1, 9, stamped=True),
+    "VERTEX_XY:PRIOR": Layout(1, 5, stamped=True),
+    "EDGE_SE2": Layout(2, 9, stamped=True),
+    "EDGE_SE2_XY": Layout(2, 5, stamped=True),
+    "EDGE_RANGE": Layout(2, 2, stamped=True),
+}
+_SPATIAL = ("VERTEX_SE3", "VERTEX_XYZ", "EDGE_SE3")
+_NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
+_FLATTEST = 1e-8
+"""Least eigenvalue of an information matrix, relative to its largest, before it is inverted: the format holds covariances,
+and a direction that was not measured has none."""
+
+
+def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
+    """Read a planar PyFG graph, plain or gzip; ``-`` = standard input.
+
+    Ranges between two poses or two landmarks are counted as skipped.
+
+    Parameters
+    ----------
+    path : the file.
+    from_odometry : forget where the vertices are and start from the edges between successive poses; landmarks that only
+        ranges measure then have no position (nan).
+
+    Raises
+    ------
+    FormatError : a line is wrong, the graph is not planar, or a pose cannot be reached.
+    """
+    with open_source(path) as source:
+        content = read_records(source, _LAYOUTS)
+    for tag in content.skipped:
+        if tag.startswith(_SPATIAL):
+            raise content.error(f"holds {tag}: the graph is three-dimensional; only planar graphs are read")
+    pose_ids, pose_of, landmark_ids, landmark_of = _numbered(content)
+    if not pose_ids:
+        raise content.error("holds no poses; is this a PyFG file?")
+    records = content.records
+    steps, seen = records["EDGE_SE2"], records["EDGE_SE2_XY"]
+    pinned, surveyed = records["VERTEX_SE2:PRIOR"], records["VERTEX_XY:PRIOR"]
+    ranged = _between_pose_and_landmark(records["EDGE_RANGE"], pose_of, landmark_of, content)
+    ends = pose_of[steps.names]
+    for of, wrong, problem in (
+        (steps, (ends < 0).any(axis=1), "an edge between poses names a landmark"),
+        (steps, ends[:, 0] == ends[:, 1], "an edge leads from a pose to itself"),
+        (seen, (pose_of[seen.names[:, 0]] < 0) | (landmark_of[seen.names[:, 1]] < 0), "needs a pose and a landmark"),
+        (ranged, ~(ranged.numbers[:, 1] > 0), "the variance of a range must be positive"),
+        (pinned, pose_of[pinned.names[:, 0]] < 0, "a prior on a pose names a landmark"),
+        (surveyed, landmark_of[surveyed.names[:, 0]] < 0, "a prior on a landmark names a pose"),
+        (records["VERTEX_SE2"], pose_of[records["VERTEX_SE2"].names[:, 0]] < 0, "a pose is named like a landmark"),
+        (records["VERTEX_XY"], landmark_of[records["VERTEX_XY"].names[:, 0]] < 0, "a landmark is named like a pose"),
+    ):
+        if wrong.any():
+            raise content.error(problem, int(of.lines[int(np.argmax(wrong))]))
+
+    def matrices(of: Records, size: int, first: int) -> Floats:
+        return _inverse(read_matrices(of.numbers[:, first:], size, of.lines, content.path, "covariance"), of, content)
+
+    plain = PlainEdges(
+        ends[:, 0],
+        ends[:, 1],
+        steps.numbers[:, :3],
+        matrices(steps, 3, 3),
+        (pose_of[seen.names[:, 0]], landmark_of[seen.names[:, 1]], seen.numbers[:, :2], matrices(seen, 2, 2)),
+        (
+            pose_of[ranged.names[:, 0]],
+            landmark_of[ranged.names[:, 1]],
+            ranged.numbers[:, 0],
+            np.sqrt(ranged.numbers[:, 1]),
+        ),
+        (pose_of[pinned.names[:, 0]], pinned.numbers[:, :3], matrices(pinned, 3, 3)),
+        (landmark_of[surveyed.names[:, 0]], surveyed.numbers[:, :2], matrices(surveyed, 2, 2)),
+    )
+    poses = told_places(records["VERTEX_SE2"], pose_of, len(pose_ids), content, from_odometry)
+    anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
+    stamps = np.arange(len(pose_ids), dtype=np.float64)
+    stamps[ends[:, 1]] = steps.stamps
+    stamps[pose_of[records["VERTEX_SE2"].names[:, 0]]] = records["VERTEX_SE2"].stamps
+    return GraphFile.checked(assembled(plain, poses, anchors), pose_ids, landmark_ids, stamps, content)
+
+
+def write_pyfg(
+    path: str | os.PathLike[str], graph: Graph, anchor_ids: Sequence[str] = (), stamps: Floats | None = None
+) -> None:
+    """Write a graph with its ranges; poses are A0, A1, ... and anchors L0, L1, ... in the order of the graph.
+
+    Calibration and lever arms are worked in at the present estimate (see graph_file.plain_edges); robust kernels
+    are not written. The vertices hold the estimate.
+
+    Parameters
+    ----------
+    path : the file, compressed where its name ends in ``.gz``.
+    graph : the graph; anchors that are not finite are left out with their ranges.
+    anchor_ids : accepted for symmetry with write_g2o; the format has no room for names or comments.
+    stamps : (n,) s, time of each pose; None = its number.
+
+    Raises
+    ------
+    OSError : the file cannot be written.
+    """
+    stamps = np.arange(len(graph.poses), dtype=np.float64) if stamps is None else stamps
+    with replacing(path) as stream:
+        for line in _lines(graph, stamps):
+            stream.write(line.encode())
+
+
+def _lines(graph: Graph, stamps: Floats) -> Iterator[str]:
+    plain = plain_edges(graph)
+    first = int(np.flatnonzero(graph.fixed_poses)[0]) if graph.fixed_poses is not None and graph.fixed_poses.any() else 0
+    placed = np.isfinite(graph.anchors).all(axis=1)
+    yield from _rows("VERTEX_SE2", stamps, [("A", np.arange(len(graph.poses)))], graph.poses)
+    yield from _rows("VERTEX_XY", None, [("L", np.flatnonzero(placed))], graph.anchors[placed])
+    pose, value, information = plain.pose_priors
+    yield from _rows("VERTEX_SE2:PRIOR", stamps[pose], [("A", pose)], value, _covariances(information))
+    anchor, value, information = plain.landmark_priors
+    yield from _rows("VERTEX_XY:PRIOR", np.full(len(anchor), stamps[first]), [("L", anchor)], value, _covariances(information))
+    ends = [("A", plain.i), ("A", plain.j)]
+    yield from _rows("EDGE_SE2", stamps[plain.j], ends, plain.T_i_j, _covariances(plain.information))
+    pose, anchor, position, information = plain.sightings
+    yield from _rows("EDGE_SE2_XY", stamps[pose], [("A", pose), ("L", anchor)], position, _covariances(information))
+    pose, anchor, distance, sigma = plain.ranges
+    yield from _rows("EDGE_RANGE", stamps[pose], [("A", pose), ("L", anchor)], np.stack([distance, sigma**2], axis=1))
+
+
+def _rows(tag: str, stamps: Floats | None, names: list[tuple[str, Ints]], *columns: Floats) -> Iterator[str]:
+    """Yield lines of one tag; numbers are written so that they read back as they were."""
+    numbers = np.concatenate(columns, axis=1).tolist()
+    times = [""] * len(numbers) if stamps is None else [f" {stamp:.6f}" for stamp in stamps.tolist()]
+    ends = zip(*([f"{letter}{number}" for number in column.tolist()] for letter, column in names), strict=True)
+    for time, name, row in zip(times, ends, numbers, strict=True):
+        yield f"{tag}{time} {' '.join(name)} {' '.join(repr(value + 0.0) for value in row)}\n"
+
+
+def _covariances(information: Floats) -> Floats:
+    """Return upper triangles of covariances (e, k (k + 1) / 2)."""
+    if len(information) == 0:
+        return upper_triangle(information)
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, np.maximum(_FLATTEST * values[:, -1:], np.finfo(np.float64).tiny))
+    return upper_triangle((vectors / values[:, None, :]) @ np.swapaxes(vectors, 1, 2))
+
+
+def _inverse(covariance: Floats, of: Records, content: RecordFile) -> Floats:
+    """Return the information matrices (e, k, k)."""
+    if len(covariance) == 0:
+        return covariance
+    values, vectors = np.linalg.eigh(covariance)
+    bad = np.flatnonzero(~(values[:, 0] > 0))
+    if len(bad):
+        raise content.error("the covariance matrix is singular", int(of.lines[bad[0]]))
+    return (vectors / values[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+
+
+def _numbered(content: RecordFile) -> tuple[tuple[str, ...], Ints, tuple[str, ...], Ints]:
+    """Return names of poses, place of every name among them (-1 = none), and the same of landmarks."""
+    parsed = [_NAME.fullmatch(name) for name in content.names]
+    index = [np.full(len(parsed), -1, dtype=np.int64) for _ in range(2)]
+    listed: list[list[tuple[bytes, int, int]]] = [[], []]
+    for place, (name, match) in enumerate(zip(content.names, parsed, strict=True)):
+        if match is None:
+            shown = name[:30].decode(errors="replace")
+            raise content.error(f"{shown!r} is not a name: a letter and a number, L for landmarks")
+        listed[match[1] == b"L"].append((match[1], int(match[2]), place))
+    names = []
+    for kind, found in zip(index, listed, strict=True):
+        found.sort()
+        kind[[place for _, _, place in found]] = np.arange(len(found))
+        names.append(tuple(content.names[place].decode() for _, _, place in found))
+    return names[0], index[0], names[1], index[1]
+
+
+def _between_pose_and_landmark(ranged: Records, pose_of: Ints, landmark_of: Ints, content: RecordFile) -> Records:
+    """Return the ranges between a pose and a landmark, in this order; the others are counted as skipped."""
+    names = ranged.names.copy()
+    swapped = (landmark_of[names[:, 0]] >= 0) & (pose_of[names[:, 1]] >= 0)
+    names[swapped] = names[swapped, ::-1]
+    used = (pose_of[names[:, 0]] >= 0) & (landmark_of[names[:, 1]] >= 0)
+    if not used.all():
+        content.skipped["EDGE_RANGE between two poses or two landmarks"] = int((~used).sum())
+    return Records(ranged.lines[used], ranged.stamps[used], names[used], ranged.numbers[used])

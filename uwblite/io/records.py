@@ -1,0 +1,148 @@
+"""Text of one record a line, ``TAG [stamp] names... numbers...``, as g2o, TORO and PyFG files are written."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from .source import OVERLONG_LINE, TextSource
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_TAGS_COUNTED = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What stands on a line behind its tag."""
+
+    names: int
+    """How many names (vertex ids)."""
+    numbers: int
+    """How many numbers."""
+    stamped: bool = False
+    """Whether a time stands before the names."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Records:
+    """All lines of one tag."""
+
+    lines: Ints
+    """(n,) line number in the file."""
+    stamps: Floats
+    """(n,) s; 0 where lines bear no time."""
+    names: Ints
+    """(n, names) index into RecordFile.names."""
+    numbers: Floats
+    """(n, numbers), finite."""
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+
+@dataclass(slots=True, eq=False)
+class RecordFile:
+    """A file taken apart."""
+
+    path: str
+    names: list[bytes]
+    """Every name once, in the order of first appearance."""
+    records: dict[str, Records]
+    """By tag; every tag asked for is there."""
+    skipped: dict[str, int] = field(default_factory=dict)
+    """Tags that were not asked for, and how many lines have them."""
+
+    def error(self, problem: str, line: int | None = None) -> FormatError:
+        """Return an error that names file and line."""
+        return FormatError(problem, self.path, line)
+
+
+def read_records(source: TextSource, layouts: Mapping[str, Layout]) -> RecordFile:
+    """Read all records of a file, in blocks.
+
+    Parameters
+    ----------
+    source : the open file.
+    layouts : by tag; lines of other tags are counted, comments (#) and blank lines are not.
+
+    Raises
+    ------
+    FormatError : a line of a known tag has another number of fields, or a number that is none or not finite.
+    """
+    known = {tag.encode(): layout for tag, layout in layouts.items()}
+    parts: dict[bytes, list[Records]] = {tag: [] for tag in known}
+    names: dict[bytes, int] = {}
+    result = RecordFile(source.path, [], {})
+    read = 0
+    for block in source.blocks():
+        rows: dict[bytes, list[tuple[int, list[bytes]]]] = {}
+        lines = block.split(b"\n")[:-1]
+        for number, line in enumerate(lines, read + 1):
+            tokens = line.split()
+            if not tokens or tokens[0].startswith(b"#"):
+                continue
+            if tokens[0] in known:
+                rows.setdefault(tokens[0], []).append((number, tokens))
+            else:
+                _count(result, tokens[0], number)
+        read += len(lines)
+        for tag, found in rows.items():
+            parts[tag].append(_table(found, known[tag], names, result))
+    result.names = list(names)
+    result.records = {tag.decode(): _joined(found, known[tag]) for tag, found in parts.items()}
+    return result
+
+
+def _count(result: RecordFile, tag: bytes, line: int) -> None:
+    if tag.startswith(OVERLONG_LINE) or not (tag.isascii() and tag.decode().isprintable()):
+        raise result.error("this is no graph file: a line begins with binary data or is longer than a megabyte", line)
+    name = tag.decode()[:40]
+    if name not in result.skipped and len(result.skipped) >= _TAGS_COUNTED:
+        name = "others"
+    result.skipped[name] = result.skipped.get(name, 0) + 1
+
+
+def _table(rows: list[tuple[int, list[bytes]]], layout: Layout, names: dict[bytes, int], result: RecordFile) -> Records:
+    """Turn the tokens of lines of one tag into arrays."""
+    first = 1 + layout.stamped
+    width = first + layout.names + layout.numbers
+    for line, tokens in rows:
+        if len(tokens) != width:
+            raise result.error(f"{tokens[0].decode()} has {len(tokens) - 1} fields, expected {width - 1}", line)
+    numeric = [tokens[1:first] + tokens[first + layout.names :] for _, tokens in rows]
+    try:
+        values = np.array(numeric, dtype=np.float64).reshape(len(rows), -1)
+    except ValueError:
+        raise _not_a_number(rows, numeric, result) from None
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise result.error("a number is not finite", rows[bad[0]][0])
+    indices = [[names.setdefault(name, len(names)) for name in tokens[first : first + layout.names]] for _, tokens in rows]
+    return Records(
+        np.array([line for line, _ in rows], dtype=np.int64),
+        values[:, 0] if layout.stamped else np.zeros(len(rows)),
+        np.array(indices, dtype=np.int64).reshape(len(rows), layout.names),
+        values[:, 1:] if layout.stamped else values,
+    )
+
+
+def _not_a_number(rows: list[tuple[int, list[bytes]]], numeric: list[list[bytes]], result: RecordFile) -> FormatError:
+    for (line, _), tokens in zip(rows, numeric, strict=True):
+        for token in tokens:
+            try:
+                float(token)
+            except ValueError:
+                return result.error(f"{token[:30]!r} is not a number", line)
+    return result.error("a number cannot be read", rows[0][0])
+
+
+def _joined(parts: list[Records], layout: Layout) -> Records:
+    if not parts:
+        none = np.zeros(0, dtype=np.int64)
+        return Records(none, np.zeros(0), none.reshape(0, layout.names), np.zeros((0, layout.numbers)))
+    columns = [(p.lines, p.stamps, p.names, p.numbers) for p in parts]
+    return Records(*(np.concatenate(column) for column in zip(*columns, strict=True)))
