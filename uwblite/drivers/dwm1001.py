@@ -20,6 +20,8 @@ from .events import Corrupt, RangeReading, corrupt
 BAUD = 115200
 MAX_RANGE_MM = 200_000
 """mm; the radio reaches 60 m, anything above this is a damaged frame."""
+MAX_PLACE_MM = 10_000_000
+"""mm; nobody sets up anchors further than this from the origin."""
 
 ERRORS = {
     0: "ok", 1: "unknown command or broken request", 2: "internal error", 3: "invalid parameter", 4: "busy",
@@ -142,6 +144,8 @@ _VALUES = {
 }  # fmt: skip
 _LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
 _STATUS_MASK = 0x01EF
+_HEAD_AS_STATUS = 0x0140
+"""``40 01``, the head of the next answer, read as a status: user data and an update pending in a node with no network."""
 _POSITION = struct.Struct("<iiiB")
 _TAG_ROW = struct.Struct("<HIBiiiB")
 _ANCHOR_ROW = struct.Struct("<QIB")
@@ -333,7 +337,9 @@ def _decode(piece: bytes, stamp: float) -> Event:
         return Answer(stamp, piece[2])
     if kind == 0x41:
         x, y, z, quality = _POSITION.unpack(value)
-        return Position(stamp, x / 1000, y / 1000, z / 1000, quality) if quality <= 100 else corrupt(piece, "quality > 100")
+        if quality > 100 or max(abs(x), abs(y), abs(z)) > MAX_PLACE_MM:
+            return corrupt(piece, "position or quality out of range")
+        return Position(stamp, x / 1000, y / 1000, z / 1000, quality)
     if kind == 0x45:
         normal, stationary = struct.unpack("<HH", value)
         return UpdateRate(stamp, normal / 10, stationary / 10)
@@ -341,7 +347,8 @@ def _decode(piece: bytes, stamp: float) -> Event:
         return _decode_config(value, stamp)
     if kind == 0x5A:
         bits = int.from_bytes(value, "little")
-        return corrupt(piece, "status with unused bits set") if bits & ~_STATUS_MASK else Status(stamp, bits)
+        damaged = bits & ~_STATUS_MASK or bits == _HEAD_AS_STATUS
+        return corrupt(piece, "status that no module has") if damaged else Status(stamp, bits)
     if kind in _VALUES:
         return Value(stamp, _VALUES[kind][1], int.from_bytes(value, "little"))
     if kind == 0x56:
@@ -366,7 +373,8 @@ def _decode_distances(piece: bytes, stamp: float) -> Event:
             anchors.append(Position(stamp, x / 1000, y / 1000, z / 1000, position_quality))
     else:
         readings = list(_ANCHOR_ROW.iter_unpack(rows))
-    if any(distance > MAX_RANGE_MM or quality > 100 for _, distance, quality in readings):
+    far = any(max(abs(a.x), abs(a.y), abs(a.z)) * 1000 > MAX_PLACE_MM for a in anchors)
+    if far or any(distance > MAX_RANGE_MM or quality > 100 for _, distance, quality in readings):
         return corrupt(piece, "distance or quality out of range")
     if len({address for address, _, _ in readings}) < len(readings):
         return corrupt(piece, "one anchor twice in a fix")

@@ -165,14 +165,15 @@ class ShellProtocol:
     def _parse(self, line: bytes) -> list[Event]:
         """Find what a line holds; the rest of it before that is Corrupt."""
         text = line.decode("latin-1").rstrip()
+        broken: Corrupt | None = None
         for find in (_find_lec, _find_les, _find_position, _find_text):
             at, event = find(text, self._stamp_at)
             if isinstance(event, Corrupt):
-                return [event]
-            if event is not None:
+                broken = broken or event
+            elif event is not None:
                 noise: list[Event] = [corrupt(line[:at], "noise before a line")] if line[:at].strip() else []
                 return [*noise, event]
-        return [corrupt(line, "not a line of the shell")]
+        return [broken or corrupt(line, "not a line of the shell")]
 
 
 Found = tuple[int, Event | None]
@@ -234,7 +235,9 @@ def _find_position(text: str, stamp_at: StampAt) -> Found:
     start = text.rfind("POS,")
     if start < 0:
         return 0, None
-    own, other = _POS.match(text, start), _LISTENER.match(text, start)
+    # A position behind a comma is the end of a broken lec line.
+    own = None if text[:start].endswith(",") else _POS.match(text, start)
+    other = _LISTENER.match(text, start)
     position = _position(own.groups()) if own else _position(other.groups()[1:]) if other else None
     if position is None or position[3] > 100:
         return start, corrupt(text.encode("latin-1"), "lep line cut or garbled")

@@ -1,0 +1,133 @@
+"""Kobuki packets, resynchronisation, and odometry from them."""
+
+import math
+import random
+
+import pytest
+from driver_harness import check_transcript, feed_whole, good
+from emulators.kobuki_device import KobukiDevice
+from emulators.world import Pose, RoomWorld, WorldClock
+
+from uwblite.drivers import kobuki
+from uwblite.drivers.events import Corrupt
+from uwblite.drivers.kobuki import Feedback, KobukiOdometer, KobukiProtocol, encode_packet
+
+RNG = random.Random(7)
+NOISES = [b"", b"\x00", b"\xaa", b"\xaa\x55", b"\xaa\x55\x4d", b"\xaa\x55\xff\x01\x0f", b"\xaa\x55\x4d\x01\x0f" + bytes(20),
+          b"\x2d\xaa\x55\x4d\x01\x0f", *(RNG.randbytes(n) for n in (1, 5, 50, 400))]  # fmt: skip
+
+
+def packets(count, seconds_before=0.0):
+    device = KobukiDevice(iter([Pose(0.0, 0.0, 0.0, 0.0), Pose(10.0, 2.0, 0.0, 0.0)]), clock := WorldClock())
+    clock.start(0.0)
+    device.next_time(0.0)
+    data = device.advance(seconds_before + 0.02 * count - 0.001)
+    return [data[i : i + 81] for i in range(0, len(data), 81)]
+
+
+def test_a_packet_is_81_bytes_and_begins_as_real_ones_do():
+    (packet,) = packets(1)
+    assert packet[:5] == bytes.fromhex("aa554d010f")
+    assert len(packet) == 81
+
+
+def test_transcript_in_every_split_and_among_noise():
+    frames = packets(20)
+    expected = feed_whole(KobukiProtocol, b"".join(frames))
+    assert len(expected) == 20
+    assert [event.time for event in expected] == [20 * k for k in range(20)]
+    check_transcript(KobukiProtocol, frames, expected, NOISES)
+
+
+def test_a_packet_cut_anywhere_does_not_take_the_next_one_with_it():
+    for seed in range(40):
+        rng = random.Random(seed)
+        subs = [(0x01, rng.randbytes(15)), (0x04, rng.randbytes(7)), (0x10, rng.randbytes(16))]
+        first, second = encode_packet(subs), packets(3)[2]
+        for cut in range(1, len(first)):
+            events = good(feed_whole(KobukiProtocol, first[:cut] + second))
+            assert events[-1] == feed_whole(KobukiProtocol, second)[0], (seed, cut)
+
+
+def test_the_sum_covers_the_length():
+    (packet,) = packets(1)
+    broken = bytearray(packet)
+    broken[-1] ^= broken[2]  # what a driver that leaves the length out would expect
+    assert all(isinstance(e, Corrupt) for e in feed_whole(KobukiProtocol, bytes(broken)))
+
+
+def test_gyro_of_any_length_and_packets_without_inertia_are_taken():
+    basic = (1).to_bytes(2, "little") + bytes(3) + (7).to_bytes(2, "little") + (9).to_bytes(2, "little") + bytes(6)
+    data = encode_packet([(0x01, basic), (0x0D, bytes(2 + 8))]) + encode_packet([(0x01, basic), (0x77, b"xyz")])
+    events = feed_whole(KobukiProtocol, data)
+    assert [(e.left, e.right, e.heading) for e in events] == [(7, 9, None)] * 2
+
+
+def feedback(k, left, right, heading=0.0, stamp=None):
+    return Feedback(k * 0.02 if stamp is None else stamp, 20 * k % 65536, left % 65536, right % 65536, heading, 0.0, 0, 0, 16.0)
+
+
+def test_encoders_wrap_both_ways():
+    odometer = KobukiOdometer()
+    ticks = [65000, 65500, 300, 900, 100, 65200]
+    for k, tick in enumerate(ticks):
+        pose, _, _ = odometer.update(feedback(k, tick, tick))
+    assert pose.x == pytest.approx((65200 - 65000) * kobuki.TICK)
+    assert pose.y == 0.0
+
+
+def test_gyro_heading_is_relative_to_the_first_and_wraps():
+    odometer = KobukiOdometer((1.0, 2.0, 0.5))
+    for k, heading in enumerate((3.0, 3.1, -3.1, -3.0)):
+        pose, _, _ = odometer.update(feedback(k, 0, 0, heading))
+    assert pose.theta == pytest.approx(0.5 + (2 * math.pi - 6.0))
+    assert (pose.x, pose.y) == (1.0, 2.0)
+
+
+def test_without_gyro_the_encoders_turn():
+    odometer = KobukiOdometer()
+    quarter = math.pi / 2 * kobuki.WHEEL_BASE / 2 / kobuki.TICK
+    odometer.update(feedback(0, 0, 0, None))
+    pose, _, _ = odometer.update(feedback(1, -round(quarter), round(quarter), None))
+    assert pose.theta == pytest.approx(math.pi / 2, abs=1e-3)
+    assert pose.x == pytest.approx(0.0, abs=1e-4)
+
+
+def test_lost_packets_are_counted_and_repeated_ones_dropped():
+    odometer = KobukiOdometer()
+    odometer.update(feedback(0, 0, 0))
+    assert odometer.update(feedback(1, 10, 10))[1] == 0
+    assert odometer.update(feedback(1, 10, 10))[0] is None
+    assert odometer.update(feedback(5, 50, 50))[1] == 3
+
+
+def test_after_a_long_silence_the_pose_is_held_and_said():
+    odometer = KobukiOdometer()
+    odometer.update(feedback(0, 0, 0))
+    pose, _, remark = odometer.update(feedback(1000, 40000, 40000))
+    assert (pose.x, pose.y) == (0.0, 0.0)
+    assert remark
+
+
+@pytest.mark.parametrize("skew", [0.0, 1e-4])
+def test_odometer_follows_the_emulated_circle(skew):
+    """Ten minutes of circling: encoders and gyro are rounded to 0.09 mm and 0.01 degrees, the path is 120 m."""
+    world, clock = RoomWorld(), WorldClock()
+    truth = []
+    device = KobukiDevice(
+        world.poses(), clock, clock_start=65000, clock_skew=skew, on_packet=lambda t, x, y, a: truth.append((t, x, y, a))
+    )
+    clock.start(100.0)
+    protocol, odometer, errors, stamps = KobukiProtocol(), KobukiOdometer((0.0, -1.5, 0.0)), [], []
+    now, rng = 100.0, random.Random(0)
+    while now < 700.0:
+        for event in protocol.feed(device.advance(now), now + rng.expovariate(1000.0)):
+            pose, missing, remark = odometer.update(event)
+            true = truth.pop(0)
+            assert not missing
+            assert not remark
+            errors.append(math.hypot(pose.x - true[1], pose.y - true[2]))
+            stamps.append(abs(pose.stamp - true[0]))
+        now = device.next_time(now)
+    assert max(errors) < 0.01
+    assert max(stamps[1000:]) < 0.002

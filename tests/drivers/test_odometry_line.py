@@ -1,0 +1,73 @@
+"""Odometry by text line."""
+
+import math
+import random
+
+import pytest
+from driver_harness import check_transcript, feed_whole, good
+
+from uwblite.drivers.events import Corrupt
+from uwblite.drivers.odometry_line import MAX_LINE, LineFormat, LineOdometer, OdometryLineProtocol, parse_format
+from uwblite.errors import ConfigError
+
+
+def test_transcript_in_every_split_and_among_noise():
+    frames = [f"{0.05 * k:.3f},{0.01 * k:.4f},{-0.02 * k:.4f},{0.001 * k:.5f}\r\n".encode() for k in range(30)]
+    expected = feed_whole(lambda: OdometryLineProtocol(LineFormat()), b"".join(frames))
+    assert len(expected) == 30
+    noises = [b"", b"\n", b"hello\n", b"1,2,3\n", b"1,2,3,nan\n", b"1,2,3,4,5\n", b"\xff\xfe\r\n", b"x" * 900 + b"\n"]
+    check_transcript(lambda: OdometryLineProtocol(LineFormat()), frames, expected, noises)
+
+
+@pytest.mark.parametrize("separator", [",", " ", ";", "\t", ", "])
+def test_separators(separator):
+    line = separator.join(["1.5", "2", "-3e0", ".25"]).encode() + b"\n"
+    (sample,) = feed_whole(lambda: OdometryLineProtocol(LineFormat()), line)
+    assert sample.values == (("t", 1.5), ("x", 2.0), ("y", -3.0), ("theta", 0.25))
+
+
+@pytest.mark.parametrize("line", [b"a,b,c,d", b"1,2,3", b"1,2,3,inf", b"1,2,3,0x10", b"1,2,3,1_0", b"1,2,3,--4"])
+def test_lines_that_do_not_fit_are_corrupt(line):
+    events = feed_whole(lambda: OdometryLineProtocol(LineFormat()), line + b"\n")
+    assert [type(e) for e in events] == [Corrupt]
+
+
+def test_prefix_and_skipped_columns():
+    spec = parse_format({"columns": "-,t,x,y,theta", "prefix": "ODO ", "time_unit": "0.001", "angle_unit": "0.0174532925"})
+    protocol, odometer = OdometryLineProtocol(spec), LineOdometer(spec)
+    (sample,) = protocol.feed(b"[info] started\n#ODO 77 2500 1.0 2.0 90\n", 3.0)
+    pose = odometer.update(sample)
+    assert (pose.x, pose.y) == (1.0, 2.0)
+    assert pose.theta == pytest.approx(math.pi / 2)
+    assert odometer.device_time(sample) == pytest.approx(2.5)
+
+
+def test_ticks_follow_a_circle_and_wrap():
+    """A full turn on a circle of 1 m radius in 2,000 steps closes to the rounding of the ticks."""
+    spec = parse_format({"columns": "t,left,right", "tick": "1e-4", "wheel_base": "0.3", "tick_modulus": "65536"})
+    odometer, protocol = LineOdometer(spec), OdometryLineProtocol(spec)
+    for k in range(2001):
+        angle = 2 * math.pi * k / 2000
+        left, right = round(angle * 0.85 / 1e-4) % 65536, round(angle * 1.15 / 1e-4) % 65536
+        for sample in good(protocol.feed(f"{k},{left},{right}\n".encode(), 0.0)):
+            pose = odometer.update(sample)
+    assert math.hypot(pose.x, pose.y) < 0.002
+    assert abs(pose.theta) < 0.001
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"columns": "t,x"}, {"columns": "t,x,y,theta,theta"}, {"columns": "t,left,right"}, {"colums": "t"}, {"tick": "abc"},
+     {"columns": "t,left,right", "tick": "0", "wheel_base": "0.3"}, {"columns": "t,x,y,psi"}],
+)  # fmt: skip
+def test_formats_that_make_no_pose_are_refused(options):
+    with pytest.raises(ConfigError):
+        parse_format(options)
+
+
+def test_memory_is_bounded():
+    protocol = OdometryLineProtocol(LineFormat())
+    rng = random.Random(0)
+    for _ in range(2000):
+        protocol.feed(rng.randbytes(500).replace(b"\n", b"x").replace(b"\r", b"x"), 0.0)
+        assert len(protocol._line) <= MAX_LINE
