@@ -3,18 +3,23 @@
 One flat array with offsets instead of a list of clouds: every step below runs once over all keyframes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from . import se2
 from .keyframes import ScanPoints
+from .point_cloud import Lines, estimate_normals, make_tree
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+
+
+_BLOCK = 128
+"""Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +45,14 @@ class Clouds:
     offsets: Ints
     """(k + 1,)."""
     points: Floats
-    """(p, 2) m, base frame of the keyframe, ordered by bearing within a cloud."""
+    """(p, 2) m, base frame of the keyframe, ordered by bearing within a cloud. Where there is a line, the mean of the
+    neighbourhood: that takes out noise, and on curved surfaces every cloud errs alike."""
     normals: Floats
     """(p, 2) unit, towards the laser; 0 where the neighbourhood is no line."""
     owner: Ints
     """(p,) keyframe."""
+    normal_variance: Floats
+    """(p,) rad^2, variance of the normal's angle by scatter about its line."""
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -72,11 +80,14 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     bearing = np.arctan2(points[:, 1], points[:, 0])
     order = np.lexsort((bearing, owner))
     owner, points, origins = owner[order], points[order], origins[order]
-    normals, neighbours = _normals(owner, points, origins, config)
-    kept = neighbours >= config.min_neighbours
-    owner, points, normals = owner[kept], points[kept], normals[kept]
+    lines, normals = _lines(owner, points, origins, config)
+    straight = lines.linearity >= config.linearity
+    kept = lines.neighbours > config.min_neighbours
+    normals = np.where(straight[:, None], normals, 0.0)[kept]
+    centres = np.where(straight[:, None], lines.centers, points)[kept]
+    owner = owner[kept]
     offsets = np.searchsorted(owner, np.arange(keyframes + 1))
-    return Clouds(offsets.astype(np.int64), points, normals, owner)
+    return Clouds(offsets.astype(np.int64), centres, normals, owner, lines.normal_variance[kept])
 
 
 def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:
@@ -93,34 +104,22 @@ def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]
     return rays.keyframe[order][first], mean[:, :2], mean[:, 2:]
 
 
-def _normals(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) -> tuple[Floats, Ints]:
-    """Return normals (p, 2) and the number of neighbours (p,) within the radius, by principal axes.
+def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) -> tuple[Lines, Floats]:
+    """Fit lines to all neighbourhoods; return them and normals (p, 2) turned towards the laser.
 
-    All clouds share one tree: a third coordinate keeps them apart.
+    A block of clouds shares one tree: a third coordinate keeps them apart.
     """
-    if not len(points):
-        return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
-    apart = np.column_stack([points, owner * (4.0 * config.normal_radius)])
-    tree = cKDTree(apart, balanced_tree=False, compact_nodes=False)
-    near = 8
-    distance, index = tree.query(apart, k=near + 1, distance_upper_bound=config.normal_radius)
-    found = np.isfinite(distance)
-    count = found.sum(axis=1)
-    padded = np.concatenate([points, np.zeros((1, 2))])
-    members = padded[np.where(found, index, len(points))]
-    mean = members.sum(axis=1) / count[:, None]
-    centred = np.where(found[:, :, None], members - mean[:, None, :], 0.0)
-    xx, yy = np.einsum("pk,pk->p", centred[:, :, 0], centred[:, :, 0]), np.einsum("pk,pk->p", centred[:, :, 1], centred[:, :, 1])
-    xy = np.einsum("pk,pk->p", centred[:, :, 0], centred[:, :, 1])
-    half, spread = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
-    along = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-    normals = np.stack([-np.sin(along), np.cos(along)], axis=1)
-    facing = np.einsum("pi,pi->p", normals, origins - points)
-    normals *= np.where(facing < 0, -1.0, 1.0)[:, None]
-    linear = half + spread > 0
-    linearity = np.where(linear, 1.0 - (half - spread) / np.where(linear, half + spread, 1.0), 0.0)
-    good = (count >= 4) & (linearity >= config.linearity)
-    return np.where(good[:, None], normals, 0.0), (count - 1).astype(np.int64)
+    parts = []
+    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=-1) + 1 + _BLOCK, _BLOCK))
+    for first, last in pairwise(blocks):
+        block = points[first:last]
+        apart = np.column_stack([block, owner[first:last] * (4.0 * config.normal_radius)])
+        parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
+    if not parts:
+        parts.append(estimate_normals(points, make_tree(points), config.normal_radius))
+    lines = Lines(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lines)))
+    facing = np.einsum("pi,pi->p", lines.normals, origins - points)
+    return lines, lines.normals * np.where(facing < 0, -1.0, 1.0)[:, None]
 
 
 def in_map(clouds: Clouds, poses: Floats) -> tuple[Floats, Floats]:

@@ -196,7 +196,7 @@ def trusted_part(information: Floats, feigned: Floats, degeneracy: float) -> tup
     """
     if degeneracy == 0.0:
         return information, np.broadcast_to(np.eye(3), information.shape)
-    basis, inverse, values, vectors = _relative_eigen(information, feigned)
+    basis, inverse, values, vectors = relative_eigen(information, feigned)
     kept = np.maximum(values - degeneracy, 0.0)
     left = basis @ vectors
     trusted = (left * kept[..., None, :]) @ np.swapaxes(left, -1, -2)
@@ -206,12 +206,12 @@ def trusted_part(information: Floats, feigned: Floats, degeneracy: float) -> tup
 
 def trusted_step(information: Floats, feigned: Floats, gradient: Floats, degeneracy: float) -> Floats:
     """Return the Gauss-Newton step (3,) in trusted directions, none in the others; see trusted_part."""
-    _, inverse, values, vectors = _relative_eigen(information, feigned)
+    _, inverse, values, vectors = relative_eigen(information, feigned)
     divisor = np.where(values > max(degeneracy, _SOLVABLE), values, np.inf)
     return np.asarray(-inverse.T @ (vectors @ ((vectors.T @ (inverse @ gradient)) / divisor)))
 
 
-def _relative_eigen(information: Floats, feigned: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def relative_eigen(information: Floats, feigned: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Return B, its inverse, eigenvalues and eigenvectors of B^-1 H B^-T where N = B B^T, N kept from vanishing."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     xy = diagonal[..., 0] + diagonal[..., 1]

@@ -18,7 +18,7 @@ from .clouds import Clouds
 from .graph import Graph, RelativePoseEdges
 from .map_result import LoopClosure
 from .marginals import Marginals
-from .pair_matching import NearestRaster, PairFactors, PairPoints, match, measured, paint, pair_points
+from .pair_matching import NearestRaster, PairFactors, PairPoints, match, measured, paint, pair_points, trusted_step
 from .refinement import surface_cells
 from .point_cloud import PointCloud, make_cloud
 from .robust import Kernel
@@ -178,9 +178,7 @@ def align_pairs(
     pose, gate = guess.copy(), first_gate
     for _ in range(iterations):
         factors = match(clouds, raster, i, pose, points, gate, gate / 2.0)
-        damping = np.zeros((len(i), 3, 3))
-        damping[:, [0, 1, 2], [0, 1, 2]] = 1e-3 * np.maximum(np.einsum("eii->ei", factors.hessian), 1.0)
-        step = -np.linalg.solve(factors.hessian + damping, factors.gradient[:, :, None])[:, :, 0]
+        step = trusted_step(factors)[0]
         reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / 0.3, np.abs(step[:, 2]) / 0.15)
         pose += step / np.maximum(reach, 1.0)[:, None]
         pose[:, 2] = se2.wrap_angle(pose[:, 2])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from . import se2
 from .clouds import Clouds
+from .line_factor import relative_eigen
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,6 +40,8 @@ class PairFactors:
 
     hessian: Floats
     """(e, 3, 3) sum of w J^T J of the point-to-line distances by T_i_j (x, y, theta), 1/m^2-like, unscaled by noise."""
+    feigned: Floats
+    """(e, 3, 3) part of it that the scatter of the normals alone would feign, see line_factor."""
     gradient: Floats
     """(e, 3) sum of w J^T r."""
     matched: Ints
@@ -152,47 +155,62 @@ def match(
     def total(values: Floats) -> Floats:
         return np.bincount(owner, values, pairs)
 
+    def outer(wx: Floats, wy: Floats, wt: Floats, jx: Floats, jy: Floats, jt: Floats) -> Floats:
+        h = np.empty((pairs, 3, 3))
+        h[:, 0, 0], h[:, 1, 1], h[:, 2, 2] = total(wx * jx), total(wy * jy), total(wt * jt)
+        h[:, 0, 1] = h[:, 1, 0] = total(wx * jy)
+        h[:, 0, 2] = h[:, 2, 0] = total(wx * jt)
+        h[:, 1, 2] = h[:, 2, 1] = total(wy * jt)
+        return h
+
     wx, wy, wt = w * nx, w * ny, w * turn
-    hessian = np.empty((pairs, 3, 3))
-    hessian[:, 0, 0], hessian[:, 1, 1], hessian[:, 2, 2] = total(wx * nx), total(wy * ny), total(wt * turn)
-    hessian[:, 0, 1] = hessian[:, 1, 0] = total(wx * ny)
-    hessian[:, 0, 2] = hessian[:, 2, 0] = total(wx * turn)
-    hessian[:, 1, 2] = hessian[:, 2, 1] = total(wy * turn)
+    hessian = outer(wx, wy, wt, nx, ny, turn)
+    v = w * (clouds.normal_variance[found[good]] + clouds.normal_variance[row[inside]])
+    along = nx * rx[inside] + ny * ry[inside]
+    feigned = outer(-v * ny, v * nx, v * along, -ny, nx, along)
     gradient = np.stack([total(wx * r), total(wy * r), total(wt * r)], axis=1)
     asked = np.bincount(pair, minlength=pairs)
-    return PairFactors(hessian, gradient, np.bincount(owner, minlength=pairs), asked, total(w * r * r), total(w))
+    matched = np.bincount(owner, minlength=pairs)
+    return PairFactors(hessian, feigned, gradient, matched, asked, total(w * r * r), total(w))
 
 
-def measured(factors: PairFactors, T_i_j: Floats, variance: Floats, floor: float = 1e-3) -> tuple[Floats, Floats]:
+_TRUSTED = 2.0
+"""Multiple of the feigned information that a direction must exceed to have been measured."""
+
+
+def trusted_step(factors: PairFactors) -> tuple[Floats, Floats]:
+    """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with
+    L^T L the information in those directions (unscaled by noise).
+
+    In the basis B that diagonalises both, feigned = B B^T and hessian = B V diag(l) V^T B^T; l must exceed a multiple
+    of 1, see line_factor.trusted_part.
+    """
+    basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.feigned)
+    kept = np.maximum(values - _TRUSTED, 0.0)
+    divisor = np.where(kept > 0.0, values, np.inf)
+    within = np.swapaxes(vectors, 1, 2) @ inverse
+    step = -np.einsum("eji,ej->ei", within, np.einsum("eij,ej->ei", within, factors.gradient) / divisor)
+    return step, np.sqrt(kept)[:, :, None] * np.swapaxes(basis @ vectors, 1, 2)
+
+
+def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Floats, Floats]:
     """Turn factors into relative-pose measurements.
 
     Parameters
     ----------
     T_i_j : (e, 3) poses about which the factors were made.
     variance : (e,) m^2, variance of one match.
-    floor : eigenvalues of the Hessian below this share of the largest are directions the clouds cannot see.
 
     Returns
     -------
     Z (e, 3) and sqrt_information (e, 3, 3) in the chart e = Z^-1 T; zero along what cannot be seen.
     """
-    # Turning acts on points metres away: eigenvectors are compared in metres by scaling theta with the clouds' radius.
-    arm = np.sqrt(factors.hessian[:, 2, 2] / np.maximum(factors.hessian[:, 0, 0] + factors.hessian[:, 1, 1], 1e-12))
-    arm = np.clip(arm, 0.3, None)
-    unit = np.ones((len(arm), 3))
-    unit[:, 2] = 1.0 / arm
-    scaled = factors.hessian * unit[:, :, None] * unit[:, None, :]
-    values, vectors = np.linalg.eigh(scaled)
-    seen = values > np.maximum(floor * values[:, -1:], 1e-9)
-    inverse = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
-    step = -np.einsum("eij,ej,ekj,ek->ei", vectors, inverse, vectors, factors.gradient * unit) * unit
+    step, root = trusted_step(factors)
     z = T_i_j + step
     z[:, 2] = se2.wrap_angle(z[:, 2])
-    root = np.sqrt(np.where(seen, values, 0.0) / variance[:, None])
-    sqrt_information = root[:, :, None] * np.swapaxes(vectors, 1, 2) / unit[:, None, :]
     c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
     turn = np.zeros((len(z), 3, 3))
     turn[:, 0, 0] = turn[:, 1, 1] = c
     turn[:, 0, 1], turn[:, 1, 0] = -s, s
     turn[:, 2, 2] = 1.0
-    return z, sqrt_information @ turn
+    return z, root @ turn / np.sqrt(variance)[:, None, None]

@@ -78,7 +78,7 @@ def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: Su
     relative = se2.between(poses[middle], poses)[clouds.owner]
     points = se2.transform(relative, clouds.points)
     normals = se2.rotate(relative[:, 2], clouds.normals)
-    owner, points, normals = _merge(piece[clouds.owner], points, normals, config.voxel)
+    owner, points, normals, scatter = _merge(piece[clouds.owner], points, normals, clouds.normal_variance, config.voxel)
     kept = np.ones(len(owner), dtype=bool)
     offsets = np.searchsorted(owner, np.arange(len(first) + 1))
     for a, b in zip(offsets[:-1], offsets[1:], strict=True):
@@ -86,13 +86,15 @@ def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: Su
             kept[a:b] = statistical_outlier_filter(points[a:b], config.neighbours, config.std_ratio)
             inner = np.flatnonzero(kept[a:b]) + a
             kept[inner] = radius_outlier_filter(points[inner], config.radius, config.min_neighbours)
-    owner, points, normals = owner[kept], points[kept], normals[kept]
+    owner, points, normals, scatter = owner[kept], points[kept], normals[kept], scatter[kept]
     offsets = np.searchsorted(owner, np.arange(len(first) + 1)).astype(np.int64)
-    return Submaps(first, last, reference, Clouds(offsets, points, normals, owner))
+    return Submaps(first, last, reference, Clouds(offsets, points, normals, owner, scatter))
 
 
-def _merge(owner: Ints, points: Floats, normals: Floats, size: float) -> tuple[Ints, Floats, Floats]:
-    """Average points and normals of each cell; the two sides of a wall stay apart by the normal's half plane."""
+def _merge(
+    owner: Ints, points: Floats, normals: Floats, scatter: Floats, size: float
+) -> tuple[Ints, Floats, Floats, Floats]:
+    """Average points, normals and their variances by cell; the two sides of a wall stay apart by the normal's half plane."""
     cell = np.floor(points / size).astype(np.int64)
     cell -= cell.min(axis=0, initial=0)
     side = (normals[:, 0] + 1e-3 * normals[:, 1] > 0).astype(np.int64)
@@ -100,10 +102,10 @@ def _merge(owner: Ints, points: Floats, normals: Floats, size: float) -> tuple[I
     key = ((owner * wide + cell[:, 0]) * high + cell[:, 1]) * 2 + side
     order = np.argsort(key, kind="stable")
     first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) > 0]))[: len(key)]
-    both = np.concatenate([points, normals], axis=1)[order]
+    both = np.concatenate([points, normals, scatter[:, None]], axis=1)[order]
     count = np.diff(np.append(first, len(key)))[:, None]
     mean = np.add.reduceat(both, first, axis=0) / count if len(key) else both
     length = np.hypot(mean[:, 2], mean[:, 3])
     clear = length > 0.5
-    normal = np.where(clear[:, None], mean[:, 2:] / np.where(clear, length, 1.0)[:, None], 0.0)
-    return owner[order][first], mean[:, :2], normal
+    normal = np.where(clear[:, None], mean[:, 2:4] / np.where(clear, length, 1.0)[:, None], 0.0)
+    return owner[order][first], mean[:, :2], normal, mean[:, 4]
