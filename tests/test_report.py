@@ -165,3 +165,10 @@ def test_the_script_zooms_and_toggles(tmp_path):
     base = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path / 'profile'}"]
     shown = subprocess.run([*base, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=120, check=False)
     assert "<title>true,true,true,true</title>" in shown.stdout
+
+
+def test_kept_and_rejected_closures_are_told_apart():
+    groups = dict(re.findall(r'<g class="closure (kept|rejected)(?: hidden)?">(.*?)</g>', page(), re.S))
+    assert groups["kept"].count("<path") == 1
+    assert "consistent with the others" in groups["kept"]
+    assert groups["rejected"].count("<path") == 2

@@ -157,7 +157,7 @@ def check_calibration(
             continue
         figures[value.name] = {"value": round(value.value, 5), "sigma": round(value.sigma, 5), "unit": value.unit}
         limit, text, advice = limits.get(value.name, (np.inf, "", ""))
-        if abs(value.value) > max(limit, 3.0 * value.sigma):
+        if abs(value.value) > max(limit, 5.0 * value.sigma):
             found.warning("radio" if "range" in value.name else "odometry", text.format(value.value), advice)
     figures["bias guess m"] = {
         a.id: {"bias": round(a.bias, 3), "sigma": round(a.bias_sigma, 3)} for a in anchors if a.status == "ok"

@@ -200,7 +200,7 @@ def _shown_closures(result: MapResult) -> tuple[list[LoopClosure], list[LoopClos
 
 def _closure_lines(result: MapResult) -> str:
     groups = []
-    for name, closures in zip(("rejected", "kept"), _shown_closures(result), strict=True):
+    for name, closures in zip(("kept", "rejected"), _shown_closures(result), strict=True):
         lines = []
         for c in closures:
             (x1, y1), (x2, y2) = result.graph.poses[c.i, :2].tolist(), result.graph.poses[c.j, :2].tolist()

@@ -75,7 +75,7 @@ def _without_verb(words: list[str]) -> int:
 
 
 def _overview() -> argparse.ArgumentParser:
-    width = max(map(len, VERBS))
+    width = max(len(verb) for verb in VERBS)
     lines = [f"  {verb:<{width}}  {import_module(f'.{verb}', __name__).HELP}" for verb in VERBS]
     return argparse.ArgumentParser(
         prog="uwblite",

@@ -4,6 +4,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from .options import add_mounting_arguments
+from .wording import signed
 
 if TYPE_CHECKING:
     from ..diagnostics import Diagnosis
@@ -29,16 +30,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from ..diagnostics import diagnose
-    from ..io.carmen import read_log
     from . import console
+    from .formats import read_recording
     from .options import apply_mounting
 
-    log = apply_mounting(read_log(args.log), args)
+    log = apply_mounting(read_recording(args.log), args)
     anchors, calibration, problem = ((), (), "") if args.quick else _trial_map(log)
     diagnosis = diagnose(log, anchors=anchors, calibration=calibration)
     cost = expected_cost(log)
     if args.json:
-        console.say_json(_summary(args.log, diagnosis, cost, problem))
+        console.say_json(summary_json(args.log, diagnosis, cost, problem))
     else:
         for line in report_lines(args.log, diagnosis, cost, problem):
             console.say(line)
@@ -83,7 +84,8 @@ def expected_cost(log: "SensorLog") -> dict[str, float]:
     }
 
 
-def _summary(name: str, diagnosis: "Diagnosis", cost: dict[str, float], problem: str) -> dict[str, Any]:
+def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float], problem: str) -> dict[str, Any]:
+    """Return the findings and figures for programs."""
     import dataclasses
 
     return {
@@ -143,7 +145,7 @@ def _anchor_lines(figures: dict[str, Any]) -> list[str]:
                 f" {a['zeros']} zero, {a['absurd']} absurd, {a['spikes']} spikes"
             )
         if anchor_id in guesses:
-            line += f", bias guess {guesses[anchor_id]['bias']:+.2f} \u00b1{guesses[anchor_id]['sigma']:.2f} m"
+            line += f", bias guess {signed(guesses[anchor_id]['bias'], plus=True)} \u00b1{guesses[anchor_id]['sigma']:.2f} m"
         lines.append(line)
     if coverage := figures.get("uwb", {}).get("coverage"):
         lines.append("heard at a time: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in coverage.items()))
@@ -152,4 +154,8 @@ def _anchor_lines(figures: dict[str, Any]) -> list[str]:
 
 def _calibration_lines(figures: dict[str, Any]) -> list[str]:
     values = {k: v for k, v in figures.get("radio calibration", {}).items() if "value" in v and ":" not in k}
-    return [f"{name}: {v['value']:+.4f} \u00b1{v['sigma']:.4f} {v['unit']}".rstrip(" 1") for name, v in values.items()]
+    lines = []
+    for name, v in values.items():
+        unit = "" if v["unit"] == "1" else f" {v['unit']}"
+        lines.append(f"{name}: {signed(v['value'], 4, plus=True)} \u00b1{v['sigma']:.4f}{unit}")
+    return lines

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --preset, --config and --set."""
     group = parser.add_argument_group("settings (a later one wins: preset, file, --set)")
-    group.add_argument("--preset", metavar="NAME", help="start from a preset: `uwblite config --preset help` lists them")
+    group.add_argument("--preset", metavar="NAME", help="start from a preset: default or paper")
     group.add_argument("--config", metavar="FILE.toml", help="read settings from a file, as `uwblite config` prints it")
     example = "change one setting, e.g. icp.max_iterations=30; repeatable"
     group.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=example)

@@ -1,0 +1,160 @@
+"""The command line's frame: verbs, exit codes, errors as one line, nothing heavy before it is needed."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+from uwblite import __version__
+from uwblite.cli import VERBS, main
+
+
+def run(*words, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "uwblite", *words], capture_output=True, text=True, check=False, timeout=120, **options
+    )
+
+
+def test_help_leads_with_examples_and_names_verbs_and_exit_codes(capsys):
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert text.index("examples:") < text.index("commands:") < text.index("exit codes:")
+    for verb in VERBS:
+        assert re.search(rf"^  {verb} +\w", text, re.M), verb
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself_examples_first(verb, capsys):
+    assert main([verb, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: uwblite {verb}")
+    assert text.index("examples:") < text.index("common options")
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"uwblite {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "usage: uwblite"),
+        (["mpa"], "unknown command 'mpa'; did you mean 'map'?"),
+        (["xyzzy"], "unknown command 'xyzzy'\n"),
+        (["-q"], "needs a command"),
+        (["map"], "required"),
+        (["map", "x.log", "--out", "y", "--no-such"], "--no-such"),
+        (["map", "x.log", "--out", "y", "--laser-pose", "1,2"], "'1,2' is not 3 numbers"),
+        (["map", "x.log", "--out", "y", "--jobs", "0"], "above 0"),
+    ],
+)
+def test_wrong_usage_exits_with_2(words, message, capsys):
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [b"", b"\0\1\2binary", b"\x1f\x8b\x08\0broken gzip", b"hello\nworld\n"])
+def test_a_bad_log_is_one_line_and_exit_1(tmp_path, content, capsys):
+    file = tmp_path / "bad.log"
+    file.write_bytes(content)
+    for words in (["map", str(file), "--out", str(tmp_path / "out")], ["check", str(file)]):
+        assert main(words) == 1
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert re.fullmatch(r"uwblite: error: [^\n]*bad\.log[^\n]*\n", err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_and_a_missing_file_are_one_line(tmp_path, capsys):
+    for path in (tmp_path, tmp_path / "missing.log"):
+        assert main(["map", str(path), "--out", str(tmp_path / "out")]) == 1
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_standard_input_is_read(tmp_path, room_log):
+    import gzip
+
+    text = gzip.decompress(room_log.read_bytes())
+    done = subprocess.run(
+        [sys.executable, "-m", "uwblite", "check", "-", "--quick"], input=text, capture_output=True, check=False, timeout=120
+    )
+    assert done.returncode == 0
+    assert b"4801 odometry readings" in done.stdout
+
+
+def test_an_unforeseen_fault_is_one_line_and_a_traceback_on_request(monkeypatch, capsys):
+    from uwblite.cli import config
+
+    def fault(_):
+        raise ZeroDivisionError("x")
+
+    monkeypatch.setattr(config, "run", fault)
+    assert main(["config"]) == 1
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "internal error: ZeroDivisionError: x" in err
+    assert main(["config", "--debug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (KeyboardInterrupt(), 130, "uwblite: interrupted"),
+        (MemoryError(), 1, "out of memory"),
+        (OSError(28, "No space left on device", "map.pgm"), 1, "map.pgm: No space left on device; free some space"),
+    ],
+)
+def test_what_the_system_throws(monkeypatch, capsys, error, code, message):
+    from uwblite.cli import config
+
+    def fault(_):
+        raise error
+
+    monkeypatch.setattr(config, "run", fault)
+    assert main(["config"]) == code
+    assert message in capsys.readouterr().err
+
+
+def test_a_reader_that_leaves_early_does_not_disturb():
+    done = subprocess.run(
+        f"{sys.executable} -m uwblite config | head -1", shell=True, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1
+
+
+def test_a_full_stdout_is_an_error():
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full here")
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "uwblite", "config"], stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=60
+        )
+    assert done.returncode == 1
+    assert "No space left" in done.stderr
+
+
+def test_names_that_ascii_cannot_write_do_no_harm(room_log):
+    done = run("check", str(room_log), "--quick", env={**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"})
+    assert done.returncode == 0, done.stderr
+
+
+def test_settings_are_printed_checked_and_overridden(tmp_path, capsys):
+    assert main(["config", "--set", "grid.resolution=0.02"]) == 0
+    text = capsys.readouterr().out
+    assert "resolution = 0.02" in text
+    assert "# " in text
+    file = tmp_path / "my.toml"
+    file.write_text(text)
+    assert main(["config", "--config", str(file), "--no-comments"]) == 0
+    assert "resolution = 0.02" in capsys.readouterr().out
+    file.write_text("[grid]\nresolutoin = 1\n")
+    assert main(["config", "--config", str(file)]) == 1
+    assert "did you mean 'grid.resolution'" in capsys.readouterr().err
+    assert main(["config", "--config", str(tmp_path / "none.toml")]) == 1
+    assert main(["config", "--preset", "papre"]) == 1
+    assert "papre" in capsys.readouterr().err

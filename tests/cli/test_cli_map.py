@@ -1,0 +1,139 @@
+"""`uwblite map` and `uwblite check` on the sample recording, end to end."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uwblite.cli import main
+from uwblite.io.tum import read_tum
+
+FILES = {
+    "anchors.csv", "config.toml", "graph.g2o", "graph.pyfg", "graph_stamps.csv", "map.pgm", "map.png", "map.yaml",
+    "report.html", "report.json", "trajectory.tum", "trajectory_covariance.csv",
+}  # fmt: skip
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in Path(folder).iterdir()}
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory, room_log):
+    """Folder with the map of the sample recording, and what was said."""
+    import contextlib
+    import io
+
+    folder = tmp_path_factory.mktemp("room") / "map"
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        code = main(["map", str(room_log), "--out", str(folder)])
+    return folder, code, said.getvalue()
+
+
+def test_the_sample_is_mapped_with_every_file(mapped):
+    folder, code, _ = mapped
+    assert code in (0, 3)
+    assert set(contents(folder)) == FILES
+
+
+def test_what_is_said_has_units_sigmas_paths_and_the_next_step(mapped):
+    folder, _, said = mapped
+    number = r"[\u2212+]?\d+\.\d+"
+    assert re.search(rf"anchor 5C0B: x {number} \u00b1\d\.\d\d m, y {number} \u00b1\d\.\d\d m, bias .* m, 190 ranges", said)
+    assert str(folder / "map.png") in said
+    assert "next: open" in said
+
+
+def test_the_trajectory_follows_the_truth(mapped, room_log):
+    from uwblite.cli import main as run
+
+    truth = room_log.parent / "room" / "truth.tum"
+    import contextlib
+    import io
+
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert run(["evaluate", str(mapped[0]), "--truth", str(truth), "--json"]) == 0
+    # Lidar noise is 0.01 m, a cell 0.05 m: three centimetres over 46 m of driving in one room.
+    assert json.loads(said.getvalue())["trajectory"]["ate"]["rmse"] < 0.03
+
+
+def test_every_odometry_stamp_has_a_pose(mapped):
+    stamps, _ = read_tum(mapped[0] / "trajectory.tum")
+    assert len(stamps) == 4801
+    assert np.all(np.diff(stamps) > 0)
+
+
+def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(mapped, room_log, tmp_path, capsys):
+    assert main(["map", str(room_log), "--out", str(tmp_path / "again"), "--jobs", "2", "-q"]) == mapped[1]
+    first, second = contents(mapped[0]), contents(tmp_path / "again")
+    assert {name for name in first if first[name] != second[name]} <= {"report.json"}
+    one, two = (json.loads(c["report.json"]) for c in (first, second))
+    one.pop("timings"), two.pop("timings")
+    assert one == two
+
+
+def test_the_command_in_the_report_makes_the_same_map(mapped, tmp_path, monkeypatch, capsys):
+    import shlex
+
+    words = shlex.split(json.loads((mapped[0] / "report.json").read_text())["command"])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.toml").write_bytes((mapped[0] / "config.toml").read_bytes())
+    assert main(words[1:]) == mapped[1]
+    assert (tmp_path / "map_again" / "map.pgm").read_bytes() == (mapped[0] / "map.pgm").read_bytes()
+    assert (tmp_path / "map_again" / "trajectory.tum").read_bytes() == (mapped[0] / "trajectory.tum").read_bytes()
+
+
+def test_a_result_is_not_replaced_unasked(mapped, room_log, capsys):
+    before = contents(mapped[0])
+    assert main(["map", str(room_log), "--out", str(mapped[0])]) == 1
+    assert "--force" in capsys.readouterr().err
+    assert contents(mapped[0]) == before
+
+
+@pytest.mark.parametrize("without", ["uwb", "loops", "lidar"])
+def test_a_sensor_may_be_missing(room_log, tmp_path, capsys, without):
+    code = main(["map", str(room_log), "--out", str(tmp_path / "map"), "--without", without, "--json"])
+    assert code in (0, 3)
+    summary = json.loads(capsys.readouterr().out)
+    names = {Path(name).name for name in summary["files"]}
+    assert ("map.pgm" in names) == (without != "lidar")
+    assert bool(summary["anchors"]) == (without != "uwb")
+    assert summary["exit_code"] == code
+
+
+def test_mounting_and_settings_of_the_command_line_count(room_log, tmp_path, capsys):
+    words = ["--laser-pose=0.1,0,0", "--tag=-0.05,0,0.6", "--resolution", "0.1", "--without", "loops", "--scale-map"]
+    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
+    yaml = (tmp_path / "map" / "map.yaml").read_text()
+    assert "resolution: 0.1" in yaml
+    assert "use_loops = false" in (tmp_path / "map" / "config.toml").read_text()
+    report = json.loads((tmp_path / "map" / "report.json").read_text())
+    assert "--laser-pose=0.1,0.0,0.0" in report["command"]
+    assert (tmp_path / "map" / "map_scale.png").exists()
+
+
+def test_a_dry_run_writes_nothing(room_log, tmp_path, capsys):
+    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--dry-run"]) == 0
+    assert "expected cost" in capsys.readouterr().out
+    assert not (tmp_path / "map").exists()
+
+
+def test_check_of_the_sample(room_log, capsys):
+    assert main(["check", str(room_log)]) == 0
+    text = capsys.readouterr().out
+    assert "bias guess" in text
+    assert "next: uwblite map" in text
+    assert "SERIOUS" not in text
+    assert main(["check", str(room_log), "--json", "--quick"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["figures"]["lidar"]["beams"] == 682
+    assert summary["expected cost of map"]["megabytes"] > 50
+
+
+def test_check_exits_with_3_where_a_finding_spoils_the_map(room_log, capsys):
+    assert main(["check", str(room_log), "--laser-flipped", "--quick"]) == 3
+    assert "mounted upright" in capsys.readouterr().out

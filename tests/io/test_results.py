@@ -1,0 +1,178 @@
+"""The result's folder: complete, repeatable, replaced as a whole or not at all."""
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from results import EVIL, small_log, small_result
+
+from uwblite.errors import ConfigError
+from uwblite.io import results
+from uwblite.io.results import RunRecord, anchors_csv, check_target, covariance_csv, write_result
+from uwblite.io.tum import read_tum
+
+RECORD = RunRecord("uwblite map run.log --out map_again", "use_uwb = true\n", {"uwblite": "0.1.0"})
+FILES = {
+    "anchors.csv", "config.toml", "graph.g2o", "graph.pyfg", "graph_stamps.csv", "map.pgm", "map.png", "map.yaml",
+    "report.html", "report.json", "trajectory.tum", "trajectory_covariance.csv",
+}  # fmt: skip
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in Path(folder).iterdir()}
+
+
+def test_all_files_of_the_contract_are_written(tmp_path):
+    names = write_result(tmp_path / "a" / "map", small_log(), small_result(), RECORD)
+    assert set(names) == set(contents(tmp_path / "a" / "map")) == FILES
+    assert names[0] == "map.png"
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["map"]
+
+
+def test_same_result_same_bytes(tmp_path):
+    for name in ("one", "two"):
+        write_result(tmp_path / name, small_log(), small_result(seconds=len(name)), RECORD)
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+def test_timings_are_the_only_difference_of_two_runs(tmp_path):
+    for name, seconds in (("one", 1.5), ("two", 2.5)):
+        record = replace(RECORD, seconds=seconds, reading_seconds=0.1 * seconds, peak_rss_bytes=int(1e6 * seconds))
+        write_result(tmp_path / name, small_log(), small_result(seconds=seconds), record)
+    one, two = contents(tmp_path / "one"), contents(tmp_path / "two")
+    assert {name for name in one if one[name] != two[name]} == {"report.json"}
+    first, second = (json.loads(c["report.json"]) for c in (one, two))
+    assert first.pop("timings")["total"] == 1.5
+    assert second.pop("timings")["peak_rss_bytes"] == 2_500_000
+    assert first == second
+
+
+def test_report_json_tells_the_story(tmp_path):
+    write_result(tmp_path / "map", small_log(), small_result(), RECORD)
+    report = json.loads((tmp_path / "map" / "report.json").read_text())
+    assert report["schema"] == 1
+    assert report["input"]["sha256"] == "ab" * 32
+    assert report["trusted"] is True
+    assert [c["accepted"] for c in report["closures"]] == [True, False, False]
+    assert report["closures"][1]["reason"] == "overlap too small"
+    assert report["anchors"][0]["bias"] == 0.46
+    assert report["calibration"][1]["reason"] == "the robot hardly turns"
+    assert set(report["files"]) == FILES - {"report.json"}
+    assert report["recording"]["scans"] == 24
+
+
+def test_anchors_csv_survives_any_id():
+    result = small_result(evil=EVIL + ',"\n')
+    rows = list(csv.DictReader(io.StringIO(anchors_csv(result))))
+    assert rows[0]["id"] == "5C0B" + EVIL + ',"\n'
+    assert float(rows[0]["sigma_x"]) == pytest.approx(0.04)
+    assert rows[1]["status"] == "mirror-ambiguous"
+    assert (float(rows[1]["alternative_x"]), float(rows[1]["alternative_y"])) == (-4.0, 3.0)
+    header = anchors_csv(result).splitlines()[0]
+    assert header.startswith("id,x,y,sigma_x,sigma_y,ranges,used_share,bias,bias_sigma,residual_rms,status")
+
+
+def test_an_unplaced_anchor_has_empty_fields():
+    lost = replace(small_result().anchors[0], position=np.full(2, np.nan), covariance=np.full((2, 2), np.nan))
+    row = next(csv.DictReader(io.StringIO(anchors_csv(replace(small_result(), anchors=(lost,))))))
+    assert row["x"] == row["sigma_x"] == ""
+
+
+def test_covariances_are_the_upper_triangle():
+    lines = covariance_csv(small_result()).splitlines()
+    assert lines[0] == "stamp,xx,xy,xtheta,yy,ytheta,thetatheta"
+    assert [float(v) for v in lines[1].split(",")] == pytest.approx([1000.0, 1e-4, 0, 0, 2e-4, 0, 1e-5])
+    assert len(lines) == 25
+
+
+def test_each_recording_has_its_trajectory(tmp_path):
+    write_result(tmp_path / "map", small_log(), small_result(sessions=2), RECORD)
+    stamps, _ = read_tum(tmp_path / "map" / "trajectory_2.tum")
+    assert len(stamps) == 24
+    assert stamps[0] == 1012.0
+
+
+def test_without_lidar_there_is_no_map_and_an_old_one_goes(tmp_path):
+    folder = tmp_path / "map"
+    write_result(folder, small_log(), small_result(), replace(RECORD, scale_map=True))
+    assert (folder / "map_scale.png").exists()
+    (folder / "notes.txt").write_text("mine")
+    write_result(folder, small_log(), small_result(lidar=False), RECORD)
+    assert set(contents(folder)) == (FILES - {"map.pgm", "map.yaml"}) | {"notes.txt"}
+
+
+def test_an_earlier_result_is_not_replaced_unasked(tmp_path):
+    folder = tmp_path / "map"
+    check_target(folder, force=False)
+    write_result(folder, small_log(), small_result(), RECORD)
+    with pytest.raises(ConfigError, match="--force"):
+        check_target(folder, force=False)
+    check_target(folder, force=True)
+    with pytest.raises(ConfigError, match="not a folder"):
+        check_target(folder / "map.yaml", force=True)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").touch()
+    check_target(tmp_path / "other", force=False)
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+def test_a_full_disk_leaves_the_previous_result(tmp_path, monkeypatch, fresh):
+    folder = tmp_path / "map"
+    if not fresh:
+        write_result(folder, small_log(), small_result(), RECORD)
+    before = contents(folder) if not fresh else {}
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(results, "render", full)
+    with pytest.raises(OSError, match="No space"):
+        write_result(folder, small_log(), small_result(evil="x"), RECORD)
+    assert (contents(folder) if folder.exists() else {}) == before
+    assert [p.name for p in tmp_path.iterdir()] == ([] if fresh else ["map"])
+
+
+KILLED = """
+import os, signal, sys
+sys.path.insert(0, {tests!r})
+from results import small_log, small_result
+from uwblite.io import results
+plain = results.{what}
+def stop(*args, **options):
+    plain(*args, **options)
+    os.kill(os.getpid(), signal.SIGKILL)
+results.{what} = stop
+results.write_result({folder!r}, small_log(), small_result(evil="x"), results.RunRecord("c", "k"))
+"""
+
+
+@pytest.mark.parametrize("what", ["write_png", "write_pyfg", "_write_trajectories", "render", "summary"])
+@pytest.mark.parametrize("fresh", [True, False])
+def test_a_killed_writer_leaves_the_previous_result(tmp_path, what, fresh):
+    folder = tmp_path / "map"
+    if not fresh:
+        write_result(folder, small_log(), small_result(), RECORD)
+    before = contents(folder) if not fresh else None
+    code = KILLED.format(tests=str(Path(__file__).parent.parent), what=what, folder=str(folder))
+    done = subprocess.run([sys.executable, "-c", code], check=False, env=dict(os.environ))
+    assert done.returncode == -signal.SIGKILL
+    visible = {p.name: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".")} if folder.exists() else None
+    assert visible == before
+    write_result(folder, small_log(), small_result(), RECORD)
+    assert set(contents(folder)) == FILES
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+def test_nothing_is_written_outside_the_folder(tmp_path):
+    hostile = small_log(name="../../../etc/passwd\0\n.log")
+    write_result(tmp_path / "map", hostile, small_result(evil="/../../x"), RECORD)
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+    assert set(contents(tmp_path / "map")) == FILES

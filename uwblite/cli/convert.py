@@ -1,0 +1,170 @@
+"""`uwblite convert`: recordings and pose graphs between formats."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from ..errors import ConfigError
+from .options import add_mounting_arguments
+
+if TYPE_CHECKING:
+    from ..sensor_log import SensorLog
+
+HELP = "convert recordings (CARMEN log, ROS 1/2 bag, CSV folder) and pose graphs (g2o, TORO, PyFG)"
+EPILOG = """\
+examples:
+  uwblite convert record.bag run.log.gz                ROS 1 bag, ROS 2 folder, .mcap or .db3 -> log
+  uwblite convert record.bag --list                    which topics are there, and which would be read
+  uwblite convert record.bag run.log --uwb-mapping uwb.toml --scan-topic /scan
+  uwblite convert run.log tables/                      -> odometry.csv, ranges.csv, scans.csv, sensors.toml
+  uwblite convert tables/ run.log --odometry-unit 0.001
+  uwblite convert run.log bag/ --to mcap               -> ROS 2 bag (MCAP or sqlite3)
+  uwblite convert run.log part.log --start 60 --end 120
+  uwblite convert graph.g2o graph.pyfg
+
+bags need the package rosbags: pip install 'uwblite[bag]'
+"""
+_TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the verb."""
+    parser.add_argument("source", help="what to convert; - reads a log from standard input")
+    parser.add_argument("target", nargs="?", help="what to make; its name tells the format, or --to does")
+    parser.add_argument("--to", choices=_TARGETS, help="format of the target where its name does not tell")
+    parser.add_argument("--force", action="store_true", help="replace a file that is already there")
+    bag = parser.add_argument_group("bags")
+    bag.add_argument("--list", action="store_true", help="list the topics and stop")
+    bag.add_argument("--odometry-topic", metavar="TOPIC", default="", help="nav_msgs/Odometry of the wheels")
+    bag.add_argument("--scan-topic", metavar="TOPIC", default="", help="sensor_msgs/LaserScan")
+    bag.add_argument("--uwb-topic", metavar="TOPIC", action="append", default=[], help="ranges; repeatable")
+    bag.add_argument("--uwb-mapping", metavar="FILE.toml", help="where ranges stand in messages, see docs/formats.md")
+    bag.add_argument("--base-frame", metavar="FRAME", default="", help="frame of the robot (the odometry's child frame)")
+    part = parser.add_argument_group("part and units")
+    part.add_argument("--start", metavar="S", type=float, help="leave out what is earlier, s after the first odometry")
+    part.add_argument("--end", metavar="S", type=float, help="leave out what is later, s after the first odometry")
+    part.add_argument("--odometry-unit", metavar="M", type=float, default=1.0, help="metres per unit of the odometry (1)")
+    part.add_argument("--angle-unit", metavar="RAD", type=float, default=1.0, help="radians per unit of its heading (1)")
+    part.add_argument("--range-unit", metavar="M", type=float, default=1.0, help="metres per unit of the ranges (1)")
+    part.add_argument("--laser-unit", metavar="M", type=float, default=1.0, help="metres per unit of the laser (1)")
+    add_mounting_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the verb."""
+    from .formats import format_of
+
+    kind = format_of(args.source)
+    if args.list:
+        return _list(args, kind)
+    if not args.target:
+        raise ConfigError("name a target: uwblite convert SOURCE TARGET")
+    if kind in ("g2o", "pyfg"):
+        return _convert_graph(args)
+    return _convert_recording(args, kind)
+
+
+def _list(args: argparse.Namespace, kind: str) -> int:
+    from ..io.rosbag import list_topics
+    from ..io.uwb_mapping import KNOWN
+    from . import console
+
+    if kind != "bag":
+        raise ConfigError(f"{args.source} is not a bag; --list shows the topics of bags")
+    roles = {"nav_msgs/msg/Odometry": "odometry", "sensor_msgs/msg/LaserScan": "scans"}
+    topics = list_topics(args.source)
+    width = max((len(t.name) for t in topics), default=0)
+    for t in topics:
+        role = roles.get(t.type) or ("ranges" if any(m.fits(t.name, t.type) for m in KNOWN) else "")
+        console.say(f"{t.count:>8}  {t.name:<{width}}  {t.type}{f'  <- {role}' if role else ''}")
+    return 0
+
+
+def _convert_graph(args: argparse.Namespace) -> int:
+    from . import console
+    from .formats import graph_format, read_graph, refuse_existing, write_graph
+
+    graph_format(args.target)
+    refuse_existing(args.force, args.target)
+    file = read_graph(args.source)
+    for warning in file.warnings:
+        console.note(f"uwblite: {args.source}: {warning}")
+    write_graph(args.target, file)
+    skipped = "".join(f", {count} {name} skipped" for name, count in file.skipped.items())
+    console.say(f"{args.target}: {len(file.graph.poses)} poses, {len(file.graph.anchors)} landmarks{skipped}")
+    return 0
+
+
+def _convert_recording(args: argparse.Namespace, kind: str) -> int:
+    from . import console
+    from .formats import format_of, refuse_existing
+    from .options import apply_mounting
+
+    to = args.to or format_of(args.target)
+    if to in ("", "bag", "g2o", "pyfg"):
+        hint = "a ROS 1 bag cannot be written; use --to mcap" if to == "bag" else "use --to log, csv, mcap or sqlite3"
+        raise ConfigError(f"{args.target}: not a format for a recording; {hint}")
+    refuse_existing(args.force, args.target)
+    log = apply_mounting(_scaled(_read(args, kind), args), args)
+    log = _cropped(log, args.start, args.end)
+    for warning in log.notes.warnings:
+        console.note(f"uwblite: {args.source}: {warning}")
+    _write(args, to, log)
+    ranges = 0 if log.ranges is None else len(log.ranges.stamps)
+    scans = 0 if log.scans is None else len(log.scans.stamps)
+    console.say(f"{args.target}: {len(log.odometry.stamps)} odometry readings, {ranges} ranges, {scans} scans")
+    if to == "log":
+        console.say(f"next: uwblite check {args.target}")
+    return 0
+
+
+def _read(args: argparse.Namespace, kind: str) -> "SensorLog":
+    from .formats import read_recording
+    from .options import read_text
+
+    if kind != "bag":
+        return read_recording(args.source)
+    from ..io.rosbag import BagTopics, read_bag
+    from ..io.uwb_mapping import parse_mappings
+
+    mappings = parse_mappings(read_text(args.uwb_mapping), args.uwb_mapping) if args.uwb_mapping else ()
+    topics = BagTopics(args.odometry_topic, args.scan_topic, tuple(args.uwb_topic), args.base_frame)
+    return read_bag(args.source, topics, mappings)
+
+
+def _write(args: argparse.Namespace, to: str, log: "SensorLog") -> None:
+    if to == "log":
+        from ..io.carmen import write_log
+
+        write_log(args.target, log)
+    elif to == "csv":
+        from ..io.csv_folder import write_csv_folder
+
+        write_csv_folder(args.target, log, force=args.force)
+    else:
+        from ..io.rosbag_writer import write_bag
+
+        write_bag(args.target, log, storage=to)
+
+
+def _scaled(log: "SensorLog", args: argparse.Namespace) -> "SensorLog":
+    """Return the recording in metres and radians."""
+    import dataclasses
+
+    odometry = dataclasses.replace(
+        log.odometry, poses=log.odometry.poses * (args.odometry_unit, args.odometry_unit, args.angle_unit)
+    )
+    ranges, scans, unit = log.ranges, log.scans, args.laser_unit
+    if ranges is not None:
+        ranges = dataclasses.replace(ranges, ranges=ranges.ranges * args.range_unit)
+    if scans is not None and unit != 1.0:
+        scaled = {name: getattr(scans, name) * unit for name in ("range_min", "range_max")}
+        scans = dataclasses.replace(scans, ranges=scans.ranges * scans.ranges.dtype.type(unit), **scaled)
+    return dataclasses.replace(log, odometry=odometry, ranges=ranges, scans=scans)
+
+
+def _cropped(log: "SensorLog", start: float | None, end: float | None) -> "SensorLog":
+    if start is None and end is None:
+        return log
+    first = float(log.odometry.stamps[0])
+    inf = float("inf")
+    return log.crop(-inf if start is None else first + start, inf if end is None else first + end)

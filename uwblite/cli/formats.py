@@ -1,0 +1,77 @@
+"""Which file is of which format, by its name and content, and who reads and writes it."""
+
+import os
+from typing import TYPE_CHECKING
+
+from ..errors import ConfigError
+
+if TYPE_CHECKING:
+    from ..io.graph_file import GraphFile
+    from ..sensor_log import SensorLog
+
+GRAPHS = {".g2o": "g2o", ".graph": "g2o", ".toro": "g2o", ".pyfg": "pyfg"}
+"""TORO files are told from g2o by their tags."""
+LOGS = {".log": "log", ".clf": "log", ".bag": "bag", ".mcap": "bag", ".db3": "bag"}
+
+
+def format_of(path: str) -> str:
+    """Return 'log', 'bag', 'csv', 'g2o' or 'pyfg'; '' where the name does not tell."""
+    if os.path.isdir(path):
+        if os.path.exists(os.path.join(path, "odometry.csv")):
+            return "csv"
+        return "bag" if os.path.exists(os.path.join(path, "metadata.yaml")) else ""
+    stem = path.removesuffix(".gz")
+    ending = os.path.splitext(stem)[1].lower()
+    return "log" if path == "-" else "csv" if path.endswith(os.sep) else (GRAPHS | LOGS).get(ending, "")
+
+
+def read_recording(path: str) -> "SensorLog":
+    """Read a recording of any kind: a CARMEN log, a ROS bag or a folder of CSV files."""
+    kind = format_of(path)
+    if kind == "csv":
+        from ..io.csv_folder import read_csv_folder
+
+        return read_csv_folder(path)
+    if kind == "bag":
+        from ..io.rosbag import read_bag
+
+        return read_bag(path)
+    from ..io.carmen import read_log
+
+    return read_log(path)
+
+
+def graph_format(path: str) -> str:
+    """Return 'g2o' or 'pyfg' for a graph's name."""
+    kind = format_of(path)
+    if kind not in ("g2o", "pyfg"):
+        raise ConfigError(f"{path}: the name must end in .g2o or .pyfg (or .gz behind that) to tell the format")
+    return kind
+
+
+def read_graph(path: str, *, from_odometry: bool = False) -> "GraphFile":
+    """Read a pose graph of any known format; standard input is g2o."""
+    from ..io.g2o import read_g2o
+    from ..io.pyfg import read_pyfg
+
+    if path != "-" and graph_format(path) == "pyfg":
+        return read_pyfg(path, from_odometry=from_odometry)
+    return read_g2o(path, from_odometry=from_odometry)
+
+
+def write_graph(path: str, file: "GraphFile") -> None:
+    """Write a pose graph in the format that its name tells; g2o files get their ranges too."""
+    from ..io.g2o import write_g2o
+    from ..io.pyfg import write_pyfg
+
+    if graph_format(path) == "pyfg":
+        write_pyfg(path, file.graph, file.anchor_ids, file.stamps)
+    else:
+        write_g2o(path, file.graph, ranges=True)
+
+
+def refuse_existing(force: bool, *paths: str | None) -> None:
+    """Refuse to replace what is there, unless forced."""
+    for path in paths:
+        if path and os.path.exists(path) and not force and os.path.isfile(path):
+            raise ConfigError(f"{path} exists; use --force to replace it, or another name")

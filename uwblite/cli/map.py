@@ -1,0 +1,231 @@
+"""`uwblite map`: from recordings to a map."""
+
+import argparse
+import shlex
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+from .options import add_mounting_arguments, add_settings_arguments
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from ..map_result import MapResult
+    from ..mapping import MappingConfig
+    from ..sensor_log import SensorLog
+
+HELP = "map a recording: trajectory, anchors, occupancy grid, report"
+EPILOG = """\
+examples:
+  uwblite map run.log --out map/                       everything at its best
+  uwblite map run.log.gz --out map/ --laser-flipped    the laser hangs upside down
+  uwblite map run.log --out a/ --without uwb           what wheels and lidar alone can do
+  uwblite map run.log --out b/ --preset paper          the paper's plain choices
+  uwblite map run.log --out c/ --set grid.resolution=0.02
+  uwblite map run.log --out map/ --dry-run             read, check and estimate only
+
+files in --out: map.png (picture), report.html, map.yaml + map.pgm (map_server, nav2), trajectory.tum (evo),
+  trajectory_covariance.csv, anchors.csv, graph.g2o, graph.pyfg, graph_stamps.csv, config.toml, report.json
+exit code 3: the files are written, but the result should not be trusted; the reasons are named
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the verb."""
+    parser.add_argument("log", help="CARMEN log, plain or .gz; - reads standard input")
+    parser.add_argument("--out", metavar="DIR", required=True, help="folder for the result")
+    parser.add_argument("--force", action="store_true", help="replace a result that is already there")
+    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
+    parser.add_argument("--dry-run", action="store_true", help="read, check and estimate time and memory; write nothing")
+    without = parser.add_argument("--without", action="append", default=[], choices=("uwb", "loops", "lidar"))
+    without.help = "leave out a sensor or the loop closures, to see what they give; repeatable"
+    parser.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes for the heavy stages (1)")
+    output = parser.add_argument_group("map")
+    output.add_argument("--resolution", metavar="M", type=float, help="edge of a cell, m: short for --set grid.resolution=M")
+    output.add_argument("--scale-map", action="store_true", help="write the probabilities too: map_scale.png (mode: scale)")
+    output.add_argument("--no-timings", action="store_true", help="leave timings out of report.json: same run, same bytes")
+    output.add_argument("--report-timings", action="store_true", help="show the stages' seconds in report.html too")
+    add_settings_arguments(parser)
+    add_mounting_arguments(parser)
+
+
+def _count(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the verb."""
+    from ..config import to_toml
+    from ..io.results import RunRecord, check_target, write_result
+    from . import console
+    from .formats import read_recording
+    from .options import apply_mounting
+
+    if not args.dry_run:
+        check_target(args.out, force=args.force)
+    config = _settings(args)
+    began = time.perf_counter()
+    log = apply_mounting(read_recording(args.log), args)
+    reading = time.perf_counter() - began
+    _tell_reader_warnings(log)
+    if args.dry_run:
+        return _dry_run(args, log)
+    result = _build(log, config, args.jobs)
+    record = RunRecord(
+        command=repeat_command(args),
+        config=to_toml(config, header="settings in force; `uwblite config` explains them"),
+        versions=_versions(),
+        preset=args.preset or "",
+        seconds=0.0 if args.no_timings else time.perf_counter() - began,
+        reading_seconds=reading,
+        peak_rss_bytes=_peak_memory(),
+        timings_in_report=args.report_timings,
+        scale_map=args.scale_map,
+    )
+    names = write_result(args.out, log, result, record)
+    if args.json:
+        console.say_json(summary_json(args, log, result, names, time.perf_counter() - began))
+    else:
+        for line in summary_lines(args, log, result, names, time.perf_counter() - began):
+            console.say(line)
+    return 3 if result.doubts else 0
+
+
+def _settings(args: argparse.Namespace) -> "MappingConfig":
+    from ..config import override
+    from .options import effective_config
+
+    config = override(effective_config(args), [f"use_{name}=false" for name in args.without])
+    return config if args.resolution is None else override(config, [f"grid.resolution={args.resolution}"])
+
+
+def _build(log: "SensorLog", config: "MappingConfig", jobs: int) -> "MapResult":
+    from ..mapping import build_map
+    from . import console
+
+    progress = console.Progress()
+    executor: Executor | None = None
+    try:
+        if jobs > 1:
+            from concurrent.futures import ProcessPoolExecutor
+
+            executor = ProcessPoolExecutor(jobs)
+        return build_map(log, config, progress=progress, executor=executor, clock=time.perf_counter)
+    finally:
+        progress.close()
+        if executor is not None:
+            executor.shutdown(cancel_futures=True)
+
+
+def _tell_reader_warnings(log: "SensorLog") -> None:
+    from . import console
+
+    notes = log.notes
+    if notes.broken:
+        number, why = notes.broken_lines[0]
+        console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
+    for warning in notes.warnings:
+        console.note(f"uwblite: {notes.source}: {warning}")
+
+
+def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
+    from ..diagnostics import diagnose
+    from . import check, console
+
+    diagnosis = diagnose(log)
+    cost = check.expected_cost(log)
+    if args.json:
+        console.say_json(check.summary_json(args.log, diagnosis, cost, ""))
+    else:
+        for line in check.report_lines(args.log, diagnosis, cost, ""):
+            console.say(line)
+    return 3 if diagnosis.serious else 0
+
+
+def repeat_command(args: argparse.Namespace) -> str:
+    """Return the command that makes the same map again, from the config.toml beside the result."""
+    words = ["uwblite", "map", args.log, "--config", "config.toml"]
+    if args.laser_pose is not None:
+        words.append("--laser-pose=" + ",".join(map(repr, args.laser_pose)))
+    if args.laser_flipped:
+        words.append("--laser-flipped")
+    if args.tag is not None:
+        words.append("--tag=" + ",".join(map(repr, args.tag)))
+    if args.anchor_height is not None:
+        words.append(f"--anchor-height={args.anchor_height!r}")
+    return shlex.join([*words, "--out", "map_again"])
+
+
+def _versions() -> dict[str, str]:
+    import platform
+
+    import numpy
+    import scipy
+
+    from .. import __version__
+
+    return {"uwblite": __version__, "Python": platform.python_version(), "numpy": numpy.__version__, "scipy": scipy.__version__}
+
+
+def _peak_memory() -> int:
+    """Return the peak resident memory of this process and the largest of its children, bytes; 0 where it is not known."""
+    try:
+        import resource
+    except ImportError:
+        return 0
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+def summary_json(
+    args: argparse.Namespace, log: "SensorLog", result: "MapResult", names: list[str], seconds: float
+) -> dict[str, Any]:
+    """Return the summary for programs; report.json has everything."""
+    import os
+
+    return {
+        "out": args.out,
+        "files": [os.path.join(args.out, name) for name in names],
+        "trusted": not result.doubts,
+        "doubts": result.doubts,
+        "warnings": result.warnings,
+        "anchors": {
+            a.id: {"x": a.position[0], "y": a.position[1], "bias": a.bias, "ranges": a.ranges, "status": a.status}
+            for a in result.anchors
+        },
+        "closures": {"accepted": sum(c.accepted for c in result.closures), "candidates": len(result.closures)},
+        "calibration": {c.name: c.value for c in result.calibration if c.state == "estimated"},
+        "seconds": round(seconds, 3),
+        "peak_rss_bytes": _peak_memory(),
+        "exit_code": 3 if result.doubts else 0,
+    }
+
+
+def summary_lines(
+    args: argparse.Namespace, log: "SensorLog", result: "MapResult", names: list[str], seconds: float
+) -> list[str]:
+    """Return what the user is told at the end."""
+    import os
+
+    from .console import duration
+    from .wording import anchor_line, calibration_line
+
+    span = float(log.odometry.stamps[-1] - log.odometry.stamps[0])
+    lines = [f"mapped {duration(span)} of driving in {duration(seconds)} ({span / max(seconds, 1e-9):.0f} times real time)"]
+    kept = sum(c.accepted for c in result.closures)
+    if result.grid is not None:
+        g = result.grid.geometry
+        size = f"{g.cols * g.resolution:.1f} x {g.rows * g.resolution:.1f} m at {g.resolution:g} m"
+        lines[0] += f": {size}, {len(result.keyframe_stamps)} keyframes, {kept} of {len(result.closures)} loop closures"
+    lines += [anchor_line(a) for a in result.anchors]
+    shown = (c for c in result.calibration if c.state == "estimated" and ":" not in c.name and abs(c.value) > 2.0 * c.sigma)
+    lines += [calibration_line(c) for c in shown]
+    lines += [f"warning: {text}" for text in result.warnings]
+    lines += [f"DOUBT: {text}" for text in result.doubts]
+    lines.append("files: " + " ".join(os.path.join(args.out, name) for name in names))
+    page = shlex.quote(os.path.join(args.out, "report.html"))
+    lines.append(f"next: open {page} in a browser, or: uwblite evaluate {shlex.quote(args.out)} --truth truth.tum")
+    return lines

@@ -1,0 +1,45 @@
+"""Numbers in words, always with unit and sigma."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..map_result import AnchorEstimate, CalibrationEstimate
+
+
+def anchor_line(anchor: "AnchorEstimate") -> str:
+    """Return one line about an anchor, such as
+
+    ``anchor 5C0B: x 12.31 ±0.04 m, y −3.20 ±0.05 m, bias +0.46 ±0.02 m, 812 ranges, 6 % down-weighted (NLOS?)``.
+    """
+    x, y = (float(v) for v in anchor.position)
+    if x != x or y != y:
+        place = "no position"
+    else:
+        sigma_x, sigma_y = (max(float(anchor.covariance[k, k]), 0.0) ** 0.5 for k in (0, 1))
+        place = f"x {signed(x)} \u00b1{sigma_x:.2f} m, y {signed(y)} \u00b1{sigma_y:.2f} m"
+    parts = [f"anchor {anchor.id}: {place}"]
+    if anchor.bias_sigma > 0:
+        parts.append(f"bias {signed(anchor.bias, plus=True)} \u00b1{anchor.bias_sigma:.2f} m")
+    parts.append(f"{anchor.ranges} ranges")
+    lost = 100 * (1 - anchor.used_share) if anchor.used_share == anchor.used_share else 0.0
+    if lost >= 0.5:
+        parts.append(f"{lost:.0f} % down-weighted (NLOS?)")
+    if anchor.status != "ok":
+        parts.append(f"{anchor.status.upper()}: {anchor.reason}" if anchor.reason else anchor.status.upper())
+    if anchor.alternative is not None:
+        parts.append(f"or at x {signed(float(anchor.alternative[0]))} m, y {signed(float(anchor.alternative[1]))} m")
+    return ", ".join(parts)
+
+
+def calibration_line(value: "CalibrationEstimate") -> str:
+    """Return one line about a calibration value; ratios in per cent."""
+    if value.unit == "1":
+        return f"{value.meaning}: {signed(100 * value.value, plus=True)} \u00b1{100 * value.sigma:.2f} % ({value.name})"
+    digits = 4 if value.unit.startswith("rad") else 3
+    number = signed(value.value, digits, plus=True)
+    return f"{value.meaning}: {number} \u00b1{value.sigma:.{digits}f} {value.unit} ({value.name})"
+
+
+def signed(value: float, digits: int = 2, *, plus: bool = False) -> str:
+    """Return a number with a true minus sign."""
+    return f"{value:{'+' if plus else ''}.{digits}f}".replace("-", "\u2212")

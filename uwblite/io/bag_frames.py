@@ -1,0 +1,68 @@
+"""Where a sensor sits on the robot, from the transforms (tf) in a bag."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Frames:
+    """A tree of frames, each known by its pose in its parent; the first transform of each frame counts."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Floats]] = {}
+
+    def add(self, transforms: Iterable[Any]) -> None:
+        """Take the transforms of a tf2_msgs/TFMessage."""
+        for t in transforms:
+            shift, turn = t.transform.translation, t.transform.rotation
+            pose = np.eye(4)
+            pose[:3, :3] = _rotation(turn.x, turn.y, turn.z, turn.w)
+            pose[:3, 3] = shift.x, shift.y, shift.z
+            self._parents.setdefault(_name(t.child_frame_id), (_name(t.header.frame_id), pose))
+
+    def pose(self, base: str, frame: str) -> Floats | None:
+        """Return T_base_frame (4, 4), None where the frames are not connected."""
+        up, down = self._to_root(base), self._to_root(frame)
+        common = next((name for name in down if name in up), None)
+        if common is None:
+            return None
+        return np.asarray(np.linalg.inv(up[common]) @ down[common], dtype=np.float64)
+
+    def _to_root(self, frame: str) -> dict[str, Floats]:
+        """Return the pose of the frame in itself and in each of its ancestors, nearest first."""
+        name, pose = _name(frame), np.eye(4)
+        chain = {name: pose}
+        while name in self._parents and self._parents[name][0] not in chain:
+            parent, step = self._parents[name]
+            pose = step @ pose
+            chain[parent] = pose
+            name = parent
+        return chain
+
+
+def planar(pose: Floats) -> tuple[Floats, bool]:
+    """Return x, y, theta (3,) of a pose (4, 4), and whether its z axis points down (mounted upside down)."""
+    return np.array([pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0])]), bool(pose[2, 2] < 0)
+
+
+def _name(frame: str) -> str:
+    return frame.lstrip("/")
+
+
+def _rotation(x: float, y: float, z: float, w: float) -> Floats:
+    """Return the rotation matrix of a quaternion of any positive length; the identity where it has none."""
+    n = x * x + y * y + z * z + w * w
+    if not 1e-12 < n < 1e12:
+        return np.eye(3)
+    s = 2.0 / n
+    return np.array(
+        [
+            [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+            [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+            [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,233 @@
+"""A recording as a folder of CSV files, for spreadsheets, pandas and other languages.
+
+| file | columns |
+|---|---|
+| odometry.csv | stamp, x, y, theta |
+| ranges.csv | stamp, anchor, range, quality |
+| scans.csv | stamp, then one column a beam; empty = nothing seen, nan = invalid |
+| sensors.toml | geometry of the scans, mounting of the sensors |
+
+Stamps in seconds, lengths in metres, angles in radians. Files of sensors that were not there are not there either.
+"""
+
+import csv
+import dataclasses
+import hashlib
+import io
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config import from_dict, parse_toml, to_toml
+from ..errors import ConfigError, FormatError
+from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges
+from .files import replacing
+from .source import open_source
+
+Floats = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ScanGeometry:
+    """Geometry that all scans share."""
+
+    angle_min: float = 0.0
+    """Angle of the first beam in the laser frame, rad."""
+    angle_increment: float = -1.0
+    """Angle between beams, rad; negative where they run clockwise."""
+    time_increment: float = 0.0
+    """Time between beams, s."""
+    range_min: float = 0.02
+    """Shorter readings are invalid, m."""
+    range_max: float = 30.0
+    """What the scanner reaches, m."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Mounting:
+    """Where the sensors sit on the base."""
+
+    laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """x, y, theta of the laser; m, m, rad."""
+    laser_flipped: bool = False
+    """The laser is mounted upside down."""
+    tag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """x, y, z of the UWB tag, z above the floor, m."""
+    anchor_height: float | None = None
+    """Height of all anchors above the floor, m."""
+    anchor_heights: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Height of single anchors above the floor, m, by id."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Sensors:
+    """Everything about the sensors that is not a reading."""
+
+    scans: ScanGeometry = ScanGeometry()
+    """Geometry of the scans."""
+    mounting: Mounting = Mounting()
+    """Mounting of the sensors."""
+
+
+def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: bool = False) -> None:
+    """Write a recording as CSV files into a folder, made where it is missing; each file is replaced when complete.
+
+    Raises
+    ------
+    ConfigError : the folder holds such files already and force is not given.
+    """
+    path = Path(folder)
+    if (path / "odometry.csv").exists() and not force:
+        raise ConfigError(f"{path} already holds a recording; use --force to replace it, or another folder")
+    path.mkdir(parents=True, exist_ok=True)
+    odometry = np.column_stack([log.odometry.stamps, log.odometry.poses])
+    _write(path / "odometry.csv", "stamp,x,y,theta", (",".join(f"{v:.6f}" for v in row) for row in odometry.tolist()))
+    if log.ranges is not None:
+        _write(path / "ranges.csv", "stamp,anchor,range,quality", _range_rows(log.ranges))
+    if log.scans is not None:
+        beams = ",".join(f"r{k}" for k in range(log.scans.ranges.shape[1]))
+        _write(path / "scans.csv", f"stamp,{beams}", _scan_rows(log.scans))
+    with replacing(path / "sensors.toml") as stream:
+        stream.write(to_toml(_sensors(log), comments=True).encode())
+
+
+def _write(path: Path, header: str, rows: Iterable[str]) -> None:
+    with replacing(path) as stream:
+        stream.write(f"{header}\n".encode())
+        for row in rows:
+            stream.write(f"{row}\n".encode())
+
+
+def _range_rows(ranges: UwbRanges) -> Iterator[str]:
+    names = [_quoted(name) for name in ranges.anchor_ids]
+    columns = (ranges.stamps.tolist(), ranges.anchor.tolist(), ranges.ranges.tolist(), ranges.quality.tolist())
+    for stamp, anchor, distance, quality in zip(*columns, strict=True):
+        yield f"{stamp:.6f},{names[anchor]},{distance:.4f},{quality:g}"
+
+
+def _quoted(text: str) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="").writerow([text])
+    return out.getvalue()
+
+
+def _scan_rows(scans: LaserScans) -> Iterator[str]:
+    for stamp, readings in zip(scans.stamps.tolist(), scans.ranges, strict=True):
+        yield f"{stamp:.6f}," + ",".join("" if v == np.inf else f"{v:.4f}" for v in readings.tolist())
+
+
+def _sensors(log: SensorLog) -> Sensors:
+    m, s = log.mounting, log.scans
+    geometry = ScanGeometry()
+    if s is not None:
+        geometry = ScanGeometry(s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max)
+    laser, tag = tuple(m.T_base_laser.tolist()), tuple(m.tag_position.tolist())
+    return Sensors(geometry, Mounting(laser, m.laser_flipped, tag, m.anchor_height, dict(m.anchor_heights)))
+
+
+def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
+    """Read a recording from a folder of CSV files.
+
+    Raises
+    ------
+    FormatError : odometry.csv is missing, or a file is not what it should be.
+    """
+    path = Path(folder)
+    digest = hashlib.sha256()
+    sensors = Sensors()
+    if (path / "sensors.toml").exists():
+        sensors = from_dict(Sensors, parse_toml(_text(path / "sensors.toml", digest), str(path / "sensors.toml")))
+    table = _in_order(_table(path / "odometry.csv", 4, digest))
+    ranges = _read_ranges(path / "ranges.csv", digest) if (path / "ranges.csv").exists() else None
+    scans = _read_scans(path / "scans.csv", sensors.scans, digest) if (path / "scans.csv").exists() else None
+    m = sensors.mounting
+    mounting = SensorMounting(np.array(m.laser), m.laser_flipped, np.array(m.tag), m.anchor_height, m.anchor_heights)
+    notes = LogNotes(source=os.fspath(folder), sha256=digest.hexdigest())
+    return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), ranges, scans, mounting, notes)
+
+
+def _text(path: Path, digest: "hashlib._Hash") -> str:
+    with open_source(path) as source:
+        data = b"".join(source.blocks())
+    digest.update(data)
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        raise FormatError("not UTF-8 text", str(path)) from None
+
+
+def _rows(path: Path, columns: int, digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
+    """Yield (line number, fields) behind the header; columns < 0 asks for at least that many."""
+    reader = csv.reader(io.StringIO(_text(path, digest)))
+    next(reader, None)
+    try:
+        for row in reader:
+            if row and (len(row) != columns if columns > 0 else len(row) < -columns):
+                raise FormatError(f"{len(row)} columns, expected {abs(columns)}", str(path), reader.line_num)
+            if row:
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise FormatError(f"not CSV: {error}", str(path), reader.line_num) from None
+
+
+def _number(text: str, path: Path, line: int) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise FormatError(f"{text[:30]!r} is not a finite number", str(path), line)
+    return value
+
+
+def _table(path: Path, columns: int, digest: "hashlib._Hash") -> Floats:
+    rows = [[_number(cell, path, line) for cell in row] for line, row in _rows(path, columns, digest)]
+    if not rows:
+        raise FormatError("there are no rows", str(path))
+    return np.array(rows)
+
+
+def _in_order(table: Floats) -> Floats:
+    return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:
+    rows = list(_rows(path, 4, digest))
+    if not rows:
+        return None
+    ids = tuple(sorted({row[1].strip() for _, row in rows}))
+    place = {name: k for k, name in enumerate(ids)}
+    table = np.array([[_number(row[k], path, line) for k in (0, 2, 3)] for line, row in rows])
+    anchor = np.array([place[row[1].strip()] for _, row in rows], dtype=np.int64)
+    order = np.argsort(table[:, 0], kind="stable")
+    return UwbRanges(table[order, 0], anchor[order], table[order, 1], table[order, 2], ids)
+
+
+def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash") -> LaserScans | None:
+    stamps: list[float] = []
+    readings: list[NDArray[np.float32]] = []
+    for line, row in _rows(path, -2, digest):
+        if readings and len(row) != len(readings[0]) + 1:
+            raise FormatError(f"{len(row) - 1} beams, the first scan has {len(readings[0])}", str(path), line)
+        try:
+            readings.append(np.array([cell or "inf" for cell in row[1:]], dtype=np.float32))
+        except ValueError:
+            raise FormatError("a reading is not a number", str(path), line) from None
+        stamps.append(_number(row[0], path, line))
+    if not readings:
+        return None
+    if geometry.angle_increment == -1.0:
+        raise FormatError(
+            "scans need their geometry in sensors.toml ([scans] angle_min, angle_increment, range_max)", str(path)
+        )
+    order = np.argsort(stamps, kind="stable")
+    ranges = np.stack([readings[k] for k in order])
+    with np.errstate(invalid="ignore"):
+        ranges[~(ranges >= geometry.range_min)] = np.nan
+    g = geometry
+    return LaserScans(
+        np.array(stamps)[order], ranges, g.angle_min, g.angle_increment, g.time_increment, g.range_min, g.range_max
+    )

@@ -1,0 +1,291 @@
+"""ROS bags to recordings and back, with the package `rosbags` (the extra ``uwblite[bag]``); no ROS is needed.
+
+Reads ROS 1 bags and ROS 2 bags in sqlite3 or MCAP. Wheel odometry comes from nav_msgs/Odometry, scans from
+sensor_msgs/LaserScan, ranges by a mapping (see uwb_mapping), mountings from tf. Times are those of the headers.
+"""
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError, FormatError, UwbliteError
+from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges
+from .bag_frames import Frames, planar
+from .uwb_mapping import KNOWN, UwbMapping
+
+Floats = NDArray[np.float64]
+
+_ODOMETRY, _SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan"
+_TF = "tf2_msgs/msg/TFMessage"
+
+
+@dataclass(frozen=True, slots=True)
+class BagTopics:
+    """Which topics to read; empty = guess from the types."""
+
+    odometry: str = ""
+    scan: str = ""
+    uwb: tuple[str, ...] = ()
+    base_frame: str = ""
+    """Empty = the odometry's child frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagTopic:
+    """One topic of a bag."""
+
+    name: str
+    type: str
+    count: int
+
+
+def list_topics(path: str | os.PathLike[str]) -> tuple[BagTopic, ...]:
+    """Return the topics of a bag, by name."""
+    with _opened(path) as reader:
+        return _topics(reader)
+
+
+def _topics(reader: Any) -> tuple[BagTopic, ...]:
+    return tuple(BagTopic(name, info.msgtype or "?", info.msgcount) for name, info in sorted(reader.topics.items()))
+
+
+def read_bag(path: str | os.PathLike[str], topics: BagTopics = BagTopics(), mappings: tuple[UwbMapping, ...] = ()) -> SensorLog:
+    """Read a bag.
+
+    Parameters
+    ----------
+    path : a ``.bag`` file, a ROS 2 bag's folder, or a single ``.mcap`` or ``.db3`` file.
+    topics : which topics to read.
+    mappings : how ranges stand in messages; the known ones are tried after these.
+
+    Returns
+    -------
+    SensorLog in time order; stamps are seconds since the epoch, as in the headers.
+
+    Raises
+    ------
+    FormatError : the bag cannot be read, or has no odometry.
+    ConfigError : a topic or field that was asked for is not there.
+    """
+    with _opened(path) as reader:
+        found = _Collector(_chosen(reader, topics, (*mappings, *KNOWN)), topics.base_frame)
+        wanted = {found.plan.odometry, found.plan.scan, *found.plan.uwb, *found.plan.tf}
+        for connection, recorded, raw in reader.messages(connections=[c for c in reader.connections if c.topic in wanted]):
+            found.take(connection.topic, recorded * 1e-9, reader.deserialize(raw, connection.msgtype))
+        return found.log(os.fspath(path), _hash(Path(path)))
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[Any]:
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise ConfigError("reading bags needs the package rosbags: pip install 'uwblite[bag]'") from None
+    name = os.fspath(path)
+    if not os.path.exists(name):
+        raise FormatError("cannot be opened: no such file or folder", name)
+    try:
+        # The store serves bags that do not carry the definitions of their messages.
+        with AnyReader([Path(name)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            yield reader
+    except (UwbliteError, MemoryError):
+        raise
+    except Exception as error:
+        # rosbags, sqlite and the decompressors each have errors of their own for a damaged file.
+        detail = " ".join(str(error).split())[:200]
+        raise FormatError(f"cannot be read as a ROS bag: {type(error).__name__}: {detail}", name) from None
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    odometry: str
+    scan: str
+    uwb: dict[str, UwbMapping]
+    tf: tuple[str, ...]
+    passed_over: tuple[str, ...]
+    """Topics that would have done too, in words."""
+
+
+def _chosen(reader: Any, asked: BagTopics, mappings: tuple[UwbMapping, ...]) -> _Plan:
+    topics = _topics(reader)
+    names = {t.name for t in topics}
+    for name in (asked.odometry, asked.scan, *asked.uwb):
+        if name and name not in names:
+            raise ConfigError(f"the bag has no topic {name}; it has {', '.join(sorted(names))}")
+    odometry = asked.odometry or _best(topics, _ODOMETRY, ("odom", "wheel"), ("filtered", "gps", "visual"))
+    scan = asked.scan or _best(topics, _SCAN, ("/scan",), ("sonar", "ultra", "back", "rear"))
+    by_topic = {}
+    for t in topics:
+        if asked.uwb and t.name not in asked.uwb:
+            continue
+        mapping = next((m for m in mappings if m.fits(t.name, t.type)), None)
+        if mapping is None and t.name in asked.uwb:
+            raise ConfigError(f"no uwb mapping fits {t.name} of type {t.type}; describe it in a file for --uwb-mapping")
+        if mapping is not None:
+            by_topic[t.name] = mapping
+    kept = by_topic if asked.uwb else _uncorrected(by_topic)
+    spare = [t.name for t in topics if t.type in (_ODOMETRY, _SCAN) and t.name not in (odometry, scan)]
+    spare += [name for name in by_topic if name not in kept]
+    return _Plan(odometry, scan, kept, tuple(t.name for t in topics if t.type == _TF), tuple(spare))
+
+
+def _best(topics: tuple[BagTopic, ...], kind: str, liked: tuple[str, ...], disliked: tuple[str, ...]) -> str:
+    """Return the likeliest topic of a type; '' where there is none."""
+
+    def rank(topic: BagTopic) -> tuple[bool, bool, int, str]:
+        name = topic.name.lower()
+        return (any(d in name for d in disliked), not any(w in name for w in liked), -topic.count, topic.name)
+
+    fitting = [t for t in topics if t.type == kind]
+    return min(fitting, key=rank).name if fitting else ""
+
+
+def _uncorrected(by_topic: dict[str, UwbMapping]) -> dict[str, UwbMapping]:
+    """Leave out X where X_raw exists: the map has its own correction."""
+    return {name: m for name, m in by_topic.items() if f"{name}_raw" not in by_topic}
+
+
+@dataclass(slots=True)
+class _Collector:
+    """Gathers the messages of the chosen topics."""
+
+    plan: _Plan
+    base_frame: str = ""
+    frames: Frames = field(default_factory=Frames)
+    odometry: list[tuple[float, float, float, float]] = field(default_factory=list)
+    ranges: list[tuple[float, str, float, float]] = field(default_factory=list)
+    scans: list[tuple[float, NDArray[np.float32]]] = field(default_factory=list)
+    layout: tuple[float, ...] = ()
+    """angle_min, angle_increment, time_increment, range_min, range_max, beams of the first scan."""
+    laser_frame: str = ""
+    tag_frames: Counter[str] = field(default_factory=Counter)
+    odd_scans: int = 0
+    unstamped: int = 0
+    late: list[float] = field(default_factory=list)
+
+    def take(self, topic: str, recorded: float, message: Any) -> None:
+        """Take a message that was recorded at a time, s."""
+        if topic in self.plan.tf:
+            self.frames.add(message.transforms)
+        elif topic == self.plan.odometry:
+            pose, turn = message.pose.pose, message.pose.pose.orientation
+            yaw = np.arctan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
+            self.base_frame = self.base_frame or message.child_frame_id
+            self.odometry.append((self._time(message.header.stamp, recorded), pose.position.x, pose.position.y, float(yaw)))
+        elif topic == self.plan.scan:
+            self._take_scan(recorded, message)
+        else:
+            mapping = self.plan.uwb[topic]
+            stamp = recorded
+            if mapping.stamp:
+                holder: Any = message
+                for name in mapping.stamp.split("."):
+                    holder = getattr(holder, name, None)
+                stamp = recorded if holder is None else self._time(holder, recorded)
+            if hasattr(message, "header"):
+                self.tag_frames[message.header.frame_id] += 1
+            self.ranges += [(stamp, *reading) for reading in mapping.extract(message, topic)]
+
+    def _time(self, stamp: Any, recorded: float) -> float:
+        seconds = float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+        if seconds <= 0.0:
+            self.unstamped += 1
+            return recorded
+        self.late.append(recorded - seconds)
+        return seconds
+
+    def _take_scan(self, recorded: float, message: Any) -> None:
+        layout = (message.angle_min, message.angle_increment, message.time_increment, message.range_min, message.range_max)
+        readings = np.asarray(message.ranges, dtype=np.float32)
+        if not self.layout:
+            self.layout, self.laser_frame = (*layout, float(len(readings))), message.header.frame_id
+        if len(readings) != self.layout[5] or abs(layout[0] - self.layout[0]) > 1e-3 or abs(layout[1] - self.layout[1]) > 1e-6:
+            self.odd_scans += 1
+            return
+        self.scans.append((self._time(message.header.stamp, recorded), readings))
+
+    def log(self, path: str, sha256: str) -> SensorLog:
+        """Return what was gathered as a recording."""
+        if not self.odometry:
+            raise FormatError(f"the bag has no odometry ({_ODOMETRY}); name its topic with --odometry-topic", path)
+        table = np.array(self.odometry)
+        table = table[np.isfinite(table).all(axis=1)]
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        warnings = list(self._warnings(len(self.odometry) - len(table)))
+        mounting = self._mounting(warnings)
+        notes = LogNotes(source=path, sha256=sha256, warnings=tuple(warnings))
+        return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), self._ranges(), self._scans(), mounting, notes)
+
+    def _ranges(self) -> UwbRanges | None:
+        rows = [r for r in self.ranges if np.isfinite(r[0]) and np.isfinite(r[2]) and np.isfinite(r[3])]
+        if not rows:
+            return None
+        ids = tuple(sorted({row[1] for row in rows}))
+        place = {name: k for k, name in enumerate(ids)}
+        stamps = np.array([row[0] for row in rows])
+        order = np.argsort(stamps, kind="stable")
+        anchor = np.array([place[row[1]] for row in rows], dtype=np.int64)
+        ranges, quality = (np.array([row[k] for row in rows]) for k in (2, 3))
+        return UwbRanges(stamps[order], anchor[order], ranges[order], quality[order], ids)
+
+    def _scans(self) -> LaserScans | None:
+        if not self.scans:
+            return None
+        angle_min, increment, time_increment, range_min, range_max, _ = map(float, self.layout)
+        stamps = np.array([stamp for stamp, _ in self.scans])
+        order = np.argsort(stamps, kind="stable")
+        readings = np.stack([self.scans[k][1] for k in order])
+        # REP-117: too near and error are not "nothing seen"; but drivers older than it write 0 for no echo.
+        with np.errstate(invalid="ignore"):
+            nothing = (readings == 0.0) | (readings >= range_max)
+            readings[~(readings >= range_min)] = np.nan
+        readings[nothing] = np.inf
+        return LaserScans(stamps[order], readings, angle_min, increment, time_increment, range_min, range_max)
+
+    def _mounting(self, warnings: list[str]) -> SensorMounting:
+        T_base_laser, flipped, tag = np.zeros(3), False, np.zeros(3)
+        if self.scans:
+            pose = self.frames.pose(self.base_frame, self.laser_frame)
+            if pose is None:
+                warnings.append(f"no transform from {self.base_frame} to {self.laser_frame}: give --laser-pose")
+            else:
+                T_base_laser, flipped = planar(pose)
+        if self.ranges:
+            frame = self.tag_frames.most_common(1)[0][0] if self.tag_frames else ""
+            pose = self.frames.pose(self.base_frame, frame) if frame else None
+            if pose is None:
+                warnings.append("no transform to the UWB tag: give --tag")
+            else:
+                tag = pose[:3, 3].copy()
+        return SensorMounting(T_base_laser, flipped, tag)
+
+    def _warnings(self, broken: int) -> Iterator[str]:
+        if self.plan.passed_over:
+            yield f"not used: {', '.join(self.plan.passed_over)}"
+        if broken:
+            yield f"{broken} odometry messages are not finite and were skipped"
+        if self.odd_scans:
+            yield f"{self.odd_scans} scans of another geometry were skipped"
+        if self.unstamped:
+            yield f"{self.unstamped} messages carry no time; the time of recording is used"
+        if self.late and abs(delay := float(np.median(self.late))) > 5.0:
+            yield f"headers and recording differ by {delay:.1f} s: the sensors' computers have other clocks"
+
+
+def _hash(path: Path) -> str:
+    """Return the hash of a file, or of all files of a folder in the order of their names."""
+    digest = hashlib.sha256()
+    for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
+        with open(file, "rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
