@@ -51,7 +51,7 @@ def check_transcript(make, frames, expected, noises, splits=200, seed=0):
         assert good(feed_split(make, noisy, rng)) == expected, noisy
 
 
-def simulate(session, device, seconds, *, line=None, step=0.0005, start=1000.0, latency=0.0008):
+def simulate(session, device, seconds, *, line=None, step=0.0005, start=1000.0, latency=0.0008, jitter=lambda: 0.0):
     """Run a session against an emulated device in simulated time, with a fault line between them.
 
     Returns
@@ -63,13 +63,16 @@ def simulate(session, device, seconds, *, line=None, step=0.0005, start=1000.0, 
     actions, to_host, reopens = [], [], 0
     device.power_up(now)
 
+    def to_come(data, delay):
+        if data:
+            due = now + delay + jitter()
+            to_host.append((max(due, to_host[-1][0]) if to_host else due, data))
+
     def do(new):
         nonlocal reopens
         for action in new:
             if isinstance(action, Send):
-                answer = device.receive(action.data, now)
-                if answer:
-                    to_host.append((now + latency, answer))
+                to_come(device.receive(action.data, now), latency)
             elif isinstance(action, Reopen):
                 reopens += 1
                 do(session.start(now))
@@ -78,9 +81,7 @@ def simulate(session, device, seconds, *, line=None, step=0.0005, start=1000.0, 
 
     do(session.start(now))
     while now < end:
-        said = device.advance(now)
-        if said:
-            to_host.append((now, said))
+        to_come(device.advance(now), 0.0)
         while to_host and to_host[0][0] <= now:
             data = to_host.pop(0)[1]
             if line is not None:

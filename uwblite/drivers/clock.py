@@ -12,6 +12,8 @@ from itertools import pairwise
 
 MAX_SKEW = 1e-3
 """Largest believable relative error of a crystal; anything above is a broken estimate."""
+BACKWARD = 1.0
+"""s; a scan may have begun before the last reading of the clock, more than that is another power-up."""
 FIT_BUCKETS = 8
 """Fewer buckets than this: offset only, no skew."""
 
@@ -50,7 +52,7 @@ class Unwrapper:
             elapsed = (now - self._now) / self._tick
             step = (count - self._count) % self._modulus
             step += self._modulus * round((elapsed - step) / self._modulus)
-            reset = step < 0 or abs(step - elapsed) * self._tick > self._tolerance
+            reset = step * self._tick < -BACKWARD or abs(step - elapsed) * self._tick > self._tolerance
             self._total = count if reset else self._total + step
         self._count, self._now = count, now
         return self._total * self._tick, reset
@@ -78,6 +80,8 @@ class ClockMap:
 
     def add(self, device: float, host: float) -> None:
         """Take one frame: stamped at `device` s by the device, arrived at `host` s."""
+        if self._minima and device < self._minima[-1][0]:
+            return
         delay = host - device
         index = int(device // self._bucket)
         if index == self._index and self._minima:

@@ -316,6 +316,7 @@ class Dwm1001Session:
         if self._step == "probe":
             self._text_mode, self._tries = False, 0
             if self._shell:
+                self._text_mode = True
                 return self._say("enter", ENTER, now, 1.2)
             self._query = 0
             return self._say("query", request(QUERIES[0]), now)
@@ -325,19 +326,23 @@ class Dwm1001Session:
         if not status.location_ready:
             self._not_ready = self._sent
             return self._wait(now)
-        self._fix_stamp = self._fix_time(now)
-        self._guess = False
+        stamp = self._fix_time(now)
+        if stamp is None:
+            self._not_ready = self._sent
+            return self._wait(now)
+        self._fix_stamp, self._guess = stamp, False
         return self._read_fix(now)
 
-    def _fix_time(self, now: float) -> float:
-        """Return when the fix that was found ready at `now` was made.
+    def _fix_time(self, now: float) -> float | None:
+        """Return when the fix that was found ready at `now` was made; None = unknown, it waited for the first poll.
 
         It lies between the last poll that found none and now. Rounds follow each other on the grid of the network's
         superframes, so the interval of the last fix, shifted by whole periods, narrows that down; where the two do not
         overlap the tag does not keep the grid, and the new interval stands alone.
         """
-        low = self._not_ready if self._not_ready is not None else now - 10.0
-        high = now
+        if self._not_ready is None and self._interval is None:
+            return None
+        low, high = self._not_ready if self._not_ready is not None else self._last_fix, now
         if self._interval is not None:
             old_low, old_high = self._interval
             turns = max(1, round((high - old_high) / self.period))
@@ -346,7 +351,7 @@ class Dwm1001Session:
             if narrow_low < narrow_high:
                 low, high = narrow_low, narrow_high
         if high - low > 4 * SPARSE:
-            return now
+            return min(now, self._last_fix + self.period)
         self._interval = (low, high)
         return (low + high) / 2
 
@@ -359,6 +364,8 @@ class Dwm1001Session:
         due = self._last_fix + self.period - LEAD
         late = now - due
         wait = DENSE if late < 2 * LEAD else SPARSE if late < 10.0 else IDLE
+        if self._interval is None:
+            due, wait = now, DENSE  # nothing is known yet of when the next one comes
         self._step, self._due = "poll", max(now + wait, due)
         if now - self._last_fix > 3.0 and self.joined is False:
             text = (
@@ -386,7 +393,7 @@ class Dwm1001Session:
             self._damaged, self._fix_stamp = True, None
             return [Corrupt(b"", "a fix read five times never came twice alike"), *self._wait(now)]
         stamp, self._fix_stamp, self._pending = self._fix_stamp, None, None
-        if self._guess and readings == self._latest:
+        if (self._guess or now < self._distrust) and readings == self._latest:
             return self._wait(now)
         gap, damaged, self._damaged = stamp - self._last_fix, self._damaged, False
         self._last_fix, self._latest = stamp, readings

@@ -235,8 +235,8 @@ def _find_position(text: str, stamp_at: StampAt) -> Found:
     start = text.rfind("POS,")
     if start < 0:
         return 0, None
-    # A position behind a comma is the end of a broken lec line.
-    own = None if text[:start].endswith(",") else _POS.match(text, start)
+    # Behind the rows of a broken lec line a position is the end of that line.
+    own = None if "DIST," in text and text[:start].endswith(",") else _POS.match(text, start)
     other = _LISTENER.match(text, start)
     position = _position(own.groups()) if own else _position(other.groups()[1:]) if other else None
     if position is None or position[3] > 100:

@@ -237,7 +237,7 @@ class KobukiOdometer:
         if reset:
             self._map = ClockMap()
         if last is not None and not reset:
-            if elapsed == 0:
+            if elapsed <= 0:
                 return None, 0, ""
             missing = max(0, round(elapsed / PERIOD) - 1)
         self._map.add(time, feedback.stamp)

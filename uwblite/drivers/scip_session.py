@@ -34,7 +34,7 @@ DRAIN = 0.25
 PATIENCE = 0.4
 """s to wait for an answer."""
 TIME_READS = 8
-LATENCY_LEARNING = 10.0
+LATENCY_LEARNING = 3.0
 """s of streaming during which the delay of a scan is measured; device and host clocks drift less than 1 ms in it."""
 NOISE_PATIENCE = 10.0
 """s of nothing but damaged scans after which the laser is started again all the same."""

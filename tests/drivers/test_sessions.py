@@ -1,0 +1,290 @@
+"""Sessions against emulated devices in simulated time: start-up from every state, recovery, clocks, damage."""
+
+import itertools
+import math
+import random
+
+import pytest
+from driver_harness import of_kind, simulate
+from emulators.dwm_device import DwmDevice, DwmOptions
+from emulators.faults import FaultyLine, parse_fault
+from emulators.scip_device import ScipDevice, ScipOptions
+from emulators.world import Epoch, Scan, WorldClock
+
+from uwblite.drivers.dwm1001_session import Dwm1001Session
+from uwblite.drivers.events import Corrupt, LaserScan, Lost, Note, Param, RangeEpoch, SetBaud
+from uwblite.drivers.scip_session import ScipSession
+
+START = 1000.0
+
+
+def plain_scans():
+    values = [[1000 + (7 * i + k) % 4000 for i in range(682)] for k in range(50)]
+    return (Scan(0.1 * k, values[k % 50]) for k in itertools.count())
+
+
+def lidar(options=None, start=START + 0.05):
+    clock, sent = WorldClock(), []
+    device = ScipDevice(plain_scans(), clock, options or ScipOptions(), lambda t, v: sent.append((t, v)))
+    clock.start(start)
+    return device, sent
+
+
+def names(actions):
+    return {note.name for note in of_kind(actions, Note)}
+
+
+@pytest.mark.parametrize(
+    "state", ["plain", "scip1", "streaming", "adjusting", "laser on", "half a command", "wrong clock"]
+)  # fmt: skip
+def test_lidar_starts_from_every_state(state):
+    options = ScipOptions(scip1=state == "scip1", streaming=state == "streaming")
+    device, sent = lidar(options)
+    power_up = device.power_up
+
+    def prepared(now):
+        power_up(now)
+        words = {"adjusting": b"TM0\n", "laser on": b"BM\n", "half a command": b"MD0044"}
+        device.receive(words.get(state, b""), now - 1.0)
+
+    device.power_up = prepared
+    session = ScipSession()
+    actions, reopens = simulate(session, device, 5.0)
+    scans = of_kind(actions, LaserScan)
+    assert reopens == 0
+    assert len(scans) > 25
+    assert not of_kind(actions, Lost)
+    truth = {tuple(v): t for t, v in sent}
+    for scan in scans:
+        true = truth[tuple(round(1000 * r) for r in scan.ranges)]
+        assert scan.stamp == pytest.approx(true, abs=0.002)
+
+
+def test_lidar_reports_who_it_is_and_its_geometry():
+    device, _ = lidar()
+    session = ScipSession()
+    actions, _ = simulate(session, device, 2.0)
+    assert {p.name for p in of_kind(actions, Param)} == {"laser_product", "laser_firmware", "laser_serial"}
+    (scan, *_) = of_kind(actions, LaserScan)
+    assert scan.angle_min == pytest.approx((44 - 384) * 2 * math.pi / 1024)
+    assert scan.angle_increment == pytest.approx(2 * math.pi / 1024)
+    assert scan.time_increment == pytest.approx(97.656e-6, rel=1e-4)
+    assert (scan.range_max, scan.range_min) == (5.6, 0.02)
+
+
+@pytest.mark.parametrize("options", [{"cluster": 3}, {"skip": 1}, {"wide": False}, {"start": 128, "end": 640}])
+def test_lidar_sub_sampled(options):
+    device, sent = lidar()
+    actions, _ = simulate(ScipSession(**options), device, 4.0)
+    scans = of_kind(actions, LaserScan)
+    assert len(scans) > (12 if "skip" in options else 20)
+    assert not of_kind(actions, Lost)
+    first = options.get("start", 44)
+    for scan, (true, values) in zip(scans, sent, strict=False):
+        assert len(scan.ranges) == len(values)
+        assert scan.stamp == pytest.approx(true, abs=0.002)
+        middle = (options.get("cluster", 1) - 1) / 2
+        assert scan.angle_min == pytest.approx((first + middle - 384) * 2 * math.pi / 1024)
+
+
+@pytest.mark.parametrize("skew", [-2e-4, 0.0, 2e-4])
+def test_lidar_stamps_stay_within_2_ms_through_a_clock_wrap(skew):
+    """Two minutes across the wrap of the 24-bit counter, with transport delays of 1 ms and rare ones of 40 ms."""
+    device, sent = lidar(ScipOptions(clock_start=(1 << 24) - 60_000, clock_skew=skew))
+    rng = random.Random(0)
+    delay = lambda: 0.04 if rng.random() < 0.02 else rng.expovariate(1000)  # noqa: E731
+    actions, _ = simulate(ScipSession(), device, 120.0, jitter=delay)
+    scans = of_kind(actions, LaserScan)
+    assert len(scans) > 1180
+    assert not names(actions) & {"lidar-clock-reset", "lidar-restart"}
+    offset = len(sent) - len(scans)
+    errors = [scan.stamp - t for scan, (t, _) in zip(scans, sent[offset if offset > 0 else 0 :], strict=False)]
+    assert max(map(abs, errors)) < 0.002
+    assert max(map(abs, errors[200:])) < 0.0015
+
+
+def test_lidar_pause_and_hardware_fault_are_named_and_survived():
+    device, _ = lidar()
+    session, advance = ScipSession(), device.advance
+
+    def scripted(now):
+        device.fault = 22 if 3 < now - START < 4 else 55 if 6 < now - START < 7 else None
+        return advance(now)
+
+    device.advance = scripted
+    actions, _ = simulate(session, device, 15.0)
+    assert {"lidar-paused", "lidar-resumed", "lidar-hardware-fault"} <= names(actions)
+    assert of_kind(actions, LaserScan)[-1].stamp > START + 14.5
+
+
+def test_lidar_that_is_silent_asks_for_the_port_to_be_opened_anew():
+    device, _ = lidar()
+    device.receive = lambda data, now: b""
+    actions, reopens = simulate(ScipSession(), device, 20.0)
+    assert reopens >= 1
+    assert "lidar-silent" in names(actions)
+    assert {a.rate for a in of_kind(actions, SetBaud)} == {19200, 57600, 250000, 500000, 750000}
+
+
+def test_lidar_with_scip_1_only_is_named():
+    device, _ = lidar(ScipOptions(scip1=True))
+    receive = device.receive
+    device.receive = lambda data, now: b"SCIP2.0\nE\n\n" if data.startswith(b"SCIP2.0") else receive(data, now)
+    actions, reopens = simulate(ScipSession(), device, 3.0)
+    assert "lidar-scip1-only" in names(actions)
+    assert reopens
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lidar_damage_costs_the_scans_that_were_damaged(seed):
+    """Noise at one byte in 20,000 hits about every tenth scan; all others arrive with the right ranges."""
+    device, sent = lidar()
+    line = FaultyLine([parse_fault("noise=0.00005@3")], seed)
+    actions, _ = simulate(ScipSession(), device, 60.0, line=line)
+    scans = of_kind(actions, LaserScan)
+    lost = sum(item.count for item in of_kind(actions, Lost))
+    assert len(scans) + lost >= len(sent) - 3
+    assert 20 < lost < 130
+    true = {tuple(v) for _, v in sent}
+    wrong = sum(tuple(round(1000 * r) for r in scan.ranges) not in true for scan in scans)
+    assert wrong == 0
+
+
+def test_lidar_scans_sent_twice_are_dropped():
+    device, _ = lidar(ScipOptions(duplicates=0.2, random=random.Random(1)))
+    actions, _ = simulate(ScipSession(), device, 20.0)
+    stamps = [scan.stamp for scan in of_kind(actions, LaserScan)]
+    assert min(b - a for a, b in itertools.pairwise(stamps)) > 0.09
+    assert "scan sent twice" in {c.why for c in of_kind(actions, Corrupt)}
+
+
+# ---- the tag
+
+
+def rounds(rng, dropouts=0.0):
+    for k in itertools.count():
+        if rng.random() >= dropouts:
+            readings = [(0x1000 + i, 2000 + rng.randrange(5000), 100) for i in range(4)]
+            yield Epoch(0.1 * k + 0.033, readings)
+
+
+def tag(options=None, seed=0, dropouts=0.0):
+    clock, sent = WorldClock(), []
+    epochs = rounds(random.Random(seed), dropouts)
+    device = DwmDevice(epochs, clock, options or DwmOptions(), lambda t, r: sent.append((t, r)))
+    clock.start(START + 0.05)
+    return device, sent
+
+
+def check_ranges(actions, sent, resolution, tolerance):
+    """Every fix from the first one on arrives, once, with its ranges and its time."""
+    epochs = of_kind(actions, RangeEpoch)
+    digits = 3 if resolution == 1 else 2
+    fixes = {tuple((a, f"{d / 1000:.{digits}f}") for a, d, _ in readings): t for t, readings in sent}
+    seen = []
+    for epoch in epochs:
+        key = tuple((int(r.anchor_id, 16), f"{r.range:.{digits}f}") for r in epoch.readings)
+        assert key in fixes
+        seen.append(fixes[key])
+        assert epoch.stamp == pytest.approx(fixes[key], abs=tolerance)
+    assert len(set(seen)) == len(seen)
+    expected = [t for t, _ in sent if seen[0] <= t <= seen[-1]]
+    assert len(seen) == len(expected)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"shell": True}, {"stream": "lec"}, {"stream": "les"}, {"stream": "lep"}, {"without_position": True}],
+    ids=str,
+)
+def test_tag_by_tlv_from_every_state(options):
+    device, sent = tag(DwmOptions(**options))
+    session = Dwm1001Session()
+    actions, reopens = simulate(session, device, 20.0)
+    assert reopens == 0
+    assert len(of_kind(actions, RangeEpoch)) > 150
+    check_ranges(actions, sent, 1, 0.005)
+    assert not of_kind(actions, Lost)
+    assert ("uwb-stream-left" in names(actions)) == ("stream" in options)
+    assert {p.name: p.value for p in of_kind(actions, Param)}["uwb_tag_id"] == "1512"
+
+
+@pytest.mark.parametrize("options", [{}, {"shell": True}, {"stream": "lec"}, {"stream": "les"}], ids=str)
+def test_tag_by_shell_from_every_state(options):
+    device, sent = tag(DwmOptions(**options))
+    actions, reopens = simulate(Dwm1001Session(shell=True), device, 20.0)
+    assert reopens == 0
+    assert len(of_kind(actions, RangeEpoch)) > 120
+    check_ranges(actions, sent, 10, 0.01)
+
+
+@pytest.mark.parametrize("dropouts", [0.2, 0.9])
+def test_tag_with_rounds_missing(dropouts):
+    device, sent = tag(dropouts=dropouts)
+    actions, _ = simulate(Dwm1001Session(), device, 60.0)
+    check_ranges(actions, sent, 1, 0.006)
+    assert not of_kind(actions, Lost)
+
+
+def test_tag_half_a_request_of_a_dead_host_is_closed_by_the_gap():
+    device, sent = tag()
+    power_up = device.power_up
+
+    def prepared(now):
+        power_up(now)
+        device.receive(b"\x0c", now - 0.5)
+
+    device.power_up = prepared
+    actions, _ = simulate(Dwm1001Session(), device, 5.0)
+    check_ranges(actions, sent, 1, 0.005)
+
+
+def test_tag_settings_that_hurt_are_named():
+    device, _ = tag(DwmOptions(stationary_detection=True, update=[10, 100], joined=False))
+    actions, _ = simulate(Dwm1001Session(), device, 8.0)
+    assert {"stationary-detection", "slow-update-rate", "not-joined"} <= names(actions)
+    device, _ = tag(DwmOptions(anchor=True))
+    actions, _ = simulate(Dwm1001Session(), device, 3.0)
+    assert "not-a-tag" in names(actions)
+    device, _ = tag(DwmOptions(stationary_detection=True, joined=False))
+    actions, _ = simulate(Dwm1001Session(shell=True), device, 6.0)
+    assert {"stationary-detection", "not-joined"} <= names(actions)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_tag_on_a_bad_cable_logs_nothing_wrong(seed):
+    """One byte in a hundred is changed and TLV has no sum: reading twice keeps wrong ranges out of the log."""
+    device, sent = tag(seed=seed)
+    line = FaultyLine([parse_fault("noise=0.01@3")], seed)
+    actions, _ = simulate(Dwm1001Session(), device, 60.0, line=line)
+    epochs = of_kind(actions, RangeEpoch)
+    true = {tuple((a, d) for a, d, _ in readings) for _, readings in sent}
+    wrong = [e for e in epochs if tuple((int(r.anchor_id, 16), round(1000 * r.range)) for r in e.readings) not in true]
+    assert len(wrong) <= 1
+    lost = sum(item.count for item in of_kind(actions, Lost))
+    assert len(epochs) > 0.5 * len(sent)
+    assert abs(len(epochs) + lost - len(sent)) < 0.05 * len(sent) + 10
+
+
+def test_tag_that_falls_silent_asks_for_the_port_to_be_opened_anew():
+    device, _ = tag()
+    device.silent = True
+    actions, reopens = simulate(Dwm1001Session(), device, 15.0)
+    assert reopens >= 1
+    assert "uwb-silent" in names(actions)
+
+
+def test_tag_that_restarts_in_mid_run_comes_back():
+    device, _ = tag()
+    session = Dwm1001Session()
+    feed, done = session.feed, []
+
+    def scripted(data, now):
+        if now > START + 5 and not done:
+            done.append(now)
+            device._reboot_at = now + 3.0
+        return feed(data, now)
+
+    session.feed = scripted
+    actions, _ = simulate(session, device, 30.0)
+    assert of_kind(actions, RangeEpoch)[-1].stamp > START + 29
