@@ -88,6 +88,7 @@ class _Reader:
         self.lines = self.messages = self.broken = 0
         self.broken_lines: list[tuple[int, str]] = []
         self.ends_broken = False
+        self.has_ipc = False
         self.handlers: dict[bytes, Callable[[list[bytes]], None]] = {
             b"ODOM": self._odom,
             b"UWB": self._uwb,
@@ -157,10 +158,13 @@ class _Reader:
 
     def _stamp(self, tokens: list[bytes], fields: int, name: str) -> float:
         """Return ipc_timestamp behind the name and contents (`fields` tokens); logger_timestamp where it is left out."""
-        if len(tokens) not in (fields + 2, fields + 3):
-            raise BrokenLine(f"{name} has {len(tokens)} fields, expected {fields + 3}")
-        if len(tokens) == fields + 2:
+        # A log leaves ipc_timestamp out everywhere or nowhere: once it was seen, a short message lacks something else.
+        if len(tokens) == fields + 3:
+            self.has_ipc, self.laser.ipc_left_out = True, False
+        elif len(tokens) == fields + 2 and not self.has_ipc:
             self.laser.ipc_left_out = True
+        else:
+            raise BrokenLine(f"{name} has {len(tokens)} fields, expected {fields + 3}")
         return stamp_of(tokens[fields:])
 
     def _count_broken(self, broken: list[tuple[int, str]]) -> None:

@@ -172,7 +172,8 @@ class LaserMessages:
                 pending, scans.pending = scans.pending, []
                 values, errors = self._decode_rows(layout.beams, pending)
                 keep = np.array([e is None for e in errors])
-                scans.ranges.frombytes(np.ascontiguousarray(values if keep.all() else values[keep]).data.cast("B"))
+                if keep.any():
+                    scans.ranges.frombytes(np.ascontiguousarray(values if keep.all() else values[keep]).data.cast("B"))
                 scans.stamps.extend(p.stamp for p, error in zip(pending, errors, strict=True) if error is None)
                 yield from ((p.number, e) for p, e in zip(pending, errors, strict=True) if e is not None)
 
