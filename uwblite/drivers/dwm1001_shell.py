@@ -249,7 +249,7 @@ def _find_text(text: str, stamp_at: StampAt) -> Found:
     if row and text[row.start() :].isprintable():
         return row.start(), TextLine(stamp_at(row.start()), text[row.start() :])
     stripped = text.strip()
-    known = _ANSWER.match(stripped) or stripped.split()[0] in COMMANDS
+    known = _ANSWER.match(stripped) or stripped.partition(" ")[0] in COMMANDS
     return 0, TextLine(stamp_at(0), stripped) if known and stripped.isprintable() else None
 
 

@@ -1,0 +1,127 @@
+"""Whatever comes down a wire: no exception, bounded memory, bounded work per byte. A million bytes per protocol with --slow."""
+
+import random
+import sys
+
+import pytest
+from driver_harness import ROOT  # noqa: F401
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uwblite.drivers.dwm1001 import TlvProtocol
+from uwblite.drivers.dwm1001_session import Dwm1001Session
+from uwblite.drivers.dwm1001_shell import ShellProtocol
+from uwblite.drivers.kobuki import KobukiProtocol
+from uwblite.drivers.odometry_line import LineFormat, OdometryLineProtocol
+from uwblite.drivers.odometry_session import KobukiSession, LineSession
+from uwblite.drivers.scip import ScipProtocol
+from uwblite.drivers.scip_session import ScipSession
+
+WORDS = {
+    "scip": [b"MD0044072501000\n", b"99b\n", b"00P\n", b"\n\n", b"GD", b"VV\n", b"QT", b"0" * 64, b"TM1\n", b";"],
+    "tlv": [b"\x40\x01\x00", b"\x41\x0d", b"\x49\x51\x04", b"\x5a\x02", b"\x48\x0e\x01", b"\x40", b"\x56\xff"],
+    "shell": [b"dwm> ", b"DIST,", b"AN0,0A1B,", b"0.00,", b"POS,", b"=2.80 ", b"0A1B[0.00,0.00,0.00]", b"\r\n", b"\x85"],
+    "kobuki": [b"\xaa\x55", b"\xaa\x55\x4d\x01\x0f", b"\x04\x07", b"\x0d\x0e", bytes(15), b"\xaa\x55\xff\x01\x0f"],
+    "line": [b"1.0,", b"2,", b"nan,", b"\n", b"\r\n", b"-3e9,", b"1,2,3,4\n", b"\x85"],
+}
+PROTOCOLS = {
+    "scip": (ScipProtocol, WORDS["scip"]),
+    "tlv": (TlvProtocol, WORDS["tlv"]),
+    "shell": (ShellProtocol, WORDS["shell"]),
+    "kobuki": (KobukiProtocol, WORDS["kobuki"]),
+    "line": (lambda: OdometryLineProtocol(LineFormat()), WORDS["line"]),
+}
+SESSIONS = {
+    "scip": ScipSession,
+    "tlv": Dwm1001Session,
+    "shell": lambda: Dwm1001Session(shell=True),
+    "kobuki": KobukiSession,
+    "line": lambda: LineSession(LineFormat()),
+}
+
+
+def held(protocol):
+    """Return the bytes that a protocol holds."""
+    total = 0
+    for value in vars(protocol).values():
+        if isinstance(value, bytearray | bytes):
+            total += len(value)
+        elif isinstance(value, list):
+            total += sum(len(item[1]) if isinstance(item[1], bytes) else 16 for item in value if isinstance(item, tuple))
+    return total
+
+
+def pieces(words):
+    return st.lists(st.one_of(st.sampled_from(words), st.binary(max_size=40)), max_size=40)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+@settings(max_examples=150)
+@given(data=st.data())
+def test_protocols_take_anything(name, data):
+    make, words = PROTOCOLS[name]
+    protocol = make()
+    for piece in data.draw(pieces(words)):
+        protocol.feed(piece, 1.0)
+        assert held(protocol) < 120_000
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+@settings(max_examples=50)
+@given(data=st.data())
+def test_splits_do_not_matter_for_any_input(name, data):
+    """The good events of any bytes are the same whole and byte by byte."""
+    from driver_harness import good
+
+    make, words = PROTOCOLS[name]
+    stream = b"".join(data.draw(pieces(words)))
+    whole, single = make(), make()
+    bytewise = [event for i in range(len(stream)) for event in single.feed(stream[i : i + 1], 1.0)]
+    assert good(whole.feed(stream, 1.0)) == good(bytewise)
+
+
+@pytest.mark.parametrize("name", SESSIONS)
+@settings(max_examples=60)
+@given(data=st.data())
+def test_sessions_take_anything_at_any_time(name, data):
+    words = PROTOCOLS[name][1]
+    session, now = SESSIONS[name](), 0.0
+    session.start(now)
+    for piece in data.draw(pieces(words)):
+        now += data.draw(st.sampled_from([0.0, 0.001, 0.1, 0.3, 1.2, 5.0]))
+        session.feed(piece, now)
+        session.tick(now)
+    session.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["noise", "words", "mutated"])
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_million_bytes(name, kind):
+    """Work per byte is bounded: counted in Python calls, so that the machine's load does not matter."""
+    make, words = PROTOCOLS[name]
+    rng = random.Random(f"{name} {kind}")
+    protocol, session, fed, largest, now = make(), SESSIONS[name](), 0, 0, 0.0
+    session.start(now)
+    calls = [0]
+
+    def count(_frame, event, _arg):
+        calls[0] += event in ("call", "c_call")
+
+    while fed < 1_000_000:
+        if kind == "noise":
+            piece = rng.randbytes(rng.randrange(1, 2000))
+        else:
+            piece = b"".join(rng.choice([*words, rng.randbytes(3)]) for _ in range(rng.randrange(1, 100)))
+            if kind == "mutated":
+                piece = bytes(b if rng.random() > 0.02 else rng.randrange(256) for b in piece)
+        fed += len(piece)
+        now += 0.01
+        sys.setprofile(count)
+        protocol.feed(piece, now)
+        sys.setprofile(None)
+        session.feed(piece, now)
+        session.tick(now)
+        largest = max(largest, held(protocol))
+    assert largest < 120_000
+    assert calls[0] < 60 * fed
