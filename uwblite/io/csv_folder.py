@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import from_dict, parse_toml, to_toml
+from ..config import from_dict, parse_toml, setting, to_toml
 from ..errors import ConfigError, FormatError
 from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges
 from .files import replacing
@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 class ScanGeometry:
     """Geometry that all scans share."""
 
-    angle_min: float = 0.0
+    angle_min: float = setting(0.0, minimum=-7.0, maximum=7.0)
     """Angle of the first beam in the laser frame, rad."""
     angle_increment: float = -1.0
     """Angle between beams, rad; negative where they run clockwise."""

@@ -97,10 +97,11 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Any]:
         # The store serves bags that do not carry the definitions of their messages.
         with AnyReader([Path(name)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
-    except (UwbliteError, MemoryError):
+    except UwbliteError:
         raise
     except Exception as error:
-        # rosbags, sqlite and the decompressors each have errors of their own for a damaged file.
+        # rosbags, sqlite and the decompressors each have errors of their own for a damaged file, and a damaged length
+        # asks for more memory than there is.
         detail = " ".join(str(error).split())[:200]
         raise FormatError(f"cannot be read as a ROS bag: {type(error).__name__}: {detail}", name) from None
 
@@ -260,8 +261,10 @@ class _Collector:
             else:
                 T_base_laser, flipped = planar(pose)
         if self.ranges:
-            frame = self.tag_frames.most_common(1)[0][0] if self.tag_frames else ""
-            pose = self.frames.pose(self.base_frame, frame) if frame else None
+            # Messages name the tag's frame, or the anchor's; then the usual names are tried.
+            names = [*(name for name, _ in self.tag_frames.most_common(1)), "uwb_tag", "uwb_link", "uwb", "tag"]
+            known = (self.frames.pose(self.base_frame, name) for name in names if name)
+            pose = next((p for p in known if p is not None), None)
             if pose is None:
                 warnings.append("no transform to the UWB tag: give --tag")
             else:

@@ -1,0 +1,88 @@
+"""CSV folders: round trips and clear errors."""
+
+import contextlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwblite.errors import ConfigError, FormatError, UwbliteError
+from uwblite.io.csv_folder import read_csv_folder, write_csv_folder
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
+
+
+def recording():
+    rng = np.random.default_rng(5)
+    stamps = 1.6e9 + 0.1 * np.arange(30)
+    readings = rng.uniform(0.5, 5.0, (10, 8)).astype(np.float32).round(4)
+    readings[1, 2], readings[2, 3] = np.inf, np.nan
+    mounting = SensorMounting(np.array([0.1, -0.05, 0.3]), True, np.array([0.02, 0.03, 0.4]), 2.0, {'a,"b': 1.5})
+    return SensorLog(
+        Odometry(stamps, rng.uniform(-3, 3, (30, 3)).round(6)),
+        UwbRanges(stamps[:20], np.arange(20) % 2, rng.uniform(1, 9, 20).round(4), np.full(20, 87.0), ("5C0B", 'a,"b')),
+        LaserScans(stamps[::3], readings, -1.5, 0.1, 1e-4, 0.02, 5.6),
+        mounting,
+    )
+
+
+def test_a_recording_survives_a_folder(tmp_path):
+    write_csv_folder(tmp_path / "t", recording())
+    read, log = read_csv_folder(tmp_path / "t"), recording()
+    np.testing.assert_allclose(read.odometry.stamps, log.odometry.stamps, atol=1e-6)
+    np.testing.assert_array_equal(read.odometry.poses, log.odometry.poses)
+    assert read.ranges.anchor_ids == log.ranges.anchor_ids
+    for name in ("anchor", "ranges", "quality"):
+        np.testing.assert_array_equal(getattr(read.ranges, name), getattr(log.ranges, name))
+    np.testing.assert_array_equal(read.scans.ranges, log.scans.ranges)
+    assert read.scans.angle_increment == 0.1
+    assert read.mounting.laser_flipped is True
+    assert read.mounting.anchor_heights == {'a,"b': 1.5}
+    np.testing.assert_array_equal(read.mounting.T_base_laser, log.mounting.T_base_laser)
+    with pytest.raises(ConfigError, match="--force"):
+        write_csv_folder(tmp_path / "t", log)
+    write_csv_folder(tmp_path / "t", log, force=True)
+
+
+def test_odometry_alone_is_enough_and_order_does_not_matter(tmp_path):
+    (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n2,1,0,0\n\n1,0,0,0\n")
+    log = read_csv_folder(tmp_path)
+    assert log.odometry.stamps.tolist() == [1, 2]
+    assert log.ranges is None
+    assert log.scans is None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("odometry.csv", "stamp,x,y,theta\n1,2,3\n", r"odometry\.csv:2: 3 columns, expected 4"),
+        ("odometry.csv", "stamp,x,y,theta\n1,2,3,nan\n", "'nan' is not a finite number"),
+        ("odometry.csv", "stamp,x,y,theta\n", "there are no rows"),
+        ("odometry.csv", "", "empty"),
+        ("odometry.csv", "stamp\n\0\n", "binary"),
+        ("ranges.csv", "stamp,anchor,range,quality\n1,A,x,1\n", r"ranges\.csv:2: 'x'"),
+        ("scans.csv", "stamp,r0,r1\n1,2,3\n1,2\n", "1 beams, the first scan has 2"),
+        ("scans.csv", "stamp,r0\n1,two\n", "not a number"),
+        ("scans.csv", "stamp,r0\n1,2\n", "geometry"),
+        ("sensors.toml", "[scans]\nangle_mn = 1\n", "did you mean 'scans.angle_min'"),
+    ],
+)
+def test_wrong_files_are_named(tmp_path, name, text, message):
+    (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n1,0,0,0\n")
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UwbliteError, match=message):
+        read_csv_folder(tmp_path)
+
+
+def test_a_folder_without_odometry_is_no_recording(tmp_path):
+    with pytest.raises(FormatError, match=r"odometry\.csv"):
+        read_csv_folder(tmp_path)
+
+
+@given(st.binary(max_size=300), st.sampled_from(["odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"]))
+def test_any_bytes_do_no_worse_than_an_error(tmp_path_factory, data, name):
+    folder = tmp_path_factory.mktemp("fuzz")
+    (folder / "odometry.csv").write_text("stamp,x,y,theta\n1,0,0,0\n")
+    (folder / name).write_bytes(data)
+    with contextlib.suppress(UwbliteError):
+        read_csv_folder(folder)

@@ -1,0 +1,200 @@
+"""Bags: round trips through both storages, a real one against its published log, messages of all kinds, broken files."""
+
+import contextlib
+import dataclasses
+
+import numpy as np
+import pytest
+
+from uwblite.errors import ConfigError, FormatError, UwbliteError
+from uwblite.io.carmen import read_log
+from uwblite.io.rosbag import BagTopics, list_topics, read_bag
+from uwblite.io.rosbag_writer import write_bag
+from uwblite.io.uwb_mapping import UwbMapping, parse_mappings
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
+
+rosbags = pytest.importorskip("rosbags.highlevel", reason="rosbags is absent")
+
+
+def recording(*, flipped=False):
+    rng = np.random.default_rng(5)
+    stamps = 1.6e9 + 0.1 * np.arange(40)
+    poses = np.column_stack([np.linspace(0, 3, 40), np.sin(np.linspace(0, 3, 40)), np.linspace(-3, 3, 40)])
+    when = np.sort(rng.uniform(stamps[0], stamps[-1], 60)).round(6)
+    ids = ("5C0B", "9.1/A", "tag-3")
+    ranges = UwbRanges(when, np.arange(60) % 3, rng.uniform(1, 9, 60), np.full(60, 100.0), ids)
+    readings = rng.uniform(0.5, 5.0, (20, 30)).astype(np.float32)
+    readings[3, 4], readings[5, 6] = np.inf, np.nan
+    scans = LaserScans(stamps[::2] + 0.01, readings, -1.5, 0.1, 1e-4, 0.02, 5.6)
+    mounting = SensorMounting(np.array([0.1, -0.05, 0.3]), flipped, np.array([0.02, 0.03, 0.4]))
+    return SensorLog(Odometry(stamps, poses), ranges, scans, mounting)
+
+
+def assert_same(one, two):
+    np.testing.assert_allclose(one.odometry.stamps, two.odometry.stamps, atol=1e-6)
+    np.testing.assert_allclose(one.odometry.poses, two.odometry.poses, atol=1e-9)
+    assert one.ranges.anchor_ids == two.ranges.anchor_ids
+    assert np.array_equal(one.ranges.anchor, two.ranges.anchor)
+    np.testing.assert_allclose(one.ranges.ranges, two.ranges.ranges, atol=1e-5)
+    np.testing.assert_allclose(one.scans.stamps, two.scans.stamps, atol=1e-6)
+    np.testing.assert_array_equal(one.scans.ranges, two.scans.ranges)
+    for name in ("angle_min", "angle_increment", "time_increment", "range_min", "range_max"):
+        assert getattr(one.scans, name) == pytest.approx(getattr(two.scans, name), rel=1e-6)
+    np.testing.assert_allclose(one.mounting.T_base_laser, two.mounting.T_base_laser, atol=1e-9)
+    np.testing.assert_allclose(one.mounting.tag_position, two.mounting.tag_position, atol=1e-9)
+    assert one.mounting.laser_flipped == two.mounting.laser_flipped
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_a_recording_survives_a_bag(tmp_path, storage, flipped):
+    write_bag(tmp_path / "bag", recording(flipped=flipped), storage=storage)
+    read = read_bag(tmp_path / "bag")
+    assert_same(read, recording(flipped=flipped))
+    assert len(read.notes.sha256) == 64
+    assert [p.name for p in tmp_path.iterdir()] == ["bag"]
+    with pytest.raises(ConfigError, match="exists"):
+        write_bag(tmp_path / "bag", recording())
+
+
+def test_topics_are_listed_and_wrong_ones_refused(tmp_path):
+    write_bag(tmp_path / "bag", recording())
+    topics = {t.name: t for t in list_topics(tmp_path / "bag")}
+    assert topics["/odom"].count == 40
+    assert topics["/uwb/anchor_9_1_A/range"].type == "sensor_msgs/msg/Range"
+    with pytest.raises(ConfigError, match=r"no topic /odo; it has .*/odom"):
+        read_bag(tmp_path / "bag", BagTopics(odometry="/odo"))
+    with pytest.raises(ConfigError, match="no uwb mapping fits /odom"):
+        read_bag(tmp_path / "bag", BagTopics(uwb=("/odom",)))
+    one = read_bag(tmp_path / "bag", BagTopics(uwb=("/uwb/anchor_5C0B/range",)))
+    assert one.ranges.anchor_ids == ("5C0B",)
+
+
+def test_a_mapping_of_ones_own_wins(tmp_path):
+    write_bag(tmp_path / "bag", recording())
+    mapping = UwbMapping(topic="/uwb/anchor_5*", anchor="topic:anchor_(.*)/", range="range", unit=2.0)
+    read = read_bag(tmp_path / "bag", BagTopics(uwb=("/uwb/anchor_5C0B/range",)), (mapping,))
+    assert read.ranges.anchor_ids == ("5C0B",)
+    np.testing.assert_allclose(read.ranges.ranges, 2 * recording().ranges.ranges[::3], atol=1e-5)
+    with pytest.raises(ConfigError, match="has no field 'rnge'; it has header"):
+        read_bag(tmp_path / "bag", mappings=(UwbMapping(topic="/uwb/*", type="*", range="rnge"),))
+
+
+@pytest.mark.parametrize(
+    ("name", "definition", "fields", "mapping", "expected"),
+    [
+        ("gtec_msgs/msg/Ranging", "int16 anchorId\nint32 range", (7, 3456), None, [("7", 3.456)]),
+        (
+            "px4_msgs/msg/SensorUwb", "uint16 mac_dest\nfloat32 distance", (0x5C0B, 2.5), None, [("5C0B", 2.5)],
+        ),
+        (
+            "x_msgs/msg/Distances", "uint16[3] anchor_distance", (np.array([120, 250, 399], dtype=np.uint16),),
+            UwbMapping(type="x_msgs/*", anchor="index", range="anchor_distance", unit=0.01, stamp=""),
+            [("0", 1.2), ("1", 2.5), ("2", 3.99)],
+        ),
+        (
+            "x_msgs/msg/Two", "int16 tagId\nint16 anchorId\nfloat32 range", (2, 9, 1.5),
+            UwbMapping(type="x_msgs/*", anchor="anchorId", stamp="", only={"tagId": 3}), [],
+        ),
+    ],
+)  # fmt: skip
+def test_foreign_messages_are_understood(tmp_path, name, definition, fields, mapping, expected):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(definition, name))
+    t = store.types
+    header = t["std_msgs/msg/Header"](seq=0, stamp=t["builtin_interfaces/msg/Time"](5, 0), frame_id="odom")
+    point, turn = t["geometry_msgs/msg/Point"](1, 2, 0), t["geometry_msgs/msg/Quaternion"](0, 0, 1, 0)
+    pose = t["geometry_msgs/msg/PoseWithCovariance"](t["geometry_msgs/msg/Pose"](point, turn), np.zeros(36))
+    still = t["geometry_msgs/msg/Vector3"](0, 0, 0)
+    twist = t["geometry_msgs/msg/TwistWithCovariance"](t["geometry_msgs/msg/Twist"](still, still), np.zeros(36))
+    odometry = t["nav_msgs/msg/Odometry"](header, "base_link", pose, twist)
+    with Writer(tmp_path / "x.bag") as writer:
+        wheels = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+        radio = writer.add_connection("/uwb", name, typestore=store)
+        writer.write(wheels, 5_000_000_000, store.serialize_ros1(odometry, "nav_msgs/msg/Odometry"))
+        writer.write(radio, 6_500_000_000, store.serialize_ros1(t[name](*fields), name))
+    log = read_bag(tmp_path / "x.bag", mappings=(mapping,) if mapping else ())
+    assert log.odometry.poses[0].tolist() == pytest.approx([1, 2, np.pi])
+    if not expected:
+        assert log.ranges is None
+        return
+    assert [(log.ranges.anchor_ids[a], r) for a, r in zip(log.ranges.anchor, log.ranges.ranges, strict=True)] == [
+        (anchor, pytest.approx(distance, rel=1e-6)) for anchor, distance in expected
+    ]
+    assert set(log.ranges.stamps) == {6.5}
+
+
+def test_the_real_bag_gives_the_measurements_of_its_log(shared_data):
+    folder = shared_data / "kasdorf_2017-11-17-12-31-28"
+    bag, log = read_bag(folder / "record.bag"), read_log(folder / "run.log.gz")
+    start = bag.odometry.stamps[0]
+    # The log holds six decimals and counts time from the first odometry.
+    for one, two in ((bag.odometry, log.odometry), (bag.ranges, log.ranges), (bag.scans, log.scans)):
+        np.testing.assert_allclose(one.stamps - start, two.stamps, atol=1e-6)
+    np.testing.assert_allclose(bag.odometry.poses, log.odometry.poses, atol=1e-6)
+    np.testing.assert_array_equal(bag.ranges.ranges, log.ranges.ranges)
+    assert bag.ranges.anchor_ids == log.ranges.anchor_ids
+    assert np.array_equal(bag.ranges.anchor, log.ranges.anchor)
+    np.testing.assert_allclose(bag.scans.ranges, log.scans.ranges, atol=6e-4)
+    np.testing.assert_allclose(bag.mounting.T_base_laser, log.mounting.T_base_laser, atol=1e-6)
+    np.testing.assert_allclose(bag.mounting.tag_position, log.mounting.tag_position, atol=1e-6)
+    assert "not used: /sonar_scan, /beacon" in bag.notes.warnings[0]
+
+
+@pytest.mark.parametrize("content", [b"", b"#ROSBAG V2.0\n", b"#ROSBAG V2.0\n" + bytes(range(256)) * 20, b"\x89MCAP0\r\n"])
+@pytest.mark.parametrize("ending", [".bag", ".mcap", ".db3"])
+def test_a_broken_bag_is_one_clear_error(tmp_path, content, ending):
+    file = tmp_path / f"x{ending}"
+    file.write_bytes(content)
+    with pytest.raises(FormatError, match="cannot be read as a ROS bag"):
+        read_bag(file)
+
+
+def test_a_missing_bag_and_an_empty_folder(tmp_path):
+    with pytest.raises(FormatError, match="no such file"):
+        read_bag(tmp_path / "none.bag")
+    with pytest.raises(FormatError):
+        read_bag(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_damaged_bytes_never_do_worse_than_an_error(tmp_path, storage):
+    write_bag(tmp_path / "bag", recording(), storage=storage)
+    file = next(p for p in (tmp_path / "bag").iterdir() if p.suffix != ".yaml")
+    whole = file.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        damaged = bytearray(whole)
+        for place in rng.integers(0, len(whole), 12):
+            damaged[place] = rng.integers(256)
+        file.write_bytes(bytes(damaged[: rng.integers(1, len(whole))] if rng.uniform() < 0.3 else damaged))
+        with contextlib.suppress(UwbliteError):
+            read_bag(tmp_path / "bag")
+
+
+def test_mappings_are_read_strictly():
+    text = '[[uwb]]\ntopic = "/beacon_raw"\nreadings = "sensed_data"\nunit = 0.001\nonly = { tagId = 3 }\n'
+    (mapping,) = parse_mappings(text)
+    assert (mapping.topic, mapping.readings, mapping.unit, mapping.only) == ("/beacon_raw", "sensed_data", 0.001, {"tagId": 3})
+    for wrong, message in (
+        ("[[uwb]]\ntopc = 1", "did you mean 'topic'"),
+        ("[uwb]\ntopic = 'x'", "uwb"),
+        ("x = 1", "uwb"),
+        ('[[uwb]]\nanchor_format = "{:q}"', "not valid"),
+        ('[[uwb]]\nanchor = "topic:("', "not valid"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            parse_mappings(wrong)
+
+
+def test_an_id_with_blanks_stays_one_word():
+    @dataclasses.dataclass
+    class Message:
+        id: str = " a b\n"
+        range: float = 1.0
+
+    assert UwbMapping(stamp="").extract(Message(), "/uwb") == [("a_b", 1.0, 100.0)]
