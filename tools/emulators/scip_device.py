@@ -9,7 +9,6 @@ from .world import FIRST_STEP, LAST_STEP, STEPS, Feed, Scan, WorldClock
 
 STEP_TIME = 0.1 / 1024
 LAST_ACCEPTED = 768
-BATCH = 0.0005
 
 
 def checksum(text: bytes) -> bytes:
@@ -104,7 +103,7 @@ class ScipDevice:
         self._power, self._input = now, bytearray()
         self._scip1, self._laser, self._adjusting = self.options.scip1, False, False
         self._stream: Stream | None = None
-        self._fault_told, self._last_command, self._last_at = None, b"", -1.0
+        self._fault_told, self._last_command = None, b""
         self._speed_set, self._sensitive, self._rate = "00", False, 19200
         self.hung = False
         if self.options.streaming:
@@ -200,6 +199,7 @@ class ScipDevice:
         if self.hung:
             return b""
         out = b""
+        self._last_command = b""
         for byte in data:
             if byte in b"\r\n":
                 line = bytes(self._input)
@@ -211,8 +211,7 @@ class ScipDevice:
         return out
 
     def _command(self, line: bytes, now: float) -> bytes:
-        repeated = line == self._last_command and now - self._last_at < BATCH
-        self._last_command, self._last_at = line, now
+        repeated, self._last_command = line == self._last_command, line
         if self._scip1:
             return self._scip1_command(line)
         if repeated:
