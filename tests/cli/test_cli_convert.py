@@ -1,0 +1,141 @@
+"""`uwblite convert` and `uwblite optimize` as a user calls them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from uwblite.cli import main
+from uwblite.io.carmen import read_log
+from uwblite.io.tum import read_tum
+
+
+def test_a_log_goes_to_tables_and_back(room_log, tmp_path, capsys):
+    tables, back = tmp_path / "tables", tmp_path / "back.log.gz"
+    assert main(["convert", str(room_log), str(tables) + "/"]) == 0
+    assert "4801 odometry readings, 735 ranges, 1200 scans" in capsys.readouterr().out
+    assert main(["convert", str(tables), str(back)]) == 0
+    assert "next: uwblite check" in capsys.readouterr().out
+    one, two = read_log(room_log), read_log(back)
+    np.testing.assert_array_equal(one.ranges.ranges, two.ranges.ranges)
+    np.testing.assert_array_equal(one.scans.ranges, two.scans.ranges)
+    np.testing.assert_allclose(one.odometry.poses, two.odometry.poses, atol=2e-6)
+    assert main(["convert", str(tables), str(back)]) == 1
+    assert "--force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_log_goes_to_a_bag_and_back(room_log, tmp_path, capsys, storage):
+    pytest.importorskip("rosbags.highlevel", reason="rosbags is absent")
+    bag, back = tmp_path / "bag", tmp_path / "back.log"
+    assert main(["convert", str(room_log), str(bag), "--to", storage, "--end", "60"]) == 0
+    assert main(["convert", str(bag), "--list"]) == 0
+    listed = capsys.readouterr().out
+    assert "/scan" in listed
+    assert "<- ranges" in listed
+    assert main(["convert", str(bag), str(back)]) == 0
+    one, two = read_log(room_log).crop(-np.inf, read_log(room_log).odometry.stamps[0] + 60.0), read_log(back)
+    np.testing.assert_allclose(one.ranges.ranges, two.ranges.ranges, atol=1e-4)
+    np.testing.assert_array_equal(one.scans.ranges, two.scans.ranges)
+    np.testing.assert_allclose(one.mounting.T_base_laser, two.mounting.T_base_laser, atol=1e-6)
+
+
+def test_units_and_parts(room_log, tmp_path, capsys):
+    words = ["--odometry-unit", "2", "--range-unit", "10", "--laser-unit", "0.5", "--start", "10", "--end", "20"]
+    assert main(["convert", str(room_log), str(tmp_path / "x.log"), *words, "--laser-flipped"]) == 0
+    one, two = read_log(room_log), read_log(tmp_path / "x.log")
+    assert len(two.odometry.stamps) == 201
+    np.testing.assert_allclose(two.odometry.poses[:, :2], 2 * one.odometry.poses[200:401, :2], atol=2e-6)
+    assert two.scans.range_max == pytest.approx(0.5 * one.scans.range_max)
+    assert two.mounting.laser_flipped
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{log}"], "name a target"),
+        (["{log}", "x.bag"], "--to mcap"),
+        (["{log}", "x.unknown"], "--to log"),
+        (["{log}", "--list"], "not a bag"),
+        (["{log}", "x.g2o"], "not a format for a recording"),
+        (["missing.bag", "x.log"], "no such file"),
+    ],
+)
+def test_what_cannot_be_converted_is_said(room_log, tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(["convert", *(w.format(log=room_log) for w in words)]) == 1
+    assert message in capsys.readouterr().err
+
+
+G2O = """VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 1.1 0 0
+VERTEX_SE2 2 2.3 0.1 0
+EDGE_SE2 0 1 1 0 0 100 0 0 100 0 100
+EDGE_SE2 1 2 1 0 0 100 0 0 100 0 100
+EDGE_SE2 0 2 2 0 0 100 0 0 100 0 100
+"""
+
+
+def test_a_graph_is_optimised_and_written_in_both_formats(tmp_path, capsys):
+    graph = tmp_path / "graph.g2o"
+    graph.write_text(G2O)
+    words = ["--out", str(tmp_path / "out.pyfg"), "--trajectory", str(tmp_path / "t.tum")]
+    assert main(["optimize", str(graph), *words]) == 0
+    assert "chi2" in capsys.readouterr().out
+    _, poses = read_tum(tmp_path / "t.tum")
+    np.testing.assert_allclose(poses[:, 0], [0, 1, 2], atol=1e-6)
+    assert main(["convert", str(tmp_path / "out.pyfg"), str(tmp_path / "again.g2o")]) == 0
+    capsys.readouterr()
+    assert main(["optimize", str(tmp_path / "again.g2o"), "--json", "--kernel", "huber"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["chi2"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["poses"] == 3
+    assert main(["optimize", str(graph), "--out", str(tmp_path / "out.pyfg")]) == 1
+    assert main(["optimize", str(graph), "--out", str(tmp_path / "out.txt")]) == 1
+    assert main(["optimize", str(graph), "--kernel", "hubert"]) == 1
+    assert main(["optimize", str(graph), "--set", "max_iteration=3"]) == 1
+    assert "did you mean 'max_iterations'" in capsys.readouterr().err
+
+
+def test_an_anchor_without_a_position_is_found_from_its_ranges(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    turn = np.linspace(0, 2 * np.pi, 60)
+    poses = np.column_stack([3 * np.cos(turn), 2 * np.sin(turn), turn + np.pi / 2])
+    lines = [f"VERTEX_SE2 {k} A{k} {x:.6f} {y:.6f} {a:.6f}" for k, (x, y, a) in enumerate(poses)]
+    for k in range(59):
+        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        dx, dy = poses[k + 1, :2] - poses[k, :2]
+        lines.append(
+            f"EDGE_SE2 {k} A{k} A{k + 1} {c * dx + s * dy:.6f} {c * dy - s * dx:.6f} {turn[1]:.6f} 1e-4 0 0 1e-4 0 1e-4"
+        )
+    distance = np.hypot(*(poses[:, :2] - (4.0, 3.0)).T) + rng.normal(0, 0.05, 60)
+    lines += [f"EDGE_RANGE {k} A{k} L0 {d:.4f} 0.0025" for k, d in enumerate(distance)]
+    (tmp_path / "g.pyfg").write_text("\n".join(lines) + "\n")
+    assert main(["optimize", str(tmp_path / "g.pyfg"), "--out", str(tmp_path / "out.g2o"), "--json"]) == 0
+    vertex = next(line for line in (tmp_path / "out.g2o").read_text().splitlines() if line.startswith("VERTEX_XY"))
+    # Sixty ranges with 0.05 m each, from around: a few centimetres.
+    assert np.hypot(*(np.array(vertex.split()[2:], dtype=float) - (4.0, 3.0))) < 0.05
+    assert json.loads(capsys.readouterr().out)["unplaced_anchors"] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "optimum"),
+    [
+        ("efpno_input_M3500_original", 137.912951),
+        ("efpno_manhattanOlson3500", 146.076613),
+        ("sesync_intel", 45.004696),
+        ("sesync_CSAIL", 40.555129),
+    ],
+)
+def test_public_graphs_reach_their_optimum(shared_data, name, optimum, capsys):
+    words = ["--from-odometry"] if "CSAIL" in name else []
+    assert main(["optimize", str(shared_data / "pose_graphs" / f"{name}.g2o.gz"), "--json", *words]) == 0
+    assert json.loads(capsys.readouterr().out)["chi2"] == pytest.approx(optimum, rel=1e-6)
+
+
+def test_plaza_from_odometry(shared_data, tmp_path, capsys):
+    words = ["--from-odometry", "--trajectory", str(tmp_path / "t.tum"), "--json"]
+    assert main(["optimize", str(shared_data / "plaza1" / "plaza1.pyfg.gz"), *words]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    # The measurements in this file are calibrated; an independent solver says chi2 2660.5.
+    assert figures["chi2"] == pytest.approx(2660.5, rel=1e-3)
