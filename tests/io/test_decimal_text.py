@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from uwblite.io.decimal_text import decode_fixed_point, encode_fixed_point
+from uwblite.io.decimal_text import decode_equal_widths, decode_fixed_point, encode_fixed_point
 
 
 def decode(rows, decimals):
@@ -61,3 +61,18 @@ def test_numbers_are_written_as_format_writes_them(values, decimals):
 
 def test_nothing_is_written_as_nothing():
     assert encode_fixed_point(np.zeros((2, 0), np.float32)) == [b"", b""]
+
+
+@given(st.integers(1, 6), st.integers(1, 2), st.lists(st.integers(0, 10**8 - 1), min_size=6, max_size=6), st.booleans())
+def test_numbers_of_equal_width_are_decoded_row_by_row(decimals, digits, numbers, spoil):
+    width = digits + 1 + decimals
+    words = [f"{(n % 10 ** (digits + decimals)) / 10**decimals:0{width}.{decimals}f}".encode() for n in numbers]
+    if spoil:
+        words[4] = words[4][:-1] + b"x"
+    text = b"ab " + b" ".join(words) + b"\n"
+    begins = np.array([3, 3 + 3 * (width + 1)])
+    values, plain = decode_equal_widths(np.frombuffer(text, np.uint8), begins, 3, width, decimals)
+    assert plain.tolist() == [True, not spoil]
+    np.testing.assert_array_equal(values[0], np.array(words[:3], np.float64).astype(np.float32))
+    if not spoil:
+        np.testing.assert_array_equal(values[1], np.array(words[3:], np.float64).astype(np.float32))

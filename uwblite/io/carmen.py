@@ -27,6 +27,7 @@ from ..sensor_log import LogNotes, Odometry, SensorLog, UwbRanges
 from .carmen_laser import LaserMessages
 from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
 from .carmen_params import Params
+from .carmen_readings import Block
 from .carmen_writer import write_log
 from .source import OVERLONG_LINE, TextSource, open_source
 
@@ -97,13 +98,13 @@ class _Reader:
 
     def feed(self, block: bytes) -> None:
         """Take a block of whole lines."""
-        text = np.frombuffer(block + b"\n" * (-len(block) % 8), dtype=np.uint8)
-        gaps = np.flatnonzero(text[: len(block)] <= 32)
-        ends = np.flatnonzero(text[: len(block)] == 10)
+        found = Block.of(block)
+        gaps = found.gaps
+        ends = gaps[found.array[gaps] == 10]
         starts = np.concatenate([[0], ends[:-1] + 1])
         first_gap = np.searchsorted(gaps, starts)
         name_ends = gaps[first_gap]
-        self.laser.begin(block, text, gaps)
+        self.laser.begin(found)
         broken: list[tuple[int, str]] = []
         rows = zip(starts.tolist(), name_ends.tolist(), ends.tolist(), first_gap.tolist(), strict=True)
         for number, (start, name_end, end, gap) in enumerate(rows, self.lines + 1):

@@ -12,7 +12,7 @@ from .. import se2
 from ..sensor_log import LaserScans
 from .carmen_messages import BrokenLine, numbers, stamp_of, time_order
 from .carmen_params import Params
-from .decimal_text import decode_fixed_point
+from .carmen_readings import Block, Pending
 
 Floats = NDArray[np.float64]
 
@@ -46,18 +46,6 @@ class _Layout:
 
 
 @dataclass(slots=True, eq=False)
-class _Pending:
-    """One message of the block at hand, parsed but for its readings."""
-
-    number: int
-    first: int
-    """Index into the gaps of the gap behind the first reading."""
-    readings: Floats | None
-    """Readings, where they were read the general way."""
-    stamp: float
-
-
-@dataclass(slots=True, eq=False)
 class _Scans:
     """All scans of one layout."""
 
@@ -65,7 +53,7 @@ class _Scans:
     """Readings of all scans, one behind the other; an array grows in place where blocks would have to be joined."""
     stamps: "array[float]" = field(default_factory=lambda: array("d"))
     seen: int = 0
-    pending: list[_Pending] = field(default_factory=list)
+    pending: list[Pending] = field(default_factory=list)
 
 
 class LaserMessages:
@@ -82,9 +70,9 @@ class LaserMessages:
         self._poses = array("d")
         """stamp, laser pose (3), robot pose (3) of every message that tells them."""
 
-    def begin(self, block: bytes, text: NDArray[np.uint8], gaps: NDArray[np.int64]) -> None:
-        """Start a block: its bytes, the same as an array padded to a multiple of 8, and where its blanks are."""
-        self._block, self._text, self._gaps = block, text, gaps
+    def begin(self, block: Block) -> None:
+        """Start a block of lines."""
+        self._block = block
 
     def wants(self, name: bytes) -> bool:
         """Tell whether a message is one of the laser messages read here."""
@@ -101,19 +89,19 @@ class LaserMessages:
         try:
             self._take_evenly_spaced(name, number, start, end, gap)
         except ValueError:
-            self._take_any(name, number, self._block[start:end].split())
+            self._take_any(name, number, self._block.text[start:end].split())
 
     def _take_evenly_spaced(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
         """Take a line whose words are parted by single blanks, leaving the readings undecoded."""
-        gaps, head = self._gaps, gap + _HEAD[name] - 1
+        gaps, head = self._block.gaps, gap + _HEAD[name] - 1
         if head >= len(gaps) or gaps[head] >= end:
             raise BrokenLine("too short")
-        layout = self._layout(name, self._block[start : gaps[head]])
+        layout = self._layout(name, self._block.text[start : gaps[head]])
         last = head + layout.beams
         if last >= len(gaps) or gaps[last] >= end:
             raise BrokenLine("too short")
-        stamp = self._tail(name, self._block[gaps[last] + 1 : end].split())
-        self._queue(layout, _Pending(number, head + 1, None, stamp))
+        stamp = self._tail(name, self._block.text[gaps[last] + 1 : end].split())
+        self._queue(layout, Pending(number, head + 1, None, stamp))
 
     def _take_any(self, name: bytes, number: int, tokens: list[bytes]) -> None:
         """Take a line the general way."""
@@ -125,9 +113,9 @@ class LaserMessages:
             raise BrokenLine(f"{what} says {layout.beams} readings but the line is too short for them")
         readings = np.array(tokens[head : head + layout.beams], dtype=np.float64)
         stamp = self._tail(name, tokens[head + layout.beams :])
-        self._queue(layout, _Pending(number, 0, readings, stamp))
+        self._queue(layout, Pending(number, 0, readings, stamp))
 
-    def _queue(self, layout: _Layout, pending: _Pending) -> None:
+    def _queue(self, layout: _Layout, pending: Pending) -> None:
         scans = self._scans.setdefault(layout, _Scans())
         if scans.seen % self._every_nth == 0:
             scans.pending.append(pending)
@@ -170,54 +158,12 @@ class LaserMessages:
         for layout, scans in self._scans.items():
             if scans.pending:
                 pending, scans.pending = scans.pending, []
-                values, errors = self._decode_rows(layout.beams, pending)
+                values, errors = self._block.decode_rows(layout.beams, pending)
                 keep = np.array([e is None for e in errors])
                 if keep.any():
                     scans.ranges.frombytes(np.ascontiguousarray(values if keep.all() else values[keep]).data.cast("B"))
                 scans.stamps.extend(p.stamp for p, error in zip(pending, errors, strict=True) if error is None)
                 yield from ((p.number, e) for p, e in zip(pending, errors, strict=True) if e is not None)
-
-    def _decode_rows(
-        self, beams: int, pending: list[_Pending]
-    ) -> tuple[NDArray[np.float32], list[ValueError | None]]:
-        values = np.empty((len(pending), beams), dtype=np.float32)
-        errors: list[ValueError | None] = [None] * len(pending)
-        first = np.array([p.first for p in pending], dtype=np.int64)
-        index = first[:, None] + np.arange(beams)
-        ends, begins = self._gaps[index], self._gaps[np.maximum(index - 1, 0)] + 1
-        plain = self._decode_plain(values, begins, ends, np.array([p.readings is None for p in pending]))
-        for row in np.flatnonzero(~plain):
-            readings = pending[row].readings
-            try:
-                if readings is None:
-                    words = self._block[begins[row, 0] : ends[row, -1]].split()
-                    readings = np.array(words, dtype=np.float64)
-                    if len(readings) != beams:
-                        raise BrokenLine("readings are parted unevenly")
-                values[row] = np.clip(readings, -1.0, 1e30)
-            except ValueError as error:
-                errors[row] = error
-        return values, errors
-
-    def _decode_plain(
-        self,
-        values: NDArray[np.float32],
-        begins: NDArray[np.int64],
-        ends: NDArray[np.int64],
-        rows: NDArray[np.bool_],
-    ) -> NDArray[np.bool_]:
-        """Fill the rows that are written plainly, digits.digits; return which."""
-        if not rows.any() or values.shape[1] == 0:
-            return rows & (values.shape[1] == 0)
-        which = int(np.argmax(rows))
-        token = self._block[begins[which, 0] : ends[which, 0]]
-        decimals = len(token) - 1 - token.find(b".")
-        if b"." not in token or not 1 <= decimals <= 6:
-            return np.zeros(len(rows), dtype=np.bool_)
-        decoded, plain = decode_fixed_point(self._text, ends, begins, decimals)
-        plain &= rows
-        values[plain] = decoded[plain]
-        return plain
 
     def robot_poses(self) -> Floats:
         """Return (k, 4) stamp and pose of the robot of every message that tells them."""

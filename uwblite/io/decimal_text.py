@@ -55,6 +55,40 @@ def decode_fixed_point(
     return values.astype(np.float32), np.asarray(plain.all(axis=-1))
 
 
+def decode_equal_widths(
+    text: Bytes, begins: Ints, count: int, width: int, decimals: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Decode rows of numbers that all have the same width, such as ``0.123 4.567 8.900``: several times faster yet.
+
+    Parameters
+    ----------
+    text : (bytes,) the text.
+    begins : (k,) index of each row's first character.
+    count : numbers in a row.
+    width : characters of each number; one blank stands between numbers and behind the last.
+    decimals : digits behind the dot, 1..6.
+
+    Returns
+    -------
+    values : (k, count) the numbers, in the unit of the text.
+    plain : (k,) whether every number of the row has that form; the values of other rows mean nothing.
+    """
+    span = count * (width + 1)
+    characters = np.empty((len(begins), count, width + 1), dtype=np.uint8)
+    for row, begin in zip(characters, begins.tolist(), strict=True):
+        row.reshape(-1)[:] = text[begin : begin + span]
+    characters ^= 0x30
+    dot = width - decimals - 1
+    plain = (characters[:, :, dot] == _DOT).all(axis=1) & (characters[:, :, width] ^ 0x30 <= 0x20).all(axis=1)
+    total = np.zeros(characters.shape[:2], dtype=np.uint32)
+    for column in (c for c in range(width) if c != dot):
+        digit = characters[:, :, column]
+        plain &= digit.max(axis=1) <= 9
+        total *= 10
+        total += digit
+    return (total / 10.0**decimals).astype(np.float32), plain
+
+
 def _words_before(text: Bytes, ends: Ints) -> NDArray[np.uint64]:
     """Return the eight bytes before each end as little-endian words, first character lowest."""
     words = text.view("<u8")
