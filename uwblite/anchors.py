@@ -137,7 +137,8 @@ def _refine(
         if scale <= tight * 1.01 and np.abs(delta).max() < 1e-3:
             break
         scale = max(0.7 * scale, tight)
-    return state[:2], float(state[2]), np.linalg.inv(normal), max(1.4826 * float(np.median(np.abs(error))), 1e-3)
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    return state[:2], float(state[2]), covariance, max(1.4826 * float(np.median(np.abs(error))), 1e-3)
 
 
 def _score(

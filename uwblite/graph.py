@@ -9,8 +9,8 @@ Unknowns live in three blocks: ``poses`` (n, 3) T_map_base, ``anchors`` (a, 2) i
 e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's.
 """
 
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,13 @@ class Linearization:
     """(e, d), in standard deviations."""
     blocks: tuple[Block, ...]
     """An edge may name several unknowns of one block; each is an entry of its own."""
+
+
+def _rows(edges: Any, which: Ints) -> Any:
+    """Return some of the edges (rows of every per-edge array)."""
+    own = {f.name: getattr(edges, f.name) for f in fields(edges)}
+    per_edge = {n: v[which] for n, v in own.items() if isinstance(v, np.ndarray) and v.ndim and n not in edges.SHARED and len(v)}
+    return replace(edges, **per_edge)
 
 
 class Edges(Protocol):
@@ -161,8 +168,14 @@ class RelativePoseEdges:
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
+    SHARED: ClassVar[tuple[str, ...]] = ()
+
     def __len__(self) -> int:
         return len(self.i)
+
+    def rows(self, which: Ints) -> "RelativePoseEdges":
+        """Return the edges with these indices."""
+        return cast(RelativePoseEdges, _rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
@@ -200,6 +213,8 @@ class OdometryEdges:
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
+    SHARED: ClassVar[tuple[str, ...]] = ()
+
     def __len__(self) -> int:
         return len(self.i)
 
@@ -214,6 +229,10 @@ class OdometryEdges:
         direction = se2.rotate(delta / 2.0, self.motion[:, :2])
         z = np.concatenate([direction * (1.0 + s)[:, None], (self.motion[:, 2] + delta)[:, None]], axis=1)
         return z, direction, s
+
+    def rows(self, which: Ints) -> "OdometryEdges":
+        """Return the edges with these indices."""
+        return cast(OdometryEdges, _rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
@@ -348,6 +367,8 @@ class RangeEdges:
     stamps: Floats = field(default_factory=lambda: np.zeros(0))
     """(e,) s, where known; not used by the graph."""
 
+    SHARED: ClassVar[tuple[str, ...]] = ("tag",)
+
     def __len__(self) -> int:
         return len(self.pose)
 
@@ -368,6 +389,10 @@ class RangeEdges:
     def distances(self, graph: Graph) -> Floats:
         """Return the slant distances (e,) between tag and anchors at the present estimates, m."""
         return self._geometry(graph)[2]
+
+    def rows(self, which: Ints) -> "RangeEdges":
+        """Return the edges with these indices."""
+        return cast(RangeEdges, _rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 1), expected minus measured."""

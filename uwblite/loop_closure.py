@@ -19,8 +19,8 @@ from .graph import Graph, RelativePoseEdges
 from .map_result import LoopClosure
 from .marginals import Marginals
 from .pair_matching import NearestRaster, PairFactors, PairPoints, match, measured, paint, pair_points, trusted_step
-from .refinement import surface_cells
 from .point_cloud import PointCloud, make_cloud
+from .refinement import surface_cells
 from .robust import Kernel
 from .scan_search import SearchConfig, search
 from .solver import SolverConfig, optimize

@@ -12,8 +12,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from . import calibration, clouds, first_estimate, keyframes, loop_closure, occupancy_grid, pair_matching, refinement, submaps
-from . import se2, summary
+from . import (
+    calibration,
+    clouds,
+    first_estimate,
+    keyframes,
+    loop_closure,
+    occupancy_grid,
+    pair_matching,
+    refinement,
+    se2,
+    submaps,
+    summary,
+)
 from .anchors import AnchorConfig
 from .calibration import CalibrationConfig
 from .clouds import CloudConfig, Clouds
@@ -28,8 +39,7 @@ from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_ed
 from .occupancy_grid import GridConfig, OccupancyGrid
 from .pair_matching import NearestRaster
 from .range_noise import RangeNoiseConfig, short_term_sigma
-from .refinement import RefinementConfig, Refined
-from .robust import Kernel
+from .refinement import Refined, RefinementConfig
 from .scan_search import SearchConfig
 from .sensor_log import SensorLog
 from .solver import SolverConfig, SolverSummary, optimize
@@ -139,7 +149,7 @@ def build_map(
         graph = _free(graph, "laser_x", "laser_y", "laser_theta", "laser_delay")
         graph, refined = _track(graph, edges, scans, path, config, stages)
         if config.use_loops:
-            graph, closures, shown = _close_loops(graph, edges, refined, scans, path, config, stages)
+            graph, closures, _shown = _close_loops(graph, edges, refined, scans, path, config, stages)
             graph, radio, refined, closures = _refine_jointly(graph, wheels, radio, closures, scans, path, config, stages)
     graph = _final_graph(graph, wheels, radio, closures, refined)
 
@@ -199,9 +209,9 @@ def _first_optimisation(
     first = first_estimate.grow(graph, wheels, radio, path, growth, config.anchors)
     stages.end("first estimate", range_sigma=round(sigma, 4), placed=int(first.placed.sum()))
     graph = replace(_estimates(graph, first.graph), fixed_anchors=~first.placed)
-    radio = replace(radio, weights=radio.weights * first.placed[radio.anchor], sigma=np.full(len(radio), growth.range_sigma))
+    radio = replace(radio, weights=np.asarray(radio.weights) * first.placed[radio.anchor], sigma=np.full(len(radio), growth.range_sigma))
     for lap in range(3):
-        radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges, held=False)
+        radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
         if lap == 2:
             graph = _free(graph, *_RADIO)
         solved, result = optimize(graph.with_edges(wheels, radio), config.solver)
@@ -304,7 +314,7 @@ def _refine_jointly(
         graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "joint refinement")
         graph = _hold_negative_heights(graph)
         if radio is not None:
-            radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges, held=True)
+            radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
         stages.end(
             f"joint refinement {lap + 1}", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
             sigma=round(refined.sigma, 4), moved=round(refined.moved, 5), **_solver_figures(refined.summary),

@@ -90,15 +90,14 @@ def tag_positions(edges: RangeEdges, poses: Floats) -> Floats:
 
 
 def learn_noise(
-    edges: RangeEdges, graph: Graph, anchors: int, config: RangeNoiseConfig, held: bool
+    edges: RangeEdges, graph: Graph, anchors: int, config: RangeNoiseConfig
 ) -> tuple[RangeEdges, tuple[RangeNoise, ...]]:
     """Give every range the standard deviation that its anchor's residuals show, slow errors counted once.
 
     Parameters
     ----------
     graph : estimates the residuals are taken at.
-    held : the trajectory is held by something else than the ranges (the lidar), so residuals show the whole error;
-        otherwise the trajectory has given way to the slow part and the assumption stands in for it.
+    anchors : how many there are.
     """
     positions, sigma = tag_positions(edges, graph.poses), edges.sigma.copy()
     errors = edges.residuals(graph)[:, 0] * edges.sigma
@@ -111,14 +110,6 @@ def learn_noise(
             off = np.abs(errors[own] - np.median(errors[own]))
             spread = max(1.4826 * float(np.median(off)), config.min_sigma)
             noise = learn(positions[own], errors[own], (off < 3.0 * spread).astype(np.float64), config)
-            if not held:
-                noise = _at_least(noise, spread, config)
         sigma[own] = effective_sigma(positions[own], noise)
         noises.append(noise)
     return replace(edges, sigma=sigma), tuple(noises)
-
-
-def _at_least(noise: RangeNoise, spread: float, config: RangeNoiseConfig) -> RangeNoise:
-    """Return the noise with the assumed share of the spread as its least slow part."""
-    slow = max(noise.slow, spread * float(np.sqrt(config.slow_share)))
-    return RangeNoise(max(noise.white, spread * float(np.sqrt(1.0 - config.slow_share))), slow, noise.length)

@@ -153,7 +153,7 @@ def match(
     owner = pair[inside]
 
     def total(values: Floats) -> Floats:
-        return np.bincount(owner, values, pairs)
+        return np.bincount(owner, values, pairs).astype(np.float64, copy=False)
 
     def outer(wx: Floats, wy: Floats, wt: Floats, jx: Floats, jy: Floats, jt: Floats) -> Floats:
         h = np.empty((pairs, 3, 3))
@@ -169,8 +169,8 @@ def match(
     along = nx * rx[inside] + ny * ry[inside]
     feigned = outer(-v * ny, v * nx, v * along, -ny, nx, along)
     gradient = np.stack([total(wx * r), total(wy * r), total(wt * r)], axis=1)
-    asked = np.bincount(pair, minlength=pairs)
-    matched = np.bincount(owner, minlength=pairs)
+    asked = np.bincount(pair, minlength=pairs).astype(np.int64)
+    matched = np.bincount(owner, minlength=pairs).astype(np.int64)
     return PairFactors(hessian, feigned, gradient, matched, asked, total(w * r * r), total(w))
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from . import se2
 from .calibration import scan_indices
 from .clouds import Clouds, in_map
 from .graph import Graph, ScanEdges

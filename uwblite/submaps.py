@@ -3,6 +3,7 @@
 (Paper, section on sub-maps: scans gathered while the travelled distance stays below epsilon, then filtered.)
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,7 +82,7 @@ def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: Su
     owner, points, normals, scatter = _merge(piece[clouds.owner], points, normals, clouds.normal_variance, config.voxel)
     kept = np.ones(len(owner), dtype=bool)
     offsets = np.searchsorted(owner, np.arange(len(first) + 1))
-    for a, b in zip(offsets[:-1], offsets[1:], strict=True):
+    for a, b in itertools.pairwise(offsets):
         if b > a:
             kept[a:b] = statistical_outlier_filter(points[a:b], config.neighbours, config.std_ratio)
             inner = np.flatnonzero(kept[a:b]) + a

@@ -52,7 +52,7 @@ def summarise(
         range_table=table,
         grid=grid,
         stages=tuple(stages),
-        warnings=tuple([*warnings, *more]),
+        warnings=(*warnings, *more),
         doubts=tuple(doubts),
     )
 
@@ -129,7 +129,7 @@ def _doubts(
     if grid is not None and closures.candidates and accepted == 0:
         text = "no loop closure was accepted"
         (doubts if not placed else warnings).append(text)
-    contradicted = sum("contradicts" in c.reason and not c.accepted for c in closures.candidates)
+    contradicted = sum("contradicts the other" in c.reason and not c.accepted for c in closures.candidates)
     if contradicted > max(accepted, 4):
         doubts.append(f"{contradicted} loop closures contradict the rest, {accepted} agree")
     return warnings, doubts
