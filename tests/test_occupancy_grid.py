@@ -188,7 +188,8 @@ def test_someone_who_stood_there_for_a_while_is_gone():
 
 
 def test_beams_that_saw_nothing_never_draw_and_clear_only_so_far():
-    poses = np.repeat(np.zeros((1, 3)), 100, axis=0)
+    # Bresenham's lines from one cell leave gaps between them; a robot that moves a little fills them.
+    poses = 0.05 * np.random.default_rng(0).normal(size=(100, 3)).clip(-2, 2)
     scans = room_scans(poses, half=5.0, beams=1440, range_max=3.0)
     assert not np.isfinite(scans.ranges).any()
     grid = from_scans(poses, scans, GridConfig(move_distance=0.0, max_clear_distance=2.0))
@@ -196,7 +197,7 @@ def test_beams_that_saw_nothing_never_draw_and_clear_only_so_far():
     assert (states != OCCUPIED).all()
     row, col = (a.astype(np.int64) for a in np.mgrid[: geometry.rows, : geometry.cols])
     far = np.linalg.norm(geometry.centre_of(row, col), axis=-1)
-    assert (states[far > 2.1] == UNKNOWN).all()
+    assert (states[far > 2.25] == UNKNOWN).all()
     assert (states[far < 1.8] == FREE).all()
     none = from_scans(poses, scans, GridConfig(move_distance=0.0, max_clear_distance=0.0))
     assert (none.states() == UNKNOWN).all()
