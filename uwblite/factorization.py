@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import lapack
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.csgraph import depth_first_order, reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
 
 from .errors import SolverError
@@ -51,7 +51,7 @@ class Ordering:
     """How many of them form a narrow band: all or none; none = the matrix is to be treated as sparse."""
 
 
-def choose_ordering(pairs: Ints, poses: int, others: int, banded: bool = True) -> Ordering:
+def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False) -> Ordering:
     """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
 
     Parameters
@@ -59,17 +59,32 @@ def choose_ordering(pairs: Ints, poses: int, others: int, banded: bool = True) -
     pairs : (b, 2) poses that share an edge.
     poses : how many there are.
     others : scalars that come after the poses.
-    banded : allow the banded form.
+    subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
     """
     if poses < 2:
         return Ordering(np.arange(poses), 0)
-    if banded and others <= _WIDEST_BORDER:
+    if not subtrees and others <= _WIDEST_BORDER:
         order = reverse_cuthill_mckee(_adjacency(pairs, poses).tocsr(), symmetric_mode=True).astype(np.int64)
         position = np.empty(poses, dtype=np.int64)
         position[order] = np.arange(poses)
         if np.max(np.abs(position[pairs[:, 0]] - position[pairs[:, 1]]), initial=0) <= _WIDEST_BAND:
             return Ordering(order, poses)
-    return Ordering(np.argsort(_superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A").perm_c).astype(np.int64), 0)
+    factor = _superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A")
+    order = np.argsort(factor.perm_c)
+    return Ordering(order[_postorder(factor.L)] if subtrees else order, 0)
+
+
+def _postorder(lower: sparse.csc_matrix) -> Ints:
+    """Return the order in which every subtree of the elimination tree is contiguous and ends at its root.
+
+    The parent of a column is its first row below the diagonal. A depth-first walk from the roots, read backwards, is
+    such an order; it costs no fill and makes neighbours in the order neighbours in the factor.
+    """
+    n = lower.shape[0]
+    column = np.repeat(np.arange(n), np.diff(lower.indptr))
+    parent = np.minimum.reduceat(np.where(lower.indices > column, lower.indices, n), lower.indptr[:-1])
+    tree = sparse.csr_matrix((np.ones(n), (parent, np.arange(n))), shape=(n + 1, n + 1))
+    return depth_first_order(tree, n, return_predecessors=False)[:0:-1].astype(np.int64)
 
 
 def _adjacency(pairs: Ints, nodes: int) -> sparse.csc_matrix:

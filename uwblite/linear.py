@@ -49,14 +49,14 @@ def free_unknowns(graph: Graph) -> dict[str, NDArray[np.bool_]]:
 class NormalEquations:
     """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free scalars."""
 
-    def __init__(self, graph: Graph, linearized: Sequence[Linearization], banded: bool = True) -> None:
+    def __init__(self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False) -> None:
         """Number the unknowns and find where every product lands.
 
         Parameters
         ----------
         graph : what is free.
         linearized : of every kind of edges; only the indices and shapes of its blocks are read.
-        banded : allow the banded factorisation where it is the faster.
+        subtrees : order for the selected inverse, not for speed.
         """
         free = free_unknowns(graph)
         counts = [int(mask.sum()) for mask in free.values()]
@@ -69,7 +69,7 @@ class NormalEquations:
         touched = [[node[name][index] for name, index, _ in lin.blocks] for lin in linearized]
         pairs, which = self._pairs(touched)
         among_poses = pairs[(pairs < counts[0]).all(axis=1)]
-        ordering = choose_ordering(among_poses, counts[0], int(width[counts[0] :].sum()), banded)
+        ordering = choose_ordering(among_poses, counts[0], int(width[counts[0] :].sum()), subtrees)
         order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
         corner = np.full(len(width) + 1, -1)
         corner[order] = np.cumsum(width[order]) - width[order]

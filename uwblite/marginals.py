@@ -1,63 +1,108 @@
-"""Marginal covariances of an optimised graph, from the factor of its normal equations."""
+"""Marginal covariances of an optimised graph, from the sparse factor of its normal equations."""
+
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.linalg import SuperLU
 
 from . import se2
-from .factorization import Factor
+from .errors import SolverError
 from .graph import Graph
-from .linear import NormalEquations, Unknowns
-from .solver import edge_weights
+from .linear import NormalEquations
+from .selected_inverse import selected_inverse
+from .solver import edge_weights, linearize
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_AT_ONCE = 300
+"""Right-hand sides solved together: bounds the memory."""
+_DEPENDENT = 1e-13
+"""Pivot, as a share of its diagonal entry, below which a direction counts as measured by nothing."""
 
 
 class Marginals:
-    """Covariances of the unknowns of a graph, given all its measurements; 0 where an unknown is held fixed."""
+    """Covariances of the unknowns of a graph given all its measurements.
 
-    def __init__(self, graph: Graph, unknowns: Unknowns, factor: Factor) -> None:
-        self._graph, self._unknowns, self._factor = graph, unknowns, factor
-        self.poses = self._block_diagonal("poses")
-        """(n, 3, 3) of x, y, theta in the map frame, m and rad."""
-        self.anchors = self._block_diagonal("anchors")
+    Zero where an unknown is held fixed, infinite on the diagonal where no edge touches it. A direction that edges
+    leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
+    """
+
+    def __init__(self, graph: Graph, normal: NormalEquations) -> None:
+        self._graph, self._unknowns = graph, normal.unknowns
+        self._factor = _factor(normal)
+        unseen = np.append(normal.diagonal <= 0, False)
+        blocks = self._block_diagonal(unseen)
+        self.poses = blocks["poses"]
+        """(n, 3, 3) of x, y, theta, map frame, m and rad."""
+        self.anchors = blocks["anchors"]
         """(a, 2, 2) m^2, map frame."""
-        self.calibration = np.sqrt(self._block_diagonal("calibration")[:, 0, 0])
+        self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
         """(c,) standard deviations, unit by name."""
 
-    def _columns(self, numbers: NDArray[np.int64]) -> Floats:
-        """Return columns (size + 1, m) of the covariance; row -1 and the columns of held scalars (-1) are 0."""
+    def _block_diagonal(self, unseen: NDArray[np.bool_]) -> dict[str, Floats]:
+        """Return by block of unknowns the covariance of each with itself."""
+        numbers = self._unknowns.number
+        rows = {name: np.broadcast_to(n[:, :, None], (*n.shape, n.shape[1])) for name, n in numbers.items()}
+        columns = {name: np.broadcast_to(n[:, None, :], (*n.shape, n.shape[1])) for name, n in numbers.items()}
+        row, column = (np.concatenate([part[name].ravel() for name in numbers]) for part in (rows, columns))
+        free = row >= 0
+        values = np.zeros(len(row))
+        values[free] = selected_inverse(self._factor, row[free], column[free])
+        values[unseen[row] & (row == column)] = np.inf
+        ends = np.cumsum([part.size for part in rows.values()])[:-1]
+        return {name: v.reshape(rows[name].shape) for name, v in zip(numbers, np.split(values, ends), strict=True)}
+
+    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
+        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""
+        i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
+        by_i, by_j = se2.between_jacobians(self._graph.poses[i], self._graph.poses[j])
+        mixed = by_i @ self._cross(i, j) @ by_j.transpose(0, 2, 1)
+        own = by_i @ self.poses[i] @ by_i.transpose(0, 2, 1) + by_j @ self.poses[j] @ by_j.transpose(0, 2, 1)
+        return own + mixed + mixed.transpose(0, 2, 1)
+
+    def _cross(self, i: Ints, j: Ints) -> Floats:
+        """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the fewer of them."""
+        if len(np.unique(i)) < len(np.unique(j)):
+            return self._cross(j, i).transpose(0, 2, 1)
+        number = self._unknowns.number["poses"]
+        cross = np.zeros((len(i), 3, 3))
+        sources = np.unique(j)
+        for first in range(0, len(sources), _AT_ONCE // 3):
+            part = sources[first : first + _AT_ONCE // 3]
+            here = np.nonzero((j >= part[0]) & (j <= part[-1]))[0]
+            columns = self._columns(number[part].ravel())
+            at = 3 * np.searchsorted(part, j[here])[:, None, None] + np.arange(3)
+            cross[here] = columns[number[i[here]][:, :, None], at]
+        return cross
+
+    def _columns(self, numbers: Ints) -> Floats:
+        """Return columns (size + 1, m) of the covariance; the last row and the columns of held scalars (-1) are 0."""
         right = np.zeros((self._unknowns.size + 1, len(numbers)))
         right[numbers, np.arange(len(numbers))] = 1.0
         right[-1] = 0.0
         right[:-1] = self._factor.solve(right[:-1])
         return right
 
-    def _block_diagonal(self, name: str) -> Floats:
-        number = self._unknowns.number[name]
-        count, width = number.shape
-        blocks = np.zeros((count, width, width))
-        for first in range(0, count, 128):
-            part = number[first : first + 128]
-            columns = self._columns(part.ravel()).reshape(-1, len(part), width)
-            blocks[first : first + 128] = columns[part[:, :, None], np.arange(len(part))[:, None, None], np.arange(width)]
-        return blocks
 
-    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
-        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for pairs of poses i (m,), j (m,)."""
-        i, j = np.atleast_1d(np.asarray(i)), np.atleast_1d(np.asarray(j))
-        number = self._unknowns.number["poses"]
-        sources, at = np.unique(i, return_inverse=True)
-        columns = self._columns(number[sources].ravel()).reshape(-1, len(sources), 3)
-        cross = columns[number[j][:, :, None], at[:, None, None], np.arange(3)]
-        by_i, by_j = se2.between_jacobians(self._graph.poses[i], self._graph.poses[j])
-        mixed = by_j @ cross @ by_i.transpose(0, 2, 1)
-        own = by_i @ self.poses[i] @ by_i.transpose(0, 2, 1) + by_j @ self.poses[j] @ by_j.transpose(0, 2, 1)
-        return own + mixed + mixed.transpose(0, 2, 1)
+def _factor(normal: NormalEquations) -> SuperLU:
+    """Factorise H itself where it is regular, else with a trace of damping that leaves open directions open."""
+    diagonal = normal.diagonal
+    seen = diagonal > 0
+    try:
+        factor = cast(SuperLU, normal.factor(np.where(seen, 0.0, 1.0)))
+        pivots = factor.U.diagonal()[factor.perm_c]
+        if np.all(pivots > _DEPENDENT * np.where(seen, diagonal, 1.0)):
+            return factor
+    except SolverError:
+        pass
+    return cast(SuperLU, normal.factor(np.where(seen, 1e-12 * diagonal, 1.0)))
 
 
 def marginals(graph: Graph) -> Marginals:
-    """Return the marginal covariances at the graph's estimates, (J^T W J)^-1 with the robust weights as they stand."""
-    linearized = [edges.linearize(graph) for edges in graph.edges]
-    normal = NormalEquations(graph, linearized, banded=False)
+    """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand."""
+    linearized = linearize(graph)
+    normal = NormalEquations(graph, linearized, subtrees=True)
     normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
-    return Marginals(graph, normal.unknowns, normal.factor(1e-12 * np.where(normal.diagonal > 0, normal.diagonal, 1.0)))
+    return Marginals(graph, normal)
