@@ -18,10 +18,10 @@ nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-R
 O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
 
 The search ends, and says why, when the decrease still to come is a negligible fraction of F, when every component of
-the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up. The
-decrease to come is extrapolated from the last two as a geometric series: exact where convergence is linear (robust
-kernels, large residuals), far on the safe side where it is quadratic; there it spares the last iteration or two that
-would only confirm.
+the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up.
+Without robust kernels the decrease to come is extrapolated from the last two as a geometric series: exact where
+convergence is linear, far on the safe side where it is quadratic, and it spares the last iteration or two that would
+only confirm. With them, reweighting converges linearly at an unknown rate, and the last decrease itself is the measure.
 """
 
 from collections.abc import Callable
@@ -155,6 +155,7 @@ def minimise(
         raise SolverError(_what_is_not_finite(graph, linearized))
     damping, growth, last_decrease = config.initial_damping, 2.0, np.inf
     history: list[tuple[float, float]] = []
+    to_come = _extrapolated if all(edges.kernel.name == "none" for edges in graph.edges) else _as_much_again
     reason, improved = "", True
     while not reason:
         if improved:
@@ -178,10 +179,10 @@ def minimise(
         improved = promised > 0 and decrease >= 0
         negligible = config.relative_decrease * chi2 + _NOTHING
         if improved:
-            if _to_come(decrease, last_decrease, promised) <= negligible and damping <= _FREE:
+            if to_come(decrease, last_decrease, promised) <= negligible and damping <= _FREE:
                 reason = SETTLED
             graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
-            damping *= max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3)
+            damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3), _LEAST_DAMPING)
             growth = 2.0
         elif 0 < promised <= 1e-3 * negligible and damping <= _FREE:
             reason = SETTLED
@@ -213,16 +214,22 @@ _NOTHING = 1e-12
 """chi2, in standard deviations squared, that never matters."""
 _FREE = 1e-2
 """lambda up to which small steps mean a minimum and not just a strong brake."""
-_FIRST_BRAKE = 1e-7
+_LEAST_DAMPING = 1e-14
+_FIRST_BRAKE = 1e-5
 """Least lambda after a step that failed."""
 _MOST_DAMPING = 1e12
 
 
-def _to_come(decrease: float, last: float, promised: float) -> float:
-    """Extrapolate the decrease after the present one; before there are two to compare, it may be as large again."""
+def _extrapolated(decrease: float, last: float, promised: float) -> float:
+    """Return the sum of the geometric series that the last two decreases begin."""
     if not np.isfinite(last):
         return max(decrease, promised)
     return decrease**2 / (last - decrease) if decrease < last else np.inf
+
+
+def _as_much_again(decrease: float, last: float, promised: float) -> float:
+    """Return what is still to come where every step halves it, as a robust kernel's reweighting does at best."""
+    return max(decrease, promised)
 
 
 def _step(normal: NormalEquations, damping: Floats) -> tuple[Floats, float]:
