@@ -1,0 +1,149 @@
+"""The documents: every command runs, every example works, every link leads somewhere, the generated page is current."""
+
+import argparse
+import importlib
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+
+import pytest
+from conftest import ROOT
+
+from uwblite.cli import VERBS, main
+from uwblite.io.uwb_mapping import parse_mappings
+
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(document, language):
+    """Yield (words behind the language, text) of the fenced blocks of a language."""
+    for info, text in re.findall(r"^```(.*?)\n(.*?)^```", document.read_text(), re.M | re.S):
+        words = info.split()
+        if words and words[0] == language:
+            yield words[1:], text
+
+
+def commands(text):
+    """Return the commands of a shell block as lists of words."""
+    lines = text.replace("\\\n", " ").splitlines()
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def parses(words):
+    """Tell whether the command line understands these words, without running them."""
+    if words in (["--version"], ["--help"]):
+        return True
+    module = importlib.import_module(f"uwblite.cli.{words[0]}")
+    parser = argparse.ArgumentParser(allow_abbrev=False, exit_on_error=False)
+    module.add_arguments(parser)
+    for option in ("-q", "-v", "--debug"):
+        parser.add_argument(option, action="store_true")
+    try:
+        parser.parse_args(words[1:])
+    except (SystemExit, argparse.ArgumentError):
+        return False
+    return True
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
+def test_every_command_is_understood(document):
+    for _, text in blocks(document, "sh"):
+        for words in commands(text):
+            name = words[0].rsplit("/", 1)[-1]
+            if name == "uwblite":
+                assert parses(words[1:]), words
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_examples_of_every_verb_are_understood(verb):
+    epilog = importlib.import_module(f"uwblite.cli.{verb}").EPILOG
+    examples = [re.sub(r"\s\s+\S.*", "", line.strip()) for line in epilog.replace("\\\n", " ").splitlines()]
+    examples = [re.sub(r"\s+", " ", line) for line in examples if line.startswith("uwblite ")]
+    assert examples
+    for line in examples:
+        words = shlex.split(line.split(" > ")[0].replace("...", ""))
+        if verb != "record" or "--out" in words:
+            assert parses(words[1:]), line
+
+
+@pytest.fixture
+def workspace(tmp_path, room_log, monkeypatch):
+    """A folder with a minute and a half of the sample recording as run.log, and its truth."""
+    assert main(["convert", str(room_log), str(tmp_path / "run.log"), "--end", "90"]) == 0
+    shutil.copy(room_log.parent / "room" / "truth.tum", tmp_path / "truth.tum")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def needed(words):
+    """Return the package that a block needs and that is not installed."""
+    package = {"evo": "evo", "bag": "rosbags"}.get(words[0]) if words else None
+    return package if package and importlib.util.find_spec(package) is None else None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
+def test_every_command_runs(document, workspace):
+    skipped = []
+    for info, text in blocks(document, "sh"):
+        if "norun" in info:
+            continue
+        if package := needed(info):
+            skipped.append(package)
+            continue
+        for words in commands(text):
+            if words[0] == "tools/quickstart":
+                assert " ".join(words) in (ROOT / ".ci" / "run").read_text()
+                continue
+            own = words[0] == "uwblite"
+            tool = [sys.executable, "-m", "uwblite"] if own else [shutil.which(words[0]) or tool_beside(words[0])]
+            environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "HOME": str(workspace)}
+            done = subprocess.run(
+                [*tool, *words[1:]], capture_output=True, text=True, check=False, timeout=300, env=environment
+            )
+            allowed = (0, 3) if words[1:2] in (["map"], ["check"]) else (0,)
+            assert done.returncode in allowed, f"{words}: {done.stdout}{done.stderr}"
+    if skipped:
+        pytest.skip(f"absent: {', '.join(skipped)}; the other commands ran")
+
+
+def tool_beside(name):
+    """Return a program installed beside this Python."""
+    return os.path.join(os.path.dirname(sys.executable), name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
+def test_every_python_example_works(document, workspace, capsys):
+    for _, text in blocks(document, "python"):
+        exec(compile(text, document.name, "exec"), {})
+
+
+def test_sample_mappings_are_valid():
+    for _, text in blocks(ROOT / "docs" / "formats.md", "toml"):
+        assert parse_mappings(text)
+
+
+@pytest.mark.parametrize("document", [*DOCUMENTS, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"], ids=lambda p: p.name)
+def test_links_within_the_repository_lead_somewhere(document):
+    for target in re.findall(r"\]\(([^)#]+)", document.read_text()):
+        if "://" not in target:
+            assert (document.parent / target).exists(), target
+
+
+def test_the_generated_page_is_current():
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "tools" / "make_docs.py"), "--check"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_first_screen_of_the_readme():
+    head = (ROOT / "README.md").read_text().splitlines()[:25]
+    assert any(line.startswith("![") for line in head)
+    assert "tools/quickstart test    # runs all checks and tests" in head
+    assert any("What it is not" in line for line in head)
