@@ -95,12 +95,13 @@ def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: Su
 def _merge(
     owner: Ints, points: Floats, normals: Floats, scatter: Floats, size: float
 ) -> tuple[Ints, Floats, Floats, Floats]:
-    """Average points, normals and their variances by cell; the two sides of a wall stay apart by the normal's half plane."""
+    """Average points, normals and their variances by cell; the two sides of a wall stay apart by facing."""
     cell = np.floor(points / size).astype(np.int64)
     cell -= cell.min(axis=0, initial=0)
-    side = (normals[:, 0] + 1e-3 * normals[:, 1] > 0).astype(np.int64)
+    # Four facings, not two: noise must not turn a normal from one side's facing into the other's, whatever way the wall runs.
+    facing = np.floor(np.arctan2(normals[:, 1], normals[:, 0]) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
     wide, high = cell.max(axis=0, initial=0) + 1
-    key = ((owner * wide + cell[:, 0]) * high + cell[:, 1]) * 2 + side
+    key = ((owner * wide + cell[:, 0]) * high + cell[:, 1]) * 4 + facing
     order = np.argsort(key, kind="stable")
     first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) > 0]))[: len(key)]
     both = np.concatenate([points, normals, scatter[:, None]], axis=1)[order]
