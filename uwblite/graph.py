@@ -38,7 +38,8 @@ class Linearization:
 def _rows(edges: Any, which: Ints) -> Any:
     """Return some of the edges (rows of every per-edge array)."""
     own = {f.name: getattr(edges, f.name) for f in fields(edges)}
-    per_edge = {n: v[which] for n, v in own.items() if isinstance(v, np.ndarray) and v.ndim and n not in edges.SHARED and len(v)}
+    arrays = {n: v for n, v in own.items() if isinstance(v, np.ndarray) and len(v) and n not in edges.SHARED}
+    per_edge = {n: v[which] for n, v in arrays.items()}
     return replace(edges, **per_edge)
 
 

@@ -24,6 +24,7 @@ from . import (
     se2,
     submaps,
     summary,
+    tracking,
 )
 from .anchors import AnchorConfig
 from .calibration import CalibrationConfig
@@ -44,6 +45,7 @@ from .scan_search import SearchConfig
 from .sensor_log import SensorLog
 from .solver import SolverConfig, SolverSummary, optimize
 from .submaps import SubmapConfig
+from .tracking import TrackingConfig
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -71,6 +73,7 @@ class MappingConfig:
     clouds: CloudConfig = field(default_factory=CloudConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
     loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
@@ -190,8 +193,8 @@ _RADIO = ("height2", "tag_x", "tag_y", "range_delay")
 def _free(graph: Graph, *names: str) -> Graph:
     """Return the graph with calibration unknowns of these names (an anchor's own by their stem) set free."""
     assert graph.fixed_calibration is not None
-    held = [not (fixed is False or name.split(":")[0] in names) for fixed, name in zip(graph.fixed_calibration.tolist(), graph.calibration.names, strict=True)]
-    return replace(graph, fixed_calibration=np.array(held, dtype=bool))
+    named = np.array([name.split(":")[0] in names for name in graph.calibration.names], dtype=bool)
+    return replace(graph, fixed_calibration=graph.fixed_calibration & ~named)
 
 
 def _estimates(graph: Graph, solved: Graph) -> Graph:
@@ -209,7 +212,7 @@ def _first_optimisation(
     first = first_estimate.grow(graph, wheels, radio, path, growth, config.anchors)
     stages.end("first estimate", range_sigma=round(sigma, 4), placed=int(first.placed.sum()))
     graph = replace(_estimates(graph, first.graph), fixed_anchors=~first.placed)
-    radio = replace(radio, weights=np.asarray(radio.weights) * first.placed[radio.anchor], sigma=np.full(len(radio), growth.range_sigma))
+    radio = replace(radio, weights=alive * first.placed[radio.anchor].astype(np.float64))
     for lap in range(3):
         radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
         if lap == 2:
@@ -264,9 +267,13 @@ def _track(
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
     settings = replace(config.refinement, partners=0, rounds=config.refinement.track_rounds)
     session = np.zeros(len(path), dtype=np.int64)
+    steps, searched = tracking.follow(
+        scans.clouds, scans.raster, graph.poses, session, config.refinement.first_gate, config.tracking, config.search
+    )
+    graph = _estimates(graph, optimize(graph.with_edges(*edges, steps), config.solver)[0])
     i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, settings)
     graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "tracking")
-    stages.end("tracking", pairs=len(i), used=int(refined.used.sum()), sigma=round(refined.sigma, 4), rounds=refined.rounds)
+    stages.end("tracking", pairs=len(i), searched=searched, used=int(refined.used.sum()), sigma=round(refined.sigma, 4), rounds=refined.rounds)
     return graph, refined
 
 
@@ -309,8 +316,9 @@ def _refine_jointly(
     for lap in range(config.refinement.selections):
         edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
         i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, config.refinement)
-        gate = config.refinement.first_gate if lap == 0 else max(0.4 * config.refinement.first_gate, config.refinement.last_gate)
-        settings = replace(config.refinement, first_gate=gate)
+        settings = config.refinement
+        if lap > 0:
+            settings = replace(settings, first_gate=max(0.4 * settings.first_gate, settings.last_gate))
         graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "joint refinement")
         graph = _hold_negative_heights(graph)
         if radio is not None:

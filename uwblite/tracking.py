@@ -1,0 +1,99 @@
+"""Following the robot from cloud to cloud, where the wheels' word is not good enough to start matching from.
+
+Neighbouring clouds are aligned from the wheels' guess. A pair that then shares few points got a bad guess (slip, a
+sharp turn between sparse scans): a correlative search around it finds the place.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import se2
+from .clouds import Clouds
+from .loop_closure import align_pairs
+from .graph import RelativePoseEdges
+from .pair_matching import NearestRaster, match, measured, pair_points
+from .point_cloud import make_cloud
+from .robust import Kernel
+from .scan_search import SearchConfig, search
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingConfig:
+    """When and where neighbouring clouds are searched for."""
+
+    good_share: float = 0.75
+    """Neighbours that share at least this part of their points need no search."""
+    gain: float = 0.08
+    """A search must raise the share by this to be believed."""
+    distance: float = 0.4
+    """Half-width of the search, m."""
+    angle: float = 0.45
+    """Half-width of the search, rad."""
+    least_share: float = 0.4
+    """A step whose clouds share a smaller part is left to the wheels."""
+    gate: float = 0.15
+    """Farthest match at the end, m."""
+    points: int = 150
+    """Points looked up per step."""
+    min_points: int = 30
+    """Clouds with fewer points with a normal measure nothing."""
+    sigma: float = 0.03
+    """Standard deviation of a match, m."""
+    correlation: float = 8.0
+    """Matches that together weigh as one."""
+
+
+def follow(
+    clouds: Clouds, raster: NearestRaster, poses: Floats, session: Ints, gate: float, config: TrackingConfig,
+    search_config: SearchConfig,
+) -> tuple[RelativePoseEdges, int]:
+    """Measure every step between neighbouring keyframes by their clouds, searching where the guess was bad.
+
+    Parameters
+    ----------
+    clouds, raster : see clouds.build and pair_matching.paint.
+    poses : (k, 3) T_map_base by wheels and radio. session : (k,) recording of each keyframe.
+    gate : reach of the raster, m.
+
+    Returns
+    -------
+    Edges of the steps that were measured, and how many of them needed a search.
+    """
+    i = np.flatnonzero(session[:-1] == session[1:])
+    step = se2.between(poses[i], poses[i + 1])
+    points = pair_points(clouds, i + 1, config.points)
+    tight = min(config.gate, gate)
+    aligned = align_pairs(clouds, raster, i, i + 1, step, points, gate, tight)
+    enough = aligned.factors.asked >= config.min_points
+    share, step, searched = aligned.share.copy(), aligned.pose.copy(), 0
+    for row in np.flatnonzero(enough & (share < config.good_share)):
+        found = _search_step(clouds, raster, int(i[row]), step[row], gate, config, search_config)
+        if found is not None and found[1] > share[row] + config.gain:
+            step[row], share[row] = found
+            searched += 1
+    kept = enough & (share >= config.least_share)
+    factors = match(clouds, raster, i, step, points, tight, tight / 2.0)
+    z, sqrt_information = measured(factors, step, np.full(len(i), config.sigma**2 * config.correlation))
+    edges = RelativePoseEdges(i[kept], i[kept] + 1, z[kept], sqrt_information[kept], Kernel("cauchy", 5.0))
+    return edges, searched
+
+
+def _search_step(
+    clouds: Clouds, raster: NearestRaster, i: int, guess: Floats, gate: float, config: TrackingConfig,
+    search_config: SearchConfig,
+) -> tuple[Floats, float] | None:
+    """Return the best pose of cloud i + 1 in cloud i and the share of points that match there."""
+    target, source = (make_cloud(p, p + n) for p, n in (clouds.cloud(i), clouds.cloud(i + 1)))
+    places = search(target, source, guess, (config.distance, config.distance, config.angle), search_config)
+    if not len(places.poses):
+        return None
+    one = np.full(len(places.poses), i)
+    points = pair_points(clouds, one + 1, config.points)
+    aligned = align_pairs(clouds, raster, one, one + 1, places.poses, points, min(0.3, gate), min(config.gate, gate))
+    best = int(np.argmax(aligned.share))
+    return aligned.pose[best], float(aligned.share[best])
