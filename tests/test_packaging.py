@@ -1,0 +1,94 @@
+"""The package as users get it: wheel and sdist complete, clean and installable; one version everywhere."""
+
+import email
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+
+import pytest
+from conftest import ROOT
+
+import uwblite
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Folder with wheel and sdist, built from a copy of the sources."""
+    for package in ("build", "setuptools", "wheel"):
+        if importlib.util.find_spec(package) is None:
+            pytest.skip(f"{package} is absent")
+    source = tmp_path_factory.mktemp("source")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    shutil.copytree(ROOT / "uwblite", source / "uwblite", ignore=shutil.ignore_patterns("__pycache__"))
+    out = tmp_path_factory.mktemp("dist")
+    subprocess.run(
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(source)], check=True, capture_output=True
+    )
+    return out
+
+
+def test_the_wheel_is_pure_and_complete(built):
+    (wheel,) = built.glob("*.whl")
+    assert wheel.name == f"uwblite-{uwblite.__version__}-py3-none-any.whl"
+    with zipfile.ZipFile(wheel) as packed:
+        names = set(packed.namelist())
+        metadata = email.message_from_bytes(packed.read(f"uwblite-{uwblite.__version__}.dist-info/METADATA"))
+        entry = packed.read(f"uwblite-{uwblite.__version__}.dist-info/entry_points.txt").decode()
+    modules = {p.relative_to(ROOT).as_posix() for p in (ROOT / "uwblite").rglob("*.py")} | {"uwblite/py.typed"}
+    assert {n for n in names if ".dist-info/" not in n} == modules
+    assert any(n.endswith("LICENSE") for n in names)
+    assert metadata["Version"] == uwblite.__version__
+    assert metadata["Requires-Python"] == ">=3.11"
+    needed = {re.split(r"[<>=;\s]", r)[0] for r in metadata.get_all("Requires-Dist") if "extra" not in r}
+    assert needed == {"numpy", "scipy", "pyserial"}
+    assert not [r for r in metadata.get_all("Requires-Dist") if "<" in r.split(";")[0]]
+    assert "uwblite = uwblite.cli:main" in entry
+
+
+def test_the_sdist_builds_the_same_wheel(built, tmp_path):
+    (sdist,) = built.glob("*.tar.gz")
+    with tarfile.open(sdist) as packed:
+        packed.extractall(tmp_path, filter="data")
+    (source,) = tmp_path.iterdir()
+    command = [sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", str(tmp_path / "again"), str(source)]
+    subprocess.run(command, check=True, capture_output=True)
+    (first,), (second,) = built.glob("*.whl"), (tmp_path / "again").glob("*.whl")
+    with zipfile.ZipFile(first) as one, zipfile.ZipFile(second) as two:
+        assert sorted(one.namelist()) == sorted(two.namelist())
+
+
+def test_twine_has_nothing_to_say(built):
+    if importlib.util.find_spec("twine") is None:
+        pytest.skip("twine is absent")
+    command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, built.iterdir())]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_installed_wheel_maps_the_sample(built, tmp_path, room_log):
+    (wheel,) = built.glob("*.whl")
+    site = tmp_path / "site"
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site), str(wheel)]
+    subprocess.run(command, check=True, capture_output=True)
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    code = "import sys, uwblite; from uwblite.cli import main; print(uwblite.__file__); sys.exit(main(sys.argv[1:]))"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "map", str(room_log), "--out", "map"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode in (0, 3), done.stderr
+    assert done.stdout.splitlines()[0].startswith(str(site))
+    assert (tmp_path / "map" / "map.png").exists()
+
+
+def test_the_changelog_and_citation_know_this_package():
+    assert f"## {uwblite.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+    assert "arXiv:2106.03648" in (ROOT / "CITATION.cff").read_text()
