@@ -92,6 +92,7 @@ class Dwm1001Session:
         self._not_ready: float | None = None
         self._fix_stamp: float | None = None
         self._interval: tuple[float, float] | None = None
+        self._found: tuple[float, float] | None = None
         self._last_fix = now
         self._pending: tuple[RangeReading, ...] | None = None
         self._latest: tuple[RangeReading, ...] | None = None
@@ -351,8 +352,9 @@ class Dwm1001Session:
             if narrow_low < narrow_high:
                 low, high = narrow_low, narrow_high
         if high - low > 4 * SPARSE:
+            self._found = None
             return min(now, self._last_fix + self.period)
-        self._interval = (low, high)
+        self._found = (low, high)
         return (low + high) / 2
 
     def _read_fix(self, now: float) -> list[Action]:
@@ -397,6 +399,7 @@ class Dwm1001Session:
             return self._wait(now)
         gap, damaged, self._damaged = stamp - self._last_fix, self._damaged, False
         self._last_fix, self._latest = stamp, readings
+        self._interval = self._found or self._interval
         lost = [Lost(stamp, round(gap / self.period) - 1)] if damaged and gap > 1.6 * self.period else []
         return [*lost, *self._epoch(readings, stamp), *self._wait(now)]
 
@@ -417,7 +420,8 @@ class Dwm1001Session:
         if self._step == "loc":
             return [lost, *self._say("loc", LOC_GET, now, ANSWER)]
         # Reading the status clears it, so the answer that was lost may have announced a fix: look for one.
-        self._fix_stamp, self._guess = self._sent, True
+        stamp = self._fix_time(self._sent + 0.002)
+        self._fix_stamp, self._guess = self._sent if stamp is None else stamp, True
         return [lost, *self._read_fix(now)]
 
     def _after_query(self, now: float) -> list[Action]:

@@ -33,10 +33,12 @@ SILENCE = 3.0
 """s without a measurement before it is said."""
 HANG = 10.0
 """s without a measurement before the port is opened anew."""
-BACK_OFF = (0.25, 0.5, 1.0, 2.0, 5.0)
+BACK_OFF = (0.1, 0.2, 0.4, 0.7, 1.0)
 """s between attempts to open a port that is gone; the last one repeats."""
 HOUSEKEEPING = 0.25
 """s between looks at silent devices and the status line."""
+DAMAGE_REPORT = 5.0
+"""s between COMMENT lines about loss and damage."""
 POLL = 0.005
 """s between reads of a port that cannot be waited on."""
 
@@ -131,7 +133,7 @@ class Recorder:
         self._params: dict[str, str] = {}
         self._lines: list[str] = []
         self.start = monotonic()
-        self.end = self.start
+        self.end = self._damage_due = self.start
 
     # ---- running
 
@@ -304,9 +306,16 @@ class Recorder:
                     self._up(link, now)
             else:
                 self._watch(link, now)
-            if link.new_lost or link.new_corrupt:
-                self.comment(f"{link.name}: lost {link.new_lost}, corrupt {link.new_corrupt} since the last such line")
-                link.new_lost = link.new_corrupt = 0
+        if now >= self._damage_due:
+            self._damage_due = now + DAMAGE_REPORT
+            self._report_damage()
+
+    def _report_damage(self) -> None:
+        hurt = [link for link in self.links if link.new_lost or link.new_corrupt]
+        if hurt:
+            self.comment("; ".join(f"{link.name}: lost {link.new_lost}, corrupt {link.new_corrupt}" for link in hurt))
+        for link in hurt:
+            link.new_lost = link.new_corrupt = 0
 
     def _watch(self, link: Link, now: float) -> None:
         silent = now - max(link.last_message, link.opened)
@@ -408,6 +417,7 @@ class Recorder:
                 link.port.close()
                 link.port = None
         self._selector.close()
+        self._report_damage()
         for line in self.summary():
             self.comment(line)
         self.log.write(self._lines)
