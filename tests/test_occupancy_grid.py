@@ -12,7 +12,7 @@ from uwblite.bresenham import mark_rays
 from uwblite.errors import ConfigError, DataError
 from uwblite.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, GridGeometry, RayCounter, from_counts, from_scans
 from uwblite.ray_counter import WEIGHT_UNIT
-from uwblite.scan_rays import in_runs, moved_scans, scan_rays
+from uwblite.scan_rays import extent, in_runs, moved_scans, scan_rays
 from uwblite.sensor_log import LaserScans
 
 
@@ -234,6 +234,41 @@ def test_rays_start_where_the_laser_was_at_their_time():
         angle, reach = scans.angles[ray], scans.ranges[0, ray]
         expected = se2.transform(pose, reach * np.array([math.cos(angle), math.sin(angle)]))
         np.testing.assert_allclose(rays.endpoints[ray], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_the_extent_holds_all_rays(flipped):
+    rng = np.random.default_rng(4)
+    poses = rng.uniform(-1.0, 1.0, (20, 3)) * [1.0, 1.0, np.pi]
+    last = poses + rng.normal(scale=0.05, size=(20, 3))
+    scans = room_scans(poses, noise=0.01, range_max=2.2)
+    options = {"flipped": flipped, "max_clear_distance": 1.5, "clear_run": 3}
+    chosen = np.arange(20)
+    rays = scan_rays(scans, chosen, poses, last, **options)
+    low, high = extent(scans, chosen, poses, last, **options)
+    points = np.concatenate([rays.origins, rays.endpoints])
+    assert (points >= low).all()
+    assert (points <= high).all()
+    still = scan_rays(scans, chosen, poses, **options)
+    low, high = extent(scans, chosen, poses, **options)
+    assert (still.endpoints.min(axis=0) - low < 2e-4).all()
+    assert (high - still.endpoints.max(axis=0) < 2e-4).all()
+
+
+def test_the_grid_ends_where_knowledge_ends():
+    poses = drive(30)
+    grid = from_scans(poses, room_scans(poses), last=poses + [0.0, 0.0, 0.5])
+    known = grid.log_odds != 0
+    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    assert (rows[0], cols[0]) == (2, 2)
+    assert (len(known) - rows[-1], known.shape[1] - cols[-1]) == (3, 3)
+    # The frame is where it was: cells of a larger grid have the same values.
+    wide = GridGeometry(0.05, np.array([-6.0, -6.0]), 240, 240)
+    whole = from_scans(poses, room_scans(poses), last=poses + [0.0, 0.0, 0.5], geometry=wide)
+    row, col = wide.cell_of(grid.geometry.centre_of(np.array(0), np.array(0)))
+    part = whole.log_odds[int(row) :, int(col) :][: known.shape[0], : known.shape[1]]
+    np.testing.assert_array_equal(part, grid.log_odds)
+    np.testing.assert_array_equal(np.count_nonzero(part), np.count_nonzero(whole.log_odds))
 
 
 def test_a_flipped_laser_sees_the_mirror_image():

@@ -31,7 +31,8 @@ def mark_rays(marks: NDArray[np.uint8], start: Ints, d_row: Ints, d_col: Ints, s
     value : 0..255.
     """
     steps = np.maximum(np.abs(d_row), np.abs(d_col))
-    order = np.argsort(-steps, kind="stable")
+    # Sorting numbers of 16 bits takes a quarter of the time.
+    order = np.argsort(-steps.astype(np.int16) if len(steps) and steps.max() < 2**15 else -steps, kind="stable")
     steps = steps[order]
     if len(steps) == 0 or steps[0] == 0:
         return

@@ -49,6 +49,10 @@ class GridGeometry:
         """Tell which cells belong to the grid."""
         return (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
 
+    def window(self, row: int, col: int, rows: int, cols: int) -> "GridGeometry":
+        """Return the part of the grid whose first cell is (row, col)."""
+        return GridGeometry(self.resolution, self.origin + self.resolution * np.array([col, row]), rows, cols)
+
     @staticmethod
     def around(low: Floats, high: Floats, resolution: float, max_cells: int, margin: int = 2) -> "GridGeometry":
         """Return the grid that holds a box, with cell edges at multiples of the resolution.

@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from .errors import ConfigError, DataError
 from .grid_geometry import GridGeometry
 from .ray_counter import WEIGHT_UNIT, Counts, RayCounter
-from .scan_rays import ScanRays, moved_scans, scan_rays
+from .scan_rays import ScanRays, extent, moved_scans, scan_rays
 from .sensor_log import LaserScans
 
 __all__ = ["GridConfig", "GridGeometry", "OccupancyGrid", "RayCounter", "from_counts", "from_scans"]
@@ -68,7 +69,7 @@ class GridConfig:
     """Weight of a beam that saw nothing against one that passed through to a hit, 0..1 (in steps of 1/16)."""
     move_distance: float = 0.1
     """A scan is traced when the laser has moved this far since the last traced one, m; 0 = every scan."""
-    move_angle: float = 0.1
+    move_angle: float = 0.2
     """... or has turned this far, rad."""
     max_cells: int = 40_000_000
     """Largest grid, cells (12 bytes each while it is made); a larger one is refused rather than run out of memory."""
@@ -143,7 +144,7 @@ def from_scans(
     config : settings.
     last : (k, 3) T_map_laser at the last ray of every scan; in between the laser moves evenly. None = no deskewing.
     flipped : the laser is mounted upside down.
-    geometry : the grid to fill; None = around all rays.
+    geometry : the grid to fill; None = the smallest around all rays.
     executor : any concurrent.futures executor; the result does not depend on it.
     progress : called after every batch of scans.
 
@@ -158,9 +159,8 @@ def from_scans(
         raise DataError("there are no scans to make a map of")
     chosen = moved_scans(first, config.move_distance, config.move_angle)
     task = _Task(scans, chosen, first[chosen], None if last is None else last[chosen], flipped, config)
-    if geometry is None:
-        geometry = _geometry_of(task)
-    counter = RayCounter(geometry, config.clear_weight)
+    around = geometry or GridGeometry.around(*task.extent(), config.resolution, config.max_cells)
+    counter = RayCounter(around, config.clear_weight)
     if executor is None:
         for done, rays in task.batches():
             counter.insert_rays(rays.origins, rays.endpoints, rays.hit, rays.scan)
@@ -169,12 +169,12 @@ def from_scans(
     else:
         done = 0
         parts = task.split(_TASKS)
-        for part, counts in zip(parts, executor.map(_count, parts, [geometry] * len(parts)), strict=True):
+        for part, counts in zip(parts, executor.map(_count, parts, [around] * len(parts)), strict=True):
             counter.add(*counts)
             done += len(part.chosen)
             if progress is not None:
                 progress(done, len(chosen))
-    return from_counts(counter, config)
+    return from_counts(counter if geometry else counter.cropped(), config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,17 +192,26 @@ class _Task:
         """Yield (scans done, rays) for a bounded number of scans at a time."""
         for start in range(0, len(self.chosen), _SCANS_AT_A_TIME):
             part = slice(start, start + _SCANS_AT_A_TIME)
-            rays = scan_rays(
-                self.scans,
-                self.chosen[part],
-                self.first[part],
-                None if self.last is None else self.last[part],
-                flipped=self.flipped,
-                max_range=self.config.max_range or math.inf,
-                max_clear_distance=self.config.max_clear_distance,
-                clear_run=self.config.clear_run,
-            )
-            yield min(start + _SCANS_AT_A_TIME, len(self.chosen)), rays
+            yield min(part.stop, len(self.chosen)), self._apply(scan_rays, part)
+
+    def extent(self) -> tuple[Floats, Floats]:
+        """Return the corners (2,) of a box around all rays, m."""
+        parts = range(0, len(self.chosen), _SCANS_AT_A_TIME)
+        boxes = [self._apply(extent, slice(start, start + _SCANS_AT_A_TIME)) for start in parts]
+        return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+
+    def _apply(self, function: Callable[..., Any], part: slice) -> Any:
+        """Call a function of scan_rays for some of the scans."""
+        return function(
+            self.scans,
+            self.chosen[part],
+            self.first[part],
+            None if self.last is None else self.last[part],
+            flipped=self.flipped,
+            max_range=self.config.max_range or math.inf,
+            max_clear_distance=self.config.max_clear_distance,
+            clear_run=self.config.clear_run,
+        )
 
     def split(self, parts: int) -> "list[_Task]":
         """Return tasks that hold only their own share of the scans."""
@@ -221,13 +230,3 @@ def _count(task: _Task, geometry: GridGeometry) -> tuple[Counts, Counts, int]:
     for _, rays in task.batches():
         counter.insert_rays(rays.origins, rays.endpoints, rays.hit, rays.scan)
     return counter.hits, counter.misses, counter.scans_used
-
-
-def _geometry_of(task: _Task) -> GridGeometry:
-    """Return the grid around all rays and laser positions."""
-    low, high = task.first[:, :2].min(axis=0), task.first[:, :2].max(axis=0)
-    for _, rays in task.batches():
-        if len(rays.hit):
-            low = np.minimum(low, rays.endpoints.min(axis=0))
-            high = np.maximum(high, rays.endpoints.max(axis=0))
-    return GridGeometry.around(low, high, task.config.resolution, task.config.max_cells)

@@ -1,5 +1,8 @@
 """Hits and misses: which cells of a grid rays end in and pass through, scan by scan."""
 
+from copy import copy
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,7 +75,7 @@ class RayCounter:
         high = np.stack([np.maximum.reduceat(rows, starts[:-1]), np.maximum.reduceat(cols, starts[:-1])], axis=1)
         size = high - low + 1
         if size.max() > _LONGEST_RAY:
-            raise DataError(f"a ray of {size.max() * self.geometry.resolution:.0f} m is too long to trace; set a smaller max_range")
+            raise DataError(f"a ray of {size.max()} cells is too long to trace; set a smaller max_range")
         first = 0
         while first < len(low):
             area = np.maximum.accumulate(size[first:], axis=0).prod(axis=1) * np.arange(1, len(low) - first + 1)
@@ -97,7 +100,8 @@ class RayCounter:
         for rays, weight in ((~hit, self._weak), (hit, WEIGHT_UNIT)):
             if weight:
                 mark_rays(marks, start[rays], step[0, rays], step[1, rays], width, weight)
-        ends = np.unique((slot * window + end[0] * width + end[1])[hit])
+        ends = np.sort((slot * window + end[0] * width + end[1])[hit])
+        ends = ends[np.diff(ends, prepend=-1) > 0]
         marks[ends] = 0
         self._add_hits(ends, low, window, width)
         for scan, (row, col) in enumerate(low.tolist()):
@@ -105,10 +109,14 @@ class RayCounter:
             self._add_window(marks[scan * window : (scan + 1) * window].reshape(height, width)[:rows, :cols], row, col)
 
     def _add_hits(self, ends: Ints, low: Ints, window: int, width: int) -> None:
+        """Count the cells in which rays ended, sorted and each once per scan, given by place in the scans' windows."""
         scan, cell = np.divmod(ends, window)
         row, col = low[scan, 0] + cell // width, low[scan, 1] + cell % width
         inside = self.geometry.inside(row, col)
-        np.add.at(self.hits.reshape(-1), (row * self.geometry.cols + col)[inside], 1)
+        flat, cell = self.hits.reshape(-1), (row * self.geometry.cols + col)[inside]
+        bounds = np.searchsorted(scan[inside], np.arange(len(low) + 1)).tolist()
+        for begin, end in pairwise(bounds):
+            flat[cell[begin:end]] += 1
 
     def _add_window(self, marks: NDArray[np.uint8], row: int, col: int) -> None:
         """Add the misses of one scan, its window's first cell at (row, col); what lies outside the grid is dropped."""
@@ -117,6 +125,19 @@ class RayCounter:
         if part.size:
             rows, cols = part.shape
             self.misses[row + top : row + top + rows, col + left : col + left + cols] += part
+
+    def cropped(self, margin: int = 2) -> "RayCounter":
+        """Return the same counts in the smallest grid that holds all of them and a margin of cells."""
+        seen = (self.hits > 0) | (self.misses > 0)
+        rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        if len(rows) == 0:
+            return self
+        top, left = max(int(rows[0]) - margin, 0), max(int(cols[0]) - margin, 0)
+        window = slice(top, int(rows[-1]) + margin + 1), slice(left, int(cols[-1]) + margin + 1)
+        counter = copy(self)
+        counter.hits, counter.misses = self.hits[window], self.misses[window]
+        counter.geometry = self.geometry.window(top, left, *counter.hits.shape)
+        return counter
 
     def add(self, hits: Counts, misses: Counts, scans_used: int) -> None:
         """Add the counts of other scans in the same grid."""

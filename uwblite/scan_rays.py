@@ -76,23 +76,64 @@ def scan_rays(
     max_clear_distance : length of rays of beams that saw nothing, m; 0 = there are none.
     clear_run : least number of adjacent beams that saw nothing.
     """
-    readings = scans.ranges[chosen]
-    hit = (readings >= scans.range_min) & (readings <= min(max_range, scans.range_max))
-    used = hit.copy()
-    if max_clear_distance > 0.0:
-        used |= in_runs(np.isposinf(readings), clear_run)
-    scan, ray = np.nonzero(used)
-    hit = hit[scan, ray]
-    reach = np.where(hit, readings[scan, ray], np.float32(min(max_clear_distance, scans.range_max)))
-    bearing = (-scans.angles if flipped else scans.angles)[ray]
+    reach, hit = _reaches(scans, chosen, max_range, max_clear_distance, clear_run)
+    used = reach > 0
+    beams = reach.shape[1]
     moved = np.zeros_like(first) if last is None else last - first
     moved[:, 2] = se2.wrap_angle(moved[:, 2])
-    fraction = ray * (1.0 / max(scans.ranges.shape[1] - 1, 1))
-    x, y, theta = (first[:, axis][scan] + moved[:, axis][scan] * fraction for axis in range(3))
+    fraction = np.arange(beams) * (1.0 / max(beams - 1, 1))
+    bearing = (first[:, 2:] + (-scans.angles if flipped else scans.angles)) + moved[:, 2:] * fraction
     # Single precision turns a ray by 5e-7 rad at most, far below a cell, and its sines are several times faster.
-    bearing = (bearing + theta).astype(np.float32)
-    ends = np.stack([x + reach * np.cos(bearing), y + reach * np.sin(bearing)])
-    return ScanRays(np.stack([x, y]).T, ends.T, hit, scan)
+    bearing = bearing.astype(np.float32)
+    origins, ends = np.empty((2, 2, int(np.count_nonzero(used))))
+    for axis, direction in enumerate((np.cos(bearing), np.sin(bearing))):
+        start = first[:, axis, None] + moved[:, axis, None] * fraction
+        origins[axis] = start[used]
+        ends[axis] = (start + reach * direction)[used]
+    scan = np.repeat(np.arange(len(chosen)), np.count_nonzero(used, axis=1))
+    return ScanRays(origins.T, ends.T, hit[used], scan)
+
+
+def extent(
+    scans: LaserScans,
+    chosen: Ints,
+    first: Floats,
+    last: Floats | None = None,
+    *,
+    flipped: bool = False,
+    max_range: float = math.inf,
+    max_clear_distance: float = 0.0,
+    clear_run: int = 1,
+) -> tuple[Floats, Floats]:
+    """Return the corners (2,) of a box that holds all rays of some scans (see scan_rays), quickly and hardly too large."""
+    low, high = first[:, :2].min(axis=0), first[:, :2].max(axis=0)
+    reach, _ = _reaches(scans, chosen, max_range, max_clear_distance, clear_run)
+    angles = -scans.angles if flipped else scans.angles
+    ahead, aside = reach * np.cos(angles).astype(np.float32), reach * np.sin(angles).astype(np.float32)
+    c, s = (v[:, None].astype(np.float32) for v in (np.cos(first[:, 2]), np.sin(first[:, 2])))
+    slack = np.zeros(len(first)) if last is None else _sweep_reach(first, last, reach.max(axis=1))
+    for axis, offset in enumerate((c * ahead - s * aside, s * ahead + c * aside)):
+        low[axis] = min(low[axis], (first[:, axis] + offset.min(axis=1) - slack).min())
+        high[axis] = max(high[axis], (first[:, axis] + offset.max(axis=1) + slack).max())
+    return low - 1e-4, high + 1e-4
+
+
+def _sweep_reach(first: Floats, last: Floats, reach: NDArray[np.float32]) -> Floats:
+    """Return how far (s,) the motion within a scan can move the end of a ray, m."""
+    moved = np.abs(last - first)
+    return np.hypot(moved[:, 0], moved[:, 1]) + np.abs(se2.wrap_angle(moved[:, 2])) * reach
+
+
+def _reaches(
+    scans: LaserScans, chosen: Ints, max_range: float, max_clear_distance: float, clear_run: int
+) -> tuple[NDArray[np.float32], Bools]:
+    """Return the length of every ray (s, b), m, 0 where there is none, and whether something is at its end."""
+    readings = scans.ranges[chosen]
+    hit = (readings >= scans.range_min) & (readings <= min(max_range, scans.range_max))
+    reach = np.where(hit, readings, np.float32(0.0))
+    if max_clear_distance > 0.0:
+        reach[in_runs(np.isposinf(readings), clear_run)] = min(max_clear_distance, scans.range_max)
+    return reach, hit
 
 
 def in_runs(flags: Bools, least: int) -> Bools:
