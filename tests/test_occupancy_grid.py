@@ -257,14 +257,14 @@ def test_the_extent_holds_all_rays(flipped):
 
 def test_the_grid_ends_where_knowledge_ends():
     poses = drive(30)
-    grid = from_scans(poses, room_scans(poses), last=poses + [0.0, 0.0, 0.5])
+    grid = from_scans(poses, room_scans(poses), last=np.add(poses, [0.0, 0.0, 0.5]))
     known = grid.log_odds != 0
     rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     assert (rows[0], cols[0]) == (2, 2)
     assert (len(known) - rows[-1], known.shape[1] - cols[-1]) == (3, 3)
     # The frame is where it was: cells of a larger grid have the same values.
     wide = GridGeometry(0.05, np.array([-6.0, -6.0]), 240, 240)
-    whole = from_scans(poses, room_scans(poses), last=poses + [0.0, 0.0, 0.5], geometry=wide)
+    whole = from_scans(poses, room_scans(poses), last=np.add(poses, [0.0, 0.0, 0.5]), geometry=wide)
     row, col = wide.cell_of(grid.geometry.centre_of(np.array(0), np.array(0)))
     part = whole.log_odds[int(row) :, int(col) :][: known.shape[0], : known.shape[1]]
     np.testing.assert_array_equal(part, grid.log_odds)
