@@ -96,6 +96,7 @@ class Dwm1001Session:
         self._last_fix = now
         self._pending: tuple[RangeReading, ...] | None = None
         self._latest: tuple[RangeReading, ...] | None = None
+        self._pending_at = now
         self._reads = 0
         self._damaged = self._guess = False
 
@@ -346,14 +347,14 @@ class Dwm1001Session:
         low, high = self._not_ready if self._not_ready is not None else self._last_fix, now
         if self._interval is not None:
             old_low, old_high = self._interval
-            turns = max(1, round((high - old_high) / self.period))
+            turns = max(1, int((high - old_low) / self.period + 1e-6))
             shift, slack = turns * self.period, turns * GRID_SLACK
             narrow_low, narrow_high = max(low, old_low + shift - slack), min(high, old_high + shift + slack)
             if narrow_low < narrow_high:
                 low, high = narrow_low, narrow_high
         if high - low > 4 * SPARSE:
             self._found = None
-            return min(now, self._last_fix + self.period)
+            return self._last_fix + self.period if now - self._last_fix < 2 * self.period else now
         self._found = (low, high)
         return (low + high) / 2
 
@@ -388,13 +389,19 @@ class Dwm1001Session:
         self._tries = 0
         fresh = {reading.anchor_id for reading in readings} - self._known
         doubtful = now < self._distrust or bool(fresh)
+        if not doubtful or readings != self._pending:
+            self._pending_at = self._sent
         if doubtful and readings != self._pending:
             self._pending = readings
             if self._reads < 5:
                 return self._say("loc", LOC_GET, now, ANSWER)
             self._damaged, self._fix_stamp = True, None
             return [Corrupt(b"", "a fix read five times never came twice alike"), *self._wait(now)]
-        stamp, self._fix_stamp, self._pending = self._fix_stamp, None, None
+        # While it was read again and again, newer fixes may have taken its place.
+        turns = max(0, int((self._pending_at - self._fix_stamp) / self.period))
+        stamp, self._fix_stamp, self._pending = self._fix_stamp + turns * self.period, None, None
+        if turns:
+            self._found = None
         if (self._guess or now < self._distrust) and readings == self._latest:
             return self._wait(now)
         gap, damaged, self._damaged = stamp - self._last_fix, self._damaged, False
