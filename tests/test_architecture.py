@@ -24,10 +24,10 @@ FLOORS = (
     ("occupancy_grid", "keyframes", "range_noise", "anchors", "scan_search", "free_space", "factorization", "selected_inverse"),
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts", "drivers/*"),
     # stages
-    ("solver", "marginals", "icp", "pair_matching", "submaps"),
-    ("first_estimate", "refinement", "loop_closure", "evaluate", "evaluate_map"),
+    ("solver", "marginals", "gnc", "icp", "pair_matching", "submaps"),
+    ("first_estimate", "refinement", "tracking", "loop_closure", "evaluate", "evaluate_map"),
     # files in, files out: types and text, no stages
-    ("io/*", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
+    ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
     ("diagnostics", "report", "summary"),
     # the walk
     ("mapping",),

@@ -21,11 +21,14 @@ _SERIES_BELOW = 1e-2
 """Angle below which the series replace sin(t)/t and its kin; both branches agree to rounding there."""
 
 
+_ABOVE_MINUS_PI = np.nextafter(-np.pi, 0.0)
+
+
 def wrap_angle(angle: ArrayLike) -> Floats:
-    """Return the angle, rad, moved into (-pi, pi]."""
+    """Return the angle, rad, moved into (-pi, pi]; one that lies there already keeps every bit."""
     angle = np.asarray(angle, dtype=np.float64)
-    wrapped = np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
-    return np.where(wrapped == -np.pi, np.pi, wrapped)
+    wrapped = angle - 2.0 * np.pi * np.ceil(angle / (2.0 * np.pi) - 0.5)
+    return np.clip(wrapped, _ABOVE_MINUS_PI, np.pi)
 
 
 def rotate(theta: ArrayLike, vectors: ArrayLike) -> Floats:

@@ -1,0 +1,176 @@
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from uwblite import se2
+
+ANGLES = np.concatenate([[0.0], np.logspace(-16, np.log10(np.pi), 300)[:-1], [np.pi]])
+"""Log grid of angles, exact 0, and pi itself."""
+SIGNED = np.concatenate([-ANGLES[::-1], ANGLES])
+
+lengths = st.floats(-1e3, 1e3)
+angles = st.one_of(st.sampled_from(list(SIGNED)), st.floats(-np.pi, np.pi))
+poses = st.builds(lambda *v: np.array(v), lengths, lengths, angles)
+points = st.builds(lambda *v: np.array(v), lengths, lengths)
+
+
+def assert_same(a, b, atol=1e-9):
+    """Compare poses, angles modulo 2 pi."""
+    np.testing.assert_allclose(a[..., :2], b[..., :2], atol=atol)
+    turn = np.remainder(a[..., 2] - b[..., 2] + np.pi, 2 * np.pi) - np.pi
+    np.testing.assert_allclose(turn, 0.0, atol=atol)
+
+
+def matrix(pose):
+    x, y, theta = pose
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
+
+
+@given(poses, poses, poses)
+def test_compose_is_associative(a, b, c):
+    assert_same(se2.compose(a, se2.compose(b, c)), se2.compose(se2.compose(a, b), c))
+
+
+@given(poses)
+def test_inverse_undoes(a):
+    assert_same(se2.compose(a, se2.inverse(a)), np.zeros(3))
+    assert_same(se2.compose(se2.inverse(a), a), np.zeros(3))
+
+
+@given(poses, poses)
+def test_between_is_the_inverse_composed(a, b):
+    assert_same(se2.between(a, b), se2.compose(se2.inverse(a), b))
+    assert_same(se2.compose(a, se2.between(a, b)), b)
+
+
+@given(poses, poses, points)
+def test_transform_follows_compose(a, b, p):
+    np.testing.assert_allclose(se2.transform(se2.compose(a, b), p), se2.transform(a, se2.transform(b, p)), atol=1e-9)
+
+
+@given(poses, poses)
+def test_compose_is_the_product_of_matrices(a, b):
+    np.testing.assert_allclose(matrix(se2.compose(a, b)), matrix(a) @ matrix(b), atol=1e-9)
+
+
+@given(poses)
+def test_exp_undoes_log(a):
+    # At a half turn log divides by sin(theta/2)/(theta/2) = 2/pi, never by less.
+    assert_same(se2.exp(se2.log(a)), a)
+
+
+@given(poses)
+def test_log_undoes_exp(xi):
+    assume(xi[2] > -np.pi)  # the other half turn ends in the same pose
+    np.testing.assert_allclose(se2.log(se2.exp(xi)), [*xi[:2], se2.wrap_angle(xi[2])], atol=1e-9)
+
+
+@pytest.mark.parametrize("v", [(1.0, 0.0), (0.0, 1.0), (3.0, -2.0)])
+def test_exp_agrees_with_a_matrix_series_on_the_log_grid_of_angles(v):
+    """The generator's exponential by scaling and squaring of its Taylor series: no division by the angle anywhere."""
+    for theta in SIGNED:
+        generator = np.array([[0.0, -theta, v[0]], [theta, 0.0, v[1]], [0.0, 0.0, 0.0]]) / 2.0**6
+        term, total = np.eye(3), np.eye(3)
+        for k in range(1, 16):
+            term = term @ generator / k
+            total = total + term
+        for _ in range(6):
+            total = total @ total
+        np.testing.assert_allclose(matrix(se2.exp([*v, theta])), total, atol=3e-14)
+
+
+def test_exp_and_log_are_inverse_to_rounding_on_the_log_grid_of_angles():
+    theta = SIGNED[1:]
+    xi = np.stack([np.full_like(theta, 2.0), np.full_like(theta, -1.0), theta], axis=1)
+    back = se2.log(se2.exp(xi))
+    np.testing.assert_allclose(back[:, :2], xi[:, :2], atol=1e-14)
+    np.testing.assert_array_equal(back[:, 2], theta)
+    assert se2.log(se2.exp([2.0, -1.0, -np.pi]))[2] == np.pi
+
+
+def test_series_and_closed_form_agree_where_they_meet():
+    edge = 1e-2
+    below, above = np.nextafter(edge, 0.0), np.nextafter(edge, 1.0)
+    np.testing.assert_allclose(se2.exp([1.0, 1.0, below]), se2.exp([1.0, 1.0, above]), atol=1e-15)
+
+
+def test_exact_zero_turn_is_a_straight_line():
+    np.testing.assert_array_equal(se2.exp([1.5, -2.5, 0.0]), [1.5, -2.5, 0.0])
+    np.testing.assert_array_equal(se2.log([1.5, -2.5, 0.0]), [1.5, -2.5, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("angle", "expected"),
+    [
+        (np.pi, np.pi),
+        (-np.pi, np.pi),
+        (3 * np.pi, np.pi),
+        (-3 * np.pi, np.pi),
+        (0.0, 0.0),
+        (2 * np.pi, 0.0),
+        (np.pi + 1e-9, -np.pi + 1e-9),
+        (-np.pi + 1e-9, -np.pi + 1e-9),
+        (-np.pi - 1e-9, np.pi - 1e-9),
+    ],
+)
+def test_wrap_at_half_turns(angle, expected):
+    assert se2.wrap_angle(angle) == pytest.approx(expected, abs=1e-15)
+
+
+@given(st.floats(-1e6, 1e6))
+def test_wrapped_angles_lie_in_the_half_open_interval_and_keep_their_direction(angle):
+    wrapped = float(se2.wrap_angle(angle))
+    assert -np.pi < wrapped <= np.pi
+    # The remainder of an angle of 1e6 is exact to 1e6 eps.
+    assert np.cos(wrapped - angle) == pytest.approx(1.0, abs=1e-9)
+
+
+@given(poses, poses)
+def test_interpolation_meets_its_ends(a, b):
+    assert_same(se2.interpolate(a, b, 0.0), a)
+    assert_same(se2.interpolate(a, b, 1.0), b, atol=1e-8)
+
+
+def test_interpolation_follows_the_arc():
+    quarter = se2.interpolate(np.zeros(3), np.array([1.0, 1.0, np.pi / 2]), 0.5)
+    np.testing.assert_allclose(quarter, [np.sin(np.pi / 4), 1 - np.cos(np.pi / 4), np.pi / 4], atol=1e-15)
+
+
+def test_trajectories_are_interpolated_in_time_and_held_at_their_ends():
+    stamps = np.array([0.0, 1.0, 1.0, 3.0])
+    path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0], [7.0, 0.0, 0.0]])
+    at = se2.interpolate_trajectory(stamps, path, np.array([-1.0, 0.5, 1.0, 2.0, 9.0]))
+    np.testing.assert_allclose(at[:, 0], [0.0, 0.5, 5.0, 6.0, 7.0])
+    np.testing.assert_array_equal(se2.interpolate_trajectory(stamps[:1], path[:1], np.array([4.0])), path[:1])
+
+
+@pytest.mark.parametrize("function", [se2.compose, se2.between])
+@given(poses, poses)
+def test_jacobians_equal_differences(function, a, b):
+    by_a, by_b = getattr(se2, f"{function.__name__}_jacobians")(a, b)
+    step = 1e-6
+    for k in range(3):
+        d = np.zeros(3)
+        d[k] = step
+        for analytic, ahead, behind in (
+            (by_a, function(a + d, b), function(a - d, b)),
+            (by_b, function(a, b + d), function(a, b - d)),
+        ):
+            slope = ahead - behind
+            slope[2] = se2.wrap_angle(slope[2])
+            # Lengths of 1e3: rounding 1e-13 over 1e-6, and the third derivative times step^2.
+            np.testing.assert_allclose(analytic[:, k], slope / (2 * step), atol=1e-6)
+
+
+def test_functions_broadcast_over_leading_axes():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(4, 1, 3)), rng.normal(size=(5, 3))
+    for function in (se2.compose, se2.between):
+        both = function(a, b)
+        assert both.shape == (4, 5, 3)
+        np.testing.assert_array_equal(both[2, 3], function(a[2, 0], b[3]))
+    assert se2.exp(a).shape == se2.log(a).shape == se2.inverse(a).shape == (4, 1, 3)
+    assert se2.transform(a, b[:, :2]).shape == (4, 5, 2)
+    assert se2.compose_jacobians(a, b)[1].shape == (4, 5, 3, 3)
