@@ -72,6 +72,7 @@ class Closures:
     """Closures found so far: accepted edges between keyframes, and every candidate's story."""
 
     edges: RelativePoseEdges
+    """One per accepted candidate, in their order."""
     candidates: tuple[LoopClosure, ...]
 
 
@@ -325,11 +326,8 @@ def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solve
     kept = squared < config.consistency
     e = closures.edges
     left = RelativePoseEdges(e.i[kept], e.j[kept], e.T_i_j[kept], e.sqrt_information[kept], Kernel("cauchy", 3.0))
-    dropped = {(int(a), int(b)): float(s) for a, b, s in zip(e.i[~kept], e.j[~kept], squared[~kept], strict=True)}
-    story = tuple(
-        replace(c, accepted=False, reason=f"contradicts the other closures: chi2 {dropped[c.i, c.j]:.0f}")
-        if c.accepted and (c.i, c.j) in dropped
-        else c
-        for c in closures.candidates
-    )
-    return solved, Closures(left, story)
+    story = list(closures.candidates)
+    standing = [k for k, c in enumerate(story) if c.accepted]
+    for k, chi2 in zip(np.array(standing)[~kept], squared[~kept], strict=True):
+        story[k] = replace(story[k], accepted=False, reason=f"contradicts the other closures: chi2 {chi2:.0f}")
+    return solved, Closures(left, tuple(story))
