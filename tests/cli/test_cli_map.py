@@ -137,3 +137,17 @@ def test_check_of_the_sample(room_log, capsys):
 def test_check_exits_with_3_where_a_finding_spoils_the_map(room_log, capsys):
     assert main(["check", str(room_log), "--laser-flipped", "--quick"]) == 3
     assert "mounted upright" in capsys.readouterr().out
+
+
+def test_walls_are_turned_along_the_axes_and_the_map_cropped(room_log, tmp_path, capsys):
+    folder = tmp_path / "map"
+    words = ["--align", "walls", "--crop=-2,-1,3,3", "--without", "uwb"]
+    assert main(["map", str(room_log), "--out", str(folder), *words]) in (0, 3)
+    _, poses = read_tum(folder / "trajectory.tum")
+    # The room's walls lie along the axes of its truth; the drive began at a known heading there.
+    _, truth = read_tum(room_log.parent / "room" / "truth.tum")
+    turned = np.degrees(np.median(poses[:, 2] - truth[:, 2])) % 90.0
+    assert min(turned, 90.0 - turned) < 1.0
+    assert np.allclose(poses[0, :2], 0.0, atol=1e-6)
+    assert (folder / "map.pgm").read_bytes().startswith(b"P5\n100 80\n")
+    assert "origin: [-2, -1, 0]" in (folder / "map.yaml").read_text()

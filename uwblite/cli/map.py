@@ -6,7 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from .options import add_mounting_arguments, add_settings_arguments
+from .options import add_mounting_arguments, add_settings_arguments, numbers
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -23,6 +23,7 @@ examples:
   uwblite map run.log --out a/ --without uwb           what wheels and lidar alone can do
   uwblite map run.log --out b/ --preset paper          the paper's plain choices
   uwblite map run.log --out c/ --set grid.resolution=0.02
+  uwblite map run.log --out d/ --align walls --crop 0,0,12,8
   uwblite map run.log --out map/ --dry-run             read, check and estimate only
 
 files in --out: map.png (picture), report.html, map.yaml + map.pgm (map_server, nav2), trajectory.tum (evo),
@@ -43,6 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes for the heavy stages (1)")
     output = parser.add_argument_group("map")
     output.add_argument("--resolution", metavar="M", type=float, help="edge of a cell, m: short for --set grid.resolution=M")
+    align = "where the axes lie: odometry (default), first-pose, walls (along x and y), anchors; short for --set align=HOW"
+    output.add_argument("--align", metavar="HOW", choices=("odometry", "first-pose", "walls", "anchors"), help=align)
+    box = "keep this part of the grid, m: short for --set crop=[...]"
+    output.add_argument("--crop", metavar="X0,Y0,X1,Y1", type=numbers(4), help=box)
     output.add_argument("--scale-map", action="store_true", help="write the probabilities too: map_scale.png (mode: scale)")
     output.add_argument("--no-timings", action="store_true", help="leave timings out of report.json: same run, same bytes")
     output.add_argument("--report-timings", action="store_true", help="show the stages' seconds in report.html too")
@@ -99,7 +104,8 @@ def _settings(args: argparse.Namespace) -> "MappingConfig":
     from .options import effective_config
 
     config = override(effective_config(args), [f"use_{name}=false" for name in args.without])
-    return config if args.resolution is None else override(config, [f"grid.resolution={args.resolution}"])
+    short = {"grid.resolution": args.resolution, "align": args.align, "crop": args.crop and list(args.crop)}
+    return override(config, [f"{name}={value}" for name, value in short.items() if value is not None])
 
 
 def _build(log: "SensorLog", config: "MappingConfig", jobs: int) -> "MapResult":

@@ -49,13 +49,15 @@ _LARGEST_SETTINGS = 1 << 20
 def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare how the sensors are mounted; the log's own PARAM lines hold where these are not given."""
     group = parser.add_argument_group("mounting (what the log says is overridden)")
-    group.add_argument("--laser-pose", metavar="X,Y,THETA", type=_numbers(3), help="laser on the base: m, m, rad")
+    group.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
     group.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
-    group.add_argument("--tag", metavar="X,Y,Z", type=_numbers(3), help="UWB tag on the base, z above the floor: m")
+    group.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), help="UWB tag on the base, z above the floor: m")
     group.add_argument("--anchor-height", metavar="H", type=float, help="height of all anchors above the floor, m")
 
 
-def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
+    """Return a reader of so many numbers separated by commas."""
+
     def parse(text: str) -> tuple[float, ...]:
         import math
 
