@@ -126,15 +126,13 @@ def select(odometry: Odometry, config: KeyframeConfig) -> Keyframes:
 
 
 def _advance(path: Floats, turned: Floats) -> Ints:
-    """Return samples such that between neighbours the path or the turning first reaches 1."""
+    """Return samples as far apart as possible with at most 1 of path and turning between neighbours, if there are such."""
     chosen = [0]
     last = len(path) - 1
     while chosen[-1] < last:
         here = chosen[-1]
-        following = min(
-            int(np.searchsorted(path, path[here] + 1.0)), int(np.searchsorted(turned, turned[here] + 1.0)), last
-        )
-        chosen.append(max(following, here + 1))
+        beyond = min(np.searchsorted(path, path[here] + 1.0, "right"), np.searchsorted(turned, turned[here] + 1.0, "right"))
+        chosen.append(min(max(int(beyond) - 1, here + 1), last))
     if len(chosen) > 2 and path[last] - path[chosen[-2]] < 0.5 and turned[last] - turned[chosen[-2]] < 0.5:
         del chosen[-2]
     return np.array(chosen, dtype=np.int64)

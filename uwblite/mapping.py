@@ -8,6 +8,7 @@ least squares, noise learnt from the data, tracking between neighbouring clouds 
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from . import (
     first_estimate,
     keyframes,
     loop_closure,
+    map_frame,
     occupancy_grid,
     pair_matching,
     refinement,
@@ -36,7 +38,7 @@ from .keyframes import KeyframeConfig, Keyframes
 from .loop_closure import Closures, LoopClosureConfig
 from .map_result import MapResult, StageSummary
 from .marginals import marginals
-from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_edges
+from .measurement import OdometryNoiseConfig, learn_noise, learn_wheels, range_edges, wheel_edges
 from .occupancy_grid import GridConfig, OccupancyGrid
 from .pair_matching import NearestRaster
 from .range_noise import RangeNoiseConfig, short_term_sigma
@@ -64,6 +66,11 @@ class MappingConfig:
     """Use the scans."""
     use_loops: bool = True
     """Search loop closures and match clouds of different times."""
+    align: Literal["odometry", "first-pose", "walls", "anchors"] = "odometry"
+    """Where the map's axes lie: where the odometry began; at the first pose; there, turned so that most walls run along x
+    and y; or at the first placed anchor, x towards the last."""
+    crop: tuple[float, float, float, float] | None = None
+    """Keep only this part of the grid: x0, y0, x1, y1, m, map frame."""
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
     ranges: RangeNoiseConfig = field(default_factory=RangeNoiseConfig)
@@ -150,11 +157,13 @@ def build_map(
     if scans is not None:
         stages.end("clouds", points=len(scans.clouds.points))
         graph = _free(graph, "laser_x", "laser_y", "laser_theta", "laser_delay")
-        graph, refined = _track(graph, edges, scans, path, config, stages)
+        graph, wheels, refined = _track(graph, wheels, radio, scans, path, config, stages)
+        edges = (wheels, *edges[1:])
         if config.use_loops:
             graph, closures, _shown = _close_loops(graph, edges, refined, scans, path, config, stages)
             graph, radio, refined, closures = _refine_jointly(graph, wheels, radio, closures, scans, path, config, stages)
     graph = _final_graph(graph, wheels, radio, closures, refined)
+    graph, first = _aligned(graph, first, scans, config)
 
     grid = _grid(log, frames, graph, config, executor, stages)
     uncertainty = marginals(graph)
@@ -262,19 +271,22 @@ def _match_round(
 
 
 def _track(
-    graph: Graph, edges: tuple[Edges, ...], scans: _Scans, path: Floats, config: MappingConfig, stages: Stages
-) -> tuple[Graph, Refined]:
+    graph: Graph, wheels: OdometryEdges, radio: RangeEdges | None, scans: _Scans, path: Floats, config: MappingConfig,
+    stages: Stages,
+) -> tuple[Graph, OdometryEdges, Refined]:
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
     settings = replace(config.refinement, partners=0, rounds=config.refinement.track_rounds)
     session = np.zeros(len(path), dtype=np.int64)
     steps, searched = tracking.follow(
         scans.clouds, scans.raster, graph.poses, session, config.refinement.first_gate, config.tracking, config.search
     )
+    wheels = learn_wheels(wheels, steps, graph)
+    edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
     graph = _estimates(graph, optimize(graph.with_edges(*edges, steps), config.solver)[0])
     i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, settings)
     graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "tracking")
     stages.end("tracking", pairs=len(i), searched=searched, used=int(refined.used.sum()), sigma=round(refined.sigma, 4), rounds=refined.rounds)
-    return graph, refined
+    return graph, wheels, refined
 
 
 def _close_loops(
@@ -344,6 +356,23 @@ def _final_graph(
     return graph.with_edges(*edges)
 
 
+def _aligned(
+    graph: Graph, first: FirstEstimate | None, scans: _Scans | None, config: MappingConfig
+) -> tuple[Graph, FirstEstimate | None]:
+    """Put the map's axes where the settings want them."""
+    placed = np.zeros(len(graph.anchors), dtype=bool) if first is None else first.placed
+    normals = np.zeros((0, 2))
+    if scans is not None and config.align == "walls":
+        normals = se2.rotate(graph.poses[scans.clouds.owner, 2], scans.clouds.normals)
+    motion = map_frame.alignment(config.align, graph, placed, normals)
+    if first is not None:
+        moved = tuple(
+            tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in first.hypotheses
+        )
+        first = replace(first, hypotheses=moved)
+    return map_frame.moved(graph, motion), first
+
+
 def _grid(
     log: SensorLog, frames: Keyframes, graph: Graph, config: MappingConfig, executor: Executor | None, stages: Stages
 ) -> OccupancyGrid | None:
@@ -360,6 +389,8 @@ def _grid(
         ends[0], log.scans, config.grid, last=ends[1], flipped=log.mounting.laser_flipped, executor=executor,
         progress=stages.teller("occupancy grid"),
     )
+    if config.crop is not None:
+        grid = map_frame.cropped(grid, config.crop)
     stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)
     return grid
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from . import se2
 from .anchors import AnchorConfig, usable
 from .calibration import odometry_indices, range_indices
-from .graph import Calibration, Graph, OdometryEdges, RangeEdges
+from .graph import Calibration, Graph, OdometryEdges, RangeEdges, RelativePoseEdges
 from .keyframes import AttachedRanges, Keyframes
 from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn
 from .robust import Kernel
@@ -113,3 +113,22 @@ def learn_noise(
         sigma[own] = effective_sigma(positions[own], noise)
         noises.append(noise)
     return replace(edges, sigma=sigma), tuple(noises)
+
+
+def learn_wheels(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
+    """Scale the wheels' noise so that it explains how far they lie from steps that the lidar measured.
+
+    Parameters
+    ----------
+    wheels : edges between neighbouring poses, in the order of the poses.
+    steps : measured steps between neighbouring poses; with fewer than 20 the wheels keep their noise.
+    graph : holds the wheels' calibration.
+    """
+    if len(steps) < 20:
+        return wheels
+    own = np.searchsorted(wheels.i, steps.i)
+    off = se2.between(steps.T_i_j, wheels.corrected(graph)[own])
+    off = np.abs(np.einsum("eij,ej->ei", wheels.sqrt_information[own], off))
+    spread = 1.4826 * np.array([np.median(off[:, :2]), np.median(off[:, 2])])
+    position, heading = np.clip(spread, 0.5, 10.0)
+    return replace(wheels, sqrt_information=wheels.sqrt_information / np.array([position, position, heading])[:, None])

@@ -15,7 +15,6 @@ from .loop_closure import align_pairs
 from .graph import RelativePoseEdges
 from .pair_matching import NearestRaster, match, measured, pair_points
 from .point_cloud import make_cloud
-from .robust import Kernel
 from .scan_search import SearchConfig, search
 
 Floats = NDArray[np.float64]
@@ -79,7 +78,7 @@ def follow(
     kept = enough & (share >= config.least_share)
     factors = match(clouds, raster, i, step, points, tight, tight / 2.0)
     z, sqrt_information = measured(factors, step, np.full(len(i), config.sigma**2 * config.correlation))
-    edges = RelativePoseEdges(i[kept], i[kept] + 1, z[kept], sqrt_information[kept], Kernel("cauchy", 5.0))
+    edges = RelativePoseEdges(i[kept], i[kept] + 1, z[kept], sqrt_information[kept])
     return edges, searched
 
 
