@@ -10,14 +10,14 @@ so only two counts per cell need be kept, their order does not matter, and work 
 who stood somewhere for a few scans is outvoted by the scans that look through the place later.
 
 A beam that saw nothing is weak evidence: the URG-04LX cannot tell "nothing there" from "too dark or too oblique". Such
-beams never draw anything; runs of adjacent ones clear space, with less weight, up to a stated distance.
+beams never draw anything; runs of adjacent ones clear space, with less weight, up to a stated distance and never beyond a
+wall that other beams have drawn. That takes a second walk over the scans, once the walls are known.
 """
 
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,14 @@ from numpy.typing import NDArray
 from .errors import ConfigError, DataError
 from .grid_geometry import GridGeometry
 from .ray_counter import WEIGHT_UNIT, Counts, RayCounter
-from .scan_rays import ScanRays, extent, moved_scans, scan_rays
+from .scan_rays import ScanRays, empty_reach, extent, moved_scans, scan_rays, seen_reach
 from .sensor_log import LaserScans
 
 __all__ = ["GridConfig", "GridGeometry", "OccupancyGrid", "RayCounter", "from_counts", "from_scans"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 Progress = Callable[[int, int], None]
 """Called as progress(scans done, scans in all)."""
 
@@ -62,7 +63,7 @@ class GridConfig:
     max_range: float = 0.0
     """Longer readings are not used, m; 0 = up to what the scanner reaches."""
     max_clear_distance: float = 3.0
-    """Beams that saw nothing clear space up to this distance, m; 0 = they clear nothing."""
+    """Beams that saw nothing clear space up to this distance or the first wall, m; 0 = they clear nothing."""
     clear_run: int = 5
     """Least number of adjacent beams that saw nothing before they clear space."""
     clear_weight: float = 0.5
@@ -111,7 +112,7 @@ class OccupancyGrid:
         return self.geometry.centre_of(row.astype(np.int64), col.astype(np.int64))
 
 
-def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
+def from_counts(counter: RayCounter, config: GridConfig, scans_used: int = 0) -> OccupancyGrid:
     """Return the map that counted hits and misses make: additive log-odds, clamped."""
     per_hit = np.float32(math.log(config.p_hit / (1.0 - config.p_hit)))
     per_miss = np.float32(math.log(config.p_miss / (1.0 - config.p_miss)) / WEIGHT_UNIT)
@@ -121,7 +122,7 @@ def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
         rows = slice(start, start + 256)
         part = counter.hits[rows] * per_hit + counter.misses[rows] * per_miss
         log_odds[rows] = np.clip(part, -config.clamp, config.clamp)
-    return OccupancyGrid(counter.geometry, log_odds, counter.scans_used)
+    return OccupancyGrid(counter.geometry, log_odds, scans_used)
 
 
 def from_scans(
@@ -161,20 +162,24 @@ def from_scans(
     task = _Task(scans, chosen, first[chosen], None if last is None else last[chosen], flipped, config)
     around = geometry or GridGeometry.around(*task.extent(), config.resolution, config.max_cells)
     counter = RayCounter(around, config.clear_weight)
-    if executor is None:
-        for done, rays in task.batches():
-            counter.insert_rays(rays.origins, rays.endpoints, rays.hit, rays.scan)
-            if progress is not None:
-                progress(done, len(chosen))
-    else:
-        done = 0
-        parts = task.split(_TASKS)
-        for part, counts in zip(parts, executor.map(_count, parts, [around] * len(parts)), strict=True):
-            counter.add(*counts)
-            done += len(part.chosen)
-            if progress is not None:
-                progress(done, len(chosen))
-    return from_counts(counter if geometry else counter.cropped(), config)
+    clears = config.max_clear_distance > 0 and config.clear_weight > 0
+
+    def tell(done: int) -> None:
+        if progress is not None:
+            progress(done, len(chosen) * (2 if clears else 1))
+
+    _trace(task, counter, None, executor, tell)
+    if clears:
+        walls = walls_of(from_counts(counter, config))
+        _trace(task, counter, walls, executor, lambda done: tell(len(chosen) + done))
+    return from_counts(counter if geometry else counter.cropped(), config, len(chosen))
+
+
+def walls_of(grid: OccupancyGrid) -> Bools:
+    """Return which cells (rows, cols) are occupied or next to an occupied one: walls without holes of two cells."""
+    occupied = np.pad(grid.log_odds > math.log(OCCUPIED_ABOVE / (1.0 - OCCUPIED_ABOVE)), 1)
+    beside = occupied[:-2] | occupied[1:-1] | occupied[2:]
+    return beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,30 +193,32 @@ class _Task:
     flipped: bool
     config: GridConfig
 
-    def batches(self) -> Iterator[tuple[int, ScanRays]]:
-        """Yield (scans done, rays) for a bounded number of scans at a time."""
+    def _parts(self) -> Iterator[slice]:
+        """Yield a bounded number of scans at a time."""
         for start in range(0, len(self.chosen), _SCANS_AT_A_TIME):
-            part = slice(start, start + _SCANS_AT_A_TIME)
-            yield min(part.stop, len(self.chosen)), self._apply(scan_rays, part)
+            yield slice(start, min(start + _SCANS_AT_A_TIME, len(self.chosen)))
+
+    def _reach(self, part: slice, empty: bool) -> NDArray[np.float32]:
+        config, chosen = self.config, self.chosen[part]
+        if empty:
+            return empty_reach(self.scans, chosen, config.max_clear_distance, config.clear_run)
+        return seen_reach(self.scans, chosen, config.max_range or math.inf)
+
+    def _poses(self, part: slice) -> tuple[Floats, Floats | None]:
+        return self.first[part], None if self.last is None else self.last[part]
+
+    def batches(self, empty: bool) -> Iterator[tuple[int, ScanRays]]:
+        """Yield (scans done, rays): of beams that saw something, or of those that saw nothing."""
+        for part in self._parts():
+            yield part.stop, scan_rays(self.scans, self._reach(part, empty), *self._poses(part), flipped=self.flipped)
 
     def extent(self) -> tuple[Floats, Floats]:
         """Return the corners (2,) of a box around all rays, m."""
-        parts = range(0, len(self.chosen), _SCANS_AT_A_TIME)
-        boxes = [self._apply(extent, slice(start, start + _SCANS_AT_A_TIME)) for start in parts]
+        boxes = []
+        for part in self._parts():
+            reach = np.maximum(self._reach(part, False), self._reach(part, True))
+            boxes.append(extent(self.scans, reach, *self._poses(part), flipped=self.flipped))
         return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
-
-    def _apply(self, function: Callable[..., Any], part: slice) -> Any:
-        """Call a function of scan_rays for some of the scans."""
-        return function(
-            self.scans,
-            self.chosen[part],
-            self.first[part],
-            None if self.last is None else self.last[part],
-            flipped=self.flipped,
-            max_range=self.config.max_range or math.inf,
-            max_clear_distance=self.config.max_clear_distance,
-            clear_run=self.config.clear_run,
-        )
 
     def split(self, parts: int) -> "list[_Task]":
         """Return tasks that hold only their own share of the scans."""
@@ -224,9 +231,31 @@ class _Task:
         return [task for task in tasks if len(task.chosen)]
 
 
-def _count(task: _Task, geometry: GridGeometry) -> tuple[Counts, Counts, int]:
+def _trace(
+    task: _Task, counter: RayCounter, walls: Bools | None, executor: Executor | None, tell: Callable[[int], None]
+) -> None:
+    """Trace the beams that saw something, or, where walls are given, those that saw nothing."""
+    if executor is None:
+        for done, rays in task.batches(empty=walls is not None):
+            _insert(counter, rays, walls)
+            tell(done)
+        return
+    parts = task.split(_TASKS)
+    done = 0
+    same: tuple[list[GridGeometry], list[Bools | None]] = [counter.geometry] * len(parts), [walls] * len(parts)
+    for part, counts in zip(parts, executor.map(_count, parts, *same), strict=True):
+        counter.add(*counts)
+        done += len(part.chosen)
+        tell(done)
+
+
+def _count(task: _Task, geometry: GridGeometry, walls: Bools | None) -> tuple[Counts, Counts]:
     """Trace one task; runs in a worker."""
     counter = RayCounter(geometry, task.config.clear_weight)
-    for _, rays in task.batches():
-        counter.insert_rays(rays.origins, rays.endpoints, rays.hit, rays.scan)
-    return counter.hits, counter.misses, counter.scans_used
+    for _, rays in task.batches(empty=walls is not None):
+        _insert(counter, rays, walls)
+    return counter.hits, counter.misses
+
+
+def _insert(counter: RayCounter, rays: ScanRays, walls: Bools | None) -> None:
+    counter.insert_rays(rays.origins, rays.endpoints, np.full(len(rays.scan), walls is None), rays.scan, walls)

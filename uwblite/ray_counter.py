@@ -37,10 +37,16 @@ class RayCounter:
         self._weak = round(clear_weight * WEIGHT_UNIT)
         self.hits: Counts = np.zeros((geometry.rows, geometry.cols), dtype=np.int32)
         self.misses: Counts = np.zeros((geometry.rows, geometry.cols), dtype=np.int32)
-        self.scans_used = 0
         self._scratch = np.zeros(0, dtype=np.uint8)
 
-    def insert_rays(self, origins: Floats, endpoints: Floats, hit: Bools, scan: Ints | None = None) -> None:
+    def insert_rays(
+        self,
+        origins: Floats,
+        endpoints: Floats,
+        hit: Bools,
+        scan: Ints | None = None,
+        walls: Bools | None = None,
+    ) -> None:
         """Trace rays; within one scan every cell counts once.
 
         Parameters
@@ -49,11 +55,14 @@ class RayCounter:
         endpoints : (r, 2) where the rays end, m, map frame.
         hit : (r,) whether something is there; a ray without a hit clears with clear_weight.
         scan : (r,) number of the scan of each ray, non-decreasing; None = all rays are of one scan.
+        walls : (rows, cols) cells before which rays without a hit end.
         """
         if origins.shape != endpoints.shape or hit.shape != origins.shape[:1]:
             raise DataError(f"rays of shapes {origins.shape}, {endpoints.shape} and {hit.shape} do not belong together")
         if len(hit) == 0:
             return
+        if walls is not None and walls.shape != self.hits.shape:
+            raise DataError(f"walls of shape {walls.shape} do not fit a grid of {self.hits.shape}")
         slot = np.zeros(len(hit), dtype=np.int64)
         if scan is not None:
             slot[1:] = np.cumsum(np.diff(scan) != 0)
@@ -64,9 +73,9 @@ class RayCounter:
         for column in (hit, *cells):
             changed[1:] |= column[1:] != column[:-1]
         slot, hit, cells = slot[changed], hit[changed], cells[:, changed]
-        self._trace(slot, hit, cells)
+        self._trace(slot, hit, cells, walls)
 
-    def _trace(self, slot: Ints, hit: Bools, cells: Ints) -> None:
+    def _trace(self, slot: Ints, hit: Bools, cells: Ints, walls: Bools | None) -> None:
         """Trace the rays of scans 0..n-1, as many scans at a time as working memory allows."""
         starts = np.searchsorted(slot, np.arange(slot[-1] + 2))
         rows, cols = np.minimum(cells[0], cells[2]), np.minimum(cells[1], cells[3])
@@ -81,11 +90,12 @@ class RayCounter:
             area = np.maximum.accumulate(size[first:], axis=0).prod(axis=1) * np.arange(1, len(low) - first + 1)
             last = first + max(1, int(np.searchsorted(area, _SCRATCH_CELLS, "right")))
             rays = slice(starts[first], starts[last])
-            self._trace_batch(slot[rays] - first, hit[rays], cells[:, rays], low[first:last], size[first:last])
+            self._trace_batch(slot[rays] - first, hit[rays], cells[:, rays], low[first:last], size[first:last], walls)
             first = last
-        self.scans_used += len(low)
 
-    def _trace_batch(self, slot: Ints, hit: Bools, cells: Ints, low: Ints, size: Ints) -> None:
+    def _trace_batch(
+        self, slot: Ints, hit: Bools, cells: Ints, low: Ints, size: Ints, walls: Bools | None
+    ) -> None:
         """Trace each scan into a window of its own, then add the windows to the grid."""
         height, width = size.max(axis=0).tolist()
         window = height * width
@@ -96,10 +106,11 @@ class RayCounter:
         begin, end = cells[:2] - low[slot].T, cells[2:] - low[slot].T
         start = slot * window + begin[0] * width + begin[1]
         step = end - begin
+        stops = None if walls is None else self._windows_of(walls, low, height, width)
         # Stronger evidence is written later and wins.
-        for rays, weight in ((~hit, self._weak), (hit, WEIGHT_UNIT)):
+        for rays, weight, stop in ((~hit, self._weak, stops), (hit, WEIGHT_UNIT, None)):
             if weight:
-                mark_rays(marks, start[rays], step[0, rays], step[1, rays], width, weight)
+                mark_rays(marks, start[rays], step[0, rays], step[1, rays], width, weight, stop)
         ends = np.sort((slot * window + end[0] * width + end[1])[hit])
         ends = ends[np.diff(ends, prepend=-1) > 0]
         marks[ends] = 0
@@ -126,6 +137,15 @@ class RayCounter:
             rows, cols = part.shape
             self.misses[row + top : row + top + rows, col + left : col + left + cols] += part
 
+    def _windows_of(self, cells: Bools, low: Ints, height: int, width: int) -> Bools:
+        """Return the scans' windows (flat) onto a grid of flags; outside the grid nothing is set."""
+        windows = np.zeros((len(low), height, width), dtype=np.bool_)
+        for window, (row, col) in zip(windows, low.tolist(), strict=True):
+            top, left = max(-row, 0), max(-col, 0)
+            part = cells[max(row, 0) : max(row + height, 0), max(col, 0) : max(col + width, 0)]
+            window[top : top + part.shape[0], left : left + part.shape[1]] = part
+        return windows.reshape(-1)
+
     def cropped(self, margin: int = 2) -> "RayCounter":
         """Return the same counts in the smallest grid that holds all of them and a margin of cells."""
         seen = (self.hits > 0) | (self.misses > 0)
@@ -139,8 +159,7 @@ class RayCounter:
         counter.geometry = self.geometry.window(top, left, *counter.hits.shape)
         return counter
 
-    def add(self, hits: Counts, misses: Counts, scans_used: int) -> None:
+    def add(self, hits: Counts, misses: Counts) -> None:
         """Add the counts of other scans in the same grid."""
         self.hits += hits
         self.misses += misses
-        self.scans_used += scans_used

@@ -22,8 +22,6 @@ class ScanRays:
     """(r, 2) m, map frame."""
     endpoints: Floats
     """(r, 2) m, map frame."""
-    hit: Bools
-    """(r,) something is at the endpoint; otherwise the ray only clears."""
     scan: Ints
     """(r,) index of the scan, in the order given."""
 
@@ -53,30 +51,31 @@ def moved_scans(poses: Floats, distance: float, angle: float) -> Ints:
     return np.array(chosen, dtype=np.int64)
 
 
+def seen_reach(scans: LaserScans, chosen: Ints, max_range: float = math.inf) -> NDArray[np.float32]:
+    """Return the length (s, b) of the rays of chosen scans (s,) that ended at something up to max_range, m; 0 = none."""
+    readings = scans.ranges[chosen]
+    return np.where((readings >= scans.range_min) & (readings <= min(max_range, scans.range_max)), readings, np.float32(0.0))
+
+
+def empty_reach(scans: LaserScans, chosen: Ints, distance: float, run: int) -> NDArray[np.float32]:
+    """Return `distance` (s, b), m, for beams of chosen scans that saw nothing, in runs of at least `run`; 0 = others."""
+    reach = np.float32(min(distance, scans.range_max))
+    return np.where(in_runs(np.isposinf(scans.ranges[chosen]), run), reach, np.float32(0.0))
+
+
 def scan_rays(
-    scans: LaserScans,
-    chosen: Ints,
-    first: Floats,
-    last: Floats | None = None,
-    *,
-    flipped: bool = False,
-    max_range: float = math.inf,
-    max_clear_distance: float = 0.0,
-    clear_run: int = 1,
+    scans: LaserScans, reach: NDArray[np.float32], first: Floats, last: Floats | None = None, *, flipped: bool = False
 ) -> ScanRays:
-    """Return the rays of some scans: all readings up to max_range, and runs of beams that saw nothing.
+    """Return the rays of some scans.
 
     Parameters
     ----------
-    chosen : (s,) indices of scans.
-    first : (s, 3) T_map_laser at the first ray of each chosen scan.
+    scans : their geometry.
+    reach : (s, b) length of the rays of each scan, m; where it is 0 there is no ray.
+    first : (s, 3) T_map_laser at the first ray of each scan.
     last : (s, 3) T_map_laser at the last ray; in between the laser moves evenly. None = it stood still.
     flipped : the laser is mounted upside down; its rays run clockwise.
-    max_range : longer readings are left out, m.
-    max_clear_distance : length of rays of beams that saw nothing, m; 0 = there are none.
-    clear_run : least number of adjacent beams that saw nothing.
     """
-    reach, hit = _reaches(scans, chosen, max_range, max_clear_distance, clear_run)
     used = reach > 0
     beams = reach.shape[1]
     moved = np.zeros_like(first) if last is None else last - first
@@ -90,24 +89,14 @@ def scan_rays(
         start = first[:, axis, None] + moved[:, axis, None] * fraction
         origins[axis] = start[used]
         ends[axis] = (start + reach * direction)[used]
-    scan = np.repeat(np.arange(len(chosen)), np.count_nonzero(used, axis=1))
-    return ScanRays(origins.T, ends.T, hit[used], scan)
+    return ScanRays(origins.T, ends.T, np.repeat(np.arange(len(reach)), np.count_nonzero(used, axis=1)))
 
 
 def extent(
-    scans: LaserScans,
-    chosen: Ints,
-    first: Floats,
-    last: Floats | None = None,
-    *,
-    flipped: bool = False,
-    max_range: float = math.inf,
-    max_clear_distance: float = 0.0,
-    clear_run: int = 1,
+    scans: LaserScans, reach: NDArray[np.float32], first: Floats, last: Floats | None = None, *, flipped: bool = False
 ) -> tuple[Floats, Floats]:
     """Return the corners (2,) of a box that holds all rays of some scans (see scan_rays), quickly and hardly too large."""
     low, high = first[:, :2].min(axis=0), first[:, :2].max(axis=0)
-    reach, _ = _reaches(scans, chosen, max_range, max_clear_distance, clear_run)
     angles = -scans.angles if flipped else scans.angles
     ahead, aside = reach * np.cos(angles).astype(np.float32), reach * np.sin(angles).astype(np.float32)
     c, s = (v[:, None].astype(np.float32) for v in (np.cos(first[:, 2]), np.sin(first[:, 2])))
@@ -122,18 +111,6 @@ def _sweep_reach(first: Floats, last: Floats, reach: NDArray[np.float32]) -> Flo
     """Return how far (s,) the motion within a scan can move the end of a ray, m."""
     moved = np.abs(last - first)
     return np.hypot(moved[:, 0], moved[:, 1]) + np.abs(se2.wrap_angle(moved[:, 2])) * reach
-
-
-def _reaches(
-    scans: LaserScans, chosen: Ints, max_range: float, max_clear_distance: float, clear_run: int
-) -> tuple[NDArray[np.float32], Bools]:
-    """Return the length of every ray (s, b), m, 0 where there is none, and whether something is at its end."""
-    readings = scans.ranges[chosen]
-    hit = (readings >= scans.range_min) & (readings <= min(max_range, scans.range_max))
-    reach = np.where(hit, readings, np.float32(0.0))
-    if max_clear_distance > 0.0:
-        reach[in_runs(np.isposinf(readings), clear_run)] = min(max_clear_distance, scans.range_max)
-    return reach, hit
 
 
 def in_runs(flags: Bools, least: int) -> Bools:
