@@ -1,4 +1,8 @@
 import contextlib
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +12,7 @@ from hypothesis import strategies as st
 from uwblite.errors import FormatError
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png, encode_png
+from uwblite.io.tum import write_tum
 from uwblite.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridGeometry, OccupancyGrid
 
 
@@ -148,3 +153,17 @@ def test_anything_else_is_a_format_error(tmp_path_factory, image, extra):
     (folder / "map.pgm").write_bytes(b"P5 2 2 255\n" + image)
     with contextlib.suppress(FormatError):
         read_map(folder / "map.yaml")
+
+
+@pytest.mark.slow
+def test_evo_draws_a_path_on_the_map(tmp_path):
+    pytest.importorskip("evo")
+    _, yaml = write_map(tmp_path, sample(60, 80))
+    poses = np.linspace([-12.0, 4.0, 0.0], [-9.0, 5.0, 0.0], 5)
+    write_tum(tmp_path / "a.tum", np.arange(5.0), poses)
+    command = ["evo_traj", "tum", "a.tum", "--ros_map_yaml", yaml.name, "--plot_mode", "xy", "--save_plot", "plot.png"]
+    environment = os.environ | {"HOME": str(tmp_path), "MPLBACKEND": "Agg"}
+    program = Path(sys.executable).with_name(command[0])
+    result = subprocess.run([program, *command[1:]], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert list(tmp_path.glob("plot*.png"))
