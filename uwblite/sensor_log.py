@@ -158,7 +158,7 @@ class SensorLog:
 def _check(values: Floats, name: str, shape: tuple[int | None, ...], ordered: bool = False) -> None:
     if values.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, values.shape, strict=True)):
         raise DataError(f"{name} has shape {values.shape}, expected {shape}")
-    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
     if len(bad):
         raise DataError(f"{name}[{bad[0]}] is not finite ({len(bad)} such rows)")
     if ordered and np.any(np.diff(values) < 0):

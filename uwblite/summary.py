@@ -30,7 +30,10 @@ def summarise(
     """Gather the result of a run; see MapResult."""
     residuals, weights = _range_residuals(graph, radio)
     ids = log.ranges.anchor_ids if log.ranges is not None else ()
-    anchors = tuple(_anchor(k, ids, log, graph, known, first, radio, residuals, weights) for k in range(len(ids)))
+    typical = 0.0
+    if first is not None and radio is not None and first.placed.any():
+        typical = float(np.median([_spread(residuals[radio.anchor == k]) for k in np.flatnonzero(first.placed)]))
+    anchors = tuple(_anchor(k, ids, log, graph, known, first, radio, residuals, typical) for k in range(len(ids)))
     told = np.array([log.mounting.height_difference(a) is not None for a in ids], dtype=bool)
     listed = unknowns(config, ids, told)
     calibrated = tuple(_calibration(k, u, graph, known) for k, u in enumerate(listed))
@@ -66,9 +69,14 @@ def _range_residuals(graph: Graph, radio: RangeEdges | None) -> tuple[Floats, Fl
     return whitened * radio.sigma, own * radio.kernel.weight(whitened**2)
 
 
+def _spread(residuals: Floats) -> float:
+    """Return the robust standard deviation of residuals about their median."""
+    return 1.4826 * float(np.median(np.abs(residuals - np.median(residuals))))
+
+
 def _anchor(
     k: int, ids: tuple[str, ...], log: SensorLog, graph: Graph, known: Marginals, first: FirstEstimate | None,
-    radio: RangeEdges | None, residuals: Floats, weights: Floats,
+    radio: RangeEdges | None, residuals: Floats, typical: float,
 ) -> AnchorEstimate:
     assert log.ranges is not None
     count = int(np.sum(log.ranges.anchor == k))
@@ -76,10 +84,10 @@ def _anchor(
         reason = f"its {count} ranges were too few or did not agree on a place"
         nowhere = np.full(2, np.nan)
         return AnchorEstimate(ids[k], nowhere, np.full((2, 2), np.nan), count, 0.0, np.nan, np.nan, np.nan, "unplaced", reason)
-    own = radio.anchor == k
-    spread = 1.4826 * float(np.median(np.abs(residuals[own] - np.median(residuals[own]))))
-    # A share by distance from the bulk, not by kernel weight: effective sigmas are wide where ranges repeat each other.
-    used = float(np.mean(np.abs(residuals[own] - np.median(residuals[own])) < 3.0 * max(spread, 0.05)))
+    own = residuals[radio.anchor == k]
+    # A share by distance, not by kernel weight: effective sigmas are wide where ranges repeat each other. The measure is
+    # what ranges to a typical anchor scatter; by its own scatter, no anchor would ever lie.
+    used = float(np.mean(np.abs(own) < 3.0 * max(typical, 0.05)))
     bias_at = graph.calibration.index(f"bias:{ids[k]}")
     bias = float(graph.calibration.values[bias_at]) if bias_at >= 0 else 0.0
     bias_sigma = float(known.calibration[bias_at]) if bias_at >= 0 else 0.0
@@ -90,7 +98,7 @@ def _anchor(
     elif used < 0.5:
         status, reason = "distrusted", f"only {used:.0%} of its ranges agree with the map"
     return AnchorEstimate(
-        ids[k], graph.anchors[k], known.anchors[k], count, used, bias, bias_sigma, spread, status, reason, alternative
+        ids[k], graph.anchors[k], known.anchors[k], count, used, bias, bias_sigma, _spread(own), status, reason, alternative
     )
 
 
@@ -121,10 +129,12 @@ def _doubts(
     placed = [a for a in anchors if a.status != "unplaced"]
     if anchors and not placed:
         doubts.append("no anchor could be placed: the trajectory rests on odometry and lidar alone")
-    if log.ranges is None:
+    if log.ranges is None or not len(log.ranges.ranges):
         warnings.append("no UWB ranges in use: the map rests on odometry and lidar")
     if grid is None:
         warnings.append("no lidar in use: trajectory and anchors only, no map")
+    elif log.scans is not None and not np.isfinite(log.scans.ranges).any():
+        warnings.append("the lidar saw nothing in any scan: the map is empty")
     accepted = sum(c.accepted for c in closures.candidates)
     if grid is not None and closures.candidates and accepted == 0:
         text = "no loop closure was accepted"

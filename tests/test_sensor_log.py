@@ -1,0 +1,76 @@
+"""One recording as arrays: what is checked when it enters, and parts of it."""
+
+import numpy as np
+import pytest
+from planted import box, odometry, ranges, recording, scans, wander
+
+from uwblite.errors import DataError
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
+
+
+@pytest.fixture(scope="module")
+def log() -> SensorLog:
+    rng = np.random.default_rng(0)
+    stamps, truth = wander(rng, 10.0, half_width=2.0)
+    radio = ranges(rng, stamps, truth, np.array([[4.0, 0.0], [-4.0, 1.0], [0.0, 5.0]]), heard=[[0, 99], [0, 8], [12, 99]])
+    return recording(odometry(stamps, truth), radio, scans(stamps, truth, box(8, 8), beams=30))
+
+
+def test_a_part_holds_what_lies_within_its_ends(log):
+    part = log.crop(9.0, 11.0)
+    for stamps in (part.odometry.stamps, part.ranges.stamps, part.scans.stamps):
+        assert stamps[0] >= 9.0
+        assert stamps[-1] <= 11.0
+    inside = (log.ranges.stamps >= 9.0) & (log.ranges.stamps <= 11.0)
+    np.testing.assert_array_equal(part.ranges.ranges, log.ranges.ranges[inside])
+    said = [part.ranges.anchor_ids[k] for k in part.ranges.anchor]
+    assert said == [log.ranges.anchor_ids[k] for k in log.ranges.anchor[inside]]
+    assert part.ranges.anchor_ids == ("A00",)
+    assert len(log.crop().odometry.stamps) == len(log.odometry.stamps)
+
+
+def test_a_part_without_scans_or_ranges_is_a_recording_too(log):
+    late = log.odometry.stamps[-1]
+    part = log.crop(late - 0.01, late)
+    assert len(part.odometry.stamps) == 1
+    assert len(part.scans.stamps) == 0
+    assert part.scans.ranges.shape == (0, 30)
+
+
+def test_a_part_without_odometry_is_none(log):
+    with pytest.raises(DataError, match="no odometry"):
+        log.crop(1e6, 2e6)
+
+
+def test_sensors_can_be_left_out(log):
+    assert log.without(uwb=True).ranges is None
+    assert log.without(uwb=True).scans is log.scans
+    assert log.without(lidar=True).scans is None
+    assert log.without().ranges is log.ranges
+
+
+ONE = Odometry(np.zeros(1), np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: SensorLog(Odometry(np.zeros(2), np.zeros((3, 3)))), "odometry.poses"),
+        (lambda: SensorLog(Odometry(np.array([1.0, 0.0]), np.zeros((2, 3)))), "backwards at index 1"),
+        (lambda: SensorLog(Odometry(np.zeros(2), np.array([[0.0, 0, 0], [np.nan, 0, 0]]))), r"poses\[1\] is not finite"),
+        (lambda: SensorLog(ONE, UwbRanges(np.zeros(1), np.array([1]), np.ones(1), np.ones(1), ("A",))), "outside anchor_ids"),
+        (lambda: SensorLog(ONE, UwbRanges(np.zeros(2), np.zeros(1, int), np.ones(2), np.ones(2), ("A",))), "ranges.anchor"),
+        (lambda: SensorLog(ONE, UwbRanges(np.zeros(1), np.zeros(1, int), np.ones(2), np.ones(1), ("A",))), "ranges.ranges"),
+        (lambda: SensorLog(ONE, None, LaserScans(np.zeros(2), np.ones((1, 4), np.float32), 0, 1, 0, 0, 9)), "scans.ranges"),
+    ],
+)
+def test_what_does_not_fit_is_named(make, words):
+    with pytest.raises(DataError, match=words):
+        make()
+
+
+def test_heights_of_single_anchors_win():
+    mounting = SensorMounting(tag_position=np.array([0, 0, 0.3]), anchor_height=2.0, anchor_heights={"A": 1.0})
+    assert mounting.height_difference("A") == pytest.approx(0.7)
+    assert mounting.height_difference("B") == pytest.approx(1.7)
+    assert SensorMounting().height_difference("A") is None
