@@ -57,6 +57,11 @@ class LoopClosureConfig:
     """Least share of points with a match after a search, which can be fooled."""
     uniqueness: float = 0.85
     """A second place that matches this share as well as the first makes a search ambiguous."""
+    slip: float = 1.0
+    """Standard deviation, m, added to the graph's guess where matching from it failed although the sub-maps ought to
+    overlap and no radio holds the trajectory: the wheels may have slipped. Such pairs are searched anew."""
+    slip_angle: float = 0.2
+    """The same for the heading, rad."""
     consistency: float = 16.0
     """Largest squared Mahalanobis distance between match and graph (3 degrees of freedom; 16 = 0.1 %)."""
     points: int = 250
@@ -103,7 +108,7 @@ class Candidates:
 
 def propose(
     graph: Graph, marginals: Marginals, submaps: Submaps, session: Ints, tried: set[tuple[int, int, bool]],
-    config: LoopClosureConfig,
+    missed: set[tuple[int, int]], config: LoopClosureConfig,
 ) -> Candidates:
     """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
 
@@ -112,6 +117,7 @@ def propose(
     graph, marginals : present estimates and their uncertainty.
     session : (k,) recording of each keyframe.
     tried : (target, source, searched) of earlier rounds; not proposed again.
+    missed : (target, source) that did not match from the graph's guess though the graph may be wrong: searched with slack.
     """
     s = len(submaps)
     reference = submaps.reference
@@ -125,13 +131,16 @@ def propose(
     if not len(a):
         return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
     covariance = marginals.relative(reference[a], reference[b])
+    slack = np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
+    astray = np.array([(int(x), int(y)) in missed for x, y in zip(a, b, strict=True)])
+    covariance = covariance + astray[:, None, None] * slack
     spread = 3.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
     seen = surface_cells(submaps.clouds, poses)
     common = np.asarray((seen @ seen.T).todense())[a, b]
     size = np.maximum(np.diff(seen.indptr), 1)
     expected = common / np.minimum(size[a], size[b])
     doubtful = spread > config.direct
-    worth = np.where(doubtful, 1.0 - distance / (config.reach + np.minimum(spread, config.search_limit)), expected)
+    worth = np.where(doubtful & ~astray, 1.0 - distance / (config.reach + np.minimum(spread, config.search_limit)), expected)
     possible = np.where(doubtful, worth > 0.0, expected > 0.25) & (size[a] > 5) & (size[b] > 5)
     fresh = np.array([(int(x), int(y), bool(d)) not in tried for x, y, d in zip(a, b, doubtful, strict=True)])
     kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
@@ -292,6 +301,16 @@ def _collect(
     )
     good = np.array([not text for text in why], dtype=bool)
     return Closures(RelativePoseEdges(i[good], j[good], z[good], sqrt_information[good]), story)
+
+
+def missed(candidates: Candidates, found: Closures, config: LoopClosureConfig) -> set[tuple[int, int]]:
+    """Return (target, source) of candidates that were matched from the graph's guess and shared too few points."""
+    direct = candidates.spread <= config.direct
+    return {
+        (int(a), int(b))
+        for a, b, d, story in zip(candidates.target, candidates.source, direct, found.candidates, strict=True)
+        if d and story.overlap < config.overlap
+    }
 
 
 def merged(one: Closures, other: Closures) -> Closures:

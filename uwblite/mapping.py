@@ -221,7 +221,7 @@ def _first_optimisation(
     first = first_estimate.grow(graph, wheels, radio, path, growth, config.anchors)
     stages.end("first estimate", range_sigma=round(sigma, 4), placed=int(first.placed.sum()))
     graph = replace(_estimates(graph, first.graph), fixed_anchors=~first.placed)
-    radio = replace(radio, weights=alive * first.placed[radio.anchor].astype(np.float64))
+    radio = replace(radio, weights=(alive & first.placed[radio.anchor]).astype(np.float64))
     for lap in range(3):
         radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
         if lap == 2:
@@ -298,19 +298,22 @@ def _close_loops(
     base = graph.with_edges(*edges, tracked.edges)
     found = loop_closure.no_closures()
     tried: set[tuple[int, int, bool]] = set()
+    missed: set[tuple[int, int]] = set()
+    held = any(isinstance(e, RangeEdges) for e in edges)
     for lap in range(config.loops.rounds):
         pieces = submaps.build(scans.clouds, base.poses, path, session, config.submaps)
         known = marginals(base.with_edges(found.edges))
-        candidates = loop_closure.propose(base, known, pieces, session, tried, config.loops)
+        candidates = loop_closure.propose(base, known, pieces, session, tried, missed, config.loops)
         tried |= candidates.names(config.loops)
         new = loop_closure.find(candidates, pieces, config.loops, config.search, stages.teller("loop closure"))
+        missed |= set() if held else loop_closure.missed(candidates, new, config.loops)
         found = loop_closure.merged(found, new)
         base, found = loop_closure.reconcile(base, found, config.loops, config.solver)
         stages.end(
             f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(candidates.target),
             accepted=len(new.edges), standing=len(found.edges),
         )
-        if not len(new.edges):
+        if not len(new.edges) and not missed - {(a, b) for a, b, searched in tried if searched}:
             break
     return _estimates(graph, base), found, len(tried)
 
