@@ -8,9 +8,10 @@ from driver_harness import check_transcript, feed_whole, good
 from emulators.scip_device import ScipDevice, ScipOptions, data_lines, encode
 from emulators.world import RoomWorld, WorldClock
 
-from uwblite.drivers import scip
+from uwblite.drivers import scip, scip_codes, scip_commands
 from uwblite.drivers.events import Corrupt
-from uwblite.drivers.scip import Distances, Geometry, Reply, ScipProtocol
+from uwblite.drivers.scip import Distances, Reply, ScipProtocol
+from uwblite.drivers.scip_commands import Geometry
 from uwblite.errors import ProtocolError
 
 RNG = random.Random(1)
@@ -107,7 +108,7 @@ def test_captured_text_lines(shared_data):
     (vv,) = feed_whole(ScipProtocol, frame("VV", "00", *lines[5:10]))
     assert vv.fields()["PROD"] == "SOKUIKI Sensor URG-04LX"
     (pp,) = feed_whole(ScipProtocol, frame("PP", "00", *lines[10:18]))
-    assert scip.parse_geometry(pp) == Geometry()
+    assert scip_commands.parse_geometry(pp) == Geometry()
 
 
 def test_text_sums_are_never_fatal_and_an_extra_line_end_in_vv_is_taken():
@@ -152,12 +153,12 @@ def test_memory_is_bounded():
 
 
 def test_range_codes_are_complete_and_become_rep_117():
-    assert sorted(scip.RANGE_CODES) == list(range(20))
-    ranges = scip.to_ranges((0, 6, 1, 7, 18, 19, 20, 1234, 5599, 5600, 9000), Geometry())
+    assert sorted(scip_codes.RANGE_CODES) == list(range(20))
+    ranges = scip_commands.to_ranges((0, 6, 1, 7, 18, 19, 20, 1234, 5599, 5600, 9000), Geometry())
     assert ranges[:2] == (math.inf, math.inf)
     assert all(math.isnan(r) for r in ranges[2:6])
     assert ranges[6:] == (0.02, 1.234, 5.599, math.inf, math.inf)
-    assert scip.to_ranges((4094, 4095), Geometry(), 4095) == (4.094, math.inf)
+    assert scip_commands.to_ranges((4094, 4095), Geometry(), 4095) == (4.094, math.inf)
 
 
 def test_geometry_of_the_urg_04lx():
@@ -169,19 +170,19 @@ def test_geometry_of_the_urg_04lx():
 
 
 def test_commands():
-    assert scip.scan_command() == b"MD0044072501000\n"
-    assert scip.scan_command(128, 640, cluster=3, skip=2, count=10, wide=False) == b"MS0128064003210\n"
-    assert scip.scan_command(count=None) == b"GD0044072501\n"
-    assert scip.bit_rate_command(19200) == b"SS019200\n"
-    assert scip.text_command("QT") == b"QT\n"
+    assert scip_commands.scan_command() == b"MD0044072501000\n"
+    assert scip_commands.scan_command(128, 640, cluster=3, skip=2, count=10, wide=False) == b"MS0128064003210\n"
+    assert scip_commands.scan_command(count=None) == b"GD0044072501\n"
+    assert scip_commands.bit_rate_command(19200) == b"SS019200\n"
+    assert scip_commands.text_command("QT") == b"QT\n"
     for bad in ({"start": 0}, {"end": 800}, {"start": 300, "end": 200}, {"cluster": 100}, {"skip": 10}, {"count": 100}):
         with pytest.raises(ProtocolError):
-            scip.scan_command(**bad)
+            scip_commands.scan_command(**bad)
     for command in ("ME", "%ST", "", "qt", "MD"):
         with pytest.raises(ProtocolError):
-            scip.text_command(command)
+            scip_commands.text_command(command)
     with pytest.raises(ProtocolError):
-        scip.bit_rate_command(38400)
+        scip_commands.bit_rate_command(38400)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +204,7 @@ def test_commands():
     ],
 )
 def test_status_codes_have_names(command, status, kind):
-    got, text = scip.status_meaning(command, status)
+    got, text = scip_codes.status_meaning(command, status)
     assert got == kind
     assert text
 
@@ -212,9 +213,9 @@ def test_absurd_parameters_are_refused():
     lines = tuple(f"{k}:{v}" for k, v in (("DMIN", 20), ("DMAX", 10), ("ARES", 1024), ("AMIN", 44), ("AMAX", 725),
                                           ("AFRT", 384), ("SCAN", 600)))  # fmt: skip
     with pytest.raises(ProtocolError):
-        scip.parse_geometry(Reply(0.0, "PP", "00", lines))
+        scip_commands.parse_geometry(Reply(0.0, "PP", "00", lines))
     with pytest.raises(ProtocolError):
-        scip.parse_geometry(Reply(0.0, "PP", "00", lines[:3]))
+        scip_commands.parse_geometry(Reply(0.0, "PP", "00", lines[:3]))
 
 
 # ---- the emulator, against the specification

@@ -9,7 +9,8 @@ from .console import note, say, say_json
 
 if TYPE_CHECKING:
     from ..drivers.events import Note, Session
-    from ..drivers.recorder import Link, Recorder
+    from ..drivers.link import Link
+    from ..drivers.recorder import Recorder
 
 HELP = "record a run: UWB tag, lidar and odometry into a log that `uwblite map` reads"
 EPILOG = """
@@ -72,8 +73,9 @@ def run(args: argparse.Namespace) -> int:
     import socket
     import time
 
+    from ..drivers.link import Mounting
     from ..drivers.log_file import LogFile, last_state
-    from ..drivers.recorder import Mounting, Recorder
+    from ..drivers.recorder import Recorder
 
     if not (args.uwb or args.lidar or args.odometry):
         note("uwblite: error: name at least one of --uwb, --lidar, --odometry; `uwblite devices` lists what is there")
@@ -151,7 +153,7 @@ def _last_part(path: Path) -> Path:
 
 
 def _links(args: argparse.Namespace, pose: tuple[float, float, float]) -> list["Link"]:
-    from ..drivers.recorder import Link
+    from ..drivers.link import Link
 
     links = []
     if args.odometry:
@@ -234,7 +236,7 @@ def _status_line(recorder: "Recorder") -> Any:
 
     def show() -> None:
         if bar.active:
-            bar.status(status_text(recorder)) if hasattr(bar, "status") else bar._draw(status_text(recorder))
+            bar(status_text(recorder), 0, 0)
 
     return show
 

@@ -24,6 +24,7 @@ from .dwm1001 import (
     short_id,
 )
 from .dwm1001 import Event as TlvEvent
+from .dwm1001_advice import advise, not_joined
 from .dwm1001_shell import (
     ENTER,
     NodeInfo,
@@ -36,6 +37,7 @@ from .dwm1001_shell import (
     shell_command,
 )
 from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, RangeReading, Reopen, Send
+from .fix_timer import FixTimer
 
 DRAIN = 0.25
 PATIENCE = 0.25
@@ -48,8 +50,6 @@ DENSE, SPARSE, IDLE = 0.004, 0.008, 0.020
 """s between polls: when a fix is due; when it is late; when none has come for a while."""
 LEAD = 0.010
 """s before a fix is due at which polling begins."""
-GRID_SLACK = 0.0001
-"""s per period by which the grid of the fixes may wander: clocks of host and network, 1e-3 at worst."""
 DISTRUST = 5.0
 """s for which a link counts as damaged after a corrupt byte."""
 MAX_ROUNDS = 8
@@ -91,8 +91,7 @@ class Dwm1001Session:
         self._error = 0
         self._not_ready: float | None = None
         self._fix_stamp: float | None = None
-        self._interval: tuple[float, float] | None = None
-        self._found: tuple[float, float] | None = None
+        self._timer = FixTimer()
         self._last_fix = now
         self._pending: tuple[RangeReading, ...] | None = None
         self._latest: tuple[RangeReading, ...] | None = None
@@ -211,12 +210,13 @@ class Dwm1001Session:
         self._reset(now)
         return [*note, Reopen("no answer")]
 
+    def _say_once(self, notes: list[Note]) -> list[Action]:
+        fresh = [note for note in notes if note.name not in self._told]
+        self._told.update(note.name for note in fresh)
+        return list(fresh)
+
     def _tell(self, level: str, name: str, text: str) -> list[Action]:
-        """Say a thing once."""
-        if name in self._told:
-            return []
-        self._told.add(name)
-        return [Note(level, name, text)]
+        return self._say_once([Note(level, name, text)])
 
     def _leave_or_use_shell(self, now: float) -> list[Action]:
         if self._shell:
@@ -257,11 +257,12 @@ class Dwm1001Session:
     def _start_lines(self, now: float) -> list[Action]:
         self.info = parse_node_info(self._texts)
         settings = dict(self.info.settings)
-        notes = self._advise(
+        rate = settings.get("upd_rate_norm", "1")
+        notes = self._say_once(advise(
             tag=self.info.mode in ("tn", ""), active=self.info.activity in ("act", ""),
             stationary=settings.get("stat_det") == "1", joined=self.info.connected,
-            low_power=settings.get("lp") == "1", period=int(settings.get("upd_rate_norm", "1")) / 10,
-        )  # fmt: skip
+            low_power=settings.get("lp") == "1", period=int(rate) / 10 if rate.isdecimal() else 0.1,
+        ))  # fmt: skip
         params = [Param("uwb_tag_id", self.info.short_id)] if self.info.short_id else []
         if self.info.firmware:
             params.append(Param("uwb_tag_firmware", self.info.firmware))
@@ -328,35 +329,12 @@ class Dwm1001Session:
         if not status.location_ready:
             self._not_ready = self._sent
             return self._wait(now)
-        stamp = self._fix_time(now)
+        stamp = self._timer.time(self._not_ready, now, self.period)
         if stamp is None:
             self._not_ready = self._sent
             return self._wait(now)
         self._fix_stamp, self._guess = stamp, False
         return self._read_fix(now)
-
-    def _fix_time(self, now: float) -> float | None:
-        """Return when the fix that was found ready at `now` was made; None = unknown, it waited for the first poll.
-
-        It lies between the last poll that found none and now. Rounds follow each other on the grid of the network's
-        superframes, so the interval of the last fix, shifted by whole periods, narrows that down; where the two do not
-        overlap the tag does not keep the grid, and the new interval stands alone.
-        """
-        if self._not_ready is None and self._interval is None:
-            return None
-        low, high = self._not_ready if self._not_ready is not None else self._last_fix, now
-        if self._interval is not None:
-            old_low, old_high = self._interval
-            turns = max(1, int((high - old_low) / self.period + 1e-6))
-            shift, slack = turns * self.period, turns * GRID_SLACK
-            narrow_low, narrow_high = max(low, old_low + shift - slack), min(high, old_high + shift + slack)
-            if narrow_low < narrow_high:
-                low, high = narrow_low, narrow_high
-        if high - low > 4 * SPARSE:
-            self._found = None
-            return self._last_fix + self.period if now - self._last_fix < 2 * self.period else now
-        self._found = (low, high)
-        return (low + high) / 2
 
     def _read_fix(self, now: float) -> list[Action]:
         self._not_ready, self._pending, self._reads = None, None, 0
@@ -367,16 +345,11 @@ class Dwm1001Session:
         due = self._last_fix + self.period - LEAD
         late = now - due
         wait = DENSE if late < 2 * LEAD else SPARSE if late < 10.0 else IDLE
-        if self._interval is None:
+        if not self._timer.settled:
             due, wait = now, DENSE  # nothing is known yet of when the next one comes
         self._step, self._due = "poll", max(now + wait, due)
-        if now - self._last_fix > 3.0 and self.joined is False:
-            text = (
-                "uwb: the tag has not joined a network: one anchor must be the initiator and on, all nodes need the same"
-                " network id, and none may be in firmware-update mode"
-            )
-            return self._tell("warning", "not-joined", text)
-        return []
+        silent = now - self._last_fix > 3.0 and self.joined is False
+        return self._say_once([not_joined()]) if silent else []
 
     def _poll(self, now: float) -> list[Action]:
         return self._say("status", STATUS_GET, now, ANSWER)
@@ -400,13 +373,11 @@ class Dwm1001Session:
         # While it was read again and again, newer fixes may have taken its place.
         turns = max(0, int((self._pending_at - self._fix_stamp) / self.period))
         stamp, self._fix_stamp, self._pending = self._fix_stamp + turns * self.period, None, None
-        if turns:
-            self._found = None
         if (self._guess or now < self._distrust) and readings == self._latest:
             return self._wait(now)
         gap, damaged, self._damaged = stamp - self._last_fix, self._damaged, False
         self._last_fix, self._latest = stamp, readings
-        self._interval = self._found or self._interval
+        self._timer.accept(stamp, as_found=not turns)
         lost = [Lost(stamp, round(gap / self.period) - 1)] if damaged and gap > 1.6 * self.period else []
         return [*lost, *self._epoch(readings, stamp), *self._wait(now)]
 
@@ -427,7 +398,7 @@ class Dwm1001Session:
         if self._step == "loc":
             return [lost, *self._say("loc", LOC_GET, now, ANSWER)]
         # Reading the status clears it, so the answer that was lost may have announced a fix: look for one.
-        stamp = self._fix_time(self._sent + 0.002)
+        stamp = self._timer.time(self._not_ready, self._sent + 0.002, self.period)
         self._fix_stamp, self._guess = self._sent if stamp is None else stamp, True
         return [lost, *self._read_fix(now)]
 
@@ -446,10 +417,10 @@ class Dwm1001Session:
                 actions.append(Param(name, form(self.values[key])))
         config = self.config
         if config is not None:
-            actions += self._advise(
+            actions += self._say_once(advise(
                 tag=not config.anchor, active=config.uwb_mode == 2, stationary=config.stationary_detection,
                 joined=None, low_power=config.low_power, period=self.period,
-            )  # fmt: skip
+            ))  # fmt: skip
         if not self._stream:
             self._step, self._due = "done", None
             return actions
@@ -462,27 +433,3 @@ class Dwm1001Session:
         self._rounds = self._tries = 0
         self._known |= {reading.anchor_id for reading in readings}
         return [RangeEpoch(stamp, readings)] if readings else []
-
-    def _advise(
-        self, *, tag: bool, active: bool, stationary: bool, joined: bool | None, low_power: bool, period: float
-    ) -> list[Action]:
-        """Name every setting that makes ranges rare or absent, and how to mend it."""
-        shell = "open a terminal on the port at 115200 bit/s, press Enter twice quickly"
-        notes: list[Action] = []
-        if not tag:
-            notes += self._tell("error", "not-a-tag", f"uwb: this node is an anchor: {shell}, type `nmt` (it restarts)")
-        if tag and not active:
-            notes += self._tell("error", "uwb-off", f"uwb: the tag's radio is off or passive: {shell}, type `nmt`")
-        if stationary:
-            text = f"uwb: stationary detection is on: the rate falls to once in 10 s at rest: {shell}, `acts` shows its"
-            text += " arguments; set accel_en to 0, then `reset` (or set `aurs 1 1` to keep 10 Hz at rest)"
-            notes += self._tell("warning", "stationary-detection", text)
-        if low_power:
-            notes += self._tell("warning", "low-power", f"uwb: low-power mode makes ranges come in bursts: {shell}, `nmt`")
-        if period > 0.1:
-            text = f"uwb: a fix only every {period:.1f} s: {shell}, type `aurs 1 1` for ten a second"
-            notes += self._tell("warning", "slow-update-rate", text)
-        if joined is False:
-            text = "uwb: not joined to a network: one anchor must be the initiator and on, all need the same network id"
-            notes += self._tell("warning", "not-joined", text)
-        return notes

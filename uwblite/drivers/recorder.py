@@ -7,9 +7,7 @@ at the start, so that a clock set by NTP in mid-run moves nothing.
 """
 
 import selectors
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 from ..errors import DeviceError
 from .events import (
@@ -23,9 +21,9 @@ from .events import (
     RangeEpoch,
     Reopen,
     Send,
-    Session,
     SetBaud,
 )
+from .link import Counts, Link, Mounting, doubts, summary_lines
 from .log_file import LogFile, number_text, pose_line, range_lines, scan_line
 from .transport import Port
 
@@ -41,66 +39,6 @@ DAMAGE_REPORT = 5.0
 """s between COMMENT lines about loss and damage."""
 POLL = 0.005
 """s between reads of a port that cannot be waited on."""
-
-
-@dataclass(slots=True)
-class Counts:
-    """What one device did."""
-
-    messages: int = 0
-    """Measurements written: scans, ranging rounds, poses."""
-    lost: int = 0
-    """Measurements that the device made and that did not arrive, by its own clock."""
-    corrupt: Counter[str] = field(default_factory=Counter)
-    """Damaged frames and noise, by reason."""
-    bytes: int = 0
-    connects: int = 0
-    silences: int = 0
-    silent_time: float = 0.0
-    """s, sum of the pauses longer than SILENCE."""
-    anchors: Counter[str] = field(default_factory=Counter)
-    """Ranges by anchor."""
-
-
-@dataclass(frozen=True, slots=True)
-class Mounting:
-    """Where the sensors sit; written to the log for the mapper."""
-
-    laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """x, y, theta on the base; m, m, rad."""
-    params: tuple[tuple[str, str], ...] = ()
-    """PARAM name, value."""
-
-
-class Link:
-    """One device: its port, session and counts.
-
-    Parameters
-    ----------
-    name : "uwb", "lidar" or "odometry".
-    url : of the port.
-    session : start-up, running and recovery.
-    """
-
-    def __init__(self, name: str, url: str, session: Session) -> None:
-        self.name, self.url, self.session = name, url, session
-        self.counts = Counts()
-        self.port: Port | None = None
-        self.retry_at = 0.0
-        self.attempt = 0
-        self.last_data = self.last_message = self.opened = 0.0
-        self.quiet = False
-        self.new_lost = self.new_corrupt = 0
-        self.rate = 0.0
-        self._rate_base = (0.0, 0)
-        self.why_down = ""
-
-    def update_rate(self, now: float) -> None:
-        """Refresh `rate`, messages per second over the last two seconds."""
-        since, count = self._rate_base
-        if now - since >= 2.0:
-            self.rate = (self.counts.messages - count) / (now - since)
-            self._rate_base = (now, self.counts.messages)
 
 
 class Recorder:
@@ -370,42 +308,12 @@ class Recorder:
 
     def summary(self) -> list[str]:
         """Return one line per device for people."""
-        seconds = self.end - self.start
-        lines = [f"recorded {seconds:.1f} s, {self.log.bytes / 1e6:.2f} MB in {self.log.path}"]
-        for link in self.links:
-            counts = link.counts
-            silent = self._silent_time(link)
-            text = (
-                f"{link.name}: {counts.messages} messages ({counts.messages / max(seconds, 1e-9):.2f}/s),"
-                f" lost {counts.lost}, corrupt {sum(counts.corrupt.values())}, connected {counts.connects} times,"
-                f" silent {silent:.1f} s"
-            )
-            if counts.anchors:
-                text += "; anchors " + ", ".join(f"{name} {count}" for name, count in sorted(counts.anchors.items()))
-            lines.append(text)
-            lines += [f"{link.name}: corrupt {count} times: {why}" for why, count in counts.corrupt.most_common(8)]
-        return lines
-
-    def _silent_time(self, link: Link) -> float:
-        if not link.counts.messages:
-            return self.end - self.start
-        return link.counts.silent_time + (self.end - link.last_message if link.quiet else 0.0)
+        size = f"{self.log.bytes / 1e6:.2f} MB in {self.log.path}"
+        return [f"recorded {self.end - self.start:.1f} s, {size}", *summary_lines(self.links, self.start, self.end)]
 
     def doubts(self) -> list[str]:
         """Return why the recording should not be trusted; empty when it can be."""
-        seconds = max(self.end - self.start, 1e-9)
-        found = []
-        for link in self.links:
-            counts = link.counts
-            silent = self._silent_time(link)
-            total = counts.messages + counts.lost
-            if not counts.messages:
-                found.append(f"{link.name}: no data at all")
-            elif silent > 0.1 * seconds:
-                found.append(f"{link.name}: silent for {silent:.0f} s of {seconds:.0f} s")
-            elif counts.lost > 0.1 * total:
-                found.append(f"{link.name}: lost {counts.lost} of {total}")
-        return found
+        return doubts(self.links, self.start, self.end)
 
     def _finish(self) -> None:
         for link in self.links:

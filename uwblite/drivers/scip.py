@@ -9,65 +9,19 @@ first, each plus 0x30; distances are a run of 2- or 3-character numbers cut into
 straddle lines. In the text lines of VV, PP and II the ``;`` before the sum is not summed, and some units print wrong
 sums there: those sums are never fatal. Sources: SCIP 2.0 specification C-42-03320B; captures of three units.
 
-Range values below DMIN (20 mm) are codes, not distances: see RANGE_CODES.
+Range values below DMIN (20 mm) are codes, not distances: see ``scip_codes``; requests are in ``scip_commands``.
 """
 
-import math
 import re
 from dataclasses import dataclass
 
-from ..errors import ProtocolError
 from .events import Corrupt, corrupt
 
-BAUD_RATES = (115200, 19200, 57600, 250000, 500000, 750000)
-"""bit/s of the RS-232 port, in the order tried; on USB the rate means nothing."""
 TIME_MODULUS = 1 << 24
 """The time stamp is a counter of 24 bit, 1 ms each: it wraps every 4 h 39 min 37 s."""
 MAX_LINE = 256
 MAX_LINES = 400
 LONGEST_ECHO = 40
-
-INF, NAN = math.inf, math.nan
-
-RANGE_CODES: dict[int, tuple[float, str]] = {
-    0: (INF, "no echo: nothing within range, or too dark to see"),
-    1: (NAN, "low intensity"),
-    2: (NAN, "low intensity"),
-    3: (NAN, "measurement error"),
-    4: (NAN, "measurement error"),
-    5: (NAN, "measurement error"),
-    6: (INF, "no valid echo; older manuals: possibly beyond 5.7 m"),
-    7: (NAN, "too near, or contradicted by its neighbours"),
-    8: (NAN, "the two modulation waves disagree in intensity"),
-    9: (NAN, "same step failed in the last two scans"),
-    **dict.fromkeys(range(10, 18), (NAN, "measurement error")),
-    18: (NAN, "strong reflector"),
-    19: (NAN, "step cannot be measured"),
-}
-"""Meaning of range values below DMIN, as REP-117 wants them: +inf = looked and saw nothing, nan = do not use."""
-
-STATUS_BY_COMMAND: dict[str, dict[str, str]] = {
-    "BM": {"00": "laser on", "01": "laser malfunction", "02": "laser is on already"},
-    "QT": {"00": "laser off, stream stopped"},
-    "RS": {"00": "reset"},
-    "TM": {"00": "ok", "01": "bad code", "02": "in time-adjust mode already", "03": "left time-adjust mode already",
-           "04": "not in time-adjust mode"},
-    "SS": {"00": "ok", "01": "not a number", "02": "no such bit rate", "03": "that rate is set already",
-           "04": "rate not possible"},
-    "CR": {"00": "ok", "01": "not a number", "02": "no such speed", "03": "that speed is set already",
-           "04": "speed not possible"},
-}  # fmt: skip
-STATUS_OF_SCANS = {
-    "00": "ok", "01": "start step is not a number", "02": "end step is not a number", "03": "cluster is not a number",
-    "04": "end step out of range", "05": "end step is before the start step", "06": "skip is not a number",
-    "07": "count is not a number", "10": "laser is off", "98": "resumed after a pause", "99": "data follow",
-}  # fmt: skip
-STATUS_OF_ALL = {
-    "0A": "cannot create the transmission", "0B": "buffer short, or the command was repeated in one batch",
-    "0C": "too few parameters", "0D": "too few parameters", "0E": "undefined command", "0F": "undefined command",
-    "0G": "string too long", "0H": "string has bad characters", "0I": "in firmware-update mode",
-    "0L": "abnormal state", "0M": "unstable",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,117 +63,7 @@ class Distances:
     """Scans still to come; 0 in an endless stream."""
 
 
-@dataclass(frozen=True, slots=True)
-class Geometry:
-    """What PP says of the unit; defaults are those of the URG-04LX."""
-
-    model: str = "URG-04LX"
-    distance_min: int = 20
-    distance_max: int = 5600
-    """mm."""
-    resolution: int = 1024
-    """Steps in a full turn."""
-    first: int = 44
-    last: int = 725
-    front: int = 384
-    """Steps; `front` looks along the laser's x axis."""
-    speed: int = 600
-    """rev/min."""
-
-    @property
-    def step_angle(self) -> float:
-        """Angle between steps, rad."""
-        return 2 * math.pi / self.resolution
-
-    @property
-    def step_time(self) -> float:
-        """Time between steps, s."""
-        return 60.0 / self.speed / self.resolution
-
-    @property
-    def period(self) -> float:
-        """Time of a turn, s."""
-        return 60.0 / self.speed
-
-
 Event = Reply | Distances | Corrupt
-
-
-# ---- commands
-
-
-def text_command(name: str) -> bytes:
-    """Build a request without parameters.
-
-    Parameters
-    ----------
-    name : one of VV PP II BM QT RS TM0 TM1 TM2 SCIP2.0.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ProtocolError : not one of these; other commands can hang a URG-04LX until its power is cycled.
-    """
-    if name not in {"VV", "PP", "II", "BM", "QT", "RS", "TM0", "TM1", "TM2", "SCIP2.0"}:
-        raise ProtocolError(f"{name!r} is not a command for a URG-04LX; use VV PP II BM QT RS TM0 TM1 TM2 SCIP2.0")
-    return name.encode() + b"\n"
-
-
-def bit_rate_command(rate: int) -> bytes:
-    """Build ``SS``: set the bit rate of the RS-232 port.
-
-    Parameters
-    ----------
-    rate : bit/s, one of BAUD_RATES.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ProtocolError : a rate that the unit does not have.
-    """
-    if rate not in BAUD_RATES:
-        raise ProtocolError(f"bit rate {rate} is not one of {sorted(BAUD_RATES)}")
-    return b"SS%06d\n" % rate
-
-
-def scan_command(
-    start: int = 44, end: int = 725, *, cluster: int = 1, skip: int = 0, count: int | None = 0, wide: bool = True,
-    geometry: Geometry | None = None,
-) -> bytes:  # fmt: skip
-    """Build GD/GS (one scan) or MD/MS (a stream).
-
-    Parameters
-    ----------
-    start, end : first and last step.
-    cluster : steps merged into one value, 0..99 (0 means 1).
-    skip : scans left out between two that are sent, 0..9.
-    count : scans to send, 0 = until QT; None = GD/GS, one scan now.
-    wide : 3 characters a value (up to 5.6 m); False: 2 characters, up to 4.095 m.
-    geometry : limits of the unit; default: of the URG-04LX.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ProtocolError : a step, cluster, skip or count that the unit would refuse.
-    """
-    unit = geometry or Geometry()
-    if not unit.first <= start <= end <= unit.last:
-        raise ProtocolError(f"steps {start}..{end} are not inside {unit.first}..{unit.last} of the {unit.model}")
-    if not 0 <= cluster <= 99 or not 0 <= skip <= 9 or not 0 <= (count or 0) <= 99:
-        raise ProtocolError(f"cluster {cluster} (0..99), skip {skip} (0..9) or count {count} (0..99) is out of range")
-    letter = "D" if wide else "S"
-    if count is None:
-        return f"G{letter}{start:04d}{end:04d}{cluster:02d}\n".encode()
-    return f"M{letter}{start:04d}{end:04d}{cluster:02d}{skip:01d}{count:02d}\n".encode()
 
 
 # ---- coding
@@ -259,83 +103,6 @@ def decode_values(data: bytes, width: int) -> tuple[int, ...]:
         return tuple([(a << 6) + b - 0xC30 for a, b in zip(data[0::2], data[1::2], strict=True)])
     columns = zip(data[0::3], data[1::3], data[2::3], strict=True)
     return tuple([(a << 12) + (b << 6) + c - 0x30C30 for a, b, c in columns])
-
-
-def to_ranges(values: tuple[int, ...], geometry: Geometry, limit: int | None = None) -> tuple[float, ...]:
-    """Convert raw values to metres with REP-117 codes.
-
-    Parameters
-    ----------
-    values : mm or RANGE_CODES.
-    geometry : gives DMIN and DMAX.
-    limit : mm, largest value that means something, where it is below DMAX (4095 with 2 characters).
-
-    Returns
-    -------
-    tuple of float, m; +inf = nothing seen, nan = invalid.
-    """
-    low, high = geometry.distance_min, min(geometry.distance_max, limit or geometry.distance_max)
-    codes = [RANGE_CODES[v][0] if v in RANGE_CODES else NAN for v in range(low)]
-    return tuple([codes[v] if v < low else v / 1000 if v < high else INF for v in values])
-
-
-def parse_geometry(reply: Reply) -> Geometry:
-    """Read the reply to PP.
-
-    Parameters
-    ----------
-    reply : of PP.
-
-    Returns
-    -------
-    Geometry
-
-    Raises
-    ------
-    ProtocolError : a field is missing or absurd.
-    """
-    fields = reply.fields()
-    try:
-        numbers = {key: int(fields[key]) for key in ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")}
-    except (KeyError, ValueError) as error:
-        raise ProtocolError(f"PP: field missing or not a number ({error})") from None
-    unit = Geometry(
-        fields.get("MODL", "unknown").partition("(")[0], numbers["DMIN"], numbers["DMAX"], numbers["ARES"],
-        numbers["AMIN"], numbers["AMAX"], numbers["AFRT"], numbers["SCAN"],
-    )  # fmt: skip
-    sane = 0 <= unit.distance_min < unit.distance_max and unit.resolution > 0 and unit.speed > 0
-    if not (sane and 0 <= unit.first < unit.last <= unit.resolution + unit.front):
-        raise ProtocolError(f"PP: absurd geometry {unit}")
-    return unit
-
-
-def status_meaning(command: str, status: str) -> tuple[str, str]:
-    """Name a status code.
-
-    Parameters
-    ----------
-    command : the echo it came with.
-    status : two characters.
-
-    Returns
-    -------
-    kind : "ok", "paused", "resumed", "hardware-fault", "refused" or "scip1".
-    text : what it means.
-    """
-    if len(status) == 1:
-        return ("ok", "SCIP 1.1: ok") if status == "0" else ("scip1", "the unit speaks SCIP 1.1; send SCIP2.0")
-    known = STATUS_BY_COMMAND.get(command[:2], STATUS_OF_SCANS if command[:1] in "GM" else {})
-    text = known.get(status) or STATUS_OF_ALL.get(status)
-    if command[:1] in "GM" and status.isdigit():
-        number = int(status)
-        if 21 <= number <= 49:
-            return "paused", f"status {status}: the unit paused to verify itself and comes back by itself"
-        if 50 <= number <= 97:
-            return "hardware-fault", f"status {status}: hardware fault (laser, motor or the like)"
-        if number == 98:
-            return "resumed", f"status {status}: {text}"
-    good = status in ("00", "99") or (command[:2], status) in {("BM", "02"), ("TM", "02"), ("TM", "03"), ("SS", "03")}
-    return "ok" if good else "refused", f"status {status}: {text or 'not in the manual'}"
 
 
 # ---- decoder

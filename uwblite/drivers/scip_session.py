@@ -15,19 +15,9 @@ import math
 from ..errors import ProtocolError
 from .clock import ClockMap, Unwrapper
 from .events import Action, Corrupt, LaserScan, Lost, Note, Param, Reopen, Send, SetBaud
-from .scip import (
-    BAUD_RATES,
-    TIME_MODULUS,
-    Distances,
-    Geometry,
-    Reply,
-    ScipProtocol,
-    parse_geometry,
-    scan_command,
-    status_meaning,
-    text_command,
-    to_ranges,
-)
+from .scip import TIME_MODULUS, Distances, Reply, ScipProtocol
+from .scip_codes import status_meaning
+from .scip_commands import BAUD_RATES, Geometry, parse_geometry, scan_command, text_command, to_ranges
 
 DRAIN = 0.25
 """s to wait for silence before the first word."""

@@ -1,0 +1,128 @@
+"""One device of a recording: its port, its session, and what it did."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from .events import Session
+
+if TYPE_CHECKING:
+    from .transport import Port
+
+
+@dataclass(slots=True)
+class Counts:
+    """What one device did."""
+
+    messages: int = 0
+    """Measurements written: scans, ranging rounds, poses."""
+    lost: int = 0
+    """Measurements that the device made and that did not arrive, by its own clock."""
+    corrupt: Counter[str] = field(default_factory=Counter)
+    """Damaged frames and noise, by reason."""
+    bytes: int = 0
+    connects: int = 0
+    silences: int = 0
+    silent_time: float = 0.0
+    """s, sum of the pauses longer than SILENCE."""
+    anchors: Counter[str] = field(default_factory=Counter)
+    """Ranges by anchor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """Where the sensors sit; written to the log for the mapper."""
+
+    laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """x, y, theta on the base; m, m, rad."""
+    params: tuple[tuple[str, str], ...] = ()
+    """PARAM name, value."""
+
+
+class Link:
+    """One device: its port, session and counts.
+
+    Parameters
+    ----------
+    name : "uwb", "lidar" or "odometry".
+    url : of the port.
+    session : start-up, running and recovery.
+    """
+
+    def __init__(self, name: str, url: str, session: Session) -> None:
+        self.name, self.url, self.session = name, url, session
+        self.counts = Counts()
+        self.port: Port | None = None
+        self.retry_at = 0.0
+        self.attempt = 0
+        self.last_data = self.last_message = self.opened = 0.0
+        self.quiet = False
+        self.new_lost = self.new_corrupt = 0
+        self.rate = 0.0
+        self._rate_base = (0.0, 0)
+        self.why_down = ""
+
+    def update_rate(self, now: float) -> None:
+        """Refresh `rate`, messages per second over the last two seconds."""
+        since, count = self._rate_base
+        if now - since >= 2.0:
+            self.rate = (self.counts.messages - count) / (now - since)
+            self._rate_base = (now, self.counts.messages)
+
+    def silent_time(self, start: float, end: float) -> float:
+        """Return how long nothing came between `start` and `end`, s, pauses up to SILENCE excepted."""
+        if not self.counts.messages:
+            return end - start
+        return self.counts.silent_time + (end - self.last_message if self.quiet else 0.0)
+
+
+def summary_lines(links: list[Link], start: float, end: float) -> list[str]:
+    """Return what each device did, for people.
+
+    Parameters
+    ----------
+    links : the devices.
+    start, end : of the recording, s.
+
+    Returns
+    -------
+    list of str
+    """
+    lines = []
+    for link in links:
+        counts = link.counts
+        text = (
+            f"{link.name}: {counts.messages} messages ({counts.messages / max(end - start, 1e-9):.2f}/s),"
+            f" lost {counts.lost}, corrupt {sum(counts.corrupt.values())}, connected {counts.connects} times,"
+            f" silent {link.silent_time(start, end):.1f} s"
+        )
+        if counts.anchors:
+            text += "; anchors " + ", ".join(f"{name} {count}" for name, count in sorted(counts.anchors.items()))
+        lines.append(text)
+        lines += [f"{link.name}: corrupt {count} times: {why}" for why, count in counts.corrupt.most_common(8)]
+    return lines
+
+
+def doubts(links: list[Link], start: float, end: float) -> list[str]:
+    """Return why a recording should not be trusted; empty when it can be.
+
+    Parameters
+    ----------
+    links : the devices.
+    start, end : of the recording, s.
+
+    Returns
+    -------
+    list of str
+    """
+    seconds, found = max(end - start, 1e-9), []
+    for link in links:
+        counts = link.counts
+        silent, total = link.silent_time(start, end), counts.messages + counts.lost
+        if not counts.messages:
+            found.append(f"{link.name}: no data at all")
+        elif silent > 0.1 * seconds:
+            found.append(f"{link.name}: silent for {silent:.0f} s of {seconds:.0f} s")
+        elif counts.lost > 0.1 * total:
+            found.append(f"{link.name}: lost {counts.lost} of {total}")
+    return found
