@@ -1,0 +1,310 @@
+"""The whole walk: a simulated room, missing sensors, determinism, progress and cancellation, real recordings."""
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+
+from planted import box, odometry, ranges, recording, scans, wander
+from simulation import logfile
+from simulation.recording import Lie, Settings, simulate
+
+from uwblite import se2
+from uwblite.errors import Cancelled, DataError
+from uwblite.evaluate import evaluate_trajectory
+from uwblite.io.carmen import read_log
+from uwblite.io.tum import read_tum
+from uwblite.mapping import MappingConfig, build_map, preset
+from uwblite.sensor_log import Odometry, UwbRanges
+
+ROOM_ATE = 0.02
+"""m. Lidar noise of 10 mm, shared by tens of rays per wall and by the pairs that see it, leaves key poses a few millimetres;
+between them the odometry (20 mm per square root of a metre) bridges 0.3 m with 5 mm in the middle. Four times that."""
+
+
+@pytest.fixture(scope="module")
+def log(room_log):
+    return read_log(room_log)
+
+
+@pytest.fixture(scope="module")
+def truth(room_log):
+    return read_tum(room_log.parent / "room" / "truth.tum")
+
+
+@pytest.fixture(scope="module")
+def result(log):
+    return build_map(log)
+
+
+@pytest.fixture(scope="module")
+def minute(log):
+    """The first 50 s of the room."""
+    return log.crop(0.0, 50.0)
+
+
+def ate(result, truth) -> float:
+    return evaluate_trajectory(result.stamps, result.trajectory, *truth).ate.rmse
+
+
+def test_the_room_is_mapped(result, truth):
+    errors = evaluate_trajectory(result.stamps, result.trajectory, *truth)
+    assert errors.ate.rmse < ROOM_ATE
+    assert errors.heading.rmse < 0.01
+    assert result.doubts == ()
+    assert all(c.accepted or c.reason for c in result.closures)
+    assert sum(c.accepted for c in result.closures) > 5
+
+
+def test_the_room_s_anchors_are_placed(result, truth, room_log):
+    laid = evaluate_trajectory(result.stamps, result.trajectory, *truth).T_truth_map
+    rows = (room_log.parent / "room" / "truth_anchors.csv").read_text().split()[1:]
+    places = {row.split(",")[0]: np.array(row.split(",")[1:3], dtype=float) for row in rows}
+    assert {a.id for a in result.anchors} == set(places)
+    for anchor in result.anchors:
+        error = np.hypot(*(se2.transform(laid, anchor.position) - places[anchor.id]))
+        # Biases and multipath of 6 cm each, seen from one side only: a decimetre or two, and half a metre at the worst.
+        assert error < 0.6
+        assert anchor.used_share > 0.7
+
+
+def test_the_room_s_walls_are_in_the_grid(result, truth, room_log):
+    """Most occupied cells lie within two cells of a true wall or column."""
+    laid = evaluate_trajectory(result.stamps, result.trajectory, *truth).T_truth_map
+    points = se2.transform(laid, result.grid.occupied_points())
+    walls = np.loadtxt(room_log.parent / "room" / "walls.csv", delimiter=",", skiprows=1)[:, -4:]
+    start, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
+    share = np.einsum("pwi,wi->pw", points[:, None] - start, along) / np.einsum("wi,wi->w", along, along)
+    gap = np.hypot(*(points[:, None] - start - np.clip(share, 0, 1)[:, :, None] * along).transpose(2, 0, 1)).min(axis=1)
+    assert len(points) > 300
+    assert np.mean(gap < 2 * result.grid.geometry.resolution) > 0.8
+
+
+def same_bytes(one, other) -> None:
+    """Assert that two results agree to the last bit."""
+    for name in ("stamps", "trajectory", "keyframe_stamps", "keyframe_covariances"):
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
+    assert one.graph.anchors.tobytes() == other.graph.anchors.tobytes()
+    assert one.graph.calibration.values.tobytes() == other.graph.calibration.values.tobytes()
+    assert one.grid.log_odds.tobytes() == other.grid.log_odds.tobytes()
+    assert [c.reason for c in one.closures] == [c.reason for c in other.closures]
+    assert [s.figures for s in one.stages] == [s.figures for s in other.stages]
+    assert one.warnings == other.warnings
+
+
+def test_equal_input_gives_equal_bytes_whoever_computes(minute):
+    one = build_map(minute)
+    same_bytes(one, build_map(minute))
+    with ThreadPoolExecutor(2) as executor:
+        same_bytes(one, build_map(minute, executor=executor))
+
+
+def test_the_recording_is_not_changed(minute):
+    before = [a.copy() for a in (minute.odometry.poses, minute.ranges.ranges, minute.ranges.anchor, minute.scans.ranges)]
+    build_map(minute)
+    after = (minute.odometry.poses, minute.ranges.ranges, minute.ranges.anchor, minute.scans.ranges)
+    for a, b in zip(before, after, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("off", "words"),
+    [({"use_uwb": False}, "no UWB"), ({"use_lidar": False}, "no lidar"), ({"use_loops": False}, None)],
+)
+def test_a_missing_sensor_is_borne_and_said(minute, truth, off, words):
+    result = build_map(minute, MappingConfig(**off))
+    said = " ".join(result.warnings)
+    assert words is None or words in said
+    assert result.doubts == ()
+    assert (result.grid is None) == ("use_lidar" in off)
+    assert (len(result.anchors) == 0) == ("use_uwb" in off)
+    if "use_lidar" not in off:
+        assert ate(result, truth) < ROOM_ATE
+    if "use_loops" in off:
+        assert result.closures == ()
+        assert not any("loop" in s.name or "joint" in s.name for s in result.stages)
+
+
+def test_a_sensor_that_never_was_is_as_one_switched_off(minute):
+    for off, log in (({"use_uwb": False}, minute.without(uwb=True)), ({"use_lidar": False}, minute.without(lidar=True))):
+        one, other = build_map(minute, MappingConfig(**off)), build_map(log)
+        assert one.trajectory.tobytes() == other.trajectory.tobytes()
+        assert one.warnings == other.warnings
+
+
+def test_wheels_alone_give_the_odometry_back(minute):
+    result = build_map(minute, MappingConfig(use_uwb=False, use_lidar=False))
+    said = se2.between(minute.odometry.poses[0], minute.odometry.poses)
+    np.testing.assert_allclose(se2.between(se2.compose(result.trajectory[0], said), result.trajectory), 0.0, atol=1e-6)
+    assert len(result.warnings) == 2
+
+
+def test_sensors_that_say_nothing_of_use_are_borne_and_said(minute):
+    silent = replace(minute.ranges, ranges=np.zeros(len(minute.ranges.ranges)))
+    result = build_map(replace(minute, ranges=silent))
+    assert any("no anchor" in d for d in result.doubts)
+    blind = replace(minute.scans, ranges=np.full_like(minute.scans.ranges, np.inf))
+    result = build_map(replace(minute, scans=blind))
+    assert any("saw nothing" in w for w in result.warnings)
+    none = UwbRanges(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
+    result = build_map(replace(minute, ranges=none))
+    assert any("no UWB" in w for w in result.warnings)
+
+
+def test_hardly_any_recording_at_all():
+    """A single sample, a robot that stands, two metres of driving: a result, not a crash."""
+    rng = np.random.default_rng(0)
+    for stamps, truth in (
+        (np.zeros(1), np.zeros((1, 3))),
+        (np.arange(50) * 0.1, np.zeros((50, 3))),
+        wander(rng, 2.0),
+    ):
+        radio = ranges(rng, stamps, truth, np.array([[2.0, 1.0], [-3.0, 2.0]])) if len(stamps) > 1 else None
+        lidar = scans(stamps, truth, box(8, 6), beams=120) if len(stamps) > 1 else None
+        result = build_map(recording(odometry(stamps, truth), radio, lidar))
+        assert result.trajectory.shape == truth.shape
+        assert np.isfinite(result.trajectory).all()
+        moved = np.hypot(*(result.trajectory[-1] - result.trajectory[0])[:2])
+        assert moved == pytest.approx(np.hypot(*(truth[-1] - truth[0])[:2]), abs=0.05)
+
+
+def test_progress_is_told_in_order(minute):
+    told = []
+    result = build_map(minute, progress=lambda *a: told.append(a))
+    assert all(0 <= done <= total and total >= 1 for _, done, total in told)
+    ended = [stage for stage, done, total in told if (done, total) == (1, 1)]
+    names = [s.name for s in result.stages]
+    assert [s for s in dict.fromkeys(ended) if s in names] == names
+    assert names[0] == "keyframes"
+    assert names[-1] == "summary"
+
+
+def test_the_caller_can_stop_at_any_call(minute):
+    calls, minute = [], minute.crop(end=25.0)
+    build_map(minute, progress=lambda *a: calls.append(a))
+    for stop in (1, len(calls) // 3, 2 * len(calls) // 3, len(calls)):
+        count = iter(range(1, len(calls) + 2))
+        with pytest.raises(Cancelled, match="stopped by the caller"):
+            build_map(minute, progress=lambda *_, count=count, stop=stop: next(count) < stop)
+
+
+def test_timings_come_from_the_caller_s_clock(minute):
+    ticks = iter(float(k) for k in range(1000))
+    timed = build_map(minute, MappingConfig(use_lidar=False), clock=lambda: next(ticks))
+    assert [s.seconds for s in timed.stages] == [1.0] * len(timed.stages)
+    assert all(s.seconds == 0.0 for s in build_map(minute, MappingConfig(use_lidar=False)).stages)
+
+
+def test_the_result_does_not_depend_on_the_odometry_s_frame(minute, truth):
+    """Turned and shifted by a kilometre, the odometry says the same."""
+    far = Odometry(minute.odometry.stamps, se2.compose(np.array([900.0, -400.0, 2.0]), minute.odometry.poses))
+    assert ate(build_map(replace(minute, odometry=far)), truth) < ROOM_ATE
+
+
+def test_presets_are_settings():
+    assert isinstance(preset("paper"), MappingConfig)
+    assert preset("paper") != preset("default")
+    with pytest.raises(DataError, match="unknown preset"):
+        preset("best")
+
+
+def simulated(tmp_path, **settings):
+    """Return the recording and the truth of a simulated drive."""
+    logfile.write(simulate(Settings(**settings)), tmp_path)
+    return read_log(tmp_path / "run.log"), read_tum(tmp_path / "truth.tum")
+
+
+LIES = (Lie(anchor=2, start=60.0, seconds=120.0, metres=3.0),)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("limit", "settings"),
+    [
+        (0.06, {"world": "hall", "minutes": 8.0, "seed": 11}),
+        (0.06, {"world": "lab", "minutes": 6.0, "seed": 12}),
+        (0.10, {"world": "corridor", "minutes": 8.0, "seed": 13}),
+        (0.06, {"world": "hall", "minutes": 8.0, "seed": 14, "nlos": "heavy", "nlos_anchors": (3, 4)}),
+        (0.08, {"world": "hall", "minutes": 8.0, "seed": 15, "odometry_scale": 2.0, "slips": 3}),
+        (0.06, {"world": "hall", "minutes": 8.0, "seed": 16, "outliers": 0.1, "zeros": 0.05, "lies": LIES}),
+        (0.06, {"world": "hall", "minutes": 8.0, "seed": 17, "anchor_height": 2.0, "tag_height": 0.3}),
+        (0.15, {"world": "hall", "minutes": 8.0, "seed": 18, "without": ("uwb",)}),
+        (0.06, {"world": "hall", "minutes": 8.0, "seed": 19, "people": 4}),
+        (0.06, {"world": "lab", "minutes": 6.0, "seed": 20, "laser_error": (0.03, -0.02, 0.03), "laser_delay": 0.03}),
+    ],
+    ids=["hall", "lab", "corridor", "nlos", "slips", "lies", "heights", "no uwb", "people", "mounting"],
+)
+def test_simulated_worlds(tmp_path, limit, settings):
+    """Odometry alone drifts by decimetres to metres within these minutes; the bars are those of drives four times as long."""
+    log, truth = simulated(tmp_path, scan_rate=5.0, **settings)
+    result = build_map(log)
+    assert ate(result, truth) < limit
+    assert result.doubts == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["hall", "corridor"])
+def test_wheels_and_radio_alone(tmp_path, world):
+    """Ranges with multipath of 6 cm and biases hold the path to a decimetre or two, however long it is."""
+    log, truth = simulated(tmp_path, world=world, minutes=10.0, seed=21, without=("laser",))
+    result = build_map(log)
+    assert ate(result, truth) < 0.25
+    assert all(a.status == "ok" for a in result.anchors)
+
+
+REAL = {
+    "plaza1": ("truth.tum", 0.45), "labyrinth": ("truth_position.tum", 0.30),
+    "carmen/freiburg-101": ("truth.tum", 0.5), "carmen/belgioioso": ("truth.tum", 0.5),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL)
+def test_real_recordings_with_a_truth(shared_data, name):
+    file, limit = REAL[name]
+    result = build_map(read_log(next((shared_data / name).glob("run.log.gz"))))
+    assert ate(result, read_tum(shared_data / name / file)) < limit
+
+
+@pytest.mark.slow
+def test_plaza_s_anchors_and_range_scale(shared_data):
+    folder = shared_data / "plaza1"
+    result = build_map(read_log(folder / "run.log.gz"))
+    laid = evaluate_trajectory(result.stamps, result.trajectory, *read_tum(folder / "truth.tum")).T_truth_map
+    rows = [row.split(",") for row in (folder / "truth_anchors.csv").read_text().split()[1:]]
+    places = {row[0]: np.array(row[1:3], dtype=float) for row in rows}
+    for anchor in result.anchors:
+        assert anchor.status == "ok"
+        assert np.hypot(*(se2.transform(laid, anchor.position) - places[anchor.id])) < 0.6
+    scale = {c.name: c for c in result.calibration}["range_scale"]
+    assert scale.value == pytest.approx(0.07, abs=0.015)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kasdorf_2017-11-17-12-31-28", "mines_exp1"])
+def test_real_recordings_without_a_truth(shared_data, name):
+    """Nothing to compare with: the map must be of what was seen, and halves of the drive must agree with the whole."""
+    log = read_log(shared_data / name / "run.log.gz")
+    result = build_map(log)
+    assert np.isfinite(result.trajectory).all()
+    assert len(result.grid.occupied_points()) > 100
+    middle = (log.odometry.stamps[0] + log.odometry.stamps[-1]) / 2
+    half = build_map(log.crop(end=middle))
+    errors = evaluate_trajectory(half.stamps, half.trajectory, result.stamps, result.trajectory)
+    assert errors.ate.rmse < 0.1
+
+
+@pytest.mark.slow
+def test_intel_is_closed(shared_data):
+    """2,725 raw scans whose odometry turns wrong by more than 150 degrees, against a SLAM estimate of others."""
+    folder = shared_data / "intel_raw"
+    log = read_log(folder / "run.log.gz")
+    result = build_map(log)
+    table = np.loadtxt(folder / "reference_poses_matched.csv", delimiter=",", skiprows=1)
+    stamps = log.scans.stamps[table[:, 1].astype(int)]
+    assert ate(result, (stamps, table[:, 2:5])) < 0.5
