@@ -32,7 +32,8 @@ devices (a path, a by-id path, socket://host:port or any other pyserial URL):
 
 The log is CARMEN text. Each line is with the kernel as soon as it is written, so a crash loses at most the last one, and
 with the disk after --sync seconds. Losses, reconnects and warnings stand in it as COMMENT lines. A recording ends with
---duration, Ctrl-C (exit code 130) or SIGTERM (0); exit code 3: written, but a device was silent or lost much.
+--duration, Ctrl-C (exit code 130), SIGTERM or a closed terminal (0). Exit code 3: written, but a device was silent or
+lost much.
 PARAM lines written besides the mounting: laser_time_increment (s between rays), laser_range_min (m), laser_product,
 laser_firmware, laser_serial, uwb_tag_id, uwb_pan_id, uwb_tag_firmware, host_monotonic_zero (log time minus the
 computer's monotonic clock, s).
@@ -98,7 +99,8 @@ def run(args: argparse.Namespace) -> int:
         links, log, monotonic=time.monotonic, wall_offset=offset, host=re.sub(r"\s+", "_", socket.gethostname()) or "host",
         mounting=mounting, on_note=_show_note,
     )  # fmt: skip
-    before = {number: signal.signal(number, lambda n, _f: stopped.append(n)) for number in (signal.SIGINT, signal.SIGTERM)}
+    endings = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, lambda n, _f: stopped.append(n)) for number in endings}
     try:
         recorder.begin(_head(args, remark))
         _suggest_names(links)

@@ -242,7 +242,6 @@ class ScipSession:
         if reply.command == "PP":
             try:
                 self.geometry = parse_geometry(reply)
-                self._stream_request()
             except ProtocolError as error:
                 if self._tries < 1:
                     self._tries = 1
@@ -250,6 +249,7 @@ class ScipSession:
                 self.geometry = Geometry()
                 text = f"lidar: {error}; going on with the limits of a URG-04LX"
                 actions += self._tell("warning", "lidar-parameters", text)
+            self._stream_request()  # a range of steps that the unit does not have is the user's mistake: say so now
         return [*actions, *self._next(now)]
 
     def _time_reply(self, reply: Reply, kind: str, now: float) -> list[Action]:
