@@ -130,7 +130,7 @@ def _whiten(sqrt_information: Floats, values: Floats) -> Floats:
 def _map_axes(sqrt_information: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the columns (3, e) of L [R(heading)^T 0; 0 1]."""
     x, y, turn = np.ascontiguousarray(sqrt_information.transpose(2, 1, 0))
-    c, s = np.cos(heading), np.sin(heading)
+    c, s = se2.cos_sin(heading)
     return x * c - y * s, x * s + y * c, turn
 
 
@@ -138,7 +138,7 @@ def _relative_residuals(
     axes: tuple[Floats, Floats, Floats], z: Floats, xi: Floats, xj: Floats
 ) -> tuple[Floats, tuple[Floats, Floats]]:
     """Return whitened residuals (3, e) and the vector m (2, e); poses are (3, e)."""
-    c, s = np.cos(xi[2]), np.sin(xi[2])
+    c, s = se2.cos_sin(xi[2])
     mx = xj[0] - xi[0] - (c * z[0] - s * z[1])
     my = xj[1] - xi[1] - (s * z[0] + c * z[1])
     return axes[0] * mx + axes[1] * my + axes[2] * se2.wrap_angle(xj[2] - xi[2] - z[2]), (mx, my)
@@ -316,7 +316,7 @@ class ScanEdges:
         by_j = _by_pose(axes[0], axes[1], -_turned_about(axes, xj, sj))
         blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
         if np.any(self.calibration >= 0):
-            c, s = np.cos(heading_j) - np.cos(heading_i), np.sin(heading_j) - np.sin(heading_i)
+            c, s = (to - at for at, to in zip(se2.cos_sin(heading_i), se2.cos_sin(heading_j), strict=True))
             by_turn = axes[2] + _turned_about(axes, si, sj)
             by_delay = self._along(axes, graph, heading_j, self.twist_j) - self._along(axes, graph, heading_i, self.twist_i)
             by_delay += by_turn * self.twist_i[:, 2]
@@ -328,7 +328,7 @@ class ScanEdges:
 
     def _along(self, axes: tuple[Floats, Floats, Floats], graph: Graph, heading: Floats, twist: Floats) -> Floats:
         """Return the derivative (3, e) by the time for which S moves with a base of these headings (e,)."""
-        c, s = np.cos(heading), np.sin(heading)
+        c, s = se2.cos_sin(heading)
         x, y = np.append(graph.calibration.values, 0.0)[self.calibration[:2]]
         vx, vy = twist[:, 0] - twist[:, 2] * y, twist[:, 1] + twist[:, 2] * x
         return axes[0] * (c * vx - s * vy) + axes[1] * (s * vx + c * vy) + axes[2] * twist[:, 2]
@@ -377,11 +377,11 @@ class RangeEdges:
         """Return R(theta) u (2, e), the vector anchor -> tag (2, e), the slant distance (e,) and the calibration (6, e)."""
         cal = np.append(graph.calibration.values, 0.0)[self.calibration.T]
         pose, anchor = graph.poses[self.pose].T, graph.anchors[self.anchor].T
-        c, s = np.cos(self.turn), np.sin(self.turn)
+        c, s = se2.cos_sin(self.turn)
         tx, ty = self.tag[0] + cal[3], self.tag[1] + cal[4]
         ux = self.lever_arm[:, 0] + (c * tx - s * ty) + self.velocity[:, 0] * cal[5]
         uy = self.lever_arm[:, 1] + (s * tx + c * ty) + self.velocity[:, 1] * cal[5]
-        c, s = np.cos(pose[2]), np.sin(pose[2])
+        c, s = se2.cos_sin(pose[2])
         arm = np.stack([c * ux - s * uy, s * ux + c * uy])
         offset = pose[:2] + arm - anchor
         squared = offset[0] ** 2 + offset[1] ** 2 + self.height**2 + cal[2]
@@ -419,8 +419,8 @@ class RangeEdges:
     def _by_calibration(self, theta: Floats, direction: Floats, distance: Floats, scale: Floats) -> tuple[Floats, ...]:
         """Return the derivatives (e,) by scale, bias, q, tag x, tag y and delay."""
         (x, y), (vx, vy) = direction, self.velocity.T
-        c, s = np.cos(theta), np.sin(theta)
-        ct, st = np.cos(theta + self.turn), np.sin(theta + self.turn)
+        c, s = se2.cos_sin(theta)
+        ct, st = se2.cos_sin(theta + self.turn)
         by_delay = (c * x + s * y) * vx + (c * y - s * x) * vy
         return distance / self.sigma, 1.0 / self.sigma, scale / (2.0 * distance), ct * x + st * y, ct * y - st * x, by_delay
 

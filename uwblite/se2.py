@@ -31,9 +31,18 @@ def wrap_angle(angle: ArrayLike) -> Floats:
     return np.clip(wrapped, _ABOVE_MINUS_PI, np.pi)
 
 
+def cos_sin(angle: ArrayLike) -> tuple[Floats, Floats]:
+    """Return cosine and sine of angles (...), rad.
+
+    Of a contiguous copy: numpy 1.24 rounds either way on strided input, depending on its address in memory.
+    """
+    angle = np.asarray(angle, dtype=np.float64, order="C")
+    return np.cos(angle), np.sin(angle)
+
+
 def rotate(theta: ArrayLike, vectors: ArrayLike) -> Floats:
     """Turn vectors (..., 2) by theta (...), rad."""
-    c, s = np.cos(theta), np.sin(theta)
+    c, s = cos_sin(theta)
     vectors = np.asarray(vectors, dtype=np.float64)
     x, y = vectors[..., 0], vectors[..., 1]
     return np.stack([c * x - s * y, s * x + c * y], axis=-1)
@@ -67,6 +76,7 @@ def between(a: ArrayLike, b: ArrayLike) -> Floats:
 
 def _sine_terms(theta: Floats) -> tuple[Floats, Floats]:
     """Return sin(t)/t and (1 - cos t)/t."""
+    theta = np.asarray(theta, order="C")
     small = np.abs(theta) < _SERIES_BELOW
     t = np.where(small, 1.0, theta)
     t2 = theta * theta
@@ -116,7 +126,7 @@ def interpolate_trajectory(stamps: Floats, poses: Floats, query: ArrayLike) -> F
 def compose_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
     """Return the Jacobians (..., 3, 3) of compose(a, b) by the coordinates of a and of b."""
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    c, s = cos_sin(a[..., 2])
     da = np.zeros((*a.shape[:-1], 3, 3))
     da[..., 0, 0] = da[..., 1, 1] = da[..., 2, 2] = 1.0
     da[..., 0, 2] = -s * b[..., 0] - c * b[..., 1]
@@ -131,7 +141,7 @@ def compose_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
 def between_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
     """Return the Jacobians (..., 3, 3) of between(a, b) by the coordinates of a and of b."""
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    c, s = cos_sin(a[..., 2])
     d = rotate(-a[..., 2], b[..., :2] - a[..., :2])
     db = np.zeros((*a.shape[:-1], 3, 3))
     db[..., 0, 0] = db[..., 1, 1] = c
