@@ -1,0 +1,219 @@
+"""What is known beforehand: frames found, moved anchors named, edges right, files strict."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwblite import se2
+from uwblite.constraints import (
+    Constraints,
+    ForbiddenClosure,
+    KnownAnchor,
+    KnownClosure,
+    KnownDistance,
+    KnownPose,
+    apply,
+)
+from uwblite.distance_edges import AnchorDistanceEdges
+from uwblite.errors import ConfigError, FormatError
+from uwblite.graph import Graph, RangeEdges, RelativePoseEdges
+from uwblite.io.constraints_file import parse_constraints, read_anchors
+from uwblite.solver import optimize
+
+IDS = ("A", "B", "C", "D")
+TRUE = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 6.0], [-1.0, 5.0]])
+STAMPS = 100.0 + 0.5 * np.arange(40)
+ALL = np.ones(4, dtype=bool)
+
+
+def drive():
+    turn = np.linspace(0, 2 * np.pi, 40)
+    return np.stack([3.5 + 2.5 * np.cos(turn), 3 + 1.5 * np.sin(turn), se2.wrap_angle(turn + np.pi / 2)], axis=1)
+
+
+def first_estimate(T=(2.0, -3.0, 1.2), anchors=TRUE):
+    """The truth seen in another frame, with edges that hold it together."""
+    T = np.array(T)
+    poses, anchors = se2.compose(T, drive()), se2.transform(T, anchors)
+    i = np.arange(39)
+    chain = RelativePoseEdges(i, i + 1, se2.between(poses[:-1], poses[1:]), np.tile(np.eye(3) * 100, (39, 1, 1)))
+    pose, anchor = np.repeat(np.arange(40), 4), np.tile(np.arange(4), 40)
+    distance = np.hypot(*(poses[pose, :2] - anchors[anchor]).T)
+    none = np.zeros(160)
+    radio = RangeEdges(
+        pose, anchor, distance, np.full(160, 0.05), np.zeros((160, 2)), none, np.zeros((160, 2)), np.zeros(2), none,
+        np.full((160, 6), -1),
+    )  # fmt: skip
+    return Graph(poses, anchors).with_edges(chain, radio)
+
+
+def surveyed(*ids, movable=False, shift=(0.0, 0.0)):
+    return tuple(KnownAnchor(i, tuple(TRUE[IDS.index(i)] + shift), 0.02, movable) for i in ids)
+
+
+angle = st.floats(-np.pi, np.pi)
+
+
+@given(st.tuples(st.floats(-50, 50), st.floats(-50, 50), angle), st.sampled_from(["AB", "ABC", "ABCD", "BD"]))
+def test_the_users_frame_is_found_from_anchors(T, ids):
+    done = apply(Constraints(anchors=surveyed(*ids)), first_estimate(T), IDS, ALL, STAMPS)
+    np.testing.assert_allclose(done.graph.anchors, TRUE, atol=1e-9)
+    np.testing.assert_allclose(se2.between(drive(), done.graph.poses), 0, atol=1e-9)
+    assert done.moved == {}
+
+
+@given(st.tuples(st.floats(-50, 50), st.floats(-50, 50), angle))
+def test_the_users_frame_is_found_from_a_pose(T):
+    known = Constraints(poses=(KnownPose(float(STAMPS[7]), tuple(drive()[7].tolist())),))
+    done = apply(known, first_estimate(T), IDS, ALL, STAMPS)
+    np.testing.assert_allclose(se2.between(drive(), done.graph.poses), 0, atol=1e-9)
+
+
+def test_one_anchor_leaves_the_heading_as_it_was():
+    done = apply(Constraints(anchors=surveyed("B")), first_estimate((2, -3, 0.0)), IDS, ALL, STAMPS)
+    solved, summary = optimize(done.graph)
+    assert summary.converged
+    np.testing.assert_allclose(solved.anchors, TRUE, atol=1e-6)
+
+
+def test_solving_keeps_what_was_said_and_the_first_pose_is_free():
+    anchors = TRUE + np.random.default_rng(1).normal(0, 0.1, TRUE.shape)
+    done = apply(Constraints(anchors=surveyed(*IDS)), first_estimate(anchors=anchors), IDS, ALL, STAMPS)
+    assert not done.graph.fixed_poses.any()
+    solved, summary = optimize(done.graph)
+    assert summary.converged
+    # Ranges of a slightly different world against the survey: both yield by less than the difference.
+    assert np.all(np.hypot(*(solved.anchors - TRUE).T) < 0.15)
+    assert solved.chi2() <= done.graph.chi2()
+
+
+@pytest.mark.parametrize("which", IDS)
+def test_an_anchor_moved_since_the_earlier_map_is_named_and_does_not_bend_the_map(which):
+    anchors = TRUE.copy()
+    anchors[IDS.index(which)] += (2.0, -1.5)
+    known = Constraints(anchors=surveyed(*IDS, movable=True))
+    done = apply(known, first_estimate(anchors=anchors), IDS, ALL, STAMPS)
+    assert set(done.moved) == {which}
+    assert done.moved[which] == pytest.approx(2.5, abs=0.01)
+    np.testing.assert_allclose(done.graph.anchors, anchors, atol=1e-6)
+    solved, _ = optimize(done.graph)
+    np.testing.assert_allclose(solved.anchors, anchors, atol=1e-6)
+
+
+def test_a_tape_between_anchors_is_heard():
+    known = Constraints(distances=(KnownDistance(("A", "B"), 9.0, 0.001),))
+    done = apply(known, first_estimate(), IDS, ALL, STAMPS)
+    assert done.graph.fixed_poses is None
+    solved, _ = optimize(done.graph)
+    assert np.hypot(*(solved.anchors[0] - solved.anchors[1])) == pytest.approx(9.0, abs=0.05)
+
+
+def test_the_jacobian_of_a_distance_is_right():
+    edges = AnchorDistanceEdges(np.array([0, 2]), np.array([1, 3]), np.array([5.0, 3.0]), np.array([0.1, 0.3]))
+    graph = first_estimate()
+    lin = edges.linearize(graph)
+    np.testing.assert_allclose(lin.residuals, edges.residuals(graph))
+    for _, index, jacobian in lin.blocks:
+        for axis in range(2):
+            step = np.zeros_like(graph.anchors)
+            step[index, axis] = 1e-6
+            up, down = (edges.residuals(graph.updated(graph.poses, graph.anchors + s, np.zeros(0))) for s in (step, -step))
+            np.testing.assert_allclose(jacobian[:, :, axis], (up - down) / 2e-6, atol=1e-6)
+
+
+def test_a_known_closure_ties_two_times_together():
+    known = Constraints(closures=(KnownClosure((float(STAMPS[3]), float(STAMPS[30]))),))
+    edges = apply(known, first_estimate(), IDS, ALL, STAMPS).graph.edges[-1]
+    assert (edges.i.tolist(), edges.j.tolist()) == ([3], [30])
+    np.testing.assert_allclose(edges.sqrt_information[0], np.eye(3) * 10)
+
+
+def test_forbidden_pairs_are_refused_both_ways_and_others_not():
+    known = Constraints(forbidden=(ForbiddenClosure((100.0, 200.0), within=5.0),))
+    one, two = np.array([101.0, 199.0, 101.0, 150.0]), np.array([198.0, 104.0, 190.0, 200.0])
+    assert known.allowed(one, two).tolist() == [False, False, True, True]
+
+
+def test_sums_take_the_later_place_of_an_anchor():
+    both = Constraints(anchors=surveyed("A", "B", movable=True)) + Constraints(anchors=surveyed("B", shift=(1, 0)))
+    assert [(a.id, a.movable) for a in both.anchors] == [("A", True), ("B", False)]
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        (Constraints(anchors=(KnownAnchor("X", (0, 0)),)), "no ranges to anchor X; the recording has A, B, C, D"),
+        (Constraints(distances=(KnownDistance(("A", "Y"), 1.0),)), "anchor Y"),
+        (Constraints(poses=(KnownPose(7.0, (0, 0, 0)),)), "stamp 7 lies outside"),
+        (Constraints(closures=(KnownClosure((101.0, 900.0)),)), "stamp 900 lies outside"),
+    ],
+)
+def test_what_does_not_belong_to_the_recording_is_refused(known, message):
+    with pytest.raises(ConfigError, match=message):
+        apply(known, first_estimate(), IDS, ALL, STAMPS)
+    gone = Constraints(anchors=(KnownAnchor("X", (0, 0), movable=True), *surveyed("A", "B", movable=True)))
+    np.testing.assert_allclose(apply(gone, first_estimate(), IDS, ALL, STAMPS).graph.anchors, TRUE, atol=1e-6)
+
+
+FILE = """
+[[anchor]]
+id = "5C0B"
+position = [1.0, 2]
+sigma = 0.02
+
+[[pose]]
+stamp = 12.5
+pose = [0, 0, 1.5]
+
+[[anchor_distance]]
+anchors = ["5C0B", "91A3"]
+distance = 7.25
+
+[[closure]]
+stamps = [10, 200]
+
+[[forbidden_closure]]
+stamps = [10, 300]
+within = 20
+"""
+
+
+def test_a_file_says_it_all():
+    known = parse_constraints(FILE)
+    assert known.anchors == (KnownAnchor("5C0B", (1.0, 2.0), 0.02),)
+    assert known.poses[0].pose == (0.0, 0.0, 1.5)
+    assert known.distances[0].anchors == ("5C0B", "91A3")
+    assert known.closures[0].stamps == (10.0, 200.0)
+    assert known.forbidden[0].within == 20.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[[anchr]]\nid = 'A'", r"unknown table 'anchr'; it may hold \[\[anchor\]\]"),
+        ("[anchor]\nid = 'A'", "unknown table 'anchor'"),
+        ("[[anchor]]\nid = 'A'", r"\[\[anchor\]\] number 1 needs position"),
+        ("[[anchor]]\nid = 'A'\nposition = [1]", "2 values, not 1"),
+        ("[[anchor]]\nid = 'A'\nposition = [1, 2]\nsigma = 0", "must be > 0"),
+        ("[[anchor]]\nid = 'A'\nposition = [1, 2]\nsgma = 1", "did you mean 'sigma'"),
+        ("anchor = [1]", "not a table"),
+        ("x = ", "not valid TOML"),
+    ],
+)
+def test_a_wrong_file_is_named(text, message):
+    with pytest.raises(ConfigError, match=message):
+        parse_constraints(text, "known.toml")
+
+
+def test_the_anchors_of_an_earlier_map(tmp_path):
+    file = tmp_path / "anchors.csv"
+    file.write_text("id,x,y,sigma_x,sigma_y,status\nA,1,2,0.01,0.3,ok\nB,3,4,,,ok\nC,,,,,unplaced\nD,1,1,1,1,distrusted\n")
+    known = read_anchors(file)
+    assert known.anchors == (KnownAnchor("A", (1.0, 2.0), 0.3, True), KnownAnchor("B", (3.0, 4.0), 0.02, True))
+    file.write_text("id,x,y\nC,,\n")
+    with pytest.raises(FormatError, match="no anchor in it has a place"):
+        read_anchors(file)
+    file.write_text("id,x\nC,1\n")
+    with pytest.raises(FormatError, match="no column 'y'"):
+        read_anchors(file)

@@ -1,0 +1,88 @@
+"""Reading what is known beforehand: a TOML file of constraints, and the anchors.csv of an earlier map."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..config import from_dict, parse_toml
+from ..constraints import Constraints, ForbiddenClosure, KnownAnchor, KnownClosure, KnownDistance, KnownPose
+from ..errors import ConfigError, FormatError
+from .csv_table import read_csv
+
+_TABLES: Mapping[str, tuple[type, str]] = {
+    "anchor": (KnownAnchor, "anchors"),
+    "pose": (KnownPose, "poses"),
+    "anchor_distance": (KnownDistance, "distances"),
+    "closure": (KnownClosure, "closures"),
+    "forbidden_closure": (ForbiddenClosure, "forbidden"),
+}
+
+
+def parse_constraints(text: str, path: str = "") -> Constraints:
+    """Return the constraints of a TOML text; path is its name for error messages.
+
+    Tables: ``[[anchor]]``, ``[[pose]]``, ``[[anchor_distance]]``, ``[[closure]]``, ``[[forbidden_closure]]``, each with the
+    fields of its class in constraints.py.
+
+    Raises
+    ------
+    ConfigError : a table or field is unknown, missing or of the wrong kind.
+    """
+    data = parse_toml(text, path)
+    found: dict[str, tuple[Any, ...]] = {}
+    for name, tables in data.items():
+        if name not in _TABLES or not isinstance(tables, list):
+            known = ", ".join(f"[[{k}]]" for k in _TABLES)
+            raise ConfigError(f"{path or 'constraints'}: unknown table {name!r}; it may hold {known}")
+        kind, field = _TABLES[name]
+        where = f"{path or 'constraints'}: [[{name}]] number"
+        found[field] = tuple(_entry(kind, table, f"{where} {k}") for k, table in enumerate(tables, 1))
+    return Constraints(**found)
+
+
+def _entry(kind: type, table: Any, where: str) -> Any:
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"{where} is not a table")
+    missing = [name for name in _REQUIRED[kind] if name not in table]
+    if missing:
+        raise ConfigError(f"{where} needs {missing[0]}")
+    try:
+        return from_dict(kind, table)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+_REQUIRED: Mapping[type, tuple[str, ...]] = {
+    KnownAnchor: ("id", "position"),
+    KnownPose: ("stamp", "pose"),
+    KnownDistance: ("anchors", "distance"),
+    KnownClosure: ("stamps",),
+    ForbiddenClosure: ("stamps",),
+}
+
+
+def read_anchors(path: str | os.PathLike[str]) -> Constraints:
+    """Return the placed anchors of an earlier map's anchors.csv as known places; they may have been moved since.
+
+    Sigmas are taken as the larger of x and y, and at least 2 cm: an earlier map's own frame is not surer than that.
+
+    Raises
+    ------
+    FormatError : it is not such a file, or no anchor in it has a place.
+    """
+    table = read_csv(path)
+    names = table.texts("id")
+    for column in ("x", "y"):
+        table.texts(column)
+    values = table.numbers("x", "y", "sigma_x", "sigma_y", default=np.nan)
+    status = table.texts("status", default="ok")
+    anchors = []
+    for name, (x, y, sigma_x, sigma_y), state in zip(names, values.tolist(), status, strict=True):
+        if np.isfinite(x) and np.isfinite(y) and state == "ok":
+            sigma = float(np.nanmax([sigma_x, sigma_y, 0.02]))
+            anchors.append(KnownAnchor(name, (x, y), sigma, movable=True))
+    if not anchors:
+        raise FormatError("no anchor in it has a place; it must be the anchors.csv of a map", os.fspath(path))
+    return Constraints(anchors=tuple(anchors))
