@@ -7,10 +7,13 @@ import numpy as np
 from uwblite import se2
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
 
+NOMINAL = SensorMounting()
+
 
 def drive(twists, seconds, rate=20.0, start=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps (n,) and true poses (n, 3) of a base that holds each twist (vx, vy, omega) for so many seconds."""
-    steps = np.concatenate([np.tile(np.asarray(t) / rate, (max(1, round(s * rate)), 1)) for t, s in zip(twists, seconds, strict=True)])
+    counts = [max(1, round(s * rate)) for s in seconds]
+    steps = np.repeat(np.asarray(twists, dtype=float) / rate, counts, axis=0)
     return np.arange(len(steps) + 1) / rate, chain(np.asarray(start, dtype=float), se2.exp(steps))
 
 
@@ -87,7 +90,7 @@ def cast(poses, bearings, walls) -> np.ndarray:
 
 def scans(
     stamps, truth, walls, rate=5.0, beams=180, fov=2 * np.pi, sweep=0.1, range_max=20.0, noise=0.0, rng=None,
-    mounting=SensorMounting(),
+    mounting=NOMINAL,
 ) -> LaserScans:
     """Return scans of walls, every ray cast from where the laser is at the ray's own time."""
     times = np.arange(stamps[0], stamps[-1] - sweep, 1.0 / rate)
@@ -102,7 +105,7 @@ def scans(
     return LaserScans(times, distance.astype(np.float32), -fov / 2, step, increment, 0.05, range_max)
 
 
-def recording(said, radio=None, lidar=None, mounting=SensorMounting()) -> SensorLog:
+def recording(said, radio=None, lidar=None, mounting=NOMINAL) -> SensorLog:
     """Return the parts as one recording."""
     return SensorLog(said, radio, lidar, mounting)
 

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from uwblite.calibration import (
-    CalibrationConfig, block, indices, odometry_indices, prior_edges, range_indices, scan_indices, unknowns,
+    CalibrationConfig,
+    block,
+    indices,
+    odometry_indices,
+    prior_edges,
+    range_indices,
+    scan_indices,
+    unknowns,
 )
 from uwblite.graph import Calibration, Graph
 
@@ -67,7 +74,7 @@ def test_tables_name_the_right_scalar_in_the_right_column():
 
 
 def test_what_is_switched_off_has_index_minus_one():
-    nothing = CalibrationConfig(**{f: 0.0 for f in CalibrationConfig.__dataclass_fields__})
+    nothing = CalibrationConfig(**dict.fromkeys(CalibrationConfig.__dataclass_fields__, 0.0))
     calibration = block(unknowns(nothing, IDS, TOLD))
     assert calibration.names == ()
     assert len(prior_edges(unknowns(nothing, IDS, TOLD))) == 0
