@@ -14,6 +14,7 @@ import pytest
 from conftest import ROOT
 
 from uwblite.cli import VERBS, main
+from uwblite.io.constraints_file import parse_constraints
 from uwblite.io.uwb_mapping import parse_mappings
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -124,8 +125,8 @@ def test_every_python_example_works(document, workspace, capsys):
 
 
 def test_sample_mappings_are_valid():
-    for _, text in blocks(ROOT / "docs" / "formats.md", "toml"):
-        assert parse_mappings(text)
+    for info, text in blocks(ROOT / "docs" / "formats.md", "toml"):
+        assert parse_constraints(text) if "constraints" in info else parse_mappings(text)
 
 
 @pytest.mark.parametrize("document", [*DOCUMENTS, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"], ids=lambda p: p.name)

@@ -151,3 +151,50 @@ def test_walls_are_turned_along_the_axes_and_the_map_cropped(room_log, tmp_path,
     assert np.allclose(poses[0, :2], 0.0, atol=1e-6)
     assert (folder / "map.pgm").read_bytes().startswith(b"P5\n100 80\n")
     assert "origin: [-2, -1, 0]" in (folder / "map.yaml").read_text()
+
+
+def anchors_of(folder):
+    import csv
+
+    with open(folder / "anchors.csv") as file:
+        return {row["id"]: (float(row["x"]), float(row["y"])) for row in csv.DictReader(file)}
+
+
+def test_a_second_map_lies_in_the_frame_of_the_first_and_names_what_was_moved(mapped, room_log, tmp_path, capsys):
+    from uwblite.io.csv_table import read_csv
+
+    truth = read_csv(room_log.parent / "room" / "truth_anchors.csv")
+    place = dict(zip(truth.texts("id"), truth.numbers("x", "y").tolist(), strict=True))
+    lines = [f"{name},{x + 3.0 * (name == 'DD07')},{y},0.05,0.05,ok" for name, (x, y) in place.items()]
+    (tmp_path / "earlier.csv").write_text("\n".join(["id,x,y,sigma_x,sigma_y,status", *lines]) + "\n")
+    words = ["--anchors-from", str(tmp_path / "earlier.csv"), "--set", "grid.resolution=0.1"]
+    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
+    assert "warning: anchor DD07 stands" in capsys.readouterr().out
+    found = anchors_of(tmp_path / "map")
+    for name, position in place.items():
+        # Four minutes in a small room leave biases open; its walls hold the rest. The frame is what is asked for here.
+        assert np.hypot(*np.subtract(found[name], position)) < 0.4, name
+
+
+def test_a_file_of_constraints_pins_the_map(room_log, tmp_path, capsys):
+    (tmp_path / "known.toml").write_text("[[pose]]\nstamp = 0\npose = [10, 20, 1.5707963]\nsigma = [0.001, 0.001, 0.001]\n")
+    words = ["--constraints", str(tmp_path / "known.toml"), "--without", "lidar"]
+    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
+    _, poses = read_tum(tmp_path / "map" / "trajectory.tum")
+    assert np.allclose(poses[0], (10, 20, np.pi / 2), atol=0.01)
+    assert "--constraints" in json.loads((tmp_path / "map" / "report.json").read_text())["command"]
+    (tmp_path / "known.toml").write_text("[[anchor]]\nid = 'FFFF'\nposition = [1, 2]\n")
+    assert main(["map", str(room_log), "--out", str(tmp_path / "other"), *words]) == 1
+    assert "no ranges to anchor FFFF" in capsys.readouterr().err
+
+
+def test_a_forbidden_closure_is_listed_as_such(room_log, tmp_path, capsys):
+    (tmp_path / "known.toml").write_text("[[forbidden_closure]]\nstamps = [30, 200]\nwithin = 30\n")
+    words = ["--constraints", str(tmp_path / "known.toml"), "--without", "uwb"]
+    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
+    closures = json.loads((tmp_path / "map" / "report.json").read_text())["closures"]
+    for c in closures:
+        apart = sorted((c["stamp_i"], c["stamp_j"]))
+        if apart[0] <= 60 and apart[1] >= 170 and apart[1] <= 230:
+            assert not c["accepted"]
+    assert any("forbidden" in c["reason"] for c in closures)

@@ -11,6 +11,7 @@ from .options import add_mounting_arguments, add_settings_arguments, numbers
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from ..constraints import Constraints
     from ..map_result import MapResult
     from ..mapping import MappingConfig
     from ..sensor_log import SensorLog
@@ -24,6 +25,7 @@ examples:
   uwblite map run.log --out b/ --preset paper          the paper's plain choices
   uwblite map run.log --out c/ --set grid.resolution=0.02
   uwblite map run.log --out d/ --align walls --crop 0,0,12,8
+  uwblite map monday.log --out monday/ --anchors-from sunday/anchors.csv    in the frame of Sunday's map
   uwblite map run.log --out map/ --dry-run             read, check and estimate only
 
 files in --out: map.png (picture), report.html, map.yaml + map.pgm (map_server, nav2), trajectory.tum (evo),
@@ -51,6 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument("--scale-map", action="store_true", help="write the probabilities too: map_scale.png (mode: scale)")
     output.add_argument("--no-timings", action="store_true", help="leave timings out of report.json: same run, same bytes")
     output.add_argument("--report-timings", action="store_true", help="show the stages' seconds in report.html too")
+    beforehand = parser.add_argument_group("known beforehand")
+    text = "surveyed anchors, pinned poses, distances, closures, see docs/formats.md"
+    beforehand.add_argument("--constraints", metavar="FILE.toml", help=text)
+    text = "go on in the frame of an earlier map: its anchors.csv; anchors that were moved since are named"
+    beforehand.add_argument("--anchors-from", metavar="FILE.csv", help=text)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
 
@@ -71,14 +78,14 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.dry_run:
         check_target(args.out, force=args.force)
-    config = _settings(args)
+    config, constraints = _settings(args), _known(args)
     began = time.perf_counter()
     log = apply_mounting(read_recording(args.log), args)
     reading = time.perf_counter() - began
     _tell_reader_warnings(log)
     if args.dry_run:
         return _dry_run(args, log)
-    result = _build(log, config, args.jobs)
+    result = _build(log, config, constraints, args.jobs)
     record = RunRecord(
         command=repeat_command(args),
         config=to_toml(config, header="settings in force; `uwblite config` explains them"),
@@ -108,7 +115,18 @@ def _settings(args: argparse.Namespace) -> "MappingConfig":
     return override(config, [f"{name}={value}" for name, value in short.items() if value is not None])
 
 
-def _build(log: "SensorLog", config: "MappingConfig", jobs: int) -> "MapResult":
+def _known(args: argparse.Namespace) -> "Constraints":
+    from ..constraints import Constraints
+    from ..io.constraints_file import parse_constraints, read_anchors
+    from .options import read_text
+
+    earlier = read_anchors(args.anchors_from) if args.anchors_from else Constraints()
+    if not args.constraints:
+        return earlier
+    return earlier + parse_constraints(read_text(args.constraints), args.constraints)
+
+
+def _build(log: "SensorLog", config: "MappingConfig", constraints: "Constraints", jobs: int) -> "MapResult":
     from ..mapping import build_map
     from . import console
 
@@ -119,7 +137,8 @@ def _build(log: "SensorLog", config: "MappingConfig", jobs: int) -> "MapResult":
             from concurrent.futures import ProcessPoolExecutor
 
             executor = ProcessPoolExecutor(jobs)
-        return build_map(log, config, progress=progress, executor=executor, clock=time.perf_counter)
+        clock = time.perf_counter
+        return build_map(log, config, constraints=constraints, progress=progress, executor=executor, clock=clock)
     finally:
         progress.close()
         if executor is not None:
@@ -154,6 +173,8 @@ def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
 def repeat_command(args: argparse.Namespace) -> str:
     """Return the command that makes the same map again, from the config.toml beside the result."""
     words = ["uwblite", "map", args.log, "--config", "config.toml"]
+    for option, value in (("--constraints", args.constraints), ("--anchors-from", args.anchors_from)):
+        words += [option, value] if value else []
     if args.laser_pose is not None:
         words.append("--laser-pose=" + ",".join(map(repr, args.laser_pose)))
     if args.laser_flipped:
