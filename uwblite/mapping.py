@@ -31,7 +31,9 @@ from . import (
 from .anchors import AnchorConfig
 from .calibration import CalibrationConfig
 from .clouds import CloudConfig, Clouds
-from .errors import Cancelled, DataError
+from .constraints import Constraints
+from .constraints import apply as apply_constraints
+from .errors import Cancelled, ConfigError, DataError
 from .first_estimate import FirstEstimate, GrowthConfig
 from .graph import Edges, Graph, OdometryEdges, RangeEdges
 from .keyframes import KeyframeConfig, Keyframes
@@ -117,6 +119,7 @@ def build_map(
     log: SensorLog,
     config: MappingConfig | None = None,
     *,
+    constraints: Constraints | None = None,
     progress: Progress | None = None,
     executor: Executor | None = None,
     clock: Callable[[], float] | None = None,
@@ -127,6 +130,7 @@ def build_map(
     ----------
     log : the recording; ranges or scans may be missing.
     config : settings; None = defaults.
+    constraints : what is known beforehand: surveyed anchors, pinned poses, an earlier map's anchors ...
     progress : called as progress(stage, done, total); returning False raises Cancelled.
     executor : any concurrent.futures executor; the result does not depend on it.
     clock : seconds, for the stages' timings; None = no timings.
@@ -135,7 +139,7 @@ def build_map(
     ------
     DataError : the recording holds nothing to map. Cancelled : the callback asked to stop.
     """
-    config = config or MappingConfig()
+    config, known = config or MappingConfig(), constraints or Constraints()
     stages = Stages(progress, clock)
     log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
 
@@ -150,8 +154,9 @@ def build_map(
         first, graph, radio, solved = _first_optimisation(graph, wheels, radio, path, config, stages)
         stages.end("first optimisation", placed=int(first.placed.sum()), **_solver_figures(solved))
     edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
+    graph, first = _constrained(graph, edges, first, known, log, frames, config, stages)
 
-    scans = _Scans.of(log, frames, config)
+    scans = _Scans.of(log, frames, known, config)
     closures = loop_closure.no_closures()
     refined: Refined | None = None
     if scans is not None:
@@ -232,6 +237,32 @@ def _first_optimisation(
     return first, graph, radio, result
 
 
+def _constrained(
+    graph: Graph, edges: tuple[Edges, ...], first: FirstEstimate | None, known: Constraints, log: SensorLog,
+    frames: Keyframes, config: MappingConfig, stages: Stages,
+) -> tuple[Graph, FirstEstimate | None]:
+    """Bring the first estimate into the user's frame, where one is known, and add what is known beforehand."""
+    if known == Constraints():
+        return graph, first
+    if known.places and config.align != "odometry":
+        raise ConfigError("known places say where the map lies; leave out align, or the places")
+    ids = log.ranges.anchor_ids if log.ranges is not None else ()
+    placed = np.zeros(len(ids), dtype=bool) if first is None else first.placed
+    done = apply_constraints(known, graph, ids, placed, frames.stamps)
+    stages.warnings += [
+        f"anchor {name} stands {off:.2f} m from its earlier place: it was moved" for name, off in done.moved.items()
+    ]
+    graph = _estimates(done.graph, optimize(done.graph.with_edges(*edges), config.solver)[0])
+    stages.end("constraints", moved=sorted(done.moved), shift=[round(v, 4) for v in done.motion.tolist()])
+    return graph, None if first is None else _moved_hypotheses(first, done.motion)
+
+
+def _moved_hypotheses(first: FirstEstimate, motion: Floats) -> FirstEstimate:
+    """Return the first estimate with its places of anchors in a frame moved by T_new_old."""
+    moved = tuple(tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in first.hypotheses)
+    return replace(first, hypotheses=moved)
+
+
 def _hold_negative_heights(graph: Graph) -> Graph:
     """Return the graph with squared heights that came out negative put back to 0 and held."""
     names, values = graph.calibration.names, graph.calibration.values.copy()
@@ -248,26 +279,53 @@ class _Scans:
     clouds: Clouds
     raster: NearestRaster
     twist: Floats
+    stamps: Floats
+    known: Constraints
+
+    def may_meet(self, i: Ints, j: Ints) -> Bools:
+        """Tell which pairs of keyframes the user has not forbidden to match."""
+        return self.known.allowed(self.stamps[i], self.stamps[j])
 
     @classmethod
-    def of(cls, log: SensorLog, frames: Keyframes, config: MappingConfig) -> "_Scans | None":
+    def of(cls, log: SensorLog, frames: Keyframes, known: Constraints, config: MappingConfig) -> "_Scans | None":
         if log.scans is None or not len(log.scans.stamps):
             return None
         owner, chosen = keyframes.choose_scans(log.scans, frames, config.keyframes)
         rays = keyframes.scan_points(log, frames, owner, chosen, config.clouds.range_max)
         built = clouds.build(rays, len(frames), config.clouds)
         reach = max(config.refinement.first_gate, 0.2)
-        return cls(built, pair_matching.paint(built, 0.2 * reach, reach), frames.twist)
+        return cls(built, pair_matching.paint(built, 0.2 * reach, reach), frames.twist, frames.stamps, known)
 
 
 def _match_round(
     graph: Graph, edges: tuple[Edges, ...], scans: _Scans, i: Ints, j: Ints, settings: RefinementConfig,
     config: MappingConfig, stages: Stages, stage: str,
 ) -> tuple[Graph, Refined]:
+    kept = scans.may_meet(i, j)
+    i, j = i[kept], j[kept]
     refined = refinement.refine(
         graph.with_edges(*edges), scans.clouds, scans.raster, scans.twist, i, j, settings, config.solver, stages.teller(stage)
     )
     return _estimates(graph, refined.graph), refined
+
+
+def _without_forbidden(found: Closures, scans: _Scans) -> Closures:
+    """Return closures with those the user has forbidden rejected."""
+    accepted = [c for c in found.candidates if c.accepted]
+    kept = scans.may_meet(*(np.array([(c.i, c.j) for c in accepted], dtype=np.int64).reshape(-1, 2).T))
+    if kept.all():
+        return found
+    banned = {(c.i, c.j) for c, keep in zip(accepted, kept, strict=True) if not keep}
+    story = tuple(
+        replace(c, accepted=False, reason="forbidden by the constraints") if c.accepted and (c.i, c.j) in banned else c
+        for c in found.candidates
+    )
+    e = found.edges
+    edges = replace(
+        e, i=e.i[kept], j=e.j[kept], T_i_j=e.T_i_j[kept], sqrt_information=e.sqrt_information[kept],
+        weights=None if e.weights is None else e.weights[kept],
+    )
+    return Closures(edges, story)
 
 
 def _track(
@@ -306,6 +364,7 @@ def _close_loops(
         candidates = loop_closure.propose(base, known, pieces, session, tried, missed, config.loops)
         tried |= candidates.names(config.loops)
         new = loop_closure.find(candidates, pieces, config.loops, config.search, stages.teller("loop closure"))
+        new = _without_forbidden(new, scans)
         missed |= set() if held else loop_closure.missed(candidates, new, config.loops)
         found = loop_closure.merged(found, new)
         base, found = loop_closure.reconcile(base, found, config.loops, config.solver)
@@ -368,12 +427,7 @@ def _aligned(
     if scans is not None and config.align == "walls":
         normals = se2.rotate(graph.poses[scans.clouds.owner, 2], scans.clouds.normals)
     motion = map_frame.alignment(config.align, graph, placed, normals)
-    if first is not None:
-        moved = tuple(
-            tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in first.hypotheses
-        )
-        first = replace(first, hypotheses=moved)
-    return map_frame.moved(graph, motion), first
+    return map_frame.moved(graph, motion), None if first is None else _moved_hypotheses(first, motion)
 
 
 def _grid(
