@@ -2,16 +2,12 @@
 
 Two ways to read it. *TLV* (default): status_get until a fix is ready, then loc_get; distances to 1 mm. *Shell*: the
 stream of ``lec``; distances to 1 cm. Either way a module left in the other mode, or streaming for a host that died, is
-brought round. The module carries no clock, so a fix is stamped between the last "not ready" and the first "ready";
-to keep that short without polling all the time, polls are dense only around the moment the next fix is due, and the
-regular beat of the fixes narrows it further.
-TLV has no checksum: on a link that has shown damage, and when an anchor is new, a fix is read twice and must agree.
+brought round. The polling itself is in ``dwm1001_poll``.
 """
 
 from .dwm1001 import (
     BAUD,
     ERRORS,
-    LOC_GET,
     STATUS_GET,
     Answer,
     Distances,
@@ -25,6 +21,7 @@ from .dwm1001 import (
 )
 from .dwm1001 import Event as TlvEvent
 from .dwm1001_advice import advise, not_joined
+from .dwm1001_poll import FixPoller
 from .dwm1001_shell import (
     ENTER,
     NodeInfo,
@@ -36,22 +33,13 @@ from .dwm1001_shell import (
     parse_node_info,
     shell_command,
 )
-from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, RangeReading, Reopen, Send
-from .fix_timer import FixTimer
+from .events import Action, Corrupt, Note, Param, RangeEpoch, Reopen, Send
 
 DRAIN = 0.25
 PATIENCE = 0.25
 """s to wait for an answer during start-up."""
-ANSWER = 0.060
-"""s to wait for an answer while polling; the longest takes 9 ms, and USB and a busy computer add some."""
-BROKEN_ANSWER = 0.015
-"""s to wait for the rest of an answer once part of it was damaged."""
-DENSE, SPARSE, IDLE = 0.004, 0.008, 0.020
-"""s between polls: when a fix is due; when it is late; when none has come for a while."""
-LEAD = 0.010
-"""s before a fix is due at which polling begins."""
-DISTRUST = 5.0
-"""s for which a link counts as damaged after a corrupt byte."""
+MAX_SILENT_POLLS = 40
+"""Polls without an answer before the module is started again."""
 MAX_ROUNDS = 8
 QUERIES = ("ver_get", "nodeid_get", "panid_get", "cfg_get", "upd_rate_get")
 
@@ -77,7 +65,7 @@ class Dwm1001Session:
         self._told: set[str] = set()
         self._known: set[str] = set()
         self._rounds = 0
-        self._distrust = -1.0
+        self._distrust_until = 0.0
         self._reset(0.0)
 
     def _reset(self, now: float) -> None:
@@ -88,16 +76,7 @@ class Dwm1001Session:
         self._streaming = ""
         self._query = 0
         self._texts: list[str] = []
-        self._error = 0
-        self._not_ready: float | None = None
-        self._fix_stamp: float | None = None
-        self._timer = FixTimer()
-        self._last_fix = now
-        self._pending: tuple[RangeReading, ...] | None = None
-        self._latest: tuple[RangeReading, ...] | None = None
-        self._pending_at = now
-        self._reads = 0
-        self._damaged = self._guess = False
+        self._poller: FixPoller | None = None
 
     @property
     def period(self) -> float:
@@ -113,7 +92,7 @@ class Dwm1001Session:
 
     def deadline(self) -> float | None:
         """Return when `tick` is due, s."""
-        return self._due
+        return self._poller.due if self._poller else self._due
 
     def stop(self) -> list[Action]:
         """Return what ends a stream; polling ends by itself."""
@@ -131,24 +110,21 @@ class Dwm1001Session:
         if not self._text_mode:
             for answer in self._tlv.feed(data, now):
                 if isinstance(answer, Corrupt):
-                    self._distrust = now + DISTRUST
                     actions += [answer] if self._step not in ("drain", "probe") else []
-                    if self._step in ("status", "loc") and self._due is not None:
-                        self._due = min(self._due, now + BROKEN_ANSWER)
+                    if self._poller:
+                        self._poller.damaged(now)
                 else:
                     actions += self._answer(answer, now)
         return actions
 
     def tick(self, now: float) -> list[Action]:
         """Do what is due."""
+        if self._poller:
+            return self._poll(self._poller, now) if now >= self._poller.due else []
         if self._due is None or now < self._due:
             return []
         if self._step == "drain":
             return self._after_drain(now)
-        if self._step == "poll":
-            return self._poll(now)
-        if self._step in ("status", "loc"):
-            return self._lost_answer(now)
         if self._step == "query":
             return self._after_query(now)
         if self._step == "lines":
@@ -248,7 +224,8 @@ class Dwm1001Session:
         if isinstance(event, PositionLine):
             return []
         self._due = now + max(3.0, 3 * self.period)
-        return self._epoch(event.readings, event.stamp)
+        self._rounds = self._tries = 0
+        return [RangeEpoch(event.stamp, event.readings)] if event.readings else []
 
     def _start_info(self, now: float) -> list[Action]:
         self._texts, self._tries = [], 0
@@ -284,11 +261,10 @@ class Dwm1001Session:
 
     def _answer(self, event: TlvEvent, now: float) -> list[Action]:
         if isinstance(event, Answer):
-            self._error = event.error
             if event.error and self._step == "query":
                 return self._after_query(now)
-            if event.error and self._step in ("status", "loc"):
-                self._step, self._due = "poll", now + SPARSE
+            if event.error and self._poller:
+                self._poller.refused(now)
                 text = f"uwb: the module answers error {event.error}, {ERRORS[event.error]}"
                 return self._tell("warning", f"uwb-error-{event.error}", text)
             if event.error and self._step == "probe" and now - self._sent < PATIENCE:
@@ -297,7 +273,7 @@ class Dwm1001Session:
         if isinstance(event, Status):
             return self._status(event, now)
         if isinstance(event, Distances):
-            return self._fix(event, now)
+            return self._poller.fix(event, now) if self._poller else []
         if isinstance(event, NodeConfig):
             self.config = event
         elif isinstance(event, UpdateRate):
@@ -323,84 +299,26 @@ class Dwm1001Session:
                 return self._say("enter", ENTER, now, 1.2)
             self._query = 0
             return self._say("query", request(QUERIES[0]), now)
-        if self._step != "status":
+        if self._poller is None:
             return []
-        self._tries = self._rounds = 0
-        if not status.location_ready:
-            self._not_ready = self._sent
-            return self._wait(now)
-        stamp = self._timer.time(self._not_ready, now, self.period)
-        if stamp is None:
-            self._not_ready = self._sent
-            return self._wait(now)
-        self._fix_stamp, self._guess = stamp, False
-        return self._read_fix(now)
+        self._rounds = 0
+        actions = self._poller.status(status, now)
+        if not status.joined and now - self._poller.last_fix > 3.0:
+            actions += self._say_once([not_joined()])
+        return actions
 
-    def _read_fix(self, now: float) -> list[Action]:
-        self._not_ready, self._pending, self._reads = None, None, 0
-        return self._say("loc", LOC_GET, now, ANSWER)
-
-    def _wait(self, now: float) -> list[Action]:
-        """Choose when to poll next."""
-        due = self._last_fix + self.period - LEAD
-        late = now - due
-        wait = DENSE if late < 2 * LEAD else SPARSE if late < 10.0 else IDLE
-        if not self._timer.settled:
-            due, wait = now, DENSE  # nothing is known yet of when the next one comes
-        self._step, self._due = "poll", max(now + wait, due)
-        silent = now - self._last_fix > 3.0 and self.joined is False
-        return self._say_once([not_joined()]) if silent else []
-
-    def _poll(self, now: float) -> list[Action]:
-        return self._say("status", STATUS_GET, now, ANSWER)
-
-    def _fix(self, event: Distances, now: float) -> list[Action]:
-        if self._step != "loc" or self._fix_stamp is None:
-            return []
-        readings = event.readings
-        self._reads += 1
-        self._tries = 0
-        fresh = {reading.anchor_id for reading in readings} - self._known
-        doubtful = now < self._distrust or bool(fresh)
-        if not doubtful or readings != self._pending:
-            self._pending_at = self._sent
-        if doubtful and readings != self._pending:
-            self._pending = readings
-            if self._reads < 5:
-                return self._say("loc", LOC_GET, now, ANSWER)
-            self._damaged, self._fix_stamp = True, None
-            return [Corrupt(b"", "a fix read five times never came twice alike"), *self._wait(now)]
-        # While it was read again and again, newer fixes may have taken its place.
-        turns = max(0, int((self._pending_at - self._fix_stamp) / self.period))
-        stamp, self._fix_stamp, self._pending = self._fix_stamp + turns * self.period, None, None
-        if (self._guess or now < self._distrust) and readings == self._latest:
-            return self._wait(now)
-        gap, damaged, self._damaged = stamp - self._last_fix, self._damaged, False
-        self._last_fix, self._latest = stamp, readings
-        self._timer.accept(stamp, as_found=not turns)
-        lost = [Lost(stamp, round(gap / self.period) - 1)] if damaged and gap > 1.6 * self.period else []
-        return [*lost, *self._epoch(readings, stamp), *self._wait(now)]
-
-    def _lost_answer(self, now: float) -> list[Action]:
-        """An answer did not come: damaged on the way, or the module is gone."""
-        self._tries += 1
-        self._tlv.reset()
-        self._distrust = now + DISTRUST
-        self._damaged = True
-        if self._tries > 40:
-            rounds = self._rounds + 1
-            self._reset(now)
-            self._rounds = rounds
-            if rounds > MAX_ROUNDS:
-                return self._give_up(now)
-            return [Note("warning", "uwb-restart", "uwb: no answer for 2 s; starting the module again")]
-        lost = Corrupt(b"", "no answer in time")
-        if self._step == "loc":
-            return [lost, *self._say("loc", LOC_GET, now, ANSWER)]
-        # Reading the status clears it, so the answer that was lost may have announced a fix: look for one.
-        stamp = self._timer.time(self._not_ready, self._sent + 0.002, self.period)
-        self._fix_stamp, self._guess = self._sent if stamp is None else stamp, True
-        return [lost, *self._read_fix(now)]
+    def _poll(self, poller: FixPoller, now: float) -> list[Action]:
+        actions = poller.tick(now)
+        if poller.failures:
+            self._tlv.reset()
+        if poller.failures <= MAX_SILENT_POLLS:
+            return actions
+        rounds = self._rounds + 1
+        self._reset(now)
+        self._rounds = rounds
+        if rounds > MAX_ROUNDS:
+            return self._give_up(now)
+        return [Note("warning", "uwb-restart", "uwb: no answer for 2 s; starting the module again")]
 
     def _after_query(self, now: float) -> list[Action]:
         self._query += 1
@@ -424,12 +342,5 @@ class Dwm1001Session:
         if not self._stream:
             self._step, self._due = "done", None
             return actions
-        self._last_fix, self._not_ready = now, None
-        return [*actions, *self._poll(now)]
-
-    # ---- both
-
-    def _epoch(self, readings: tuple[RangeReading, ...], stamp: float) -> list[Action]:
-        self._rounds = self._tries = 0
-        self._known |= {reading.anchor_id for reading in readings}
-        return [RangeEpoch(stamp, readings)] if readings else []
+        self._step, self._poller = "poll", FixPoller(now, self.period, self._known, self._distrust_until)
+        return [*actions, *self._poller.tick(now)]
