@@ -199,7 +199,8 @@ def bench_map(logs: list[str], repeats: int, options: list[str]) -> None:
             with tempfile.TemporaryDirectory() as folder:
                 command = [sys.executable, "-m", "uwblite", "map", path, "--out", f"{folder}/map", "-q", *options]
                 began = time.perf_counter()
-                child = os.posix_spawn(sys.executable, command, {**os.environ, "PYTHONPATH": str(ROOT)})
+                quiet = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+                child = os.posix_spawn(sys.executable, command, {**os.environ, "PYTHONPATH": str(ROOT)}, file_actions=quiet)
                 _, status, used = os.wait4(child, 0)
                 walls.append(time.perf_counter() - began)
                 if os.waitstatus_to_exitcode(status) not in (0, 3):
