@@ -64,6 +64,7 @@ def compare(log: Path, truth: Path) -> dict[str, dict[str, float]]:
         items.sort(key=lambda item: item[0])
         stamps = [stamp for stamp, _ in sent[name]]
         matched: dict[int, float] = {}
+        items = [item for item in items if stamps and item[0] >= stamps[0] - REACH[name]]
         foreign = 0
         for stamp, content in items:
             near = bisect_left(stamps, stamp)
