@@ -24,7 +24,7 @@ class KeyframeConfig:
     """Travelled distance after which a new keyframe begins, m. Smaller: finer trajectory, slower."""
     angle: float = 0.35
     """Turned angle after which a new keyframe begins, rad."""
-    scans: int = 3
+    scans: int = 2
     """Scans gathered into the cloud of one keyframe, nearest in time first; more average the lidar's noise."""
 
 

@@ -40,7 +40,7 @@ from .keyframes import KeyframeConfig, Keyframes
 from .loop_closure import Closures, LoopClosureConfig
 from .map_result import MapResult, StageSummary
 from .marginals import marginals
-from .measurement import OdometryNoiseConfig, learn_noise, learn_wheels, range_edges, wheel_edges
+from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_edges
 from .occupancy_grid import GridConfig, OccupancyGrid
 from .pair_matching import NearestRaster
 from .range_noise import RangeNoiseConfig, short_term_sigma
@@ -333,12 +333,13 @@ def _track(
     stages: Stages,
 ) -> tuple[Graph, OdometryEdges, Refined]:
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
-    settings = replace(config.refinement, partners=0, rounds=config.refinement.track_rounds)
-    session = np.zeros(len(path), dtype=np.int64)
-    steps, searched = tracking.follow(
-        scans.clouds, scans.raster, graph.poses, session, config.refinement.first_gate, config.tracking, config.search
+    settings = replace(
+        config.refinement, partners=0, rounds=config.refinement.track_rounds, first_gate=config.refinement.later_gate
     )
-    wheels = learn_wheels(wheels, steps, graph)
+    session = np.zeros(len(path), dtype=np.int64)
+    steps, wheels, searched = tracking.follow(
+        scans.clouds, scans.raster, wheels, graph, config.refinement.first_gate, config.tracking, config.search
+    )
     edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
     graph = _estimates(graph, optimize(graph.with_edges(*edges, steps), config.solver)[0])
     i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, settings)
@@ -372,7 +373,7 @@ def _close_loops(
             f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(candidates.target),
             accepted=len(new.edges), standing=len(found.edges),
         )
-        if not len(new.edges) and not missed - {(a, b) for a, b, searched in tried if searched}:
+        if len(new.edges) < 0.05 * len(found.edges) and not missed - {(a, b) for a, b, searched in tried if searched}:
             break
     return _estimates(graph, base), found, len(tried)
 
@@ -392,7 +393,7 @@ def _refine_jointly(
         i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, config.refinement)
         settings = config.refinement
         if lap > 0:
-            settings = replace(settings, first_gate=max(0.4 * settings.first_gate, settings.last_gate))
+            settings = replace(settings, first_gate=settings.later_gate)
         graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "joint refinement")
         graph = _hold_negative_heights(graph)
         if radio is not None:

@@ -18,6 +18,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+_SAME_FACING = float(np.sqrt(0.5))
+"""Least cosine between the normals of two matched points."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestRaster:
     """For every cell around every cloud: which of its points is nearest."""
@@ -96,6 +100,10 @@ class PairPoints:
     """(q,) pair of each row."""
     row: Ints
     """(q,) row in the clouds' arrays."""
+    points: Floats
+    """(2, q) m, in the source cloud's frame."""
+    normals: Floats
+    """(2, q)."""
 
 
 def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
@@ -109,7 +117,8 @@ def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
     pair = np.repeat(np.arange(len(j)), take)
     rank = np.arange(len(pair)) - first[pair]
     picked = begin[pair] + (rank * (end - begin)[pair]) // np.maximum(take[pair], 1)
-    return PairPoints(first, pair, rows[picked])
+    row = rows[picked]
+    return PairPoints(first, pair, row, np.ascontiguousarray(clouds.points[row].T), np.ascontiguousarray(clouds.normals[row].T))
 
 
 def match(
@@ -128,32 +137,34 @@ def match(
     -------
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
-    pairs = len(i)
-    pair, row = points.pair, points.row
+    pairs, pair = len(i), points.pair
     c, s = np.cos(T_i_j[:, 2])[pair], np.sin(T_i_j[:, 2])[pair]
-    px, py = clouds.points[row, 0], clouds.points[row, 1]
+    px, py = points.points
     rx, ry = c * px - s * py, s * px + c * py
-    x, y = rx + T_i_j[pair, 0], ry + T_i_j[pair, 1]
-    target = i[pair]
-    cx = np.floor((x - raster.origin[target, 0]) / raster.cell).astype(np.int64)
-    cy = np.floor((y - raster.origin[target, 1]) / raster.cell).astype(np.int64)
-    wide, high = raster.shape[target, 0], raster.shape[target, 1]
+    x, y = rx + T_i_j[:, 0][pair], ry + T_i_j[:, 1][pair]
+    cx = ((x - raster.origin[i, 0][pair]) * (1.0 / raster.cell)).astype(np.int64)
+    cy = ((y - raster.origin[i, 1][pair]) * (1.0 / raster.cell)).astype(np.int64)
+    wide, high = raster.shape[i, 0][pair], raster.shape[i, 1][pair]
+    # A raster's outer rim of one cell names no point, so that truncation of small negative numbers does no harm.
     inside = np.flatnonzero((cx >= 0) & (cy >= 0) & (cx < wide) & (cy < high))
-    found = raster.nearest[raster.start[target[inside]] + cx[inside] * high[inside] + cy[inside]]
-    inside, found = inside[found >= 0], found[found >= 0]
-    nx, ny = clouds.normals[found, 0], clouds.normals[found, 1]
+    found = raster.nearest[raster.start[i][pair[inside]] + cx[inside] * high[inside] + cy[inside]]
+    near = np.flatnonzero(found >= 0)
+    inside, found = inside[near], found[near]
+    nx, ny = clouds.normals[found].T
     dx, dy = x[inside] - clouds.points[found, 0], y[inside] - clouds.points[found, 1]
-    sx, sy = clouds.normals[row[inside], 0], clouds.normals[row[inside], 1]
-    agree = nx * (c[inside] * sx - s[inside] * sy) + ny * (s[inside] * sx + c[inside] * sy)
-    r = nx * dx + ny * dy
-    good = (dx * dx + dy * dy <= gate * gate) & (agree > np.sqrt(0.5))
-    inside, nx, ny, r = inside[good], nx[good], ny[good], r[good]
+    sx, sy = points.normals[:, inside]
+    ci, si = c[inside], s[inside]
+    good = np.flatnonzero((dx * dx + dy * dy <= gate * gate) & (nx * (ci * sx - si * sy) + ny * (si * sx + ci * sy) > _SAME_FACING))
+    inside, found, nx, ny = inside[good], found[good], nx[good], ny[good]
+    r = nx * dx[good] + ny * dy[good]
     turn = ny * rx[inside] - nx * ry[inside]
     w = 1.0 / (1.0 + (r / scale) ** 2) ** 2
     owner = pair[inside]
+    starts = np.searchsorted(owner, np.arange(pairs + 1))
 
     def total(values: Floats) -> Floats:
-        return np.bincount(owner, values, pairs).astype(np.float64, copy=False)
+        sums = np.concatenate([[0.0], np.cumsum(values)])
+        return sums[starts[1:]] - sums[starts[:-1]]
 
     def outer(wx: Floats, wy: Floats, wt: Floats, jx: Floats, jy: Floats, jt: Floats) -> Floats:
         h = np.empty((pairs, 3, 3))
@@ -165,12 +176,12 @@ def match(
 
     wx, wy, wt = w * nx, w * ny, w * turn
     hessian = outer(wx, wy, wt, nx, ny, turn)
-    v = w * (clouds.normal_variance[found[good]] + clouds.normal_variance[row[inside]])
+    v = w * (clouds.normal_variance[found] + clouds.normal_variance[points.row[inside]])
     along = nx * rx[inside] + ny * ry[inside]
     feigned = outer(-v * ny, v * nx, v * along, -ny, nx, along)
     gradient = np.stack([total(wx * r), total(wy * r), total(wt * r)], axis=1)
     asked = np.bincount(pair, minlength=pairs).astype(np.int64)
-    matched = np.bincount(owner, minlength=pairs).astype(np.int64)
+    matched = np.diff(starts)
     return PairFactors(hessian, feigned, gradient, matched, asked, total(w * r * r), total(w))
 
 

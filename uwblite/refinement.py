@@ -29,25 +29,27 @@ class RefinementConfig:
 
     rounds: int = 12
     """Most rounds of matching and solving; 0 = no joint refinement (the paper)."""
-    track_rounds: int = 12
+    track_rounds: int = 5
     """Most rounds of matching neighbouring clouds before loops are sought."""
     selections: int = 2
     """How often the pairs are chosen anew and refined."""
-    first_gate: float = 0.5
+    first_gate: float = 0.35
     """Farthest match in the first round, m."""
+    later_gate: float = 0.2
+    """Farthest match in the first round where the poses are good already: after tracking, and when pairs are chosen anew."""
     last_gate: float = 0.12
     """Farthest match in the last rounds, m."""
-    shrink: float = 0.75
+    shrink: float = 0.7
     """Gate of a round as a share of the one before."""
-    partners: int = 8
+    partners: int = 6
     """Clouds from other times that each cloud is matched with."""
     epoch: float = 2.0
     """Travelled distance within which only the best partner counts, m."""
     neighbours: tuple[int, ...] = (1, 2, 4)
     """Following keyframes that each cloud is matched with."""
-    points: int = 100
+    points: int = 60
     """Points looked up per pair."""
-    min_matches: int = 20
+    min_matches: int = 15
     """Pairs with fewer matches do not count."""
     min_share: float = 0.3
     """Pairs that match a smaller share of the points looked up do not count."""
@@ -55,8 +57,8 @@ class RefinementConfig:
     """Standard deviation of a point-to-line distance before it is learnt, m."""
     correlation: float = 4.0
     """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
-    settled: float = 0.002
-    """Rounds end early when no pose moves by more than this at the last gate, m."""
+    settled: float = 0.0007
+    """Rounds end early when the poses move by less than this (root mean square) at the last gate, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +78,7 @@ class Refined:
     """Learnt standard deviation of a point-to-line distance, m."""
     rounds: int
     moved: float
-    """Largest move of a pose in the last round, m."""
+    """Root mean square move of the poses in the last round, m."""
     summary: SolverSummary
 
 
@@ -172,8 +174,8 @@ def refine(
             probe, i=i[used], j=j[used], T_i_j=z, sqrt_information=sqrt_information,
             twist_i=twist[i[used]], twist_j=twist[j[used]], kernel=Kernel("cauchy", 5.0),
         )
-        solved, summary = optimize(graph.with_edges(edges), replace(solver, max_iterations=6, relative_decrease=1e-4))
-        moved = float(np.hypot(*(solved.poses - graph.poses)[:, :2].T).max(initial=0.0))
+        solved, summary = optimize(graph.with_edges(edges), replace(solver, max_iterations=3, relative_decrease=1e-3))
+        moved = float(np.sqrt(np.mean(np.sum((solved.poses - graph.poses)[:, :2] ** 2, axis=1))))
         graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
         rounds += 1
         if on_round is not None:

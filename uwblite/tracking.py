@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from . import se2
 from .clouds import Clouds
 from .loop_closure import align_pairs
-from .graph import RelativePoseEdges
+from .graph import Graph, OdometryEdges, RelativePoseEdges
+from .measurement import learn_wheels
 from .pair_matching import NearestRaster, match, measured, pair_points
 from .point_cloud import make_cloud
 from .scan_search import SearchConfig, search
@@ -29,6 +30,9 @@ class TrackingConfig:
     """Neighbours that share at least this part of their points need no search."""
     gain: float = 0.08
     """A search must raise the share by this to be believed."""
+    arm: float = 3.0
+    """Distance of surfaces, m, at which an error of heading counts as one of position: what the wheels may miss by
+    (3 sigma) must stay below the first gate, or a poor match is searched for."""
     distance: float = 0.4
     """Half-width of the search, m."""
     angle: float = 0.45
@@ -48,38 +52,46 @@ class TrackingConfig:
 
 
 def follow(
-    clouds: Clouds, raster: NearestRaster, poses: Floats, session: Ints, gate: float, config: TrackingConfig,
+    clouds: Clouds, raster: NearestRaster, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig,
     search_config: SearchConfig,
-) -> tuple[RelativePoseEdges, int]:
-    """Measure every step between neighbouring keyframes by their clouds, searching where the guess was bad.
+) -> tuple[RelativePoseEdges, OdometryEdges, int]:
+    """Measure every step between neighbouring keyframes by their clouds, searching where the guess may have been bad.
 
     Parameters
     ----------
     clouds, raster : see clouds.build and pair_matching.paint.
-    poses : (k, 3) T_map_base by wheels and radio. session : (k,) recording of each keyframe.
+    wheels : edges between neighbouring keyframes. graph : poses by wheels and radio, the guess.
     gate : reach of the raster, m.
 
     Returns
     -------
-    Edges of the steps that were measured, and how many of them needed a search.
+    Edges of the steps that were measured, the wheels with the noise that these steps show, and the number of searches.
     """
-    i = np.flatnonzero(session[:-1] == session[1:])
-    step = se2.between(poses[i], poses[i + 1])
+    i, tight = wheels.i, min(config.gate, gate)
     points = pair_points(clouds, i + 1, config.points)
-    tight = min(config.gate, gate)
-    aligned = align_pairs(clouds, raster, i, i + 1, step, points, gate, tight)
+    aligned = align_pairs(clouds, raster, i, i + 1, se2.between(graph.poses[i], graph.poses[i + 1]), points, gate, tight)
     enough = aligned.factors.asked >= config.min_points
-    share, step, searched = aligned.share.copy(), aligned.pose.copy(), 0
-    for row in np.flatnonzero(enough & (share < config.good_share)):
+    share, step = aligned.share.copy(), aligned.pose.copy()
+    good = enough & (share >= config.good_share)
+    learnt = learn_wheels(wheels, _edges(clouds, raster, i[good], step[good], tight, config), graph)
+    sigma = 1.0 / np.einsum("eii->ei", learnt.sqrt_information)
+    basin = 3.0 * (sigma[:, 0] + sigma[:, 2] * config.arm) < gate
+    rows = np.flatnonzero(enough & ~good & ~basin)
+    for row in rows:
         found = _search_step(clouds, raster, int(i[row]), step[row], gate, config, search_config)
         if found is not None and found[1] > share[row] + config.gain:
             step[row], share[row] = found
-            searched += 1
     kept = enough & (share >= config.least_share)
-    factors = match(clouds, raster, i, step, points, tight, tight / 2.0)
+    return _edges(clouds, raster, i[kept], step[kept], tight, config), learnt, len(rows)
+
+
+def _edges(
+    clouds: Clouds, raster: NearestRaster, i: Ints, step: Floats, gate: float, config: TrackingConfig
+) -> RelativePoseEdges:
+    """Return the steps (e, 3) from keyframes i to i + 1 as edges with the information of their matches."""
+    factors = match(clouds, raster, i, step, pair_points(clouds, i + 1, config.points), gate, gate / 2.0)
     z, sqrt_information = measured(factors, step, np.full(len(i), config.sigma**2 * config.correlation))
-    edges = RelativePoseEdges(i[kept], i[kept] + 1, z[kept], sqrt_information[kept])
-    return edges, searched
+    return RelativePoseEdges(i, i + 1, z, sqrt_information)
 
 
 def _search_step(
