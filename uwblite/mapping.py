@@ -344,7 +344,10 @@ def _track(
     graph = _estimates(graph, optimize(graph.with_edges(*edges, steps), config.solver)[0])
     i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, settings)
     graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "tracking")
-    stages.end("tracking", pairs=len(i), searched=searched, used=int(refined.used.sum()), sigma=round(refined.sigma, 4), rounds=refined.rounds)
+    stages.end(
+        "tracking", pairs=len(i), searched=searched, used=int(refined.used.sum()), sigma=round(refined.sigma, 4),
+        rounds=refined.rounds,
+    )
     return graph, wheels, refined
 
 

@@ -154,7 +154,8 @@ def match(
     dx, dy = x[inside] - clouds.points[found, 0], y[inside] - clouds.points[found, 1]
     sx, sy = points.normals[:, inside]
     ci, si = c[inside], s[inside]
-    good = np.flatnonzero((dx * dx + dy * dy <= gate * gate) & (nx * (ci * sx - si * sy) + ny * (si * sx + ci * sy) > _SAME_FACING))
+    facing = nx * (ci * sx - si * sy) + ny * (si * sx + ci * sy)
+    good = np.flatnonzero((dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING))
     inside, found, nx, ny = inside[good], found[good], nx[good], ny[good]
     r = nx * dx[good] + ny * dy[good]
     turn = ny * rx[inside] - nx * ry[inside]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from . import se2
 from .clouds import Clouds
-from .loop_closure import align_pairs
 from .graph import Graph, OdometryEdges, RelativePoseEdges
+from .loop_closure import align_pairs
 from .measurement import learn_wheels
 from .pair_matching import NearestRaster, match, measured, pair_points
 from .point_cloud import make_cloud
