@@ -198,3 +198,26 @@ def test_a_forbidden_closure_is_listed_as_such(room_log, tmp_path, capsys):
         if apart[0] <= 60 and apart[1] >= 170 and apart[1] <= 230:
             assert not c["accepted"]
     assert any("forbidden" in c["reason"] for c in closures)
+
+
+def test_localize_finds_a_part_in_the_map(mapped, room_log, tmp_path, capsys):
+    part = tmp_path / "part.log"
+    assert main(["convert", str(room_log), str(part), "--start", "120"]) == 0
+    words = ["--map", str(mapped[0]), "--out", str(tmp_path / "p.tum"), "--picture", str(tmp_path / "p.png")]
+    before = contents(mapped[0])
+    assert main(["localize", str(part), *words, "--covariance", str(tmp_path / "p.csv")]) == 0
+    said = capsys.readouterr().out
+    assert "% of the walls lie on those of the map" in said
+    stamps, poses = read_tum(tmp_path / "p.tum")
+    there, whole = read_tum(mapped[0] / "trajectory.tum")
+    from uwblite.se2 import interpolate_trajectory
+
+    error = np.hypot(*(poses - interpolate_trajectory(there, whole, stamps))[:, :2].T)
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    assert contents(mapped[0]) == before
+    assert main(["localize", str(part), *words, "--json"]) == 1
+    assert "--force" in capsys.readouterr().err
+    assert main(["localize", str(part), *words, "--json", "--force", "--quiet"]) == 0
+    assert json.loads(capsys.readouterr().out)["overlap"] > 0.9
+    assert main(["localize", str(part), "--map", str(tmp_path), "--out", str(tmp_path / "q.tum")]) == 1

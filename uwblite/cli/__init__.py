@@ -15,7 +15,7 @@ from typing import Any
 from .. import __version__
 from ..errors import UwbliteError
 
-VERBS = ("map", "check", "record", "devices", "convert", "evaluate", "optimize", "config")
+VERBS = ("map", "localize", "check", "record", "devices", "convert", "evaluate", "optimize", "config")
 """In the order in which a user meets them; `uwblite VERB` is the module of the same name."""
 
 _DESCRIPTION = """\
