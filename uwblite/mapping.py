@@ -397,14 +397,18 @@ def _refine_jointly(
         settings = config.refinement
         if lap > 0:
             settings = replace(settings, first_gate=settings.later_gate)
+        before = graph.poses
         graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "joint refinement")
         graph = _hold_negative_heights(graph)
+        shift = float(np.sqrt(np.mean(np.sum((graph.poses - before)[:, :2] ** 2, axis=1))))
         if radio is not None:
             radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
         stages.end(
             f"joint refinement {lap + 1}", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
-            sigma=round(refined.sigma, 4), moved=round(refined.moved, 5), **_solver_figures(refined.summary),
+            sigma=round(refined.sigma, 4), shift=round(shift, 5), **_solver_figures(refined.summary),
         )
+        if shift < config.refinement.same_pairs:
+            break
     return graph, radio, refined, closures
 
 

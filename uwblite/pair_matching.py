@@ -162,10 +162,10 @@ def match(
     w = 1.0 / (1.0 + (r / scale) ** 2) ** 2
     owner = pair[inside]
     starts = np.searchsorted(owner, np.arange(pairs + 1))
+    some, begin = np.diff(starts) > 0, np.minimum(starts[:-1], max(len(owner) - 1, 0))
 
     def total(values: Floats) -> Floats:
-        sums = np.concatenate([[0.0], np.cumsum(values)])
-        return sums[starts[1:]] - sums[starts[:-1]]
+        return np.where(some, np.add.reduceat(values, begin), 0.0) if len(values) else np.zeros(pairs)
 
     def outer(wx: Floats, wy: Floats, wt: Floats, jx: Floats, jy: Floats, jt: Floats) -> Floats:
         h = np.empty((pairs, 3, 3))

@@ -31,8 +31,10 @@ class RefinementConfig:
     """Most rounds of matching and solving; 0 = no joint refinement (the paper)."""
     track_rounds: int = 5
     """Most rounds of matching neighbouring clouds before loops are sought."""
-    selections: int = 2
-    """How often the pairs are chosen anew and refined."""
+    selections: int = 3
+    """How often, at most, the pairs are chosen anew and refined."""
+    same_pairs: float = 0.04
+    """The pairs are not chosen anew when the poses moved by less than this (root mean square) since they were, m."""
     first_gate: float = 0.35
     """Farthest match in the first round, m."""
     later_gate: float = 0.2
