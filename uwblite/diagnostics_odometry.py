@@ -123,10 +123,8 @@ def _check_heading(odometry: Odometry, length: Floats, found: Findings) -> dict[
 
 def _spread_out(xy: Floats, length: Floats, distance: float = 0.2) -> np.ndarray[Any, np.dtype[np.int64]]:
     """Return samples about a distance apart along the path, m."""
-    path = np.concatenate([[0.0], np.cumsum(length)])
-    wanted = np.arange(0.0, path[-1], distance)
-    index = np.unique(np.searchsorted(path, wanted))
-    return index[index < len(xy)]
+    piece = np.floor(np.concatenate([[0.0], np.cumsum(length)]) / distance)
+    return np.flatnonzero(np.diff(piece, prepend=-1.0) > 0)
 
 
 def _straightness(xy: Floats) -> float:

@@ -119,13 +119,13 @@ def _check_coverage(log: SensorLog, found: Findings, window: float = 2.0) -> dic
     ranges = log.ranges
     assert ranges is not None
     start, end = float(log.odometry.stamps[0]), float(log.odometry.stamps[-1])
-    windows = max(1, int(np.ceil((end - start) / window)))
-    usable = (ranges.ranges > 0.02) & (ranges.ranges < LONGEST)
-    slot = np.clip(((ranges.stamps - start) / window).astype(np.int64), 0, windows - 1)
-    heard = np.zeros((windows, len(ranges.anchor_ids)), dtype=bool)
-    heard[slot[usable], ranges.anchor[usable]] = True
-    count = heard.sum(axis=1)
-    shares = {f"at least {n}": round(float(np.mean(count >= n)), 3) for n in (1, 2, 3)}
+    usable = (ranges.ranges > 0.02) & (ranges.ranges < LONGEST) & (ranges.stamps >= start) & (ranges.stamps <= end)
+    # Windows in which nobody is heard are only counted, however long the recording claims to be.
+    windows = max(1.0, np.ceil((end - start) / window))
+    slot = np.floor((ranges.stamps[usable] - start) / window)
+    heard = np.unique(np.stack([slot, ranges.anchor[usable].astype(np.float64)]), axis=1)
+    count = np.unique(heard[0], return_counts=True)[1]
+    shares = {f"at least {n}": round(min(float(np.sum(count >= n)) / float(windows), 1.0), 3) for n in (1, 2, 3)}
     if len(ranges.anchor_ids) > 1 and shares["at least 2"] < 0.5:
         found.warning(
             "radio",
