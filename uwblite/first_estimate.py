@@ -43,6 +43,9 @@ class GrowthConfig:
     base's settings is the commonest gross fault, and a factor of two the commonest value."""
     agreement: float = 2.0
     """Ranges agree when their median error is below so many standard deviations."""
+    tear: float = 1.0
+    """No slip throws a step between keyframes off by more than this, m or rad: then a piece was laid on mirrored or in the
+    wrong place, however well its ranges agree."""
     clear_enough: float = 0.35
     """A first stretch is good when its anchors (up to three) are worth this each; 1 = placed without error, 0 = unclear."""
 
@@ -148,10 +151,16 @@ class _Growth:
         return FirstEstimate(final, self.placed, found, self.doubtful)
 
     def misfit(self) -> float:
-        """Return the median error of all ranges to placed anchors, in assumed standard deviations; 0 without any."""
+        """Return the median error of all ranges to placed anchors, in assumed standard deviations; 0 without any.
+
+        A trajectory that is torn somewhere never agrees.
+        """
         part = self._part(0, len(self.path))
         errors = [np.abs(e.residuals(part)[:, 0] * e.sigma) for e in part.edges if isinstance(e, RangeEdges)]
-        return float(np.median(errors[0])) / (0.6745 * self.config.range_sigma) if errors else 0.0
+        median = float(np.median(errors[0])) / (0.6745 * self.config.range_sigma) if errors else 0.0
+        steps = self.odometry.corrected(replace(self.graph, calibration=self.calibration))
+        off = se2.between(steps, se2.between(self.poses[:-1], self.poses[1:]))
+        return max(median, self.config.agreement) if np.any(np.abs(off) > self.config.tear) else median
 
     def _complete(self) -> bool:
         return self.low == 0 and self.high == len(self.path)
