@@ -128,7 +128,7 @@ def write_result(folder: str | os.PathLike[str], log: SensorLog, result: MapResu
         )
         write_text(waiting / "report.html", page)
         hashes = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(waiting.iterdir())}
-        write_text(waiting / "report.json", json.dumps(summary(log, result, record, hashes), indent=1, allow_nan=False) + "\n")
+        write_text(waiting / "report.json", _json_lines(summary(log, result, record, hashes)))
         names = sorted((p.name for p in waiting.iterdir()), key=_order)
     return names
 
@@ -310,6 +310,17 @@ def summary(log: SensorLog, result: MapResult, record: RunRecord, hashes: dict[s
         }
     ready: dict[str, Any] = _ready(content)
     return ready
+
+
+def _json_lines(content: dict[str, Any]) -> str:
+    """Return JSON with a line for each field, and for each entry of a list of tables."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            return "[\n  " + ",\n  ".join(json.dumps(v, allow_nan=False) for v in value) + "\n ]"
+        return json.dumps(value, allow_nan=False)
+
+    return "{\n " + ",\n ".join(f"{json.dumps(k)}: {text(v)}" for k, v in content.items()) + "\n}\n"
 
 
 def _anchor_entry(anchor: Any) -> dict[str, Any]:
