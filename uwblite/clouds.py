@@ -3,6 +3,7 @@
 One flat array with offsets instead of a list of clouds: every step below runs once over all keyframes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
@@ -34,6 +35,8 @@ class CloudConfig:
     """Points with fewer neighbours are left out as noise."""
     linearity: float = 0.85
     """Least share of a neighbourhood's spread that lies along the line for its normal to count, 0..1."""
+    raster: float = 0.1
+    """Cell of the tables of nearest points, m; smaller takes memory with the square and gains nothing on lines."""
     range_max: float = 30.0
     """Longer readings do not enter clouds, m."""
 
@@ -73,7 +76,7 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
 
     Parameters
     ----------
-    rays : points of all keyframes.
+    rays : points of all keyframes of a block, numbered from 0.
     keyframes : k, number of keyframes.
     """
     owner, points, origins = _average_cells(rays, config.voxel)
@@ -88,6 +91,19 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     owner = owner[kept]
     offsets = np.searchsorted(owner, np.arange(keyframes + 1))
     return Clouds(offsets.astype(np.int64), centres, normals, owner, lines.normal_variance[kept])
+
+
+def joined(parts: Sequence[Clouds]) -> Clouds:
+    """Return the clouds of blocks of keyframes, one after the other, as one."""
+    starts = np.cumsum([0] + [len(p) for p in parts])
+    counts = np.concatenate([p.counts for p in parts] or [np.zeros(0, dtype=np.int64)])
+    return Clouds(
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        np.concatenate([p.points for p in parts] or [np.zeros((0, 2))]),
+        np.concatenate([p.normals for p in parts] or [np.zeros((0, 2))]),
+        np.concatenate([p.owner + a for p, a in zip(parts, starts, strict=False)] or [counts]),
+        np.concatenate([p.normal_variance for p in parts] or [np.zeros(0)]),
+    )
 
 
 def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:

@@ -54,6 +54,8 @@ from .tracking import TrackingConfig
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+_BLOCK = 128
+"""Keyframes whose rays are held at once."""
 Progress = Callable[[str, int, int], object]
 """progress(stage, done, total); returning False asks to stop, see errors.Cancelled."""
 
@@ -291,10 +293,15 @@ class _Scans:
         if log.scans is None or not len(log.scans.stamps):
             return None
         owner, chosen = keyframes.choose_scans(log.scans, frames, config.keyframes)
-        rays = keyframes.scan_points(log, frames, owner, chosen, config.clouds.range_max)
-        built = clouds.build(rays, len(frames), config.clouds)
+        parts = []
+        for block in range(0, len(frames), _BLOCK):
+            size = min(_BLOCK, len(frames) - block)
+            own = slice(*np.searchsorted(owner, [block, block + size]).tolist())
+            rays = keyframes.scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
+            parts.append(clouds.build(replace(rays, keyframe=rays.keyframe - block), size, config.clouds))
+        built = clouds.joined(parts)
         reach = max(config.refinement.first_gate, 0.2)
-        return cls(built, pair_matching.paint(built, 0.2 * reach, reach), frames.twist, frames.stamps, known)
+        return cls(built, pair_matching.paint(built, config.clouds.raster, reach), frames.twist, frames.stamps, known)
 
 
 def _match_round(

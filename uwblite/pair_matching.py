@@ -5,7 +5,8 @@ million points is a handful of array operations and no tree. A pair's matches ar
 of its relative pose (3 x 3), which is all that the graph needs to know of them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+_AT_ONCE = 65536
+"""Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
 _SAME_FACING = float(np.sqrt(0.5))
 """Least cosine between the normals of two matched points."""
 
@@ -105,6 +108,12 @@ class PairPoints:
     normals: Floats
     """(2, q)."""
 
+    def of(self, first: int, last: int) -> "PairPoints":
+        """Return the points of the pairs [first, last)."""
+        a, b = np.searchsorted(self.pair, [first, last])
+        own = self.first[first:last]
+        return PairPoints(own - a, self.pair[a:b] - first, self.row[a:b], self.points[:, a:b], self.normals[:, a:b])
+
 
 def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
     """List up to `limit` evenly spaced points with normals of the source cloud j (e,) of each pair."""
@@ -137,6 +146,16 @@ def match(
     -------
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
+    if len(points.pair) <= _AT_ONCE or len(i) < 2:
+        return _match(clouds, raster, i, T_i_j, points, gate, scale)
+    cuts = np.unique([0, *np.searchsorted(points.first, np.arange(_AT_ONCE, len(points.pair), _AT_ONCE)).tolist(), len(i)])
+    parts = [_match(clouds, raster, i[a:b], T_i_j[a:b], points.of(a, b), gate, scale) for a, b in pairwise(cuts)]
+    return PairFactors(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PairFactors)))
+
+
+def _match(
+    clouds: Clouds, raster: NearestRaster, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float
+) -> PairFactors:
     pairs, pair = len(i), points.pair
     c, s = np.cos(T_i_j[:, 2])[pair], np.sin(T_i_j[:, 2])[pair]
     px, py = points.points
