@@ -15,8 +15,8 @@ BROKEN_ANSWER = 0.015
 """s to wait for the rest of an answer once part of it was damaged."""
 DENSE, SPARSE, IDLE = 0.004, 0.008, 0.020
 """s between polls: when a fix is due; when it is late; when none has come for a while."""
-LEAD = 0.010
-"""s before a fix is due at which polling begins."""
+LEAD, LONGER_LEAD = 0.010, 0.025
+"""s before a fix is due at which polling begins; added when the first poll found the fix already there."""
 DISTRUST = 5.0
 """s for which a link counts as damaged after a corrupt byte."""
 READS = 5
@@ -50,6 +50,7 @@ class FixPoller:
         self._candidate_at = now
         self._latest: tuple[RangeReading, ...] | None = None
         self._reads = 0
+        self._lead = LEAD
         self._damaged = self._guess = False
 
     def tick(self, now: float) -> list[Action]:
@@ -85,6 +86,8 @@ class FixPoller:
         if stamp is None:
             self._not_ready = self._sent
             return self._rest(now)
+        # Polling that begins after the fix cannot tell when it came: begin earlier until a poll finds none.
+        self._lead = self._lead + LONGER_LEAD if self._not_ready is None else max(LEAD, self._lead / 2)
         self._stamp, self._guess = stamp, False
         return self._read_fix(now)
 
@@ -110,7 +113,8 @@ class FixPoller:
         if (self._guess or suspect) and readings == self._latest:
             return self._rest(now)
         if self._latest is not None and stamp < self.last_fix + self._period / 2:
-            stamp, turns = stamp + self._period, turns + 1  # a new fix cannot be that close to the last one
+            # A new fix cannot be that close to the last one.
+            stamp, turns = min(now, stamp + self._period), turns + 1
         return [*self._accept(stamp, readings, as_found=not (turns or self._guess)), *self._rest(now)]
 
     def _accept(self, stamp: float, readings: tuple[RangeReading, ...], *, as_found: bool) -> list[Action]:
@@ -133,9 +137,9 @@ class FixPoller:
 
     def _rest(self, now: float) -> list[Action]:
         """Choose when to poll next."""
-        due = self.last_fix + self._period - LEAD
+        due = self.last_fix + self._period - min(self._lead, self._period)
         late = now - due
-        wait = DENSE if late < 2 * LEAD else SPARSE if late < 10.0 else IDLE
+        wait = DENSE if late < self._lead + LEAD else SPARSE if late < 10.0 else IDLE
         if not self._timer.settled:
             due, wait = now, DENSE  # nothing is known yet of when the next one comes
         self._waiting, self.due = "", max(now + wait, due)

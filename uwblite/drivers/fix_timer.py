@@ -27,6 +27,7 @@ class FixTimer:
         self._grid: Bracket | None = None
         self._found: Bracket | None = None
         self._strays = 0
+        self._tight = False
 
     @property
     def settled(self) -> bool:
@@ -50,13 +51,13 @@ class FixTimer:
         if low is None:
             return None
         tight = now - low <= WIDEST
-        self._found = (low, now) if tight else None
+        self._tight, self._found = tight, (low, now) if tight else None
         if self._grid is None:
             return (low + now) / 2 if tight else now
         slot = self._slot(now, period)
         narrow = max(low, slot[0]), min(now, slot[1])
         if narrow[0] < narrow[1]:
-            self._found = narrow
+            self._found = narrow if tight else None
             return sum(narrow) / 2
         if not tight:
             return now if self.last is None else min(now, self.last + period)
@@ -82,7 +83,7 @@ class FixTimer:
         as_found : it is what `time` returned last, so its bracket counts from now on.
         """
         self.last = stamp
-        if not as_found:
-            return
+        if not (as_found and self._tight):
+            return  # a grid must not confirm itself
         self._strays = 0 if self._found else self._strays + 1
         self._grid = self._found or self._grid

@@ -248,10 +248,6 @@ class KobukiOdometer:
         pose = OdometryPose(self._map.host(time), self._x, self._y, self._theta, speed, feedback.turn_rate)
         return pose, missing, remark
 
-    def reconnected(self) -> None:
-        """Say that the port was closed in between: the next packet starts a new clock map."""
-        self._map = ClockMap()
-
     def _move(self, last: Feedback, now: Feedback, elapsed: float) -> float:
         left, right = (_wrapped(b - a) * TICK for a, b in ((last.left, now.left), (last.right, now.right)))
         travel = (left + right) / 2

@@ -25,9 +25,8 @@ class KobukiSession:
         self._wheel_drop = 0
 
     def start(self, now: float) -> list[Action]:
-        """Begin, or begin again after a reconnect."""
+        """Begin, or begin again after a reconnect: the base stayed on, its clock and encoders counted on."""
         self._protocol = KobukiProtocol()
-        self._odometer.reconnected()
         return []
 
     def deadline(self) -> float | None:
