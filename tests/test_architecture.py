@@ -25,7 +25,7 @@ FLOORS = (
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts", "distance_edges", "constraints", "drivers/*"),
     # stages
     ("solver", "marginals", "gnc", "icp", "pair_matching", "submaps"),
-    ("first_estimate", "refinement", "tracking", "loop_closure", "evaluate", "evaluate_map"),
+    ("first_estimate", "sessions", "refinement", "tracking", "loop_closure", "evaluate", "evaluate_map"),
     # files in, files out: types and text, no stages
     ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
     ("diagnostics", "report", "summary"),

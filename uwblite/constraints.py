@@ -183,7 +183,7 @@ def _fit(
     if len(anchors) < 2:
         shift = (there - here)[0] if len(anchors) else np.zeros(2)
         return np.array([*shift, 0.0]), {}
-    motion = _consensus(here, there, np.array([_tolerance(a) for a in anchors]))
+    motion = consensus(here, there, np.array([_tolerance(a) for a in anchors]))
     return motion, _strayed(known, graph, index, placed, motion)
 
 
@@ -192,7 +192,7 @@ def _tolerance(anchor: KnownAnchor) -> float:
     return 3.0 * anchor.sigma + 0.6
 
 
-def _consensus(here: Floats, there: Floats, tolerance: Floats) -> Floats:
+def consensus(here: Floats, there: Floats, tolerance: Floats) -> Floats:
     """Return the motion of the pair of places that most others agree with, fitted to all of these."""
     best: tuple[float, Bools] = (-np.inf, np.ones(len(here), dtype=bool))
     for i, j in combinations(range(len(here)), 2):

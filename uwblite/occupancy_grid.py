@@ -15,7 +15,7 @@ wall that other beams have drawn. That takes a second walk over the scans, once 
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -28,7 +28,7 @@ from .ray_counter import WEIGHT_UNIT, Counts, RayCounter
 from .scan_rays import ScanRays, empty_reach, extent, moved_scans, scan_rays, seen_reach
 from .sensor_log import LaserScans
 
-__all__ = ["GridConfig", "GridGeometry", "OccupancyGrid", "RayCounter", "from_counts", "from_scans"]
+__all__ = ["GridConfig", "GridGeometry", "OccupancyGrid", "RayCounter", "Sweeps", "from_counts", "from_scans", "from_sweeps"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -154,25 +154,64 @@ def from_scans(
     ConfigError : the map would be larger than config.max_cells.
     DataError : poses and scans do not belong together.
     """
-    if first.shape != (len(scans.stamps), 3) or (last is not None and last.shape != first.shape):
-        raise DataError(f"{len(scans.stamps)} scans need as many poses, not {first.shape}")
-    if len(first) == 0:
+    sweeps = Sweeps(scans, first, last, flipped)
+    return from_sweeps([sweeps], config, geometry=geometry, executor=executor, progress=progress)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweeps:
+    """Scans of one recording and where the laser was."""
+
+    scans: LaserScans
+    first: Floats
+    """(k, 3) T_map_laser at the first ray of every scan."""
+    last: Floats | None = None
+    """(k, 3) T_map_laser at the last ray; in between the laser moves evenly. None = no deskewing."""
+    flipped: bool = False
+    """The laser is mounted upside down."""
+
+    def __post_init__(self) -> None:
+        count, first, last = len(self.scans.stamps), self.first, self.last
+        if first.shape != (count, 3) or (last is not None and last.shape != first.shape):
+            raise DataError(f"{count} scans need as many poses, not {first.shape}")
+
+
+def from_sweeps(
+    recordings: Sequence[Sweeps],
+    config: GridConfig = GridConfig(),
+    *,
+    geometry: GridGeometry | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> OccupancyGrid:
+    """Make one map of the scans of all recordings; see from_scans."""
+    if not any(len(sweeps.first) for sweeps in recordings):
         raise DataError("there are no scans to make a map of")
-    chosen = moved_scans(first, config.move_distance, config.move_angle)
-    task = _Task(scans, chosen, first[chosen], None if last is None else last[chosen], flipped, config)
-    around = geometry or GridGeometry.around(*task.extent(), config.resolution, config.max_cells)
-    counter = RayCounter(around, config.clear_weight)
+    tasks = [_task(sweeps, config) for sweeps in recordings if len(sweeps.first)]
+    count = sum(len(task.chosen) for task in tasks)
+    boxes = [task.extent() for task in tasks]
+    low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+    counter = RayCounter(geometry or GridGeometry.around(low, high, config.resolution, config.max_cells), config.clear_weight)
     clears = config.max_clear_distance > 0 and config.clear_weight > 0
 
-    def tell(done: int) -> None:
-        if progress is not None:
-            progress(done, len(chosen) * (2 if clears else 1))
+    def trace(walls: Bools | None, before: int) -> None:
+        for task in tasks:
+            _trace(task, counter, walls, executor, teller(before))
+            before += len(task.chosen)
 
-    _trace(task, counter, None, executor, tell)
+    def teller(before: int) -> Callable[[int], None]:
+        return lambda done: None if progress is None else progress(before + done, count * (2 if clears else 1))
+
+    trace(None, 0)
     if clears:
-        walls = walls_of(from_counts(counter, config))
-        _trace(task, counter, walls, executor, lambda done: tell(len(chosen) + done))
-    return from_counts(counter if geometry else counter.cropped(), config, len(chosen))
+        trace(walls_of(from_counts(counter, config)), count)
+    return from_counts(counter if geometry else counter.cropped(), config, count)
+
+
+def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":
+    chosen = moved_scans(sweeps.first, config.move_distance, config.move_angle)
+    last = None if sweeps.last is None else sweeps.last[chosen]
+    return _Task(sweeps.scans, chosen, sweeps.first[chosen], last, sweeps.flipped, config)
 
 
 def walls_of(grid: OccupancyGrid) -> Bools:
