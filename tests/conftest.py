@@ -43,6 +43,6 @@ def room_log():
 
 
 def pytest_terminal_summary(terminalreporter):
-    skipped = [report for report in terminalreporter.stats.get("skipped", []) if "absent" in str(report.longrepr)]
+    skipped = [report for report in terminalreporter.stats.get("skipped", []) if "recordings absent" in str(report.longrepr)]
     if skipped:
         terminalreporter.write_sep("!", f"{len(skipped)} tests on real recordings SKIPPED: {SHARED} is absent", yellow=True)

@@ -80,7 +80,7 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     keyframes : k, number of keyframes.
     """
     owner, points, origins = _average_cells(rays, config.voxel)
-    bearing = np.arctan2(points[:, 1], points[:, 0])
+    bearing = se2.bearing(points)
     order = np.lexsort((bearing, owner))
     owner, points, origins = owner[order], points[order], origins[order]
     lines, normals = _lines(owner, points, origins, config)

@@ -71,7 +71,7 @@ def contradiction(free: FreeSpace, points: Floats, margin: float, least: int = 1
         return 0.0, 0.0
     local = se2.transform(se2.inverse(free.poses)[:, None, :], points[None, :, :])
     distance = np.hypot(local[..., 0], local[..., 1])
-    bearing = np.arctan2(local[..., 1], local[..., 0])
+    bearing = se2.bearing(local)
     turns = np.remainder(bearing - free.angle_min + 0.5 * free.angle_increment, 2.0 * np.pi)
     bins = (turns / free.angle_increment).astype(np.int64)
     scan = np.arange(len(free.poses))[:, None]

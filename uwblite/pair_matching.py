@@ -157,7 +157,7 @@ def _match(
     clouds: Clouds, raster: NearestRaster, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float
 ) -> PairFactors:
     pairs, pair = len(i), points.pair
-    c, s = np.cos(T_i_j[:, 2])[pair], np.sin(T_i_j[:, 2])[pair]
+    c, s = (v[pair] for v in se2.cos_sin(T_i_j[:, 2]))
     px, py = points.points
     rx, ry = c * px - s * py, s * px + c * py
     x, y = rx + T_i_j[:, 0][pair], ry + T_i_j[:, 1][pair]
@@ -239,7 +239,7 @@ def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Flo
     step, root = trusted_step(factors)
     z = T_i_j + step
     z[:, 2] = se2.wrap_angle(z[:, 2])
-    c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
+    c, s = se2.cos_sin(z[:, 2])
     turn = np.zeros((len(z), 3, 3))
     turn[:, 0, 0] = turn[:, 1, 1] = c
     turn[:, 0, 1], turn[:, 1, 0] = -s, s

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from . import se2
 from .calibration import scan_indices
 from .clouds import Clouds, in_map
 from .graph import Graph, ScanEdges
@@ -89,7 +90,7 @@ def surface_cells(clouds: Clouds, poses: Floats, size: float = 0.5) -> sparse.cs
     points, normals = in_map(clouds, poses)
     usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
     cell = np.floor(points[usable] / size).astype(np.int64)
-    facing = np.floor(np.arctan2(normals[usable, 1], normals[usable, 0]) * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
+    facing = np.floor(se2.bearing(normals[usable]) * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
     cell -= cell.min(axis=0, initial=0)
     key = (cell[:, 0] * (cell[:, 1].max(initial=0) + 1) + cell[:, 1]) * 8 + facing
     _, column = np.unique(key, return_inverse=True)

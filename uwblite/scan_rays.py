@@ -99,7 +99,7 @@ def extent(
     low, high = first[:, :2].min(axis=0), first[:, :2].max(axis=0)
     angles = -scans.angles if flipped else scans.angles
     ahead, aside = reach * np.cos(angles).astype(np.float32), reach * np.sin(angles).astype(np.float32)
-    c, s = (v[:, None].astype(np.float32) for v in (np.cos(first[:, 2]), np.sin(first[:, 2])))
+    c, s = (v[:, None].astype(np.float32) for v in se2.cos_sin(first[:, 2]))
     slack = np.zeros(len(first)) if last is None else _sweep_reach(first, last, reach.max(axis=1))
     for axis, offset in enumerate((c * ahead - s * aside, s * ahead + c * aside)):
         low[axis] = min(low[axis], (first[:, axis] + offset.min(axis=1) - slack).min())

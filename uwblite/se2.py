@@ -40,6 +40,12 @@ def cos_sin(angle: ArrayLike) -> tuple[Floats, Floats]:
     return np.cos(angle), np.sin(angle)
 
 
+def bearing(vectors: ArrayLike) -> Floats:
+    """Return the direction (...) of vectors (..., 2), rad in (-pi, pi]; of contiguous copies, see cos_sin."""
+    vectors = np.asarray(vectors, dtype=np.float64)
+    return np.arctan2(np.ascontiguousarray(vectors[..., 1]), np.ascontiguousarray(vectors[..., 0]))
+
+
 def rotate(theta: ArrayLike, vectors: ArrayLike) -> Floats:
     """Turn vectors (..., 2) by theta (...), rad."""
     c, s = cos_sin(theta)

@@ -99,7 +99,7 @@ def _merge(
     cell = np.floor(points / size).astype(np.int64)
     cell -= cell.min(axis=0, initial=0)
     # Four facings, not two: noise must not turn a normal from one side's facing into the other's, whatever way the wall runs.
-    facing = np.floor(np.arctan2(normals[:, 1], normals[:, 0]) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
+    facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
     wide, high = cell.max(axis=0, initial=0) + 1
     key = ((owner * wide + cell[:, 0]) * high + cell[:, 1]) * 4 + facing
     order = np.argsort(key, kind="stable")
