@@ -27,11 +27,12 @@ FLOORS = (
     ("solver", "marginals", "gnc", "icp", "pair_matching", "submaps"),
     ("first_estimate", "sessions", "refinement", "tracking", "loop_closure", "evaluate", "evaluate_map"),
     # files in, files out: types and text, no stages
+    ("plain_closures",),
     ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
     ("diagnostics", "report", "summary"),
     # the walk
     ("mapping",),
-    ("localize", "io/results"),
+    ("localize", "presets", "io/results"),
     ("cli/*", "__main__"),
 )
 """From the ground up: a module imports from its own floor and below. The first pattern that fits counts, exact names first."""

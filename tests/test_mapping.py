@@ -15,11 +15,11 @@ from simulation import logfile
 from simulation.recording import Lie, Settings, simulate
 
 from uwblite import se2
-from uwblite.errors import Cancelled, DataError
+from uwblite.errors import Cancelled
 from uwblite.evaluate import evaluate_trajectory
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
-from uwblite.mapping import MappingConfig, build_map, preset
+from uwblite.mapping import MappingConfig, build_map
 from uwblite.sensor_log import Odometry, UwbRanges
 
 ROOM_ATE = 0.02
@@ -205,13 +205,6 @@ def test_the_result_does_not_depend_on_the_odometry_s_frame(minute, truth):
     """Turned and shifted by a kilometre, the odometry says the same."""
     far = Odometry(minute.odometry.stamps, se2.compose(np.array([900.0, -400.0, 2.0]), minute.odometry.poses))
     assert ate(build_map(replace(minute, odometry=far)), truth) < ROOM_ATE
-
-
-def test_presets_are_settings():
-    assert isinstance(preset("paper"), MappingConfig)
-    assert preset("paper") != preset("default")
-    with pytest.raises(DataError, match="unknown preset"):
-        preset("best")
 
 
 def simulated(tmp_path, **settings):

@@ -10,7 +10,8 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from uwblite.config import field_docs, permitted, toml_value
-from uwblite.mapping import MappingConfig, preset
+from uwblite.mapping import MappingConfig
+from uwblite.presets import preset
 
 TARGET = ROOT / "docs" / "tuning.md"
 

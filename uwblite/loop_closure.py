@@ -9,6 +9,7 @@ Every candidate is kept, with the reason for its fate.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,9 @@ Bools = NDArray[np.bool_]
 class LoopClosureConfig:
     """Search and acceptance of loop closures."""
 
+    method: Literal["search", "icp"] = "search"
+    """search: candidates by the graph's own uncertainty, judged by all that follows here. icp: the paper's plain way, by
+    the settings of [icp]; of those here only rounds, partners and correlation count (see plain_closures)."""
     partners: int = 4
     """Candidates per sub-map and round, best expected overlap first."""
     rounds: int = 4

@@ -22,6 +22,7 @@ from . import (
     map_frame,
     occupancy_grid,
     pair_matching,
+    plain_closures,
     refinement,
     se2,
     submaps,
@@ -33,9 +34,10 @@ from .calibration import CalibrationConfig
 from .clouds import CloudConfig, Clouds
 from .constraints import Constraints
 from .constraints import apply as apply_constraints
-from .errors import Cancelled, ConfigError, DataError
+from .errors import Cancelled, ConfigError
 from .first_estimate import FirstEstimate, GrowthConfig
 from .graph import Edges, Graph, OdometryEdges, RangeEdges
+from .icp import IcpConfig
 from .keyframes import KeyframeConfig, Keyframes
 from .loop_closure import Closures, LoopClosureConfig
 from .map_result import MapResult, StageSummary
@@ -84,6 +86,7 @@ class MappingConfig:
     clouds: CloudConfig = field(default_factory=CloudConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
     loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)
+    icp: IcpConfig = field(default_factory=IcpConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
@@ -160,22 +163,27 @@ def build_map(
 
     scans = _Scans.of(log, frames, known, config)
     closures = loop_closure.no_closures()
+    tracked: Refined | None = None
     refined: Refined | None = None
     if scans is not None:
         stages.end("clouds", points=len(scans.clouds.points))
         graph = _free(graph, "laser_x", "laser_y", "laser_theta", "laser_delay")
-        graph, wheels, refined = _track(graph, wheels, radio, scans, path, config, stages)
+        if config.tracking.on:
+            graph, wheels, tracked = _track(graph, wheels, radio, scans, path, config, stages)
         edges = (wheels, *edges[1:])
         if config.use_loops:
-            graph, closures, _shown = _close_loops(graph, edges, refined, scans, path, config, stages)
+            held = edges if tracked is None else (*edges, tracked.edges)
+            close = _close_loops if config.loops.method == "search" else _close_loops_plainly
+            graph, closures = close(graph, held, scans, path, config, stages)
             graph, radio, refined, closures = _refine_jointly(graph, wheels, radio, closures, scans, path, config, stages)
-    graph = _final_graph(graph, wheels, radio, closures, refined)
+    graph = _final_graph(graph, wheels, radio, closures, tracked, refined)
     graph, first = _aligned(graph, first, scans, config)
 
     grid = _grid(log, frames, graph, config, executor, stages)
     uncertainty = marginals(graph)
     result = summary.summarise(
-        log, frames, graph, uncertainty, first, radio, closures, refined, grid, config.calibration, stages.done, stages.warnings
+        log, frames, graph, uncertainty, first, radio, closures, refined or tracked, grid, config.calibration, stages.done,
+        stages.warnings,
     )
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
@@ -197,7 +205,7 @@ def _measurements(
     if log.ranges is None:
         return graph, wheels, None, path
     attached = keyframes.attach_ranges(log.ranges, log.odometry, frames, log.mounting)
-    radio = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.anchors)
+    radio = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.anchors, config.ranges.kernel)
     return graph, wheels, radio if np.any(radio.weights) else None, path
 
 
@@ -359,12 +367,11 @@ def _track(
 
 
 def _close_loops(
-    graph: Graph, edges: tuple[Edges, ...], tracked: Refined, scans: _Scans, path: Floats, config: MappingConfig,
-    stages: Stages,
-) -> tuple[Graph, Closures, int]:
+    graph: Graph, edges: tuple[Edges, ...], scans: _Scans, path: Floats, config: MappingConfig, stages: Stages
+) -> tuple[Graph, Closures]:
     """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
     session = np.zeros(len(path), dtype=np.int64)
-    base = graph.with_edges(*edges, tracked.edges)
+    base = graph.with_edges(*edges)
     found = loop_closure.no_closures()
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
@@ -385,7 +392,24 @@ def _close_loops(
         )
         if len(new.edges) < 0.05 * len(found.edges) and not missed - {(a, b) for a, b, searched in tried if searched}:
             break
-    return _estimates(graph, base), found, len(tried)
+    return _estimates(graph, base), found
+
+
+def _close_loops_plainly(
+    graph: Graph, edges: tuple[Edges, ...], scans: _Scans, path: Floats, config: MappingConfig, stages: Stages
+) -> tuple[Graph, Closures]:
+    """Align sub-maps pair by pair and solve once more with those that fit (paper: second optimisation)."""
+    session = np.zeros(len(path), dtype=np.int64)
+    found = loop_closure.no_closures()
+    for lap in range(config.loops.rounds):
+        pieces = submaps.build(scans.clouds, graph.poses, path, session, config.submaps)
+        teller = stages.teller("loop closure")
+        found = _without_forbidden(plain_closures.find(graph, pieces, session, config.loops, config.icp, teller), scans)
+        stages.end(f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(found.candidates), accepted=len(found.edges))
+        solved, result = optimize(graph.with_edges(*edges, found.edges), config.solver)
+        graph = _estimates(graph, solved)
+        stages.end(f"second optimisation {lap + 1}", **_solver_figures(result))
+    return graph, found
 
 
 def _refine_jointly(
@@ -420,17 +444,18 @@ def _refine_jointly(
 
 
 def _final_graph(
-    graph: Graph, wheels: OdometryEdges, radio: RangeEdges | None, closures: Closures, refined: Refined | None
+    graph: Graph, wheels: OdometryEdges, radio: RangeEdges | None, closures: Closures, tracked: Refined | None,
+    refined: Refined | None,
 ) -> Graph:
-    """Return the graph with every measurement that holds it."""
+    """Return the graph with every measurement that holds it; the joint refinement's take the place of all other scans'."""
     edges: list[Edges] = [wheels]
     if radio is not None:
         edges.append(radio)
     if refined is not None:
-        edges.append(refined.edges)
-    else:
-        edges.append(closures.edges)
-    return graph.with_edges(*edges)
+        return graph.with_edges(*edges, refined.edges)
+    if tracked is not None:
+        edges.append(tracked.edges)
+    return graph.with_edges(*edges, closures.edges)
 
 
 def _aligned(
@@ -476,19 +501,3 @@ def _solver_figures(result: SolverSummary) -> dict[str, object]:
         "dof": result.dof,
         "chi2_per_dof": round(result.chi2_per_dof, 4),
     }
-
-
-def preset(name: str) -> MappingConfig:
-    """Return the settings of a preset.
-
-    ``default``: what is best. ``paper``: the paper's plain choices: point-to-point ICP between sub-maps of 9 m with
-    outlier distance 0.1 m, fitness 0.1, 300 iterations; no robust kernels, no calibration, no refinement.
-    """
-    if name == "default":
-        return MappingConfig()
-    if name == "paper":
-        return MappingConfig(
-            submaps=SubmapConfig(epsilon=9.0),
-            loops=LoopClosureConfig(),
-        )
-    raise DataError(f"unknown preset {name!r}; choose default or paper")

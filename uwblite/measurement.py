@@ -17,6 +17,9 @@ from .sensor_log import SensorMounting
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_STEPS = Kernel("cauchy", 5.0)
+_RANGES = Kernel("cauchy", 2.5)
+
 
 @dataclass(frozen=True, slots=True)
 class OdometryNoiseConfig:
@@ -30,6 +33,8 @@ class OdometryNoiseConfig:
     """Standard deviation of heading after one radian of turning, rad; grows with the square root of the angle."""
     standing: float = 0.0005
     """Standard deviation of position (m) and heading (rad) of a robot that stands."""
+    kernel: Kernel = _STEPS
+    """Robust kernel: a step that slipped must not bend the rest; none = squared errors (the paper)."""
 
 
 def wheel_edges(keyframes: Keyframes, first: int, config: OdometryNoiseConfig, calibration: Calibration) -> OdometryEdges:
@@ -49,13 +54,13 @@ def wheel_edges(keyframes: Keyframes, first: int, config: OdometryNoiseConfig, c
         keyframes.duration,
         sqrt_information,
         odometry_indices(calibration, n),
-        Kernel("cauchy", 5.0),
+        config.kernel,
     )
 
 
 def range_edges(
     attached: AttachedRanges, first: int, anchor_ids: tuple[str, ...], mounting: SensorMounting,
-    calibration: Calibration, sigma: float, search: AnchorConfig,
+    calibration: Calibration, sigma: float, search: AnchorConfig, kernel: Kernel = _RANGES,
 ) -> RangeEdges:
     """Return one edge per range; readings that cannot be distances get weight 0.
 
@@ -64,6 +69,7 @@ def range_edges(
     first : the graph's number of the recording's first pose.
     anchor_ids : names of the graph's anchors; attached.anchor indexes them.
     sigma : m, for all ranges until noise is learnt.
+    search : says which readings can be distances. kernel : robust kernel of all ranges.
     """
     told = np.array([mounting.height_difference(a) or 0.0 for a in anchor_ids])
     return RangeEdges(
@@ -77,7 +83,7 @@ def range_edges(
         np.asarray(mounting.tag_position[:2], dtype=np.float64),
         told[attached.anchor],
         range_indices(calibration, attached.anchor, anchor_ids),
-        Kernel("cauchy", 2.5),
+        kernel,
         usable(attached.ranges, search).astype(np.float64),
         attached.stamps,
     )

@@ -13,8 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .robust import Kernel
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+_ROBUST = Kernel("cauchy", 2.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +35,8 @@ class RangeNoiseConfig:
     """No radio of this kind is trusted beyond this, m."""
     learn: bool = True
     """Estimate white and slow part from the residuals."""
+    kernel: Kernel = _ROBUST
+    """Robust kernel: ranges through walls are long; none = squared errors (the paper)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

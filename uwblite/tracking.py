@@ -26,6 +26,8 @@ Ints = NDArray[np.int64]
 class TrackingConfig:
     """When and where neighbouring clouds are searched for."""
 
+    on: bool = True
+    """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
     good_share: float = 0.75
     """Neighbours that share at least this part of their points need no search."""
     gain: float = 0.08

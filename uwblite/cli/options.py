@@ -21,7 +21,8 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
 def effective_config(args: argparse.Namespace) -> "MappingConfig":
     """Return the settings that --preset, --config and --set amount to."""
     from ..config import merge, override, parse_toml
-    from ..mapping import MappingConfig, preset
+    from ..mapping import MappingConfig
+    from ..presets import preset
 
     config = preset(args.preset) if args.preset else MappingConfig()
     if args.config:

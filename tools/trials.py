@@ -1,0 +1,182 @@
+"""Simulated drives with their truth, and how far a map of one is from it; shared by the tools that measure accuracy."""
+
+import os
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+import numpy as np
+from numpy.typing import NDArray
+from simulation import logfile
+from simulation.recording import Settings, simulate
+
+from uwblite import se2
+from uwblite.cli.evaluate import read_landmarks
+from uwblite.evaluate import evaluate_anchors, evaluate_trajectory
+from uwblite.evaluate_map import LandmarkErrors, Landmarks, find_columns, landmark_errors, landmark_errors_along
+from uwblite.io.carmen import read_log
+from uwblite.io.csv_table import read_csv
+from uwblite.io.tum import read_tum
+from uwblite.map_result import MapResult
+from uwblite.mapping import MappingConfig, build_map
+from uwblite.sensor_log import SensorLog
+
+Floats = NDArray[np.float64]
+Task = TypeVar("Task")
+Answer = TypeVar("Answer")
+
+SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A recording and what is true of it."""
+
+    log: SensorLog
+    stamps: Floats
+    """(n,) s, of the true poses."""
+    poses: Floats
+    """(n, 3) T_truth_base."""
+    anchors: dict[str, Floats]
+    """(2,) m by id."""
+    columns: Landmarks | None = None
+    pairs: tuple[tuple[str, str], ...] | None = None
+    """Pairs of columns whose distance is judged; None = all."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How far a map is from the truth; plain numbers, so that they travel between processes."""
+
+    ate: float
+    """m."""
+    heading: float
+    """rad, rms; nan where the truth has none."""
+    column: float
+    """m, mean absolute error of the distances between columns found in the map; nan without a map or columns."""
+    drawn: float
+    """m, the same for the columns as the trajectory draws them: needs no map, and judges the most smeared one."""
+    pairs: tuple[tuple[str, str, float, float], ...]
+    """Names, error in the map (nan = a column was not found) and error as drawn, m."""
+    missing: tuple[str, ...]
+    """Columns that were not found in the map."""
+    anchors: float
+    """m, rms; nan without any."""
+    anchor_errors: tuple[tuple[str, float], ...]
+    """m by id; inf = not placed."""
+    closures: tuple[int, int]
+    """Accepted, candidates."""
+    doubts: tuple[str, ...]
+    stages: tuple[tuple[str, float], ...]
+    """Name, s."""
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the whole map, s."""
+        return sum(s for _, s in self.stages)
+
+
+def made(settings: Settings) -> Trial:
+    """Simulate a drive and read it back from a log in a temporary folder."""
+    with tempfile.TemporaryDirectory(prefix="uwblite-") as folder:
+        logfile.write(simulate(settings), Path(folder))
+        return loaded(Path(folder))
+
+
+def loaded(folder: Path) -> Trial:
+    """Read what tools/simulate.py wrote."""
+    log = read_log(next(p for p in (folder / "run.log", folder / "run.log.gz") if p.exists()))
+    stamps, poses = read_tum(folder / "truth.tum")
+    table = read_csv(folder / "truth_anchors.csv")
+    anchors = dict(zip(table.texts("id"), table.numbers("x", "y"), strict=True))
+    columns, pairs = read_landmarks(str(folder / "columns.csv"))
+    return Trial(log, stamps, poses, anchors, columns, pairs)
+
+
+def judged(result: MapResult, trial: Trial, max_gap: float = 1.0) -> Figures:
+    """Compare a map with the truth."""
+    path = evaluate_trajectory(result.stamps, result.trajectory, trial.stamps, trial.poses, max_gap=max_gap)
+    nan = float("nan")
+    in_map = drawn = None
+    if trial.columns is not None and len(trial.columns.names):
+        seen = trial.poses[path.matched]
+        estimate = se2.interpolate_trajectory(result.stamps, result.trajectory, trial.stamps[path.matched])
+        drawn = landmark_errors_along(trial.columns, seen, estimate, trial.pairs)
+        if result.grid is not None:
+            occupied = se2.transform(path.T_truth_map, result.grid.occupied_points())
+            found = find_columns(occupied, trial.columns, cell=result.grid.geometry.resolution)
+            in_map = landmark_errors(found, trial.columns, trial.pairs)
+    ids = tuple(a.id for a in result.anchors)
+    places = np.array([a.position for a in result.anchors]).reshape(-1, 2)
+    true_places = np.array(list(trial.anchors.values())).reshape(-1, 2)
+    anchors = evaluate_anchors(ids, places, tuple(trial.anchors), true_places, path.T_truth_map)
+    by_id = dict(zip(anchors.ids, anchors.distances.tolist(), strict=True))
+    return Figures(
+        ate=path.ate.rmse,
+        heading=nan if path.heading is None else path.heading.rmse,
+        column=nan if in_map is None or not in_map.pairs else in_map.mean,
+        drawn=nan if drawn is None or not drawn.pairs else drawn.mean,
+        pairs=_pairs(in_map, drawn),
+        missing=() if in_map is None else in_map.missing,
+        anchors=anchors.rmse,
+        anchor_errors=tuple((i, by_id.get(i, float("inf"))) for i in ids),
+        closures=(sum(c.accepted for c in result.closures), len(result.closures)),
+        doubts=result.doubts,
+        stages=tuple((s.name, s.seconds) for s in result.stages),
+    )
+
+
+def _pairs(in_map: LandmarkErrors | None, drawn: LandmarkErrors | None) -> tuple[tuple[str, str, float, float], ...]:
+    if drawn is None:
+        return ()
+    found = {} if in_map is None else dict(zip(in_map.pairs, in_map.errors.tolist(), strict=True))
+    rows = zip(drawn.pairs, drawn.errors.tolist(), strict=True)
+    return tuple((a, b, found.get((a, b), float("nan")), error) for (a, b), error in rows)
+
+
+def mapped(trial: Trial, config: MappingConfig) -> Figures:
+    """Map a trial and compare with the truth."""
+    return judged(build_map(trial.log, config, clock=time.perf_counter), trial)
+
+
+def spread_out(work: Callable[[Task], Answer], tasks: Sequence[Task], jobs: int) -> Iterator[Answer]:
+    """Yield work(task) in the order of the tasks, in so many processes."""
+    if jobs <= 1:
+        yield from map(work, tasks)
+        return
+    with ProcessPoolExecutor(jobs) as pool:
+        yield from pool.map(work, tasks)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Return a Markdown table; numbers get three decimals, nan a dash."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(_cell(c) for c in row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float | np.floating):
+        return "-" if np.isnan(value) else f"{value:.3f}"
+    return str(value)
+
+
+def write_section(path: Path, name: str, text: str) -> None:
+    """Replace the part of a document between the marks of this name, or add it at the end."""
+    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    document = path.read_text() if path.exists() else ""
+    part = f"{begin}\n{text.strip()}\n{end}"
+    pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
+    document = pattern.sub(lambda _: part, document) if pattern.search(document) else f"{document.rstrip()}\n\n{part}\n"
+    path.write_text(document.lstrip())

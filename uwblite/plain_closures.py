@@ -1,0 +1,120 @@
+"""Loop closures as the paper finds them: ICP between sub-maps that overlap where the first optimisation puts them.
+
+One registration per pair, from the graph's guess; a pair is accepted when the fitness score, the mean squared distance
+of the source's points to the target, stays below a threshold. Nothing else is asked: no search, no uniqueness, no
+consistency among closures. ``loop_closure`` does what experience adds to that.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import se2
+from .graph import Graph, RelativePoseEdges
+from .icp import IcpConfig, Registration, align
+from .loop_closure import Closures, LoopClosureConfig, no_closures
+from .map_result import LoopClosure
+from .point_cloud import PointCloud, make_cloud
+from .submaps import Submaps
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_CELL = 0.5
+"""m; two sub-maps overlap by the share of such squares of the smaller one that both have points in."""
+_LEAST_SHARED = 0.25
+"""Least such share of a candidate."""
+
+
+def find(
+    graph: Graph, submaps: Submaps, session: Ints, config: LoopClosureConfig, icp: IcpConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> Closures:
+    """Align every pair of sub-maps that overlap by the graph; keep all, with what became of them.
+
+    Parameters
+    ----------
+    graph : poses that place the sub-maps.
+    session : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
+    config : its partners bound the candidates per sub-map. icp : method, outlier distance, iterations and fitness.
+    progress : called with (done, total).
+    """
+    target, source = candidates(graph.poses, submaps, session, config.partners)
+    if not len(target):
+        return no_closures()
+    prepared: dict[int, PointCloud] = {}
+    story, information = [], []
+    for done, (a, b) in enumerate(zip(target.tolist(), source.tolist(), strict=True)):
+        i, j = int(submaps.reference[a]), int(submaps.reference[b])
+        guess = se2.between(graph.poses[i], graph.poses[j])
+        found = align(_prepare(submaps, a, prepared), _prepare(submaps, b, prepared), guess, icp)
+        information.append(found.information / config.correlation)
+        story.append(_story(i, j, found, information[-1]))
+        if progress is not None:
+            progress(done + 1, len(target))
+    good = np.flatnonzero([c.accepted for c in story])
+    kept = [story[k] for k in good]
+    return Closures(
+        RelativePoseEdges(
+            np.array([c.i for c in kept], dtype=np.int64),
+            np.array([c.j for c in kept], dtype=np.int64),
+            np.array([c.T_i_j for c in kept]).reshape(-1, 3),
+            _root(np.array([information[k] for k in good]).reshape(-1, 3, 3)),
+        ),
+        tuple(story),
+    )
+
+
+def candidates(poses: Floats, submaps: Submaps, session: Ints, limit: int) -> tuple[Ints, Ints]:
+    """Return target (c,) and source (c,) of the pairs of sub-maps that share enough of their surface, a < b.
+
+    Parameters
+    ----------
+    poses : (k, 3) of the keyframes. session : (k,).
+    limit : most partners per sub-map, best overlap first.
+    """
+    shared = _shared(poses[submaps.reference], submaps)
+    a, b = np.triu_indices(len(submaps), 1)
+    first = session[submaps.reference]
+    worth = np.where((b - a > 1) | (first[a] != first[b]), shared[a, b], 0.0)
+    order = np.lexsort((b, a, -worth))
+    order = order[worth[order] >= _LEAST_SHARED]
+    # Best pairs first: a pair is kept while either of its sub-maps still has room.
+    used, kept = np.zeros(len(submaps), dtype=np.int64), []
+    for row in order.tolist():
+        if min(used[a[row]], used[b[row]]) < limit:
+            used[[a[row], b[row]]] += 1
+            kept.append(row)
+    rows = np.array(sorted(kept), dtype=np.int64)
+    return a[rows], b[rows]
+
+
+def _shared(poses: Floats, submaps: Submaps) -> Floats:
+    """Return (s, s) which share of the squares of the smaller sub-map the larger one has points in, too."""
+    owner = submaps.clouds.owner
+    points = se2.transform(poses[owner], submaps.clouds.points)
+    cell = np.floor(points / _CELL).astype(np.int64)
+    cell -= cell.min(axis=0, initial=0)
+    _, column = np.unique(cell[:, 0] * (cell[:, 1].max(initial=0) + 1) + cell[:, 1], return_inverse=True)
+    seen = np.zeros((len(submaps), int(column.max(initial=-1)) + 1), dtype=np.float32)
+    seen[owner, column] = 1.0
+    size = np.maximum(seen.sum(axis=1), 1.0)
+    return np.asarray(seen @ seen.T / np.minimum(size[:, None], size[None]), dtype=np.float64)
+
+
+def _prepare(submaps: Submaps, k: int, prepared: dict[int, PointCloud]) -> PointCloud:
+    if k not in prepared:
+        prepared[k] = make_cloud(submaps.clouds.cloud(k)[0])
+    return prepared[k]
+
+
+def _story(i: int, j: int, found: Registration, information: Floats) -> LoopClosure:
+    why = f"fitness score {found.fitness:.3g} m2 after {found.iterations} iterations" if found.converged else found.reason
+    return LoopClosure(i, j, found.T_target_source, information, found.rmse, found.overlap, found.converged, why)
+
+
+def _root(information: Floats) -> Floats:
+    """Return L (e, 3, 3) with L^T L = information (e, 3, 3), which may be singular."""
+    values, vectors = np.linalg.eigh(information)
+    return np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
