@@ -85,14 +85,14 @@ def read_bag(path: str | os.PathLike[str], topics: BagTopics = BagTopics(), mapp
 
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[Any]:
+    name = os.fspath(path)
+    if not os.path.exists(name):
+        raise FormatError("cannot be opened: no such file or folder", name)
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise ConfigError("reading bags needs the package rosbags: pip install 'uwblite[bag]'") from None
-    name = os.fspath(path)
-    if not os.path.exists(name):
-        raise FormatError("cannot be opened: no such file or folder", name)
     try:
         # The store serves bags that do not carry the definitions of their messages.
         with AnyReader([Path(name)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
