@@ -66,20 +66,16 @@ def unknowns(
     told_height : (a,) whose height is known.
     recording : which one of the graph's; all but the first add their number to the names, see of_recording.
     """
-    wheels = (
+    common = (
         Unknown("odometry_scale", config.odometry_scale, "1", "relative error of travelled distance"),
         Unknown("heading_scale", config.heading_scale, "1", "relative error of turned angle"),
         Unknown("heading_per_metre", config.heading_per_metre, "rad/m", "heading drift per travelled metre"),
         Unknown("heading_rate", config.heading_rate, "rad/s", "heading drift per second of motion"),
-    )
-    shared = (
         Unknown("laser_x", config.laser_offset, "m", "correction of the laser's x on the base"),
         Unknown("laser_y", config.laser_offset, "m", "correction of the laser's y on the base"),
         Unknown("laser_theta", config.laser_angle, "rad", "correction of the laser's heading on the base"),
         Unknown("laser_delay", config.laser_delay, "s", "laser clock against odometry clock"),
         Unknown("range_scale", config.range_scale, "1", "relative error of all ranges"),
-    )
-    tag = (
         Unknown("tag_x", config.tag_offset, "m", "correction of the tag's x on the base"),
         Unknown("tag_y", config.tag_offset, "m", "correction of the tag's y on the base"),
         Unknown("range_delay", config.range_delay, "s", "radio clock against odometry clock"),
@@ -90,18 +86,26 @@ def unknowns(
         if not told:
             text = f"squared height of anchor {anchor_id} above the tag"
             own.append(Unknown(f"height2:{anchor_id}", config.anchor_height**2, "m^2", text))
-    listed = (*wheels, *shared, *tag, *own)
+    listed = tuple(u for u in (*common, *own) if u.sigma > 0)
     if recording > 0:
         where = f" in recording {recording + 1}"
-        listed = tuple(
-            replace(u, name=of_recording(u.name, recording), meaning=u.meaning + where) for u in listed if u not in shared
-        )
-    return tuple(u for u in listed if u.sigma > 0)
+        renamed = (replace(u, name=of_recording(u.name, recording), meaning=u.meaning + where) for u in listed)
+        listed = tuple(u for u in renamed if u.name not in SHARED)
+    return listed
+
+
+SHARED = ("laser_x", "laser_y", "laser_theta", "laser_delay", "range_scale")
+"""Unknowns that all recordings have in common."""
 
 
 def of_recording(name: str, recording: int) -> str:
-    """Return what an unknown is called in a recording: its name in the first (0), ``name#2`` in the second ..."""
-    return name if recording == 0 else f"{name}#{recording + 1}"
+    """Return what an unknown is called in a recording: ``name`` in the first (0), ``name#2`` in the second ..., where own."""
+    return name if recording == 0 or name in SHARED else f"{name}#{recording + 1}"
+
+
+def stem(name: str) -> str:
+    """Return the name of an unknown without the anchor and the recording that it belongs to."""
+    return name.split(":")[0].split("#")[0]
 
 
 def block(listed: tuple[Unknown, ...]) -> Calibration:
@@ -120,22 +124,19 @@ def indices(calibration: Calibration, *names: str) -> Ints:
     return np.array([calibration.index(name) for name in names], dtype=np.int64)
 
 
-def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str, ...], recording: int = 0) -> Ints:
-    """Return the (m, 6) calibration indices of RangeEdges for a recording's ranges to the given anchors (m,)."""
-
-    def own(*names: str) -> Ints:
-        return indices(calibration, *(of_recording(name, recording) for name in names))
-
-    bias, height = own(*(f"bias:{a}" for a in anchor_ids)), own(*(f"height2:{a}" for a in anchor_ids))
-    scale, (tag_x, tag_y, delay) = calibration.index("range_scale"), own("tag_x", "tag_y", "range_delay")
+def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str, ...]) -> Ints:
+    """Return the (m, 6) calibration indices of RangeEdges for ranges to the given anchors (m,)."""
+    bias = indices(calibration, *(f"bias:{a}" for a in anchor_ids))
+    height = indices(calibration, *(f"height2:{a}" for a in anchor_ids))
+    scale, tag_x, tag_y, delay = indices(calibration, "range_scale", "tag_x", "tag_y", "range_delay")
     table = np.stack([np.full(len(bias), scale), bias, height, *(np.full(len(bias), k) for k in (tag_x, tag_y, delay))], axis=1)
     return table[anchor]
 
 
-def odometry_indices(calibration: Calibration, edges: int, recording: int = 0) -> Ints:
-    """Return the (e, 4) calibration indices of a recording's OdometryEdges."""
+def odometry_indices(calibration: Calibration, edges: int) -> Ints:
+    """Return the (e, 4) calibration indices of OdometryEdges."""
     names = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
-    return np.broadcast_to(indices(calibration, *(of_recording(name, recording) for name in names)), (edges, 4))
+    return np.broadcast_to(indices(calibration, *names), (edges, 4))
 
 
 def scan_indices(calibration: Calibration) -> Ints:
