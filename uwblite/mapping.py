@@ -1,11 +1,11 @@
-"""The page that is the algorithm: from a recording to trajectory, anchors and map.
+"""The page that is the algorithm: from recordings to trajectories, anchors and map.
 
 ``build_map`` reads as the paper does: keyframes and edges, first optimisation with wheels and radio, sub-maps and
 loop closures, second optimisation with lidar edges, occupancy grid. Beyond the paper stand the calibration in the same
 least squares, noise learnt from the data, tracking between neighbouring clouds and the joint refinement of all of them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -25,6 +25,7 @@ from . import (
     plain_closures,
     refinement,
     se2,
+    sessions,
     submaps,
     summary,
     tracking,
@@ -35,20 +36,21 @@ from .clouds import CloudConfig, Clouds
 from .constraints import Constraints
 from .constraints import apply as apply_constraints
 from .errors import Cancelled, ConfigError
-from .first_estimate import FirstEstimate, GrowthConfig
-from .graph import Edges, Graph, OdometryEdges, RangeEdges
+from .first_estimate import GrowthConfig
+from .graph import Edges, Graph
 from .icp import IcpConfig
-from .keyframes import KeyframeConfig, Keyframes
+from .keyframes import KeyframeConfig
 from .loop_closure import Closures, LoopClosureConfig
 from .map_result import MapResult, StageSummary
 from .marginals import marginals
 from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_edges
-from .occupancy_grid import GridConfig, OccupancyGrid
+from .occupancy_grid import GridConfig, OccupancyGrid, Sweeps
 from .pair_matching import NearestRaster
 from .range_noise import RangeNoiseConfig, short_term_sigma
 from .refinement import Refined, RefinementConfig
 from .scan_search import SearchConfig
 from .sensor_log import SensorLog
+from .sessions import Drives, Part, Session
 from .solver import SolverConfig, SolverSummary, optimize
 from .submaps import SubmapConfig
 from .tracking import TrackingConfig
@@ -121,7 +123,7 @@ class Stages:
 
 
 def build_map(
-    log: SensorLog,
+    logs: SensorLog | Sequence[SensorLog],
     config: MappingConfig | None = None,
     *,
     constraints: Constraints | None = None,
@@ -129,11 +131,12 @@ def build_map(
     executor: Executor | None = None,
     clock: Callable[[], float] | None = None,
 ) -> MapResult:
-    """Compute trajectory, anchors and map of a recording.
+    """Compute trajectories, anchors and map of one or more recordings.
 
     Parameters
     ----------
-    log : the recording; ranges or scans may be missing.
+    logs : the recording, ranges or scans may be missing; or several that hear the same anchors, by whatever robots on
+        whatever days: they become one map in the frame of the first.
     config : settings; None = defaults.
     constraints : what is known beforehand: surveyed anchors, pinned poses, an earlier map's anchors ...
     progress : called as progress(stage, done, total); returning False raises Cancelled.
@@ -142,58 +145,54 @@ def build_map(
 
     Raises
     ------
-    DataError : the recording holds nothing to map. Cancelled : the callback asked to stop.
+    DataError : there is nothing to map, or recordings share too few anchors. Cancelled : the callback asked to stop.
     """
     config, known = config or MappingConfig(), constraints or Constraints()
     stages = Stages(progress, clock)
-    log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
+    logs = [logs] if isinstance(logs, SensorLog) else logs
+    logs = [log.without(uwb=not config.use_uwb, lidar=not config.use_lidar) for log in logs]
 
-    frames = keyframes.select(log.odometry, config.keyframes)
-    stages.end("keyframes", keyframes=len(frames), travelled=round(float(frames.path.sum()), 3))
+    drives = sessions.gather(logs, config.keyframes)
+    travelled = sum(float(s.frames.path.sum()) for s in drives.sessions)
+    stages.end("keyframes", keyframes=len(drives.stamps), travelled=round(travelled, 3))
 
-    graph, wheels, radio, path = _measurements(log, frames, config)
-    stages.end("edges", odometry=len(wheels), ranges=0 if radio is None else len(radio))
+    parts = [_measurements(session, config) for session in drives.sessions]
+    ranges = sum(len(part.radio) for part in parts if part.radio is not None)
+    stages.end("edges", odometry=sum(len(part.wheels) for part in parts), ranges=ranges)
 
-    first: FirstEstimate | None = None
-    if radio is not None:
-        first, graph, radio, solved = _first_optimisation(graph, wheels, radio, path, config, stages)
-        stages.end("first optimisation", placed=int(first.placed.sum()), **_solver_figures(solved))
-    edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
-    graph, first = _constrained(graph, edges, first, known, log, frames, config, stages)
+    part = _first_optimisation(parts, drives, config, stages)
+    part = _constrained(part, known, drives, config, stages)
 
-    scans = _Scans.of(log, frames, known, config)
+    scans = _Scans.of(drives, known, config)
     closures = loop_closure.no_closures()
     tracked: Refined | None = None
     refined: Refined | None = None
     if scans is not None:
         stages.end("clouds", points=len(scans.clouds.points))
-        graph = _free(graph, "laser_x", "laser_y", "laser_theta", "laser_delay")
+        part = replace(part, graph=_free(part.graph, *_LASER))
         if config.tracking.on:
-            graph, wheels, tracked = _track(graph, wheels, radio, scans, path, config, stages)
-        edges = (wheels, *edges[1:])
+            part, tracked = _track(part, scans, drives, config, stages)
         if config.use_loops:
-            held = edges if tracked is None else (*edges, tracked.edges)
+            held = part.edges if tracked is None else (*part.edges, tracked.edges)
             close = _close_loops if config.loops.method == "search" else _close_loops_plainly
-            graph, closures = close(graph, held, scans, path, config, stages)
-            graph, radio, refined, closures = _refine_jointly(graph, wheels, radio, closures, scans, path, config, stages)
-    graph = _final_graph(graph, wheels, radio, closures, tracked, refined)
-    graph, first = _aligned(graph, first, scans, config)
+            part, closures = close(part, held, scans, drives, config, stages)
+            part = _moved_anchors_apart(part, drives, config, stages)
+            part, refined = _refine_jointly(part, scans, drives, config, stages)
+    part = _final(part, closures, tracked, refined)
+    part = _aligned(part, scans, config)
 
-    grid = _grid(log, frames, graph, config, executor, stages)
-    uncertainty = marginals(graph)
+    grid = _grid(drives, part.graph, config, executor, stages)
+    uncertainty = marginals(part.graph)
     result = summary.summarise(
-        log, frames, graph, uncertainty, first, radio, closures, refined or tracked, grid, config.calibration, stages.done,
-        stages.warnings,
+        drives, part, uncertainty, closures, grid, config.calibration, stages.done, stages.warnings
     )
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
 
 
-def _measurements(
-    log: SensorLog, frames: Keyframes, config: MappingConfig
-) -> tuple[Graph, OdometryEdges, RangeEdges | None, Floats]:
-    """Return the graph by dead reckoning with its calibration priors, the wheels' and the radio's edges and the path (k,)."""
-    ids = log.ranges.anchor_ids if log.ranges is not None else ()
+def _measurements(session: Session, config: MappingConfig) -> Part:
+    """Return a recording's graph by dead reckoning with its calibration priors, and what its wheels and radio measured."""
+    log, frames, ids = session.log, session.frames, session.anchor_ids
     told = np.array([log.mounting.height_difference(a) is not None for a in ids], dtype=bool)
     listed = calibration.unknowns(config.calibration, ids, told)
     block = calibration.block(listed)
@@ -201,12 +200,11 @@ def _measurements(
     graph = graph.with_edges(calibration.prior_edges(listed))
     graph = _free(replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool)), *_WHEELS, "bias", "range_scale")
     wheels = wheel_edges(frames, 0, config.odometry, block)
-    path = np.concatenate([[0.0], np.cumsum(frames.path)])
     if log.ranges is None:
-        return graph, wheels, None, path
+        return Part(graph, wheels, None, None, ids)
     attached = keyframes.attach_ranges(log.ranges, log.odometry, frames, log.mounting)
     radio = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.anchors, config.ranges.kernel)
-    return graph, wheels, radio if np.any(radio.weights) else None, path
+    return Part(graph, wheels, radio if np.any(radio.weights) else None, None, ids)
 
 
 _WHEELS = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
@@ -215,9 +213,9 @@ _RADIO = ("height2", "tag_x", "tag_y", "range_delay")
 
 
 def _free(graph: Graph, *names: str) -> Graph:
-    """Return the graph with calibration unknowns of these names (an anchor's own by their stem) set free."""
+    """Return the graph with calibration unknowns of these names (an anchor's or a recording's own by their stem) set free."""
     assert graph.fixed_calibration is not None
-    named = np.array([name.split(":")[0] in names for name in graph.calibration.names], dtype=bool)
+    named = np.array([calibration.stem(name) in names for name in graph.calibration.names], dtype=bool)
     return replace(graph, fixed_calibration=graph.fixed_calibration & ~named)
 
 
@@ -226,51 +224,69 @@ def _estimates(graph: Graph, solved: Graph) -> Graph:
     return graph.updated(solved.poses, solved.anchors, solved.calibration.values)
 
 
-def _first_optimisation(
-    graph: Graph, wheels: OdometryEdges, radio: RangeEdges, path: Floats, config: MappingConfig, stages: Stages
-) -> tuple[FirstEstimate, Graph, RangeEdges, SolverSummary]:
-    """Grow trajectory and anchors from nothing, then optimise wheels and radio together (paper: first optimisation)."""
+def _first_optimisation(parts: Sequence[Part], drives: Drives, config: MappingConfig, stages: Stages) -> Part:
+    """Grow each recording from nothing, bring them together and optimise wheels and radio (paper: first optimisation)."""
+    parts = [_settled(_grown(part, drives, n, config, stages), config, stages) for n, part in enumerate(parts)]
+    joined = sessions.join(parts, drives)
+    stages.warnings += joined.warnings
+    if len(parts) == 1:
+        return joined.part
+    return _settled(joined.part, config, stages)
+
+
+def _grown(part: Part, drives: Drives, number: int, config: MappingConfig, stages: Stages) -> Part:
+    """Grow trajectory and anchors of one recording."""
+    radio, path = part.radio, drives.path[drives.sessions[number].rows]
+    if radio is None:
+        return part
     alive = np.asarray(radio.weights) > 0
     sigma = short_term_sigma(radio.stamps[alive], radio.anchor[alive], radio.ranges[alive], config.ranges)
     growth = replace(config.growth, range_sigma=max(1.5 * sigma, config.growth.least_sigma))
-    first = first_estimate.grow(graph, wheels, radio, path, growth, config.anchors)
-    stages.end("first estimate", range_sigma=round(sigma, 4), placed=int(first.placed.sum()))
-    graph = replace(_estimates(graph, first.graph), fixed_anchors=~first.placed)
+    first = first_estimate.grow(part.graph, part.wheels, radio, path - path[0], growth, config.anchors)
+    whose = {"recording": number + 1} if len(drives) > 1 else {}
+    stages.end("first estimate", range_sigma=round(sigma, 4), placed=int(first.placed.sum()), **whose)
+    graph = replace(_estimates(part.graph, first.graph), fixed_anchors=~first.placed)
     radio = replace(radio, weights=(alive & first.placed[radio.anchor]).astype(np.float64))
+    return replace(part, graph=graph, radio=radio, first=first)
+
+
+def _settled(part: Part, config: MappingConfig, stages: Stages) -> Part:
+    """Optimise wheels and radio together, the ranges' noise learnt by the way."""
+    graph, radio = part.graph, part.radio
+    if radio is None or part.first is None:
+        return part
     for lap in range(3):
         radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
         if lap == 2:
             graph = _free(graph, *_RADIO)
-        solved, result = optimize(graph.with_edges(wheels, radio), config.solver)
+        solved, result = optimize(graph.with_edges(part.wheels, radio), config.solver)
         graph = _hold_negative_heights(_estimates(graph, solved))
         stages.tell("first optimisation", lap + 1, 3)
-    return first, graph, radio, result
+    stages.end("first optimisation", placed=int(part.first.placed.sum()), **_solver_figures(result))
+    return replace(part, graph=graph, radio=radio)
 
 
-def _constrained(
-    graph: Graph, edges: tuple[Edges, ...], first: FirstEstimate | None, known: Constraints, log: SensorLog,
-    frames: Keyframes, config: MappingConfig, stages: Stages,
-) -> tuple[Graph, FirstEstimate | None]:
+def _constrained(part: Part, known: Constraints, drives: Drives, config: MappingConfig, stages: Stages) -> Part:
     """Bring the first estimate into the user's frame, where one is known, and add what is known beforehand."""
     if known == Constraints():
-        return graph, first
+        return part
     if known.places and config.align != "odometry":
         raise ConfigError("known places say where the map lies; leave out align, or the places")
-    ids = log.ranges.anchor_ids if log.ranges is not None else ()
-    placed = np.zeros(len(ids), dtype=bool) if first is None else first.placed
-    done = apply_constraints(known, graph, ids, placed, frames.stamps)
+    placed = np.zeros(len(part.anchor_ids), dtype=bool) if part.first is None else part.first.placed
+    done = apply_constraints(known, part.graph, part.anchor_ids, placed, drives.stamps)
     stages.warnings += [
         f"anchor {name} stands {off:.2f} m from its earlier place: it was moved" for name, off in done.moved.items()
     ]
-    graph = _estimates(done.graph, optimize(done.graph.with_edges(*edges), config.solver)[0])
+    graph = _estimates(done.graph, optimize(done.graph.with_edges(*part.edges), config.solver)[0])
     stages.end("constraints", moved=sorted(done.moved), shift=[round(v, 4) for v in done.motion.tolist()])
-    return graph, None if first is None else _moved_hypotheses(first, done.motion)
+    return replace(part, graph=graph, first=sessions.moved_hypotheses(part.first, done.motion))
 
 
-def _moved_hypotheses(first: FirstEstimate, motion: Floats) -> FirstEstimate:
-    """Return the first estimate with its places of anchors in a frame moved by T_new_old."""
-    moved = tuple(tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in first.hypotheses)
-    return replace(first, hypotheses=moved)
+def _moved_anchors_apart(part: Part, drives: Drives, config: MappingConfig, stages: Stages) -> Part:
+    """Look again, once the lidar holds the poses, for anchors that were moved between recordings."""
+    apart = sessions.apart(part, drives, config.solver)
+    stages.warnings += apart.warnings
+    return apart.part
 
 
 def _hold_negative_heights(graph: Graph) -> Graph:
@@ -297,19 +313,28 @@ class _Scans:
         return self.known.allowed(self.stamps[i], self.stamps[j])
 
     @classmethod
-    def of(cls, log: SensorLog, frames: Keyframes, known: Constraints, config: MappingConfig) -> "_Scans | None":
-        if log.scans is None or not len(log.scans.stamps):
+    def of(cls, drives: Drives, known: Constraints, config: MappingConfig) -> "_Scans | None":
+        if not any(session.has_scans for session in drives.sessions):
             return None
-        owner, chosen = keyframes.choose_scans(log.scans, frames, config.keyframes)
-        parts = []
-        for block in range(0, len(frames), _BLOCK):
-            size = min(_BLOCK, len(frames) - block)
-            own = slice(*np.searchsorted(owner, [block, block + size]).tolist())
-            rays = keyframes.scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
-            parts.append(clouds.build(replace(rays, keyframe=rays.keyframe - block), size, config.clouds))
-        built = clouds.joined(parts)
+        built = clouds.joined([block for session in drives.sessions for block in _clouds(session, config)])
         reach = max(config.refinement.first_gate, 0.2)
-        return cls(built, pair_matching.paint(built, config.clouds.raster, reach), frames.twist, frames.stamps, known)
+        return cls(built, pair_matching.paint(built, config.clouds.raster, reach), drives.twist, drives.stamps, known)
+
+
+def _clouds(session: Session, config: MappingConfig) -> list[Clouds]:
+    """Return the clouds of a recording's keyframes, a block at a time; empty ones without lidar."""
+    log, frames = session.log, session.frames
+    if log.scans is None:
+        none = np.zeros(0, dtype=np.int64)
+        return [Clouds(np.zeros(len(frames) + 1, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))]
+    owner, chosen = keyframes.choose_scans(log.scans, frames, config.keyframes)
+    parts = []
+    for block in range(0, len(frames), _BLOCK):
+        size = min(_BLOCK, len(frames) - block)
+        own = slice(*np.searchsorted(owner, [block, block + size]).tolist())
+        rays = keyframes.scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
+        parts.append(clouds.build(replace(rays, keyframe=rays.keyframe - block), size, config.clouds))
+    return parts
 
 
 def _match_round(
@@ -343,41 +368,37 @@ def _without_forbidden(found: Closures, scans: _Scans) -> Closures:
     return Closures(edges, story)
 
 
-def _track(
-    graph: Graph, wheels: OdometryEdges, radio: RangeEdges | None, scans: _Scans, path: Floats, config: MappingConfig,
-    stages: Stages,
-) -> tuple[Graph, OdometryEdges, Refined]:
+def _track(part: Part, scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages) -> tuple[Part, Refined]:
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
     settings = replace(
         config.refinement, partners=0, rounds=config.refinement.track_rounds, first_gate=config.refinement.later_gate
     )
-    session = np.zeros(len(path), dtype=np.int64)
     steps, wheels, searched = tracking.follow(
-        scans.clouds, scans.raster, wheels, graph, config.refinement.first_gate, config.tracking, config.search
+        scans.clouds, scans.raster, part.wheels, part.graph, config.refinement.first_gate, config.tracking, config.search
     )
-    edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
-    graph = _estimates(graph, optimize(graph.with_edges(*edges, steps), config.solver)[0])
-    i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, settings)
-    graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "tracking")
+    part = replace(part, wheels=wheels)
+    graph = _estimates(part.graph, optimize(part.graph.with_edges(*part.edges, steps), config.solver)[0])
+    i, j = refinement.choose_pairs(scans.clouds, graph.poses, drives.path, drives.session, settings)
+    graph, refined = _match_round(graph, part.edges, scans, i, j, settings, config, stages, "tracking")
     stages.end(
         "tracking", pairs=len(i), searched=searched, used=int(refined.used.sum()), sigma=round(refined.sigma, 4),
         rounds=refined.rounds,
     )
-    return graph, wheels, refined
+    return replace(part, graph=graph), refined
 
 
 def _close_loops(
-    graph: Graph, edges: tuple[Edges, ...], scans: _Scans, path: Floats, config: MappingConfig, stages: Stages
-) -> tuple[Graph, Closures]:
+    part: Part, edges: tuple[Edges, ...], scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages
+) -> tuple[Part, Closures]:
     """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
-    session = np.zeros(len(path), dtype=np.int64)
-    base = graph.with_edges(*edges)
+    session = drives.session
+    base = part.graph.with_edges(*edges)
     found = loop_closure.no_closures()
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
-    held = any(isinstance(e, RangeEdges) for e in edges)
+    held = part.radio is not None
     for lap in range(config.loops.rounds):
-        pieces = submaps.build(scans.clouds, base.poses, path, session, config.submaps)
+        pieces = submaps.build(scans.clouds, base.poses, drives.path, session, config.submaps)
         known = marginals(base.with_edges(found.edges))
         candidates = loop_closure.propose(base, known, pieces, session, tried, missed, config.loops)
         tried |= candidates.names(config.loops)
@@ -392,39 +413,38 @@ def _close_loops(
         )
         if len(new.edges) < 0.05 * len(found.edges) and not missed - {(a, b) for a, b, searched in tried if searched}:
             break
-    return _estimates(graph, base), found
+    return replace(part, graph=_estimates(part.graph, base)), found
 
 
 def _close_loops_plainly(
-    graph: Graph, edges: tuple[Edges, ...], scans: _Scans, path: Floats, config: MappingConfig, stages: Stages
-) -> tuple[Graph, Closures]:
+    part: Part, edges: tuple[Edges, ...], scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages
+) -> tuple[Part, Closures]:
     """Align sub-maps pair by pair and solve once more with those that fit (paper: second optimisation)."""
-    session = np.zeros(len(path), dtype=np.int64)
+    graph, session = part.graph, drives.session
     found = loop_closure.no_closures()
     for lap in range(config.loops.rounds):
-        pieces = submaps.build(scans.clouds, graph.poses, path, session, config.submaps)
+        pieces = submaps.build(scans.clouds, graph.poses, drives.path, session, config.submaps)
         teller = stages.teller("loop closure")
         found = _without_forbidden(plain_closures.find(graph, pieces, session, config.loops, config.icp, teller), scans)
         stages.end(f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(found.candidates), accepted=len(found.edges))
         solved, result = optimize(graph.with_edges(*edges, found.edges), config.solver)
         graph = _estimates(graph, solved)
         stages.end(f"second optimisation {lap + 1}", **_solver_figures(result))
-    return graph, found
+    return replace(part, graph=graph), found
 
 
 def _refine_jointly(
-    graph: Graph, wheels: OdometryEdges, radio: RangeEdges | None, closures: Closures, scans: _Scans, path: Floats,
-    config: MappingConfig, stages: Stages,
-) -> tuple[Graph, RangeEdges | None, Refined | None, Closures]:
+    part: Part, scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages
+) -> tuple[Part, Refined | None]:
     """Let all overlapping clouds pull on all poses; what the ranges weigh is learnt anew from where the lidar puts them."""
     if config.refinement.rounds == 0:
-        return graph, radio, None, closures
-    session = np.zeros(len(path), dtype=np.int64)
+        return part, None
+    graph, radio = part.graph, part.radio
     graph = _free(graph, *_RADIO) if radio is not None else graph
     refined: Refined | None = None
     for lap in range(config.refinement.selections):
-        edges: tuple[Edges, ...] = (wheels,) if radio is None else (wheels, radio)
-        i, j = refinement.choose_pairs(scans.clouds, graph.poses, path, session, config.refinement)
+        edges = replace(part, radio=radio).edges
+        i, j = refinement.choose_pairs(scans.clouds, graph.poses, drives.path, drives.session, config.refinement)
         settings = config.refinement
         if lap > 0:
             settings = replace(settings, first_gate=settings.later_gate)
@@ -440,56 +460,51 @@ def _refine_jointly(
         )
         if shift < config.refinement.same_pairs:
             break
-    return graph, radio, refined, closures
+    return replace(part, graph=graph, radio=radio), refined
 
 
-def _final_graph(
-    graph: Graph, wheels: OdometryEdges, radio: RangeEdges | None, closures: Closures, tracked: Refined | None,
-    refined: Refined | None,
-) -> Graph:
+def _final(part: Part, closures: Closures, tracked: Refined | None, refined: Refined | None) -> Part:
     """Return the graph with every measurement that holds it; the joint refinement's take the place of all other scans'."""
-    edges: list[Edges] = [wheels]
-    if radio is not None:
-        edges.append(radio)
     if refined is not None:
-        return graph.with_edges(*edges, refined.edges)
-    if tracked is not None:
-        edges.append(tracked.edges)
-    return graph.with_edges(*edges, closures.edges)
+        return replace(part, graph=part.graph.with_edges(*part.edges, refined.edges))
+    lidar: tuple[Edges, ...] = (closures.edges,) if tracked is None else (tracked.edges, closures.edges)
+    return replace(part, graph=part.graph.with_edges(*part.edges, *lidar))
 
 
-def _aligned(
-    graph: Graph, first: FirstEstimate | None, scans: _Scans | None, config: MappingConfig
-) -> tuple[Graph, FirstEstimate | None]:
+def _aligned(part: Part, scans: _Scans | None, config: MappingConfig) -> Part:
     """Put the map's axes where the settings want them."""
-    placed = np.zeros(len(graph.anchors), dtype=bool) if first is None else first.placed
-    normals = np.zeros((0, 2))
+    graph, normals = part.graph, np.zeros((0, 2))
+    placed = np.zeros(len(graph.anchors), dtype=bool) if part.first is None else part.first.placed
     if scans is not None and config.align == "walls":
         normals = se2.rotate(graph.poses[scans.clouds.owner, 2], scans.clouds.normals)
     motion = map_frame.alignment(config.align, graph, placed, normals)
-    return map_frame.moved(graph, motion), None if first is None else _moved_hypotheses(first, motion)
+    return replace(part, graph=map_frame.moved(graph, motion), first=sessions.moved_hypotheses(part.first, motion))
 
 
 def _grid(
-    log: SensorLog, frames: Keyframes, graph: Graph, config: MappingConfig, executor: Executor | None, stages: Stages
+    drives: Drives, graph: Graph, config: MappingConfig, executor: Executor | None, stages: Stages
 ) -> OccupancyGrid | None:
     """Trace every scan from where the laser was at its first and last ray (paper: Bresenham, binary Bayes filter)."""
-    if log.scans is None or not len(log.scans.stamps):
+    sweeps = [_sweeps(session, graph) for session in drives.sessions if session.has_scans]
+    if not sweeps:
         return None
-    cal = graph.calibration
-    correction = np.array([cal.get("laser_x"), cal.get("laser_y"), cal.get("laser_theta")])
-    mount = se2.compose(correction, log.mounting.T_base_laser)
-    first = log.scans.stamps + cal.get("laser_delay")
-    last = first + log.scans.time_increment * (log.scans.ranges.shape[1] - 1)
-    ends = [se2.compose(keyframes.dense_trajectory(log.odometry, frames, graph.poses, t), mount) for t in (first, last)]
-    grid = occupancy_grid.from_scans(
-        ends[0], log.scans, config.grid, last=ends[1], flipped=log.mounting.laser_flipped, executor=executor,
-        progress=stages.teller("occupancy grid"),
-    )
+    grid = occupancy_grid.from_sweeps(sweeps, config.grid, executor=executor, progress=stages.teller("occupancy grid"))
     if config.crop is not None:
         grid = map_frame.cropped(grid, config.crop)
     stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)
     return grid
+
+
+def _sweeps(session: Session, graph: Graph) -> Sweeps:
+    """Return the scans of a recording with where its laser was."""
+    scans, mounting, cal = session.log.scans, session.log.mounting, graph.calibration
+    assert scans is not None
+    correction = np.array([cal.get("laser_x"), cal.get("laser_y"), cal.get("laser_theta")])
+    mount = se2.compose(correction, mounting.T_base_laser)
+    first = scans.stamps + cal.get("laser_delay")
+    last = first + scans.time_increment * (scans.ranges.shape[1] - 1)
+    ends = [se2.compose(session.dense_trajectory(graph.poses, stamps), mount) for stamps in (first, last)]
+    return Sweeps(scans, ends[0], ends[1], mounting.laser_flipped)
 
 
 def _solver_figures(result: SolverSummary) -> dict[str, object]:

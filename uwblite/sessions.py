@@ -8,6 +8,7 @@ What is wrong with wheels, tag and ranges stays each recording's own, see calibr
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from .anchors import AnchorHypothesis
 from .constraints import consensus
 from .errors import DataError
 from .first_estimate import FirstEstimate
-from .graph import Calibration, Graph, OdometryEdges, PriorEdges, RangeEdges
+from .graph import Calibration, Edges, Graph, OdometryEdges, PriorEdges, RangeEdges
 from .keyframes import KeyframeConfig, Keyframes
 from .marginals import marginals
 from .robust import Kernel
@@ -56,9 +57,18 @@ class Session:
         return slice(self.first, self.first + len(self.frames))
 
     @property
+    def has_scans(self) -> bool:
+        """Whether it has lidar."""
+        return self.log.scans is not None and len(self.log.scans.stamps) > 0
+
+    @property
     def anchor_ids(self) -> tuple[str, ...]:
         """Names of the anchors it heard."""
         return self.log.ranges.anchor_ids if self.log.ranges is not None else ()
+
+    def dense_trajectory(self, poses: Floats, stamps: Floats | None = None) -> Floats:
+        """Return T_map_base (n, 3) at stamps (default: all of its odometry's), given the poses of all keyframes."""
+        return keyframes.dense_trajectory(self.log.odometry, self.frames, poses[self.rows], stamps)
 
     @property
     def name(self) -> str:
@@ -124,6 +134,11 @@ class Part:
     anchor_ids: tuple[str, ...]
     """(a,) of the graph's anchors."""
 
+    @property
+    def edges(self) -> tuple[Edges, ...]:
+        """Wheels, and ranges where there are any."""
+        return (self.wheels,) if self.radio is None else (self.wheels, self.radio)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joined:
@@ -175,10 +190,15 @@ def join(parts: Sequence[Part], drives: Drives) -> Joined:
 def _other_name(name: str, here: Floats, spread: float, number: int, known: dict[str, tuple[Floats, float]]) -> str:
     """Return what to call an anchor that does not stand at its first place: as a recording that found it here does."""
     for earlier in range(1, number):
-        other = calibration.of_recording(name, earlier)
+        other = _numbered(name, earlier)
         if other in known and np.hypot(*(known[other][0] - here)) < _FIRST_TOLERANCE + 2.0 * np.hypot(spread, known[other][1]):
             return other
-    return calibration.of_recording(name, number)
+    return _numbered(name, number)
+
+
+def _numbered(name: str, recording: int) -> str:
+    """Return what an anchor is called that stands elsewhere in a recording than before."""
+    return f"{name}#{recording + 1}"
 
 
 def moved_text(name: str, distance: float, recording: int, own: str) -> str:
@@ -193,8 +213,7 @@ def _places(part: Part) -> dict[str, tuple[Floats, float]]:
     placed = np.flatnonzero(part.first.placed & ~part.first.ambiguous)
     if len(placed) < 2:
         placed = np.flatnonzero(part.first.placed)
-    edges = [part.wheels] if part.radio is None else [part.wheels, part.radio]
-    spread = marginals(part.graph.with_edges(*edges)).anchors
+    spread = marginals(part.graph.with_edges(*part.edges)).anchors
     return {
         part.anchor_ids[k]: (part.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, 25.0)))) for k in placed
     }
@@ -222,8 +241,7 @@ def _one_graph(parts: Sequence[Part], motions: Sequence[Floats], names: Sequence
     """Make the parts one, each moved by its motion, its anchors under the given names."""
     ids = tuple(dict.fromkeys(name for own in names for name in own))
     place = [np.array([ids.index(name) for name in own], dtype=np.int64) for own in names]
-    block, priors, fixed = _one_calibration([part.graph for part in parts])
-    at = [calibration.indices(block, *part.graph.calibration.names) for part in parts]
+    block, priors, fixed, at = _one_calibration([part.graph for part in parts])
     poses = np.concatenate([se2.compose(m, part.graph.poses) for m, part in zip(motions, parts, strict=True)])
     first = _one_first_estimate(parts, motions, place, len(ids))
     anchors = np.zeros((len(ids), 2))
@@ -239,20 +257,21 @@ def _one_graph(parts: Sequence[Part], motions: Sequence[Floats], names: Sequence
     )  # fmt: skip
 
 
-def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, Bools]:
-    """Return the block with every unknown of the graphs once, their priors, and which are held by all that have them."""
-    names = tuple(dict.fromkeys(name for graph in graphs for name in graph.calibration.names))
+def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, Bools, list[Ints]]:
+    """Return the block of all recordings' unknowns, its priors, which are held, and where each graph's are in it."""
+    named = [tuple(calibration.of_recording(name, n) for name in graph.calibration.names) for n, graph in enumerate(graphs)]
+    names = tuple(dict.fromkeys(name for own in named for name in own))
     block = Calibration(names, np.zeros(len(names)))
+    at = [calibration.indices(block, *own) for own in named]
     values, roots, fixed = block.values, np.zeros((len(names), 1, 1)), np.ones(len(names), dtype=bool)
-    for graph in reversed(graphs):
-        own = calibration.indices(block, *graph.calibration.names)
+    for graph, own in zip(reversed(graphs), reversed(at), strict=True):
         assert graph.fixed_calibration is not None
         fixed[own] &= graph.fixed_calibration
         values[own] = graph.calibration.values
         for edges in graph.edges:
             if isinstance(edges, PriorEdges) and edges.block == "calibration":
                 roots[own[edges.index]] = edges.sqrt_information
-    return block, PriorEdges("calibration", np.arange(len(names)), np.zeros((len(names), 1)), roots), fixed
+    return block, PriorEdges("calibration", np.arange(len(names)), np.zeros((len(names), 1)), roots), fixed, at
 
 
 def _one_first_estimate(
@@ -263,9 +282,9 @@ def _one_first_estimate(
     hypotheses: list[tuple[AnchorHypothesis, ...]] = [()] * anchors
     some = [part.first for part in parts if part.first is not None]
     for part, motion, own in zip(parts, motions, place, strict=True):
-        if part.first is None:
-            continue
         moved = moved_hypotheses(part.first, motion)
+        if moved is None:
+            continue
         for k, here in enumerate(own.tolist()):
             better = moved.placed[k] and not (placed[here] and (clear[here] or moved.ambiguous[k]))
             if better or not hypotheses[here]:
@@ -275,8 +294,10 @@ def _one_first_estimate(
     return replace(some[0], placed=placed, hypotheses=tuple(hypotheses), ambiguous=placed & ~clear) if some else None
 
 
-def moved_hypotheses(first: FirstEstimate, motion: Floats) -> FirstEstimate:
-    """Return the first estimate with its places of anchors in a frame moved by T_new_old."""
+def moved_hypotheses(first: FirstEstimate | None, motion: Floats) -> FirstEstimate | None:
+    """Return the first estimate, where there is one, with its places of anchors in a frame moved by T_new_old."""
+    if first is None:
+        return None
     moved = tuple(tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in first.hypotheses)
     return replace(first, hypotheses=moved)
 
@@ -318,8 +339,9 @@ def _one_radio(
     if not moved:
         return None
     stacked = ("pose", "anchor", "ranges", "sigma", "lever_arm", "turn", "velocity", "height", "calibration", "stamps")
-    weights = np.concatenate([np.ones(len(r)) if r.weights is None else r.weights for r in moved])
-    return replace(moved[0], weights=weights, **{name: np.concatenate([getattr(r, name) for r in moved]) for name in stacked})
+    rows: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in moved]) for name in stacked}
+    rows["weights"] = np.concatenate([np.ones(len(r)) if r.weights is None else r.weights for r in moved])
+    return replace(moved[0], **rows)
 
 
 def apart(part: Part, drives: Drives, solver: SolverConfig) -> Joined:
@@ -337,12 +359,12 @@ def apart(part: Part, drives: Drives, solver: SolverConfig) -> Joined:
     warnings: list[str] = []
     for k in range(len(part.anchor_ids)):
         rows = np.flatnonzero(pairs[:, 0] == k).tolist()
-        known = {row: k for row in rows[:1]}
+        known = dict.fromkeys(rows[:1], k)
         for row in rows[1:]:
             recording = int(pairs[row, 1])
             same = [n for r, n in known.items() if not _differ(place[row] - place[r], covariance[row] + covariance[r])]
             if not same:
-                ids.append(calibration.of_recording(part.anchor_ids[k], recording))
+                ids.append(_numbered(part.anchor_ids[k], recording))
                 source.append(k)
                 anchors = np.vstack([anchors, place[row]])
             known[row] = same[0] if same else len(ids) - 1
@@ -369,14 +391,15 @@ def _differ(off: Floats, covariance: Floats) -> bool:
 def _places_by_recording(part: Part, heard: Ints, solver: SolverConfig) -> tuple[Floats, Floats, Ints]:
     """Return place (p, 2), covariance (p, 2, 2) and (anchor, recording) of each anchor as each recording heard it."""
     radio, graph = part.radio, part.graph
-    assert radio is not None and part.first is not None and graph.fixed_calibration is not None
+    assert radio is not None
+    assert part.first is not None
+    assert graph.fixed_calibration is not None
     alive = np.flatnonzero((np.asarray(radio.weights) > 0) & part.first.placed[radio.anchor])
     pairs, which = np.unique(np.stack([radio.anchor[alive], heard[alive]], axis=1), axis=0, return_inverse=True)
-    own = np.array([name.startswith("bias:") for name in graph.calibration.names], dtype=bool)
-    alone = Graph(
-        graph.poses, graph.anchors[pairs[:, 0]], tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration"),
-        graph.calibration, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=graph.fixed_calibration | ~own,
-    )  # fmt: skip
+    own = np.array([calibration.stem(name) == "bias" for name in graph.calibration.names], dtype=bool)
+    priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration")
+    held, fixed = np.ones(len(graph.poses), dtype=bool), graph.fixed_calibration | ~own
+    alone = Graph(graph.poses, graph.anchors[pairs[:, 0]], priors, graph.calibration, held, None, fixed)
     edges = replace(radio.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5))
     solved = optimize(alone.with_edges(edges), solver)[0]
     return solved.anchors, marginals(solved).anchors, pairs

@@ -6,15 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .calibration import CalibrationConfig, Unknown, unknowns
-from .first_estimate import FirstEstimate
 from .graph import Graph, RangeEdges
-from .keyframes import Keyframes, dense_trajectory
 from .loop_closure import Closures
 from .map_result import AnchorEstimate, CalibrationEstimate, MapResult, StageSummary
 from .marginals import Marginals
 from .occupancy_grid import OccupancyGrid
-from .refinement import Refined
-from .sensor_log import SensorLog
+from .sessions import Drives, Part, Session
 
 Floats = NDArray[np.float64]
 
@@ -23,30 +20,29 @@ _SHOWN = 0.7
 
 
 def summarise(
-    log: SensorLog, frames: Keyframes, graph: Graph, known: Marginals, first: FirstEstimate | None,
-    radio: RangeEdges | None, closures: Closures, refined: Refined | None, grid: OccupancyGrid | None,
+    drives: Drives, part: Part, known: Marginals, closures: Closures, grid: OccupancyGrid | None,
     config: CalibrationConfig, stages: Sequence[StageSummary], warnings: Sequence[str],
 ) -> MapResult:
     """Gather the result of a run; see MapResult."""
+    graph, first, radio = part.graph, part.first, part.radio
     residuals, weights = _range_residuals(graph, radio)
-    ids = log.ranges.anchor_ids if log.ranges is not None else ()
     typical = 0.0
     if first is not None and radio is not None and first.placed.any():
         typical = float(np.median([_spread(residuals[radio.anchor == k]) for k in np.flatnonzero(first.placed)]))
-    anchors = tuple(_anchor(k, ids, log, graph, known, first, radio, residuals, typical) for k in range(len(ids)))
-    told = np.array([log.mounting.height_difference(a) is not None for a in ids], dtype=bool)
-    listed = unknowns(config, ids, told)
-    calibrated = tuple(_calibration(k, u, graph, known) for k, u in enumerate(listed))
-    table = {} if radio is None or log.ranges is None else {
-        "stamp": log.ranges.stamps, "anchor": radio.anchor.astype(np.float64), "range": radio.ranges,
+    anchors = tuple(_anchor(k, part, drives, known, residuals, typical) for k in range(len(part.anchor_ids)))
+    listed = {u.name: u for session in drives.sessions for u in _unknowns(session, config)}
+    calibrated = tuple(_calibration(k, listed[name], graph, known) for k, name in enumerate(graph.calibration.names))
+    table = {} if radio is None else {
+        "stamp": radio.stamps, "anchor": radio.anchor.astype(np.float64), "range": radio.ranges,
         "residual": residuals, "weight": weights,
     }
-    more, doubts = _doubts(log, anchors, radio, closures, refined, grid)
+    more, doubts = _doubts(drives, anchors, closures, grid)
+    stamps = [session.log.odometry.stamps for session in drives.sessions]
     return MapResult(
-        stamps=log.odometry.stamps,
-        trajectory=dense_trajectory(log.odometry, frames, graph.poses),
-        session=np.zeros(len(log.odometry.stamps), dtype=np.int64),
-        keyframe_stamps=frames.stamps,
+        stamps=np.concatenate(stamps),
+        trajectory=np.concatenate([session.dense_trajectory(graph.poses) for session in drives.sessions]),
+        session=np.repeat(np.arange(len(drives)), [len(own) for own in stamps]),
+        keyframe_stamps=drives.stamps,
         keyframe_covariances=known.poses,
         graph=graph,
         anchors=anchors,
@@ -58,6 +54,12 @@ def summarise(
         warnings=(*warnings, *more),
         doubts=tuple(doubts),
     )
+
+
+def _unknowns(session: Session, config: CalibrationConfig) -> tuple[Unknown, ...]:
+    ids, mounting = session.anchor_ids, session.log.mounting
+    told = np.array([mounting.height_difference(a) is not None for a in ids], dtype=bool)
+    return unknowns(config, ids, told, session.number)
 
 
 def _range_residuals(graph: Graph, radio: RangeEdges | None) -> tuple[Floats, Floats]:
@@ -74,21 +76,19 @@ def _spread(residuals: Floats) -> float:
     return 1.4826 * float(np.median(np.abs(residuals - np.median(residuals))))
 
 
-def _anchor(
-    k: int, ids: tuple[str, ...], log: SensorLog, graph: Graph, known: Marginals, first: FirstEstimate | None,
-    radio: RangeEdges | None, residuals: Floats, typical: float,
-) -> AnchorEstimate:
-    assert log.ranges is not None
-    count = int(np.sum(log.ranges.anchor == k))
+def _anchor(k: int, part: Part, drives: Drives, known: Marginals, residuals: Floats, typical: float) -> AnchorEstimate:
+    graph, first, radio, name = part.graph, part.first, part.radio, part.anchor_ids[k]
+    count = _count(name, drives) if radio is None else int(np.sum(radio.anchor == k))
     if first is None or radio is None or not first.placed[k]:
         reason = f"its {count} ranges were too few or did not agree on a place"
         nowhere = np.full(2, np.nan)
-        return AnchorEstimate(ids[k], nowhere, np.full((2, 2), np.nan), count, 0.0, np.nan, np.nan, np.nan, "unplaced", reason)
+        return AnchorEstimate(name, nowhere, np.full((2, 2), np.nan), count, 0.0, np.nan, np.nan, np.nan, "unplaced", reason)
     own = residuals[radio.anchor == k]
     # A share by distance, not by kernel weight: effective sigmas are wide where ranges repeat each other. The measure is
     # what ranges to a typical anchor scatter; by its own scatter, no anchor would ever lie.
     used = float(np.mean(np.abs(own) < 3.0 * max(typical, 0.05)))
-    bias_at = graph.calibration.index(f"bias:{ids[k]}")
+    # The bias in the first recording that heard it; in the others it is theirs, see the calibration.
+    bias_at = int(radio.calibration[np.argmax(radio.anchor == k), 1])
     bias = float(graph.calibration.values[bias_at]) if bias_at >= 0 else 0.0
     bias_sigma = float(known.calibration[bias_at]) if bias_at >= 0 else 0.0
     status, reason, alternative = "ok", "", None
@@ -98,8 +98,14 @@ def _anchor(
     elif used < 0.5:
         status, reason = "distrusted", f"only {used:.0%} of its ranges agree with the map"
     return AnchorEstimate(
-        ids[k], graph.anchors[k], known.anchors[k], count, used, bias, bias_sigma, _spread(own), status, reason, alternative
+        name, graph.anchors[k], known.anchors[k], count, used, bias, bias_sigma, _spread(own), status, reason, alternative
     )
+
+
+def _count(name: str, drives: Drives) -> int:
+    """Return how many ranges to an anchor the recordings hold."""
+    heard = [(s.log.ranges, s.anchor_ids.index(name)) for s in drives.sessions if name in s.anchor_ids]
+    return sum(int(np.sum(ranges.anchor == k)) for ranges, k in heard if ranges is not None)
 
 
 def _calibration(k: int, unknown: Unknown, graph: Graph, known: Marginals) -> CalibrationEstimate:
@@ -115,8 +121,7 @@ def _calibration(k: int, unknown: Unknown, graph: Graph, known: Marginals) -> Ca
 
 
 def _doubts(
-    log: SensorLog, anchors: tuple[AnchorEstimate, ...], radio: RangeEdges | None, closures: Closures,
-    refined: Refined | None, grid: OccupancyGrid | None,
+    drives: Drives, anchors: tuple[AnchorEstimate, ...], closures: Closures, grid: OccupancyGrid | None
 ) -> tuple[list[str], list[str]]:
     """Return warnings and reasons not to trust the result."""
     warnings: list[str] = []
@@ -129,11 +134,12 @@ def _doubts(
     placed = [a for a in anchors if a.status != "unplaced"]
     if anchors and not placed:
         doubts.append("no anchor could be placed: the trajectory rests on odometry and lidar alone")
-    if log.ranges is None or not len(log.ranges.ranges):
+    logs = [session.log for session in drives.sessions]
+    if not any(log.ranges is not None and len(log.ranges.ranges) for log in logs):
         warnings.append("no UWB ranges in use: the map rests on odometry and lidar")
     if grid is None:
         warnings.append("no lidar in use: trajectory and anchors only, no map")
-    elif log.scans is not None and not np.isfinite(log.scans.ranges).any():
+    elif not any(log.scans is not None and np.isfinite(log.scans.ranges).any() for log in logs):
         warnings.append("the lidar saw nothing in any scan: the map is empty")
     accepted = sum(c.accepted for c in closures.candidates)
     if grid is not None and closures.candidates and accepted == 0:
