@@ -73,8 +73,9 @@ def test_the_examples_of_every_verb_are_understood(verb):
 
 @pytest.fixture
 def workspace(tmp_path, room_log, monkeypatch):
-    """A folder with a minute and a half of the sample recording as run.log, and its truth."""
+    """A folder with a minute and a half of the sample recording as run.log, another as second.log, and the truth."""
     assert main(["convert", str(room_log), str(tmp_path / "run.log"), "--end", "90"]) == 0
+    assert main(["convert", str(room_log), str(tmp_path / "second.log"), "--start", "120", "--end", "210"]) == 0
     shutil.copy(room_log.parent / "room" / "truth.tum", tmp_path / "truth.tum")
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -221,3 +221,22 @@ def test_localize_finds_a_part_in_the_map(mapped, room_log, tmp_path, capsys):
     assert main(["localize", str(part), *words, "--json", "--force", "--quiet"]) == 0
     assert json.loads(capsys.readouterr().out)["overlap"] > 0.9
     assert main(["localize", str(part), "--map", str(tmp_path), "--out", str(tmp_path / "q.tum")]) == 1
+
+
+def test_two_recordings_become_one_map_through_their_anchors(mapped, room_log, tmp_path, capsys):
+    parts = [tmp_path / "first.log", tmp_path / "second.log"]
+    assert main(["convert", str(room_log), str(parts[0]), "--end", "110"]) == 0
+    assert main(["convert", str(room_log), str(parts[1]), "--start", "120"]) == 0
+    assert main(["map", *map(str, parts), "--out", str(tmp_path / "map")]) in (0, 3)
+    assert "anchor 5C0B:" in capsys.readouterr().out
+    report = json.loads((tmp_path / "map" / "report.json").read_text())
+    assert [Path(i["source"]).name for i in report["inputs"]] == ["first.log", "second.log"]
+    there, whole = read_tum(mapped[0] / "trajectory.tum")
+    from uwblite.se2 import between, compose, interpolate_trajectory, inverse
+
+    # Both drives lie as in the map of the whole: where the first begins there is where it begins here.
+    first, start = read_tum(tmp_path / "map" / "trajectory.tum")
+    T = compose(interpolate_trajectory(there, whole, first[:1])[0], inverse(start[0]))
+    second, poses = read_tum(tmp_path / "map" / "trajectory_2.tum")
+    apart = between(interpolate_trajectory(there, whole, second), compose(T, poses))
+    assert np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=1))) < 0.06

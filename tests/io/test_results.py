@@ -31,7 +31,7 @@ def contents(folder):
 
 
 def test_all_files_of_the_contract_are_written(tmp_path):
-    names = write_result(tmp_path / "a" / "map", small_log(), small_result(), RECORD)
+    names = write_result(tmp_path / "a" / "map", [small_log()], small_result(), RECORD)
     assert set(names) == set(contents(tmp_path / "a" / "map")) == FILES
     assert names[0] == "map.png"
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["map"]
@@ -39,14 +39,14 @@ def test_all_files_of_the_contract_are_written(tmp_path):
 
 def test_same_result_same_bytes(tmp_path):
     for name in ("one", "two"):
-        write_result(tmp_path / name, small_log(), small_result(seconds=len(name)), RECORD)
+        write_result(tmp_path / name, [small_log()], small_result(seconds=len(name)), RECORD)
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
 def test_timings_are_the_only_difference_of_two_runs(tmp_path):
     for name, seconds in (("one", 1.5), ("two", 2.5)):
         record = replace(RECORD, seconds=seconds, reading_seconds=0.1 * seconds, peak_rss_bytes=int(1e6 * seconds))
-        write_result(tmp_path / name, small_log(), small_result(seconds=seconds), record)
+        write_result(tmp_path / name, [small_log()], small_result(seconds=seconds), record)
     one, two = contents(tmp_path / "one"), contents(tmp_path / "two")
     assert {name for name in one if one[name] != two[name]} == {"report.json"}
     first, second = (json.loads(c["report.json"]) for c in (one, two))
@@ -56,10 +56,10 @@ def test_timings_are_the_only_difference_of_two_runs(tmp_path):
 
 
 def test_report_json_tells_the_story(tmp_path):
-    write_result(tmp_path / "map", small_log(), small_result(), RECORD)
+    write_result(tmp_path / "map", [small_log()], small_result(), RECORD)
     report = json.loads((tmp_path / "map" / "report.json").read_text())
     assert report["schema"] == 1
-    assert report["input"]["sha256"] == "ab" * 32
+    assert report["inputs"][0]["sha256"] == "ab" * 32
     assert report["trusted"] is True
     assert [c["accepted"] for c in report["closures"]] == [True, False, False]
     assert report["closures"][1]["reason"] == "overlap too small"
@@ -94,7 +94,7 @@ def test_covariances_are_the_upper_triangle():
 
 
 def test_each_recording_has_its_trajectory(tmp_path):
-    write_result(tmp_path / "map", small_log(), small_result(sessions=2), RECORD)
+    write_result(tmp_path / "map", [small_log()], small_result(sessions=2), RECORD)
     stamps, _ = read_tum(tmp_path / "map" / "trajectory_2.tum")
     assert len(stamps) == 24
     assert stamps[0] == 1012.0
@@ -102,17 +102,17 @@ def test_each_recording_has_its_trajectory(tmp_path):
 
 def test_without_lidar_there_is_no_map_and_an_old_one_goes(tmp_path):
     folder = tmp_path / "map"
-    write_result(folder, small_log(), small_result(), replace(RECORD, scale_map=True))
+    write_result(folder, [small_log()], small_result(), replace(RECORD, scale_map=True))
     assert (folder / "map_scale.png").exists()
     (folder / "notes.txt").write_text("mine")
-    write_result(folder, small_log(), small_result(lidar=False), RECORD)
+    write_result(folder, [small_log()], small_result(lidar=False), RECORD)
     assert set(contents(folder)) == (FILES - {"map.pgm", "map.yaml"}) | {"notes.txt"}
 
 
 def test_an_earlier_result_is_not_replaced_unasked(tmp_path):
     folder = tmp_path / "map"
     check_target(folder, force=False)
-    write_result(folder, small_log(), small_result(), RECORD)
+    write_result(folder, [small_log()], small_result(), RECORD)
     with pytest.raises(ConfigError, match="--force"):
         check_target(folder, force=False)
     check_target(folder, force=True)
@@ -127,7 +127,7 @@ def test_an_earlier_result_is_not_replaced_unasked(tmp_path):
 def test_a_full_disk_leaves_the_previous_result(tmp_path, monkeypatch, fresh):
     folder = tmp_path / "map"
     if not fresh:
-        write_result(folder, small_log(), small_result(), RECORD)
+        write_result(folder, [small_log()], small_result(), RECORD)
     before = contents(folder) if not fresh else {}
 
     def full(*_, **__):
@@ -135,7 +135,7 @@ def test_a_full_disk_leaves_the_previous_result(tmp_path, monkeypatch, fresh):
 
     monkeypatch.setattr(results, "render", full)
     with pytest.raises(OSError, match="No space"):
-        write_result(folder, small_log(), small_result(evil="x"), RECORD)
+        write_result(folder, [small_log()], small_result(evil="x"), RECORD)
     assert (contents(folder) if folder.exists() else {}) == before
     assert [p.name for p in tmp_path.iterdir()] == ([] if fresh else ["map"])
 
@@ -150,7 +150,7 @@ def stop(*args, **options):
     plain(*args, **options)
     os.kill(os.getpid(), signal.SIGKILL)
 results.{what} = stop
-results.write_result({folder!r}, small_log(), small_result(evil="x"), results.RunRecord("c", "k"))
+results.write_result({folder!r}, [small_log()], small_result(evil="x"), results.RunRecord("c", "k"))
 """
 
 
@@ -159,20 +159,20 @@ results.write_result({folder!r}, small_log(), small_result(evil="x"), results.Ru
 def test_a_killed_writer_leaves_the_previous_result(tmp_path, what, fresh):
     folder = tmp_path / "map"
     if not fresh:
-        write_result(folder, small_log(), small_result(), RECORD)
+        write_result(folder, [small_log()], small_result(), RECORD)
     before = contents(folder) if not fresh else None
     code = KILLED.format(tests=str(Path(__file__).parent.parent), what=what, folder=str(folder))
     done = subprocess.run([sys.executable, "-c", code], check=False, env=dict(os.environ))
     assert done.returncode == -signal.SIGKILL
     visible = {p.name: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".")} if folder.exists() else None
     assert visible == before
-    write_result(folder, small_log(), small_result(), RECORD)
+    write_result(folder, [small_log()], small_result(), RECORD)
     assert set(contents(folder)) == FILES
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 
 def test_nothing_is_written_outside_the_folder(tmp_path):
     hostile = small_log(name="../../../etc/passwd\0\n.log")
-    write_result(tmp_path / "map", hostile, small_result(evil="/../../x"), RECORD)
+    write_result(tmp_path / "map", [hostile], small_result(evil="/../../x"), RECORD)
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
     assert set(contents(tmp_path / "map")) == FILES

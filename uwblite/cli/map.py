@@ -25,6 +25,7 @@ examples:
   uwblite map run.log --out b/ --preset paper          the paper's plain choices
   uwblite map run.log --out c/ --set grid.resolution=0.02
   uwblite map run.log --out d/ --align walls --crop 0,0,12,8
+  uwblite map monday.log tuesday.log --out both/       one map of several drives: anchors tie them together
   uwblite map monday.log --out monday/ --anchors-from sunday/anchors.csv    in the frame of Sunday's map
   uwblite map run.log --out map/ --dry-run             read, check and estimate only
 
@@ -36,7 +37,8 @@ exit code 3: the files are written, but the result should not be trusted; the re
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
-    parser.add_argument("log", help="CARMEN log, plain or .gz; - reads standard input")
+    several = "CARMEN log, plain or .gz, ROS bag or CSV folder; several are mapped together; - reads a log from standard input"
+    parser.add_argument("logs", metavar="LOG", nargs="+", help=several)
     parser.add_argument("--out", metavar="DIR", required=True, help="folder for the result")
     parser.add_argument("--force", action="store_true", help="replace a result that is already there")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
@@ -80,12 +82,13 @@ def run(args: argparse.Namespace) -> int:
         check_target(args.out, force=args.force)
     config, constraints = _settings(args), _known(args)
     began = time.perf_counter()
-    log = apply_mounting(read_recording(args.log), args)
+    logs = [apply_mounting(read_recording(path), args) for path in args.logs]
     reading = time.perf_counter() - began
-    _tell_reader_warnings(log)
+    for log in logs:
+        _tell_reader_warnings(log)
     if args.dry_run:
-        return _dry_run(args, log)
-    result = _build(log, config, constraints, args.jobs)
+        return max(_dry_run(args, log) for log in logs)
+    result = _build(logs, config, constraints, args.jobs)
     record = RunRecord(
         command=repeat_command(args),
         config=to_toml(config, header="settings in force; `uwblite config` explains them"),
@@ -97,11 +100,11 @@ def run(args: argparse.Namespace) -> int:
         timings_in_report=args.report_timings,
         scale_map=args.scale_map,
     )
-    names = write_result(args.out, log, result, record)
+    names = write_result(args.out, logs, result, record)
     if args.json:
-        console.say_json(summary_json(args, log, result, names, time.perf_counter() - began))
+        console.say_json(summary_json(args, result, names, time.perf_counter() - began))
     else:
-        for line in summary_lines(args, log, result, names, time.perf_counter() - began):
+        for line in summary_lines(args, logs, result, names, time.perf_counter() - began):
             console.say(line)
     return 3 if result.doubts else 0
 
@@ -126,7 +129,7 @@ def _known(args: argparse.Namespace) -> "Constraints":
     return earlier + parse_constraints(read_text(args.constraints), args.constraints)
 
 
-def _build(log: "SensorLog", config: "MappingConfig", constraints: "Constraints", jobs: int) -> "MapResult":
+def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Constraints", jobs: int) -> "MapResult":
     from ..mapping import build_map
     from . import console
 
@@ -138,6 +141,7 @@ def _build(log: "SensorLog", config: "MappingConfig", constraints: "Constraints"
 
             executor = ProcessPoolExecutor(jobs)
         clock = time.perf_counter
+        log = logs[0] if len(logs) == 1 else logs
         return build_map(log, config, constraints=constraints, progress=progress, executor=executor, clock=clock)
     finally:
         progress.close()
@@ -163,16 +167,16 @@ def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
     diagnosis = diagnose(log)
     cost = check.expected_cost(log)
     if args.json:
-        console.say_json(check.summary_json(args.log, diagnosis, cost, ""))
+        console.say_json(check.summary_json(log.notes.source, diagnosis, cost, ""))
     else:
-        for line in check.report_lines(args.log, diagnosis, cost, ""):
+        for line in check.report_lines(log.notes.source, diagnosis, cost, ""):
             console.say(line)
     return 3 if diagnosis.serious else 0
 
 
 def repeat_command(args: argparse.Namespace) -> str:
     """Return the command that makes the same map again, from the config.toml beside the result."""
-    words = ["uwblite", "map", args.log, "--config", "config.toml"]
+    words = ["uwblite", "map", *args.logs, "--config", "config.toml"]
     for option, value in (("--constraints", args.constraints), ("--anchors-from", args.anchors_from)):
         words += [option, value] if value else []
     if args.laser_pose is not None:
@@ -208,7 +212,7 @@ def _peak_memory() -> int:
 
 
 def summary_json(
-    args: argparse.Namespace, log: "SensorLog", result: "MapResult", names: list[str], seconds: float
+    args: argparse.Namespace, result: "MapResult", names: list[str], seconds: float
 ) -> dict[str, Any]:
     """Return the summary for programs; report.json has everything."""
     import os
@@ -232,7 +236,7 @@ def summary_json(
 
 
 def summary_lines(
-    args: argparse.Namespace, log: "SensorLog", result: "MapResult", names: list[str], seconds: float
+    args: argparse.Namespace, logs: list["SensorLog"], result: "MapResult", names: list[str], seconds: float
 ) -> list[str]:
     """Return what the user is told at the end."""
     import os
@@ -240,7 +244,7 @@ def summary_lines(
     from .console import duration
     from .wording import anchor_line, calibration_line
 
-    span = float(log.odometry.stamps[-1] - log.odometry.stamps[0])
+    span = sum(float(log.odometry.stamps[-1] - log.odometry.stamps[0]) for log in logs)
     lines = [f"mapped {duration(span)} of driving in {duration(seconds)} ({span / max(seconds, 1e-9):.0f} times real time)"]
     kept = sum(c.accepted for c in result.closures)
     if result.grid is not None:

@@ -22,7 +22,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,7 +35,7 @@ from ..errors import ConfigError
 from ..map_picture import PictureAnchor, draw_map
 from ..map_result import MapResult
 from ..report import render
-from ..sensor_log import SensorLog
+from ..sensor_log import LogNotes, SensorLog
 from .files import write_text
 from .g2o import write_g2o
 from .map_server import trinary_image, write_map
@@ -94,8 +94,16 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
         raise PermissionError(13, os.strerror(13), str(nearest))
 
 
-def write_result(folder: str | os.PathLike[str], log: SensorLog, result: MapResult, record: RunRecord) -> list[str]:
+def write_result(
+    folder: str | os.PathLike[str], logs: Sequence[SensorLog], result: MapResult, record: RunRecord
+) -> list[str]:
     """Write a result into a folder, made where it is missing; files of an earlier result are replaced.
+
+    Parameters
+    ----------
+    folder : where to write.
+    logs : the recordings, in the order of the result's sessions.
+    result, record : what was made of them, and how.
 
     Returns
     -------
@@ -115,20 +123,20 @@ def write_result(folder: str | os.PathLike[str], log: SensorLog, result: MapResu
             grid_png = encode_png(trinary_image(result.grid))
             if record.scale_map:
                 write_map(waiting, result.grid, name="map_scale", mode="scale")
-        write_png(waiting / "map.png", picture(result, _title(log)))
+        write_png(waiting / "map.png", picture(result, ", ".join(os.path.basename(log.notes.source) for log in logs)))
         _write_graphs(waiting, result)
         write_text(waiting / "config.toml", record.config)
         page = render(
             result,
-            title=_title(log),
+            title=_title(logs),
             command=record.command,
-            facts=_facts(log, result, record),
+            facts=_facts(logs, result, record),
             grid_png=grid_png,
             timings=record.timings_in_report,
         )
         write_text(waiting / "report.html", page)
         hashes = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(waiting.iterdir())}
-        write_text(waiting / "report.json", _json_lines(summary(log, result, record, hashes)))
+        write_text(waiting / "report.json", _json_lines(summary(logs, result, record, hashes)))
         names = sorted((p.name for p in waiting.iterdir()), key=_order)
     return names
 
@@ -170,8 +178,8 @@ def _replacing(folder: Path) -> Iterator[Path]:
         shutil.rmtree(waiting, ignore_errors=True)
 
 
-def _title(log: SensorLog) -> str:
-    return log.notes.source or "recording"
+def _title(logs: Sequence[SensorLog]) -> str:
+    return ", ".join(log.notes.source or "recording" for log in logs)
 
 
 def _write_trajectories(folder: Path, result: MapResult) -> None:
@@ -237,7 +245,7 @@ def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
     kept = [(*poses[c.i, :2], *poses[c.j, :2]) for c in result.closures if c.accepted]
     anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors]
     closures = np.array(kept, dtype=np.float64).reshape(-1, 4)
-    return draw_map(result.grid, np.vstack(parts), anchors=anchors, closures=closures, caption=os.path.basename(caption))
+    return draw_map(result.grid, np.vstack(parts), anchors=anchors, closures=closures, caption=caption)
 
 
 def _travelled(result: MapResult) -> float:
@@ -245,44 +253,28 @@ def _travelled(result: MapResult) -> float:
     return float(steps[np.diff(result.session) == 0].sum())
 
 
-def _facts(log: SensorLog, result: MapResult, record: RunRecord) -> tuple[tuple[str, str], ...]:
-    ranges = 0 if log.ranges is None else len(log.ranges.stamps)
-    scans = 0 if log.scans is None else len(log.scans.stamps)
-    duration = float(log.odometry.stamps[-1] - log.odometry.stamps[0])
+def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> tuple[tuple[str, str], ...]:
+    sums = _recording(logs, result)
     facts = [
-        ("recording", f"{duration:.0f} s, {_travelled(result):.1f} m, {ranges} ranges, {scans} scans"),
-        ("sha256", log.notes.sha256),
+        ("recording", "{duration:.0f} s, {travelled:.1f} m, {ranges} ranges, {scans} scans".format(**sums)),
+        *(("sha256", log.notes.sha256) for log in logs),
         ("settings", record.preset or "defaults"),
         ("made by", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
     ]
     return tuple((name, value) for name, value in facts if value)
 
 
-def summary(log: SensorLog, result: MapResult, record: RunRecord, hashes: dict[str, str]) -> dict[str, Any]:
+def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, hashes: dict[str, str]) -> dict[str, Any]:
     """Return the result as report.json has it (JSON-ready); see docs/formats.md."""
-    notes, grid = log.notes, result.grid
+    grid = result.grid
     content = {
         "schema": SCHEMA,
         "versions": record.versions,
         "command": record.command,
         "preset": record.preset,
         "config_sha256": hashlib.sha256(record.config.encode()).hexdigest(),
-        "input": {
-            "source": notes.source,
-            "sha256": notes.sha256,
-            "lines": notes.lines,
-            "broken_lines": notes.broken,
-            "first_broken": [{"line": number, "why": why} for number, why in notes.broken_lines],
-            "skipped": notes.skipped,
-            "reader_warnings": list(notes.warnings),
-        },
-        "recording": {
-            "duration": float(log.odometry.stamps[-1] - log.odometry.stamps[0]),
-            "travelled": _travelled(result),
-            "odometry": len(log.odometry.stamps),
-            "ranges": 0 if log.ranges is None else len(log.ranges.stamps),
-            "scans": 0 if log.scans is None else len(log.scans.stamps),
-        },
+        "inputs": [_input_entry(log.notes) for log in logs],
+        "recording": _recording(logs, result),
         "trusted": not result.doubts,
         "doubts": list(result.doubts),
         "warnings": list(result.warnings),
@@ -310,6 +302,29 @@ def summary(log: SensorLog, result: MapResult, record: RunRecord, hashes: dict[s
         }
     ready: dict[str, Any] = _ready(content)
     return ready
+
+
+def _recording(logs: Sequence[SensorLog], result: MapResult) -> dict[str, Any]:
+    """Return duration, s, distance, m, and counts of all recordings together."""
+    return {
+        "duration": sum(float(log.odometry.stamps[-1] - log.odometry.stamps[0]) for log in logs),
+        "travelled": _travelled(result),
+        "odometry": sum(len(log.odometry.stamps) for log in logs),
+        "ranges": sum(0 if log.ranges is None else len(log.ranges.stamps) for log in logs),
+        "scans": sum(0 if log.scans is None else len(log.scans.stamps) for log in logs),
+    }
+
+
+def _input_entry(notes: LogNotes) -> dict[str, Any]:
+    return {
+        "source": notes.source,
+        "sha256": notes.sha256,
+        "lines": notes.lines,
+        "broken_lines": notes.broken,
+        "first_broken": [{"line": number, "why": why} for number, why in notes.broken_lines],
+        "skipped": notes.skipped,
+        "reader_warnings": list(notes.warnings),
+    }
 
 
 def _json_lines(content: dict[str, Any]) -> str:
