@@ -30,7 +30,7 @@ FLOORS = (
     # files in, files out: types and text, no stages
     ("plain_closures",),
     ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
-    ("diagnostics", "report", "summary"),
+    ("diagnostics", "report_map", "report", "summary"),
     # the walk
     ("mapping",),
     ("localize", "presets", "io/results"),

@@ -4,7 +4,6 @@ Everything that comes from a log (names of files and anchors, reasons) is escape
 from elsewhere, and its script reads only the page itself.
 """
 
-import base64
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
@@ -13,17 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .map_result import AnchorEstimate, LoopClosure, MapResult
+from .map_result import AnchorEstimate, MapResult
+from .report_map import draw, number, shown_closures, sigma, thin
 from .report_page import PAGE, SCRIPT, STYLE
 
 Floats = NDArray[np.float64]
 
-MOST_POINTS = 4000
-"""Points of one line drawn at most."""
 MOST_RESIDUALS = 1500
 """Residuals of one anchor drawn at most."""
-MOST_CLOSURES = 1500
-"""Rejected closures drawn and listed at most; accepted ones all are."""
 NLOS_BELOW = 0.5
 """Ranges of less weight are marked as outliers or blocked sight."""
 
@@ -50,7 +46,7 @@ def render(
     """
     sections = (
         _banner(result),
-        _section("Map", _map(result, grid_png)),
+        _section("Map", draw(result, grid_png)),
         _section("Anchors", _anchor_table(result.anchors)),
         _section("Range residuals", _residuals(result)) if len(result.range_table.get("stamp", ())) else "",
         _section("Calibration", _calibration_table(result)),
@@ -82,135 +78,6 @@ def _banner(result: MapResult) -> str:
     return f'<section id="warnings">{"".join(parts)}</section>'
 
 
-def _number(value: float, digits: int = 3, sign: bool = False) -> str:
-    return f"{value:{'+' if sign else ''}.{digits}f}".replace("-", "\u2212") if np.isfinite(value) else "\u2013"
-
-
-def _thin(n: int, most: int) -> NDArray[np.int64]:
-    """Return at most about `most` of n indices, evenly spread, the last included."""
-    return np.unique(np.append(np.arange(0, n, max(1, -(-n // most))), n - 1)) if n else np.zeros(0, dtype=np.int64)
-
-
-def _coordinates(points: Floats, digits: int = 3) -> str:
-    """Return points (n, 2) as SVG coordinates, y upwards turned into y downwards."""
-    return " ".join(f"{x:.{digits}f},{-y:.{digits}f}" for x, y in points.tolist())
-
-
-def _extent(result: MapResult) -> tuple[float, float, float, float]:
-    """Return the box of everything drawn: x, y (downwards) of the corner, width, height, m."""
-    parts = [result.trajectory[:, :2], result.graph.poses[:, :2]]
-    parts += [np.asarray(a.position)[None] for a in result.anchors]
-    if result.grid is not None:
-        geometry = result.grid.geometry
-        parts.append(np.stack([geometry.origin, geometry.corner]))
-    points = np.concatenate(parts)
-    points = points[np.isfinite(points).all(axis=1)]
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = 0.03 * float(np.max(high - low)) + 0.5
-    return (
-        float(low[0]) - margin,
-        -float(high[1]) - margin,
-        float(high[0] - low[0]) + 2 * margin,
-        float(high[1] - low[1]) + 2 * margin,
-    )
-
-
-def _map(result: MapResult, grid_png: bytes | None) -> str:
-    x, y, width, height = _extent(result)
-    size = max(width, height)
-    parts = []
-    if grid_png is not None and result.grid is not None:
-        geometry = result.grid.geometry
-        corner, data = geometry.corner, base64.b64encode(grid_png).decode()
-        parts.append(
-            f'<image class="grid" x="{geometry.origin[0]:.4f}" y="{-corner[1]:.4f}" preserveAspectRatio="none"'
-            f' width="{corner[0] - geometry.origin[0]:.4f}" height="{corner[1] - geometry.origin[1]:.4f}"'
-            f' href="data:image/png;base64,{data}"/>'
-        )
-    parts.append(_closure_lines(result))
-    parts.append('<g class="trajectory">')
-    for session in np.unique(result.session):
-        path = result.trajectory[result.session == session, :2]
-        parts.append(f'<polyline class="s{int(session) % 6}" points="{_coordinates(path[_thin(len(path), MOST_POINTS)])}"/>')
-    start = result.trajectory[0]
-    parts.append(
-        f'<circle class="start" cx="{start[0]:.3f}" cy="{-start[1]:.3f}" r="{size / 150:.3f}"><title>start</title></circle></g>'
-    )
-    parts.append('<g class="anchors">' + "".join(_anchor_mark(a, size) for a in result.anchors) + "</g>")
-    bar = _scale_length(size)
-    svg = (
-        f'<svg id="map-view" viewBox="{x:.3f} {y:.3f} {width:.3f} {height:.3f}" role="img" aria-label="map"'
-        f' style="--s:{size / 900:.6f};aspect-ratio:{width:.3f}/{height:.3f}">{"".join(parts)}'
-        f'<g class="bar"><path d="M{x + size / 40:.3f} {y + height - size / 40:.3f}h{bar:g}"/>'
-        f'<text x="{x + size / 40:.3f}" y="{y + height - size / 25:.3f}">{bar:g} m</text></g></svg>'
-    )
-    layers = (("grid", "map"), ("trajectory", "trajectory"), ("anchors", "anchors, 2\u03c3"), ("kept", "closures kept"))
-    boxes = "".join(f'<label><input type=checkbox checked data-layer="{k}"> {escape(v)}</label>' for k, v in layers)
-    boxes += '<label><input type=checkbox data-layer="rejected"> closures rejected</label>'
-    buttons = '<button id="zoom-in" aria-label="zoom in">+</button><button id="zoom-out" aria-label="zoom out">\u2212</button>'
-    hint = "<p class=hint>Wheel or pinch zooms, dragging moves, point at things for details.</p>"
-    return f'<div class=controls>{boxes}{buttons}<button id="zoom-all">all</button></div><div class=mapbox>{svg}</div>{hint}'
-
-
-def _scale_length(size: float) -> float:
-    """Return a round length of about a fifth of the size, m."""
-    power = 10.0 ** np.floor(np.log10(size / 5.0))
-    return float(max(k * power for k in (1.0, 2.0, 5.0) if k * power <= size / 5.0))
-
-
-def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:
-    if not np.isfinite(anchor.position).all():
-        return ""
-    cx, cy = float(anchor.position[0]), -float(anchor.position[1])
-    label = (
-        f"anchor {anchor.id}: x {_number(anchor.position[0], 2)} \u00b1{_sigma(anchor, 0):.2f} m, "
-        f"y {_number(anchor.position[1], 2)} \u00b1{_sigma(anchor, 1):.2f} m, {anchor.status} {anchor.reason}"
-    )
-    r = size / 110
-    state = "ok" if anchor.status == "ok" else "doubt"
-    mark = (
-        f'<g class="anchor {state}"><title>{escape(label.strip())}</title>{_ellipse(anchor, cx, cy)}'
-        f'<g transform="translate({cx:.3f} {cy:.3f})"><path d="M0-9L8 5H-8z"/><text>{escape(anchor.id)}</text></g>'
-    )
-    if anchor.alternative is not None and np.isfinite(anchor.alternative).all():
-        mark += f'<circle class="mirror" cx="{anchor.alternative[0]:.3f}" cy="{-anchor.alternative[1]:.3f}" r="{r:.3f}"/>'
-    return mark + "</g>"
-
-
-def _sigma(anchor: AnchorEstimate, axis: int) -> float:
-    return float(np.sqrt(max(anchor.covariance[axis, axis], 0.0)))
-
-
-def _ellipse(anchor: AnchorEstimate, cx: float, cy: float) -> str:
-    """Return the 2-sigma ellipse: half axes 2 sqrt(eigenvalue) along the eigenvectors, y turned downwards."""
-    if not np.isfinite(anchor.covariance).all():
-        return ""
-    values, vectors = np.linalg.eigh(anchor.covariance)
-    minor, major = 2.0 * np.sqrt(np.maximum(values, 0.0))
-    angle = -float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
-    turn = f'transform="rotate({angle:.2f} {cx:.3f} {cy:.3f})"'
-    return f'<ellipse cx="{cx:.3f}" cy="{cy:.3f}" rx="{major:.4f}" ry="{minor:.4f}" {turn}/>'
-
-
-def _shown_closures(result: MapResult) -> tuple[list[LoopClosure], list[LoopClosure]]:
-    kept = [c for c in result.closures if c.accepted]
-    rejected = [c for c in result.closures if not c.accepted]
-    return kept, [rejected[k] for k in _thin(len(rejected), MOST_CLOSURES)]
-
-
-def _closure_lines(result: MapResult) -> str:
-    groups = []
-    for name, closures in zip(("kept", "rejected"), _shown_closures(result), strict=True):
-        lines = []
-        for c in closures:
-            (x1, y1), (x2, y2) = result.graph.poses[c.i, :2].tolist(), result.graph.poses[c.j, :2].tolist()
-            label = f"{c.i}\u2013{c.j}: {c.reason} (fitness {c.fitness:.3f} m, overlap {100 * c.overlap:.0f} %)"
-            lines.append(f'<path d="M{x1:.3f} {-y1:.3f}L{x2:.3f} {-y2:.3f}"><title>{escape(label)}</title></path>')
-        hidden = " hidden" if name == "rejected" else ""
-        groups.append(f'<g class="closure {name}{hidden}">{"".join(lines)}</g>')
-    return "".join(groups)
-
-
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], empty: str) -> str:
     if not rows:
         return f"<p>{escape(empty)}</p>"
@@ -236,15 +103,15 @@ def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
     rows = [
         (
             a.id,
-            _number(a.position[0]),
-            _number(_sigma(a, 0)),
-            _number(a.position[1]),
-            _number(_sigma(a, 1)),
-            _number(a.bias, sign=True),
-            _number(a.bias_sigma),
+            number(a.position[0]),
+            number(sigma(a, 0)),
+            number(a.position[1]),
+            number(sigma(a, 1)),
+            number(a.bias, sign=True),
+            number(a.bias_sigma),
             str(a.ranges),
             f"{100 * (1 - a.used_share):.0f} %" if np.isfinite(a.used_share) else "\u2013",
-            _number(a.residual_rms),
+            number(a.residual_rms),
             f"{a.status}: {a.reason}" if a.reason else a.status,
         )
         for a in anchors
@@ -257,8 +124,8 @@ def _calibration_table(result: MapResult) -> str:
     rows = [
         (
             c.name,
-            _number(c.value, 4, True),
-            _number(c.sigma, 4),
+            number(c.value, 4, True),
+            number(c.sigma, 4),
             c.unit,
             c.meaning,
             f"{c.state}: {c.reason}" if c.reason else c.state,
@@ -269,7 +136,7 @@ def _calibration_table(result: MapResult) -> str:
 
 
 def _closure_table(result: MapResult) -> str:
-    kept, rejected = _shown_closures(result)
+    kept, rejected = shown_closures(result)
     count = sum(c.accepted for c in result.closures)
     reasons = Counter(c.reason for c in result.closures if not c.accepted)
     text = f"<p>{count} of {len(result.closures)} candidates kept.</p>" if result.closures else ""
@@ -288,7 +155,7 @@ def _stage_table(result: MapResult, timings: bool) -> str:
     rows = []
     for stage in result.stages:
         chi2, dof = stage.figures.get("chi2"), stage.figures.get("dof")
-        ratio = _number(chi2 / dof) if chi2 is not None and dof else ""
+        ratio = number(chi2 / dof) if chi2 is not None and dof else ""
         others = ", ".join(f"{k} {_figure(v)}" for k, v in stage.figures.items() if k not in ("chi2", "dof"))
         time = (f"{stage.seconds:.2f}",) if timings else ()
         rows.append((stage.name, "" if chi2 is None else f"{chi2:.1f}", "" if dof is None else str(dof), ratio, *time, others))
@@ -316,9 +183,7 @@ def _residuals(result: MapResult) -> str:
         mine = np.flatnonzero(table["anchor"] == index)
         mine = mine[np.isfinite(table["residual"][mine])]
         if len(mine):
-            parts.append(
-                _residual_plot(anchor.id, table, mine[_thin(len(mine), MOST_RESIDUALS)], start, max(end - start, 1e-9))
-            )
+            parts.append(_residual_plot(anchor.id, table, mine[thin(len(mine), MOST_RESIDUALS)], start, max(end - start, 1e-9)))
     return "".join(parts)
 
 
@@ -333,9 +198,7 @@ def _residual_plot(anchor_id: str, table: dict[str, Floats], which: NDArray[np.i
     x = 1000.0 * (table["stamp"][which] - start) / span
     y = 60.0 - 55.0 * np.clip(residual / limit, -1.0, 1.0)
     dots = "".join(
-        f'<path class="{name}" d="{_dots(x[sel], y[sel])}"/>'
-        for name, sel in (("los", good), ("nlos", ~good))
-        if sel.any()
+        f'<path class="{name}" d="{_dots(x[sel], y[sel])}"/>' for name, sel in (("los", good), ("nlos", ~good)) if sel.any()
     )
     return (
         f"<figure><figcaption>{escape(anchor_id)} <span class=hint>\u00b1{limit:.2f} m, {span:.0f} s,"

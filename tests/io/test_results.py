@@ -16,7 +16,8 @@ from results import EVIL, small_log, small_result
 
 from uwblite.errors import ConfigError
 from uwblite.io import results
-from uwblite.io.results import RunRecord, anchors_csv, check_target, covariance_csv, write_result
+from uwblite.io.result_text import RunRecord, anchors_csv, covariance_csv
+from uwblite.io.results import check_target, write_result
 from uwblite.io.tum import read_tum
 
 RECORD = RunRecord("uwblite map run.log --out map_again", "use_uwb = true\n", {"uwblite": "0.1.0"})

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from ..io.files import write_text
     from ..io.map_server import read_map
     from ..io.png import write_png
-    from ..io.results import covariance_csv
+    from ..io.result_text import covariance_csv
     from ..io.tum import write_tum
     from ..localize import localize
     from . import console

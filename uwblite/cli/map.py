@@ -73,7 +73,8 @@ def _count(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from ..config import to_toml
-    from ..io.results import RunRecord, check_target, write_result
+    from ..io.result_text import RunRecord
+    from ..io.results import check_target, write_result
     from . import console
     from .formats import read_recording
     from .options import apply_mounting
