@@ -198,3 +198,21 @@ def test_an_id_with_blanks_stays_one_word():
         range: float = 1.0
 
     assert UwbMapping(stamp="").extract(Message(), "/uwb") == [("a_b", 1.0, 100.0)]
+
+
+@pytest.mark.slow
+def test_the_real_bag_gives_the_map_of_its_log(shared_data):
+    from scipy.spatial import cKDTree
+
+    from uwblite import se2
+    from uwblite.mapping import build_map
+
+    folder = shared_data / "kasdorf_2017-11-17-12-31-28"
+    bag, log = build_map(read_bag(folder / "record.bag")), build_map(read_log(folder / "run.log.gz"))
+    poses = se2.interpolate_trajectory(bag.stamps - bag.stamps[0], bag.trajectory, log.stamps)
+    # The log leaves out the time within a sweep: at 0.2 m/s a sweep of 50 ms is a centimetre.
+    assert np.sqrt(np.mean(np.sum((poses - log.trajectory)[:, :2] ** 2, axis=1))) < 0.02
+    one, two = bag.grid.occupied_points(), log.grid.occupied_points()
+    near = 1.01 * log.grid.geometry.resolution
+    assert np.mean(cKDTree(one).query(two)[0] < near) > 0.9
+    assert np.mean(cKDTree(two).query(one)[0] < near) > 0.9
