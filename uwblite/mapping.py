@@ -176,16 +176,17 @@ def build_map(
             held = part.edges if tracked is None else (*part.edges, tracked.edges)
             close = _close_loops if config.loops.method == "search" else _close_loops_plainly
             part, closures = close(part, held, scans, drives, config, stages)
-            part = _moved_anchors_apart(part, drives, config, stages)
             part, refined = _refine_jointly(part, scans, drives, config, stages)
+            apart = sessions.apart(part, drives, config.solver)
+            if apart.warnings:
+                stages.warnings += apart.warnings
+                part, refined = _refine_jointly(apart.part, scans, drives, config, stages)
     part = _final(part, closures, tracked, refined)
     part = _aligned(part, scans, config)
 
     grid = _grid(drives, part.graph, config, executor, stages)
     uncertainty = marginals(part.graph)
-    result = summary.summarise(
-        drives, part, uncertainty, closures, grid, config.calibration, stages.done, stages.warnings
-    )
+    result = summary.summarise(drives, part, uncertainty, closures, grid, config.calibration, stages.done, stages.warnings)
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
 
@@ -280,13 +281,6 @@ def _constrained(part: Part, known: Constraints, drives: Drives, config: Mapping
     graph = _estimates(done.graph, optimize(done.graph.with_edges(*part.edges), config.solver)[0])
     stages.end("constraints", moved=sorted(done.moved), shift=[round(v, 4) for v in done.motion.tolist()])
     return replace(part, graph=graph, first=sessions.moved_hypotheses(part.first, done.motion))
-
-
-def _moved_anchors_apart(part: Part, drives: Drives, config: MappingConfig, stages: Stages) -> Part:
-    """Look again, once the lidar holds the poses, for anchors that were moved between recordings."""
-    apart = sessions.apart(part, drives, config.solver)
-    stages.warnings += apart.warnings
-    return apart.part
 
 
 def _hold_negative_heights(graph: Graph) -> Graph:
