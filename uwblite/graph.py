@@ -35,10 +35,11 @@ class Linearization:
     """An edge may name several unknowns of one block; each is an entry of its own."""
 
 
-def _rows(edges: Any, which: Ints) -> Any:
-    """Return some of the edges (rows of every per-edge array)."""
+def pick_rows(edges: Any, which: Ints) -> Any:
+    """Return some of the edges of a kind (rows of every array but those its SHARED names); kernel and kind stay."""
+    shared = getattr(edges, "SHARED", ())
     own = {f.name: getattr(edges, f.name) for f in fields(edges)}
-    arrays = {n: v for n, v in own.items() if isinstance(v, np.ndarray) and len(v) and n not in edges.SHARED}
+    arrays = {n: v for n, v in own.items() if isinstance(v, np.ndarray) and len(v) and n not in shared}
     per_edge = {n: v[which] for n, v in arrays.items()}
     return replace(edges, **per_edge)
 
@@ -176,7 +177,7 @@ class RelativePoseEdges:
 
     def rows(self, which: Ints) -> "RelativePoseEdges":
         """Return the edges with these indices."""
-        return cast(RelativePoseEdges, _rows(self, which))
+        return cast(RelativePoseEdges, pick_rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
@@ -233,7 +234,7 @@ class OdometryEdges:
 
     def rows(self, which: Ints) -> "OdometryEdges":
         """Return the edges with these indices."""
-        return cast(OdometryEdges, _rows(self, which))
+        return cast(OdometryEdges, pick_rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
@@ -282,6 +283,8 @@ class ScanEdges:
     """(4,) indices of C's x, y, theta and of the delay, s, in the calibration block; -1 = not an unknown (taken as 0)."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
+
+    SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 
     def __len__(self) -> int:
         return len(self.i)
@@ -393,7 +396,7 @@ class RangeEdges:
 
     def rows(self, which: Ints) -> "RangeEdges":
         """Return the edges with these indices."""
-        return cast(RangeEdges, _rows(self, which))
+        return cast(RangeEdges, pick_rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 1), expected minus measured."""
