@@ -164,6 +164,18 @@ def test_jacobians_equal_differences(function, a, b):
             np.testing.assert_allclose(analytic[:, k], slope / (2 * step), atol=1e-6)
 
 
+def test_bits_do_not_depend_on_where_angles_lie_in_memory():
+    rng = np.random.default_rng(1)
+    table = rng.uniform(-3.0, 3.0, size=(199, 3))
+    columns = np.ascontiguousarray(table.T)
+    for shift in range(8):
+        elsewhere = np.concatenate([np.zeros(shift), table.ravel()])[shift:].reshape(-1, 3)
+        for ours, theirs in zip(se2.cos_sin(elsewhere[:, 2]), se2.cos_sin(columns[2]), strict=True):
+            assert ours.tobytes() == theirs.tobytes()
+        assert se2.exp(elsewhere).tobytes() == se2.exp(columns.T.copy()).tobytes()
+        assert se2.compose(elsewhere, elsewhere[::-1]).tobytes() == se2.compose(table, table[::-1].copy()).tobytes()
+
+
 def test_functions_broadcast_over_leading_axes():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(4, 1, 3)), rng.normal(size=(5, 3))

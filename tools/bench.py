@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """Measure stages and whole runs, beside other libraries where they are installed; prints medians, ratios, peak RSS.
 
-    python tools/bench.py                                   everything that needs no recording
+    python tools/bench.py                                   everything that takes seconds and needs no recording
     python tools/bench.py graphs --repeats 21               pose graphs, against GTSAM (pip install gtsam)
     python tools/bench.py icp                               registration, against small_gicp and Open3D
     python tools/bench.py map --log hall=/tmp/hall/run.log  whole runs of `uwblite map`; --log may be repeated
     python tools/bench.py start                             import and --help above bare python
+    python tools/bench.py hundred                           75,000 poses grown from their odometry: minutes
 
 Runs of a library and of its peers alternate, so that a busy machine slows both; one core and one BLAS thread unless
 --cores says otherwise. Recordings are made by tools/simulate.py (hall, 31 min: --minutes 31; ten-fold: --minutes 310).
@@ -27,7 +28,7 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-PARTS = ("graphs", "large", "marginals", "gnc", "icp", "start", "map")
+PARTS = ("graphs", "large", "marginals", "gnc", "icp", "start", "hundred", "map")
 SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
 
 
@@ -143,6 +144,23 @@ def bench_gnc(repeats: int) -> None:
         show(seed, spent, *errors, errors[2] / errors[0])
 
 
+def bench_hundred() -> None:
+    """Grow a hundred times the paper's graph from its odometry; compare with the minimum next to the truth."""
+    from bench_graphs import ate, paper_graph, trilaterated
+
+    from uwblite.growing import optimize_growing
+    from uwblite.solver import optimize
+
+    head("Hundred times the paper", "from", "s", "iterations at the end", "chi2 / dof", "ATE, m")
+    graph, truth = paper_graph(100)
+    show("(the odometry)", 0, 0, "", ate(graph.poses, truth))
+    near = graph.updated(truth, trilaterated(truth, graph.edges[2], len(graph.anchors)), graph.calibration.values)
+    for name, run in (("truth, plain", lambda: optimize(near)), ("odometry, growing", lambda: optimize_growing(graph))):
+        began = time.perf_counter()
+        found, summary = run()
+        show(name, time.perf_counter() - began, summary.iterations, summary.chi2_per_dof, ate(found.poses, truth))
+
+
 def bench_icp(repeats: int) -> None:
     """Align two noisy views of a hall, everything from the bare points included."""
     import numpy as np
@@ -224,7 +242,7 @@ def main() -> int:
     unknown = set(args.parts) - set(PARTS)
     if unknown:
         parser.error(f"unknown part {', '.join(sorted(unknown))}; choose from {', '.join(PARTS)}")
-    parts = args.parts or [p for p in PARTS if p != "map" or args.log]
+    parts = args.parts or [p for p in PARTS if p not in ("hundred", "map") or (p == "map" and args.log)]
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: args.cores])
     runs = {
@@ -234,6 +252,7 @@ def main() -> int:
         "gnc": lambda: bench_gnc(max(1, args.repeats // 3)),
         "icp": lambda: bench_icp(args.repeats),
         "start": lambda: bench_start(args.repeats),
+        "hundred": bench_hundred,
         "map": lambda: bench_map(args.log, max(1, args.repeats // 3), args.map_option),
     }
     for part in parts:
