@@ -35,9 +35,9 @@ _FIRST_TOLERANCE = 0.5
 """How far first estimates of one anchor may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""
 _LEAST_MOVE = 0.25
 """An anchor that two recordings see nearer together than this was not moved, m."""
-_MOVED = 30.0
+_MOVED = 20.0
 """Squared Mahalanobis distance between two recordings' places of an anchor from which on it was moved (2 degrees of
-freedom; 3e-7 by chance, the rest for what the sigmas do not know)."""
+freedom; 5e-5 by chance, the rest for what the sigmas do not know)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
