@@ -17,6 +17,8 @@ lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dro
 nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05; K. Madsen, H. B. Nielsen,
 O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
 
+Next to the minimum H hardly changes any more: a step that follows one of little effect takes the factor of that one.
+
 The search ends, and says why, when the decrease still to come is a negligible fraction of F, when every component of
 the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up.
 Without robust kernels the decrease to come is extrapolated from the last two as a geometric series: exact where
@@ -32,6 +34,7 @@ from numpy.typing import NDArray
 
 from . import se2
 from .errors import ConfigError, SolverError
+from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost
 from .linear import NormalEquations, Unknowns, free_unknowns
 
@@ -157,7 +160,9 @@ def minimise(
     history: list[tuple[float, float]] = []
     to_come = _extrapolated if all(edges.kernel.name == "none" for edges in graph.edges) else _as_much_again
     reason, improved = "", True
+    factor: Factor | None = None
     while not reason:
+        reused = factor is not None
         if improved:
             normal.fill(linearized, [_or_none(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
             diagonal = normal.diagonal
@@ -168,7 +173,7 @@ def minimise(
         if len(history) == config.max_iterations:
             reason = USED_UP
             break
-        step, promised = _step(normal, damping * scale)
+        factor, step, promised = _step(normal, damping * scale, factor)
         trial = moved(graph, normal.unknowns, step)
         trial_linearized = linearize(trial)
         trial_chi2 = _cost(trial, trial_linearized)
@@ -181,13 +186,17 @@ def minimise(
         if improved:
             if to_come(decrease, last_decrease, promised) <= negligible and damping <= _FREE:
                 reason = SETTLED
+            near = not reused and decrease <= _NEAR * chi2 and damping <= _NEARLY_FREE
+            factor = factor if near else None
             graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3), _LEAST_DAMPING)
             growth = 2.0
         elif 0 < promised <= 1e-3 * negligible and damping <= _FREE:
             reason = SETTLED
         else:
-            damping, growth = max(damping * growth, _FIRST_BRAKE), growth * 2.0
+            factor = None
+            if not reused:
+                damping, growth = max(damping * growth, _FIRST_BRAKE), growth * 2.0
             if damping > _MOST_DAMPING:
                 reason = STUCK
     chi2_history, damping_history = np.array(history).reshape(-1, 2).T
@@ -214,6 +223,10 @@ _NOTHING = 1e-12
 """chi2, in standard deviations squared, that never matters."""
 _FREE = 1e-2
 """lambda up to which small steps mean a minimum and not just a strong brake."""
+_NEAR = 1e-2
+"""A step that decreased chi2 by less than this fraction of it changed H so little that the next one takes its factor."""
+_NEARLY_FREE = 1e-6
+"""lambda up to which that holds."""
 _LEAST_DAMPING = 1e-14
 _FIRST_BRAKE = 1e-5
 """Least lambda after a step that failed."""
@@ -232,13 +245,22 @@ def _as_much_again(decrease: float, last: float, promised: float) -> float:
     return max(decrease, promised)
 
 
-def _step(normal: NormalEquations, damping: Floats) -> tuple[Floats, float]:
-    """Return the damped step and the decrease it promises (not positive: the factorisation failed)."""
+def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tuple[Factor | None, Floats, float]:
+    """Return the factor used, the step and the decrease it promises (not positive: the factorisation failed).
+
+    Parameters
+    ----------
+    factor : of a step before, to be used again; None = factorise anew.
+    """
+    if factor is not None:
+        step = factor.solve(-normal.gradient)
+        return factor, step, -float(step @ normal.gradient)
     try:
-        step = normal.factor(damping).solve(-normal.gradient)
+        factor = normal.factor(damping)
     except SolverError:
-        return np.zeros(len(damping)), -1.0
-    return step, float(step @ (damping * step - normal.gradient))
+        return None, np.zeros(len(damping)), -1.0
+    step = factor.solve(-normal.gradient)
+    return factor, step, float(step @ (damping * step - normal.gradient))
 
 
 def linearize(graph: Graph) -> list[Linearization]:
