@@ -99,6 +99,16 @@ def test_pairs_are_ordered_unique_and_overlap():
         assert {(a, a + n) for a in range(len(truth) - n)} <= set(zip(i.tolist(), j.tolist(), strict=True))
 
 
+def test_clouds_take_turns_at_giving_the_lines():
+    """One way round only, what lines seen obliquely lean would add up over a path."""
+    truth, path, clouds = room(6)
+    start = Graph(truth).with_edges(chained(truth, NOISE))
+    edges = refined(start, clouds, path, selections=1).edges
+    for gap in CONFIG.neighbours:
+        apart = np.abs(edges.i - edges.j) == gap
+        assert 0.4 < np.mean(edges.i[apart] < edges.j[apart]) < 0.6
+
+
 def test_no_partners_are_only_neighbours():
     truth, path, clouds = room(5)
     session = np.zeros(len(truth), dtype=np.int64)

@@ -33,8 +33,9 @@ class CloudConfig:
     """Neighbourhood of a normal, m."""
     min_neighbours: int = 3
     """Points with fewer neighbours are left out as noise."""
-    linearity: float = 0.85
-    """Least share of a neighbourhood's spread that lies along the line for its normal to count, 0..1."""
+    linearity: float = 0.7
+    """Least share of a neighbourhood's spread that lies along the line for its normal to count, 0..1. A right angle has
+    about 0.75: corners say where along a corridor the robot is."""
     raster: float = 0.1
     """Cell of the tables of nearest points, m; smaller takes memory with the square and gains nothing on lines."""
     range_max: float = 30.0
