@@ -80,11 +80,28 @@ def test_a_changed_place_is_doubted(log, earlier):
     np.testing.assert_array_equal(found.correction, 0)
 
 
-def test_a_recording_that_hears_no_anchor_of_the_map_is_refused(log, earlier):
-    for alone in (log.without(uwb=True), log):
-        strangers = Constraints(anchors=(KnownAnchor("X", (0, 0)), KnownAnchor("Y", (1, 1))))
+def test_a_recording_with_neither_an_anchor_of_the_map_nor_walls_is_refused(log, earlier):
+    strangers = Constraints(anchors=(KnownAnchor("X", (0, 0)), KnownAnchor("Y", (1, 1))))
+    blind, bare = log.without(lidar=True), log.without(uwb=True, lidar=True)
+    for alone, grid in ((blind, earlier.grid), (log, None), (bare, earlier.grid)):
         with pytest.raises(DataError, match="hears 0 of the map's anchors"):
-            localize(alone, strangers, earlier.grid)
+            localize(alone, strangers, grid)
+
+
+def test_walls_alone_find_the_place_and_it_is_said(log, earlier):
+    found = localize(part(log).without(uwb=True), anchors_of(earlier), earlier.grid)
+    assert np.sqrt(np.mean(errors(found, earlier) ** 2)) < 0.025
+    assert any("walls alone" in w for w in found.result.warnings)
+    assert not found.result.doubts
+
+
+def test_a_place_with_two_equal_halves_is_doubted(log, earlier):
+    """The map and a second copy of it beside it: the walls fit both."""
+    grid = earlier.grid
+    twice = np.concatenate([grid.log_odds, np.zeros((40, grid.log_odds.shape[1]), np.float32), grid.log_odds])
+    both = dataclasses.replace(grid, geometry=dataclasses.replace(grid.geometry, rows=len(twice)), log_odds=twice)
+    found = localize(part(log).without(uwb=True), anchors_of(earlier), both)
+    assert any("elsewhere" in d for d in found.result.doubts)
 
 
 def test_covariances_and_anchors_move_along(log, earlier):

@@ -2,7 +2,8 @@
 
 The new recording is mapped on its own, with the earlier map's anchors as known places, so that it needs no start pose
 and has the accuracy of a whole map within itself; then its walls are laid over the earlier ones as one piece. Both maps
-widen a wall alike, so that their difference is free of it. The earlier map is not changed.
+widen a wall alike, so that their difference is free of it. Where fewer than two of the map's anchors are heard, the
+walls are sought in the whole map, whatever way they lie. The earlier map is not changed.
 """
 
 from collections.abc import Callable
@@ -15,11 +16,12 @@ from numpy.typing import NDArray
 from . import map_frame, se2
 from .constraints import Constraints
 from .errors import DataError
-from .icp import IcpConfig, align
+from .icp import IcpConfig, Registration, align
 from .map_result import MapResult, StageSummary
 from .mapping import MappingConfig, Progress, build_map
 from .occupancy_grid import OccupancyGrid
 from .point_cloud import PointCloud, make_cloud
+from .scan_search import SearchConfig, search
 from .sensor_log import SensorLog
 
 Floats = NDArray[np.float64]
@@ -56,7 +58,8 @@ def localize(
 
     Parameters
     ----------
-    log : the recording, with ranges to at least two of the map's anchors.
+    log : the recording, with ranges to at least two of the map's anchors, or with lidar in a place that no other part of
+        the map looks like.
     anchors : the earlier map's anchors, see io.constraints_file.read_anchors.
     grid : the earlier map; None = anchors only.
     config : settings; None = defaults.
@@ -64,42 +67,74 @@ def localize(
 
     Raises
     ------
-    DataError : the recording does not hear two of the map's anchors.
+    DataError : the recording does not hear two of the map's anchors, and there are no walls to compare.
     """
     heard = set(log.ranges.anchor_ids) if log.ranges is not None else set()
     shared = [a.id for a in anchors.anchors if a.id in heard]
-    if len(shared) < 2:
+    alone = len(shared) < 2
+    if alone and (grid is None or log.scans is None):
         raise DataError(
             f"the recording hears {len(shared)} of the map's anchors ({', '.join(a.id for a in anchors.anchors)}); "
-            "two or more are needed to find it in the map"
+            "two or more are needed to find it in the map, or lidar in both"
         )
     config = replace(config or MappingConfig(), align="odometry", crop=None)
-    result = build_map(log, config, constraints=anchors, progress=progress, executor=executor, clock=clock)
+    known = Constraints() if alone else anchors
+    result = build_map(log, config, constraints=known, progress=progress, executor=executor, clock=clock)
     if grid is None or result.grid is None:
         return Localization(result, np.zeros(3), float("nan"))
-    return _laid_over(result, grid)
+    if alone:
+        text = f"it hears {len(shared)} of the map's anchors: the walls alone say where it was"
+        result = replace(result, warnings=(*result.warnings, text))
+    return _laid_over(result, grid, anywhere=alone)
 
 
-def _laid_over(result: MapResult, grid: OccupancyGrid) -> Localization:
+def _laid_over(result: MapResult, grid: OccupancyGrid, *, anywhere: bool) -> Localization:
     """Lay the new walls over the earlier ones and move everything along."""
     assert result.grid is not None
     earlier, new = _walls(grid), _walls(result.grid)
-    settings = IcpConfig(max_correspondence_distance=0.15, coarse_distance=REACH, sigma=0.05, max_iterations=100)
     # The iteration's frame is the middle of the new walls: there a turn and a shift are independent.
     middle = np.array([*new.points.mean(axis=0), 0.0]) if len(new) else np.zeros(3)
     local = make_cloud(se2.transform(se2.inverse(middle), new.points))
-    found = align(earlier, local, middle, settings)
+    guesses = _anywhere(earlier, local) if anywhere else middle[None]
+    fits = sorted((align(earlier, local, guess, _FIT) for guess in guesses), key=lambda fit: (-fit.converged, -fit.overlap))
+    found = fits[0]
     figures = {"overlap": round(found.overlap, 4), "rmse": round(found.rmse, 4), "reason": found.reason}
     if not found.converged or found.overlap < LEAST_OVERLAP:
         doubt = (
-            f"the walls do not lie on those of the map (overlap {found.overlap:.0%}, {found.reason}): "
-            "the place has changed, or it is another; the position rests on the anchors alone"
+            f"the walls do not lie on those of the map (overlap {found.overlap:.0%}, {found.reason}): the place has changed, "
+            f"or it is another; the position {'is not known' if anywhere else 'rests on the anchors alone'}"
         )
         stages = (*result.stages, StageSummary("walls", 0.0, figures))
         return Localization(replace(result, doubts=(*result.doubts, doubt), stages=stages), np.zeros(3), found.overlap)
+    rival = max((fit.overlap for fit in fits[1:] if _elsewhere(fit, found)), default=0.0)
+    if rival > _UNIQUE * found.overlap:
+        doubt = f"the walls fit elsewhere in the map about as well (overlap {rival:.0%} against {found.overlap:.0%})"
+        result = replace(result, doubts=(*result.doubts, doubt))
     motion = se2.compose(found.T_target_source, se2.inverse(middle))
     figures["shift"] = [round(v, 4) for v in motion.tolist()]
     return Localization(_moved(result, motion, StageSummary("walls", 0.0, figures)), motion, found.overlap)
+
+
+_FIT = IcpConfig(max_correspondence_distance=0.15, coarse_distance=REACH, sigma=0.05, max_iterations=100)
+_UNIQUE = 0.85
+"""A second place whose overlap is this share of the first's makes the first doubtful."""
+_EVERYWHERE = SearchConfig(resolution=0.25, angle_step=0.05, spread=0.25, candidates=8, separation=1.0)
+"""Coarse: the alignment that follows reaches farther than a step."""
+
+
+def _anywhere(earlier: PointCloud, local: PointCloud) -> Floats:
+    """Return poses (c, 3) of the new walls, about their middle, at which they may lie in the earlier map."""
+    if not len(earlier) or not len(local):
+        return np.zeros((1, 3))
+    low, high = earlier.points.min(axis=0), earlier.points.max(axis=0)
+    width, depth = ((high - low) / 2.0).tolist()
+    poses = search(earlier, local, np.array([*(low + high) / 2.0, 0.0]), (width, depth, np.pi), _EVERYWHERE).poses
+    return poses if len(poses) else np.zeros((1, 3))
+
+
+def _elsewhere(one: Registration, other: Registration) -> bool:
+    x, y, theta = se2.between(one.T_target_source, other.T_target_source).tolist()
+    return bool(one.converged and (np.hypot(x, y) > 0.5 or abs(theta) > 0.1))
 
 
 def _walls(grid: OccupancyGrid) -> PointCloud:
