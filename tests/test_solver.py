@@ -9,9 +9,9 @@ from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
 from uwblite.graph import Calibration, Graph, PriorEdges, RelativePoseEdges
 from uwblite.io.g2o import read_g2o
-from uwblite.linear import NormalEquations
+from uwblite.linear import NormalEquations, moved
 from uwblite.robust import Kernel
-from uwblite.solver import SolverConfig, edge_weights, linearize, moved, optimize
+from uwblite.solver import SolverConfig, edge_weights, linearize, optimize
 
 OPTIMA = {
     "efpno_input_M3500_original": 137.912951,

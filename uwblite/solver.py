@@ -32,11 +32,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from . import se2
 from .errors import ConfigError, SolverError
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost
-from .linear import NormalEquations, Unknowns, free_unknowns
+from .linear import NormalEquations, Unknowns, free_unknowns, moved
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -94,21 +93,6 @@ class SolverSummary:
     def chi2_per_dof(self) -> float:
         """About 1 where the noise model holds; nan without redundancy."""
         return self.chi2 / self.dof if self.dof > 0 else float("nan")
-
-
-def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
-    """Return the graph moved by a step: poses along the arc of a constant twist, the rest straight.
-
-    With the turn w of a pose and its shift t in the map frame, x -> x + V(w) t: to first order addition, and the shift
-    turns with the pose. Long bent chains need about two iterations fewer than with plain addition.
-    """
-    shift = unknowns.spread("poses", step)
-    arc = se2.exp(shift)
-    poses = np.empty_like(graph.poses)
-    poses[:, :2] = graph.poses[:, :2] + arc[:, :2]
-    poses[:, 2] = se2.wrap_angle(graph.poses[:, 2] + shift[:, 2])
-    calibration = graph.calibration.values + unknowns.spread("calibration", step)[:, 0]
-    return graph.updated(poses, graph.anchors + unknowns.spread("anchors", step), calibration)
 
 
 def edge_weights(edges: Edges, graph: Graph) -> Floats:
