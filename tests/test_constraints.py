@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.constraints import (
+    Clock,
     Constraints,
     ForbiddenClosure,
     KnownAnchor,
@@ -24,6 +25,7 @@ from uwblite.solver import optimize
 IDS = ("A", "B", "C", "D")
 TRUE = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 6.0], [-1.0, 5.0]])
 STAMPS = 100.0 + 0.5 * np.arange(40)
+CLOCK = Clock(STAMPS, np.zeros(40, dtype=np.int64))
 ALL = np.ones(4, dtype=bool)
 
 
@@ -57,7 +59,7 @@ angle = st.floats(-np.pi, np.pi)
 
 @given(st.tuples(st.floats(-50, 50), st.floats(-50, 50), angle), st.sampled_from(["AB", "ABC", "ABCD", "BD"]))
 def test_the_users_frame_is_found_from_anchors(T, ids):
-    done = apply(Constraints(anchors=surveyed(*ids)), first_estimate(T), IDS, ALL, STAMPS)
+    done = apply(Constraints(anchors=surveyed(*ids)), first_estimate(T), IDS, ALL, CLOCK)
     np.testing.assert_allclose(done.graph.anchors, TRUE, atol=1e-9)
     np.testing.assert_allclose(se2.between(drive(), done.graph.poses), 0, atol=1e-9)
     assert done.moved == {}
@@ -66,12 +68,12 @@ def test_the_users_frame_is_found_from_anchors(T, ids):
 @given(st.tuples(st.floats(-50, 50), st.floats(-50, 50), angle))
 def test_the_users_frame_is_found_from_a_pose(T):
     known = Constraints(poses=(KnownPose(float(STAMPS[7]), tuple(drive()[7].tolist())),))
-    done = apply(known, first_estimate(T), IDS, ALL, STAMPS)
+    done = apply(known, first_estimate(T), IDS, ALL, CLOCK)
     np.testing.assert_allclose(se2.between(drive(), done.graph.poses), 0, atol=1e-9)
 
 
 def test_one_anchor_leaves_the_heading_as_it_was():
-    done = apply(Constraints(anchors=surveyed("B")), first_estimate((2, -3, 0.0)), IDS, ALL, STAMPS)
+    done = apply(Constraints(anchors=surveyed("B")), first_estimate((2, -3, 0.0)), IDS, ALL, CLOCK)
     solved, summary = optimize(done.graph)
     assert summary.converged
     np.testing.assert_allclose(solved.anchors, TRUE, atol=1e-6)
@@ -79,7 +81,7 @@ def test_one_anchor_leaves_the_heading_as_it_was():
 
 def test_solving_keeps_what_was_said_and_the_first_pose_is_free():
     anchors = TRUE + np.random.default_rng(1).normal(0, 0.1, TRUE.shape)
-    done = apply(Constraints(anchors=surveyed(*IDS)), first_estimate(anchors=anchors), IDS, ALL, STAMPS)
+    done = apply(Constraints(anchors=surveyed(*IDS)), first_estimate(anchors=anchors), IDS, ALL, CLOCK)
     assert not done.graph.fixed_poses.any()
     solved, summary = optimize(done.graph)
     assert summary.converged
@@ -93,7 +95,7 @@ def test_an_anchor_moved_since_the_earlier_map_is_named_and_does_not_bend_the_ma
     anchors = TRUE.copy()
     anchors[IDS.index(which)] += (2.0, -1.5)
     known = Constraints(anchors=surveyed(*IDS, movable=True))
-    done = apply(known, first_estimate(anchors=anchors), IDS, ALL, STAMPS)
+    done = apply(known, first_estimate(anchors=anchors), IDS, ALL, CLOCK)
     assert set(done.moved) == {which}
     assert done.moved[which] == pytest.approx(2.5, abs=0.01)
     np.testing.assert_allclose(done.graph.anchors, anchors, atol=1e-6)
@@ -103,7 +105,7 @@ def test_an_anchor_moved_since_the_earlier_map_is_named_and_does_not_bend_the_ma
 
 def test_a_tape_between_anchors_is_heard():
     known = Constraints(distances=(KnownDistance(("A", "B"), 9.0, 0.001),))
-    done = apply(known, first_estimate(), IDS, ALL, STAMPS)
+    done = apply(known, first_estimate(), IDS, ALL, CLOCK)
     assert done.graph.fixed_poses is None
     solved, _ = optimize(done.graph)
     assert np.hypot(*(solved.anchors[0] - solved.anchors[1])) == pytest.approx(9.0, abs=0.05)
@@ -124,7 +126,7 @@ def test_the_jacobian_of_a_distance_is_right():
 
 def test_a_known_closure_ties_two_times_together():
     known = Constraints(closures=(KnownClosure((float(STAMPS[3]), float(STAMPS[30]))),))
-    edges = apply(known, first_estimate(), IDS, ALL, STAMPS).graph.edges[-1]
+    edges = apply(known, first_estimate(), IDS, ALL, CLOCK).graph.edges[-1]
     assert (edges.i.tolist(), edges.j.tolist()) == ([3], [30])
     np.testing.assert_allclose(edges.sqrt_information[0], np.eye(3) * 10)
 
@@ -132,7 +134,31 @@ def test_a_known_closure_ties_two_times_together():
 def test_forbidden_pairs_are_refused_both_ways_and_others_not():
     known = Constraints(forbidden=(ForbiddenClosure((100.0, 200.0), within=5.0),))
     one, two = np.array([101.0, 199.0, 101.0, 150.0]), np.array([198.0, 104.0, 190.0, 200.0])
-    assert known.allowed(one, two).tolist() == [False, False, True, True]
+    clock = Clock(np.concatenate([one, two]), np.zeros(8, dtype=np.int64))
+    assert known.allowed(clock, np.arange(4), np.arange(4, 8)).tolist() == [False, False, True, True]
+
+
+def test_stamps_of_several_recordings_are_told_apart():
+    """Two clocks that both begin at 100 s; the second is meant where it is named."""
+    clock = Clock(np.concatenate([STAMPS[:20], STAMPS[:20]]), np.repeat([0, 1], 20))
+    stamp = float(STAMPS[7])
+    assert (clock.nearest(stamp, 1), clock.nearest(stamp, 2)) == (7, 27)
+    known = Constraints(closures=(KnownClosure((stamp, stamp), recordings=(2, 1)),))
+    edges = apply(known, first_estimate(), IDS, ALL, clock).graph.edges[-1]
+    assert (edges.i.tolist(), edges.j.tolist()) == ([27], [7])
+    banned = Constraints(forbidden=(ForbiddenClosure((stamp, stamp), within=0.1, recordings=(1, 2)),))
+    i, j = np.array([7, 27, 6, 7]), np.array([27, 7, 27, 7])
+    assert banned.allowed(clock, i, j).tolist() == [False, False, True, True]
+    with pytest.raises(ConfigError, match="there is no recording 3; there are 2"):
+        apply(Constraints(poses=(KnownPose(stamp, (0, 0, 0), recording=3),)), first_estimate(), IDS, ALL, clock)
+    with pytest.raises(ConfigError, match=r"outside recording 2 \(100 to 109.5 s\)"):
+        apply(Constraints(poses=(KnownPose(300.0, (0, 0, 0), recording=2),)), first_estimate(), IDS, ALL, clock)
+
+
+def test_of_a_moved_anchor_the_last_place_counts(tmp_path):
+    file = tmp_path / "anchors.csv"
+    file.write_text("id,x,y,sigma_x,sigma_y,status\nA,1,2,0.1,0.1,ok\nA#2,5,6,0.1,0.1,ok\nB#7,3,4,0.1,0.1,ok\n")
+    assert [(a.id, a.position) for a in read_anchors(file).anchors] == [("A", (5.0, 6.0)), ("B#7", (3.0, 4.0))]
 
 
 def test_sums_take_the_later_place_of_an_anchor():
@@ -151,9 +177,9 @@ def test_sums_take_the_later_place_of_an_anchor():
 )
 def test_what_does_not_belong_to_the_recording_is_refused(known, message):
     with pytest.raises(ConfigError, match=message):
-        apply(known, first_estimate(), IDS, ALL, STAMPS)
+        apply(known, first_estimate(), IDS, ALL, CLOCK)
     gone = Constraints(anchors=(KnownAnchor("X", (0, 0), movable=True), *surveyed("A", "B", movable=True)))
-    np.testing.assert_allclose(apply(gone, first_estimate(), IDS, ALL, STAMPS).graph.anchors, TRUE, atol=1e-6)
+    np.testing.assert_allclose(apply(gone, first_estimate(), IDS, ALL, CLOCK).graph.anchors, TRUE, atol=1e-6)
 
 
 FILE = """

@@ -47,6 +47,8 @@ class KnownPose:
     """x, y, theta in the user's frame; m, m, rad."""
     sigma: tuple[float, float, float] = setting((0.05, 0.05, 0.05), above=0.0)
     """Standard deviations; m, m, rad. A large one (100) says that this one is not known."""
+    recording: int = setting(1, minimum=1)
+    """Which of several recordings the stamp belongs to: 1, 2, ... as they are named to `map`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,8 @@ class KnownClosure:
     """Pose of the robot at the second time as seen from the first; m, m, rad."""
     sigma: tuple[float, float, float] = setting((0.1, 0.1, 0.1), above=0.0)
     """m, m, rad."""
+    recordings: tuple[int, int] = setting((1, 1), minimum=1)
+    """Which of several recordings the stamps belong to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +85,8 @@ class ForbiddenClosure:
     """s, on the recording's clock."""
     within: float = 10.0
     """It holds for all poses that are this near in time to the two, s."""
+    recordings: tuple[int, int] = setting((1, 1), minimum=1)
+    """Which of several recordings the stamps belong to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,13 +115,42 @@ class Constraints:
         """Whether they say where the map lies."""
         return bool(self.anchors or self.poses)
 
-    def allowed(self, stamps_i: Floats, stamps_j: Floats) -> Bools:
-        """Tell which pairs of poses (n,), by their stamps, may be matched with each other."""
-        allowed = np.ones(len(stamps_i), dtype=bool)
+    def allowed(self, clock: "Clock", i: Ints, j: Ints) -> Bools:
+        """Tell which pairs (n,) of the clock's poses may be matched with each other."""
+        allowed = np.ones(len(i), dtype=bool)
         for ban in self.forbidden:
-            for first, second in (ban.stamps, ban.stamps[::-1]):
-                allowed &= ~((np.abs(stamps_i - first) <= ban.within) & (np.abs(stamps_j - second) <= ban.within))
+            near = [clock.off(s, r) <= ban.within for s, r in zip(ban.stamps, ban.recordings, strict=True)]
+            allowed &= ~((near[0][i] & near[1][j]) | (near[1][i] & near[0][j]))
         return allowed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clock:
+    """When the poses of a graph were."""
+
+    stamps: Floats
+    """(n,) s, each on the clock of its recording."""
+    session: Ints
+    """(n,) recording of each: 0, 1, ..."""
+
+    def off(self, stamp: float, recording: int) -> Floats:
+        """Return how far (n,), s, each pose is from a stamp of a recording (1, 2, ...); inf for those of others."""
+        return np.where(self.session == recording - 1, np.abs(self.stamps - stamp), np.inf)
+
+    def nearest(self, stamp: float, recording: int) -> int:
+        """Return the pose nearest to a stamp.
+
+        Raises
+        ------
+        ConfigError : there is no such recording, or the stamp lies outside it.
+        """
+        own = self.stamps[self.session == recording - 1]
+        if not len(own):
+            raise ConfigError(f"constraints: there is no recording {recording}; there are {int(self.session.max()) + 1}")
+        if not own.min() - 1.0 <= stamp <= own.max() + 1.0:
+            where = f"recording {recording}" if self.session.max() > 0 else "the recording"
+            raise ConfigError(f"constraints: stamp {stamp:g} lies outside {where} ({own.min():g} to {own.max():g} s)")
+        return int(np.argmin(self.off(stamp, recording)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +165,7 @@ class Applied:
     """Anchors that are not where they were said to be, by id: how far off they are, m."""
 
 
-def apply(known: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, stamps: Floats) -> Applied:
+def apply(known: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
     """Bring a first estimate into the user's frame and add what is known to its edges.
 
     Parameters
@@ -139,21 +174,18 @@ def apply(known: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed:
     graph : first estimate; its first pose is held.
     anchor_ids : (a,) names of its anchors.
     placed : (a,) which of them have a position.
-    stamps : (n,) s, of its poses.
+    clock : when its poses were.
 
     Raises
     ------
     ConfigError : an anchor is not in the recording, or a stamp lies outside it.
     """
     known = _present(known, anchor_ids)
-    for stamp in (*(p.stamp for p in known.poses), *(s for c in known.closures for s in c.stamps)):
-        if not stamps[0] - 1.0 <= stamp <= stamps[-1] + 1.0:
-            raise ConfigError(f"constraints: stamp {stamp:g} lies outside the recording ({stamps[0]:g} to {stamps[-1]:g} s)")
     index = {name: k for k, name in enumerate(anchor_ids)}
-    motion, moved = _fit(known, graph, index, placed, stamps)
+    motion, moved = _fit(known, graph, index, placed, clock)
     graph = replace(graph, poses=se2.compose(motion, graph.poses), anchors=se2.transform(motion, graph.anchors))
-    edges = [*_anchor_priors(known, index, moved), *_pose_priors(known, stamps)]
-    edges += [*_distances(known, index), *_closures(known, stamps)]
+    edges = [*_anchor_priors(known, index, moved), *_pose_priors(known, clock)]
+    edges += [*_distances(known, index), *_closures(known, clock)]
     if known.places:
         graph = replace(graph, fixed_poses=np.zeros(len(graph.poses), dtype=bool))
         edges += _gauge(known, graph, moved)
@@ -170,12 +202,12 @@ def _present(known: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
 
 
 def _fit(
-    known: Constraints, graph: Graph, index: dict[str, int], placed: Bools, stamps: Floats
+    known: Constraints, graph: Graph, index: dict[str, int], placed: Bools, clock: Clock
 ) -> tuple[Floats, dict[str, float]]:
     """Return the rigid motion (3,) that brings most known places together, and anchors that do not join in."""
     if known.poses:
         first = min(known.poses, key=lambda p: p.sigma)
-        motion = se2.compose(np.array(first.pose), se2.inverse(graph.poses[_nearest(stamps, first.stamp)]))
+        motion = se2.compose(np.array(first.pose), se2.inverse(graph.poses[clock.nearest(first.stamp, first.recording)]))
         return motion, _strayed(known, graph, index, placed, motion)
     anchors = [a for a in known.anchors if placed[index[a.id]]]
     here = np.array([graph.anchors[index[a.id]] for a in anchors]).reshape(-1, 2)
@@ -222,10 +254,6 @@ def _strayed(known: Constraints, graph: Graph, index: dict[str, int], placed: Bo
     return strayed
 
 
-def _nearest(stamps: Floats, stamp: float) -> int:
-    return int(np.argmin(np.abs(stamps - stamp)))
-
-
 def _anchor_priors(known: Constraints, index: dict[str, int], moved: dict[str, float]) -> list[Edges]:
     """Surveyed anchors are believed; those of an earlier map under a kernel that lets go of a moved one."""
     edges: list[Edges] = []
@@ -239,10 +267,10 @@ def _anchor_priors(known: Constraints, index: dict[str, int], moved: dict[str, f
     return edges
 
 
-def _pose_priors(known: Constraints, stamps: Floats) -> list[Edges]:
+def _pose_priors(known: Constraints, clock: Clock) -> list[Edges]:
     if not known.poses:
         return []
-    place = np.array([_nearest(stamps, p.stamp) for p in known.poses], dtype=np.int64)
+    place = np.array([clock.nearest(p.stamp, p.recording) for p in known.poses], dtype=np.int64)
     root = np.array([np.diag(1.0 / np.array(p.sigma)) for p in known.poses])
     return [PriorEdges("poses", place, np.array([p.pose for p in known.poses]), root)]
 
@@ -255,12 +283,13 @@ def _distances(known: Constraints, index: dict[str, int]) -> list[Edges]:
     return [AnchorDistanceEdges(ends[:, 0], ends[:, 1], values[:, 0], values[:, 1])]
 
 
-def _closures(known: Constraints, stamps: Floats) -> list[Edges]:
+def _closures(known: Constraints, clock: Clock) -> list[Edges]:
     if not known.closures:
         return []
-    ends = np.array([[_nearest(stamps, s) for s in c.stamps] for c in known.closures], dtype=np.int64)
+    ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in known.closures]
+    i, j = np.array(ends, dtype=np.int64).T
     root = np.array([np.diag(1.0 / np.array(c.sigma)) for c in known.closures])
-    return [RelativePoseEdges(ends[:, 0], ends[:, 1], np.array([c.pose for c in known.closures]), root)]
+    return [RelativePoseEdges(i, j, np.array([c.pose for c in known.closures]), root)]
 
 
 def _gauge(known: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:

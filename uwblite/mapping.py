@@ -33,7 +33,7 @@ from . import (
 from .anchors import AnchorConfig
 from .calibration import CalibrationConfig
 from .clouds import CloudConfig, Clouds
-from .constraints import Constraints
+from .constraints import Clock, Constraints
 from .constraints import apply as apply_constraints
 from .errors import Cancelled, ConfigError
 from .first_estimate import GrowthConfig
@@ -274,7 +274,7 @@ def _constrained(part: Part, known: Constraints, drives: Drives, config: Mapping
     if known.places and config.align != "odometry":
         raise ConfigError("known places say where the map lies; leave out align, or the places")
     placed = np.zeros(len(part.anchor_ids), dtype=bool) if part.first is None else part.first.placed
-    done = apply_constraints(known, part.graph, part.anchor_ids, placed, drives.stamps)
+    done = apply_constraints(known, part.graph, part.anchor_ids, placed, drives.clock)
     stages.warnings += [
         f"anchor {name} stands {off:.2f} m from its earlier place: it was moved" for name, off in done.moved.items()
     ]
@@ -299,12 +299,12 @@ class _Scans:
     clouds: Clouds
     raster: NearestRaster
     twist: Floats
-    stamps: Floats
+    clock: Clock
     known: Constraints
 
     def may_meet(self, i: Ints, j: Ints) -> Bools:
         """Tell which pairs of keyframes the user has not forbidden to match."""
-        return self.known.allowed(self.stamps[i], self.stamps[j])
+        return self.known.allowed(self.clock, i, j)
 
     @classmethod
     def of(cls, drives: Drives, known: Constraints, config: MappingConfig) -> "_Scans | None":
@@ -312,7 +312,7 @@ class _Scans:
             return None
         built = clouds.joined([block for session in drives.sessions for block in _clouds(session, config)])
         reach = max(config.refinement.first_gate, 0.2)
-        return cls(built, pair_matching.paint(built, config.clouds.raster, reach), drives.twist, drives.stamps, known)
+        return cls(built, pair_matching.paint(built, config.clouds.raster, reach), drives.twist, drives.clock, known)
 
 
 def _clouds(session: Session, config: MappingConfig) -> list[Clouds]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from . import calibration, keyframes, se2
 from .anchors import AnchorHypothesis
-from .constraints import consensus
+from .constraints import Clock, consensus
 from .errors import DataError
 from .first_estimate import FirstEstimate
 from .graph import Calibration, Edges, Graph, OdometryEdges, PriorEdges, RangeEdges
@@ -93,6 +93,11 @@ class Drives:
 
     def __len__(self) -> int:
         return len(self.sessions)
+
+    @property
+    def clock(self) -> Clock:
+        """When the keyframes were."""
+        return Clock(self.stamps, self.session)
 
 
 def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Drives:

@@ -66,7 +66,8 @@ _REQUIRED: Mapping[type, tuple[str, ...]] = {
 def read_anchors(path: str | os.PathLike[str]) -> Constraints:
     """Return the placed anchors of an earlier map's anchors.csv as known places; they may have been moved since.
 
-    Sigmas are taken as the larger of x and y, and at least 2 cm: an earlier map's own frame is not surer than that.
+    Where the map knows an anchor at several places (``5C0B``, later ``5C0B#2``), the last one counts. Sigmas are taken as
+    the larger of x and y, and at least 2 cm: an earlier map's own frame is not surer than that.
 
     Raises
     ------
@@ -78,11 +79,13 @@ def read_anchors(path: str | os.PathLike[str]) -> Constraints:
         table.texts(column)
     values = table.numbers("x", "y", "sigma_x", "sigma_y", default=np.nan)
     status = table.texts("status", default="ok")
-    anchors = []
+    anchors: dict[str, KnownAnchor] = {}
     for name, (x, y, sigma_x, sigma_y), state in zip(names, values.tolist(), status, strict=True):
         if np.isfinite(x) and np.isfinite(y) and state == "ok":
             sigma = float(np.nanmax([sigma_x, sigma_y, 0.02]))
-            anchors.append(KnownAnchor(name, (x, y), sigma, movable=True))
+            anchor, mark, number = name.rpartition("#")
+            name = anchor if mark and number.isdigit() and anchor in names else name
+            anchors[name] = KnownAnchor(name, (x, y), sigma, movable=True)
     if not anchors:
         raise FormatError("no anchor in it has a place; it must be the anchors.csv of a map", os.fspath(path))
-    return Constraints(anchors=tuple(anchors))
+    return Constraints(anchors=tuple(anchors.values()))
