@@ -240,3 +240,40 @@ def test_two_recordings_become_one_map_through_their_anchors(mapped, room_log, t
     second, poses = read_tum(tmp_path / "map" / "trajectory_2.tum")
     apart = between(interpolate_trajectory(there, whole, second), compose(T, poses))
     assert np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=1))) < 0.06
+
+
+def test_localize_fills_a_folder_but_never_the_map_s(mapped, room_log, tmp_path, capsys):
+    part, out = tmp_path / "part.log", tmp_path / "there"
+    assert main(["convert", str(room_log), str(part), "--start", "150"]) == 0
+    before = contents(mapped[0])
+    assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(mapped[0]), "--force"]) == 1
+    assert "is the map itself" in capsys.readouterr().err
+    assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(part)]) == 1
+    assert "name a folder" in capsys.readouterr().err
+    assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(out), "-q"]) == 0
+    assert set(contents(out)) == {"trajectory.tum", "trajectory_covariance.csv", "path.png", "report.json"}
+    report = json.loads((out / "report.json").read_text())
+    assert report["overlap"] > 0.9
+    assert report["map"] == str(mapped[0])
+    assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(out)]) == 1
+    assert "--force" in capsys.readouterr().err
+    assert contents(mapped[0]) == before
+
+
+def test_localize_in_a_map_without_anchors_goes_by_its_walls(mapped, room_log, tmp_path, capsys):
+    import shutil
+
+    bare = tmp_path / "bare"
+    shutil.copytree(mapped[0], bare)
+    header = (bare / "anchors.csv").read_text().splitlines()[0]
+    (bare / "anchors.csv").write_text(header + "\n")
+    part = tmp_path / "part.log"
+    assert main(["convert", str(room_log), str(part), "--start", "120"]) == 0
+    capsys.readouterr()
+    assert main(["localize", str(part), "--map", str(bare), "--out", str(tmp_path / "p.tum"), "--json"]) in (0, 3)
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["overlap"] > 0.9
+    assert any("walls alone" in w for w in summary["warnings"])
+    (bare / "map.yaml").unlink()
+    assert main(["localize", str(part), "--map", str(bare), "--out", str(tmp_path / "q.tum")]) == 1
+    assert "no anchor in it has a place" in capsys.readouterr().err

@@ -10,15 +10,16 @@ from .options import add_mounting_arguments, add_settings_arguments
 if TYPE_CHECKING:
     from ..localize import Localization
     from ..occupancy_grid import OccupancyGrid
-    from ..sensor_log import SensorLog
 
 HELP = "find the trajectory of a new recording in an existing map, by its anchors and walls"
 EPILOG = """\
 examples:
   uwblite localize new.log --map map/ --out new.tum
   uwblite localize new.log --map map/ --out new.tum --picture new.png --covariance new.csv
+  uwblite localize new.log --map map/ --out new/       all of these in a folder, and report.json
 
-The start pose need not be known: the anchors' ids tie the recording to the map. The map is not changed.
+The start pose need not be known: the anchors' ids tie the recording to the map. Where fewer than two of them are heard,
+the walls are sought in the whole map; without lidar, the anchors alone say it to a decimetre or two. The map is not changed.
 exit code 3: written, but the walls do not fit, or an anchor was moved; the reasons are named
 """
 
@@ -27,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
     parser.add_argument("--map", metavar="DIR", required=True, help="folder that uwblite map wrote: anchors.csv, map.yaml")
-    parser.add_argument("--out", metavar="FILE.tum", required=True, help="trajectory in the map's frame")
+    out = "trajectory in the map's frame, FILE.tum; any other name is a folder for it, its covariances and a report"
+    parser.add_argument("--out", metavar="FILE.tum|DIR", required=True, help=out)
     parser.add_argument("--covariance", metavar="FILE.csv", help="covariance of every keyframe")
     parser.add_argument("--picture", metavar="FILE.png", help="the path drawn on the map")
     parser.add_argument("--force", action="store_true", help="replace files that are already there")
@@ -42,31 +44,57 @@ def run(args: argparse.Namespace) -> int:
     from ..io.files import write_text
     from ..io.map_server import read_map
     from ..io.png import write_png
-    from ..io.result_text import covariance_csv
+    from ..io.result_text import covariance_csv, json_lines
     from ..io.tum import write_tum
     from ..localize import localize
     from . import console
     from .formats import read_recording, refuse_existing
     from .options import apply_mounting, effective_config
 
-    refuse_existing(args.force, args.out, args.covariance, args.picture)
+    files = _files(args)
+    refuse_existing(args.force, *files.values())
     config = effective_config(args)
-    anchors = read_anchors(os.path.join(args.map, "anchors.csv"))
     yaml = os.path.join(args.map, "map.yaml")
     grid = read_map(yaml) if os.path.exists(yaml) else None
+    anchors = read_anchors(os.path.join(args.map, "anchors.csv"), least=1 if grid is None else 0)
     log = apply_mounting(read_recording(args.log), args)
     progress = console.Progress()
     try:
         found = localize(log, anchors, grid, config, progress=progress, clock=time.perf_counter)
     finally:
         progress.close()
-    write_tum(args.out, found.result.stamps, found.result.trajectory)
-    if args.covariance:
-        write_text(args.covariance, covariance_csv(found.result))
-    if args.picture:
-        write_png(args.picture, _picture(found, grid, os.path.basename(args.log)))
-    _say(args, log, found)
+    if "report" in files:
+        os.makedirs(args.out, exist_ok=True)
+    write_tum(files["trajectory"], found.result.stamps, found.result.trajectory)
+    if "covariance" in files:
+        write_text(files["covariance"], covariance_csv(found.result))
+    if "picture" in files:
+        write_png(files["picture"], _picture(found, grid, os.path.basename(args.log)))
+    summary = _summary(found, list(files.values()))
+    if "report" in files:
+        about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
+        write_text(files["report"], json_lines(about | summary))
+    if args.json:
+        console.say_json(summary)
+    else:
+        _say(found, list(files.values()))
     return 3 if found.result.doubts else 0
+
+
+def _files(args: argparse.Namespace) -> dict[str, str]:
+    """Return the files to be written, by what they hold."""
+    from ..errors import ConfigError
+
+    if args.out.endswith((".tum", ".tum.gz")):
+        named = {"trajectory": args.out, "covariance": args.covariance, "picture": args.picture}
+        return {what: name for what, name in named.items() if name}
+    if os.path.realpath(args.out) == os.path.realpath(args.map):
+        raise ConfigError(f"--out {args.out} is the map itself, which is not changed; choose another folder")
+    if os.path.isfile(args.out):
+        raise ConfigError(f"{args.out} is a file; name a folder, or a trajectory that ends in .tum")
+    names = {"trajectory": "trajectory.tum", "covariance": "trajectory_covariance.csv", "picture": "path.png"}
+    own = {what: os.path.join(args.out, name) for what, name in (names | {"report": "report.json"}).items()}
+    return own | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}
 
 
 def _picture(found: "Localization", grid: "OccupancyGrid | None", caption: str) -> Any:
@@ -76,25 +104,27 @@ def _picture(found: "Localization", grid: "OccupancyGrid | None", caption: str) 
     return draw_map(grid, found.result.trajectory, anchors=anchors, caption=caption)
 
 
-def _say(args: argparse.Namespace, log: "SensorLog", found: "Localization") -> None:
+def _summary(found: "Localization", files: list[str]) -> dict[str, Any]:
+    """Return what was found, ready for JSON."""
+    result = found.result
+    x, y, theta = found.correction.tolist()
+    return {
+        "files": files,
+        "poses": len(result.stamps),
+        "correction_by_walls": {"x": x, "y": y, "theta": theta},
+        "overlap": found.overlap if found.overlap == found.overlap else None,
+        "warnings": list(result.warnings),
+        "doubts": list(result.doubts),
+        "exit_code": 3 if result.doubts else 0,
+    }
+
+
+def _say(found: "Localization", files: list[str]) -> None:
     from . import console
     from .wording import signed
 
     result = found.result
     x, y, theta = found.correction.tolist()
-    if args.json:
-        console.say_json(
-            {
-                "files": [f for f in (args.out, args.covariance, args.picture) if f],
-                "poses": len(result.stamps),
-                "correction_by_walls": {"x": x, "y": y, "theta": theta},
-                "overlap": found.overlap,
-                "warnings": result.warnings,
-                "doubts": result.doubts,
-                "exit_code": 3 if result.doubts else 0,
-            }
-        )
-        return
     start = result.trajectory[0]
     console.say(f"{len(result.stamps)} poses; the drive began at x {signed(start[0])} m, y {signed(start[1])} m")
     if found.overlap == found.overlap:
@@ -108,4 +138,4 @@ def _say(args: argparse.Namespace, log: "SensorLog", found: "Localization") -> N
         console.say(f"warning: {text}")
     for text in result.doubts:
         console.say(f"DOUBT: {text}")
-    console.say("files: " + " ".join(f for f in (args.out, args.covariance, args.picture) if f))
+    console.say("files: " + " ".join(files))
