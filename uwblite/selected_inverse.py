@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
@@ -22,8 +23,10 @@ from .errors import SolverError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_RANGE = 48
-"""Columns treated together: more means larger products but more zeros among them."""
+_WIDEST = 64
+"""Columns of a range at most."""
+_OVERHEAD = 10000.0
+"""What a range costs beyond its entries, in entries: calls of library functions take time, however small the matrices."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +61,8 @@ def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
     order = np.argsort(first, kind="stable")
     found = np.empty(len(rows))
     fronts, pivots = _fronts(factor), factor.U.diagonal()
-    bounds = np.searchsorted(first[order], np.arange(len(fronts) + 1) * _RANGE)
+    starts = np.array([front.rows[0] for front in fronts])
+    bounds = np.append(np.searchsorted(first[order], starts), len(order))
     waiting = np.bincount([f.parent for f in fronts if f.parent >= 0], minlength=len(fronts))
     inverses: dict[int, Floats] = {}
     for s in range(len(fronts) - 1, -1, -1):
@@ -71,31 +75,69 @@ def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
             if not waiting[front.parent]:
                 del inverses[front.parent]
         here = order[bounds[s] : bounds[s + 1]]
-        found[here] = inverse[first[here] - s * _RANGE, np.searchsorted(front.rows, second[here])]
+        found[here] = inverse[first[here] - starts[s], np.searchsorted(front.rows, second[here])]
     return found
 
 
 def _fronts(factor: SuperLU) -> list[_Front]:
-    """Cut L into ranges; R of a range is what its columns touch and what the ranges below it hand on."""
+    """Cut L into ranges; R of a range is what its columns touch and what the ranges before it hand on."""
     lower = factor.L
     lower.sort_indices()
-    n, fronts = lower.shape[0], []
-    handed: list[list[Ints]] = [[] for _ in range(0, n, _RANGE)]
-    column = np.repeat(np.arange(n), np.diff(lower.indptr))
-    for s, start in enumerate(range(0, n, _RANGE)):
-        end = min(start + _RANGE, n)
+    ranges = _ranges(lower)
+    owner = np.repeat(np.arange(len(ranges)), [end - start for start, end, _ in ranges])
+    fronts = []
+    for start, end, below in ranges:
         inside = slice(lower.indptr[start], lower.indptr[end])
-        touched = lower.indices[inside].astype(np.int64)
-        below = np.unique(np.concatenate([touched[touched >= end], *handed[s]]))
         rows = np.concatenate([np.arange(start, end), below])
         panel = np.zeros((len(rows), end - start))
-        panel[np.searchsorted(rows, touched), column[inside] - start] = lower.data[inside]
-        parent = int(below[0]) // _RANGE if len(below) else -1
-        if parent >= 0:
-            handed[parent].append(below[below >= (parent + 1) * _RANGE])
-        handed[s].clear()
-        fronts.append(_Front(rows, end - start, panel, parent))
+        column = np.repeat(np.arange(end - start), np.diff(lower.indptr[start : end + 1]))
+        panel[np.searchsorted(rows, lower.indices[inside]), column] = lower.data[inside]
+        fronts.append(_Front(rows, end - start, panel, int(owner[below[0]]) if len(below) else -1))
     return fronts
+
+
+def _ranges(lower: sparse.csc_matrix) -> list[tuple[int, int, Ints]]:
+    """Return start, end and rows below of ranges of columns, joined while that saves work.
+
+    Rows below are handed on to the range that holds the first of them, so that each finds all it needs there.
+    """
+    handed: dict[int, Ints] = {}
+    done: list[tuple[int, int, Ints]] = []
+    start, end, below = 0, 0, np.zeros(0, dtype=np.int64)
+    for first, last in _within_subtrees(lower):
+        touched = [lower.indices[lower.indptr[first] : lower.indptr[last]]]
+        touched += [handed.pop(c) for c in range(first, last) if c in handed]
+        if len(below) and below[0] < last:
+            touched.append(below)
+        own = np.unique(np.concatenate(touched).astype(np.int64))
+        own = own[own >= last]
+        both = np.union1d(below[below >= last], own)
+        apart = (end - start + len(below)) ** 2 + (last - first + len(own)) ** 2 + _OVERHEAD
+        if end > start and (last - start > _WIDEST or (last - start + len(both)) ** 2 > apart):
+            done.append((start, end, below))
+            if len(below) and below[0] >= last:
+                target = int(below[0])
+                handed[target] = np.union1d(handed[target], below) if target in handed else below
+            start, both = first, own
+        end, below = last, both
+    return [*done, (start, end, below)]
+
+
+def _within_subtrees(lower: sparse.csc_matrix) -> list[tuple[int, int]]:
+    """Cut the columns into ranges that lie within the subtree of their last: they touch no more rows than it does."""
+    n = lower.shape[0]
+    column = np.repeat(np.arange(n), np.diff(lower.indptr))
+    parent = np.minimum.reduceat(np.where(lower.indices > column, lower.indices, n), lower.indptr[:-1]).tolist()
+    deepest = list(range(n + 1))
+    for j, above in enumerate(parent):
+        if deepest[j] < deepest[above]:
+            deepest[above] = deepest[j]
+    cuts, end = [], n
+    while end:
+        start = max(deepest[end - 1], end - _WIDEST)
+        cuts.append((start, end))
+        end = start
+    return cuts[::-1]
 
 
 def _front_inverse(front: _Front, pivots: Floats, fronts: list[_Front], inverses: dict[int, Floats]) -> Floats:
