@@ -21,7 +21,8 @@ FLOORS = (
     ("sensor_log", "config", "drivers/events"),
     # parts without a view of the whole
     ("graph", "landmark_edges", "point_cloud", "nearest", "bresenham", "grid_geometry", "scan_rays", "ray_counter", "drawing"),
-    ("occupancy_grid", "keyframes", "range_noise", "anchors", "scan_search", "free_space", "factorization", "selected_inverse"),
+    ("occupancy_grid", "keyframes", "range_noise", "range_mixture", "anchors", "scan_search", "free_space"),
+    ("factorization", "selected_inverse"),
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts"),
     ("distance_edges", "constraints", "drivers/*"),
     # stages

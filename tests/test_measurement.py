@@ -15,7 +15,9 @@ from uwblite.graph import Calibration, Graph, RelativePoseEdges
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
 from uwblite.measurement import OdometryNoiseConfig, learn_noise, learn_wheels, range_edges, tag_positions, wheel_edges
 from uwblite.range_noise import RangeNoiseConfig
+from uwblite.robust import SQUARED
 from uwblite.sensor_log import Odometry, SensorMounting
+from uwblite.solver import optimize
 
 NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
 MOUNTING = SensorMounting(tag_position=np.array([0.2, -0.1, 0.4]), anchor_height=2.4)
@@ -141,3 +143,71 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
     assert np.median(factor[:, 2]) == pytest.approx(np.clip(heading, 0.5, 10.0), rel=0.3)
     few = RelativePoseEdges(some[:5], some[:5] + 1, said[:5], steps.sqrt_information[:5])
     assert learn_wheels(wheels, few, graph) is wheels
+
+
+def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
+    """Steps in a corridor repeat the wheels' own word along it; across and in heading the wheels err four times as much."""
+    rng = np.random.default_rng(2)
+    stamps, truth = wander(rng, 300.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    exact = wheel_edges(frames, 0, NOISE, Calibration())
+    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
+    off = rng.standard_normal((len(exact), 3)) * sigma * 4.0
+    wheels = replace(exact, motion=se2.compose(exact.motion, off))
+    said = se2.compose(wheels.motion, np.column_stack([np.zeros(len(off)), se2.inverse(off)[:, 1:]]))
+    blind = np.tile(np.diag([0.0, 100.0, 100.0]), (len(exact), 1, 1))
+    learnt = learn_wheels(wheels, RelativePoseEdges(exact.i, exact.j, said, blind), Graph(frames.odometry))
+    factor = np.einsum("eii->ei", exact.sqrt_information)[0] / np.einsum("eii->ei", learnt.sqrt_information)[0]
+    assert factor == pytest.approx([1.0, 4.0, 4.0], rel=0.2)
+
+
+def test_a_range_is_an_outlier_by_what_one_range_scatters():
+    """A hundred alike ranges weigh little each, yet one that is 10 sigma off hardly pulls."""
+    rng = np.random.default_rng(6)
+    stamps, truth = wander(rng, 60.0, half_width=2.0)
+    places = np.array([[8.0, 0.0]])
+    radio = ranges(rng, stamps, truth, places, sigma=0.05, rate=8.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    attached = attach_ranges(radio, Odometry(stamps, truth), frames, SensorMounting())
+    edges = range_edges(attached, 0, radio.anchor_ids, SensorMounting(), Calibration(), 0.3, AnchorConfig())
+    slow = 0.15 * np.sin(tag_positions(edges, truth[frames.index]).sum(axis=1))
+    edges = replace(edges, ranges=edges.ranges + slow + np.where(np.arange(len(edges)) == 40, 2.0, 0.0))
+    graph = Graph(truth[frames.index], places)
+    learnt, (noise,) = learn_noise(edges, graph, 1, RangeNoiseConfig())
+    np.testing.assert_allclose(learnt.sigma, noise.sigma)
+    assert np.median(learnt.weights) < 0.3
+    assert learnt.weights[40] < 0.05 * np.median(learnt.weights)
+
+
+def test_late_ranges_pull_less_than_early_ones():
+    _, truth, frames, places, _, edges = world(9, 150.0, 1, sigma=0.0, rate=4.0)
+    rng, graph = np.random.default_rng(7), Graph(truth[frames.index], places)
+    late = np.where(rng.random(len(edges)) < 0.3, rng.exponential(0.6, len(edges)), 0.0)
+    noisy = replace(edges, ranges=edges.distances(graph) + 0.05 * rng.standard_normal(len(edges)) + late)
+    learnt, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig())
+    off = noisy.ranges - edges.distances(graph)
+    mean = learnt.weights @ off / learnt.weights.sum()
+    assert abs(mean) < 0.03 < np.median(off) + 0.01 < np.mean(off)
+    plain, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig(learn=False))
+    assert plain.weights @ off / plain.weights.sum() > 0.1
+
+
+@pytest.mark.parametrize("calibration", [(0.04, 0.06), (-0.05, -0.3)])
+def test_noise_does_not_draw_the_wheels_scale(calibration):
+    """Errors in variables: the noise of a step is as large as the step. Fitted to the true poses, scale and turn come out
+    within four standard deviations of what was planted, sigma / sqrt(sum of squared steps)."""
+    scale, turn = calibration
+    rng = np.random.default_rng(8)
+    stamps, truth = wander(rng, 600.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    names = unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool))
+    exact = wheel_edges(frames, 0, OdometryNoiseConfig(distance=0.3, heading_per_metre=0.5), block(names))
+    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
+    noise = rng.standard_normal((len(exact), 3)) * sigma
+    wheels = replace(exact, motion=exact.motion / [1 + scale, 1 + scale, 1 + turn] + noise)
+    graph = Graph(truth[frames.index], calibration=block(names), fixed_poses=np.ones(len(frames), dtype=bool))
+    held = np.array([n not in ("odometry_scale", "heading_scale") for n in graph.calibration.names])
+    solved, _ = optimize(replace(graph, fixed_calibration=held).with_edges(replace(wheels, kernel=SQUARED)))
+    reach = sigma[0] / np.sqrt((wheels.motion**2).sum(axis=0))
+    assert solved.calibration.get("odometry_scale") == pytest.approx(scale, abs=4 * reach[0])
+    assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])

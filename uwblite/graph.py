@@ -197,7 +197,9 @@ class OdometryEdges:
     """Motion from pose i to pose j by the wheels, corrected by the wheels' calibration.
 
     With distance scale 1 + s and heading error delta = k dtheta + b length + g duration, the measured motion
-    (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``.
+    (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s in
+    x and y and by 1 + k in heading: it is the wheels' own, before the correction. Without that, noise alone would
+    draw s and k towards wheels that count less (errors in variables).
     """
 
     i: Ints
@@ -224,6 +226,11 @@ class OdometryEdges:
         """Return the motion (e, 3) with the present calibration applied."""
         return self._corrected(graph)[0]
 
+    def own_scale(self, graph: Graph) -> Floats:
+        """Return by what (e, 3) an error of the corrected motion is divided to be one of the wheels' own."""
+        s, k, _, _ = np.append(graph.calibration.values, 0.0)[self.calibration].T
+        return np.maximum(np.stack([1.0 + s, 1.0 + s, 1.0 + k], axis=1), _LEAST_SCALE)
+
     def _corrected(self, graph: Graph) -> tuple[Floats, Floats, Floats]:
         padded = np.append(graph.calibration.values, 0.0)
         s, k, b, g = padded[self.calibration].T
@@ -239,26 +246,35 @@ class OdometryEdges:
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
         d = se2.between(graph.poses[self.i], graph.poses[self.j])
-        return _whiten(self.sqrt_information, se2.between(self.corrected(graph), d))
+        return _whiten(self.sqrt_information, se2.between(self.corrected(graph), d) / self.own_scale(graph))
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses and the calibration in use."""
         xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
         z, direction, s = self._corrected(graph)
-        axes = _map_axes(self.sqrt_information, xi[2] + z[:, 2])
+        stretch = self.own_scale(graph)
+        axes = _map_axes(self.sqrt_information / stretch[:, None, :], xi[2] + z[:, 2])
         residuals, m = _relative_residuals(axes, z.T, xi, xj)
         by_i, by_j = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, xj)), _by_pose(*axes)
         blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
         if np.any(self.calibration >= 0):
             nx, ny = se2.rotate(xi[2], direction).T
             half = 0.5 * (1.0 + s)
-            by_scale = -axes[0] * nx - axes[1] * ny
+            shift = axes[0] * m[0] + axes[1] * m[1]
+            # A scale held at its least no longer changes what errors are divided by.
+            across, turning = np.where(stretch[:, 1:] > _LEAST_SCALE, 1.0 / stretch[:, 1:], 0.0).T
+            by_scale = -axes[0] * nx - axes[1] * ny - shift * across
             by_delta = axes[0] * (m[1] + half * ny) - axes[1] * (m[0] + half * nx) - axes[2]
-            columns = (by_scale, by_delta * self.motion[:, 2], by_delta * self.length, by_delta * self.duration)
+            by_turn = by_delta * self.motion[:, 2] - (residuals - shift) * turning
+            columns = (by_scale, by_turn, by_delta * self.length, by_delta * self.duration)
             for index, column in zip(self.calibration.T, columns, strict=True):
                 if np.any(index >= 0):
                     blocks.append(("calibration", np.maximum(index, 0), _by_pose(np.where(index >= 0, column, 0.0))))
         return Linearization(residuals.T, tuple(blocks))
+
+
+_LEAST_SCALE = 0.1
+"""Wheels that count more than ten times what they do are not believed: nothing is divided by less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

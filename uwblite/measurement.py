@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from . import se2
+from . import range_mixture, se2
 from .anchors import AnchorConfig, usable
 from .calibration import odometry_indices, range_indices
 from .graph import Calibration, Graph, OdometryEdges, RangeEdges, RelativePoseEdges
@@ -98,43 +98,56 @@ def tag_positions(edges: RangeEdges, poses: Floats) -> Floats:
 def learn_noise(
     edges: RangeEdges, graph: Graph, anchors: int, config: RangeNoiseConfig
 ) -> tuple[RangeEdges, tuple[RangeNoise, ...]]:
-    """Give every range the standard deviation that its anchor's residuals show, slow errors counted once.
+    """Give every range the standard deviation that its anchor's residuals show, and a weight that counts slow errors once.
+
+    The weight is no part of sigma: whether a range is an outlier is judged by what one range scatters.
 
     Parameters
     ----------
     graph : estimates the residuals are taken at.
     anchors : how many there are.
     """
-    positions, sigma = tag_positions(edges, graph.poses), edges.sigma.copy()
+    positions, sigma, weights = tag_positions(edges, graph.poses), edges.sigma.copy(), np.zeros(len(edges))
     errors = edges.residuals(graph)[:, 0] * edges.sigma
     alive = np.ones(len(edges), dtype=bool) if edges.weights is None else edges.weights > 0
     noises = []
     for anchor in range(anchors):
         own = np.flatnonzero(alive & (edges.anchor == anchor))
         noise = assumed(config)
-        if len(own) >= 5:
-            off = np.abs(errors[own] - np.median(errors[own]))
-            spread = max(1.4826 * float(np.median(off)), config.min_sigma)
-            noise = learn(positions[own], errors[own], (off < 3.0 * spread).astype(np.float64), config)
-        sigma[own] = effective_sigma(positions[own], noise)
+        trust = np.ones(len(own))
+        if config.learn and len(own) >= 5:
+            mixture = range_mixture.fit(-errors[own], config.min_sigma)
+            trust = np.maximum(mixture.weights(-errors[own]), 1e-6)
+            noise = learn(positions[own], errors[own], mixture.core(-errors[own]), config)
+        sigma[own] = max(noise.sigma, 1e-6)
+        weights[own] = trust * (sigma[own] / effective_sigma(positions[own], noise, trust)) ** 2
         noises.append(noise)
-    return replace(edges, sigma=sigma), tuple(noises)
+    return replace(edges, sigma=sigma, weights=weights), tuple(noises)
 
 
 def learn_wheels(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
-    """Scale the wheels' noise so that it explains how far they lie from steps that the lidar measured.
+    """Scale the wheels' noise along, across and in heading so that it explains how far they lie from measured steps.
 
     Parameters
     ----------
     wheels : edges between neighbouring poses, in the order of the poses.
-    steps : measured steps between neighbouring poses; with fewer than 20 the wheels keep their noise.
+    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see do not count;
+        where fewer than 20 steps see one, its noise stays.
     graph : holds the wheels' calibration.
     """
-    if len(steps) < 20:
+    if len(steps) < _ENOUGH_STEPS:
         return wheels
     own = np.searchsorted(wheels.i, steps.i)
-    off = se2.between(steps.T_i_j, wheels.corrected(graph)[own])
+    off = se2.between(steps.T_i_j, wheels.corrected(graph)[own]) / wheels.own_scale(graph)[own]
     off = np.abs(np.einsum("eij,ej->ei", wheels.sqrt_information[own], off))
-    spread = 1.4826 * np.array([np.median(off[:, :2]), np.median(off[:, 2])])
-    position, heading = np.clip(spread, 0.5, 10.0)
-    return replace(wheels, sqrt_information=wheels.sqrt_information / np.array([position, position, heading])[:, None])
+    information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
+    onto = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ information
+    seen = np.einsum("eii->ei", onto) > 0.9
+    factor = np.ones(3)
+    for k in np.flatnonzero(seen.sum(axis=0) >= _ENOUGH_STEPS):
+        factor[k] = np.clip(1.4826 * np.median(off[seen[:, k], k]), 0.3, 10.0)
+    return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
+
+
+_ENOUGH_STEPS = 20
+"""Measured steps from which the noise of the wheels may be learnt."""

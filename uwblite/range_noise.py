@@ -141,24 +141,24 @@ def _fit(
     return RangeNoise(white, slow, best[2])
 
 
-def effective_sigma(positions: Floats, noise: RangeNoise) -> Floats:
+def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None = None) -> Floats:
     """Return the standard deviation (m,) to give each of one anchor's ranges so that all together weigh what they know.
 
     Parameters
     ----------
     positions : (m, 2) tag at the ranges, m.
     noise : the anchor's noise.
+    weights : (m,) how far each range counts as a neighbour of others, 0..1; None = all 1.
     """
     if noise.slow == 0.0 or len(positions) == 0:
         return np.full(len(positions), max(noise.sigma, 1e-6))
-    return np.sqrt(noise.white**2 + noise.slow**2 * _alike(positions, noise.length))
+    return np.sqrt(noise.white**2 + noise.slow**2 * _alike(positions, noise.length, weights))
 
 
-def _alike(positions: Floats, length: float) -> Floats:
+def _alike(positions: Floats, length: float, weights: Floats | None) -> Floats:
     """Return the sum (m,) of exp(-distance / length) over all ranges, itself included; places binned to length / 4."""
-    cells, inverse, counts = np.unique(
-        np.round(positions * (4.0 / length)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
+    cells, inverse = np.unique(np.round(positions * (4.0 / length)).astype(np.int64), axis=0, return_inverse=True)
+    counts = np.bincount(inverse.reshape(-1), weights, len(cells)).astype(np.float64)
     tree = cKDTree(cells / 4.0)
     near = tree.sparse_distance_matrix(tree, 4.0, output_type="coo_matrix")
     total = np.bincount(near.row, np.exp(-near.data) * counts[near.col], len(cells))

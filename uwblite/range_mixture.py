@@ -1,0 +1,131 @@
+"""What one anchor's range errors are made of: a core, a tail of detours, and nonsense.
+
+A radio ray that meets no obstacle errs a little and either way; one that goes around or through something comes late,
+never early. So the errors of an anchor are taken as a mixture of a normal core, the same core lengthened by an
+exponentially distributed detour, and a uniform rest of readings that mean nothing (lies, reflections, false detections)::
+
+    f(e) = (1 - p - u) N(e; c, s) + p EMG(e; c, s, t) + u / W
+
+All parameters come from the errors themselves by expectation maximisation (A. Dempster, N. Laird, D. Rubin 1977). The
+weights that then make least squares the maximum-likelihood estimate of the place of the mode m are s^2 psi(e) / (e - m)
+with psi = -f' / f: late errors pull less than early ones of the same size.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfcx, ndtr
+
+Floats = NDArray[np.float64]
+
+_ROUNDS = 60
+_SHORTEST = 2.0
+"""Least mean detour, in standard deviations of the core; a shorter one is no tail but a part of the core."""
+_CLEAN = 15.0
+"""Ranges to the core that are taken as seen beforehand: a few ranges alone show neither tail nor nonsense."""
+_WIDEST = 2.0
+"""Nonsense is spread at least this wide, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class RangeMixture:
+    """Distribution of one anchor's errors, measured minus expected."""
+
+    centre: float
+    """Mean of the core, m."""
+    sigma: float
+    """Standard deviation of the core, m."""
+    tail: float
+    """Share of ranges with a detour, 0..1."""
+    detour: float
+    """Mean detour, m."""
+    wild: float
+    """Share of nonsense, 0..1."""
+    width: float
+    """Extent of the nonsense, m."""
+
+    def core(self, errors: Floats) -> Floats:
+        """Return the probability (m,) of each error to be of the core."""
+        normal, late = _densities(errors - self.centre, self.sigma, self.detour)
+        core = (1.0 - self.tail - self.wild) * normal
+        return core / (core + self.tail * late + self.wild / self.width + 1e-300)
+
+    def mode(self) -> float:
+        """Return the likeliest error, m."""
+        low, high = 0.0, 3.0 * self.sigma
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self._score(np.array([middle]))[0] > 0.0 else (middle, high)
+        return self.centre + low
+
+    def weights(self, errors: Floats) -> Floats:
+        """Return the weights (m,), 0..1, of squared errors about the mode that make them a maximum-likelihood estimate."""
+        off, mode = errors - self.centre, self.mode() - self.centre
+        near = np.abs(off - mode) < 1e-3 * self.sigma
+        away = np.where(near, mode + 1e-3 * self.sigma, off)
+        return np.clip(self.sigma**2 * self._score(away) / (away - mode), 0.0, 1.0)
+
+    def _score(self, off: Floats) -> Floats:
+        """Return -f' / f at errors (m,) from the core's mean."""
+        normal, late = _densities(off, self.sigma, self.detour)
+        core = (1.0 - self.tail - self.wild) * normal
+        slope = core * off / self.sigma**2 + self.tail / self.detour * (late - normal)
+        return slope / (core + self.tail * late + self.wild / self.width + 1e-300)
+
+
+def fit(errors: Floats, least_sigma: float) -> RangeMixture:
+    """Fit the mixture to errors.
+
+    Parameters
+    ----------
+    errors : (m,) measured minus expected, m; m >= 1.
+    least_sigma : the core is not narrower, m.
+    """
+    centre, sigma = shortest_half(errors)
+    sigma = max(sigma, least_sigma)
+    width = max(float(np.ptp(errors)), _WIDEST)
+    tail, detour, wild = 0.2, 4.0 * sigma, 0.05
+    for _ in range(_ROUNDS):
+        off = errors - centre
+        normal, late = _densities(off, sigma, detour)
+        parts = np.stack([(1.0 - tail - wild) * normal, tail * late, np.full(len(off), wild / width)])
+        parts /= parts.sum(axis=0) + 1e-300
+        core, slow, rest = parts.sum(axis=1)
+        total = core + slow + rest + _CLEAN
+        tail, wild = float(slow / total), float(rest / total)
+        detour = max(float(parts[1] @ _mean_detour(off, sigma, detour)) / max(float(slow), 1e-9), _SHORTEST * sigma)
+        before = centre
+        centre += float(parts[0] @ off) / max(float(core), 1e-9)
+        sigma = max(float(np.sqrt(parts[0] @ (errors - centre) ** 2 / max(float(core), 1e-9))), least_sigma)
+        if abs(centre - before) < 1e-4 * sigma:
+            break
+    return RangeMixture(centre, sigma, tail, detour, wild, width)
+
+
+def shortest_half(values: Floats, share: float = 0.5) -> tuple[float, float]:
+    """Return middle and normal-equivalent standard deviation of the shortest interval with this share of the values (m,)."""
+    order = np.sort(values)
+    inside = max(int(np.ceil(share * len(order))), 1)
+    spans = order[inside - 1 :] - order[: len(order) - inside + 1]
+    first = int(np.argmin(spans))
+    return float(order[first : first + inside].mean()), float(spans[first]) / (2.0 * 0.6745)
+
+
+def _densities(off: Floats, sigma: float, detour: float) -> tuple[Floats, Floats]:
+    """Return the densities (m,) of the core and of core plus detour at errors from the core's mean."""
+    z = off / sigma
+    normal = np.exp(-0.5 * z**2) / (sigma * np.sqrt(2.0 * np.pi))
+    # exp(a) erfc(b) in the form that neither overflows nor loses digits on its side of b = 0.
+    b = (sigma / detour - z) / np.sqrt(2.0)
+    early = np.exp(-0.5 * z**2) * erfcx(np.maximum(b, 0.0))
+    late = 2.0 * np.exp(np.minimum(0.5 * (sigma / detour) ** 2 - z * sigma / detour, 0.0)) * ndtr(-b * np.sqrt(2.0))
+    return normal, np.where(b >= 0.0, early, late) / (2.0 * detour)
+
+
+def _mean_detour(off: Floats, sigma: float, detour: float) -> Floats:
+    """Return the expected detour (m,) of late errors: a normal distribution about off - sigma^2 / detour cut off at 0."""
+    a = (off - sigma**2 / detour) / sigma
+    # phi(a) / Phi(a) by the scaled complementary error function, good for large negative a.
+    hazard = np.sqrt(2.0 / np.pi) / erfcx(-np.maximum(np.minimum(a, 20.0), -1e8) / np.sqrt(2.0))
+    return np.maximum(sigma * (a + np.where(a < 20.0, hazard, 0.0)), 0.0)
