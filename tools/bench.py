@@ -8,8 +8,9 @@
     python tools/bench.py start                             import and --help above bare python
     python tools/bench.py hundred                           75,000 poses grown from their odometry: minutes
 
-Runs of a library and of its peers alternate, so that a busy machine slows both; one core and one BLAS thread unless
---cores says otherwise. Recordings are made by tools/simulate.py (hall, 31 min: --minutes 31; ten-fold: --minutes 310).
+Processor time on one core and one BLAS thread; runs of a library and of its peers alternate, so that a busy machine
+slows both. Start is wall time, whole runs are both. Recordings are made by tools/simulate.py (hall, 31 min: --minutes 31;
+ten-fold: --minutes 310).
 """
 
 import argparse
@@ -32,17 +33,22 @@ PARTS = ("graphs", "large", "marginals", "gnc", "icp", "start", "hundred", "map"
 SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
 
 
-def measured(repeats: int, *functions: Callable[[], Any] | None) -> list[tuple[float, Any]]:
-    """Return for each function the median time, ms, and its last result; calls alternate after one that does not count."""
+def measured(
+    repeats: int, *functions: Callable[[], Any] | None, clock: Callable[[], float] = time.process_time
+) -> list[tuple[float, Any]]:
+    """Return for each function the median time, ms, and its last result; calls alternate after one that does not count.
+
+    On one core the processor time of this process is the wall time that an idle machine would show.
+    """
     times: list[list[float]] = [[] for _ in functions]
     results: list[Any] = [None for _ in functions]
     for repeat in range(repeats + 1):
         for k, function in enumerate(functions):
             if function is not None:
-                began = time.perf_counter()
+                began = clock()
                 results[k] = function()
                 if repeat:
-                    times[k].append(1e3 * (time.perf_counter() - began))
+                    times[k].append(1e3 * (clock() - began))
     middle = [sorted(t)[len(t) // 2] if t else float("nan") for t in times]
     return list(zip(middle, results, strict=True))
 
@@ -201,7 +207,9 @@ def bench_start(repeats: int) -> None:
         "uwblite --help": ["-m", "uwblite", "--help"],
     }
     done = measured(
-        repeats, *(lambda c=c: subprocess.run([sys.executable, *c], capture_output=True, check=True) for c in commands.values())
+        repeats,
+        *(lambda c=c: subprocess.run([sys.executable, *c], capture_output=True, check=True) for c in commands.values()),
+        clock=time.perf_counter,
     )
     for name, (spent, _) in zip(commands, done, strict=True):
         show(name, spent, spent - done[0][0])
@@ -209,10 +217,11 @@ def bench_start(repeats: int) -> None:
 
 def bench_map(logs: list[str], repeats: int, options: list[str]) -> None:
     """Run `uwblite map` on recordings: wall time, real-time factor, peak memory."""
-    head("Whole runs of `uwblite map`", "recording", "MB", "recorded, s", "wall, s", "real-time factor", "peak RSS, MB")
+    columns = ("recording", "MB", "recorded, s", "wall, s", "processor, s", "real-time factor", "peak RSS, MB")
+    head("Whole runs of `uwblite map`", *columns)
     for entry in logs:
         name, _, path = entry.rpartition("=")
-        walls, peak, recorded = [], 0.0, float("nan")
+        walls, busy, peak, recorded = [], [], 0.0, float("nan")
         for _ in range(repeats):
             with tempfile.TemporaryDirectory() as folder:
                 command = [sys.executable, "-m", "uwblite", "map", path, "--out", f"{folder}/map", "-q", *options]
@@ -221,13 +230,14 @@ def bench_map(logs: list[str], repeats: int, options: list[str]) -> None:
                 child = os.posix_spawn(sys.executable, command, {**os.environ, "PYTHONPATH": str(ROOT)}, file_actions=quiet)
                 _, status, used = os.wait4(child, 0)
                 walls.append(time.perf_counter() - began)
+                busy.append(used.ru_utime + used.ru_stime)
                 if os.waitstatus_to_exitcode(status) not in (0, 3):
                     raise SystemExit(f"uwblite map failed on {path}")
                 peak = max(peak, used.ru_maxrss / 1024.0)
                 stamps = [float(line.split()[0]) for line in (Path(folder) / "map" / "trajectory.tum").open() if line[0] != "#"]
                 recorded = stamps[-1] - stamps[0]
-        wall = sorted(walls)[len(walls) // 2]
-        show(name or Path(path).name, os.path.getsize(path) / 1e6, recorded, wall, recorded / wall, peak)
+        wall, processor = sorted(walls)[len(walls) // 2], sorted(busy)[len(busy) // 2]
+        show(name or Path(path).name, os.path.getsize(path) / 1e6, recorded, wall, processor, recorded / processor, peak)
 
 
 def main() -> int:
