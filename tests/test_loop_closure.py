@@ -79,7 +79,7 @@ def hall():
     session = np.zeros(len(truth), dtype=np.int64)
     pieces = build(clouds, graph.poses, path, session, SubmapConfig(epsilon=4.0))
     known = marginals(graph)
-    return truth, graph, known, pieces, session, propose(graph, known, pieces, session, set(), set(), CONFIG)
+    return truth, graph, known, pieces, session, propose(graph, known, pieces, session, set(), set(), True, CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess
 def test_what_was_tried_is_not_proposed_again(hall):
     _, graph, known, pieces, session, candidates = hall
     tried = candidates.names(CONFIG)
-    again = propose(graph, known, pieces, session, tried, set(), CONFIG)
+    again = propose(graph, known, pieces, session, tried, set(), True, CONFIG)
     assert not tried & again.names(CONFIG)
 
 
@@ -116,7 +116,7 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
     assert gone == few
     assert gone
     assert not missed(replace(candidates, spread=np.full(len(candidates.target), 9.0)), closures, CONFIG)
-    again = propose(graph, known, pieces, session, sure.names(CONFIG), gone, replace(CONFIG, partners=99))
+    again = propose(graph, known, pieces, session, sure.names(CONFIG), gone, True, replace(CONFIG, partners=99))
     for a, b, spread in zip(again.target.tolist(), again.source.tolist(), again.spread, strict=True):
         assert (a, b) not in gone or spread > 3 * CONFIG.slip * 0.99
     assert gone & set(zip(again.target.tolist(), again.source.tolist(), strict=True))
@@ -126,7 +126,7 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
 def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
     _, graph, known, pieces, session, _ = hall
     half = (np.arange(len(session)) >= pieces.first[len(pieces) // 2]).astype(np.int64)
-    candidates = propose(graph, known, pieces, half, set(), set(), replace(CONFIG, partners=99))
+    candidates = propose(graph, known, pieces, half, set(), set(), True, replace(CONFIG, partners=99))
     close = candidates.source - candidates.target == 1
     assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
 
@@ -333,7 +333,7 @@ def test_a_robot_that_never_returns_has_no_candidates():
     graph = drifted(np.random.default_rng(1), truth, NOISE / 10)
     session = np.zeros(60, dtype=np.int64)
     pieces = build(clouds, graph.poses, truth[:, 0], session, SubmapConfig(epsilon=8.0))
-    far = propose(graph, marginals(graph), pieces, session, set(), set(), replace(CONFIG, reach=6.0, search_limit=1.0))
+    far = propose(graph, marginals(graph), pieces, session, set(), set(), True, replace(CONFIG, reach=6.0, search_limit=1.0))
     apart = np.hypot(*(truth[pieces.reference[far.target], :2] - truth[pieces.reference[far.source], :2]).T)
     assert np.all(apart < 7.0)
     assert optimize(graph, SOLVER)[1].converged

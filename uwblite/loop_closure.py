@@ -7,7 +7,7 @@ only good one, see through no wall, and finally live in peace with all other clo
 Every candidate is kept, with the reason for its fate.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from . import se2
 from .clouds import Clouds
+from .free_space import FreeSpace, contradiction, free_space
 from .graph import Graph, RelativePoseEdges
 from .map_result import LoopClosure
 from .marginals import Marginals
@@ -30,6 +31,12 @@ from .submaps import Submaps
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+
+
+_BEARINGS = 360
+"""Bins of the free space around a keyframe."""
+_SAME_PLACE = 0.3
+"""Matches nearer than this, m and rad, are one place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +64,7 @@ class LoopClosureConfig:
     """Fitness: greatest root mean square distance of matched points, m."""
     overlap: float = 0.4
     """Least share of points with a match when the graph's guess was good."""
-    overlap_after_search: float = 0.55
+    overlap_after_search: float = 0.5
     """Least share of points with a match after a search, which can be fooled."""
     uniqueness: float = 0.85
     """A second place that matches this share as well as the first makes a search ambiguous."""
@@ -66,14 +73,25 @@ class LoopClosureConfig:
     overlap and no radio holds the trajectory: the wheels may have slipped. Such pairs are searched anew."""
     slip_angle: float = 0.2
     """The same for the heading, rad."""
+    chain_consistency: float = 400.0
+    """The same where no radio holds the trajectory: one slip or one false step makes a chain of steps wrong far beyond
+    its covariance, so a lone candidate is doubted less here and must live in peace with the other closures later."""
     consistency: float = 16.0
     """Largest squared Mahalanobis distance between match and graph (3 degrees of freedom; 16 = 0.1 %)."""
     points: int = 250
     """Points looked up per pair."""
     match_sigma: float = 0.03
     """Standard deviation of a match, m."""
-    correlation: float = 8.0
-    """Matches that together weigh as one."""
+    correlation: float = 24.0
+    """Matches that together weigh as one: they share the bending of both sub-maps."""
+    through: float = 0.12
+    """Largest share of one sub-map's points that may stand where the other saw free space; people and drift leave some."""
+    through_margin: float = 0.3
+    """How far inside the free space a point must stand to count, m."""
+    views: int = 8
+    """Keyframes of a sub-map whose free space is looked at."""
+    places: int = 3
+    """Places found by a search that are matched before one is chosen."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +121,8 @@ class Candidates:
     """(c, 3, 3) of the guess."""
     spread: Floats
     """(c,) 3 sigma of its position, m."""
+    held: bool = True
+    """Radio or known anchors hold the trajectory, so that its covariance is to be believed."""
 
     def names(self, config: LoopClosureConfig) -> set[tuple[int, int, bool]]:
         """Return (target, source, searched) of each, to remember what was tried."""
@@ -112,7 +132,7 @@ class Candidates:
 
 def propose(
     graph: Graph, marginals: Marginals, submaps: Submaps, session: Ints, tried: set[tuple[int, int, bool]],
-    missed: set[tuple[int, int]], config: LoopClosureConfig,
+    missed: set[tuple[int, int]], held: bool, config: LoopClosureConfig,
 ) -> Candidates:
     """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
 
@@ -121,6 +141,7 @@ def propose(
     graph, marginals : present estimates and their uncertainty.
     session : (k,) recording of each keyframe.
     tried : (target, source, searched) of earlier rounds; not proposed again.
+    held : the trajectory is held by radio.
     missed : (target, source) that did not match from the graph's guess though the graph may be wrong: searched with slack.
     """
     s = len(submaps)
@@ -133,7 +154,7 @@ def propose(
     near = distance < config.reach + config.search_limit
     a, b, distance = a[near], b[near], distance[near]
     if not len(a):
-        return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
+        return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), held)
     covariance = marginals.relative(reference[a], reference[b])
     slack = np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
     astray = np.array([(int(x), int(y)) in missed for x, y in zip(a, b, strict=True)])
@@ -149,7 +170,7 @@ def propose(
     fresh = np.array([(int(x), int(y), bool(d)) not in tried for x, y, d in zip(a, b, doubtful, strict=True)])
     kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
     a, b = a[kept], b[kept]
-    return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept])
+    return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept], held)
 
 
 def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
@@ -204,7 +225,7 @@ def align_pairs(
 
 def find(
     candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: SearchConfig,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, free: Sequence[FreeSpace] | None = None,
 ) -> Closures:
     """Match candidates and judge each on its own.
 
@@ -212,40 +233,63 @@ def find(
     ----------
     candidates : see propose. submaps : their clouds.
     progress : called with (done, total).
+    free : what each sub-map saw to be free, see seen_free; None = no candidate is held to see through walls.
     """
     if not len(candidates.target):
         return no_closures()
     searched = candidates.spread > config.direct
-    guess, second, found = _search_guesses(candidates, submaps, searched, config, search_config, progress)
     clouds = submaps.clouds
     raster = paint(clouds, 0.1, 0.5)
+    row, guess = _guesses(candidates, submaps, searched, config, search_config, progress)
+    points = pair_points(clouds, candidates.source[row], config.points)
+    tries = align_pairs(clouds, raster, candidates.target[row], candidates.source[row], guess, points, 0.5, config.gate)
+    best, second = _best_places(row, tries, len(searched))
+    found = best >= 0
+    pose = np.where(found[:, None], tries.pose[best], candidates.guess)
     points = pair_points(clouds, candidates.source, config.points)
-    result = align_pairs(clouds, raster, candidates.target, candidates.source, guess, points, 0.5, config.gate)
-    variance = np.full(len(guess), config.match_sigma**2 * config.correlation)
-    z, sqrt_information = measured(result.factors, result.pose, variance)
-    why = _judge(candidates, searched, found, second, result, z, sqrt_information, config)
+    factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
+    result = _Matched(pose, factors)
+    variance = np.full(len(pose), config.match_sigma**2 * config.correlation)
+    z, sqrt_information = measured(factors, pose, variance)
+    through = _see_through(candidates, submaps, result, free, config)
+    why = _judge(candidates, searched, found, second, through, result, z, sqrt_information, config)
     return _collect(candidates, submaps, result, z, sqrt_information, why)
 
 
-def _search_guesses(
+def _guesses(
     candidates: Candidates, submaps: Submaps, searched: Bools, config: LoopClosureConfig, search_config: SearchConfig,
     progress: Callable[[int, int], None] | None,
-) -> tuple[Floats, Floats, Bools]:
-    """Return start poses (c, 3), the relative score of the second best place (c,), and whether a search found any (c,)."""
-    guess, second, found = candidates.guess.copy(), np.zeros(len(searched)), np.ones(len(searched), dtype=bool)
-    rows = np.flatnonzero(searched)
+) -> tuple[Ints, Floats]:
+    """Return places to start matching from: candidate (g,) and pose (g, 3); several for those that were searched for."""
+    rows, guesses = [], []
     prepared: dict[int, PointCloud] = {}
-    for done, row in enumerate(rows):
-        half_width = float(np.minimum(candidates.spread[row], config.search_limit))
-        turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[row, 2, 2]), 0.1, config.search_angle))
-        pair = [_prepare(submaps, int(k[row]), prepared) for k in (candidates.target, candidates.source)]
-        places = search(pair[0], pair[1], guess[row], (half_width, half_width, turn), search_config)
-        found[row] = len(places.poses) > 0
-        if found[row]:
-            guess[row], second[row] = places.poses[0], places.ambiguity
-        if progress is not None:
-            progress(done + 1, len(rows))
-    return guess, second, found
+    total = int(searched.sum())
+    for k in range(len(searched)):
+        poses = candidates.guess[k : k + 1]
+        if searched[k]:
+            half_width = float(np.minimum(candidates.spread[k], config.search_limit))
+            turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[k, 2, 2]), 0.1, config.search_angle))
+            pair = [_prepare(submaps, int(c[k]), prepared) for c in (candidates.target, candidates.source)]
+            poses = search(pair[0], pair[1], poses[0], (half_width, half_width, turn), search_config).poses[: config.places]
+            if progress is not None:
+                progress(int(searched[: k + 1].sum()), total)
+        rows.append(np.full(len(poses), k))
+        guesses.append(poses)
+    return np.concatenate(rows).astype(np.int64), np.concatenate(guesses)
+
+
+def _best_places(row: Ints, tries: _Matched, candidates: int) -> tuple[Ints, Floats]:
+    """Return the best try of each candidate (c,), -1 = none, and what share of its matches another place reaches (c,)."""
+    best, second = np.full(candidates, -1, dtype=np.int64), np.zeros(candidates)
+    share = tries.share
+    for k in np.unique(row):
+        own = np.flatnonzero(row == k)
+        first = own[np.argmax(share[own])]
+        best[k] = first
+        apart = se2.between(tries.pose[first], tries.pose[own])
+        other = own[(np.hypot(apart[:, 0], apart[:, 1]) > _SAME_PLACE) | (np.abs(apart[:, 2]) > _SAME_PLACE)]
+        second[k] = share[other].max(initial=0.0) / max(share[first], 1e-9)
+    return best, second
 
 
 def _prepare(submaps: Submaps, k: int, prepared: dict[int, PointCloud]) -> PointCloud:
@@ -256,9 +300,45 @@ def _prepare(submaps: Submaps, k: int, prepared: dict[int, PointCloud]) -> Point
     return prepared[k]
 
 
+def seen_free(clouds: Clouds, submaps: Submaps, poses: Floats, config: LoopClosureConfig) -> list[FreeSpace]:
+    """Return what each sub-map saw to be free: by bearing, how far up to the nearest point of each of its clouds.
+
+    Parameters
+    ----------
+    clouds : one per keyframe. poses : (k, 3) T_map_base of the keyframes.
+    """
+    distance, bearing = np.hypot(clouds.points[:, 0], clouds.points[:, 1]), se2.bearing(clouds.points)
+    step = 2.0 * np.pi / _BEARINGS
+    bins = np.clip(((bearing + np.pi) / step).astype(np.int64), 0, _BEARINGS - 1)
+    nearest = np.full((len(clouds), _BEARINGS), np.inf)
+    np.minimum.at(nearest, (clouds.owner, bins), distance)
+    free = []
+    for first, last, reference in zip(submaps.first, submaps.last, submaps.reference, strict=True):
+        views = np.unique(np.linspace(first, last - 1, config.views).round().astype(np.int64))
+        relative = se2.between(poses[reference], poses[views])
+        free.append(free_space(relative, nearest[views], -np.pi + 0.5 * step, step))
+    return free
+
+
+def _see_through(
+    candidates: Candidates, submaps: Submaps, result: _Matched, free: Sequence[FreeSpace] | None, config: LoopClosureConfig
+) -> Floats:
+    """Return the larger share of points (c,) of either sub-map that would stand in what the other saw to be free."""
+    through = np.zeros(len(candidates.target))
+    if free is None:
+        return through
+    promising = (result.share >= min(config.overlap, config.overlap_after_search)) & (result.rms <= config.sigma)
+    for k in np.flatnonzero(promising):
+        a, b = int(candidates.target[k]), int(candidates.source[k])
+        one = contradiction(free[a], se2.transform(result.pose[k], submaps.clouds.cloud(b)[0]), config.through_margin)
+        other = se2.transform(se2.inverse(result.pose[k]), submaps.clouds.cloud(a)[0])
+        through[k] = max(one[0], contradiction(free[b], other, config.through_margin)[0])
+    return through
+
+
 def _judge(
-    candidates: Candidates, searched: Bools, found: Bools, second: Floats, result: _Matched, z: Floats,
-    sqrt_information: Floats, config: LoopClosureConfig,
+    candidates: Candidates, searched: Bools, found: Bools, second: Floats, through: Floats, result: _Matched,
+    z: Floats, sqrt_information: Floats, config: LoopClosureConfig,
 ) -> list[str]:
     """Return why each candidate is rejected; '' = accepted so far."""
     error = se2.between(z, candidates.guess)
@@ -270,6 +350,7 @@ def _judge(
     joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
     distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), visible)
     strength = np.linalg.eigvalsh(information)[:, 1]
+    most = config.consistency if candidates.held else config.chain_consistency
     why: list[str] = []
     for k in range(len(z)):
         least = config.overlap_after_search if searched[k] else config.overlap
@@ -279,12 +360,14 @@ def _judge(
             text = f"only {result.share[k]:.0%} of its points match (least {least:.0%})"
         elif result.rms[k] > config.sigma:
             text = f"matches lie {result.rms[k]:.3f} m apart (most {config.sigma:g} m)"
+        elif through[k] > config.through:
+            text = f"{through[k]:.0%} of its points would stand where free space was seen (most {config.through:.0%})"
         elif strength[k] < 1.0:
             text = "the surfaces fix neither position nor heading"
         elif searched[k] and second[k] > config.uniqueness:
             text = f"another place matches {second[k]:.0%} as well"
-        elif distance[k] > config.consistency:
-            text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {config.consistency:g})"
+        elif distance[k] > most:
+            text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {most:g})"
         else:
             text = ""
         why.append(text)

@@ -364,19 +364,19 @@ def _without_forbidden(found: Closures, scans: _Scans) -> Closures:
 
 def _track(part: Part, scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages) -> tuple[Part, Refined]:
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
-    settings = replace(
-        config.refinement, partners=0, rounds=config.refinement.track_rounds, first_gate=config.refinement.later_gate
+    rules = config.refinement
+    followed = tracking.follow(
+        scans.clouds, scans.raster, part.wheels, part.graph, rules.first_gate, config.tracking, config.search
     )
-    steps, wheels, searched = tracking.follow(
-        scans.clouds, scans.raster, part.wheels, part.graph, config.refinement.first_gate, config.tracking, config.search
-    )
-    part = replace(part, wheels=wheels)
-    graph = _estimates(part.graph, optimize(part.graph.with_edges(*part.edges, steps), config.solver)[0])
+    part = replace(part, wheels=followed.wheels)
+    graph = _estimates(part.graph, optimize(part.graph.with_edges(*part.edges, followed.steps), config.solver)[0])
+    gate = float(np.clip(followed.miss, rules.later_gate, rules.first_gate))
+    settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
     i, j = refinement.choose_pairs(scans.clouds, graph.poses, drives.path, drives.session, settings)
     graph, refined = _match_round(graph, part.edges, scans, i, j, settings, config, stages, "tracking")
     stages.end(
-        "tracking", pairs=len(i), searched=searched, used=int(refined.used.sum()), sigma=round(refined.sigma, 4),
-        rounds=refined.rounds,
+        "tracking", pairs=len(i), searched=followed.searched, used=int(refined.used.sum()), gate=round(gate, 3),
+        sigma=round(refined.sigma, 4), rounds=refined.rounds,
     )
     return replace(part, graph=graph), refined
 
@@ -394,9 +394,10 @@ def _close_loops(
     for lap in range(config.loops.rounds):
         pieces = submaps.build(scans.clouds, base.poses, drives.path, session, config.submaps)
         known = marginals(base.with_edges(found.edges))
-        candidates = loop_closure.propose(base, known, pieces, session, tried, missed, config.loops)
+        candidates = loop_closure.propose(base, known, pieces, session, tried, missed, held, config.loops)
         tried |= candidates.names(config.loops)
-        new = loop_closure.find(candidates, pieces, config.loops, config.search, stages.teller("loop closure"))
+        free = loop_closure.seen_free(scans.clouds, pieces, base.poses, config.loops)
+        new = loop_closure.find(candidates, pieces, config.loops, config.search, stages.teller("loop closure"), free)
         new = _without_forbidden(new, scans)
         missed |= set() if held else loop_closure.missed(candidates, new, config.loops)
         found = loop_closure.merged(found, new)

@@ -30,13 +30,13 @@ class RefinementConfig:
 
     rounds: int = 12
     """Most rounds of matching and solving; 0 = no joint refinement (the paper)."""
-    track_rounds: int = 5
+    track_rounds: int = 12
     """Most rounds of matching neighbouring clouds before loops are sought."""
     selections: int = 3
     """How often, at most, the pairs are chosen anew and refined."""
     same_pairs: float = 0.04
     """The pairs are not chosen anew when the poses moved by less than this (root mean square) since they were, m."""
-    first_gate: float = 0.35
+    first_gate: float = 0.5
     """Farthest match in the first round, m."""
     later_gate: float = 0.2
     """Farthest match in the first round where the poses are good already: after tracking, and when pairs are chosen anew."""

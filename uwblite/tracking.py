@@ -32,9 +32,6 @@ class TrackingConfig:
     """Neighbours that share at least this part of their points need no search."""
     gain: float = 0.08
     """A search must raise the share by this to be believed."""
-    arm: float = 3.0
-    """Distance of surfaces, m, at which an error of heading counts as one of position: what the wheels may miss by
-    (3 sigma) must stay below the first gate, or a poor match is searched for."""
     distance: float = 0.4
     """Half-width of the search, m."""
     angle: float = 0.45
@@ -53,10 +50,24 @@ class TrackingConfig:
     """Matches that together weigh as one."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Followed:
+    """Steps between neighbouring keyframes."""
+
+    steps: RelativePoseEdges
+    """Those that were measured."""
+    wheels: OdometryEdges
+    """With the noise that the measured steps show."""
+    miss: float
+    """By how much the wheels typically misplace points of the next cloud, 3 sigma, m."""
+    searched: int
+    """Steps that were searched for."""
+
+
 def follow(
     clouds: Clouds, raster: NearestRaster, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig,
     search_config: SearchConfig,
-) -> tuple[RelativePoseEdges, OdometryEdges, int]:
+) -> Followed:
     """Measure every step between neighbouring keyframes by their clouds, searching where the guess may have been bad.
 
     Parameters
@@ -65,9 +76,6 @@ def follow(
     wheels : edges between neighbouring keyframes. graph : poses by wheels and radio, the guess.
     gate : reach of the raster, m.
 
-    Returns
-    -------
-    Edges of the steps that were measured, the wheels with the noise that these steps show, and the number of searches.
     """
     i, tight = wheels.i, min(config.gate, gate)
     points = pair_points(clouds, i + 1, config.points)
@@ -76,15 +84,24 @@ def follow(
     share, step = aligned.share.copy(), aligned.pose.copy()
     good = enough & (share >= config.good_share)
     learnt = learn_wheels(wheels, _edges(clouds, raster, i[good], step[good], tight, config), graph)
-    sigma = 1.0 / np.einsum("eii->ei", learnt.sqrt_information)
-    basin = 3.0 * (sigma[:, 0] + sigma[:, 2] * config.arm) < gate
-    rows = np.flatnonzero(enough & ~good & ~basin)
+    miss = _miss(clouds, learnt)
+    rows = np.flatnonzero(enough & ~good & (miss > 0.7 * gate))
     for row in rows:
         found = _search_step(clouds, raster, int(i[row]), step[row], gate, config, search_config)
         if found is not None and found[1] > share[row] + config.gain:
             step[row], share[row] = found
     kept = enough & (share >= config.least_share)
-    return _edges(clouds, raster, i[kept], step[kept], tight, config), learnt, len(rows)
+    steps = _edges(clouds, raster, i[kept], step[kept], tight, config)
+    learnt = learn_wheels(wheels, steps, graph)
+    return Followed(steps, learnt, float(np.median(miss)) if len(miss) else 0.0, len(rows))
+
+
+def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
+    """Return by how much the wheels may misplace points of the next cloud (e,), 3 sigma, m."""
+    sigma = 1.0 / np.einsum("eii->ei", wheels.sqrt_information)
+    reach = np.hypot(clouds.points[:, 0], clouds.points[:, 1])
+    arm = float(np.quantile(reach, 0.75)) if len(reach) else 0.0
+    return 3.0 * (sigma[:, 0] + sigma[:, 2] * arm)
 
 
 def _edges(
