@@ -25,7 +25,8 @@ def followed(truth, clouds, said):
     for step in said:
         poses.append(se2.compose(poses[-1], step))
     raster = paint(clouds, 0.1, GATE)
-    return follow(clouds, raster, wheels, Graph(np.array(poses)), GATE, TrackingConfig(), SearchConfig())
+    result = follow(clouds, raster, wheels, Graph(np.array(poses)), GATE, TrackingConfig(), SearchConfig())
+    return result.steps, result.wheels, result.searched
 
 
 @pytest.fixture(scope="module")
