@@ -1,0 +1,168 @@
+#!/usr/bin/env python3
+"""Are the stated uncertainties true? Maps simulated drives and compares errors with the covariances that uwblite states.
+
+    python tools/consistency.py                              20 drives of 7 min; writes into docs/accuracy.md
+    python tools/consistency.py --runs 4 --minutes 4 --print a quick look
+    python tools/consistency.py --set refinement.correlation=8 --print
+
+The normalised estimation error squared (NEES) of an estimate with error e and covariance P is e^T P^-1 e; where P is
+true, its expectation is the number of dimensions (3 for a pose, 2 for an anchor) and 95 % of the values lie below the
+quantile of chi-square. Covariances are relative to the first pose, so the true frame is laid over the map's at the
+first pose and not by a best fit: a fit would share the error out over the run and make all of it look better than it
+is.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from simulation.recording import Settings
+from trials import ROOT, Trial, made, spread_out, table, write_section
+
+from uwblite import se2
+from uwblite.config import override
+from uwblite.map_result import MapResult
+from uwblite.mapping import MappingConfig, build_map
+
+Floats = NDArray[np.float64]
+
+DRIVES = {
+    "hall": Settings(world="hall"),
+    "lab": Settings(world="lab"),
+    "corridor": Settings(world="corridor"),
+    "hall, bad wheels and radio": Settings(world="hall", odometry_scale=2.0, nlos="heavy", nlos_anchors=(3, 4)),
+}
+FIRST_SEED = 1000
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Normalised errors of one drive."""
+
+    name: str
+    poses: Floats
+    """(k,) NEES of the key poses but the first; 3 expected."""
+    position: Floats
+    """(k,) of x and y alone; 2."""
+    heading: Floats
+    """(k,) of the heading alone; 1."""
+    anchors: Floats
+    """(a,) 2 expected."""
+    error: float
+    """m, rms of the positions in the frame of the first pose."""
+    stated: float
+    """m, rms that the covariances state."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A drive and the settings to map it with."""
+
+    name: str
+    settings: Settings
+    changes: tuple[str, ...]
+
+
+def nees(error: Floats, covariance: Floats) -> Floats:
+    """Return e^T P^-1 e (n,) of errors (n, d) with covariances (n, d, d)."""
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+
+
+def compare(name: str, result: MapResult, trial: Trial) -> Consistency:
+    """Return the normalised errors of a map."""
+    truth = se2.interpolate_trajectory(trial.stamps, trial.poses, result.keyframe_stamps)
+    T_map_truth = se2.compose(result.graph.poses[0], se2.inverse(truth[0]))
+    error = result.graph.poses - se2.compose(T_map_truth, truth)
+    error[:, 2] = se2.wrap_angle(error[:, 2])
+    error, covariance = error[1:], result.keyframe_covariances[1:]
+    placed = [a for a in result.anchors if a.status == "ok"]
+    off = np.array([a.position - se2.transform(T_map_truth, trial.anchors[a.id]) for a in placed]).reshape(-1, 2)
+    spread = np.array([a.covariance for a in placed]).reshape(-1, 2, 2)
+    return Consistency(
+        name,
+        nees(error, covariance),
+        nees(error[:, :2], covariance[:, :2, :2]),
+        error[:, 2] ** 2 / covariance[:, 2, 2],
+        nees(off, spread),
+        float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))),
+        float(np.sqrt(np.mean(covariance[:, 0, 0] + covariance[:, 1, 1]))),
+    )
+
+
+def work(task: Task) -> Consistency:
+    """Simulate a drive, map it and compare; the grid does not matter and is drawn coarsely."""
+    trial = made(task.settings)
+    config = override(MappingConfig(), ("grid.resolution=0.5", *task.changes))
+    return compare(task.name, build_map(trial.log, config), trial)
+
+
+def row(name: str, some: Sequence[Consistency]) -> list[object]:
+    """Return a row of the table: means over drives, and shares of all values below the quantile of 95 %."""
+    def inside(values: list[Floats], dimensions: int) -> str:
+        return f"{100.0 * float(np.mean(np.concatenate(values) < chi2.ppf(0.95, dimensions))):.0f} %"
+
+    return [
+        name, len(some),
+        *(f"{np.mean([np.mean(getattr(c, part)) for c in some]):.1f}" for part in ("poses", "position", "heading")),
+        f"{np.median(np.concatenate([c.poses for c in some])):.1f}",
+        inside([c.poses for c in some], 3),
+        float(np.sqrt(np.mean([c.error**2 for c in some]))), float(np.sqrt(np.mean([c.stated**2 for c in some]))),
+        *(f"{f(np.concatenate([c.anchors for c in some])):.1f}" for f in (np.mean, np.median)),
+        inside([c.anchors for c in some], 2),
+    ]
+
+
+HEAD = (
+    "drive", "runs", "pose (3)", "x, y (2)", "heading (1)", "pose, median (2.4)", "pose, inside 95 %", "error", "stated",
+    "anchor (2)", "anchor, median (1.4)", "anchor, inside 95 %",
+)
+
+
+def document(found: Sequence[Consistency], minutes: float) -> str:
+    """Return the section of the page."""
+    names = list(dict.fromkeys(c.name for c in found))
+    rows = [row(n, [c for c in found if c.name == n]) for n in names]
+    rows.append(row("all", found))
+    return (
+        f"## Are the stated uncertainties true?\n\n{len(found)} simulated drives of {minutes:g} min. Normalised errors squared "
+        "(in brackets what is expected of true\ncovariances), in the frame of the first pose, relative to which the "
+        "covariances are; the share of them inside the\nquantile of 95 %; rms error and rms stated standard deviation of the "
+        "positions, m.\n\n" + table(HEAD, rows)
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--runs", type=int, default=20, metavar="N", help="drives (20)")
+    p.add_argument("--minutes", type=float, default=7.0, metavar="N", help="length of each (7)")
+    p.add_argument("--out", type=Path, default=ROOT / "docs" / "accuracy.md", metavar="FILE", help="page to write into")
+    p.add_argument("--print", action="store_true", help="print instead of writing")
+    p.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting; repeatable")
+    p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
+    args = p.parse_args(argv)
+    tasks = [
+        Task(name, replace(DRIVES[name], seed=FIRST_SEED + k, minutes=args.minutes, scan_rate=5.0), tuple(args.set))
+        for k, name in zip(range(args.runs), list(DRIVES) * args.runs, strict=False)
+    ]
+    found = []
+    for c in spread_out(work, tasks, args.jobs):
+        found.append(c)
+        told = f"poses {c.poses.mean():.2f}, anchors {c.anchors.mean() if len(c.anchors) else float('nan'):.2f}"
+        told += f", {c.error:.4f} m of {c.stated:.4f} m stated"
+        print(f"{len(found)} of {len(tasks)}, {c.name}: {told}", file=sys.stderr, flush=True)
+    text = document(found, args.minutes)
+    if args.print:
+        print(text)
+    else:
+        write_section(args.out, "consistency", text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
