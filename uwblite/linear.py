@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import se2
-from .factorization import BandedLayout, Blocks, Factor, Layout, SparseLayout, choose_ordering
+from .factorization import Factor, choose_ordering
 from .graph import Graph, Linearization
+from .layouts import Blocks, make_layout
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -99,8 +100,7 @@ class NormalEquations:
         self.unknowns = Unknowns({name: s.T for name, s in scalars.items()}, int(width.sum()))
         blocks = self._place_blocks(pairs, corner, width)
         self._place_products(linearized, touched, which, corner)
-        in_band = int(width[ordering.order[: ordering.in_band]].sum())
-        self._layout: Layout = BandedLayout(blocks, in_band) if in_band else SparseLayout(blocks)
+        self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
 
@@ -124,7 +124,19 @@ class NormalEquations:
         """Lay the blocks out in the array of values."""
         swap = corner[pairs[:, 0]] < corner[pairs[:, 1]]
         lower, left = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
-        blocks = Blocks(corner[lower], corner[left], width[lower], width[left], int(width.sum()), len(width) - self._inner)
+        height, across = width[lower], width[left]
+        ends = np.cumsum(height * across)
+        full = len(width) - self._inner
+        blocks = Blocks(
+            corner[lower],
+            corner[left],
+            height,
+            across,
+            ends - height * across,
+            int(width.sum()),
+            full,
+            int(np.sum(height * across)),
+        )
         first_full = blocks.size - blocks.full
         self._base = np.append(
             blocks.start - blocks.row * blocks.width - blocks.column, blocks.full_start - first_full * blocks.size
