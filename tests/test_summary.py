@@ -10,6 +10,7 @@ from uwblite import se2
 from uwblite.calibration import CalibrationConfig
 from uwblite.evaluate import evaluate_trajectory
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.presets import preset
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -129,6 +130,15 @@ def test_an_anchor_of_a_few_ranges_is_unplaced(run):
     assert np.isnan(silent.position).all()
     assert "4 ranges" in silent.reason
     assert result.doubts == ()
+
+
+def test_noise_that_the_measurements_belie_is_a_doubt(run):
+    """Ranges of 4 cm taken as of 5 mm, squared: chi2 per degree of freedom is about 8^2 less what the poses give way."""
+    _, _, log, good = run
+    paper = preset("paper")
+    result = build_map(log, replace(paper, ranges=replace(paper.ranges, sigma=0.005)))
+    assert any("chi2/dof" in d for d in result.doubts)
+    assert not any("chi2/dof" in d for d in good.doubts)
 
 
 def test_no_anchor_at_all_is_a_doubt(run):

@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
+_POOR = 4.0
+"""chi2 per degree of freedom beyond which errors are twice what the noise allows: the model does not hold."""
 
 
 def summarise(
@@ -37,6 +39,10 @@ def summarise(
         "residual": residuals, "weight": weights,
     }
     more, doubts = _doubts(drives, anchors, closures, grid)
+    fits = [float(stage.figures["chi2_per_dof"]) for stage in stages if "chi2_per_dof" in stage.figures]
+    if fits and fits[-1] > _POOR:
+        times = float(np.sqrt(fits[-1]))
+        doubts.append(f"measurements lie {times:.1f} times as far off as their noise allows (chi2/dof {fits[-1]:.1f})")
     stamps = [session.log.odometry.stamps for session in drives.sessions]
     return MapResult(
         stamps=np.concatenate(stamps),
