@@ -17,9 +17,11 @@ from . import (
     calibration,
     clouds,
     first_estimate,
+    joining,
     keyframes,
     loop_closure,
     map_frame,
+    moved_anchors,
     occupancy_grid,
     pair_matching,
     plain_closures,
@@ -177,7 +179,7 @@ def build_map(
             close = _close_loops if config.loops.method == "search" else _close_loops_plainly
             part, closures = close(part, held, scans, drives, config, stages)
             part, refined = _refine_jointly(part, scans, drives, config, stages)
-            apart = sessions.apart(part, drives, config.solver)
+            apart = moved_anchors.apart(part, drives, config.solver)
             if apart.warnings:
                 stages.warnings += apart.warnings
                 part, refined = _refine_jointly(apart.part, scans, drives, config, stages)
@@ -228,7 +230,7 @@ def _estimates(graph: Graph, solved: Graph) -> Graph:
 def _first_optimisation(parts: Sequence[Part], drives: Drives, config: MappingConfig, stages: Stages) -> Part:
     """Grow each recording from nothing, bring them together and optimise wheels and radio (paper: first optimisation)."""
     parts = [_settled(_grown(part, drives, n, config, stages), config, stages) for n, part in enumerate(parts)]
-    joined = sessions.join(parts, drives)
+    joined = joining.join(parts, drives)
     stages.warnings += joined.warnings
     if len(parts) == 1:
         return joined.part
