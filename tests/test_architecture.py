@@ -27,7 +27,8 @@ FLOORS = (
     ("distance_edges", "constraints", "drivers/*"),
     # stages
     ("solver", "marginals", "gnc", "icp", "pair_matching", "submaps"),
-    ("first_estimate", "growing", "sessions", "joining", "moved_anchors", "refinement", "tracking", "loop_closure", "evaluate", "evaluate_map"),
+    ("first_estimate", "growing", "sessions", "joining", "moved_anchors", "refinement", "tracking", "loop_closure"),
+    ("evaluate", "evaluate_map"),
     # files in, files out: types and text, no stages
     ("plain_closures",),
     ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
