@@ -21,7 +21,7 @@ class Layout(Protocol):
     """Places of the values."""
 
     def factor(self, values: Floats) -> Factor:
-        """Factorise the matrix with these values; raise SolverError where it is not positive definite."""
+        """Factorise the matrix with these values; raise SolverError where a factorisation meets a pivot it cannot use."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -221,7 +221,7 @@ class NormalEquations:
 
         Raises
         ------
-        SolverError : the matrix is not positive definite to working precision.
+        SolverError : a pivot cannot be used. (SuperLU goes on through negative ones: the step then promises no decrease.)
         """
         values = self.values.copy()
         values[self._diagonal] += damping
