@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Repeat the experiments of the paper on simulated buildings, with its plain settings and with the defaults.
 
-    python tools/reproduce_paper.py            docs/paper.md and docs/images/paper_*.png, about half an hour on two cores
+    python tools/reproduce_paper.py            docs/paper.md and docs/images/paper_*.png; half an hour on two busy cores
     python tools/reproduce_paper.py --quick --out /tmp/paper    drives of 6 min, one seed, a few minutes
 
 Liu et al., Cost-effective Mapping of Mobile Robot Based on the Fusion of UWB and Short-range 2D LiDAR (CITATION.cff):
@@ -294,9 +294,9 @@ find a column in. *ATE* is the root mean square error of the trajectory after al
 """
 
 NOTES = """
-Why it differs where it does: the simulated radio errs by a bias and a multipath of 6 cm each per anchor, which is what
-the module's data sheet and published measurements say of a line of sight, and the hall hides little; the radio alone then
-holds the plain map to less than a decimetre, and there is little left for closures to gain. The fitness score of the
+Why it differs where it does: the simulated radio errs by a bias and a multipath of 6 cm each per anchor, and the hall
+hides little; the radio alone then holds the plain map to less than a decimetre, and there is little left for closures to
+gain. In the corridor, behind walls, the plain map keeps a third of a metre. The fitness score of the
 paper counts every point of a sub-map, also those that the other never saw, so most of the pairs that overlap in part
 are rejected. The defaults match neighbouring scans in every method, also in *odometry* and *odometry + UWB*: there only
 what would join different times is left out. GMapping, the fifth method of its table, is not repeated: it is another program.
@@ -310,7 +310,7 @@ def document(results: Results, args: argparse.Namespace) -> str:
     parts = [
         HEAD.format(drives=f"{len(seeds)} of the hall, one of a corridor loop and one of a cluttered lab, {minutes}"),
         "## What reproduces\n\n" + differences(results, seeds) + "\n" + NOTES,
-        f"## Table I: methods\n\nHall: mean of {len(seeds)} drives.\n\n" + table_1(results, seeds),
+        "## Table I: methods\n\nHall: mean of the drives.\n\n" + table_1(results, seeds),
         "## Table II: which UWB nodes\n\nHall, heavy NLOS on nodes 3 and 4.\n\n" + by_row(results, "II", "nodes"),
         "## Table III: size of sub-maps\n\nSub-maps of 0 m are single key poses; the paper's preset then tries the best four "
         "partners of each only.\n\n" + by_row(results, "III", "epsilon, m"),
