@@ -21,14 +21,14 @@ FLOORS = (
     ("sensor_log", "config", "drivers/events"),
     # parts without a view of the whole
     ("graph", "landmark_edges", "point_cloud", "nearest", "bresenham", "grid_geometry", "scan_rays", "ray_counter", "drawing"),
-    ("occupancy_grid", "keyframes", "range_noise", "range_mixture", "anchors", "scan_search", "free_space"),
+    ("evaluate", "occupancy_grid", "keyframes", "range_noise", "range_mixture", "anchors", "scan_search", "free_space"),
     ("factorization", "layouts", "selected_inverse"),
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts"),
     ("distance_edges", "constraints", "drivers/*"),
     # stages
     ("solver", "marginals", "gnc", "icp", "pair_matching", "submaps"),
     ("first_estimate", "growing", "sessions", "joining", "moved_anchors", "refinement", "tracking", "loop_closure"),
-    ("evaluate", "evaluate_map"),
+    ("evaluate_map",),
     # files in, files out: types and text, no stages
     ("plain_closures",),
     ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),

@@ -15,6 +15,7 @@ from . import se2
 from .config import setting
 from .distance_edges import AnchorDistanceEdges
 from .errors import ConfigError
+from .evaluate import align
 from .graph import Edges, Graph, PriorEdges, RelativePoseEdges
 from .robust import Kernel
 
@@ -228,20 +229,13 @@ def consensus(here: Floats, there: Floats, tolerance: Floats) -> Floats:
     """Return the motion of the pair of places that most others agree with, fitted to all of these."""
     best: tuple[float, Bools] = (-np.inf, np.ones(len(here), dtype=bool))
     for i, j in combinations(range(len(here)), 2):
-        motion = _rigid(here[[i, j]], there[[i, j]])
+        motion = align(here[[i, j]], there[[i, j]])
         error = np.hypot(*(se2.transform(motion, here) - there).T) / tolerance
         worth = float(np.sum(np.maximum(1.0 - error**2, 0.0)))
         if worth > best[0]:
             best = (worth, error < 1.0)
     agree = best[1] if best[1].sum() > 1 else np.ones(len(here), dtype=bool)
-    return _rigid(here[agree], there[agree])
-
-
-def _rigid(here: Floats, there: Floats) -> Floats:
-    """Return the motion (3,) that brings points (n, 2) nearest to others (n, 2), least squares (Umeyama without scale)."""
-    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
-    theta = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
-    return np.array([*(there.mean(axis=0) - se2.rotate(theta, here.mean(axis=0))), theta])
+    return align(here[agree], there[agree])
 
 
 def _strayed(known: Constraints, graph: Graph, index: dict[str, int], placed: Bools, motion: Floats) -> dict[str, float]:

@@ -25,7 +25,7 @@ class AnchorEstimate:
     ranges: int
     """Ranges in the recording."""
     used_share: float
-    """Mean weight of its ranges in the final optimisation, 0..1; the rest was held to be outliers or NLOS."""
+    """Share of its ranges, 0..1, that agree with the map: within 3 times the scatter of ranges to a typical anchor."""
     bias: float
     """m, added to every range of this anchor."""
     bias_sigma: float
@@ -51,7 +51,7 @@ class CalibrationEstimate:
     unit: str
     meaning: str
     state: str
-    """'estimated', 'prior' (the recording cannot show it) or 'off'."""
+    """'estimated', or 'prior': the recording cannot show it."""
     reason: str = ""
     """Why it stayed at the prior."""
 

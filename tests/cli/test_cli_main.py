@@ -47,7 +47,7 @@ def test_version(capsys):
         (["-q"], "needs a command"),
         (["map"], "required"),
         (["map", "x.log", "--out", "y", "--no-such"], "--no-such"),
-        (["map", "x.log", "--out", "y", "--laser-pose", "1,2"], "'1,2' is not 3 numbers"),
+        (["map", "x.log", "--out", "y", "--laser-pose", "-1,2"], "'-1,2' is not 3 numbers"),
         (["map", "x.log", "--out", "y", "--jobs", "0"], "above 0"),
     ],
 )
@@ -158,3 +158,11 @@ def test_settings_are_printed_checked_and_overridden(tmp_path, capsys):
     assert main(["config", "--config", str(tmp_path / "none.toml")]) == 1
     assert main(["config", "--preset", "papre"]) == 1
     assert "papre" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["map", "localize", "check", "record"])
+def test_numbers_that_begin_with_a_minus_need_no_equals_sign(verb, capsys):
+    needed = {"localize": ["--map", "nowhere"], "check": []}.get(verb, []) + ([] if verb == "check" else ["--out", "nowhere/x"])
+    log = [] if verb == "record" else ["missing.log"]
+    assert main([verb, *log, *needed, "--laser-pose", "-0.1,0,-1e-3", "--tag", "-.05,0,.6"]) in (1, 2)
+    assert "expected one argument" not in capsys.readouterr().err

@@ -106,7 +106,7 @@ def test_a_sensor_may_be_missing(room_log, tmp_path, capsys, without):
 
 
 def test_mounting_and_settings_of_the_command_line_count(room_log, tmp_path, capsys):
-    words = ["--laser-pose=0.1,0,0", "--tag=-0.05,0,0.6", "--resolution", "0.1", "--without", "loops", "--scale-map"]
+    words = ["--laser-pose=0.1,0,0", "--tag", "-0.05,0,0.6", "--resolution", "0.1", "--without", "loops", "--scale-map"]
     assert main(["map", str(room_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
     yaml = (tmp_path / "map" / "map.yaml").read_text()
     assert "resolution: 0.1" in yaml

@@ -6,6 +6,7 @@ errors answer at once on a small computer. This package alone prints, and this f
 """
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -94,6 +95,8 @@ def _verb_parser(verb: str, module: Any) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
+    # argparse takes "-0.05,0,0.6" for an option unless told that numbers may be joined by commas.
+    parser._negative_number_matcher = re.compile(r"-[\d.][\d.,eE+-]*$")
     module.add_arguments(parser)
     common = parser.add_argument_group("common options")
     common.add_argument("-q", "--quiet", action="store_true", help="no progress and no notes on stderr")

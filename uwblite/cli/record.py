@@ -42,8 +42,6 @@ computer's monotonic clock, s).
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    # argparse takes "-0.05,0,0.6" for an option unless told that numbers may be joined by commas.
-    parser._negative_number_matcher = re.compile(r"-[\d.][\d.,eE+-]*$")
     devices = parser.add_argument_group("devices")
     devices.add_argument("--uwb", metavar="[tlv:|shell:]PORT", help="DWM1001 tag")
     devices.add_argument("--lidar", metavar="PORT", help="URG-04LX")
