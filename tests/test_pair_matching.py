@@ -61,9 +61,10 @@ def test_the_raster_names_the_nearest_point_to_a_cell(seed):
         slack = cell * np.sqrt(2) / 2
         assert np.all(painted[nearest < reach - slack])
         assert not np.any(painted[nearest > reach + slack])
-        named = np.hypot(*(clouds.points[cells[painted]] - centres[painted]).T)
+        named_rows = clouds.offsets[k] + cells[painted]
+        named = np.hypot(*(clouds.points[named_rows] - centres[painted]).T)
         assert np.all(named <= nearest[painted] + 2 * slack + 1e-9)
-        assert np.isin(cells[painted], own).all()
+        assert np.isin(named_rows, own).all()
 
 
 @settings(max_examples=20)
@@ -74,7 +75,7 @@ def test_pair_points_are_spread_over_the_points_with_normals(seed, limit):
     j = np.array([3, 1, 0, 2, 3])
     points = pair_points(clouds, j, limit)
     for pair, cloud in enumerate(j):
-        rows = points.row[points.pair == pair]
+        rows = points.of(pair)
         own = np.flatnonzero((clouds.owner == cloud) & np.any(clouds.normals != 0.0, axis=1))
         assert len(rows) == min(limit, len(own))
         assert np.isin(rows, own).all()
@@ -92,8 +93,9 @@ def by_hand(clouds, raster, i, pose, rows, gate, scale):
         cx, cy = np.floor((at - raster.origin[i]) / raster.cell).astype(int)
         if not (0 <= cx < raster.shape[i, 0] and 0 <= cy < raster.shape[i, 1]):
             continue
-        target = raster.nearest[raster.start[i] + cx * raster.shape[i, 1] + cy]
-        if target < 0 or np.hypot(*(at - clouds.points[target])) > gate:
+        number = raster.nearest[raster.start[i] + cx * raster.shape[i, 1] + cy]
+        target = clouds.offsets[i] + number
+        if number < 0 or np.hypot(*(at - clouds.points[target])) > gate:
             continue
         if clouds.normals[target] @ se2.rotate(pose[2], clouds.normals[row]) > np.sqrt(0.5):
             found.append((clouds.points[row], clouds.points[target], clouds.normals[target]))
@@ -111,7 +113,7 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
     points = pair_points(clouds, j, 120)
     factors = match(clouds, raster, i, pose, points, gate, scale)
     for e in range(3):
-        rows = points.row[points.pair == e]
+        rows = points.of(e)
         source, target, normal = by_hand(clouds, raster, i[e], pose[e], rows, gate, scale)
         assert factors.asked[e] == len(rows)
         assert factors.matched[e] == len(source)

@@ -20,7 +20,7 @@ from .free_space import FreeSpace, contradiction, free_space
 from .graph import Graph, RelativePoseEdges
 from .map_result import LoopClosure
 from .marginals import Marginals
-from .pair_matching import NearestRaster, PairFactors, PairPoints, match, measured, paint, pair_points, trusted_step
+from .pair_matching import CloudRasters, PairFactors, PairPoints, match, measured, paint, pair_points, trusted_step
 from .point_cloud import PointCloud, make_cloud
 from .refinement import surface_cells
 from .robust import Kernel
@@ -200,7 +200,7 @@ class _Matched:
 
 
 def align_pairs(
-    clouds: Clouds, raster: NearestRaster, i: Ints, j: Ints, guess: Floats, points: PairPoints, first_gate: float,
+    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, guess: Floats, points: PairPoints, first_gate: float,
     last_gate: float, iterations: int = 20,
 ) -> _Matched:
     """Align many pairs of clouds at once, each on its own: point-to-line ICP with a shrinking gate.

@@ -47,7 +47,7 @@ from .map_result import MapResult, StageSummary
 from .marginals import marginals
 from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_edges
 from .occupancy_grid import GridConfig, OccupancyGrid, Sweeps
-from .pair_matching import NearestRaster
+from .pair_matching import CloudRasters
 from .range_noise import RangeNoiseConfig, short_term_sigma
 from .refinement import Refined, RefinementConfig
 from .scan_search import SearchConfig
@@ -299,7 +299,7 @@ class _Scans:
     """Lidar of a run, ready for matching."""
 
     clouds: Clouds
-    raster: NearestRaster
+    raster: CloudRasters
     twist: Floats
     clock: Clock
     known: Constraints

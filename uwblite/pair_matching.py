@@ -6,7 +6,6 @@ of its relative pose (3 x 3), which is all that the graph needs to know of them.
 """
 
 from dataclasses import dataclass, fields
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,26 +18,27 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-_AT_ONCE = 65536
+_AT_ONCE = 16384
 """Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
 _SAME_FACING = float(np.sqrt(0.5))
 """Least cosine between the normals of two matched points."""
+_NOBODY = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NearestRaster:
-    """For every cell around every cloud: which of its points is nearest."""
+class CloudRasters:
+    """A raster for every cloud: which of its points is nearest to each cell around it."""
 
     cell: float
     """m."""
     origin: Floats
     """(k, 2) lower corner of each cloud's raster in its own frame, m."""
     shape: Ints
-    """(k, 2) cells in x and y."""
+    """(k, 2) cells in x and y; the outermost ones name no point."""
     start: Ints
     """(k,) first cell of each raster in `nearest`."""
-    nearest: NDArray[np.int32]
-    """(cells,) row of the nearest point in the clouds' arrays, -1 = none within reach."""
+    nearest: NDArray[np.signedinteger]
+    """(cells,) number of the nearest point within its cloud, -1 = none within reach; 16 bits where they suffice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ class PairFactors:
     """(e,) sum of w."""
 
 
-def paint(clouds: Clouds, cell: float, reach: float) -> NearestRaster:
+def paint(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     """Build the rasters: each point with a normal claims the cells within reach, nearer cells last.
 
     Parameters
@@ -69,69 +69,70 @@ def paint(clouds: Clouds, cell: float, reach: float) -> NearestRaster:
     cell, reach : cell size and distance up to which a point is a neighbour, m.
     """
     usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
-    owner, points = clouds.owner[usable], clouds.points[usable]
-    margin = reach + cell
-    low = np.full((len(clouds), 2), np.inf)
-    high = np.full((len(clouds), 2), -np.inf)
-    np.minimum.at(low, owner, points)
-    np.maximum.at(high, owner, points)
+    owner = clouds.owner[usable]
+    x, y = (np.asarray(column, dtype=np.float64) for column in clouds.points[usable].T)
+    low, high = _boxes(np.stack([x, y]), owner, len(clouds))
     some = np.isfinite(low[:, 0])
+    margin = reach + cell
     low = np.where(some[:, None], low - margin, 0.0)
     shape = np.where(some[:, None], np.ceil((high + margin - low) / cell), 0.0).astype(np.int64) + some[:, None]
     size = shape[:, 0] * shape[:, 1]
     start = np.concatenate([[0], np.cumsum(size)[:-1]])
-    nearest = np.full(int(size.sum()), -1, dtype=np.int32)
-    at = ((points - low[owner]) / cell).astype(np.int64)
-    base = start[owner] + at[:, 0] * shape[owner, 1] + at[:, 1]
+    narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
+    rows = (usable - clouds.offsets[owner]).astype(np.int16 if narrow else np.int32)
+    nearest = np.full(int(size.sum()), _NOBODY, dtype=rows.dtype)
+    stride = shape[owner, 1]
+    base = ((x - low[owner, 0]) / cell).astype(np.int64) * stride + ((y - low[owner, 1]) / cell).astype(np.int64) + start[owner]
     steps = int(np.floor(reach / cell))
     offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
     offsets = [o for o in offsets if np.hypot(*o) * cell <= reach]
-    stride = shape[owner, 1]
-    rows = usable.astype(np.int32)
     for dx, dy in sorted(offsets, key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o)):
-        nearest[base + dx * stride + dy] = rows
-    return NearestRaster(cell, low, shape, start, nearest)
+        nearest[base + (dx * stride + dy)] = rows
+    return CloudRasters(cell, low, shape, start, nearest)
+
+
+def _boxes(points: Floats, owner: Ints, clouds: int) -> tuple[Floats, Floats]:
+    """Return the corners (k, 2) of a box around the points (2, p) of each cloud; inf where it has none."""
+    low, high = np.full((clouds, 2), np.inf), np.full((clouds, 2), -np.inf)
+    if len(owner):
+        first = np.flatnonzero(np.concatenate([[True], np.diff(owner) > 0]))
+        low[owner[first]] = np.minimum.reduceat(points, first, axis=1).T
+        high[owner[first]] = np.maximum.reduceat(points, first, axis=1).T
+    return low, high
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairPoints:
-    """The points that pairs look up: those of cloud j with a normal, thinned, pair after pair."""
+    """The points that pairs look up: those of cloud j with a normal, thinned."""
 
-    first: Ints
-    """(e,) first row of each pair."""
-    pair: Ints
-    """(q,) pair of each row."""
-    row: Ints
-    """(q,) row in the clouds' arrays."""
-    points: Floats
-    """(2, q) m, in the source cloud's frame."""
-    normals: Floats
-    """(2, q)."""
+    row: NDArray[np.int32]
+    """(e, n) rows in the clouds' arrays, a pair's own in front; -1 behind them where a pair has fewer than others."""
 
-    def of(self, first: int, last: int) -> "PairPoints":
-        """Return the points of the pairs [first, last)."""
-        a, b = np.searchsorted(self.pair, [first, last])
-        own = self.first[first:last]
-        return PairPoints(own - a, self.pair[a:b] - first, self.row[a:b], self.points[:, a:b], self.normals[:, a:b])
+    @property
+    def count(self) -> Ints:
+        """(e,) points of each pair."""
+        return np.asarray((self.row >= 0).sum(axis=1))
+
+    def of(self, pair: int) -> Ints:
+        """Return the rows of one pair."""
+        rows = self.row[pair]
+        return np.asarray(rows[rows >= 0], dtype=np.int64)
 
 
 def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
     """List up to `limit` evenly spaced points with normals of the source cloud j (e,) of each pair."""
     usable = np.any(clouds.normals != 0.0, axis=1)
     ranks = np.concatenate([[0], np.cumsum(usable)])
-    rows = np.flatnonzero(usable)
+    rows = np.append(np.flatnonzero(usable), _NOBODY).astype(np.int32)
     begin, end = ranks[clouds.offsets[j]], ranks[clouds.offsets[j + 1]]
     take = np.minimum(end - begin, limit)
-    first = np.concatenate([[0], np.cumsum(take)[:-1]]).astype(np.int64) if len(j) else np.zeros(0, dtype=np.int64)
-    pair = np.repeat(np.arange(len(j)), take)
-    rank = np.arange(len(pair)) - first[pair]
-    picked = begin[pair] + (rank * (end - begin)[pair]) // np.maximum(take[pair], 1)
-    row = rows[picked]
-    return PairPoints(first, pair, row, np.ascontiguousarray(clouds.points[row].T), np.ascontiguousarray(clouds.normals[row].T))
+    rank = np.arange(take.max(initial=0))
+    picked = begin[:, None] + (rank * (end - begin)[:, None]) // np.maximum(take, 1)[:, None]
+    return PairPoints(rows[np.where(rank < take[:, None], picked, len(rows) - 1)])
 
 
 def match(
-    clouds: Clouds, raster: NearestRaster, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float
+    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float
 ) -> PairFactors:
     """Match the listed points of each pair's source cloud to lines of its target cloud i.
 
@@ -146,63 +147,86 @@ def match(
     -------
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
-    if len(points.pair) <= _AT_ONCE or len(i) < 2:
-        return _match(clouds, raster, i, T_i_j, points, gate, scale)
-    cuts = np.unique([0, *np.searchsorted(points.first, np.arange(_AT_ONCE, len(points.pair), _AT_ONCE)).tolist(), len(i)])
-    parts = [_match(clouds, raster, i[a:b], T_i_j[a:b], points.of(a, b), gate, scale) for a, b in pairwise(cuts)]
+    surface = _Surface.of(clouds)
+    at_once = max(_AT_ONCE // max(points.row.shape[1], 1), 1)
+    parts = [
+        _match(clouds, surface, raster, i[a : a + at_once], T_i_j[a : a + at_once], points.row[a : a + at_once], gate, scale)
+        for a in range(0, max(len(i), 1), at_once)
+    ]
     return PairFactors(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PairFactors)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """Points, normals and variances of all clouds, each coordinate in one piece."""
+
+    x: Floats
+    y: Floats
+    nx: Floats
+    ny: Floats
+    variance: Floats
+
+    @classmethod
+    def of(cls, clouds: Clouds) -> "_Surface":
+        columns = (*clouds.points.T, *clouds.normals.T, clouds.normal_variance)
+        return cls(*(np.ascontiguousarray(column) for column in columns))
+
+
 def _match(
-    clouds: Clouds, raster: NearestRaster, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float
+    clouds: Clouds, surface: _Surface, raster: CloudRasters, i: Ints, T_i_j: Floats, row: NDArray[np.int32],
+    gate: float, scale: float,
 ) -> PairFactors:
-    pairs, pair = len(i), points.pair
-    c, s = (v[pair] for v in se2.cos_sin(T_i_j[:, 2]))
-    px, py = points.points
+    """Match pairs (e,) whose source points stand in a table (e, n): per-pair values are columns (e, 1)."""
+    c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
+    px, py = surface.x.take(row), surface.y.take(row)
     rx, ry = c * px - s * py, s * px + c * py
-    x, y = rx + T_i_j[:, 0][pair], ry + T_i_j[:, 1][pair]
-    cx = ((x - raster.origin[i, 0][pair]) * (1.0 / raster.cell)).astype(np.int64)
-    cy = ((y - raster.origin[i, 1][pair]) * (1.0 / raster.cell)).astype(np.int64)
-    wide, high = raster.shape[i, 0][pair], raster.shape[i, 1][pair]
-    # A raster's outer rim of one cell names no point, so that truncation of small negative numbers does no harm.
-    inside = np.flatnonzero((cx >= 0) & (cy >= 0) & (cx < wide) & (cy < high))
-    found = raster.nearest[raster.start[i][pair[inside]] + cx[inside] * high[inside] + cy[inside]]
-    near = np.flatnonzero(found >= 0)
-    inside, found = inside[near], found[near]
-    nx, ny = clouds.normals[found].T
-    dx, dy = x[inside] - clouds.points[found, 0], y[inside] - clouds.points[found, 1]
-    sx, sy = points.normals[:, inside]
-    ci, si = c[inside], s[inside]
-    facing = nx * (ci * sx - si * sy) + ny * (si * sx + ci * sy)
-    good = np.flatnonzero((dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING))
-    inside, found, nx, ny = inside[good], found[good], nx[good], ny[good]
-    r = nx * dx[good] + ny * dy[good]
-    turn = ny * rx[inside] - nx * ry[inside]
-    w = 1.0 / (1.0 + (r / scale) ** 2) ** 2
-    owner = pair[inside]
-    starts = np.searchsorted(owner, np.arange(pairs + 1))
-    some, begin = np.diff(starts) > 0, np.minimum(starts[:-1], max(len(owner) - 1, 0))
+    x, y = rx + T_i_j[:, :1], ry + T_i_j[:, 1:2]
+    found = _look_up(raster, i, x, y)
+    near = found >= 0
+    target = found + clouds.offsets[i, None]
+    target *= near
+    nx, ny = surface.nx.take(target), surface.ny.take(target)
+    dx, dy = x - surface.x.take(target), y - surface.y.take(target)
+    sx, sy = surface.nx.take(row), surface.ny.take(row)
+    facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
+    good = near & (dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING) & (row >= 0)
+    r = nx * dx + ny * dy
+    root = good / (1.0 + np.square(r * (1.0 / scale)))
+    weighted = np.empty((len(i), 4, row.shape[1]))
+    wx, wy = np.multiply(root, nx, out=weighted[:, 0]), np.multiply(root, ny, out=weighted[:, 1])
+    weighted[:, 2] = wy * rx - wx * ry
+    weighted[:, 3] = root * r
+    summed = weighted @ weighted.transpose(0, 2, 1)
+    weighted[:, 2] = wx * rx + wy * ry
+    # The tangent (-ny, nx) stands where the normal stood; its variance weighs it once more.
+    tangent = np.stack([-wy, wx, weighted[:, 2]], axis=1)
+    scatter = surface.variance.take(target) + surface.variance.take(row)
+    feigned = (tangent * scatter[:, None]) @ tangent.transpose(0, 2, 1)
+    return PairFactors(
+        hessian=summed[:, :3, :3],
+        feigned=feigned,
+        gradient=summed[:, :3, 3],
+        matched=good.sum(axis=1),
+        asked=(row >= 0).sum(axis=1),
+        squared=summed[:, 3, 3],
+        weight=np.einsum("en,en->e", root, root),
+    )
 
-    def total(values: Floats) -> Floats:
-        return np.where(some, np.add.reduceat(values, begin), 0.0) if len(values) else np.zeros(pairs)
 
-    def outer(wx: Floats, wy: Floats, wt: Floats, jx: Floats, jy: Floats, jt: Floats) -> Floats:
-        h = np.empty((pairs, 3, 3))
-        h[:, 0, 0], h[:, 1, 1], h[:, 2, 2] = total(wx * jx), total(wy * jy), total(wt * jt)
-        h[:, 0, 1] = h[:, 1, 0] = total(wx * jy)
-        h[:, 0, 2] = h[:, 2, 0] = total(wx * jt)
-        h[:, 1, 2] = h[:, 2, 1] = total(wy * jt)
-        return h
-
-    wx, wy, wt = w * nx, w * ny, w * turn
-    hessian = outer(wx, wy, wt, nx, ny, turn)
-    v = w * (clouds.normal_variance[found] + clouds.normal_variance[points.row[inside]])
-    along = nx * rx[inside] + ny * ry[inside]
-    feigned = outer(-v * ny, v * nx, v * along, -ny, nx, along)
-    gradient = np.stack([total(wx * r), total(wy * r), total(wt * r)], axis=1)
-    asked = np.bincount(pair, minlength=pairs).astype(np.int64)
-    matched = np.diff(starts)
-    return PairFactors(hessian, feigned, gradient, matched, asked, total(w * r * r), total(w))
+def _look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> Ints:
+    """Return the number (e, n) of the point of cloud i (e,) nearest to each x, y (e, n), m; -1 where none is near."""
+    per_cell = 1.0 / raster.cell
+    # Truncation takes what lies up to a cell below the raster into its rim, which names no point.
+    cx = ((x - raster.origin[i, :1]) * per_cell).astype(np.int32)
+    cy = ((y - raster.origin[i, 1:]) * per_cell).astype(np.int32)
+    wide, high = raster.shape[i, :1].astype(np.uint32), raster.shape[i, 1:].astype(np.uint32)
+    inside = (cx.view(np.uint32) < wide) & (cy.view(np.uint32) < high)
+    cell = cx * raster.shape[i, 1:] + cy
+    cell += raster.start[i, None]
+    cell *= inside
+    if not len(raster.nearest):
+        return np.full(x.shape, _NOBODY, dtype=np.int64)
+    return np.where(inside, raster.nearest.take(cell), _NOBODY).astype(np.int64)
 
 
 _TRUSTED = 2.0

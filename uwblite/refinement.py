@@ -16,7 +16,7 @@ from . import se2
 from .calibration import scan_indices
 from .clouds import Clouds, in_map
 from .graph import Graph, ScanEdges
-from .pair_matching import NearestRaster, PairFactors, match, measured, pair_points
+from .pair_matching import CloudRasters, PairFactors, match, measured, pair_points
 from .robust import Kernel
 from .solver import SolverConfig, SolverSummary, optimize
 
@@ -138,7 +138,7 @@ def choose_pairs(
 def refine(
     graph: Graph,
     clouds: Clouds,
-    raster: NearestRaster,
+    raster: CloudRasters,
     twist: Floats,
     i: Ints,
     j: Ints,

@@ -14,7 +14,7 @@ from .clouds import Clouds
 from .graph import Graph, OdometryEdges, RelativePoseEdges
 from .loop_closure import align_pairs
 from .measurement import learn_wheels
-from .pair_matching import NearestRaster, match, measured, pair_points
+from .pair_matching import CloudRasters, match, measured, pair_points
 from .point_cloud import make_cloud
 from .scan_search import SearchConfig, search
 
@@ -65,7 +65,7 @@ class Followed:
 
 
 def follow(
-    clouds: Clouds, raster: NearestRaster, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig,
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig,
     search_config: SearchConfig,
 ) -> Followed:
     """Measure every step between neighbouring keyframes by their clouds, searching where the guess may have been bad.
@@ -105,7 +105,7 @@ def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
 
 
 def _edges(
-    clouds: Clouds, raster: NearestRaster, i: Ints, step: Floats, gate: float, config: TrackingConfig
+    clouds: Clouds, raster: CloudRasters, i: Ints, step: Floats, gate: float, config: TrackingConfig
 ) -> RelativePoseEdges:
     """Return the steps (e, 3) from keyframes i to i + 1 as edges with the information of their matches."""
     factors = match(clouds, raster, i, step, pair_points(clouds, i + 1, config.points), gate, gate / 2.0)
@@ -114,7 +114,7 @@ def _edges(
 
 
 def _search_step(
-    clouds: Clouds, raster: NearestRaster, i: int, guess: Floats, gate: float, config: TrackingConfig,
+    clouds: Clouds, raster: CloudRasters, i: int, guess: Floats, gate: float, config: TrackingConfig,
     search_config: SearchConfig,
 ) -> tuple[Floats, float] | None:
     """Return the best pose of cloud i + 1 in cloud i and the share of points that match there."""
