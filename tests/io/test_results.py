@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,9 +16,9 @@ import pytest
 from results import EVIL, small_log, small_result
 
 from uwblite.errors import ConfigError
-from uwblite.io import results
+from uwblite.io import folders, results
 from uwblite.io.result_text import RunRecord, anchors_csv, covariance_csv
-from uwblite.io.results import check_target, write_result
+from uwblite.io.results import check_target, is_of_result, mend_result, write_result
 from uwblite.io.tum import read_tum
 
 RECORD = RunRecord("uwblite map run.log --out map_again", "use_uwb = true\n", {"uwblite": "0.1.0"})
@@ -169,6 +170,124 @@ def test_a_killed_writer_leaves_the_previous_result(tmp_path, what, fresh):
     assert visible == before
     write_result(folder, [small_log()], small_result(), RECORD)
     assert set(contents(folder)) == FILES
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+@pytest.mark.parametrize("foreign", [True, False])
+def test_a_kill_at_any_step_leaves_one_result_whole(tmp_path, monkeypatch, foreign):
+    """Before every step by which names change, the writer is killed; the next reader finds the old result or the new one."""
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+    write_result(tmp_path / "new", [small_log()], small_result(evil="x"), RECORD)
+    new = contents(tmp_path / "new")
+    seen = set()
+    for step in range(60):
+        folder = tmp_path / "map"
+        shutil.rmtree(folder, ignore_errors=True)
+        write_result(folder, [small_log()], small_result(lidar=False), RECORD)
+        old = contents(folder)
+        if foreign:
+            (folder / "mine").mkdir()
+            (folder / "mine" / "notes.txt").write_text("mine")
+        ended = killed_at(step, folder)
+        mend_result(folder)
+        found = {name: data for name, data in files_of(folder).items() if is_of_result(name)}
+        assert found in (old, new), step
+        assert not foreign or (folder / "mine" / "notes.txt").read_text() == "mine"
+        seen.add("new" if found == new else "old")
+        if ended == 0:
+            break
+        assert ended == -signal.SIGKILL
+    assert ended == 0
+    assert step > (12 if foreign else 1)
+    assert seen == {"old", "new"}
+
+
+def killed_at(step, folder):
+    """Write in a process of its own, killed before the given step; return how it ended."""
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    left = [step]
+
+    def counted(plain):
+        def call(*args, **options):
+            if left[0] == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+            left[0] -= 1
+            return plain(*args, **options)
+
+        return call
+
+    def complete(path, plain=folders.sync_folder):
+        if left[0] == step:
+            os.replace, os.unlink, shutil.rmtree = counted(os.replace), counted(os.unlink), counted(shutil.rmtree)
+            Path.unlink, folders._exchange = counted(Path.unlink), counted(folders._exchange)
+        plain(path)
+
+    folders.sync_folder = complete
+    write_result(folder, [small_log()], small_result(evil="x"), RECORD)
+    os._exit(0)
+
+
+def files_of(folder):
+    return {p.name: p.read_bytes() for p in Path(folder).iterdir() if p.is_file()}
+
+
+def test_a_result_in_use_by_others_keeps_its_folder(tmp_path, monkeypatch):
+    folder = tmp_path / "map"
+    write_result(folder, [small_log()], small_result(lidar=False), RECORD)
+    folder.chmod(0o750)
+    (tmp_path / "link").symlink_to(folder)
+    write_result(tmp_path / "link", [small_log()], small_result(), RECORD)
+    assert (tmp_path / "link").is_symlink()
+    assert set(contents(folder)) == FILES
+    assert folder.stat().st_mode & 0o777 == 0o750
+    (folder / "notes.txt").write_text("mine")
+    inode = folder.stat().st_ino
+    write_result(folder, [small_log()], small_result(lidar=False), RECORD)
+    assert folder.stat().st_ino == inode
+    (folder / "notes.txt").unlink()
+    monkeypatch.chdir(folder)
+    write_result(".", [small_log()], small_result(), RECORD)
+    assert (Path.cwd().stat().st_ino, set(contents("."))) == (inode, FILES)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "map"]
+
+
+def test_a_system_that_cannot_exchange_folders_renames_files(tmp_path, monkeypatch):
+    folder = tmp_path / "map"
+    write_result(folder, [small_log()], small_result(), RECORD)
+    monkeypatch.setattr(folders, "_exchange", lambda one, other: False)
+    write_result(folder, [small_log()], small_result(lidar=False, evil="x"), RECORD)
+    assert set(contents(folder)) == FILES - {"map.pgm", "map.yaml"}
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+FILE_LIMIT = """
+import resource, signal, sys
+sys.path.insert(0, {tests!r})
+from results import small_log, small_result
+from uwblite.io import results
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
+try:
+    results.write_result(sys.argv[1], [small_log()], small_result(evil="x"), results.RunRecord("c", "k"))
+except OSError:
+    sys.exit(7)
+"""
+
+
+@pytest.mark.parametrize("limit", [0, 100, 3000, 9000])
+@pytest.mark.parametrize("foreign", [True, False])
+def test_running_out_of_space_leaves_the_previous_result(tmp_path, limit, foreign):
+    folder = tmp_path / "map"
+    write_result(folder, [small_log()], small_result(), RECORD)
+    if foreign:
+        (folder / "notes.txt").write_text("mine")
+    before = contents(folder)
+    code = FILE_LIMIT.format(tests=str(Path(__file__).parent.parent))
+    done = subprocess.run([sys.executable, "-c", code, str(folder), str(limit)], check=False, env=dict(os.environ))
+    assert done.returncode == 7
+    assert contents(folder) == before
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 

@@ -70,9 +70,11 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     from .. import se2
     from ..evaluate import evaluate_trajectory
     from ..evaluate_map import find_columns, landmark_errors, landmark_errors_along
+    from ..io.results import mend_result
     from ..io.tum import read_tum
 
     folder = Path(args.dir)
+    mend_result(folder)
     stamps, poses = in_order(*read_tum(folder / "trajectory.tum"))
     true_stamps, true_poses = in_order(*read_tum(args.truth))
     trajectory = evaluate_trajectory(stamps, poses, true_stamps, true_poses, max_gap=args.max_gap, rpe_delta=args.delta)

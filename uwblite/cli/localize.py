@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from ..io.map_server import read_map
     from ..io.png import write_png
     from ..io.result_text import covariance_csv, json_lines
+    from ..io.results import mend_result
     from ..io.tum import write_tum
     from ..localize import localize
     from . import console
@@ -54,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     files = _files(args)
     refuse_existing(args.force, *files.values())
     config = effective_config(args)
+    mend_result(args.map)
     yaml = os.path.join(args.map, "map.yaml")
     grid = read_map(yaml) if os.path.exists(yaml) else None
     anchors = read_anchors(os.path.join(args.map, "anchors.csv"), least=1 if grid is None else 0)

@@ -41,7 +41,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with suppress(OSError):
             os.unlink(temporary)
         raise
-    _sync_folder(folder)
+    sync_folder(folder)
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
@@ -55,7 +55,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def _sync_folder(folder: str) -> None:
+def sync_folder(folder: str | os.PathLike[str]) -> None:
     """Force the new name to the disk, where the file system allows it."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)

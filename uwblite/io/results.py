@@ -12,17 +12,15 @@
 | report.html | everything on one page |
 | report.json | the same for programs; hashes of the other files |
 
-Every file is complete on the disk before the first takes its place, so that a full disk or a crash leaves the previous
-result whole; report.json comes last and holds the hash of each, so that a mixture can be told.
+A result is replaced as a whole, see folders.py: a full disk or a crash leaves the previous one. report.json holds the
+hash of every other file.
 """
 
 import hashlib
 import os
 import re
-import secrets
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +32,7 @@ from ..map_result import MapResult
 from ..report import render
 from ..sensor_log import SensorLog
 from .files import write_text
+from .folders import mend, replacing_folder
 from .g2o import write_g2o
 from .map_server import trinary_image, write_map
 from .png import encode_png, write_png
@@ -45,7 +44,17 @@ _CONTRACT = re.compile(
     r"trajectory(_\d+)?\.tum|trajectory_covariance\.csv|anchors\.csv|map\.(pgm|yaml|png)|map_scale\.(png|yaml)"
     r"|graph\.(g2o|pyfg)|graph_stamps\.csv|config\.toml|report\.(html|json)"
 )
-_WAITING = ".uwblite-partial-"
+
+
+def is_of_result(name: str) -> bool:
+    """Tell whether a file's name is one of those that a result may hold."""
+    return _CONTRACT.fullmatch(name) is not None
+
+
+def mend_result(folder: str | os.PathLike[str]) -> None:
+    """Finish a replacement of a result that a crash has interrupted, where there is one and it may be finished."""
+    with suppress(OSError):
+        mend(folder, is_of_result)
 
 
 def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
@@ -59,7 +68,7 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{path} is not a folder; choose another --out")
-    held = sorted(p.name for p in path.iterdir() if _CONTRACT.fullmatch(p.name)) if path.is_dir() else []
+    held = sorted(p.name for p in path.iterdir() if is_of_result(p.name)) if path.is_dir() else []
     if held and not force:
         raise ConfigError(f"{path} already holds a result ({held[0]}, ...); use --force to replace it, or another --out")
     nearest = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
@@ -84,7 +93,7 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
     ------
     OSError : the disk is full or cannot be written; an earlier result is untouched.
     """
-    with _replacing(Path(folder)) as waiting:
+    with replacing_folder(folder, is_of_result) as waiting:
         _write_trajectories(waiting, result)
         write_text(waiting / "trajectory_covariance.csv", covariance_csv(result))
         write_text(waiting / "anchors.csv", anchors_csv(result))
@@ -115,38 +124,6 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
 def _order(name: str) -> tuple[int, str]:
     first = ("map.png", "report.html", "map.yaml", "map.pgm", "trajectory.tum", "anchors.csv", "report.json")
     return (first.index(name) if name in first else len(first), name)
-
-
-@contextmanager
-def _replacing(folder: Path) -> Iterator[Path]:
-    """Give a folder to write into; when the block ends well its files take their places.
-
-    A new folder appears whole, by one rename. Into an existing one the finished files are renamed one by one, which
-    needs no space and no time; files of an earlier result that have no successor go.
-    """
-    if not folder.is_dir():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = not folder.is_dir()
-    home = folder.absolute().parent if fresh else folder
-    for left in home.glob(f"{_WAITING}*" if not fresh else f".{folder.name}{_WAITING}*"):
-        shutil.rmtree(left, ignore_errors=True)
-    waiting = home / f"{f'.{folder.name}' if fresh else ''}{_WAITING}{secrets.token_hex(4)}"
-    waiting.mkdir()
-    try:
-        yield waiting
-        if fresh:
-            with suppress(OSError):
-                folder.rmdir()
-            os.replace(waiting, folder)
-            return
-        names = {p.name for p in waiting.iterdir()}
-        for name in sorted(names, key=lambda n: (n == "report.json", n)):
-            os.replace(waiting / name, folder / name)
-        for old in folder.iterdir():
-            if _CONTRACT.fullmatch(old.name) and old.name not in names:
-                old.unlink()
-    finally:
-        shutil.rmtree(waiting, ignore_errors=True)
 
 
 def _title(logs: Sequence[SensorLog]) -> str:

@@ -1,0 +1,124 @@
+"""Replacing a folder of files as a whole, as far as the system allows.
+
+A reader that looks at any time, and whoever looks after a crash, shall find all of the old files or all of the new ones.
+A new folder appears by one rename. One that holds nothing but an earlier result changes places with its successor in
+one step, where the system can do that (Linux' renameat2). In a folder that others use too, which therefore has to stay,
+the finished files are first named as such and then renamed one by one: what a crash leaves undone is done by `mend`.
+"""
+
+import ctypes
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from .files import sync_folder, write_text
+
+_WAITING = ".uwblite-partial-"
+_READY = ".uwblite-ready"
+_LIST = "files"
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+Owned = Callable[[str], bool]
+"""Tells by its name whether a file belongs to a result."""
+
+
+@contextmanager
+def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Path]:
+    """Give an empty folder to write into; when the block ends well, its files replace those of a folder.
+
+    Parameters
+    ----------
+    path : the folder, made with its parents where it is missing.
+    owned : which files of an earlier result go; all others stay.
+
+    Raises
+    ------
+    OSError : the disk is full or may not be written; the folder is as it was.
+    """
+    folder = Path(os.path.realpath(path))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    mend(folder, owned)
+    beside = not folder.exists() or _may_change_places(folder, owned)
+    home, prefix = (folder.parent, f".{folder.name}{_WAITING}") if beside else (folder, _WAITING)
+    _clear(home, prefix)
+    waiting = home / f"{prefix}{secrets.token_hex(4)}"
+    waiting.mkdir()
+    try:
+        yield waiting
+        sync_folder(waiting)
+        if not (beside and _in_one_step(waiting, folder, owned)):
+            write_text(waiting / _LIST, "\n".join(sorted(p.name for p in waiting.iterdir())))
+            folder.mkdir(exist_ok=True)
+            os.replace(waiting, folder / _READY)
+            sync_folder(folder)
+            mend(folder, owned)
+    finally:
+        shutil.rmtree(waiting, ignore_errors=True)
+
+
+def mend(path: str | os.PathLike[str], owned: Owned) -> bool:
+    """Finish a replacement that was interrupted after all of its files were complete; return whether there was one."""
+    folder = Path(os.path.realpath(path))
+    ready = folder / _READY
+    if ready.is_symlink() or not (ready / _LIST).is_file():
+        return False
+    names = [n for n in (ready / _LIST).read_text().split("\n") if owned(n)]
+    for name in names:
+        with suppress(FileNotFoundError):
+            os.replace(ready / name, folder / name)
+    for old in list(folder.iterdir()):
+        if owned(old.name) and old.name not in names:
+            old.unlink()
+    sync_folder(folder)
+    (ready / _LIST).unlink()
+    shutil.rmtree(ready, ignore_errors=True)
+    return True
+
+
+def _clear(home: Path, prefix: str) -> None:
+    """Remove what killed writers left."""
+    for left in list(home.iterdir()):
+        if left.name.startswith(prefix):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _may_change_places(folder: Path, owned: Owned) -> bool:
+    """Tell whether a folder holds nothing but a result and nobody is known to stand in it."""
+    others = [p.name for p in folder.iterdir() if not (owned(p.name) and p.is_file() and not p.is_symlink())]
+    if [name for name in others if not name.startswith(_WAITING)] or os.path.ismount(folder):
+        return False
+    with suppress(OSError):
+        if Path.cwd().is_relative_to(folder):
+            return False
+    return os.access(folder.parent, os.W_OK | os.X_OK)
+
+
+def _in_one_step(waiting: Path, folder: Path, owned: Owned) -> bool:
+    """Put a finished folder in the place of another by one rename; False where the system cannot."""
+    if not folder.exists() or not any(folder.iterdir()):
+        if folder.exists():
+            shutil.copymode(folder, waiting)
+        os.replace(waiting, folder)
+        sync_folder(folder.parent)
+        return True
+    with suppress(OSError):
+        shutil.copymode(folder, waiting)
+    if not _exchange(waiting, folder):
+        return False
+    sync_folder(folder.parent)
+    for late in list(waiting.iterdir()):
+        if not owned(late.name) and not late.name.startswith(_WAITING):
+            os.replace(late, folder / late.name)
+    return True
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two names change places in one step; False where the system or the file system cannot."""
+    call = getattr(ctypes.CDLL(None), "renameat2", None) if os.name == "posix" else None
+    if call is None:
+        return False
+    names = (ctypes.c_char_p(os.fsencode(name)) for name in (one, other))
+    first, second = names
+    return bool(call(_AT_FDCWD, first, _AT_FDCWD, second, ctypes.c_uint(_RENAME_EXCHANGE)) == 0)
