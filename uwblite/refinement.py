@@ -16,12 +16,14 @@ from . import se2
 from .calibration import scan_indices
 from .clouds import Clouds, in_map
 from .graph import Graph, ScanEdges
+from .linear import NormalEquations
 from .pair_matching import CloudRasters, PairFactors, match, measured, pair_points
 from .robust import Kernel
-from .solver import SolverConfig, SolverSummary, optimize
+from .solver import SolverConfig, SolverSummary, check, linearize, minimise
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,8 +166,10 @@ def refine(
     names = scan_indices(graph.calibration)
     gate, sigma, moved, rounds = config.first_gate, config.sigma, np.inf, 0
     empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names)
+    probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j], kernel=Kernel("cauchy", 5.0))
+    normal: NormalEquations | None = None
+    brief = replace(solver, max_iterations=3, relative_decrease=1e-3)
     while True:
-        probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j])
         T_i_j = probe.relative(graph)
         factors = match(clouds, raster, i, T_i_j, points, gate, max(gate / 3.0, 2.5 * sigma))
         used = (factors.matched >= config.min_matches) & (factors.matched >= config.min_share * factors.asked)
@@ -173,15 +177,16 @@ def refine(
             sigma = float(np.sqrt(factors.squared[used].sum() / max(factors.weight[used].sum(), 1.0)))
             sigma = max(sigma, 0.25 * config.sigma)
         degree = np.bincount(i[used], minlength=len(clouds)) + np.bincount(j[used], minlength=len(clouds))
-        shared = 0.5 * (degree[i[used]] + degree[j[used]])
+        shared = 0.5 * (degree[i] + degree[j])
         variance = sigma**2 * config.correlation * np.maximum(shared / 2.0, 1.0)
-        part = PairFactors(*(getattr(factors, f)[used] for f in PairFactors.__slots__))
-        z, sqrt_information = measured(part, T_i_j[used], variance)
-        edges = replace(
-            probe, i=i[used], j=j[used], T_i_j=z, sqrt_information=sqrt_information,
-            twist_i=twist[i[used]], twist_j=twist[j[used]], kernel=Kernel("cauchy", 5.0),
-        )
-        solved, summary = optimize(graph.with_edges(edges), replace(solver, max_iterations=3, relative_decrease=1e-3))
+        z, sqrt_information = measured(factors, T_i_j, variance)
+        # Pairs that do not count stay in with no weight: then all rounds share one pattern, analysed once.
+        edges = replace(probe, T_i_j=z, sqrt_information=sqrt_information, weights=used.astype(np.float64))
+        problem = graph.with_edges(edges)
+        check(problem)
+        linearized = linearize(problem)
+        normal = normal or NormalEquations(problem, linearized)
+        solved, summary = minimise(problem, linearized, normal, brief)
         moved = float(np.sqrt(np.mean(np.sum((solved.poses - graph.poses)[:, :2] ** 2, axis=1))))
         graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
         rounds += 1
@@ -189,5 +194,13 @@ def refine(
             on_round(rounds, config.rounds)
         last = gate <= config.last_gate * 1.001
         if rounds >= config.rounds or (last and moved < config.settled):
-            return Refined(graph, edges, i, j, factors, used, sigma, rounds, moved, summary)
+            return Refined(graph, _only(edges, used), i, j, factors, used, sigma, rounds, moved, summary)
         gate = max(gate * config.shrink, config.last_gate)
+
+
+def _only(edges: ScanEdges, used: Bools) -> ScanEdges:
+    """Return the edges that counted."""
+    return replace(
+        edges, i=edges.i[used], j=edges.j[used], T_i_j=edges.T_i_j[used], sqrt_information=edges.sqrt_information[used],
+        twist_i=edges.twist_i[used], twist_j=edges.twist_j[used], weights=None,
+    )
