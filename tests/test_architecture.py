@@ -24,9 +24,9 @@ FLOORS = (
     ("evaluate", "occupancy_grid", "keyframes", "range_noise", "range_mixture", "anchors", "scan_search", "free_space"),
     ("factorization", "layouts", "selected_inverse"),
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts"),
-    ("distance_edges", "constraints", "drivers/*"),
+    ("distance_edges", "constraints", "turning", "drivers/*"),
     # stages
-    ("solver", "marginals", "gnc", "icp", "pair_matching", "submaps"),
+    ("solver", "marginals", "evidence", "gnc", "icp", "pair_matching", "submaps"),
     ("first_estimate", "growing", "sessions", "joining", "moved_anchors", "refinement", "tracking", "loop_closure"),
     ("evaluate_map",),
     # files in, files out: types and text, no stages

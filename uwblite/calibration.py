@@ -15,29 +15,33 @@ Ints = NDArray[np.int64]
 class CalibrationConfig:
     """Prior standard deviation of each unknown; 0 switches it off (held at its nominal value)."""
 
-    odometry_scale: float = 0.01
+    odometry_scale: float = 0.025
     """Relative error of travelled distance (wheel radius), 1."""
-    heading_scale: float = 0.1
+    heading_scale: float = 0.3
     """Relative error of turned angle (track width), 1."""
-    heading_per_metre: float = 0.02
+    heading_per_metre: float = 0.05
     """Heading drift per travelled metre (unequal wheels), rad/m."""
     heading_rate: float = 0.0005
     """Heading drift per second while the robot moves (gyro bias), rad/s."""
-    range_scale: float = 0.05
-    """Relative error of all ranges (clock of the radios), 1."""
-    range_bias: float = 0.6
-    """Constant error of one anchor's ranges, m."""
+    range_scale: float = 0.3
+    """Relative error of all ranges where the radios' idea of distance is off, 1."""
+    range_scale_sound: float = 0.005
+    """The same for radios that are sound, as most are: they measure times of flight. The data choose, see evidence."""
+    range_bias: float = 0.8
+    """Constant error of one anchor's ranges where nobody calibrated the radios' antennas, m."""
+    range_bias_sound: float = 0.1
+    """The same where the maker did, m. The data choose between these and what lies between."""
     anchor_height: float = 1.5
     """Height of anchors above the tag where nobody told, m."""
     tag_offset: float = 0.03
     """Error of the tag's position on the base in x and y, m."""
     range_delay: float = 0.1
     """Clock offset of the radio against the odometry, s."""
-    laser_offset: float = 0.03
+    laser_offset: float = 0.1
     """Error of the laser's position on the base in x and y, m."""
-    laser_angle: float = 0.02
+    laser_angle: float = 0.05
     """Error of the laser's heading on the base, rad."""
-    laser_delay: float = 0.03
+    laser_delay: float = 0.1
     """Clock offset of the laser against the odometry, s."""
 
 

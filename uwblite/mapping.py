@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from . import (
     calibration,
     clouds,
+    evidence,
     first_estimate,
     joining,
     keyframes,
@@ -31,6 +32,7 @@ from . import (
     submaps,
     summary,
     tracking,
+    turning,
 )
 from .anchors import AnchorConfig
 from .calibration import CalibrationConfig
@@ -76,6 +78,8 @@ class MappingConfig:
     """Use the scans."""
     use_loops: bool = True
     """Search loop closures and match clouds of different times."""
+    turn_laser: bool = True
+    """Take the laser as mounted the other way up than told where its turns agree with the wheels' only so."""
     align: Literal["odometry", "first-pose", "walls", "anchors"] = "odometry"
     """Where the map's axes lie: where the odometry began; at the first pose; there, turned so that most walls run along x
     and y; or at the first placed anchor, x towards the last."""
@@ -153,6 +157,7 @@ def build_map(
     stages = Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
     logs = [log.without(uwb=not config.use_uwb, lidar=not config.use_lidar) for log in logs]
+    logs = [_upright(log, config, stages) for log in logs]
 
     drives = sessions.gather(logs, config.keyframes)
     travelled = sum(float(s.frames.path.sum()) for s in drives.sessions)
@@ -178,8 +183,11 @@ def build_map(
             held = part.edges if tracked is None else (*part.edges, tracked.edges)
             close = _close_loops if config.loops.method == "search" else _close_loops_plainly
             part, closures = close(part, held, scans, drives, config, stages)
+            if part.radio is not None:
+                widened = evidence.choose_widths(part.graph, (*held, closures.edges), config.calibration)
+                part = replace(part, graph=widened)
             part, refined = _refine_jointly(part, scans, drives, config, stages)
-            apart = moved_anchors.apart(part, drives, config.solver)
+            apart = moved_anchors.apart(part, drives, config.solver, config.ranges)
             if apart.warnings:
                 stages.warnings += apart.warnings
                 part, refined = _refine_jointly(apart.part, scans, drives, config, stages)
@@ -191,6 +199,23 @@ def build_map(
     result = summary.summarise(drives, part, uncertainty, closures, grid, config.calibration, stages.done, stages.warnings)
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
+
+
+def _upright(log: SensorLog, config: MappingConfig, stages: Stages) -> SensorLog:
+    """Return the recording with the laser the way up that its turns show."""
+    seen = turning.compare(log, _TURNS) if config.turn_laser and log.scans is not None else None
+    if seen is None or not (seen.agree and seen.turned_over):
+        return log
+    flipped = not log.mounting.laser_flipped
+    stages.warnings.append(
+        f"the laser is mounted {'upside down' if flipped else 'upright'}, not as told: so its turns agree "
+        f"{seen.told / max(seen.other, 1e-6):.0f} times better with the wheels'; it was taken that way"
+    )
+    return replace(log, mounting=replace(log.mounting, laser_flipped=flipped))
+
+
+_TURNS = 300
+"""Scan pairs looked at for the way up of the laser."""
 
 
 def _measurements(session: Session, config: MappingConfig) -> Part:
@@ -261,7 +286,7 @@ def _settled(part: Part, config: MappingConfig, stages: Stages) -> Part:
     for lap in range(3):
         radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
         if lap == 2:
-            graph = _free(graph, *_RADIO)
+            graph = _free(evidence.choose_widths(graph, (part.wheels, radio), config.calibration), *_RADIO)
         solved, result = optimize(graph.with_edges(part.wheels, radio), config.solver)
         graph = _hold_negative_heights(_estimates(graph, solved))
         stages.tell("first optimisation", lap + 1, 3)

@@ -106,3 +106,23 @@ def marginals(graph: Graph) -> Marginals:
     normal = NormalEquations(graph, linearized, subtrees=True)
     normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
     return Marginals(graph, normal)
+
+
+def calibration_covariance(graph: Graph) -> Floats:
+    """Return the covariance (c, c) of the calibration values at the graph's estimates; 0 where they are held.
+
+    Raises
+    ------
+    SolverError : the measurements leave a direction open.
+    """
+    linearized = linearize(graph)
+    normal = NormalEquations(graph, linearized)
+    normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
+    number = normal.unknowns.number["calibration"][:, 0]
+    free = np.flatnonzero(number >= 0)
+    right = np.zeros((normal.unknowns.size, len(free)))
+    right[number[free], np.arange(len(free))] = 1.0
+    columns = normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0)).solve(right)
+    covariance = np.zeros((len(number), len(number)))
+    covariance[np.ix_(free, free)] = columns[number[free]]
+    return covariance

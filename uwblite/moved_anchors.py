@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from . import calibration
 from .graph import Graph, PriorEdges
 from .marginals import marginals
+from .measurement import learn_noise
+from .range_noise import RangeNoiseConfig
 from .robust import Kernel
 from .sessions import Drives, Joined, Part, moved_text, numbered
 from .solver import SolverConfig, optimize
@@ -22,7 +24,7 @@ _MOVED = 20.0
 freedom; 5e-5 by chance, the rest for what the sigmas do not know)."""
 
 
-def apart(part: Part, drives: Drives, solver: SolverConfig) -> Joined:
+def apart(part: Part, drives: Drives, solver: SolverConfig, noise: RangeNoiseConfig) -> Joined:
     """Give anchors that were moved between recordings a place of their own, once the poses are known well.
 
     With the poses held, every recording's ranges say where each anchor stood then; places whose distance their
@@ -31,7 +33,7 @@ def apart(part: Part, drives: Drives, solver: SolverConfig) -> Joined:
     if len(drives) == 1 or part.radio is None or part.first is None:
         return Joined(part, ())
     heard = drives.session[part.radio.pose]
-    place, covariance, pairs = _places_by_recording(part, heard, solver)
+    place, covariance, pairs = _places_by_recording(part, heard, solver, noise)
     ids, anchors, anchor = list(part.anchor_ids), part.graph.anchors.copy(), part.radio.anchor.copy()
     source = list(range(len(ids)))
     warnings: list[str] = []
@@ -66,7 +68,9 @@ def _differ(off: Floats, covariance: Floats) -> bool:
     return bool(np.hypot(*off) > _LEAST_MOVE and off @ np.linalg.solve(covariance, off) > _MOVED)
 
 
-def _places_by_recording(part: Part, heard: Ints, solver: SolverConfig) -> tuple[Floats, Floats, Ints]:
+def _places_by_recording(
+    part: Part, heard: Ints, solver: SolverConfig, noise: RangeNoiseConfig
+) -> tuple[Floats, Floats, Ints]:
     """Return place (p, 2), covariance (p, 2, 2) and (anchor, recording) of each anchor as each recording heard it."""
     radio, graph = part.radio, part.graph
     assert radio is not None
@@ -78,6 +82,11 @@ def _places_by_recording(part: Part, heard: Ints, solver: SolverConfig) -> tuple
     priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration")
     held, fixed = np.ones(len(graph.poses), dtype=bool), graph.fixed_calibration | ~own
     alone = Graph(graph.poses, graph.anchors[pairs[:, 0]], priors, graph.calibration, held, None, fixed)
-    edges = replace(radio.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5))
+    # What the joint map held to be outliers may be an anchor that was moved: first all ranges count alike.
+    alike = np.ones(len(alive))
+    edges = replace(
+        radio.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5), weights=alike
+    )
+    edges, _ = learn_noise(edges, optimize(alone.with_edges(edges), solver)[0], len(pairs), noise)
     solved = optimize(alone.with_edges(edges), solver)[0]
     return solved.anchors, marginals(solved).anchors, pairs

@@ -27,7 +27,9 @@ def effective_config(args: argparse.Namespace) -> "MappingConfig":
     config = preset(args.preset) if args.preset else MappingConfig()
     if args.config:
         config = merge(config, parse_toml(read_text(args.config), args.config))
-    return override(config, args.set)
+    # Who says how the laser hangs is believed.
+    told = ["turn_laser=false"] if getattr(args, "laser_flipped", False) else []
+    return override(config, [*told, *args.set])
 
 
 def read_text(path: str) -> str:
