@@ -7,9 +7,9 @@ from scipy.optimize import least_squares
 
 from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
-from uwblite.graph import Calibration, Graph, PriorEdges, RelativePoseEdges
+from uwblite.graph import Calibration, Graph, OdometryEdges, PriorEdges, RelativePoseEdges
 from uwblite.io.g2o import read_g2o
-from uwblite.linear import NormalEquations, moved
+from uwblite.linear import NormalEquations, moved, moved_along
 from uwblite.robust import Kernel
 from uwblite.solver import SolverConfig, edge_weights, linearize, optimize
 
@@ -321,6 +321,67 @@ def test_poses_move_along_arcs_and_headings_stay_wrapped():
     expected = se2.compose(graph.poses, se2.exp(in_own_frame))
     np.testing.assert_allclose(there.poses, expected, atol=1e-12)
     assert np.all(np.abs(there.poses[:, 2]) <= np.pi)
+
+
+@pytest.mark.parametrize("held", HELD[:4], ids=lambda h: "+".join(h) or "default")
+def test_link_by_link_is_the_same_step_to_first_order(held):
+    graph = mixed(3, **held)
+    normal = filled(graph)
+    step = np.random.default_rng(0).normal(size=normal.unknowns.size)
+    linked = np.array([True, True, False, True, True])
+
+    def apart(scale):
+        one, other = (
+            move(graph, normal.unknowns, scale * step, *more) for move, more in ((moved, ()), (moved_along, (linked,)))
+        )
+        np.testing.assert_array_equal(one.anchors, other.anchors)
+        np.testing.assert_array_equal(one.calibration.values, other.calibration.values)
+        assert (np.abs(other.poses[:, 2]) <= np.pi).all()
+        return np.abs(se2.between(one.poses, other.poses)).max()
+
+    assert apart(1e-3) < 1e-4 * max(apart(0.1), 1e-9) * 1.1 + 1e-12
+
+
+def test_link_by_link_a_turned_chain_keeps_its_shape():
+    graph = mixed(3)
+    normal = filled(graph)
+    whole = np.zeros((6, 3))
+    whole[:, 2] = 1.0
+    whole[:, :2] = np.stack([-graph.poses[:, 1], graph.poses[:, 0]], axis=1) - [-graph.poses[0, 1], graph.poses[0, 0]]
+    step = np.zeros(normal.unknowns.size)
+    number = normal.unknowns.number["poses"]
+    step[number[number >= 0]] = whole[number >= 0]
+    turned = moved_along(graph, normal.unknowns, step, np.ones(5, dtype=bool)).poses
+    shapes = (se2.between(poses[1:-1], poses[2:]) for poses in (turned, graph.poses))
+    np.testing.assert_allclose(*shapes, atol=1e-12)
+
+
+def test_a_long_chain_takes_up_a_wrong_wheel_in_a_few_steps():
+    rng = np.random.default_rng(5)
+    n, wrong = 1500, 0.06
+    step = np.stack([np.full(n - 1, 0.3), np.zeros(n - 1), rng.normal(scale=0.2, size=n - 1)], axis=1)
+    noisy = step + rng.normal(size=step.shape) * [0.01, 0.005, 0.01]
+    noisy[:, 2] -= wrong * 0.3
+    noisy[:, :2] = se2.rotate(-wrong * 0.15, noisy[:, :2])
+    truth, start = (np.zeros((n, 3)) for _ in range(2))
+    for k in range(n - 1):
+        truth[k + 1], start[k + 1] = se2.compose(truth[k], step[k]), se2.compose(start[k], noisy[k])
+    i = np.arange(n - 1)
+    wheels = OdometryEdges(
+        i, i + 1, noisy, np.full(n - 1, 0.3), np.full(n - 1, 0.5), np.tile(np.diag([100.0, 200.0, 100.0]), (n - 1, 1, 1)),
+        np.tile([-1, -1, 0, -1], (n - 1, 1)), Kernel("cauchy", 5.0),
+    )
+    seen = i[i % 97 != 0]
+    matched = step[seen] + rng.normal(scale=0.002, size=(len(seen), 3))
+    lidar = RelativePoseEdges(seen, seen + 1, matched, np.tile(500.0 * np.eye(3), (len(seen), 1, 1)))
+    prior = PriorEdges("calibration", np.array([0]), np.zeros((1, 1)), np.full((1, 1, 1), 10.0))
+    graph = Graph(start, np.zeros((0, 2)), (wheels, lidar, prior), Calibration(("heading_per_metre",), np.zeros(1)))
+    solved, summary = optimize(graph)
+    assert summary.converged
+    assert summary.iterations <= 12
+    assert solved.calibration.values[0] == pytest.approx(wrong, abs=4 * 0.01 / 0.3 / np.sqrt(n))
+    off = se2.between(se2.between(truth[:-1], truth[1:]), se2.between(solved.poses[:-1], solved.poses[1:]))
+    assert np.abs(off[:, 2]).max() < 5 * 0.01
 
 
 def test_the_summary_tells_what_happened():

@@ -49,6 +49,43 @@ def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
     poses = np.empty_like(graph.poses)
     poses[:, :2] = graph.poses[:, :2] + arc[:, :2]
     poses[:, 2] = se2.wrap_angle(graph.poses[:, 2] + shift[:, 2])
+    return _moved_to(graph, unknowns, step, poses)
+
+
+def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: NDArray[np.bool_]) -> Graph:
+    """Return the graph moved by a step, poses link by link: each relative pose changes as the step says to first order,
+    and the chain is put together again from these.
+
+    The same as `moved` to first order. Where a step turns poses by much, what was rigid between neighbours stays rigid
+    here, whatever the turn; what closes a loop stays closed there.
+
+    Parameters
+    ----------
+    linked : (n - 1,) pose k + 1 hangs on pose k.
+    """
+    shift, start = unknowns.spread("poses", step), moved(graph, unknowns, step).poses
+    link = se2.between(graph.poses[:-1], graph.poses[1:])
+    by_first, by_second = se2.between_jacobians(graph.poses[:-1], graph.poses[1:])
+    link = link + np.einsum("eij,ej->ei", by_first, shift[:-1]) + np.einsum("eij,ej->ei", by_second, shift[1:])
+    free = np.zeros(len(start), dtype=bool)
+    free[1:] = linked & np.all(unknowns.number["poses"][1:] >= 0, axis=1)
+    first = np.maximum.accumulate(np.where(free, 0, np.arange(len(free))))
+    poses = start.copy()
+    poses[:, 2] = start[first, 2] + _since(np.append(0.0, link[:, 2]), first)
+    way = np.zeros_like(start[:, :2])
+    way[1:] = se2.rotate(poses[:-1, 2], link[:, :2])
+    poses[:, :2] = start[first, :2] + _since(way, first)
+    poses[:, 2] = se2.wrap_angle(poses[:, 2])
+    return _moved_to(graph, unknowns, step, np.where(free[:, None], poses, start))
+
+
+def _since(values: Floats, first: Ints) -> Floats:
+    """Return sums of the values after row first[k] up to row k."""
+    total = np.cumsum(values, axis=0)
+    return total - total[first]
+
+
+def _moved_to(graph: Graph, unknowns: Unknowns, step: Floats, poses: Floats) -> Graph:
     calibration = graph.calibration.values + unknowns.spread("calibration", step)[:, 0]
     return graph.updated(poses, graph.anchors + unknowns.spread("anchors", step), calibration)
 
