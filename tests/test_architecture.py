@@ -27,10 +27,10 @@ FLOORS = (
     ("distance_edges", "constraints", "turning", "drivers/*"),
     # stages
     ("solver", "marginals", "evidence", "gnc", "icp", "pair_matching", "submaps"),
-    ("first_estimate", "growing", "sessions", "joining", "moved_anchors", "refinement", "tracking", "loop_closure"),
+    ("first_estimate", "growing", "sessions", "thinning", "joining", "moved_anchors", "refinement", "tracking", "loop_closure"),
     ("evaluate_map",),
     # files in, files out: types and text, no stages
-    ("plain_closures",),
+    ("plain_closures", "landmarks"),
     ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
     ("diagnostics", "report_map", "report", "summary"),
     # the walk

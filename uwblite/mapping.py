@@ -20,6 +20,7 @@ from . import (
     first_estimate,
     joining,
     keyframes,
+    landmarks,
     loop_closure,
     map_frame,
     moved_anchors,
@@ -57,6 +58,7 @@ from .sensor_log import SensorLog
 from .sessions import Drives, Part, Session
 from .solver import SolverConfig, SolverSummary, optimize
 from .submaps import SubmapConfig
+from .thinning import thinned
 from .tracking import TrackingConfig
 
 Floats = NDArray[np.float64]
@@ -158,6 +160,7 @@ def build_map(
     logs = [logs] if isinstance(logs, SensorLog) else logs
     logs = [log.without(uwb=not config.use_uwb, lidar=not config.use_lidar) for log in logs]
     logs = [_upright(log, config, stages) for log in logs]
+    logs = [thinned(log, config.keyframes, config.grid) for log in logs]
 
     drives = sessions.gather(logs, config.keyframes)
     travelled = sum(float(s.frames.path.sum()) for s in drives.sessions)
@@ -191,6 +194,8 @@ def build_map(
             if apart.warnings:
                 stages.warnings += apart.warnings
                 part, refined = _refine_jointly(apart.part, scans, drives, config, stages)
+    if known.landmark_distances:
+        part, refined = _measured_distances(part, closures, tracked, refined, known, scans, drives, config, stages)
     part = _final(part, closures, tracked, refined)
     part = _aligned(part, scans, config)
 
@@ -493,14 +498,39 @@ def _final(part: Part, closures: Closures, tracked: Refined | None, refined: Ref
     return replace(part, graph=part.graph.with_edges(*part.edges, *lidar))
 
 
+def _measured_distances(
+    part: Part, closures: Closures, tracked: Refined | None, refined: Refined | None, known: Constraints,
+    scans: _Scans | None, drives: Drives, config: MappingConfig, stages: Stages
+) -> tuple[Part, Refined | None]:
+    """Let true distances between landmarks pull on the map as it is without them."""
+    if scans is None:
+        raise ConfigError("constraints: distances between landmarks need the lidar, which sees them")
+    held = _final(part, closures, tracked, refined)
+    poses = se2.compose(_alignment(held, scans, config), held.graph.poses)
+    tied = landmarks.ties(known, scans.clouds, poses, drives.path)
+    solved = optimize(held.graph.with_edges(tied.edges), config.solver)[0]
+    part = replace(part, graph=_estimates(part.graph.with_edges(tied.edges), solved))
+    if refined is not None:
+        part, refined = _refine_jointly(part, scans, drives, config, stages)
+    figures, warnings = landmarks.outcome(known, tied, part.graph)
+    stages.warnings += warnings
+    stages.end("measured distances", distances=figures)
+    return part, refined
+
+
 def _aligned(part: Part, scans: _Scans | None, config: MappingConfig) -> Part:
     """Put the map's axes where the settings want them."""
+    motion = _alignment(part, scans, config)
+    return replace(part, graph=map_frame.moved(part.graph, motion), first=sessions.moved_hypotheses(part.first, motion))
+
+
+def _alignment(part: Part, scans: _Scans | None, config: MappingConfig) -> Floats:
+    """Return T_new_map (3,), by which the map is turned to where the settings want its axes."""
     graph, normals = part.graph, np.zeros((0, 2))
     placed = np.zeros(len(graph.anchors), dtype=bool) if part.first is None else part.first.placed
     if scans is not None and config.align == "walls":
         normals = se2.rotate(graph.poses[scans.clouds.owner, 2], scans.clouds.normals)
-    motion = map_frame.alignment(config.align, graph, placed, normals)
-    return replace(part, graph=map_frame.moved(graph, motion), first=sessions.moved_hypotheses(part.first, motion))
+    return map_frame.alignment(config.align, graph, placed, normals)
 
 
 def _grid(

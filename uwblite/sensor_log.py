@@ -100,6 +100,8 @@ class LogNotes:
     skipped: dict[str, int] = field(default_factory=dict)
     """Messages that are known and not used, by name."""
     warnings: tuple[str, ...] = ()
+    scans_left_out: int = 0
+    """Scans that were recorded and are not among `scans`, because no map looks at them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

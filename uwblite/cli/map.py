@@ -75,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
     from ..config import to_toml
     from ..io.result_text import RunRecord
     from ..io.results import check_target, write_result
+    from ..thinning import thinned
     from . import console
     from .formats import read_recording
     from .options import apply_mounting
@@ -85,10 +86,11 @@ def run(args: argparse.Namespace) -> int:
     began = time.perf_counter()
     logs = [apply_mounting(read_recording(path), args) for path in args.logs]
     reading = time.perf_counter() - began
-    for log in logs:
-        _tell_reader_warnings(log)
+    _tell_reader_warnings(logs)
     if args.dry_run:
         return max(_dry_run(args, log) for log in logs)
+    # The scans that no map looks at are most of the memory.
+    logs = [thinned(log, config.keyframes, config.grid) for log in logs]
     result = _build(logs, config, constraints, args.jobs)
     record = RunRecord(
         command=repeat_command(args),
@@ -150,15 +152,15 @@ def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Const
             executor.shutdown(cancel_futures=True)
 
 
-def _tell_reader_warnings(log: "SensorLog") -> None:
+def _tell_reader_warnings(logs: list["SensorLog"]) -> None:
     from . import console
 
-    notes = log.notes
-    if notes.broken:
-        number, why = notes.broken_lines[0]
-        console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
-    for warning in notes.warnings:
-        console.note(f"uwblite: {notes.source}: {warning}")
+    for notes in (log.notes for log in logs):
+        if notes.broken:
+            number, why = notes.broken_lines[0]
+            console.note(f"uwblite: {notes.broken} broken lines skipped; the first is line {number}: {why}")
+        for warning in notes.warnings:
+            console.note(f"uwblite: {notes.source}: {warning}")
 
 
 def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:

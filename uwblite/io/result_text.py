@@ -133,7 +133,7 @@ def recording_figures(logs: Sequence[SensorLog], result: MapResult) -> dict[str,
         "travelled": _travelled(result),
         "odometry": sum(len(log.odometry.stamps) for log in logs),
         "ranges": sum(0 if log.ranges is None else len(log.ranges.stamps) for log in logs),
-        "scans": sum(0 if log.scans is None else len(log.scans.stamps) for log in logs),
+        "scans": sum(log.notes.scans_left_out + (0 if log.scans is None else len(log.scans.stamps)) for log in logs),
     }
 
 
