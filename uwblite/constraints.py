@@ -65,6 +65,30 @@ class KnownDistance:
 
 
 @dataclass(frozen=True, slots=True)
+class KnownLandmark:
+    """Something that the lidar sees, by its place in the map as it comes out without distances to it."""
+
+    name: str = ""
+    """Any."""
+    position: tuple[float, float] = (0.0, 0.0)
+    """m, map frame. Of a column, about its centre; of anything else, the very point that was measured from."""
+    radius: float = setting(0.0, minimum=0.0)
+    """Of a round column, m: its centre is then sought nearby. 0 = not a column."""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownLandmarkDistance:
+    """The true distance between two landmarks; of columns, between their centres."""
+
+    landmarks: tuple[str, str] = ("", "")
+    """Their names."""
+    distance: float = setting(0.0, above=0.0)
+    """m."""
+    sigma: float = setting(0.02, above=0.0)
+    """m; of landmarks that are no columns it includes how well their places were read off the map."""
+
+
+@dataclass(frozen=True, slots=True)
 class KnownClosure:
     """Two times at which the robot was at the same place, or places at a known pose to each other."""
 
@@ -99,6 +123,8 @@ class Constraints:
     distances: tuple[KnownDistance, ...] = ()
     closures: tuple[KnownClosure, ...] = ()
     forbidden: tuple[ForbiddenClosure, ...] = ()
+    landmarks: tuple[KnownLandmark, ...] = ()
+    landmark_distances: tuple[KnownLandmarkDistance, ...] = ()
 
     def __add__(self, other: "Constraints") -> "Constraints":
         """Return both together; of one anchor's places the other's counts."""
@@ -109,6 +135,8 @@ class Constraints:
             self.distances + other.distances,
             self.closures + other.closures,
             self.forbidden + other.forbidden,
+            self.landmarks + other.landmarks,
+            self.landmark_distances + other.landmark_distances,
         )
 
     @property

@@ -96,7 +96,7 @@ def _find_column(cells: Floats, place: Floats, radius: float, reach: float, cell
     best = int(np.argmax(np.where(arc >= _LEAST_ARC, score, -np.inf)))
     if arc[best] < _LEAST_ARC or score[best] <= 0.0:
         return np.full(2, np.nan)
-    return _fit_circle(cells, lattice[best], radius, 1.5 * cell)
+    return fit_circle(cells, lattice[best], radius, 1.5 * cell)
 
 
 def _scores(centres: Floats, cells: Floats, radius: float, cell: float) -> tuple[Floats, Floats]:
@@ -113,7 +113,7 @@ def _scores(centres: Floats, cells: Floats, radius: float, cell: float) -> tuple
     return arc - 0.7 * spoilt - 0.5 * offset / cell, arc
 
 
-def _fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Floats:
+def fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Floats:
     """Return the centre (2,) after Gauss-Newton on the distances to the circle with Tukey's weights within the gate."""
     for _ in range(20):
         ray = cells - centre

@@ -7,7 +7,16 @@ from typing import Any
 import numpy as np
 
 from ..config import from_dict, parse_toml
-from ..constraints import Constraints, ForbiddenClosure, KnownAnchor, KnownClosure, KnownDistance, KnownPose
+from ..constraints import (
+    Constraints,
+    ForbiddenClosure,
+    KnownAnchor,
+    KnownClosure,
+    KnownDistance,
+    KnownLandmark,
+    KnownLandmarkDistance,
+    KnownPose,
+)
 from ..errors import ConfigError, FormatError
 from .csv_table import read_csv
 
@@ -15,6 +24,8 @@ _TABLES: Mapping[str, tuple[type, str]] = {
     "anchor": (KnownAnchor, "anchors"),
     "pose": (KnownPose, "poses"),
     "anchor_distance": (KnownDistance, "distances"),
+    "landmark": (KnownLandmark, "landmarks"),
+    "landmark_distance": (KnownLandmarkDistance, "landmark_distances"),
     "closure": (KnownClosure, "closures"),
     "forbidden_closure": (ForbiddenClosure, "forbidden"),
 }
@@ -23,8 +34,8 @@ _TABLES: Mapping[str, tuple[type, str]] = {
 def parse_constraints(text: str, path: str = "") -> Constraints:
     """Return the constraints of a TOML text; path is its name for error messages.
 
-    Tables: ``[[anchor]]``, ``[[pose]]``, ``[[anchor_distance]]``, ``[[closure]]``, ``[[forbidden_closure]]``, each with the
-    fields of its class in constraints.py.
+    Tables: ``[[anchor]]``, ``[[pose]]``, ``[[anchor_distance]]``, ``[[landmark]]``, ``[[landmark_distance]]``,
+    ``[[closure]]``, ``[[forbidden_closure]]``, each with the fields of its class in constraints.py.
 
     Raises
     ------
@@ -58,6 +69,8 @@ _REQUIRED: Mapping[type, tuple[str, ...]] = {
     KnownAnchor: ("id", "position"),
     KnownPose: ("stamp", "pose"),
     KnownDistance: ("anchors", "distance"),
+    KnownLandmark: ("name", "position"),
+    KnownLandmarkDistance: ("landmarks", "distance"),
     KnownClosure: ("stamps",),
     ForbiddenClosure: ("stamps",),
 }
