@@ -25,6 +25,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+_CLOUDS_AT_ONCE = 128
+"""Clouds whose overlaps with all others are held at once; a bound on the memory."""
+
 
 @dataclass(frozen=True, slots=True)
 class RefinementConfig:
@@ -116,25 +119,33 @@ def choose_pairs(
     near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
     joined = (session[near_i] == session[near_j]) & (path[near_j] - path[near_i] < 3.0)
     near_i, near_j = near_i[joined], near_j[joined]
-    seen = surface_cells(clouds, poses)
-    common = (seen @ seen.T).tocoo()
-    size = np.maximum(np.diff(seen.indptr), 1)
-    share = common.data / np.minimum(size[common.row], size[common.col])
-    far = np.abs(path[common.row] - path[common.col]) > config.epoch
-    kept = np.flatnonzero(far & (share > config.min_share) & (common.data >= 4))
-    i, j, share = common.row[kept].astype(np.int64), common.col[kept].astype(np.int64), share[kept]
-    order = np.lexsort((j, -share, (path[j] / config.epoch).astype(np.int64), session[j], i))
-    i, j, share = i[order], j[order], share[order]
-    epoch = (path[j] / config.epoch).astype(np.int64)
-    fresh = np.concatenate([[True], (np.diff(i) != 0) | (np.diff(epoch) != 0) | (np.diff(session[j]) != 0)])[: len(i)]
-    i, j, share = i[fresh], j[fresh], share[fresh]
-    order = np.lexsort((j, -share, i))
-    i, j = i[order], j[order]
-    rank = np.arange(len(i)) - np.searchsorted(i, i)
-    i, j = i[rank < config.partners], j[rank < config.partners]
+    i, j = _best_views(surface_cells(clouds, poses), path, session, config) if config.partners else (near_i[:0], near_j[:0])
     low, high = np.minimum(i, j), np.maximum(i, j)
     pairs = np.unique(np.concatenate([low, near_i]) * k + np.concatenate([high, near_j]))
     return pairs // k, pairs % k
+
+
+def _best_views(seen: sparse.csr_matrix, path: Floats, session: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
+    """Return for every cloud i the clouds j from other times that share most with it, one of each epoch."""
+    size = np.maximum(np.diff(seen.indptr), 1)
+    epoch = (path / config.epoch).astype(np.int64)
+    across, found = seen.T.tocsr(), []
+    for first in range(0, seen.shape[0], _CLOUDS_AT_ONCE):
+        common = (seen[first : first + _CLOUDS_AT_ONCE] @ across).tocoo()
+        i, j = common.row.astype(np.int64) + first, common.col.astype(np.int64)
+        share = common.data / np.minimum(size[i], size[j])
+        kept = np.flatnonzero((np.abs(path[i] - path[j]) > config.epoch) & (share > config.min_share) & (common.data >= 4))
+        i, j, share = i[kept], j[kept], share[kept]
+        order = np.lexsort((j, -share, epoch[j], session[j], i))
+        i, j, share = i[order], j[order], share[order]
+        fresh = np.flatnonzero(np.diff(np.stack([i, epoch[j], session[j]]), axis=1, prepend=-1).any(axis=0))
+        i, j, share = i[fresh], j[fresh], share[fresh]
+        order = np.lexsort((j, -share, i))
+        i, j = i[order], j[order]
+        best = np.arange(len(i)) - np.searchsorted(i, i) < config.partners
+        found.append((i[best], j[best]))
+    i, j = (np.concatenate(part) for part in zip(*found, strict=True))
+    return i, j
 
 
 def refine(
