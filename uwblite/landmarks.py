@@ -83,9 +83,8 @@ def sightings(landmark: KnownLandmark, clouds: Clouds, poses: Floats, path: Floa
 
 def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
     """Return where one cloud has a column (2,): the place of the whole map tells where to look, the cloud is what was seen."""
-    near = points[np.abs(np.hypot(*(points - place).T) - radius) < _NEAR]
-    centre = fit_circle(near, place, radius, _NEAR)
-    centre = fit_circle(near, centre, radius, 0.5 * _NEAR)
+    near = points[np.hypot(*(points - place).T) < radius + _NEAR]
+    centre = fit_circle(near, fit_circle(near, place, radius, 0.2), radius, 0.1)
     return centre if np.hypot(*(centre - place)) < _NEAR else place
 
 
