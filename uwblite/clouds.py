@@ -19,7 +19,7 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
-_BLOCK = 128
+_BLOCK = 32
 """Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
 
 
