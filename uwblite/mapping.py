@@ -64,7 +64,7 @@ from .tracking import TrackingConfig
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-_BLOCK = 128
+_BLOCK = 32
 """Keyframes whose rays are held at once."""
 Progress = Callable[[str, int, int], object]
 """progress(stage, done, total); returning False asks to stop, see errors.Cancelled."""
