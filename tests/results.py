@@ -38,7 +38,8 @@ def small_result(*, evil: str = "", lidar: bool = True, sessions: int = 1, secon
     log_odds = np.where(rng.uniform(size=(80, 100)) < 0.1, 4.0, -4.0).astype(np.float32)
     log_odds[:10] = 0.0
     return MapResult(
-        stamps, poses, np.repeat(np.arange(sessions), 24), stamps, covariances, Graph(poses, anchors, (chain, edges)),
+        stamps, poses, np.repeat(np.arange(sessions), 24),
+        stamps, np.repeat(np.arange(sessions), 24), covariances, Graph(poses, anchors, (chain, edges)),
         (
             AnchorEstimate("5C0B" + evil, anchors[0], np.diag([0.0016, 0.0004]), k, 0.94, 0.46, 0.02, 0.05, "ok"),
             AnchorEstimate(

@@ -139,7 +139,7 @@ def evaluate_trajectory(
 
 
 def _covered(stamps: Floats, queries: Floats, max_gap: float) -> Ints:
-    """Return the indices of queries that lie between stamps at most max_gap apart, or within max_gap of either end."""
+    """Return the indices of queries that lie between stamps at most max_gap apart, or at a stamp."""
     right = np.clip(np.searchsorted(stamps, queries), 1, max(1, len(stamps) - 1))
     if len(stamps) < 2:
         return np.empty(0, dtype=np.int64)
@@ -147,8 +147,8 @@ def _covered(stamps: Floats, queries: Floats, max_gap: float) -> Ints:
     inside = (queries >= before) & (queries <= after) & (after - before <= max_gap)
     # Rounded stamps may stick out by a little; a pose held for longer than that would be invented.
     edge = 1e-3
-    at_end = ((queries < before) & (before - queries <= edge)) | ((queries > after) & (queries - after <= edge))
-    return np.flatnonzero(inside | at_end)
+    at_a_stamp = (np.abs(queries - before) <= edge) | (np.abs(queries - after) <= edge)
+    return np.flatnonzero(inside | at_a_stamp)
 
 
 def _span(stamps: Floats) -> str:

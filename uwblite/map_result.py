@@ -100,6 +100,8 @@ class MapResult:
     """(n,) which recording each stamp belongs to (all 0 for one recording)."""
     keyframe_stamps: Floats
     """(k,) s."""
+    keyframe_session: Ints
+    """(k,) which recording each keyframe belongs to."""
     keyframe_covariances: Floats
     """(k, 3, 3) marginal covariance of each keyframe, map frame (relative to the first pose)."""
     graph: Graph

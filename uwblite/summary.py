@@ -49,6 +49,7 @@ def summarise(
         trajectory=np.concatenate([session.dense_trajectory(graph.poses) for session in drives.sessions]),
         session=np.repeat(np.arange(len(drives)), [len(own) for own in stamps]),
         keyframe_stamps=drives.stamps,
+        keyframe_session=drives.session,
         keyframe_covariances=known.poses,
         graph=graph,
         anchors=anchors,

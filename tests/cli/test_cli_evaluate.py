@@ -10,7 +10,7 @@ from uwblite.cli import main
 from uwblite.evaluate_map import sample_surfaces
 from uwblite.grid_geometry import GridGeometry
 from uwblite.io.map_server import write_map
-from uwblite.io.tum import write_tum
+from uwblite.io.tum import read_tum, write_tum
 from uwblite.occupancy_grid import OccupancyGrid
 
 COLUMNS = np.array([[2.0, 2.0, 0.3], [6.0, 2.0, 0.3], [2.0, 5.0, 0.25]])
@@ -119,3 +119,28 @@ def test_errors_are_one_line(result, capsys):
     assert main([*words, "--anchors", str(root / "anchors.csv")]) == 1
     assert "no column 'id'" in capsys.readouterr().err
     assert main(["evaluate", str(root / "map")]) == 2
+
+
+def test_each_recording_of_a_joint_map_and_all_together(result, capsys):
+    """The second recording lies askew in the common frame: alone it is perfect, together they are not."""
+    root, words = result
+    stamps, truth = read_tum(root / "truth.tum")
+    askew = se2.compose(np.array([0.2, 0.0, 0.0]), se2.compose(T_MAP_TRUTH, truth))
+    write_tum(root / "map" / "trajectory_2.tum", stamps - 95.0, askew)
+    write_tum(root / "truth_2.tum", stamps - 95.0, truth)
+    second = ["--truth", str(root / "truth_2.tum")]
+    assert main([*words, *second, "--json", "--anchors", str(root / "anchors.csv")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["trajectory"]["compared"] == 800
+    assert found["trajectory"]["ate"]["rmse"] == pytest.approx(0.1, abs=1e-4)
+    assert [own["ate"]["rmse"] < 1e-5 for own in found["recordings"]] == [True, True]
+    assert main([*words[:2], *second, "--recording", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["trajectory"]["ate"]["rmse"] < 1e-5
+    assert main([*words, *second]) == 0
+    text = capsys.readouterr().out
+    assert "together" in text
+    assert "recording 2 alone" in text
+    assert main([*words[:2], *second, "--recording", "3"]) == 1
+    assert "has no trajectory_3.tum" in capsys.readouterr().err
+    assert main([*words, *second, "--recording", "2"]) == 1
+    assert "--recording is for a single --truth" in capsys.readouterr().err

@@ -90,8 +90,8 @@ def test_an_unplaced_anchor_has_empty_fields():
 
 def test_covariances_are_the_upper_triangle():
     lines = covariance_csv(small_result()).splitlines()
-    assert lines[0] == "stamp,xx,xy,xtheta,yy,ytheta,thetatheta"
-    assert [float(v) for v in lines[1].split(",")] == pytest.approx([1000.0, 1e-4, 0, 0, 2e-4, 0, 1e-5])
+    assert lines[0] == "stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording"
+    assert [float(v) for v in lines[1].split(",")] == pytest.approx([1000.0, 1e-4, 0, 0, 2e-4, 0, 1e-5, 1])
     assert len(lines) == 25
 
 
@@ -100,6 +100,10 @@ def test_each_recording_has_its_trajectory(tmp_path):
     stamps, _ = read_tum(tmp_path / "map" / "trajectory_2.tum")
     assert len(stamps) == 24
     assert stamps[0] == 1012.0
+    for name in ("graph_stamps.csv", "trajectory_covariance.csv"):
+        with (tmp_path / "map" / name).open() as file:
+            rows = list(csv.DictReader(file))
+        assert [row["recording"] for row in rows] == ["1"] * 24 + ["2"] * 24
 
 
 def test_without_lidar_there_is_no_map_and_an_old_one_goes(tmp_path):

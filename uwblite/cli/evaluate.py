@@ -5,11 +5,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
     from numpy.typing import NDArray
 
     from ..evaluate import AnchorErrors, ErrorStatistics, TrajectoryErrors
     from ..evaluate_map import LandmarkErrors, Landmarks, WallErrors
+
+    Drive = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+    """Stamps (n,) s and poses (n, 3) of a result, and the true ones."""
 
 HELP = "compare a map, its trajectory and anchors with the truth"
 EPILOG = """\
@@ -17,9 +22,12 @@ examples:
   uwblite evaluate map/ --truth truth.tum
   uwblite evaluate map/ --truth truth.tum --anchors truth_anchors.csv --landmarks columns.csv
   uwblite evaluate map/ --truth truth.tum --json
+  uwblite evaluate both/ --truth monday.tum --truth tuesday.tum    a map of two recordings
+  uwblite evaluate both/ --truth tuesday.tum --recording 2         only the second of them
 
 The trajectory is laid over the truth by the best rigid motion, without scale; ATE and RPE are those of evo_ape -a and
-evo_rpe. Columns are searched in the map; the distances between them are what is judged.
+evo_rpe. Several truths, in one frame, are of the recordings in their order: each is judged alone and all together, under
+one motion. Columns are searched in the map; the distances between them are what is judged.
 
 files (lengths in metres):
   --truth      stamp x y z qx qy qz qw        identity quaternions throughout = the heading is not known
@@ -35,7 +43,8 @@ DEFAULT_RADIUS = 0.3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("dir", help="folder that uwblite map wrote: trajectory.tum, anchors.csv, map.yaml")
-    parser.add_argument("--truth", metavar="FILE.tum", required=True, help="true poses")
+    parser.add_argument("--truth", metavar="FILE.tum", required=True, action="append", help="true poses; one per recording")
+    parser.add_argument("--recording", metavar="N", type=_number, help="the recording that a single truth is of (1)")
     parser.add_argument("--anchors", metavar="FILE.csv", help="true anchors")
     parser.add_argument("--landmarks", metavar="FILE.csv", help="true columns")
     parser.add_argument("--walls", metavar="FILE.csv", help="true walls")
@@ -46,11 +55,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
 
 
+def _number(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
+
+
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from ..errors import ConfigError
     from . import console
 
+    if args.recording and len(args.truth) > 1:
+        raise ConfigError("--recording is for a single --truth; several are of recording 1, 2, ...")
     for name in ("delta", "max_gap", "search_radius", "tolerance"):
         if not getattr(args, name) > 0:
             raise ConfigError(f"--{name.replace('_', '-')} must be positive, not {getattr(args, name):g}")
@@ -71,15 +88,19 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     from ..evaluate import evaluate_trajectory
     from ..evaluate_map import find_columns, landmark_errors, landmark_errors_along
     from ..io.results import mend_result
-    from ..io.tum import read_tum
 
     folder = Path(args.dir)
     mend_result(folder)
-    stamps, poses = in_order(*read_tum(folder / "trajectory.tum"))
-    true_stamps, true_poses = in_order(*read_tum(args.truth))
+    drives = [_drive(folder, truth, number) for number, truth in enumerate(args.truth, args.recording or 1)]
+    stamps, poses, true_stamps, true_poses = _one_after_another(drives)
     trajectory = evaluate_trajectory(stamps, poses, true_stamps, true_poses, max_gap=args.max_gap, rpe_delta=args.delta)
     summary: dict[str, Any] = {"trajectory": _trajectory_summary(trajectory, len(true_stamps))}
-    lines = _trajectory_lines(trajectory, len(true_stamps))
+    lines = _trajectory_lines(trajectory, len(true_stamps), "together" if len(drives) > 1 else "trajectory")
+    if len(drives) > 1:
+        alone = [evaluate_trajectory(*drive, max_gap=args.max_gap, rpe_delta=args.delta) for drive in drives]
+        summary["recordings"] = [_trajectory_summary(own, len(drive[2])) for own, drive in zip(alone, drives, strict=True)]
+        for number, (own, drive) in enumerate(zip(alone, drives, strict=True), 1):
+            lines += _trajectory_lines(own, len(drive[2]), f"recording {number} alone")
     if args.anchors:
         anchors = _anchors(folder / "anchors.csv", args.anchors, trajectory.T_truth_map)
         summary["anchors"] = {**_plain(anchors), "errors": dict(zip(anchors.ids, anchors.distances.tolist(), strict=True))}
@@ -109,6 +130,36 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     if occupied is None and (args.landmarks or args.walls):
         lines.append("no map.yaml in the folder: columns and walls are not judged")
     return summary, lines
+
+
+def _drive(folder: Path, truth: str, number: int) -> "Drive":
+    """Return stamps and poses of a recording in a result, and the true ones."""
+    from ..errors import ConfigError
+    from ..io.tum import read_tum
+
+    own = folder / ("trajectory.tum" if number == 1 else f"trajectory_{number}.tum")
+    if number > 1 and folder.is_dir() and not own.exists():
+        raise ConfigError(f"{folder} has no {own.name}: it is a map of fewer recordings")
+    return (*in_order(*read_tum(own)), *in_order(*read_tum(truth)))
+
+
+def _one_after_another(drives: "Sequence[Drive]") -> "Drive":
+    """Return all recordings as one; their stamps are moved apart, for they may be of the same hour or of clocks set anew."""
+    import numpy as np
+
+    if len(drives) == 1:
+        return drives[0]
+    moved: list[Drive] = []
+    free = 0.0
+    for stamps, poses, true_stamps, true_poses in drives:
+        begin = free - min(stamps[0], true_stamps[0])
+        moved.append((stamps + begin, poses, true_stamps + begin, true_poses))
+        free = max(moved[-1][0][-1], moved[-1][2][-1]) + _PAUSE
+    return tuple(np.concatenate(column) for column in zip(*moved, strict=True))  # type: ignore[return-value]
+
+
+_PAUSE = 1e6
+"""s between two recordings that are judged as one: more than any gap that is bridged."""
 
 
 def in_order(stamps: "NDArray[np.float64]", poses: "NDArray[np.float64]") -> "tuple[NDArray[np.float64], NDArray[np.float64]]":
@@ -185,14 +236,14 @@ def _trajectory_summary(t: "TrajectoryErrors", true_count: int) -> dict[str, Any
     }
 
 
-def _trajectory_lines(t: "TrajectoryErrors", true_count: int) -> list[str]:
+def _trajectory_lines(t: "TrajectoryErrors", true_count: int, title: str = "trajectory") -> list[str]:
     import math
 
     def row(name: str, s: "ErrorStatistics", unit: str, scale: float = 1.0) -> str:
         numbers = "".join(f"{scale * v:11.4f}" for v in (s.rmse, s.mean, s.median, s.max))
         return f"{name:<24}{numbers}  {unit}"
 
-    head = f"{'trajectory':<24}{'rmse':>11}{'mean':>11}{'median':>11}{'max':>11}"
+    head = f"{title:<24}{'rmse':>11}{'mean':>11}{'median':>11}{'max':>11}"
     lines = [head, row("  position (ATE)", t.ate, "m")]
     if t.heading is not None:
         lines.append(row("  heading", t.heading, "deg", math.degrees(1.0)))

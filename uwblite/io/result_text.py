@@ -46,12 +46,19 @@ def _decimal(value: float, digits: int = 6) -> str:
 
 
 def covariance_csv(result: MapResult) -> str:
-    """Return stamp and covariance (upper triangle; m^2, m rad, rad^2; map frame) of every keyframe as CSV."""
-    lines = ["stamp,xx,xy,xtheta,yy,ytheta,thetatheta"]
+    """Return stamp and covariance (upper triangle; m^2, m rad, rad^2; map frame) and recording of every keyframe as CSV."""
+    lines = ["stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording"]
     upper = np.triu_indices(3)
-    for stamp, matrix in zip(result.keyframe_stamps.tolist(), result.keyframe_covariances, strict=True):
-        lines.append(f"{stamp:.6f}," + ",".join(f"{v:.6e}" for v in matrix[upper].tolist()))
+    rows = (result.keyframe_stamps.tolist(), result.keyframe_covariances, result.keyframe_session.tolist())
+    for stamp, matrix, session in zip(*rows, strict=True):
+        lines.append(f"{stamp:.6f}," + ",".join(f"{v:.6e}" for v in matrix[upper].tolist()) + f",{session + 1}")
     return "\n".join(lines) + "\n"
+
+
+def stamps_csv(result: MapResult) -> str:
+    """Return number, stamp (s, on the clock of its recording) and recording of every pose of the graph as CSV."""
+    rows = zip(result.keyframe_stamps.tolist(), result.keyframe_session.tolist(), strict=True)
+    return "id,stamp,recording\n" + "".join(f"{k},{stamp:.6f},{session + 1}\n" for k, (stamp, session) in enumerate(rows))
 
 
 def anchors_csv(result: MapResult) -> str:

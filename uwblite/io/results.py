@@ -3,11 +3,11 @@
 | file | what |
 |---|---|
 | trajectory.tum | pose at every odometry stamp, map frame; trajectory_2.tum ... for further recordings |
-| trajectory_covariance.csv | stamp and covariance of every keyframe |
+| trajectory_covariance.csv | stamp, covariance and recording of every keyframe |
 | anchors.csv | anchors with sigmas, biases, shares of ranges used |
 | map.pgm, map.yaml | the map for map_server and nav2 |
 | map.png | picture of the map with path, anchors, closures |
-| graph.g2o, graph.pyfg | the optimised pose graph; graph_stamps.csv has the time of each pose |
+| graph.g2o, graph.pyfg | the optimised pose graph; graph_stamps.csv has the time and the recording of each pose |
 | config.toml | the settings that were in force |
 | report.html | everything on one page |
 | report.json | the same for programs; hashes of the other files |
@@ -37,7 +37,7 @@ from .g2o import write_g2o
 from .map_server import trinary_image, write_map
 from .png import encode_png, write_png
 from .pyfg import write_pyfg
-from .result_text import RunRecord, anchors_csv, covariance_csv, json_lines, recording_figures, summary
+from .result_text import RunRecord, anchors_csv, covariance_csv, json_lines, recording_figures, stamps_csv, summary
 from .tum import write_tum
 
 _CONTRACT = re.compile(
@@ -141,8 +141,7 @@ def _write_graphs(folder: Path, result: MapResult) -> None:
     write_g2o(folder / "graph.g2o", result.graph)
     ids = tuple(a.id for a in result.anchors)
     write_pyfg(folder / "graph.pyfg", result.graph, ids, result.keyframe_stamps)
-    rows = "".join(f"{k},{stamp:.6f}\n" for k, stamp in enumerate(result.keyframe_stamps.tolist()))
-    write_text(folder / "graph_stamps.csv", "id,stamp\n" + rows)
+    write_text(folder / "graph_stamps.csv", stamps_csv(result))
 
 
 def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
