@@ -37,6 +37,7 @@ def small_result(*, evil: str = "", lidar: bool = True, sessions: int = 1, secon
     geometry = GridGeometry(0.1, np.array([-5.0, -4.0]), 80, 100)
     log_odds = np.where(rng.uniform(size=(80, 100)) < 0.1, 4.0, -4.0).astype(np.float32)
     log_odds[:10] = 0.0
+    agrees = (rng.uniform(size=2 * k) > 0.1).astype(np.float64)
     return MapResult(
         stamps, poses, np.repeat(np.arange(sessions), 24),
         stamps, np.repeat(np.arange(sessions), 24), covariances, Graph(poses, anchors, (chain, edges)),
@@ -54,7 +55,7 @@ def small_result(*, evil: str = "", lidar: bool = True, sessions: int = 1, secon
         closures,
         {
             "stamp": stamps[pose], "anchor": anchor.astype(np.float64), "range": distance,
-            "residual": rng.normal(0, 0.05, 2 * k), "weight": (rng.uniform(size=2 * k) > 0.1).astype(np.float64),
+            "residual": rng.normal(0, 0.05, 2 * k), "weight": agrees, "agrees": agrees,
         },
         OccupancyGrid(geometry, log_odds, 24) if lidar else None,
         (StageSummary("first optimisation", seconds, {"chi2": 40.0, "dof": 50, "iterations": 7, "note": "x" + evil}),),

@@ -5,6 +5,7 @@ import shutil
 import struct
 import subprocess
 import zlib
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -71,6 +72,29 @@ def test_everything_that_belongs_in_it_is_there():
     assert 'class="mirror"' in text
 
 
+def test_marked_ranges_are_those_that_disagree():
+    result = small_result()
+    text = page()
+    for index in (0, 1):
+        mine = result.range_table["anchor"] == index
+        share = 100 * np.mean(result.range_table["agrees"][mine] == 0)
+        assert f"{share:.0f} % marked" in text
+    drawn = sum(figure.count("M") for figure in re.findall(r'class="(?:los|nlos)" d="([^"]*)"', text))
+    assert drawn == len(result.range_table["stamp"])
+    joint = page(sessions=2)
+    assert "one recording after another" in joint
+    xs = [float(x) for x in re.findall(r"M([\d.]+) [\d.]+h0", joint)]
+    assert (min(xs), max(xs)) == (0.0, 1000.0)
+
+
+def test_reasons_that_differ_in_figures_only_are_counted_together():
+    result = small_result()
+    more = [replace(result.closures[1], reason=f"only {k}% of its points match (least 40%)") for k in (3, 12, 37)]
+    text = render(replace(result, closures=(*result.closures, *more)), title="a", command="b")
+    assert "only \u2026% of its points match (least \u2026%)</td><td>3</td>" in text
+    assert "only 12% of its points" in text
+
+
 def test_nothing_comes_from_elsewhere():
     for link in Page(page()).links:
         assert link.startswith("data:"), link
@@ -93,22 +117,18 @@ def test_same_result_same_bytes_unless_timings_are_asked_for():
 
 
 def test_works_without_lidar_and_without_radio():
-    import dataclasses
-
-    bare = dataclasses.replace(small_result(lidar=False), anchors=(), range_table={}, closures=(), calibration=(), warnings=())
+    bare = replace(small_result(lidar=False), anchors=(), range_table={}, closures=(), calibration=(), warnings=())
     text = render(bare, title="a", command="b")
     assert "No warnings." in text
     assert "<image" not in text
 
 
 def test_an_unplaced_anchor_is_listed_and_not_drawn():
-    import dataclasses
-
     result = small_result()
-    lost = dataclasses.replace(
+    lost = replace(
         result.anchors[0], id="lost", position=np.full(2, np.nan), covariance=np.full((2, 2), np.nan), status="unplaced"
     )
-    text = render(dataclasses.replace(result, anchors=(*result.anchors, lost)), title="a", command="b")
+    text = render(replace(result, anchors=(*result.anchors, lost)), title="a", command="b")
     assert "unplaced" in text
     assert "nan" not in text
     assert text.count("<ellipse") == 2
@@ -161,14 +181,17 @@ def test_the_script_zooms_and_toggles(tmp_path):
       var box = document.querySelector('[data-layer=rejected]'), layer = document.querySelector('.rejected');
       var hidden = layer.classList.contains('hidden');
       box.click();
-      document.title = [Math.abs(zoomed * 1.5 - whole) < 1e-3, Math.abs(back - whole) < 1e-3,
+      var at = svg.getBoundingClientRect();
+      svg.dispatchEvent(new PointerEvent('pointermove', {clientX: at.x + at.width / 2, clientY: at.y + at.height / 2}));
+      var said = document.getElementById('place').textContent;
+      document.title = [/^x -?[0-9.]+ m, y -?[0-9.]+ m$/.test(said), Math.abs(zoomed * 1.5 - whole) < 1e-3, Math.abs(back - whole) < 1e-3,
         hidden, !layer.classList.contains('hidden')].join();
     </script></body>"""
     file = tmp_path / "report.html"
     file.write_text(page().replace("</body>", probe))
     base = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path / 'profile'}"]
     shown = subprocess.run([*base, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=120, check=False)
-    assert "<title>true,true,true,true</title>" in shown.stdout
+    assert "<title>true,true,true,true,true</title>" in shown.stdout
 
 
 def test_kept_and_rejected_closures_are_told_apart():

@@ -89,7 +89,7 @@ def unknowns(
         own.append(Unknown(f"bias:{anchor_id}", config.range_bias, "m", f"constant error of ranges to anchor {anchor_id}"))
         if not told:
             text = f"squared height of anchor {anchor_id} above the tag"
-            own.append(Unknown(f"height2:{anchor_id}", config.anchor_height**2, "m^2", text))
+            own.append(Unknown(f"height2:{anchor_id}", config.anchor_height**2, "m\u00b2", text))
     listed = tuple(u for u in (*common, *own) if u.sigma > 0)
     if recording > 0:
         where = f" in recording {recording + 1}"

@@ -111,7 +111,8 @@ class MapResult:
     closures: tuple[LoopClosure, ...]
     """Accepted and rejected."""
     range_table: dict[str, Floats]
-    """Per range: stamp, anchor (index into anchors), range, residual (m), weight (0..1); for reports."""
+    """Per range: stamp, anchor (index into anchors), range, residual (m), weight (0..1) in the
+    last optimisation, agrees (1 or 0) as anchors' used_share counts it; for reports."""
     grid: OccupancyGrid | None
     """None without lidar."""
     stages: tuple[StageSummary, ...]

@@ -4,6 +4,7 @@ Everything that comes from a log (names of files and anchors, reasons) is escape
 from elsewhere, and its script reads only the page itself.
 """
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
@@ -20,8 +21,6 @@ Floats = NDArray[np.float64]
 
 MOST_RESIDUALS = 1500
 """Residuals of one anchor drawn at most."""
-NLOS_BELOW = 0.5
-"""Ranges of less weight are marked as outliers or blocked sight."""
 
 
 def render(
@@ -82,8 +81,13 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], empty: str) -
     if not rows:
         return f"<p>{escape(empty)}</p>"
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    body = "".join("<tr>" + "".join(_cell(cell) for cell in row) + "</tr>" for row in rows)
     return f"<div class=scroll><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _cell(text: str) -> str:
+    """Return a cell of a table; one that holds a sentence may be wrapped, but not to a word a line."""
+    return f"<td class=words>{escape(text)}</td>" if len(text) > 20 and " " in text else f"<td>{escape(text)}</td>"
 
 
 def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
@@ -138,7 +142,8 @@ def _calibration_table(result: MapResult) -> str:
 def _closure_table(result: MapResult) -> str:
     kept, rejected = shown_closures(result)
     count = sum(c.accepted for c in result.closures)
-    reasons = Counter(c.reason for c in result.closures if not c.accepted)
+    # Reasons that differ in their figures only are one kind.
+    reasons = Counter(re.sub(r"\d+(\.\d+)?", "\u2026", c.reason) for c in result.closures if not c.accepted)
     text = f"<p>{count} of {len(result.closures)} candidates kept.</p>" if result.closures else ""
     if reasons:
         text += _table(("rejected because", "candidates"), [(why, str(n)) for why, n in reasons.most_common(30)], "")
@@ -175,15 +180,20 @@ def _figure(value: Any) -> str:
 
 def _residuals(result: MapResult) -> str:
     table = {name: np.asarray(values) for name, values in result.range_table.items()}
-    start, end = float(table["stamp"].min()), float(table["stamp"].max())
+    several = len(np.unique(result.session)) > 1
+    # The clocks of several recordings have nothing in common: their ranges are drawn one after another.
+    time = np.arange(len(table["stamp"]), dtype=np.float64) if several else table["stamp"] - table["stamp"].min()
+    span = max(float(time.max()), 1e-9)
+    along = "one recording after another" if several else f"{span:.0f} s"
     parts = [
-        "<p class=hint>Expected minus measured range over time; <span class=nlos-text>marked</span>: down-weighted (NLOS?).</p>"
+        "<p class=hint>Expected minus measured range over time; <span class=nlos-text>marked</span>: does not agree with the"
+        " map, as where something blocks the radio's sight (NLOS).</p>"
     ]
     for index, anchor in enumerate(result.anchors):
         mine = np.flatnonzero(table["anchor"] == index)
         mine = mine[np.isfinite(table["residual"][mine])]
         if len(mine):
-            parts.append(_residual_plot(anchor.id, table, mine[thin(len(mine), MOST_RESIDUALS)], start, max(end - start, 1e-9)))
+            parts.append(_residual_plot(anchor.id, table, mine[thin(len(mine), MOST_RESIDUALS)], time / span, along))
     return "".join(parts)
 
 
@@ -191,17 +201,17 @@ def _dots(x: Floats, y: Floats) -> str:
     return "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _residual_plot(anchor_id: str, table: dict[str, Floats], which: NDArray[np.int64], start: float, span: float) -> str:
-    residual, good = table["residual"][which], table["weight"][which] >= NLOS_BELOW
+def _residual_plot(anchor_id: str, table: dict[str, Floats], which: NDArray[np.int64], time: Floats, along: str) -> str:
+    residual, good = table["residual"][which], table["agrees"][which] > 0
     inner = float(np.quantile(np.abs(residual[good]), 0.99)) if good.any() else 0.0
-    limit = max(1.5 * inner, 0.1)
-    x = 1000.0 * (table["stamp"][which] - start) / span
+    limit = max(2.0 * inner, 0.1)
+    x = 1000.0 * time[which]
     y = 60.0 - 55.0 * np.clip(residual / limit, -1.0, 1.0)
     dots = "".join(
         f'<path class="{name}" d="{_dots(x[sel], y[sel])}"/>' for name, sel in (("los", good), ("nlos", ~good)) if sel.any()
     )
     return (
-        f"<figure><figcaption>{escape(anchor_id)} <span class=hint>\u00b1{limit:.2f} m, {span:.0f} s,"
+        f"<figure><figcaption>{escape(anchor_id)} <span class=hint>axis \u00b1{limit:.2f} m, {escape(along)};"
         f" {100 * float(np.mean(~good)):.0f} % marked</span></figcaption>"
         f'<svg class="residuals" viewBox="0 0 1000 120" preserveAspectRatio="none" role="img"'
         f' aria-label="residuals of {escape(anchor_id)}">'

@@ -81,11 +81,17 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
         f'<text x="{x + size / 40:.3f}" y="{y + height - size / 25:.3f}">{bar:g} m</text></g></svg>'
     )
     layers = (("grid", "map"), ("trajectory", "trajectory"), ("anchors", "anchors, 2\u03c3"), ("kept", "closures kept"))
-    boxes = "".join(f'<label><input type=checkbox checked data-layer="{k}"> {escape(v)}</label>' for k, v in layers)
-    boxes += '<label><input type=checkbox data-layer="rejected"> closures rejected</label>'
-    buttons = '<button id="zoom-in" aria-label="zoom in">+</button><button id="zoom-out" aria-label="zoom out">\u2212</button>'
-    hint = "<p class=hint>Wheel or pinch zooms, dragging moves, point at things for details.</p>"
-    return f'<div class=controls>{boxes}{buttons}<button id="zoom-all">all</button></div><div class=mapbox>{svg}</div>{hint}'
+    boxes = "".join(_switch(name, text, True) for name, text in layers) + _switch("rejected", "closures rejected", False)
+    names = (("zoom-in", "+", "zoom in"), ("zoom-out", "\u2212", "zoom out"), ("zoom-all", "all", "all of the map"))
+    buttons = " ".join(f'<button id="{name}" aria-label="{label}">{text}</button>' for name, text, label in names)
+    hint = '<p class=hint><output id="place"></output>Wheel or pinch zooms, dragging moves, point at things for details.</p>'
+    return f"<div class=controls>{boxes}<span class=buttons>{buttons}</span></div><div class=mapbox>{svg}</div>{hint}"
+
+
+def _switch(name: str, text: str, on: bool) -> str:
+    """Return the switch of a layer of the map, with the colour it has there."""
+    state = " checked" if on else ""
+    return f'<label><input type=checkbox{state} data-layer="{name}"> <i class="key key-{name}"></i> {escape(text)}</label>'
 
 
 def _scale_length(size: float) -> float:

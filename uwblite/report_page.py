@@ -24,13 +24,18 @@ h1{font-size:1.5rem;overflow-wrap:anywhere}h2{font-size:1.15rem;margin:1.6rem 0 
 .scroll{overflow-x:auto}
 table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.9rem}
 th,td{text-align:left;padding:.2rem .6rem;border-bottom:1px solid var(--line);vertical-align:top}
-.facts th{font-weight:500;color:var(--dim);white-space:nowrap}.facts td{overflow-wrap:anywhere}
+td{white-space:nowrap}td.words{white-space:normal;min-width:15rem}
+.key{display:inline-block;width:1.1rem;height:.25rem;border-radius:.1rem;vertical-align:middle;background:#1769aa}
+.key-kept{background:#2e7d32}.key-rejected{background:#d81b60}.key-anchors{background:#b3261e}.key-grid{background:#888}
+summary{cursor:pointer;padding:.4rem 0}
+.facts td{white-space:normal}.facts th{font-weight:500;color:var(--dim);white-space:nowrap}.facts td{overflow-wrap:anywhere}
 .box{padding:.6rem .9rem;border-radius:.4rem;margin:.6rem 0}.box ul{margin:.3rem 0;padding-left:1.2rem}
 .good{background:var(--good)}.warn{background:var(--warn)}.bad{background:var(--bad)}
 .hint{color:var(--dim);font-size:.85rem}.nlos-text{color:var(--nlos)}
 pre{background:var(--warn);padding:.6rem;border-radius:.4rem;white-space:pre-wrap;overflow-wrap:anywhere}
 .controls{display:flex;flex-wrap:wrap;gap:.3rem .9rem;align-items:center;margin-bottom:.4rem}
 .controls label{white-space:nowrap;padding:.2rem 0}button{font:inherit;min-width:2.2rem;min-height:2.2rem}
+.buttons{white-space:nowrap}
 .mapbox{border:1px solid var(--line);border-radius:.4rem;overflow:hidden}
 #map-view{display:block;width:100%;max-height:80vh;touch-action:none;cursor:grab;background:#cdcdcd}
 image.grid{image-rendering:pixelated}
@@ -47,9 +52,10 @@ stroke-dasharray:calc(var(--s)*4px)}
 .anchor text,.bar text{font-size:calc(var(--s)*14px);fill:#1b1f24;paint-order:stroke;
 stroke:#fff;stroke-width:calc(var(--s)*4px)}
 .bar path{stroke:#1b1f24;stroke-width:calc(var(--s)*3px)}
-.closure path{fill:none;stroke-width:calc(var(--s)*1.5px);stroke-linecap:round}
-.closure path:hover{stroke-width:calc(var(--s)*6px)}
+.closure path{fill:none;stroke-width:calc(var(--s)*1.5px);stroke-linecap:round;opacity:.45}
+.closure path:hover{stroke-width:calc(var(--s)*6px);opacity:1}
 .kept path{stroke:#2e7d32}.rejected path{stroke:#d81b60;stroke-dasharray:calc(var(--s)*5px)}
+#place{font-variant-numeric:tabular-nums;float:right;color:var(--fg)}
 .hidden{display:none}
 figure{margin:.6rem 0}figcaption{font-weight:600}
 .residuals{display:block;width:100%;height:7rem;border:1px solid var(--line);border-radius:.3rem}
@@ -94,7 +100,10 @@ SCRIPT = """
     svg.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, event);
   });
+  var place = document.getElementById('place');
   svg.addEventListener('pointermove', function (event) {
+    var here = point(event);
+    place.textContent = 'x ' + here.x.toFixed(2) + ' m, y ' + (-here.y).toFixed(2) + ' m';
     var before = pointers.get(event.pointerId);
     if (!before) { return; }
     if (pointers.size === 2) {

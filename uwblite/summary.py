@@ -31,12 +31,14 @@ def summarise(
     typical = 0.0
     if first is not None and radio is not None and first.placed.any():
         typical = float(np.median([_spread(residuals[radio.anchor == k]) for k in np.flatnonzero(first.placed)]))
-    anchors = tuple(_anchor(k, part, drives, known, residuals, typical) for k in range(len(part.anchor_ids)))
+    # By what ranges to a typical anchor scatter; by its own scatter, no anchor would ever lie.
+    limit = 3.0 * max(typical, 0.05)
+    anchors = tuple(_anchor(k, part, drives, known, residuals, limit) for k in range(len(part.anchor_ids)))
     listed = {u.name: u for session in drives.sessions for u in _unknowns(session, config)}
     calibrated = tuple(_calibration(k, listed[name], graph, known) for k, name in enumerate(graph.calibration.names))
     table = {} if radio is None else {
         "stamp": radio.stamps, "anchor": radio.anchor.astype(np.float64), "range": radio.ranges,
-        "residual": residuals, "weight": weights,
+        "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
     }
     more, doubts = _doubts(drives, anchors, closures, grid)
     fits = [float(stage.figures["chi2_per_dof"]) for stage in stages if "chi2_per_dof" in stage.figures]
@@ -83,7 +85,7 @@ def _spread(residuals: Floats) -> float:
     return 1.4826 * float(np.median(np.abs(residuals - np.median(residuals))))
 
 
-def _anchor(k: int, part: Part, drives: Drives, known: Marginals, residuals: Floats, typical: float) -> AnchorEstimate:
+def _anchor(k: int, part: Part, drives: Drives, known: Marginals, residuals: Floats, limit: float) -> AnchorEstimate:
     graph, first, radio, name = part.graph, part.first, part.radio, part.anchor_ids[k]
     count = _count(name, drives) if radio is None else int(np.sum(radio.anchor == k))
     if first is None or radio is None or not first.placed[k]:
@@ -91,9 +93,8 @@ def _anchor(k: int, part: Part, drives: Drives, known: Marginals, residuals: Flo
         nowhere = np.full(2, np.nan)
         return AnchorEstimate(name, nowhere, np.full((2, 2), np.nan), count, 0.0, np.nan, np.nan, np.nan, "unplaced", reason)
     own = residuals[radio.anchor == k]
-    # A share by distance, not by kernel weight: effective sigmas are wide where ranges repeat each other. The measure is
-    # what ranges to a typical anchor scatter; by its own scatter, no anchor would ever lie.
-    used = float(np.mean(np.abs(own) < 3.0 * max(typical, 0.05)))
+    # A share by distance, not by kernel weight: effective sigmas are wide where ranges repeat each other.
+    used = float(np.mean(np.abs(own) < limit))
     # The bias in the first recording that heard it; in the others it is theirs, see the calibration.
     bias_at = int(radio.calibration[np.argmax(radio.anchor == k), 1])
     bias = float(graph.calibration.values[bias_at]) if bias_at >= 0 else 0.0

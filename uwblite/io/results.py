@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from ..errors import ConfigError
 from ..map_picture import PictureAnchor, draw_map
 from ..map_result import MapResult
+from ..occupancy_grid import OccupancyGrid
 from ..report import render
 from ..sensor_log import SensorLog
 from .files import write_text
@@ -156,10 +157,19 @@ def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
 
 def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> tuple[tuple[str, str], ...]:
     sums = recording_figures(logs, result)
+    grid, kept = result.grid, sum(c.accepted for c in result.closures)
     facts = [
         ("recording", "{duration:.0f} s, {travelled:.1f} m, {ranges} ranges, {scans} scans".format(**sums)),
+        ("map", "" if grid is None else _size(grid)),
+        ("graph", f"{len(result.keyframe_stamps)} keyframes, {kept} of {len(result.closures)} loop closures kept"),
         *(("sha256", log.notes.sha256) for log in logs),
         ("settings", record.preset or "defaults"),
         ("made by", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
     ]
     return tuple((name, value) for name, value in facts if value)
+
+
+def _size(grid: OccupancyGrid) -> str:
+    g = grid.geometry
+    width, depth = g.cols * g.resolution, g.rows * g.resolution
+    return f"{width:.1f} x {depth:.1f} m, cells of {g.resolution:g} m, {grid.scans_used} scans drawn"
