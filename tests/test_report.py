@@ -184,7 +184,8 @@ def test_the_script_zooms_and_toggles(tmp_path):
       var at = svg.getBoundingClientRect();
       svg.dispatchEvent(new PointerEvent('pointermove', {clientX: at.x + at.width / 2, clientY: at.y + at.height / 2}));
       var said = document.getElementById('place').textContent;
-      document.title = [/^x -?[0-9.]+ m, y -?[0-9.]+ m$/.test(said), Math.abs(zoomed * 1.5 - whole) < 1e-3, Math.abs(back - whole) < 1e-3,
+      document.title = [/^x -?[0-9.]+ m, y -?[0-9.]+ m$/.test(said),
+        Math.abs(zoomed * 1.5 - whole) < 1e-3, Math.abs(back - whole) < 1e-3,
         hidden, !layer.classList.contains('hidden')].join();
     </script></body>"""
     file = tmp_path / "report.html"
