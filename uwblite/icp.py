@@ -33,8 +33,11 @@ _COARSE_TOLERANCE = 10.0
 """The coarse stage hands over at steps so many times the tolerance."""
 _GATE_SHRINK = 0.6
 """Per iteration of the coarse stage."""
-_LEAST_REACH = 0.2
+_LEAST_REACH = 0.15
 """m; a finer table of nearest points is larger and no better."""
+_CELLS_PER_REACH = 3
+_MOST_SCORED = 250
+"""Source points whose nearest neighbours make the fitness score of point_to_line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +97,7 @@ class Registration:
     """m, root mean square distance of inliers from their partner: its line, or the point."""
     fitness: float
     """m^2, mean squared distance from the source points to the nearest target point, whatever the distance; inf where
-    a cloud is empty. (point_to_line: of every coarse_stride-th source point.)"""
+    a cloud is empty. (point_to_line: of every coarse_stride-th source point, a few hundred at most.)"""
     information: Floats
     """(3, 3) inverse covariance of the pose in the chart e = between(measured, true) = x, y, theta in the source's
     frame; zero in directions that were not measured."""
@@ -159,7 +162,6 @@ class _Descent:
     pose: Floats
     rows: LineRows
     system: LineFactor
-    feigned: Floats
     iterations: int
     small: bool
     """The last step was below the tolerance."""
@@ -170,25 +172,24 @@ def _descend(
     gate: float, stride: int, tolerance: float, budget: int,
 ) -> _Descent:
     """Iterate associate, linearise, step; the gate shrinks to max_correspondence_distance."""
-    raster, last = target.raster(max(gate, _LEAST_REACH), stride), config.max_correspondence_distance
+    raster, last = target.raster(max(gate, _LEAST_REACH), stride, _CELLS_PER_REACH), config.max_correspondence_distance
     rows = np.ascontiguousarray(rows[:, ::stride])
     for iteration in range(1, budget + 1):
         final = gate <= last
         # What lies far off before the clouds meet is not yet an outlier: the kernel widens with the gate.
         sigma = config.sigma * max(1.0, gate / last)
-        settings = LineFactorConfig(gate, sigma, config.kernel, config.max_normal_angle, config.degeneracy)
-        cos_sin_xy = (np.cos(pose[2]), np.sin(pose[2]), pose[0], pose[1])
-        matched = line_rows(target, raster, rows, cos_sin_xy, settings, two_sided)
-        system, feigned = line_system(matched, settings)
-        small, enough = False, int(system.matched) * stride >= config.min_matches
+        settings = LineFactorConfig(gate, sigma, config.kernel, config.max_normal_angle)
+        matched = line_rows(target, raster, rows, pose, settings, two_sided)
+        system = line_system(matched, settings)
+        small, enough = False, system.matched * stride >= config.min_matches
         if enough:
-            step = trusted_step(system.information, feigned, system.gradient, config.degeneracy)
+            step = trusted_step(system.information, system.feigned, system.gradient, config.degeneracy)
             pose = pose + step
             small = final and _small(step, config, tolerance)
         if not enough or small or iteration == budget:
             break
         gate = max(last, gate * _GATE_SHRINK)
-    return _Descent(pose, matched, system, feigned, iteration, small)
+    return _Descent(pose, matched, system, iteration, small)
 
 
 def _align_lines(target: PointCloud, source: PointCloud, guess: Floats, config: IcpConfig) -> Registration:
@@ -204,17 +205,18 @@ def _align_lines(target: PointCloud, source: PointCloud, guess: Floats, config: 
         target, rows, pose, config, two_sided, gate=config.max_correspondence_distance, stride=1, tolerance=1.0,
         budget=max(1, config.max_iterations - used),
     )
-    matches, used, pose = int(end.system.matched), used + end.iterations, _wrapped(end.pose)
+    matches, used, pose = end.system.matched, used + end.iterations, _wrapped(end.pose)
     weight = float(np.sum(end.rows.weight))
     if matches < config.min_matches or weight == 0.0:
         return _no_overlap(pose, source, used, matches)
-    trusted, _ = trusted_part(end.system.information, end.feigned, config.degeneracy)
+    trusted = trusted_part(end.system.information, end.system.feigned, config.degeneracy)
     square = end.rows.residual**2
     # Neighbouring means share their noise: so many of them tell as much as one point.
     shared = float(np.sum(end.rows.matched * source.neighbours)) / matches
     variance = float(np.sum(end.rows.weight * square)) / weight * shared
     information = trusted * config.sigma**2 / max(variance, config.min_sigma**2)
-    fitness = fitness_score(target, source.points[:: config.coarse_stride], pose)
+    scored = source.points[:: max(config.coarse_stride, len(source) // _MOST_SCORED)]
+    fitness = fitness_score(target, scored, pose)
     rmse = float(np.sqrt(np.sum(square) / matches))
     return _result(source, pose, end.small, used, matches, rmse, fitness, information, config)
 

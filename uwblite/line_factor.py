@@ -16,10 +16,12 @@ angle and the Jacobian J_t of the tangent, N = sum w v J_t^T J_t / sigma^2 is th
 feign; in directions where H does not exceed a multiple of N nothing was measured, and trusted_part says nothing.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from .config import setting
 from .nearest import NearestRaster
@@ -52,22 +54,20 @@ class LineFactorConfig:
     """On residual / sigma."""
     max_normal_angle: float = 0.8
     """rad; points whose normals differ by more are no pair; nor are the two sides of a wall."""
-    degeneracy: float = 2.0
-    """Multiple of the information feigned by the scatter of the normals that a direction must exceed; 0 trusts all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineFactor:
-    """Gauss-Newton system of one pair, or of k pairs, by the coordinates x, y, theta of T_target_source."""
+    """Gauss-Newton system of one pair by the coordinates x, y, theta of T_target_source."""
 
     information: Floats
-    """(..., 3, 3) H."""
+    """(3, 3) H."""
     gradient: Floats
-    """(..., 3) g, half the derivative of chi2 by the pose."""
-    chi2: Floats
-    """(...) robust sum of squares of residual / sigma over the matched points."""
-    matched: Ints
-    """(...) how many points found a partner."""
+    """(3,) g, half the derivative of chi2 by the pose."""
+    feigned: Floats
+    """(3, 3) N, the information that the scatter of the normals alone would feign."""
+    matched: int
+    """How many points found a partner."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,8 +84,6 @@ class LineRows:
     """(m,) m; zero where the partner has no line."""
     weight: Floats
     """(m,) of the robust kernel, 0..1."""
-    cost: Floats
-    """(m,) robust square of residual / sigma."""
     matched: Bools
     """(m,)."""
 
@@ -103,7 +101,7 @@ def line_rows(
     target: PointCloud,
     raster: NearestRaster,
     source: Floats,
-    pose: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike],
+    pose: Floats,
     config: LineFactorConfig,
     two_sided: bool,
 ) -> LineRows:
@@ -113,10 +111,11 @@ def line_rows(
     ----------
     target, raster : the cloud and its table of nearest points.
     source : (4, m) see source_rows.
-    pose : cos theta, sin theta, x, y of T_target_source; each a number, or (m,) one for every point.
+    pose : (3,) T_target_source.
     two_sided : normals may also be opposite; for clouds without viewpoints.
     """
-    c, s, tx, ty = pose
+    tx, ty, theta = pose.tolist()
+    c, s = math.cos(theta), math.sin(theta)
     px, py, nx, ny = source
     arm_x, arm_y = c * px - s * py, s * px + c * py
     x, y = arm_x + tx, arm_y + ty
@@ -129,55 +128,29 @@ def line_rows(
     dx, dy = x - qx, y - qy
     matched = (dx * dx + dy * dy <= config.gate**2) & (agreement >= least)
     residual = (line_x * x + line_y * y - offset) * matched
-    squared = (residual / config.sigma) ** 2
     return LineRows(
         jacobian=np.stack([line_x, line_y, line_y * arm_x - line_x * arm_y]),
         tangent=np.stack([-line_y, line_x, line_x * arm_x + line_y * arm_y]),
         normal_variance=variance,
         residual=residual,
-        weight=config.kernel.weight(squared) * matched,
-        cost=config.kernel.rho(squared),
+        weight=config.kernel.weight(np.square(residual * (1.0 / config.sigma))) * matched,
         matched=matched,
     )
 
 
-def _outer_sum(rows: Floats, weight: Floats, starts: Ints | None) -> Floats:
-    """Return sum of weight * rows rows^T of rows (3, m): (3, 3), or (k, 3, 3) by segments."""
-    weighted = rows * weight
-    if starts is None:
-        return np.asarray(weighted @ rows.T)
-    products = (weighted[:, None, :] * rows[None, :, :]).reshape(9, -1)
-    return np.add.reduceat(products, starts, axis=1).T.reshape(-1, 3, 3)
-
-
-def _sum(rows: Floats, starts: Ints | None) -> Floats:
-    return np.asarray(rows.sum(axis=-1) if starts is None else np.add.reduceat(rows, starts, axis=-1))
-
-
-def line_system(rows: LineRows, config: LineFactorConfig, starts: Ints | None = None) -> tuple[LineFactor, Floats]:
-    """Sum rows to a Gauss-Newton system.
-
-    Parameters
-    ----------
-    starts : (k,) where each pair's rows start, strictly increasing; None: all rows belong to one pair.
-
-    Returns
-    -------
-    factor : nothing taken away.
-    feigned : (..., 3, 3) N, the information that the scatter of the normals alone would feign.
-    """
+def line_system(rows: LineRows, config: LineFactorConfig) -> LineFactor:
+    """Sum rows to a Gauss-Newton system, nothing taken away."""
     scale = config.sigma**-2
-    gradient = _sum(rows.jacobian * (rows.weight * rows.residual), starts).T * scale
-    factor = LineFactor(
-        information=_outer_sum(rows.jacobian, rows.weight, starts) * scale,
-        gradient=gradient,
-        chi2=_sum(rows.cost, starts),
-        matched=_sum(rows.matched.astype(np.float64), starts).astype(np.int64),
+    weighted = rows.jacobian * (rows.weight * scale)
+    return LineFactor(
+        information=weighted @ rows.jacobian.T,
+        gradient=weighted @ rows.residual,
+        feigned=(rows.tangent * (rows.weight * rows.normal_variance * scale)) @ rows.tangent.T,
+        matched=int(np.count_nonzero(rows.matched)),
     )
-    return factor, _outer_sum(rows.tangent, rows.weight * rows.normal_variance, starts) * scale
 
 
-def trusted_part(information: Floats, feigned: Floats, degeneracy: float) -> tuple[Floats, Floats]:
+def trusted_part(information: Floats, feigned: Floats, degeneracy: float) -> Floats:
     """Take from an information matrix what the scatter of the normals may have feigned.
 
     In the basis that diagonalises both, H = B B^T diag(l) and N = B B^T, the eigenvalue l becomes
@@ -185,95 +158,42 @@ def trusted_part(information: Floats, feigned: Floats, degeneracy: float) -> tup
 
     Parameters
     ----------
-    information, feigned : (..., 3, 3) H and N.
+    information, feigned : (3, 3) H and N.
     degeneracy : multiple of N that H must exceed.
 
     Returns
     -------
-    trusted : (..., 3, 3), positive semi-definite, at most H.
-    projector : (..., 3, 3) P that takes the gradient g to P g, so that trusted and P g have the step of H and g in
-        trusted directions and none in the others.
+    (3, 3), positive semi-definite, at most H.
     """
     if degeneracy == 0.0:
-        return information, np.broadcast_to(np.eye(3), information.shape)
-    basis, inverse, values, vectors = relative_eigen(information, feigned)
-    kept = np.maximum(values - degeneracy, 0.0)
+        return information
+    basis, _, values, vectors = relative_eigen(information, feigned)
     left = basis @ vectors
-    trusted = (left * kept[..., None, :]) @ np.swapaxes(left, -1, -2)
-    share = kept / np.maximum(values, _TINY)
-    return trusted, (left * share[..., None, :]) @ np.swapaxes(vectors, -1, -2) @ inverse
+    return np.asarray((left * np.maximum(values - degeneracy, 0.0)) @ left.T)
 
 
 def trusted_step(information: Floats, feigned: Floats, gradient: Floats, degeneracy: float) -> Floats:
-    """Return the Gauss-Newton step (3,) in trusted directions, none in the others; see trusted_part."""
-    _, inverse, values, vectors = relative_eigen(information, feigned)
+    """Return the Gauss-Newton step (3,) in trusted directions, none in the others; see trusted_part.
+
+    With V that diagonalises both, V^T N V = 1 and V^T H V = diag(l), the step is -V diag(1 / l) V^T g over the trusted l.
+    """
+    values, vectors, failed = lapack.dsygv(information, feigned + np.diag(_floor(information)))
+    if failed:
+        return np.zeros(3)
     divisor = np.where(values > max(degeneracy, _SOLVABLE), values, np.inf)
-    return np.asarray(-inverse.T @ (vectors @ ((vectors.T @ (inverse @ gradient)) / divisor)))
+    return np.asarray(-vectors @ ((vectors.T @ gradient) / divisor))
+
+
+def _floor(information: Floats) -> Floats:
+    """Return what keeps the diagonal (..., 3) of N from vanishing."""
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    xy = diagonal[..., 0] + diagonal[..., 1]
+    return np.stack([xy, xy, diagonal[..., 2]], axis=-1) * _FEIGNED_FLOOR + _TINY
 
 
 def relative_eigen(information: Floats, feigned: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return B, its inverse, eigenvalues and eigenvectors of B^-1 H B^-T where N = B B^T, N kept from vanishing."""
-    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
-    xy = diagonal[..., 0] + diagonal[..., 1]
-    floor = np.stack([xy, xy, diagonal[..., 2]], axis=-1) * _FEIGNED_FLOOR + _TINY
-    basis = np.asarray(np.linalg.cholesky(feigned + floor[..., None] * np.eye(3)), dtype=np.float64)
+    """Return (..., 3, 3) B, its inverse, eigenvalues and eigenvectors of B^-1 H B^-T where N = B B^T, N kept from vanishing."""
+    basis = np.asarray(np.linalg.cholesky(feigned + _floor(information)[..., None] * np.eye(3)), dtype=np.float64)
     inverse = np.asarray(np.linalg.inv(basis), dtype=np.float64)
     values, vectors = np.linalg.eigh(inverse @ information @ np.swapaxes(inverse, -1, -2))
     return basis, inverse, values, vectors
-
-
-def pair_factor(
-    target: PointCloud, source: PointCloud, T_target_source: Floats, config: LineFactorConfig
-) -> LineFactor:
-    """Associate one source with a target once and linearise; see pair_factors."""
-    batch = pair_factors(
-        target, source.centers, source.normals, np.array([len(source)]), np.asarray(T_target_source)[None], config,
-        two_sided=not source.oriented,
-    )
-    return LineFactor(batch.information[0], batch.gradient[0], batch.chi2[0], batch.matched[0])
-
-
-def pair_factors(
-    target: PointCloud,
-    points: Floats,
-    normals: Floats | None,
-    counts: Ints,
-    transforms: Floats,
-    config: LineFactorConfig,
-    two_sided: bool = False,
-) -> LineFactor:
-    """Associate k sources with one target once and linearise each pair.
-
-    Parameters
-    ----------
-    target : cloud with lines.
-    points : (m, 2) the sources' points (best: their centers) one source after the other, m, each in its own frame.
-    normals : (m, 2) their normals, zero where a point has none; None: none has.
-    counts : (k,) points of each source.
-    transforms : (k, 3) T_target_source.
-    config : which pairs count.
-    two_sided : the sources' normals do not tell the sides of a wall.
-
-    Returns
-    -------
-    LineFactor with leading axis k; without what the scatter of the normals feigns.
-    """
-    counts, transforms = np.asarray(counts), np.asarray(transforms, dtype=np.float64)
-    k = len(counts)
-    factor = LineFactor(np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros(k), np.zeros(k, np.int64))
-    some = np.flatnonzero(counts)
-    if len(some) == 0:
-        return factor
-    each = np.stack([np.cos(transforms[:, 2]), np.sin(transforms[:, 2]), transforms[:, 0], transforms[:, 1]])
-    c, s, x, y = np.repeat(each, counts, axis=1)
-    starts = (np.cumsum(counts) - counts)[some]
-    rows = line_rows(
-        target, target.raster(config.gate), source_rows(points, normals), (c, s, x, y), config,
-        two_sided or not target.oriented,
-    )
-    system, feigned = line_system(rows, config, starts)
-    trusted, projector = trusted_part(system.information, feigned, config.degeneracy)
-    factor.information[some] = trusted
-    factor.gradient[some] = (projector @ system.gradient[:, :, None])[:, :, 0]
-    factor.chi2[some], factor.matched[some] = system.chi2, system.matched
-    return factor

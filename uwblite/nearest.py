@@ -14,7 +14,6 @@ from .errors import DataError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_CELLS_PER_REACH = 4
 _MAX_CELLS = 1 << 26
 
 
@@ -40,24 +39,24 @@ class NearestRaster:
         return np.asarray(self.table.take(row * self.width + column), dtype=np.int64)
 
 
-def make_raster(points: Floats, reach: float, stride: int = 1) -> NearestRaster:
+def make_raster(points: Floats, reach: float, stride: int = 1, cells: int = 4) -> NearestRaster:
     """Tabulate the nearest point around a cloud.
 
-    Cells are a quarter of the reach; distances are taken between centres of cells, the later point wins a tie.
+    Distances are taken between centres of cells, the later point wins a tie.
 
     Parameters
     ----------
     points : (n, 2), m.
     reach : distance from a point up to which it is found, m, to a cell's accuracy.
     stride : only every so-many-th point is tabulated (under its index in points).
+    cells : how many of them make the reach; the table takes time with its square.
 
     Raises
     ------
     DataError : the cloud is too wide for a table of cells this small.
     """
-    chosen = np.arange(0, len(points), stride)
-    cell = reach / _CELLS_PER_REACH
-    margin = _CELLS_PER_REACH + 1
+    chosen = np.arange(0, len(points), stride, dtype=np.int32)
+    cell, margin = reach / cells, cells + 1
     if len(chosen) == 0:
         return NearestRaster(np.zeros(2), cell, 1, 1, np.full(1, len(points), np.int32))
     low, high = points[chosen].min(axis=0), points[chosen].max(axis=0)
@@ -66,19 +65,19 @@ def make_raster(points: Floats, reach: float, stride: int = 1) -> NearestRaster:
     if not size[0] * size[1] <= _MAX_CELLS:
         raise DataError(f"points spread over {high - low} m need too many cells of {cell} m; filter outliers first")
     width, height = int(size[0]), int(size[1])
-    cells = ((points[chosen] - origin) / cell).astype(np.int64)
-    base = cells[:, 1] * width + cells[:, 0]
+    column, row = ((points[chosen] - origin) / cell).astype(np.int64).T
+    base = row * width + column
     table = np.full(width * height, len(points), np.int32)
+    table[base] = chosen
+    last = table[base] == chosen
     # Far offsets are written first: of repeated cells the last, nearest one stays.
-    table[_disc(width)[:, None] + base] = chosen
+    table[_disc(width, cells)[:, None] + base[last]] = chosen[last]
     return NearestRaster(origin, cell, width, height, table)
 
 
-def _disc(width: int) -> Ints:
-    """Return flat offsets of the cells within reach, the farthest first."""
-    side = np.arange(-_CELLS_PER_REACH, _CELLS_PER_REACH + 1)
-    dx, dy = (a.ravel() for a in np.meshgrid(side, side))
-    square = dx * dx + dy * dy
+def _disc(width: int, reach: int) -> Ints:
+    """Return flat offsets of the cells within reach, cells, the farthest first."""
+    side = np.arange(-reach, reach + 1)
+    square = np.add.outer(side * side, side * side).ravel()
     order = np.argsort(-square, kind="stable")
-    order = order[square[order] <= _CELLS_PER_REACH**2]
-    return np.asarray(dy[order] * width + dx[order], dtype=np.int64)
+    return np.asarray(np.add.outer(side * width, side).ravel()[order[square[order] <= reach**2]], dtype=np.int64)

@@ -210,17 +210,17 @@ class PointCloud:
     """(7, n + 1) normal x, y; distance of the line from the origin, m; center x, y, m; variance of the normal, rad^2;
     1 where there is a line. Points without a line have a zero normal: they pull at nothing. Column n stands for no
     point, far from everything."""
-    rasters: dict[tuple[float, int], NearestRaster] = field(default_factory=dict, repr=False)
-    """Tables of nearest centers by (reach, stride); filled on first use by raster()."""
+    rasters: dict[tuple[float, int, int], NearestRaster] = field(default_factory=dict, repr=False)
+    """Tables of nearest centers by (reach, stride, cells); filled on first use by raster()."""
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def raster(self, reach: float, stride: int = 1) -> NearestRaster:
-        """Return the table of nearest centers within reach, m; made on first use."""
-        key = (reach, stride)
+    def raster(self, reach: float, stride: int = 1, cells: int = 4) -> NearestRaster:
+        """Return the table of nearest centers within reach, m, see make_raster; made on first use."""
+        key = (reach, stride, cells)
         if key not in self.rasters:
-            self.rasters[key] = make_raster(self.centers, reach, stride)
+            self.rasters[key] = make_raster(self.centers, reach, stride, cells)
         return self.rasters[key]
 
 
