@@ -169,10 +169,13 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
     count = both + 1.0
     mx = (np.bincount(i, dx, n) - np.bincount(j, dx, n)) / count
     my = (np.bincount(i, dy, n) - np.bincount(j, dy, n)) / count
-    xx, xy, yy = dx * dx, dx * dy, dy * dy
-    a = (np.bincount(i, xx, n) + np.bincount(j, xx, n)) / count - mx * mx
+    # Squares take the place of their roots: less memory to go through the cache.
+    xy = dx * dy
+    dx *= dx
+    dy *= dy
+    a = (np.bincount(i, dx, n) + np.bincount(j, dx, n)) / count - mx * mx
     b = (np.bincount(i, xy, n) + np.bincount(j, xy, n)) / count - mx * my
-    c = (np.bincount(i, yy, n) + np.bincount(j, yy, n)) / count - my * my
+    c = (np.bincount(i, dy, n) + np.bincount(j, dy, n)) / count - my * my
     trace, gap = a + c, np.hypot(a - c, 2.0 * b)
     large, small = 0.5 * (trace + gap), np.maximum(0.5 * (trace - gap), 0.0)
     valid = (both >= min_neighbours) & (large > 0.0)
