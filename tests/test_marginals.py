@@ -6,7 +6,7 @@ from planted_graphs import dense_system, loop, relative_edges
 
 from uwblite import se2
 from uwblite.graph import Calibration, Graph, PriorEdges
-from uwblite.marginals import marginals
+from uwblite.marginals import JointCovariance, marginals
 from uwblite.robust import Kernel
 from uwblite.solver import optimize
 
@@ -64,6 +64,23 @@ def test_relative_covariances_follow_from_the_joint_one(few):
         joint = np.block([[covariance("poses", p, "poses", q) for q in (a, b)] for p in (a, b)])
         np.testing.assert_allclose(relative, J @ joint @ J.T, rtol=1e-5, atol=1e-12)
     np.testing.assert_allclose(found.relative(j, i)[2], found.relative(j[2], i[2])[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("chosen", [np.arange(0, 60, 7), np.array([40, 3, 17]), np.array([5]), np.array([0]), np.arange(60)])
+def test_joint_covariances_of_chosen_poses_are_those_of_all(chosen):
+    graph, _ = calibrated()
+    i, j = np.meshgrid(chosen, chosen)
+    i, j = i.ravel(), j.ravel()
+    joint = JointCovariance(graph, chosen)
+    np.testing.assert_allclose(joint.relative(i, j), marginals(graph).relative(i, j), rtol=1e-6, atol=1e-12)
+
+
+def test_joint_covariances_where_something_is_not_measured():
+    graph, _, _ = loop(2)
+    lonely = replace(graph, anchors=np.vstack([graph.anchors, [9.0, 9.0]]))
+    i, j = np.array([3, 5]), np.array([5, 9])
+    found, expected = (JointCovariance(g, np.array([9, 3, 5])).relative(i, j) for g in (lonely, graph))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-12)
 
 
 def test_relative_covariance_of_neighbours_is_that_of_their_odometry():

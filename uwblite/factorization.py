@@ -48,7 +48,7 @@ class Ordering:
     """The poses are a narrow band."""
 
 
-def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False) -> Ordering:
+def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False, last: Ints | None = None) -> Ordering:
     """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
 
     Parameters
@@ -57,10 +57,11 @@ def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False
     poses : how many there are.
     others : scalars that come after the poses.
     subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
+    last : poses that come after the others, in the sparse form.
     """
     if poses < 2:
         return Ordering(np.arange(poses), False, False)
-    bordered = not subtrees and others <= _WIDEST_BORDER
+    bordered = not subtrees and last is None and others <= _WIDEST_BORDER
     if bordered:
         order = reverse_cuthill_mckee(_adjacency(pairs, poses).tocsr(), symmetric_mode=True).astype(np.int64)
         position = np.empty(poses, dtype=np.int64)
@@ -69,6 +70,9 @@ def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False
             return Ordering(order, True, True)
     factor = superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A")
     order = np.argsort(factor.perm_c)
+    if last is not None:
+        late = np.isin(order, last)
+        order = np.concatenate([order[~late], order[late]])
     return Ordering(order[_postorder(factor.L)] if subtrees else order, bordered, False)
 
 

@@ -107,7 +107,9 @@ _Touched = tuple[Ints, bool]
 class NormalEquations:
     """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free scalars."""
 
-    def __init__(self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False) -> None:
+    def __init__(
+        self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False, last: Ints | None = None
+    ) -> None:
         """Number the unknowns and find where every product lands.
 
         Parameters
@@ -115,6 +117,7 @@ class NormalEquations:
         graph : what is free.
         linearized : of every kind of edges; only the indices and shapes of its blocks are read.
         subtrees : order for the selected inverse, not for speed.
+        last : poses to be eliminated after all others.
         """
         free = free_unknowns(graph)
         counts = [int(mask.sum()) for mask in free.values()]
@@ -127,7 +130,8 @@ class NormalEquations:
         touched = [[(node[name][index], name != "calibration") for name, index, _ in lin.blocks] for lin in linearized]
         pairs, which = self._pairs(touched)
         among_poses = pairs[(pairs < counts[0]).all(axis=1)]
-        ordering = choose_ordering(among_poses, counts[0], int(width[counts[0] :].sum()), subtrees)
+        late = None if last is None else node["poses"][last]
+        ordering = choose_ordering(among_poses, counts[0], int(width[counts[0] :].sum()), subtrees, late)
         order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
         corner = np.full(len(width) + 1, -1)
         corner[order] = np.cumsum(width[order]) - width[order]

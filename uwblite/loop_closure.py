@@ -19,7 +19,7 @@ from .clouds import Clouds
 from .free_space import FreeSpace, contradiction, free_space
 from .graph import Graph, RelativePoseEdges
 from .map_result import LoopClosure
-from .marginals import Marginals
+from .marginals import JointCovariance
 from .pair_matching import CloudRasters, PairFactors, PairPoints, match, measured, paint, pair_points, trusted_step
 from .point_cloud import PointCloud, make_cloud
 from .refinement import surface_cells
@@ -131,14 +131,14 @@ class Candidates:
 
 
 def propose(
-    graph: Graph, marginals: Marginals, submaps: Submaps, session: Ints, tried: set[tuple[int, int, bool]],
+    graph: Graph, marginals: JointCovariance, submaps: Submaps, session: Ints, tried: set[tuple[int, int, bool]],
     missed: set[tuple[int, int]], held: bool, config: LoopClosureConfig,
 ) -> Candidates:
     """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
 
     Parameters
     ----------
-    graph, marginals : present estimates and their uncertainty.
+    graph, marginals : present estimates, and the uncertainty of the sub-maps' reference keyframes.
     session : (k,) recording of each keyframe.
     tried : (target, source, searched) of earlier rounds; not proposed again.
     held : the trajectory is held by radio.

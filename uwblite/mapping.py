@@ -47,7 +47,7 @@ from .icp import IcpConfig
 from .keyframes import KeyframeConfig
 from .loop_closure import Closures, LoopClosureConfig
 from .map_result import MapResult, StageSummary
-from .marginals import marginals
+from .marginals import JointCovariance, marginals
 from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_edges
 from .occupancy_grid import GridConfig, OccupancyGrid, Sweeps
 from .pair_matching import CloudRasters
@@ -425,7 +425,7 @@ def _close_loops(
     held = part.radio is not None
     for lap in range(config.loops.rounds):
         pieces = submaps.build(scans.clouds, base.poses, drives.path, session, config.submaps)
-        known = marginals(base.with_edges(found.edges))
+        known = JointCovariance(base.with_edges(found.edges), pieces.reference)
         candidates = loop_closure.propose(base, known, pieces, session, tried, missed, held, config.loops)
         tried |= candidates.names(config.loops)
         free = loop_closure.seen_free(scans.clouds, pieces, base.poses, config.loops)

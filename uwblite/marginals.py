@@ -4,6 +4,7 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
 from . import se2
@@ -57,10 +58,7 @@ class Marginals:
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""
         i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
-        by_i, by_j = se2.between_jacobians(self._graph.poses[i], self._graph.poses[j])
-        mixed = by_i @ self._cross(i, j) @ by_j.transpose(0, 2, 1)
-        own = by_i @ self.poses[i] @ by_i.transpose(0, 2, 1) + by_j @ self.poses[j] @ by_j.transpose(0, 2, 1)
-        return own + mixed + mixed.transpose(0, 2, 1)
+        return _relative(self._graph, i, j, self.poses[i], self.poses[j], self._cross(i, j))
 
     def _cross(self, i: Ints, j: Ints) -> Floats:
         """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the fewer of them."""
@@ -84,6 +82,53 @@ class Marginals:
         right[-1] = 0.0
         right[:-1] = self._factor.solve(right[:-1])
         return right
+
+
+class JointCovariance:
+    """Covariances among some poses of a graph given all its measurements: of all their pairs at once."""
+
+    def __init__(self, graph: Graph, poses: Ints) -> None:
+        """Eliminate everything else; the rest of the factor is that of the poses' own information matrix.
+
+        With the chosen poses last, H = L D L^T ends in a dense block L2 D2 L2^T, their information once all others are
+        marginalised out, and its inverse is W^T W with W = D2^-1/2 L2^-1.
+        """
+        linearized = linearize(graph)
+        normal = NormalEquations(graph, linearized, last=poses)
+        normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
+        factor = _factor(normal)
+        number = normal.unknowns.number["poses"]
+        # Behind the chosen poses stand only anchors and calibration.
+        scalars = np.setdiff1d(number[poses], [-1])
+        late = np.arange(int(np.sum(number >= 0)) - len(scalars), normal.unknowns.size)
+        place = factor.perm_c[late].astype(np.int64)
+        order = np.argsort(place)
+        inside = place[order]
+        lower = factor.L[inside][:, inside].toarray(order="F")
+        whitened = np.tril(lapack.dtrtri(lower, lower=1, unitdiag=1, overwrite_c=1)[0])
+        whitened /= np.sqrt(factor.U.diagonal()[inside])[:, None]
+        whitened = whitened[:, np.argsort(order)[: len(scalars)]]
+        self._graph = graph
+        self._covariance: Floats = np.zeros((len(scalars) + 1, len(scalars) + 1))
+        self._covariance[:-1, :-1] = whitened.T @ whitened
+        self._row = np.where(np.isin(number, scalars), number - (late[0] if len(late) else 0), len(scalars))
+
+    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
+        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
+        i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
+
+        def among(a: Ints, b: Ints) -> Floats:
+            return np.asarray(self._covariance[self._row[a][:, :, None], self._row[b][:, None, :]])
+
+        return _relative(self._graph, i, j, among(i, i), among(j, j), among(i, j))
+
+
+def _relative(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross: Floats) -> Floats:
+    """Return the covariances (m, 3, 3) of between(X_i, X_j) by the poses' own and mutual ones."""
+    by_i, by_j = se2.between_jacobians(graph.poses[i], graph.poses[j])
+    mixed = by_i @ cross @ by_j.transpose(0, 2, 1)
+    own = by_i @ of_i @ by_i.transpose(0, 2, 1) + by_j @ of_j @ by_j.transpose(0, 2, 1)
+    return own + mixed + mixed.transpose(0, 2, 1)
 
 
 def _factor(normal: NormalEquations) -> SuperLU:
