@@ -434,18 +434,34 @@ def test_blocks_may_end_anywhere(tmp_path, monkeypatch, size):
 
 
 def test_memory_is_bounded_whatever_the_file_claims(tmp_path):
-    with gzip.open(tmp_path / "a.log.gz", "wb", compresslevel=1) as stream:
+    with (tmp_path / "a.log").open("wb") as stream:
         stream.write(odometry(50).encode())
-        for _ in range(64):
+        for _ in range(32):
             stream.write(b"ROBOTLASER1 0 0 1 0.1 8 0 0 3 " + b"1 " * (1 << 20))
         stream.write(b"\n" + b"ROBOTLASER1 0 0 1 0.000001 8 0 0 99999 1 2 3\n")
     tracemalloc.start()
-    log = read_log(tmp_path / "a.log.gz")
+    log = read_log(tmp_path / "a.log")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert log.notes.broken == 2
     assert "longer than a megabyte" in log.notes.broken_lines[0][1]
     assert peak < 40e6
+
+
+@pytest.mark.parametrize("filling", [b"\n", b"A", b"ODOM 0 0 0 0 0 0 1.0 h 1\n", b"# c\n"])
+def test_what_is_packed_to_fill_the_memory_is_refused(tmp_path, filling):
+    with gzip.open(tmp_path / "a.log.gz", "wb", compresslevel=1) as stream:
+        for _ in range(100):
+            stream.write(filling * ((1 << 20) // len(filling)))
+    with pytest.raises(FormatError, match="unpacks to more than 100 times"):
+        read_log(tmp_path / "a.log.gz")
+
+
+def test_blank_lines_count_as_lines(tmp_path):
+    (tmp_path / "a.log").write_text("\n\n" + odometry(50) + "\nBROKEN!\n\n")
+    log = read_log(tmp_path / "a.log")
+    assert log.notes.lines == 50 + 5
+    assert [number for number, _ in log.notes.broken_lines] == [54]
 
 
 def test_memory_is_what_the_scans_take(tmp_path):

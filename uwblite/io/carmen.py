@@ -102,12 +102,15 @@ class _Reader:
         gaps = found.gaps
         ends = gaps[found.array[gaps] == 10]
         starts = np.concatenate([[0], ends[:-1] + 1])
+        line_numbers, count = self.lines + 1 + np.arange(len(starts)), len(starts)
+        if len(written := np.flatnonzero(ends > starts)) < count:
+            starts, ends, line_numbers = starts[written], ends[written], line_numbers[written]
         first_gap = np.searchsorted(gaps, starts)
         name_ends = gaps[first_gap]
         self.laser.begin(found)
         broken: list[tuple[int, str]] = []
-        rows = zip(starts.tolist(), name_ends.tolist(), ends.tolist(), first_gap.tolist(), strict=True)
-        for number, (start, name_end, end, gap) in enumerate(rows, self.lines + 1):
+        rows = zip(line_numbers.tolist(), starts.tolist(), name_ends.tolist(), ends.tolist(), first_gap.tolist(), strict=True)
+        for number, start, name_end, end, gap in rows:
             name = block[start:name_end]
             try:
                 handler = self.handlers.get(name)
@@ -120,7 +123,7 @@ class _Reader:
             except (BrokenLine, ValueError) as error:
                 broken.append((number, why_broken(error)))
             self.messages += 1
-        self.lines += len(starts)
+        self.lines += count
         broken += [(number, why_broken(error)) for number, error in self.laser.decode()]
         self._count_broken(broken)
 

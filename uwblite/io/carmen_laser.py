@@ -136,7 +136,7 @@ class LaserMessages:
                 raise BrokenLine(f"FLASER has {len(tail)} fields behind its readings, expected 9")
             poses, rest = numbers(tail[:6], "FLASER", 6), tail[6:]
         else:
-            rest = tail[1 + int(tail[0]) :] if tail[0].isdigit() else tail
+            rest = tail[1 + int(tail[0]) :] if tail and len(tail[0]) < 10 and tail[0].isdigit() else tail
             if name == b"RAWLASER1":
                 rest = rest if len(rest) in (2, 3) else tail
                 if len(rest) not in (2, 3):

@@ -162,8 +162,8 @@ def _text(path: Path, digest: "hashlib._Hash") -> str:
 def _rows(path: Path, columns: int, digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
     """Yield (line number, fields) behind the header; columns < 0 asks for at least that many."""
     reader = csv.reader(io.StringIO(_text(path, digest)))
-    next(reader, None)
     try:
+        next(reader, None)
         for row in reader:
             if row and (len(row) != columns if columns > 0 else len(row) < -columns):
                 raise FormatError(f"{len(row)} columns, expected {abs(columns)}", str(path), reader.line_num)

@@ -70,8 +70,12 @@ def read_csv(path: str | os.PathLike[str]) -> CsvTable:
     FormatError : unreadable, not text, or a row has another number of fields than the header.
     """
     name = os.fspath(path)
+    data = b""
     with open_source(name) as source:
-        data = b"".join(source.blocks())
+        for block in source.blocks():
+            data += block
+            if len(data) > _LARGEST:
+                raise FormatError(f"is larger than {_LARGEST >> 20} MB: not a small table", name)
     try:
         text = data.decode()
     except UnicodeDecodeError:
@@ -79,9 +83,27 @@ def read_csv(path: str | os.PathLike[str]) -> CsvTable:
     kept = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
     if not kept:
         raise FormatError("holds no table; its first line must name the columns", name)
-    fields = [tuple(f.strip() for f in row) for row in csv.reader(line for _, line in kept)]
-    header, rows, lines = fields[0], fields[1:], tuple(k for k, _ in kept[1:])
+    fields, lines = _fields(kept, name)
+    header, rows, lines = fields[0], fields[1:], lines[1:]
     for row, line in zip(rows, lines, strict=True):
         if len(row) != len(header):
             raise FormatError(f"has {len(row)} fields where the header names {len(header)}", name, line)
     return CsvTable(name, header, tuple(rows), lines)
+
+
+_LARGEST = 1 << 26
+"""Bytes of a table that is read."""
+
+
+def _fields(kept: list[tuple[int, str]], name: str) -> tuple[list[tuple[str, ...]], tuple[int, ...]]:
+    """Return the fields of each row and the number of the line on which it ends."""
+    reader = csv.reader(line for _, line in kept)
+    fields: list[tuple[str, ...]] = []
+    lines: list[int] = []
+    try:
+        for row in reader:
+            fields.append(tuple(f.strip() for f in row))
+            lines.append(kept[reader.line_num - 1][0])
+    except csv.Error as error:
+        raise FormatError(f"is no comma-separated table ({error})", name, kept[max(reader.line_num, 1) - 1][0]) from None
+    return fields, tuple(lines)

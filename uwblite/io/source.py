@@ -19,6 +19,10 @@ MAX_LINE_BYTES = 1 << 20
 OVERLONG_LINE = b"\xfe"
 """Stands in a block in place of a line longer than MAX_LINE_BYTES."""
 
+_BOMB_BYTES, _BOMB_RATIO = 1 << 24, 100
+"""A recording packs to a tenth. What unpacks to a hundred times its size, and to more than so many bytes, is made to fill
+the memory."""
+
 _GZIP = b"\x1f\x8b"
 _OTHER_FORMATS = (
     (b"#ROSBAG", "this is a ROS 1 bag; turn it into a log first: uwblite convert"),
@@ -38,6 +42,7 @@ class _HashingReader(io.RawIOBase):
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self.hash = hashlib.sha256()
+        self.count = 0
 
     def readable(self) -> bool:
         return True
@@ -45,6 +50,7 @@ class _HashingReader(io.RawIOBase):
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
         data = self._stream.read(len(buffer))
         self.hash.update(data)
+        self.count += len(data)
         buffer[: len(data)] = data
         return len(data)
 
@@ -75,8 +81,12 @@ class TextSource:
         A last line without newline gets one. Lines longer than MAX_LINE_BYTES are replaced by OVERLONG_LINE, so that
         line numbers stay true and memory stays bounded.
         """
-        carry, overlong, first = b"", False, True
+        carry, overlong, first, unpacked = b"", False, True, 0
         while data := self._text.read(size):
+            unpacked += len(data)
+            if unpacked > _BOMB_BYTES and unpacked > _BOMB_RATIO * self._hashing.count:
+                problem = f"unpacks to more than {_BOMB_RATIO} times its size: nothing that was measured does"
+                raise FormatError(problem, self.path)
             if first:
                 data, first = _checked_start(data, self.path), False
             if overlong:

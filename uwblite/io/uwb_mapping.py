@@ -115,7 +115,14 @@ def parse_mappings(text: str, path: str = "") -> tuple[UwbMapping, ...]:
     return tuple(_checked(from_dict(UwbMapping, table), path) for table in tables)
 
 
+_PLAIN_FORMAT = re.compile(r"[^{}]{0,40}\{(:[#0]*[0-9]{0,2}[a-zA-Z]?)?\}[^{}]{0,40}")
+"""No attributes, and no widths that fill the memory."""
+
+
 def _checked(mapping: UwbMapping, path: str) -> UwbMapping:
+    if not _PLAIN_FORMAT.fullmatch(mapping.anchor_format):
+        wrong = mapping.anchor_format[:40]
+        raise ConfigError(f"{path}: anchor_format {wrong!r} is not text around one '{{}}' or such as '{{:04X}}'")
     try:
         mapping.anchor_format.format(0)
         re.compile(mapping.anchor)
