@@ -74,3 +74,14 @@ def test_heights_of_single_anchors_win():
     assert mounting.height_difference("A") == pytest.approx(0.7)
     assert mounting.height_difference("B") == pytest.approx(1.7)
     assert SensorMounting().height_difference("A") is None
+
+
+@pytest.mark.parametrize("value", [1e8, -1e30, 1e308])
+def test_numbers_that_nobody_measures_are_refused(value):
+    stamps, poses = np.arange(3.0), np.zeros((3, 3))
+    far = poses.copy()
+    far[1, 0] = value
+    with pytest.raises(DataError, match=r"odometry\.poses\[1\] is beyond 1e\+07"):
+        SensorLog(Odometry(stamps, far))
+    with pytest.raises(DataError, match=r"odometry\.stamps"):
+        SensorLog(Odometry(np.array([0.0, 1.0, 1e300]), poses))

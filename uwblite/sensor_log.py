@@ -104,6 +104,10 @@ class LogNotes:
     """Scans that were recorded and are not among `scans`, because no map looks at them."""
 
 
+MOST_METRES, MOST_SECONDS = 1e7, 1e20
+"""Numbers beyond these are no measurements: a quarter of the Earth's girth, and more than any time in any unit."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorLog:
     """One recording. `ranges` and `scans` are None when the sensor was not there."""
@@ -116,13 +120,13 @@ class SensorLog:
 
     def __post_init__(self) -> None:
         _check(self.odometry.stamps, "odometry.stamps", (None,), ordered=True)
-        _check(self.odometry.poses, "odometry.poses", (len(self.odometry.stamps), 3))
+        _check(self.odometry.poses, "odometry.poses", (len(self.odometry.stamps), 3), most=MOST_METRES)
         if len(self.odometry.stamps) == 0:
             raise DataError("the log has no odometry; uwblite needs ODOM messages (or ROBOTLASER1 with robot poses)")
         if self.ranges is not None:
             m = len(self.ranges.stamps)
             _check(self.ranges.stamps, "ranges.stamps", (None,), ordered=True)
-            _check(self.ranges.ranges, "ranges.ranges", (m,))
+            _check(self.ranges.ranges, "ranges.ranges", (m,), most=MOST_METRES)
             _check(self.ranges.quality, "ranges.quality", (m,))
             if self.ranges.anchor.shape != (m,):
                 raise DataError(f"ranges.anchor has shape {self.ranges.anchor.shape}, expected ({m},)")
@@ -157,11 +161,16 @@ class SensorLog:
         return replace(self, odometry=odometry, ranges=ranges, scans=scans)
 
 
-def _check(values: Floats, name: str, shape: tuple[int | None, ...], ordered: bool = False) -> None:
+def _check(
+    values: Floats, name: str, shape: tuple[int | None, ...], ordered: bool = False, most: float = MOST_SECONDS
+) -> None:
     if values.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, values.shape, strict=True)):
         raise DataError(f"{name} has shape {values.shape}, expected {shape}")
     bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
     if len(bad):
         raise DataError(f"{name}[{bad[0]}] is not finite ({len(bad)} such rows)")
+    far = np.flatnonzero((np.abs(values) > most).any(axis=tuple(range(1, values.ndim))))
+    if len(far):
+        raise DataError(f"{name}[{far[0]}] is beyond {most:g} ({len(far)} such rows); are the units right?")
     if ordered and np.any(np.diff(values) < 0):
         raise DataError(f"{name} runs backwards at index {int(np.argmax(np.diff(values) < 0)) + 1}; sort by time first")

@@ -545,3 +545,17 @@ def test_what_is_known_of_public_recordings(shared_data):
     mines = read_log(shared_data / "mines_exp1" / "run.log.gz")
     assert np.isfinite(mines.scans.ranges).mean() == pytest.approx(0.45, abs=0.01)
     assert mines.scans.time_increment == pytest.approx(0.1 / 1024)
+
+
+@pytest.mark.parametrize("line", ["ODOM 1e308 0 0 0 0 0 0.15 h 1", "ODOM 0 0 0 0 0 0 1e300 h 1", "UWB A 1e200 100 0.1 h 1"])
+def test_a_line_that_nobody_measured_is_broken(tmp_path, line):
+    (tmp_path / "a.log").write_text(odometry(60) + line + "\n")
+    log = read_log(tmp_path / "a.log")
+    assert (log.notes.broken, len(log.odometry.stamps)) == (1, 60)
+
+
+def test_a_laser_line_that_breaks_off_behind_its_readings_is_broken(tmp_path):
+    whole = robotlaser(["1.0", "2.0", "3.0"])
+    (tmp_path / "a.log").write_text(odometry(60) + whole + whole[: whole.index("3.0") + 3] + "\n")
+    log = read_log(tmp_path / "a.log")
+    assert (log.notes.broken, len(log.scans.stamps)) == (1, 1)

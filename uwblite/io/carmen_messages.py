@@ -5,6 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..sensor_log import MOST_METRES, MOST_SECONDS
+
 Floats = NDArray[np.float64]
 
 
@@ -19,6 +21,8 @@ def numbers(tokens: list[bytes], what: str, count: int) -> list[float]:
     values = [float(token) for token in tokens]
     if not math.isfinite(sum(values)):
         raise BrokenLine(f"{what} holds a number that is not finite")
+    if max(map(abs, values)) > MOST_METRES:
+        raise BrokenLine(f"{what} holds a number beyond anything that a robot measures")
     return values
 
 
@@ -27,6 +31,8 @@ def stamp_of(tokens: list[bytes]) -> float:
     stamp = float(tokens[0] if len(tokens) == 3 else tokens[1])
     if not math.isfinite(stamp):
         raise BrokenLine("the stamp is not finite")
+    if abs(stamp) > MOST_SECONDS:
+        raise BrokenLine("the stamp is no time")
     return stamp
 
 
