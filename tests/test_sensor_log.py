@@ -85,3 +85,10 @@ def test_numbers_that_nobody_measures_are_refused(value):
         SensorLog(Odometry(stamps, far))
     with pytest.raises(DataError, match=r"odometry\.stamps"):
         SensorLog(Odometry(np.array([0.0, 1.0, 1e300]), poses))
+
+
+def test_a_thousand_anchors_are_enough():
+    names = tuple(f"A{k}" for k in range(1001))
+    radio = UwbRanges(np.arange(3.0), np.zeros(3, dtype=np.int64), np.ones(3), np.full(3, 100.0), names)
+    with pytest.raises(DataError, match="name 1001 anchors"):
+        SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), radio)

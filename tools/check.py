@@ -5,9 +5,11 @@ examples:
   python tools/check.py                     lint, types and the fast tests
   python tools/check.py --slow              the slow tests too
   python tools/check.py --tests -k icp      only tests, and only some
+  python tools/check.py --tests -n 4        in four processes (two where pytest-xdist is installed)
 """
 
 import argparse
+import importlib.util
 import os
 import subprocess
 import sys
@@ -32,11 +34,18 @@ def main() -> int:
         else:
             print("== mypy: SKIPPED; the annotations of numpy before 2.0 are too coarse for it")
     if not args.lint:
-        steps += [("pytest", ["pytest", *(["--slow"] if args.slow else []), *pytest_args])]
+        steps += [("pytest", ["pytest", *_workers(pytest_args), *(["--slow"] if args.slow else []), *pytest_args])]
     results = [(name, _run(name, command)) for name, command in steps]
     failed = [name for name, code in results if code]
     print("checks: " + ("all passed" if not failed else "FAILED: " + ", ".join(failed)))
     return 1 if failed else 0
+
+
+def _workers(pytest_args: list[str]) -> list[str]:
+    """Return the options for two test processes, where pytest-xdist is there and nothing else is asked for."""
+    if importlib.util.find_spec("xdist") is None or (os.cpu_count() or 1) < 2 or {"-n", "-s", "--pdb"} & set(pytest_args):
+        return []
+    return ["-n", "2", "--dist", "worksteal"]
 
 
 def _numpy_has_exact_types() -> bool:

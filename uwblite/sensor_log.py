@@ -106,6 +106,8 @@ class LogNotes:
 
 MOST_METRES, MOST_SECONDS = 1e7, 1e20
 """Numbers beyond these are no measurements: a quarter of the Earth's girth, and more than any time in any unit."""
+MOST_ANCHORS = 1000
+"""A building may have hundreds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +128,11 @@ class SensorLog:
         if self.ranges is not None:
             m = len(self.ranges.stamps)
             _check(self.ranges.stamps, "ranges.stamps", (None,), ordered=True)
+            if len(self.ranges.anchor_ids) > MOST_ANCHORS:
+                raise DataError(
+                    f"the ranges name {len(self.ranges.anchor_ids)} anchors, more than {MOST_ANCHORS}: is the anchor's id what "
+                    "stands in its field?"
+                )
             _check(self.ranges.ranges, "ranges.ranges", (m,), most=MOST_METRES)
             _check(self.ranges.quality, "ranges.quality", (m,))
             if self.ranges.anchor.shape != (m,):
