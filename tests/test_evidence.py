@@ -69,8 +69,8 @@ def widths(graph):
 def test_a_sound_radio_gets_narrow_priors(seed):
     graph, edges = solved(seed)
     found = widths(choose_widths(graph, (edges,), CONFIG))
-    assert found["range_scale"] == CONFIG.range_scale_sound
-    assert found["bias:A00"] == found["bias:A03"] == CONFIG.range_bias_sound
+    assert found["range_scale"] < 2.0 * CONFIG.range_scale_sound
+    assert CONFIG.range_bias_sound < found["bias:A00"] == found["bias:A03"] < 2.0 * CONFIG.range_bias_sound
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -84,10 +84,21 @@ def test_a_radio_with_large_biases_gets_wide_ones(seed):
 @pytest.mark.parametrize("scale", [1.07, 0.93])
 def test_a_radio_with_another_idea_of_the_metre_gets_a_wide_scale(scale):
     graph, edges = solved(0, scale=scale)
-    assert widths(choose_widths(graph, (edges,), CONFIG))["range_scale"] == CONFIG.range_scale
+    assert widths(choose_widths(graph, (edges,), CONFIG))["range_scale"] > 0.9 * CONFIG.range_scale
 
 
 def test_nothing_free_leaves_the_graph_alone():
     graph, edges = solved(0)
     held = replace(graph, fixed_calibration=np.ones(len(graph.calibration.values), dtype=bool))
     assert choose_widths(held, (edges,), CONFIG) is held
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_of_the_two_may_be_held():
+    graph, edges = solved(1, bias=(0.9, 0.4, 1.3, 0.7))
+    scale = graph.calibration.index("range_scale")
+    held = np.asarray(graph.fixed_calibration).copy()
+    held[scale] = True
+    found = widths(choose_widths(replace(graph, fixed_calibration=held), (edges,), CONFIG))
+    assert found["range_scale"] == CONFIG.range_scale
+    assert found["bias:A02"] > 3 * CONFIG.range_bias_sound

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, short_term_sigma
+from uwblite.range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, short_term_sigma, steady_sigma
 
 CONFIG = RangeNoiseConfig(sigma=0.2, slow_share=0.4, correlation_length=2.0, min_sigma=0.01, learn=True)
 
@@ -164,3 +164,25 @@ def test_short_term_noise_does_not_depend_on_the_order_of_equal_anchors():
     mixed = rng.permutation(300)
     one = short_term_sigma(stamps, anchor, ranges, CONFIG)
     assert short_term_sigma(stamps[mixed], anchor[mixed], ranges[mixed], CONFIG) == one
+
+
+@given(st.integers(1, 300), st.floats(0.5, 30.0), st.floats(-3.1, 3.1))
+def test_ranges_from_one_place_weigh_as_one_draw_of_the_steady_part(n, distance, bearing):
+    offsets = np.tile([distance * np.cos(bearing), distance * np.sin(bearing)], (n, 1))
+    assert np.sum(steady_sigma(offsets, CONFIG) ** -2.0) == pytest.approx(CONFIG.steady**-2.0, rel=1e-9)
+
+
+@given(st.floats(0.5, 5.0), st.floats(2.0, 20.0))
+def test_what_is_steady_depends_on_directions_and_ratios_of_distances(radius, factor):
+    """The same drive around an anchor at any scale; errors from all sides are more draws than errors from one."""
+    bearing = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
+    ring = radius * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    near, far = steady_sigma(ring, CONFIG), steady_sigma(factor * ring, CONFIG)
+    np.testing.assert_allclose(near, far, rtol=0.1)
+    side = radius * np.stack([np.cos(bearing / 20.0), np.sin(bearing / 20.0)], axis=1)
+    assert np.sum(near**-2.0) > 1.5 * np.sum(steady_sigma(side, CONFIG) ** -2.0)
+
+
+def test_steady_errors_can_be_switched_off():
+    assert not np.any(steady_sigma(np.ones((4, 2)), replace(CONFIG, steady=0.0)))
+    assert len(steady_sigma(np.zeros((0, 2)), CONFIG)) == 0

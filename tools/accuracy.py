@@ -87,6 +87,8 @@ INGREDIENTS: dict[str, tuple[str, ...]] = {
     "calibration of the clocks": ("calibration.range_delay=0", "calibration.laser_delay=0"),
     "noise of ranges learnt": ("ranges.learn=false",),
     "correlation of ranges": ("ranges.learn=false", "ranges.slow_share=0"),
+    "errors steady by direction": ("ranges.steady=0",),
+    "evidence for the radio's priors": ("calibration.range_scale_sound=0.15", "calibration.range_bias_sound=0.8"),
     "robust kernels of wheels and ranges": ("odometry.kernel.name=none", "ranges.kernel.name=none"),
     "tracking": ("tracking.on=false",),
     "loop closures of sub-maps": ("loops.rounds=0",),

@@ -15,7 +15,7 @@ Ints = NDArray[np.int64]
 class CalibrationConfig:
     """Prior standard deviation of each unknown; 0 switches it off (held at its nominal value)."""
 
-    odometry_scale: float = 0.025
+    odometry_scale: float = 0.02
     """Relative error of travelled distance (wheel radius), 1."""
     heading_scale: float = 0.3
     """Relative error of turned angle (track width), 1."""
@@ -23,7 +23,7 @@ class CalibrationConfig:
     """Heading drift per travelled metre (unequal wheels), rad/m."""
     heading_rate: float = 0.0005
     """Heading drift per second while the robot moves (gyro bias), rad/s."""
-    range_scale: float = 0.3
+    range_scale: float = 0.15
     """Relative error of all ranges where the radios' idea of distance is off, 1."""
     range_scale_sound: float = 0.005
     """The same for radios that are sound, as most are: they measure times of flight. The data choose, see evidence."""

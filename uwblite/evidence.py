@@ -4,7 +4,9 @@ Most radios are sound: their clocks are right to parts of a million and the make
 centimetres. Some are not: scales 7 % off and biases of a metre and more are on record. A prior wide enough for those
 leaves the others' anchors and the map's scale hanging in the air, wherever bias and distance look alike along a path.
 So the priors' standard deviations are chosen by the evidence, the probability of all measurements with the unknowns
-integrated out (type-II maximum likelihood: I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
+integrated out (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992): widths from sound to unsound are tried, and
+what is taken is their mean on the scale of logarithms, weighted by that probability. Where the recording cannot tell, it
+is one between.
 
 With the posterior N(a, P) found under the prior N(0, D), the evidence of another prior N(0, D') is, relative to it,
 
@@ -48,13 +50,15 @@ def choose_widths(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     except SolverError:
         return graph
     mean, before = graph.calibration.values[which], sigma[which]
-    best, most = before, -np.inf
-    for scale_width in _between(config.range_scale_sound, config.range_scale, 2):
-        for bias_width in _between(config.range_bias_sound, config.range_bias, _STEPS):
-            width = np.repeat([scale_width, bias_width], [len(scale), len(bias)])
-            worth = log_evidence(mean, covariance, before, width)
-            if worth > most:
-                best, most = width, worth
+    scales = _between(config.range_scale_sound, config.range_scale, 2) if len(scale) else [1.0]
+    biases = _between(config.range_bias_sound, config.range_bias, _STEPS) if len(bias) else [1.0]
+    tried = np.array([(s, b) for s in scales for b in biases])
+    counts = [len(scale), len(bias)]
+    worth = np.array([log_evidence(mean, covariance, before, np.repeat(pair, counts)) for pair in tried])
+    if not np.isfinite(worth).any():
+        return graph
+    likely = np.exp(worth - worth.max())
+    best = np.repeat(np.exp(likely @ np.log(tried) / likely.sum()), counts)
     sigma[which] = best
     return _with_prior_sigma(graph, sigma)
 

@@ -187,7 +187,10 @@ def build_map(
             close = _close_loops if config.loops.method == "search" else _close_loops_plainly
             part, closures = close(part, held, scans, drives, config, stages)
             if part.radio is not None:
-                widened = evidence.choose_widths(part.graph, (*held, closures.edges), config.calibration)
+                radio, _ = learn_noise(part.radio, part.graph, len(part.graph.anchors), config.ranges, steady=True)
+                part = replace(part, radio=radio)
+                lidar = (closures.edges,) if tracked is None else (tracked.edges, closures.edges)
+                widened = evidence.choose_widths(part.graph, (*part.edges, *lidar), config.calibration)
                 part = replace(part, graph=widened)
             part, refined = _refine_jointly(part, scans, drives, config, stages)
             apart = moved_anchors.apart(part, drives, config.solver, config.ranges)
@@ -197,6 +200,8 @@ def build_map(
     if known.landmark_distances:
         part, refined = _measured_distances(part, closures, tracked, refined, known, scans, drives, config, stages)
     part = _final(part, closures, tracked, refined)
+    if refined is not None and part.radio is not None:
+        part = replace(part, graph=_hold_negative_heights(optimize(part.graph, config.solver)[0]))
     part = _aligned(part, scans, config)
 
     grid = _grid(drives, part.graph, config, executor, stages)
@@ -480,7 +485,7 @@ def _refine_jointly(
         graph = _hold_negative_heights(graph)
         shift = float(np.sqrt(np.mean(np.sum((graph.poses - before)[:, :2] ** 2, axis=1))))
         if radio is not None:
-            radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
+            radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges, steady=True)
         stages.end(
             f"joint refinement {lap + 1}", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
             sigma=round(refined.sigma, 4), shift=round(shift, 5), **_solver_figures(refined.summary),

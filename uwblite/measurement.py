@@ -10,7 +10,7 @@ from .anchors import AnchorConfig, usable
 from .calibration import odometry_indices, range_indices
 from .graph import Calibration, Graph, OdometryEdges, RangeEdges, RelativePoseEdges
 from .keyframes import AttachedRanges, Keyframes
-from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn
+from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, steady_sigma
 from .robust import Kernel
 from .sensor_log import SensorMounting
 
@@ -25,7 +25,7 @@ _RANGES = Kernel("cauchy", 2.5)
 class OdometryNoiseConfig:
     """Random errors of the wheels; systematic ones are calibrated."""
 
-    distance: float = 0.012
+    distance: float = 0.018
     """Standard deviation of position along and across after one metre, m; grows with the square root of the distance."""
     heading_per_metre: float = 0.008
     """Standard deviation of heading after one metre, rad; grows with the square root of the distance."""
@@ -96,7 +96,7 @@ def tag_positions(edges: RangeEdges, poses: Floats) -> Floats:
 
 
 def learn_noise(
-    edges: RangeEdges, graph: Graph, anchors: int, config: RangeNoiseConfig
+    edges: RangeEdges, graph: Graph, anchors: int, config: RangeNoiseConfig, steady: bool = False
 ) -> tuple[RangeEdges, tuple[RangeNoise, ...]]:
     """Give every range the standard deviation that its anchor's residuals show, and a weight that counts slow errors once.
 
@@ -106,6 +106,9 @@ def learn_noise(
     ----------
     graph : estimates the residuals are taken at.
     anchors : how many there are.
+    steady : count errors that depend on direction and distance alone once as well, see range_noise.steady_sigma: right
+        where the lidar holds the poses. Without it such errors hardly matter for the poses, since the anchors' places
+        absorb them; what matters then is that all ranges together hold the trajectory.
     """
     positions, sigma, weights = tag_positions(edges, graph.poses), edges.sigma.copy(), np.zeros(len(edges))
     errors = edges.residuals(graph)[:, 0] * edges.sigma
@@ -120,7 +123,11 @@ def learn_noise(
             trust = np.maximum(mixture.weights(-errors[own]), 1e-6)
             noise = learn(positions[own], errors[own], mixture.core(-errors[own]), config)
         sigma[own] = max(noise.sigma, 1e-6)
-        weights[own] = trust * (sigma[own] / effective_sigma(positions[own], noise, trust)) ** 2
+        effective = np.hypot(
+            effective_sigma(positions[own], noise, trust),
+            steady_sigma(positions[own] - graph.anchors[anchor], config, trust) if steady else 0.0,
+        )
+        weights[own] = trust * (sigma[own] / effective) ** 2
         noises.append(noise)
     return replace(edges, sigma=sigma, weights=weights), tuple(noises)
 

@@ -32,8 +32,8 @@ def preset(name: str) -> MappingConfig:
         return MappingConfig()
     if name == "paper":
         return MappingConfig(
-            odometry=OdometryNoiseConfig(kernel=SQUARED),
-            ranges=RangeNoiseConfig(sigma=0.1, slow_share=0.0, learn=False, kernel=SQUARED),
+            odometry=OdometryNoiseConfig(distance=0.012, kernel=SQUARED),
+            ranges=RangeNoiseConfig(sigma=0.1, slow_share=0.0, steady=0.0, learn=False, kernel=SQUARED),
             calibration=CalibrationConfig(**dict.fromkeys(CalibrationConfig.__slots__, 0.0)),
             clouds=CloudConfig(linearity=1.0),
             submaps=SubmapConfig(epsilon=9.0),

@@ -33,6 +33,9 @@ class RangeNoiseConfig:
     """Distance over which the slow part stays alike, m, before it is learnt."""
     min_sigma: float = 0.03
     """No radio of this kind is trusted beyond this, m."""
+    steady: float = 0.06
+    """Standard deviation of what an anchor's errors have in common in one direction and at one distance from it, m: radiation
+    patterns and received power alone make so much, and no residual shows what a wrong place of the anchor explains as well."""
     learn: bool = True
     """Estimate white and slow part from the residuals."""
     kernel: Kernel = _ROBUST
@@ -153,6 +156,22 @@ def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None
     if noise.slow == 0.0 or len(positions) == 0:
         return np.full(len(positions), max(noise.sigma, 1e-6))
     return np.sqrt(noise.white**2 + noise.slow**2 * _alike(positions, noise.length, weights))
+
+
+def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | None = None) -> Floats:
+    """Return the standard deviation (m,) to give each of one anchor's ranges for what they err alike by direction and distance.
+
+    Parameters
+    ----------
+    offsets : (m, 2) from the anchor to the tag, m.
+    """
+    if config.steady == 0.0 or len(offsets) == 0:
+        return np.zeros(len(offsets))
+    distance = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 0.1)
+    bearing = np.arctan2(offsets[:, 1], offsets[:, 0])
+    # Half a radian of direction is alike, and half an e-fold of distance.
+    polar = np.stack([np.cos(bearing), np.sin(bearing), np.log(distance)], axis=1)
+    return config.steady * np.sqrt(_alike(polar, 0.5, weights))
 
 
 def _alike(positions: Floats, length: float, weights: Floats | None) -> Floats:
