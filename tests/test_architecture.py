@@ -22,7 +22,7 @@ FLOORS = (
     # parts without a view of the whole
     ("graph", "landmark_edges", "point_cloud", "nearest", "bresenham", "grid_geometry", "scan_rays", "ray_counter", "drawing"),
     ("evaluate", "occupancy_grid", "keyframes", "range_noise", "range_mixture", "anchors", "scan_search", "free_space"),
-    ("factorization", "layouts", "selected_inverse"),
+    ("factorization", "layouts", "selected_inverse", "two_level"),
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts"),
     ("distance_edges", "constraints", "turning", "drivers/*"),
     # stages

@@ -27,6 +27,8 @@ _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""
 _WIDEST_BORDER = 48
 """Scalars that make a border; more of them are left to the sparse matrix."""
+_MANY, _TIED = 500, 4
+"""From so many poses on, with so many neighbours each, iteration wins over factorisation."""
 
 
 class Factor(Protocol):
@@ -46,6 +48,8 @@ class Ordering:
     """Everything else is a border."""
     banded: bool
     """The poses are a narrow band."""
+    iterative: bool = False
+    """A factor would fill up: see two_level."""
 
 
 def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False, last: Ints | None = None) -> Ordering:
@@ -61,6 +65,8 @@ def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False
     """
     if poses < 2:
         return Ordering(np.arange(poses), False, False)
+    if not subtrees and last is None and poses >= _MANY and len(pairs) - poses > _TIED * poses:
+        return Ordering(np.arange(poses), False, False, iterative=True)
     bordered = not subtrees and last is None and others <= _WIDEST_BORDER
     if bordered:
         order = reverse_cuthill_mckee(_adjacency(pairs, poses).tocsr(), symmetric_mode=True).astype(np.int64)

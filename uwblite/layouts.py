@@ -12,6 +12,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
 from .factorization import BandedFactor, BorderedFactor, Factor, Ordering, superlu
+from .two_level import LocalPlaces, Pieces, TwoLevelFactor
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -124,8 +125,25 @@ class SparseLayout:
 
     def factor(self, values: Floats) -> SuperLU:
         """Factorise the matrix with these values; it is used up by the next call."""
+        return superlu(self.matrix(values), "NATURAL")
+
+    def matrix(self, values: Floats) -> sparse.csc_matrix:
+        """Return the matrix with these values; it is used up by the next call."""
         np.take(values, self._source, out=self._matrix.data)
-        return superlu(self._matrix, "NATURAL")
+        return self._matrix
+
+
+class IterativeLayout:
+    """Both triangles in compressed columns, and where their pieces are."""
+
+    def __init__(self, blocks: Blocks, pieces: Pieces) -> None:
+        """Find the places of the values in the matrix, and of its entries in the pieces' blocks."""
+        self._sparse, self._pieces = SparseLayout(blocks), pieces
+        self._local = LocalPlaces(self._sparse.matrix(np.zeros(blocks.full_start + blocks.full * blocks.size + 1)), pieces)
+
+    def factor(self, values: Floats) -> TwoLevelFactor:
+        """Prepare to solve with these values."""
+        return TwoLevelFactor(self._sparse.matrix(values).copy(), self._pieces, self._local)
 
 
 class BandedLayout:

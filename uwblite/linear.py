@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from . import se2
 from .factorization import Factor, choose_ordering
 from .graph import Graph, Linearization
-from .layouts import Blocks, make_layout
+from .layouts import Blocks, IterativeLayout, Layout, make_layout
+from .two_level import cut
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -141,7 +142,12 @@ class NormalEquations:
         self.unknowns = Unknowns({name: s.T for name, s in scalars.items()}, int(width.sum()))
         blocks = self._place_blocks(pairs, corner, width)
         self._place_products(linearized, touched, which, corner)
-        self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
+        if ordering.iterative:
+            number = self.unknowns.number["poses"]
+            chain = number[:, 0] >= 0
+            self._layout: Layout = IterativeLayout(blocks, cut(number[chain], graph.poses[chain], self.unknowns.size))
+        else:
+            self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
 
