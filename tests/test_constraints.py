@@ -243,3 +243,9 @@ def test_the_anchors_of_an_earlier_map(tmp_path):
     file.write_text("id,x\nC,1\n")
     with pytest.raises(FormatError, match="no column 'y'"):
         read_anchors(file)
+
+
+@pytest.mark.parametrize("field", ["position = [1e300, 0]", "position = [0, 0]\nsigma = 1e9"])
+def test_numbers_that_nobody_measured_are_refused(field):
+    with pytest.raises(ConfigError, match="beyond 1e"):
+        parse_constraints(f'[[anchor]]\nid = "A"\n{field}\n')

@@ -144,3 +144,11 @@ def test_each_recording_of_a_joint_map_and_all_together(result, capsys):
     assert "has no trajectory_3.tum" in capsys.readouterr().err
     assert main([*words, *second, "--recording", "2"]) == 1
     assert "--recording is for a single --truth" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("row", ["C1,1,2,0", "C1,1,2,-1", "C1,nan,2,0.3", "C1,1e300,2,0.3"])
+def test_columns_that_cannot_be_are_refused(result, capsys, row):
+    root, words = result
+    (root / "odd.csv").write_text(f"name,x,y,radius\n{row}\nC2,1,1,0.2\n")
+    assert main([*words, "--landmarks", str(root / "odd.csv")]) == 1
+    assert capsys.readouterr().err.startswith("uwblite: error: ")

@@ -183,11 +183,16 @@ def _anchors(path: Path, truth: str, T_truth_map: "NDArray[np.float64]") -> "Anc
 
 def read_landmarks(path: str) -> "tuple[Landmarks, tuple[tuple[str, str], ...] | None]":
     """Return the columns of a table, and the pairs it wants judged (None = all)."""
+    import numpy as np
+
+    from ..errors import FormatError
     from ..evaluate_map import Landmarks
     from ..io.csv_table import read_csv
 
     table = read_csv(path)
     names = table.texts("name")
+    if not (np.isfinite(table.numbers("x", "y")).all() and (table.numbers("radius", default=DEFAULT_RADIUS) > 0).all()):
+        raise FormatError("places must be numbers, and radii positive", path)
     radii = table.numbers("radius", default=DEFAULT_RADIUS)[:, 0]
     neighbours = [text.split() for text in table.texts("neighbours", default="")]
     pairs = tuple((a, b) for a, others in zip(names, neighbours, strict=True) for b in others)

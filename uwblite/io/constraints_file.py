@@ -18,6 +18,7 @@ from ..constraints import (
     KnownPose,
 )
 from ..errors import ConfigError, FormatError
+from ..sensor_log import MOST_METRES, MOST_SECONDS
 from .csv_table import read_csv
 
 _TABLES: Mapping[str, tuple[type, str]] = {
@@ -59,6 +60,10 @@ def _entry(kind: type, table: Any, where: str) -> Any:
     missing = [name for name in _REQUIRED[kind] if name not in table]
     if missing:
         raise ConfigError(f"{where} needs {missing[0]}")
+    for name, value in table.items():
+        most = MOST_SECONDS if name.startswith("stamp") else MOST_METRES
+        if any(isinstance(v, int | float) and abs(v) > most for v in (value if isinstance(value, list) else [value])):
+            raise ConfigError(f"{where}: {name} is beyond {most:g}: nobody measured that")
     try:
         return from_dict(kind, table)
     except ConfigError as error:

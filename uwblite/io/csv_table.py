@@ -56,8 +56,8 @@ class CsvTable:
                 number = float(text) if text or default is None else default
             except ValueError:
                 number = math.inf
-            if math.isinf(number):
-                raise FormatError(f"{column} is {text!r}, not a number", self.path, line)
+            if abs(number) > _FARTHEST:
+                raise FormatError(f"{column} is {text[:40]!r}, not a number that makes sense", self.path, line)
             numbers.append(number)
         return numbers
 
@@ -93,6 +93,8 @@ def read_csv(path: str | os.PathLike[str]) -> CsvTable:
 
 _LARGEST = 1 << 26
 """Bytes of a table that is read."""
+_FARTHEST = 1e9
+"""m; a number beyond it is no place on Earth."""
 
 
 def _fields(kept: list[tuple[int, str]], name: str) -> tuple[list[tuple[str, ...]], tuple[int, ...]]:

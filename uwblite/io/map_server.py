@@ -106,8 +106,8 @@ def read_map(path: str | os.PathLike[str]) -> OccupancyGrid:
     resolution = _number(settings, "resolution", name)
     origin = _numbers(settings, "origin", name)
     occupied, free = _number(settings, "occupied_thresh", name), _number(settings, "free_thresh", name)
-    if not resolution > 0 or len(origin) != 3:
-        raise FormatError("resolution must be positive and origin must be [x, y, yaw]", name)
+    if not 1e-4 <= resolution <= 1e3 or len(origin) != 3 or max(map(abs, origin)) > 1e7:
+        raise FormatError("resolution must be positive (0.0001 to 1000 m) and origin must be a place [x, y, yaw]", name)
     if origin[2] != 0.0:
         raise FormatError(f"origin is turned by {origin[2]} rad; only maps with yaw 0 are read", name)
     mode = str(settings.get("mode", "trinary"))
