@@ -11,8 +11,9 @@ from test_pair_matching import CORRIDOR, ROOM, scanned
 from uwblite import se2
 from uwblite.clouds import in_map
 from uwblite.graph import Graph
+from uwblite.marginals import marginals
 from uwblite.pair_matching import paint
-from uwblite.refinement import RefinementConfig, choose_pairs, refine, surface_cells
+from uwblite.refinement import RefinementConfig, choose_pairs, refine, surface_cells, with_fewer_pairs
 from uwblite.solver import SolverConfig
 
 CONFIG = RefinementConfig()
@@ -160,3 +161,19 @@ def test_rounds_are_told_and_bounded():
     assert len(result.edges) == result.used.sum()
     again = refine(graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig())
     assert again.graph.poses.tobytes() == result.graph.poses.tobytes()
+
+
+
+def test_fewer_pairs_tell_nearly_as_much():
+    """With a fourth of the pairs every pose is held by some ties still; what lies between them is a little less sure."""
+    truth, path, clouds = room(5, 0.01)
+    graph = Graph(truth).with_edges(chained(truth, NOISE))
+    result = refined(graph, clouds, path, selections=1)
+    whole = result.graph.with_edges(result.edges)
+    far = np.abs(result.edges.i - result.edges.j) > 4
+    fewer = with_fewer_pairs(whole, int(far.sum()) // 4)
+    assert np.sum(np.abs(fewer.edges[-1].i - fewer.edges[-1].j) > 4) <= far.sum() // 4
+    assert with_fewer_pairs(whole, int(far.sum())).edges[-1] is result.edges
+    ratio = np.sqrt(marginals(fewer).poses[1:, [0, 1, 2], [0, 1, 2]] / marginals(whole).poses[1:, [0, 1, 2], [0, 1, 2]])
+    assert np.all(np.median(ratio, axis=0) > 0.9)
+    assert np.all(np.median(ratio, axis=0) < 1.7)

@@ -205,7 +205,7 @@ def build_map(
     part = _aligned(part, scans, config)
 
     grid = _grid(drives, part.graph, config, executor, stages)
-    uncertainty = marginals(part.graph)
+    uncertainty = marginals(refinement.with_fewer_pairs(part.graph))
     result = summary.summarise(drives, part, uncertainty, closures, grid, config.calibration, stages.done, stages.warnings)
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
