@@ -4,7 +4,7 @@ import pytest
 from uwblite.bitmap_font import HEIGHT, WIDTH, text_mask
 from uwblite.drawing import Canvas
 from uwblite.io.png import decode_png, encode_png
-from uwblite.map_picture import ANCHOR, CLOSURE, PAPER, PATH, WALL, PictureAnchor, _round_length, draw_map
+from uwblite.map_picture import ANCHOR, CLOSURE, PAPER, PATH, PATHS, WALL, PictureAnchor, _round_length, draw_map
 from uwblite.occupancy_grid import GridGeometry, OccupancyGrid
 
 
@@ -98,3 +98,12 @@ def test_letters_differ_and_unknown_ones_become_boxes():
     assert text_mask("ab", 3).shape == (3 * HEIGHT, 3 * (2 * WIDTH + 1))
     assert text_mask("\u20ac").any()
     assert text_mask("").shape[0] == HEIGHT
+
+
+def test_recordings_have_colours_of_their_own():
+    one, two = np.array([[0.0, 0.0], [4.0, 0.0]]), np.array([[0.0, 3.0], [4.0, 3.0]])
+    gap = np.full((1, 2), np.nan)
+    image = draw_map(None, np.vstack([one, gap, two, gap]))
+    colours = {tuple(c) for c in image.reshape(-1, 3).tolist()}
+    assert {PATHS[0], PATHS[1]} <= colours
+    assert PATHS[1] not in {tuple(c) for c in draw_map(None, one).reshape(-1, 3).tolist()}

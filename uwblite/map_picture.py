@@ -18,6 +18,8 @@ PAPER: Colour = (226, 229, 233)
 FLOOR: Colour = (255, 255, 255)
 WALL: Colour = (24, 28, 36)
 PATH: Colour = (37, 99, 235)
+PATHS: tuple[Colour, ...] = (PATH, (124, 58, 180), (0, 128, 140), (92, 64, 51))
+"""Of the recordings, in turn."""
 CLOSURE: Colour = (234, 120, 20)
 ANCHOR: Colour = (208, 28, 60)
 START: Colour = (22, 150, 80)
@@ -56,7 +58,8 @@ def draw_map(
     Parameters
     ----------
     grid : cells; None = none were mapped.
-    trajectory : (n, 2 or more) x, y of the base, m, map frame; a row of nan parts recordings.
+    trajectory : (n, 2 or more) x, y of the base, m, map frame; a row of nan parts recordings,
+        which have colours of their own.
     anchors : those to draw; positions that are not finite are left out.
     closures : (c, 4) x, y, x, y of the two poses of each accepted loop closure, m.
     caption : words below the map.
@@ -85,18 +88,23 @@ def draw_map(
     if closures is not None and len(closures):
         ends = np.concatenate([pixel(closures[:, :2]), pixel(closures[:, 2:])], axis=1)
         canvas.lines(ends, 1.3, CLOSURE, 0.75)
-    track = pixel(path)
-    canvas.polyline(track, 2.2, PATH, 0.85)
-    finite = track[np.isfinite(track).all(axis=1)]
-    if len(finite):
-        canvas.discs(finite[:1], 7.0, FLOOR)
-        canvas.discs(finite[:1], 5.0, START)
-        canvas.discs(finite[-1:], 7.0, FLOOR)
-        canvas.discs(finite[-1:], 5.0, PATH)
+    for number, track in enumerate(_recordings(pixel(path))):
+        colour = PATHS[number % len(PATHS)]
+        canvas.polyline(track, 2.2, colour, 0.85)
+        for end, fill in ((track[:1], START), (track[-1:], colour)):
+            canvas.discs(end, 7.0, FLOOR)
+            canvas.discs(end, 5.0, fill)
     for anchor in placed:
         _draw_anchor(canvas, anchor, pixel)
     _draw_foot(image, height, scale, caption)
     return image
+
+
+def _recordings(track: Floats) -> list[Floats]:
+    """Return the pieces of a path between its rows of nan."""
+    gaps = np.flatnonzero(~np.isfinite(track).all(axis=1))
+    pieces = np.split(track, np.unique(np.concatenate([gaps, gaps + 1])))
+    return [piece for piece in pieces if len(piece) and np.isfinite(piece).all()]
 
 
 def _extent(grid: OccupancyGrid | None, path: Floats, anchors: list[PictureAnchor]) -> tuple[Floats, Floats]:

@@ -18,7 +18,10 @@ MOST_CLOSURES = 1500
 
 def number(value: float, digits: int = 3, sign: bool = False) -> str:
     """Return a number with a true minus sign; a dash where it is not finite."""
-    return f"{value:{'+' if sign else ''}.{digits}f}".replace("-", "\u2212") if np.isfinite(value) else "\u2013"
+    if not np.isfinite(value):
+        return "\u2013"
+    # What rounds to zero has no sign to be told.
+    return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "\u2212")
 
 
 def thin(n: int, most: int) -> NDArray[np.int64]:

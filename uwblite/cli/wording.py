@@ -42,4 +42,4 @@ def calibration_line(value: "CalibrationEstimate") -> str:
 
 def signed(value: float, digits: int = 2, *, plus: bool = False) -> str:
     """Return a number with a true minus sign."""
-    return f"{value:{'+' if plus else ''}.{digits}f}".replace("-", "\u2212")
+    return f"{round(value, digits) + 0.0:{'+' if plus else ''}.{digits}f}".replace("-", "\u2212")
