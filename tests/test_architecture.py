@@ -26,8 +26,9 @@ FLOORS = (
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts"),
     ("distance_edges", "constraints", "turning", "drivers/*"),
     # stages
-    ("solver", "marginals", "evidence", "gnc", "icp", "pair_matching", "submaps"),
-    ("first_estimate", "growing", "sessions", "thinning", "joining", "moved_anchors", "refinement", "tracking", "loop_closure"),
+    ("solver", "marginals", "evidence", "gnc", "icp", "pair_matching", "submaps", "pair_alignment", "sight", "closures"),
+    ("first_estimate", "growing", "sessions", "thinning", "joining", "moved_anchors", "refinement", "tracking"),
+    ("closure_candidates", "loop_closure"),
     ("evaluate_map",),
     # files in, files out: types and text, no stages
     ("plain_closures", "landmarks"),

@@ -10,18 +10,10 @@ from test_pair_matching import scanned
 
 from uwblite import se2
 from uwblite.calibration import odometry_indices
+from uwblite.closure_candidates import Candidates, missed, propose
+from uwblite.closures import Closures, LoopClosureConfig, merged, no_closures
 from uwblite.graph import Calibration, Graph, OdometryEdges, RelativePoseEdges
-from uwblite.loop_closure import (
-    Candidates,
-    Closures,
-    LoopClosureConfig,
-    find,
-    merged,
-    missed,
-    no_closures,
-    propose,
-    reconcile,
-)
+from uwblite.loop_closure import find, reconcile
 from uwblite.map_result import LoopClosure
 from uwblite.marginals import marginals
 from uwblite.scan_search import SearchConfig

@@ -8,9 +8,9 @@ from planted import box, drive
 from test_pair_matching import scanned
 
 from uwblite import se2
+from uwblite.closures import LoopClosureConfig
 from uwblite.graph import Graph
 from uwblite.icp import IcpConfig
-from uwblite.loop_closure import LoopClosureConfig
 from uwblite.plain_closures import candidates, find
 from uwblite.submaps import SubmapConfig, build
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from . import (
     calibration,
+    closure_candidates,
+    closures,
     clouds,
     evidence,
     first_estimate,
@@ -30,6 +32,7 @@ from . import (
     refinement,
     se2,
     sessions,
+    sight,
     submaps,
     summary,
     tracking,
@@ -37,6 +40,7 @@ from . import (
 )
 from .anchors import AnchorConfig
 from .calibration import CalibrationConfig
+from .closures import Closures, LoopClosureConfig
 from .clouds import CloudConfig, Clouds
 from .constraints import Clock, Constraints
 from .constraints import apply as apply_constraints
@@ -45,7 +49,6 @@ from .first_estimate import GrowthConfig
 from .graph import Edges, Graph
 from .icp import IcpConfig
 from .keyframes import KeyframeConfig
-from .loop_closure import Closures, LoopClosureConfig
 from .map_result import MapResult, StageSummary
 from .marginals import JointCovariance, marginals
 from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_edges
@@ -112,6 +115,7 @@ class Stages:
         self._since = clock() if clock else 0.0
         self.done: list[StageSummary] = []
         self.warnings: list[str] = []
+        self.doubts: list[str] = []
 
     def tell(self, stage: str, done: int, total: int) -> None:
         """Report progress; raises Cancelled where the callback returns False."""
@@ -174,7 +178,7 @@ def build_map(
     part = _constrained(part, known, drives, config, stages)
 
     scans = _Scans.of(drives, known, config)
-    closures = loop_closure.no_closures()
+    found = closures.no_closures()
     tracked: Refined | None = None
     refined: Refined | None = None
     if scans is not None:
@@ -185,11 +189,11 @@ def build_map(
         if config.use_loops:
             held = part.edges if tracked is None else (*part.edges, tracked.edges)
             close = _close_loops if config.loops.method == "search" else _close_loops_plainly
-            part, closures = close(part, held, scans, drives, config, stages)
+            part, found = close(part, held, scans, drives, config, stages)
             if part.radio is not None:
                 radio, _ = learn_noise(part.radio, part.graph, len(part.graph.anchors), config.ranges, steady=True)
                 part = replace(part, radio=radio)
-                lidar = (closures.edges,) if tracked is None else (tracked.edges, closures.edges)
+                lidar = (found.edges,) if tracked is None else (tracked.edges, found.edges)
                 widened = evidence.choose_widths(part.graph, (*part.edges, *lidar), config.calibration)
                 part = replace(part, graph=widened)
             part, refined = _refine_jointly(part, scans, drives, config, stages)
@@ -197,16 +201,19 @@ def build_map(
             if apart.warnings:
                 stages.warnings += apart.warnings
                 part, refined = _refine_jointly(apart.part, scans, drives, config, stages)
+        _look_again(part, scans, drives, stages)
     if known.landmark_distances:
-        part, refined = _measured_distances(part, closures, tracked, refined, known, scans, drives, config, stages)
-    part = _final(part, closures, tracked, refined)
+        part, refined = _measured_distances(part, found, tracked, refined, known, scans, drives, config, stages)
+    part = _final(part, found, tracked, refined)
     if refined is not None and part.radio is not None:
         part = replace(part, graph=_hold_negative_heights(optimize(part.graph, config.solver)[0]))
     part = _aligned(part, scans, config)
 
     grid = _grid(drives, part.graph, config, executor, stages)
     uncertainty = marginals(refinement.with_fewer_pairs(part.graph))
-    result = summary.summarise(drives, part, uncertainty, closures, grid, config.calibration, stages.done, stages.warnings)
+    result = summary.summarise(
+        drives, part, uncertainty, found, grid, config.calibration, stages.done, stages.warnings, stages.doubts
+    )
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
 
@@ -382,21 +389,8 @@ def _match_round(
 
 def _without_forbidden(found: Closures, scans: _Scans) -> Closures:
     """Return closures with those the user has forbidden rejected."""
-    accepted = [c for c in found.candidates if c.accepted]
-    kept = scans.may_meet(*(np.array([(c.i, c.j) for c in accepted], dtype=np.int64).reshape(-1, 2).T))
-    if kept.all():
-        return found
-    banned = {(c.i, c.j) for c, keep in zip(accepted, kept, strict=True) if not keep}
-    story = tuple(
-        replace(c, accepted=False, reason="forbidden by the constraints") if c.accepted and (c.i, c.j) in banned else c
-        for c in found.candidates
-    )
-    e = found.edges
-    edges = replace(
-        e, i=e.i[kept], j=e.j[kept], T_i_j=e.T_i_j[kept], sqrt_information=e.sqrt_information[kept],
-        weights=None if e.weights is None else e.weights[kept],
-    )
-    return Closures(edges, story)
+    kept = scans.may_meet(found.edges.i, found.edges.j)
+    return found if kept.all() else found.without(kept, ["forbidden by the constraints"] * len(kept))
 
 
 def _track(part: Part, scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages) -> tuple[Part, Refined]:
@@ -424,20 +418,20 @@ def _close_loops(
     """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
     session = drives.session
     base = part.graph.with_edges(*edges)
-    found = loop_closure.no_closures()
+    found = closures.no_closures()
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
     held = part.radio is not None
     for lap in range(config.loops.rounds):
         pieces = submaps.build(scans.clouds, base.poses, drives.path, session, config.submaps)
         known = JointCovariance(base.with_edges(found.edges), pieces.reference)
-        candidates = loop_closure.propose(base, known, pieces, session, tried, missed, held, config.loops)
+        candidates = closure_candidates.propose(base, known, pieces, session, tried, missed, held, config.loops)
         tried |= candidates.names(config.loops)
-        free = loop_closure.seen_free(scans.clouds, pieces, base.poses, config.loops)
+        free = sight.seen_free(scans.clouds, pieces, base.poses)
         new = loop_closure.find(candidates, pieces, config.loops, config.search, stages.teller("loop closure"), free)
         new = _without_forbidden(new, scans)
-        missed |= set() if held else loop_closure.missed(candidates, new, config.loops)
-        found = loop_closure.merged(found, new)
+        missed |= set() if held else closure_candidates.missed(candidates, new, config.loops)
+        found = closures.merged(found, new)
         base, found = loop_closure.reconcile(base, found, config.loops, config.solver)
         stages.end(
             f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(candidates.target),
@@ -453,7 +447,7 @@ def _close_loops_plainly(
 ) -> tuple[Part, Closures]:
     """Align sub-maps pair by pair and solve once more with those that fit (paper: second optimisation)."""
     graph, session = part.graph, drives.session
-    found = loop_closure.no_closures()
+    found = closures.no_closures()
     for lap in range(config.loops.rounds):
         pieces = submaps.build(scans.clouds, graph.poses, drives.path, session, config.submaps)
         teller = stages.teller("loop closure")
@@ -493,6 +487,22 @@ def _refine_jointly(
         if shift < config.refinement.same_pairs:
             break
     return replace(part, graph=graph, radio=radio), refined
+
+
+def _look_again(part: Part, scans: _Scans, drives: Drives, stages: Stages) -> None:
+    """Compare what visits to the same place saw; doubt a map in which they saw through each other's walls."""
+    share, visits = sight.disagreement(scans.clouds, part.graph.poses, drives.path, drives.session)
+    stages.end("visits compared", visits=visits, disagreement=round(share, 4))
+    if share > _DISAGREEMENT and visits >= _ENOUGH_VISITS:
+        stages.doubts.append(
+            f"{share:.0%} of what was seen on one visit to a place stands where another visit saw free space: "
+            "parts of the map lie in a wrong place to each other"
+        )
+
+
+_DISAGREEMENT = 0.05
+"""Share from which visits do not show the same place; people, glass and doors leave half of it."""
+_ENOUGH_VISITS = 10
 
 
 def _final(part: Part, closures: Closures, tracked: Refined | None, refined: Refined | None) -> Part:

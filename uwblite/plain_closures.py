@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import se2
+from .closures import Closures, LoopClosureConfig, no_closures
 from .graph import Graph, RelativePoseEdges
 from .icp import IcpConfig, Registration, align
-from .loop_closure import Closures, LoopClosureConfig, no_closures
 from .map_result import LoopClosure
 from .point_cloud import PointCloud, make_cloud
 from .submaps import Submaps

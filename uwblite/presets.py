@@ -1,10 +1,10 @@
 """Named settings."""
 
 from .calibration import CalibrationConfig
+from .closures import LoopClosureConfig
 from .clouds import CloudConfig
 from .errors import DataError
 from .icp import IcpConfig
-from .loop_closure import LoopClosureConfig
 from .mapping import MappingConfig
 from .measurement import OdometryNoiseConfig
 from .range_noise import RangeNoiseConfig

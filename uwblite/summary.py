@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .calibration import CalibrationConfig, Unknown, unknowns
+from .closures import Closures
 from .graph import Graph, RangeEdges
-from .loop_closure import Closures
 from .map_result import AnchorEstimate, CalibrationEstimate, MapResult, StageSummary
 from .marginals import Marginals
 from .occupancy_grid import OccupancyGrid
@@ -24,6 +24,7 @@ _POOR = 4.0
 def summarise(
     drives: Drives, part: Part, known: Marginals, closures: Closures, grid: OccupancyGrid | None,
     config: CalibrationConfig, stages: Sequence[StageSummary], warnings: Sequence[str],
+    doubts: Sequence[str],
 ) -> MapResult:
     """Gather the result of a run; see MapResult."""
     graph, first, radio = part.graph, part.first, part.radio
@@ -40,11 +41,11 @@ def summarise(
         "stamp": radio.stamps, "anchor": radio.anchor.astype(np.float64), "range": radio.ranges,
         "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
     }
-    more, doubts = _doubts(drives, anchors, closures, grid)
+    more, own_doubts = _doubts(drives, anchors, closures, grid)
     fits = [float(stage.figures["chi2_per_dof"]) for stage in stages if "chi2_per_dof" in stage.figures]
     if fits and fits[-1] > _POOR:
         times = float(np.sqrt(fits[-1]))
-        doubts.append(f"measurements lie {times:.1f} times as far off as their noise allows (chi2/dof {fits[-1]:.1f})")
+        own_doubts.append(f"measurements lie {times:.1f} times as far off as their noise allows (chi2/dof {fits[-1]:.1f})")
     stamps = [session.log.odometry.stamps for session in drives.sessions]
     return MapResult(
         stamps=np.concatenate(stamps),
@@ -61,7 +62,7 @@ def summarise(
         grid=grid,
         stages=tuple(stages),
         warnings=(*warnings, *more),
-        doubts=tuple(doubts),
+        doubts=(*doubts, *own_doubts),
     )
 
 

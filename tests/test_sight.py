@@ -1,0 +1,67 @@
+"""Free space and the surfaces that stand in it: maps that fit together, and maps that were folded on purpose."""
+
+import numpy as np
+import pytest
+from test_loop_closure import walked
+
+from uwblite import se2
+from uwblite.sight import disagreement, nearest_by_bearing, seen_free, sees_through
+from uwblite.submaps import SubmapConfig, build
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return walked(3)
+
+
+def test_nearest_by_bearing_is_the_nearest_point_of_every_direction(drive):
+    clouds = drive[2]
+    nearest = nearest_by_bearing(clouds)
+    bins = nearest.shape[1]
+    points = clouds.cloud(7)[0]
+    bearing = np.arctan2(points[:, 1], points[:, 0])
+    for k in range(0, bins, 17):
+        within = (bearing >= 2 * np.pi * k / bins - np.pi) & (bearing < 2 * np.pi * (k + 1) / bins - np.pi)
+        expected = np.hypot(*points[within].T).min() if within.any() else np.inf
+        assert nearest[7, k] == pytest.approx(expected)
+
+
+def test_visits_agree_where_every_pose_is_true(drive):
+    truth, path, clouds = drive
+    share, visits = disagreement(clouds, truth, path, np.zeros(len(truth), dtype=np.int64))
+    assert visits > 20
+    assert share < 0.01
+
+
+@pytest.mark.parametrize("error", [(2.0, 1.0, 0.0), (0.0, 0.0, 0.5)])
+def test_visits_disagree_where_half_of_the_drive_lies_elsewhere(drive, error):
+    truth, path, clouds = drive
+    poses, half = truth.copy(), len(truth) // 2
+    poses[half:] = se2.compose(np.array(error), truth[half:])
+    assert disagreement(clouds, poses, path, np.zeros(len(truth), dtype=np.int64))[0] > 0.05
+
+
+def test_one_visit_has_nothing_to_compare_with(drive):
+    truth, path, clouds = drive
+    assert disagreement(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.int64)) == (0.0, 0)
+
+
+def test_recordings_are_visits_of_their_own(drive):
+    truth, path, clouds = drive
+    session = (np.arange(len(truth)) >= len(truth) // 2).astype(np.int64)
+    assert disagreement(clouds, truth, 0.01 * path, session)[1] > 0
+
+
+def test_sub_maps_in_their_place_see_through_nothing_and_elsewhere_through_walls(drive):
+    truth, path, clouds = drive
+    pieces = build(clouds, truth, path, np.zeros(len(truth), dtype=np.int64), SubmapConfig(epsilon=4.0))
+    free = seen_free(clouds, pieces, truth)
+    where = truth[pieces.reference]
+    pairs = ((a, b) for a in range(len(where)) for b in range(a + 2, len(where)))
+    a, b = next((a, b) for a, b in pairs if np.hypot(*(where[a] - where[b])[:2]) < 2.0)
+    points = [pieces.clouds.cloud(k)[0] for k in (a, b)]
+    T_a_b = se2.between(where[a], where[b])
+    assert sees_through(free[a], points[0], free[b], points[1], T_a_b) < 0.05
+    assert sees_through(free[a], points[0], free[b], points[1], se2.compose(T_a_b, [1.5, 1.0, 0.0])) > 0.12
+
+
