@@ -1,6 +1,7 @@
 """Lidar clouds of all keyframes as one array: averaged in small cells, with normals that face the laser.
 
-One flat array with offsets instead of a list of clouds: every step below runs once over all keyframes.
+One flat array with offsets instead of a list of clouds: every step below runs once over all keyframes. Single precision,
+a few micrometres at the reach of a lidar, and coordinates in one piece each: hours of clouds fit into memory.
 """
 
 from collections.abc import Sequence
@@ -48,14 +49,14 @@ class Clouds:
 
     offsets: Ints
     """(k + 1,)."""
-    points: Floats
+    points: NDArray[np.floating]
     """(p, 2) m, base frame of the keyframe, ordered by bearing within a cloud. Where there is a line, the mean of the
     neighbourhood: that takes out noise, and on curved surfaces every cloud errs alike."""
-    normals: Floats
+    normals: NDArray[np.floating]
     """(p, 2) unit, towards the laser; 0 where the neighbourhood is no line."""
-    owner: Ints
+    owner: NDArray[np.signedinteger]
     """(p,) keyframe."""
-    normal_variance: Floats
+    normal_variance: NDArray[np.floating]
     """(p,) rad^2, variance of the normal's angle by scatter about its line."""
 
     def __len__(self) -> int:
@@ -67,9 +68,9 @@ class Clouds:
         return np.diff(self.offsets)
 
     def cloud(self, k: int) -> tuple[Floats, Floats]:
-        """Return points and normals of one cloud."""
+        """Return points and normals of one cloud, in double precision."""
         rows = slice(self.offsets[k], self.offsets[k + 1])
-        return self.points[rows], self.normals[rows]
+        return self.points[rows].astype(np.float64), self.normals[rows].astype(np.float64)
 
 
 def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
@@ -91,20 +92,33 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     centres = np.where(straight[:, None], lines.centers, points)[kept]
     owner = owner[kept]
     offsets = np.searchsorted(owner, np.arange(keyframes + 1))
-    return Clouds(offsets.astype(np.int64), centres, normals, owner, lines.normal_variance[kept])
+    return Clouds(
+        offsets.astype(np.int64),
+        centres.astype(np.float32, order="F"),
+        normals.astype(np.float32, order="F"),
+        owner.astype(np.int32),
+        lines.normal_variance[kept].astype(np.float32),
+    )
 
 
 def joined(parts: Sequence[Clouds]) -> Clouds:
     """Return the clouds of blocks of keyframes, one after the other, as one."""
     starts = np.cumsum([0] + [len(p) for p in parts])
     counts = np.concatenate([p.counts for p in parts] or [np.zeros(0, dtype=np.int64)])
-    return Clouds(
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        np.concatenate([p.points for p in parts] or [np.zeros((0, 2))]),
-        np.concatenate([p.normals for p in parts] or [np.zeros((0, 2))]),
-        np.concatenate([p.owner + a for p, a in zip(parts, starts, strict=False)] or [counts]),
-        np.concatenate([p.normal_variance for p in parts] or [np.zeros(0)]),
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    size = int(offsets[-1])
+    whole = Clouds(
+        offsets,
+        np.empty((size, 2), dtype=np.float32, order="F"),
+        np.empty((size, 2), dtype=np.float32, order="F"),
+        np.empty(size, dtype=np.int32),
+        np.empty(size, dtype=np.float32),
     )
+    for part, first in zip(parts, starts.tolist(), strict=False):
+        rows = slice(int(offsets[first]), int(offsets[first]) + len(part.points))
+        whole.points[rows], whole.normals[rows], whole.normal_variance[rows] = part.points, part.normals, part.normal_variance
+        whole.owner[rows] = part.owner + first
+    return whole
 
 
 def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:
