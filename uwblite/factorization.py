@@ -27,6 +27,8 @@ _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""
 _WIDEST_BORDER = 48
 """Scalars that make a border; more of them are left to the sparse matrix."""
+_LONGEST_LINK = 16
+"""Poses; edges that reach farther make no chain."""
 _MANY, _TIED = 500, 4
 """From so many poses on, with so many neighbours each, iteration wins over factorisation."""
 
@@ -74,12 +76,28 @@ def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False
         position[order] = np.arange(poses)
         if np.max(np.abs(position[pairs[:, 0]] - position[pairs[:, 1]]), initial=0) <= _WIDEST_BAND:
             return Ordering(order, True, True)
+    if last is not None:
+        return Ordering(_before(pairs, poses, last), False, False)
     factor = superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A")
     order = np.argsort(factor.perm_c)
-    if last is not None:
-        late = np.isin(order, last)
-        order = np.concatenate([order[~late], order[late]])
     return Ordering(order[_postorder(factor.L)] if subtrees else order, bordered, False)
+
+
+def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
+    """Return the order in which some poses come last and the others fill little.
+
+    What is left of a chain is a chain: it is halved again and again by blocks as long as its edges reach, so that few
+    of the last poses meet in any one elimination. (Minimum degree runs along the chain and gathers them all.)
+    """
+    late = np.zeros(poses, dtype=bool)
+    late[last[last >= 0]] = True
+    reach = int(np.max(np.abs(np.diff(pairs[~late[pairs].any(axis=1)], axis=1)), initial=1))
+    if reach > _LONGEST_LINK:
+        order = np.argsort(superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A").perm_c)
+    else:
+        block = np.arange(poses) // reach + 1
+        order = np.lexsort((np.arange(poses), block & -block))
+    return np.concatenate([order[~late[order]], order[late[order]]])
 
 
 def _postorder(lower: sparse.csc_matrix) -> Ints:
