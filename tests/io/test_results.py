@@ -222,13 +222,13 @@ def killed_at(step, folder):
 
         return call
 
-    def complete(path, plain=folders.sync_folder):
+    def complete(path, plain=folders.sync_files):
         if left[0] == step:
             os.replace, os.unlink, shutil.rmtree = counted(os.replace), counted(os.unlink), counted(shutil.rmtree)
             Path.unlink, folders._exchange = counted(Path.unlink), counted(folders._exchange)
         plain(path)
 
-    folders.sync_folder = complete
+    folders.sync_files = complete
     write_result(folder, [small_log()], small_result(evil="x"), RECORD)
     os._exit(0)
 
@@ -264,6 +264,27 @@ def test_a_system_that_cannot_exchange_folders_renames_files(tmp_path, monkeypat
     write_result(folder, [small_log()], small_result(lidar=False, evil="x"), RECORD)
     assert set(contents(folder)) == FILES - {"map.pgm", "map.yaml"}
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+def test_every_file_is_on_the_disk_before_it_counts(tmp_path, monkeypatch):
+    """Each file and its folder are synced after their last write, before the name of the folder changes."""
+    synced, events = set(), []
+    plain_sync, plain_replace = os.fsync, os.replace
+
+    def fsync(handle):
+        synced.add(os.stat(handle).st_ino)
+        plain_sync(handle)
+
+    def replace_(old, new):
+        if Path(old).is_dir():
+            events.append({p.name for p in Path(old).iterdir() if p.stat().st_ino not in synced})
+            assert Path(old).stat().st_ino in synced
+        plain_replace(old, new)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace_)
+    write_result(tmp_path / "map", [small_log()], small_result(), RECORD)
+    assert events == [set()]
 
 
 FILE_LIMIT = """

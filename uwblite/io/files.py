@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import BinaryIO
 
+WAITING = ".uwblite-partial-"
+"""In the name of a folder whose files are forced to the disk all at once, before it takes its place; see folders.py."""
+
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
@@ -35,13 +38,15 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             else:
                 yield stream
             stream.flush()
-            os.fsync(stream.fileno())
+            if not (waiting := WAITING in os.path.basename(folder)):
+                os.fsync(stream.fileno())
         os.replace(temporary, target)
     except BaseException:
         with suppress(OSError):
             os.unlink(temporary)
         raise
-    sync_folder(folder)
+    if not waiting:
+        sync_folder(folder)
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
@@ -63,3 +68,23 @@ def sync_folder(folder: str | os.PathLike[str]) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def sync_files(folder: str | os.PathLike[str]) -> None:
+    """Force all files of a folder, and their names, to the disk; writing begins for all of them before one is waited for.
+
+    Raises
+    ------
+    OSError : the disk cannot take them.
+    """
+    handles = [os.open(entry.path, os.O_RDONLY) for entry in os.scandir(folder) if entry.is_file(follow_symlinks=False)]
+    try:
+        if hasattr(os, "posix_fadvise"):
+            for handle in handles:
+                os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
+        for handle in handles:
+            os.fsync(handle)
+    finally:
+        for handle in handles:
+            os.close(handle)
+    sync_folder(folder)

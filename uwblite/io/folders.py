@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .files import sync_folder, write_text
+from .files import WAITING, sync_files, sync_folder, write_text
 
-_WAITING = ".uwblite-partial-"
 _READY = ".uwblite-ready"
 _LIST = "files"
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -41,15 +40,16 @@ def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Pat
     folder.parent.mkdir(parents=True, exist_ok=True)
     mend(folder, owned)
     beside = not folder.exists() or _may_change_places(folder, owned)
-    home, prefix = (folder.parent, f".{folder.name}{_WAITING}") if beside else (folder, _WAITING)
+    home, prefix = (folder.parent, f".{folder.name}{WAITING}") if beside else (folder, WAITING)
     _clear(home, prefix)
     waiting = home / f"{prefix}{secrets.token_hex(4)}"
     waiting.mkdir()
     try:
         yield waiting
-        sync_folder(waiting)
+        sync_files(waiting)
         if not (beside and _in_one_step(waiting, folder, owned)):
             write_text(waiting / _LIST, "\n".join(sorted(p.name for p in waiting.iterdir())))
+            sync_files(waiting)
             folder.mkdir(exist_ok=True)
             os.replace(waiting, folder / _READY)
             sync_folder(folder)
@@ -87,7 +87,7 @@ def _clear(home: Path, prefix: str) -> None:
 def _may_change_places(folder: Path, owned: Owned) -> bool:
     """Tell whether a folder holds nothing but a result and nobody is known to stand in it."""
     others = [p.name for p in folder.iterdir() if not (owned(p.name) and p.is_file() and not p.is_symlink())]
-    if [name for name in others if not name.startswith(_WAITING)] or os.path.ismount(folder):
+    if [name for name in others if not name.startswith(WAITING)] or os.path.ismount(folder):
         return False
     with suppress(OSError):
         if Path.cwd().is_relative_to(folder):
@@ -109,7 +109,7 @@ def _in_one_step(waiting: Path, folder: Path, owned: Owned) -> bool:
         return False
     sync_folder(folder.parent)
     for late in list(waiting.iterdir()):
-        if not owned(late.name) and not late.name.startswith(_WAITING):
+        if not owned(late.name) and not late.name.startswith(WAITING):
             os.replace(late, folder / late.name)
     return True
 
