@@ -166,3 +166,19 @@ def test_numbers_that_begin_with_a_minus_need_no_equals_sign(verb, capsys):
     log = [] if verb == "record" else ["missing.log"]
     assert main([verb, *log, *needed, "--laser-pose", "-0.1,0,-1e-3", "--tag", "-.05,0,.6"]) in (1, 2)
     assert "expected one argument" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["map", "x.log", "--out", "y", "--resolutoin", "1"], "unknown option --resolutoin; did you mean --resolution?"),
+        (["map", "x.log", "--out", "y", "--resolutoin=1"], "unknown option --resolutoin; did you mean --resolution?"),
+        (["check", "a.log", "b.log"], "one argument too many: b.log"),
+        (["map", "x.log"], "the following arguments are required: --out"),
+    ],
+)
+def test_a_usage_error_is_short_and_says_what_was_meant(words, said, capsys):
+    assert main(words) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == f"uwblite {words[0]}: error: {said}"
+    assert second == f"`uwblite {words[0]} --help` shows the options, examples first"

@@ -8,10 +8,11 @@ errors answer at once on a small computer. This package alone prints, and this f
 import argparse
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 from .. import __version__
 from ..errors import UwbliteError
@@ -88,8 +89,22 @@ def _overview() -> argparse.ArgumentParser:
     )
 
 
+class _VerbParser(argparse.ArgumentParser):
+    """A parser whose errors are short: what is wrong, what may have been meant, where the options stand."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong and leave with code 2."""
+        name, _, wrong = message.partition(": ")
+        if name == "unrecognized arguments":
+            word = wrong.split()[0].partition("=")[0]
+            near = get_close_matches(word, self._option_string_actions, n=1)
+            message = f"unknown option {word}" if word.startswith("-") else f"one argument too many: {word}"
+            message += f"; did you mean {near[0]}?" if near else ""
+        self.exit(2, f"{self.prog}: error: {message}\n`{self.prog} --help` shows the options, examples first\n")
+
+
 def _verb_parser(verb: str, module: Any) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _VerbParser(
         prog=f"uwblite {verb}",
         description=f"{module.HELP}\n\n{module.EPILOG.strip()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -111,7 +126,11 @@ def _run(module: Any, args: argparse.Namespace) -> int:
 
     console.set_up(quiet=args.quiet, verbose=args.verbose)
     try:
-        code = int(module.run(args))
+        with warnings.catch_warnings():
+            if not args.debug:
+                # numpy's remarks on overflows say nothing to a user; what comes of them is told in our own words.
+                warnings.simplefilter("ignore", RuntimeWarning)
+            code = int(module.run(args))
     except KeyboardInterrupt:
         return console.fail("interrupted", 130)
     except UwbliteError as error:
