@@ -16,7 +16,7 @@ MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACK
 
 FLOORS = (
     # ground
-    ("errors", "se2", "robust", "findings", "bitmap_font", "report_page"),
+    ("errors", "se2", "robust", "parallel", "findings", "bitmap_font", "report_page"),
     # what was measured, settings
     ("sensor_log", "config", "drivers/events"),
     # parts without a view of the whole
@@ -28,7 +28,7 @@ FLOORS = (
     # stages
     ("solver", "marginals", "evidence", "gnc", "icp", "pair_matching", "submaps", "pair_alignment", "sight", "closures"),
     ("first_estimate", "growing", "sessions", "thinning", "joining", "moved_anchors", "refinement", "tracking"),
-    ("closure_candidates", "loop_closure"),
+    ("closure_candidates", "closure_matching", "loop_closure"),
     ("evaluate_map",),
     # files in, files out: types and text, no stages
     ("plain_closures", "landmarks"),

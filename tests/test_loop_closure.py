@@ -222,7 +222,7 @@ def test_a_wide_uncertainty_is_searched(hall, closures):
     one = replace(one, guess=exact + off)
     told = []
     found = find(one, hall[3], CONFIG, SEARCH, lambda done, total: told.append((done, total)))
-    assert told == [(k + 1, len(pairs)) for k in range(len(pairs))]
+    assert told == [(len(pairs), len(pairs))]
     assert len(found.edges) >= len(pairs) // 2
     good = [k for k, c in enumerate(found.candidates) if c.accepted]
     error = se2.between(exact[good], found.edges.T_i_j)

@@ -4,7 +4,7 @@ Where the graph's own covariance of two sub-maps is small, they are candidates w
 it is large, when they might.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,17 @@ class Candidates:
     """(c,) 3 sigma of its position, m."""
     held: bool = True
     """Radio or known anchors hold the trajectory, so that its covariance is to be believed."""
+
+    def rows(self, chosen: slice) -> "Candidates":
+        """Return some of them."""
+        return replace(
+            self, target=self.target[chosen], source=self.source[chosen], guess=self.guess[chosen],
+            covariance=self.covariance[chosen], spread=self.spread[chosen],
+        )
+
+    def renumbered(self, target: Ints, source: Ints) -> "Candidates":
+        """Return them with other numbers of sub-maps."""
+        return replace(self, target=target, source=source)
 
     def names(self, config: LoopClosureConfig) -> set[tuple[int, int, bool]]:
         """Return (target, source, searched) of each, to remember what was tried."""

@@ -72,6 +72,15 @@ class Clouds:
         rows = slice(self.offsets[k], self.offsets[k + 1])
         return self.points[rows].astype(np.float64), self.normals[rows].astype(np.float64)
 
+    def chosen(self, which: Ints) -> "Clouds":
+        """Return some clouds (s,), in this order."""
+        counts = self.counts[which]
+        first = np.cumsum(counts) - counts
+        rows = np.repeat(self.offsets[which] - first, counts) + np.arange(int(counts.sum()))
+        owner = np.repeat(np.arange(len(which), dtype=np.int32), counts)
+        offsets = np.append(first, counts.sum()).astype(np.int64)
+        return Clouds(offsets, self.points[rows], self.normals[rows], owner, self.normal_variance[rows])
+
 
 def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     """Average rays in cells, drop lone points, estimate normals and order each cloud by bearing.

@@ -189,7 +189,7 @@ def build_map(
         if config.use_loops:
             held = part.edges if tracked is None else (*part.edges, tracked.edges)
             close = _close_loops if config.loops.method == "search" else _close_loops_plainly
-            part, found = close(part, held, scans, drives, config, stages)
+            part, found = close(part, held, scans, drives, config, stages, executor)
             if part.radio is not None:
                 radio, _ = learn_noise(part.radio, part.graph, len(part.graph.anchors), config.ranges, steady=True)
                 part = replace(part, radio=radio)
@@ -208,6 +208,8 @@ def build_map(
     if refined is not None and part.radio is not None:
         part = replace(part, graph=_hold_negative_heights(optimize(part.graph, config.solver)[0]))
     part = _aligned(part, scans, config)
+    # What only matching needed is most of the memory.
+    scans = tracked = refined = None
 
     grid = _grid(drives, part.graph, config, executor, stages)
     uncertainty = marginals(refinement.with_fewer_pairs(part.graph))
@@ -413,7 +415,8 @@ def _track(part: Part, scans: _Scans, drives: Drives, config: MappingConfig, sta
 
 
 def _close_loops(
-    part: Part, edges: tuple[Edges, ...], scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages
+    part: Part, edges: tuple[Edges, ...], scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages,
+    executor: Executor | None,
 ) -> tuple[Part, Closures]:
     """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
     session = drives.session
@@ -428,7 +431,8 @@ def _close_loops(
         candidates = closure_candidates.propose(base, known, pieces, session, tried, missed, held, config.loops)
         tried |= candidates.names(config.loops)
         free = sight.seen_free(scans.clouds, pieces, base.poses)
-        new = loop_closure.find(candidates, pieces, config.loops, config.search, stages.teller("loop closure"), free)
+        teller = stages.teller("loop closure")
+        new = loop_closure.find(candidates, pieces, config.loops, config.search, teller, free, executor)
         new = _without_forbidden(new, scans)
         missed |= set() if held else closure_candidates.missed(candidates, new, config.loops)
         found = closures.merged(found, new)
@@ -443,7 +447,8 @@ def _close_loops(
 
 
 def _close_loops_plainly(
-    part: Part, edges: tuple[Edges, ...], scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages
+    part: Part, edges: tuple[Edges, ...], scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages,
+    executor: Executor | None,
 ) -> tuple[Part, Closures]:
     """Align sub-maps pair by pair and solve once more with those that fit (paper: second optimisation)."""
     graph, session = part.graph, drives.session
@@ -451,7 +456,8 @@ def _close_loops_plainly(
     for lap in range(config.loops.rounds):
         pieces = submaps.build(scans.clouds, graph.poses, drives.path, session, config.submaps)
         teller = stages.teller("loop closure")
-        found = _without_forbidden(plain_closures.find(graph, pieces, session, config.loops, config.icp, teller), scans)
+        found = plain_closures.find(graph, pieces, session, config.loops, config.icp, teller, executor)
+        found = _without_forbidden(found, scans)
         stages.end(f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(found.candidates), accepted=len(found.edges))
         solved, result = optimize(graph.with_edges(*edges, found.edges), config.solver)
         graph = _estimates(graph, solved)

@@ -5,17 +5,21 @@ of the source's points to the target, stays below a threshold. Nothing else is a
 consistency among closures. ``loop_closure`` does what experience adds to that.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import se2
 from .closures import Closures, LoopClosureConfig, no_closures
+from .clouds import Clouds
 from .graph import Graph, RelativePoseEdges
 from .icp import IcpConfig, Registration, align
 from .map_result import LoopClosure
-from .point_cloud import PointCloud, make_cloud
+from .parallel import in_order
+from .point_cloud import make_cloud
 from .submaps import Submaps
 
 Floats = NDArray[np.float64]
@@ -25,11 +29,13 @@ _CELL = 0.5
 """m; two sub-maps overlap by the share of such squares of the smaller one that both have points in."""
 _LEAST_SHARED = 0.25
 """Least such share of a candidate."""
+_AT_ONCE = 32
+"""Pairs of a batch."""
 
 
 def find(
     graph: Graph, submaps: Submaps, session: Ints, config: LoopClosureConfig, icp: IcpConfig,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, executor: Executor | None = None,
 ) -> Closures:
     """Align every pair of sub-maps that overlap by the graph; keep all, with what became of them.
 
@@ -39,20 +45,20 @@ def find(
     session : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
     config : its partners bound the candidates per sub-map. icp : method, outlier distance, iterations and fitness.
     progress : called with (done, total).
+    executor : any concurrent.futures executor; the result does not depend on it.
     """
     target, source = candidates(graph.poses, submaps, session, config.partners)
     if not len(target):
         return no_closures()
-    prepared: dict[int, PointCloud] = {}
-    story, information = [], []
-    for done, (a, b) in enumerate(zip(target.tolist(), source.tolist(), strict=True)):
-        i, j = int(submaps.reference[a]), int(submaps.reference[b])
-        guess = se2.between(graph.poses[i], graph.poses[j])
-        found = align(_prepare(submaps, a, prepared), _prepare(submaps, b, prepared), guess, icp)
-        information.append(found.information / config.correlation)
-        story.append(_story(i, j, found, information[-1]))
+    i, j = submaps.reference[target], submaps.reference[source]
+    guess = se2.between(graph.poses[i], graph.poses[j])
+    results: list[Registration] = []
+    for part in in_order(_align, _batches(submaps.clouds, target, source, guess, icp), executor):
+        results += part
         if progress is not None:
-            progress(done + 1, len(target))
+            progress(len(results), len(target))
+    information = [found.information / config.correlation for found in results]
+    story = [_story(int(i[k]), int(j[k]), found, information[k]) for k, found in enumerate(results)]
     good = np.flatnonzero([c.accepted for c in story])
     kept = [story[k] for k in good]
     return Closures(
@@ -103,10 +109,30 @@ def _shared(poses: Floats, submaps: Submaps) -> Floats:
     return np.asarray(seen @ seen.T / np.minimum(size[:, None], size[None]), dtype=np.float64)
 
 
-def _prepare(submaps: Submaps, k: int, prepared: dict[int, PointCloud]) -> PointCloud:
-    if k not in prepared:
-        prepared[k] = make_cloud(submaps.clouds.cloud(k)[0])
-    return prepared[k]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Batch:
+    """Some pairs of sub-maps and their clouds."""
+
+    clouds: Clouds
+    target: Ints
+    source: Ints
+    guess: Floats
+    icp: IcpConfig
+
+
+def _batches(clouds: Clouds, target: Ints, source: Ints, guess: Floats, icp: IcpConfig) -> Iterator[_Batch]:
+    for first in range(0, len(target), _AT_ONCE):
+        rows = slice(first, first + _AT_ONCE)
+        used, number = np.unique(np.concatenate([target[rows], source[rows]]), return_inverse=True)
+        own_target, own_source = np.split(number.reshape(-1).astype(np.int64), 2)
+        yield _Batch(clouds.chosen(used), own_target, own_source, guess[rows], icp)
+
+
+def _align(batch: _Batch) -> list[Registration]:
+    """Align the pairs of a batch; runs in a worker."""
+    prepared = [make_cloud(batch.clouds.cloud(k)[0]) for k in range(len(batch.clouds))]
+    pairs = zip(batch.target.tolist(), batch.source.tolist(), batch.guess, strict=True)
+    return [align(prepared[a], prepared[b], guess, batch.icp) for a, b, guess in pairs]
 
 
 def _story(i: int, j: int, found: Registration, information: Floats) -> LoopClosure:

@@ -4,6 +4,8 @@ import argparse
 import shlex
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from .options import add_mounting_arguments, add_settings_arguments, numbers
@@ -75,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
     from ..config import to_toml
     from ..io.result_text import RunRecord
     from ..io.results import check_target, write_result
+    from ..parallel import in_order
     from ..thinning import thinned
     from . import console
     from .formats import read_recording
@@ -84,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
         check_target(args.out, force=args.force)
     config, constraints = _settings(args), _known(args)
     began = time.perf_counter()
-    logs = [apply_mounting(read_recording(path), args) for path in args.logs]
+    with _workers(args.jobs if len(args.logs) > 1 else 1) as executor:
+        logs = [apply_mounting(log, args) for log in in_order(read_recording, args.logs, executor)]
     reading = time.perf_counter() - began
     _tell_reader_warnings(logs)
     if args.dry_run:
@@ -137,19 +141,28 @@ def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Const
     from . import console
 
     progress = console.Progress()
-    executor: Executor | None = None
+    log = logs[0] if len(logs) == 1 else logs
     try:
-        if jobs > 1:
-            from concurrent.futures import ProcessPoolExecutor
-
-            executor = ProcessPoolExecutor(jobs)
-        clock = time.perf_counter
-        log = logs[0] if len(logs) == 1 else logs
-        return build_map(log, config, constraints=constraints, progress=progress, executor=executor, clock=clock)
+        with _workers(jobs) as executor:
+            clock = time.perf_counter
+            return build_map(log, config, constraints=constraints, progress=progress, executor=executor, clock=clock)
     finally:
         progress.close()
-        if executor is not None:
-            executor.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _workers(jobs: int) -> Iterator["Executor | None"]:
+    """Start so many processes; for one job, none."""
+    if jobs == 1:
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+
+    executor = ProcessPoolExecutor(jobs)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(cancel_futures=True)
 
 
 def _tell_reader_warnings(logs: list["SensorLog"]) -> None:
