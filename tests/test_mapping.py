@@ -310,3 +310,16 @@ def test_intel_is_closed(shared_data):
     table = np.loadtxt(folder / "reference_poses_matched.csv", delimiter=",", skiprows=1)
     stamps = log.scans.stamps[table[:, 1].astype(int)]
     assert ate(result, (stamps, table[:, 2:5])) < 0.5
+
+
+def test_a_large_grid_is_announced_and_may_be_declined(minute, monkeypatch):
+    monkeypatch.setattr("uwblite.mapping._LARGE_GRID", 100)
+    told = []
+
+    def decline(stage, done, total):
+        told.append(stage)
+        return "million cells" not in stage
+
+    with pytest.raises(Cancelled, match="MB"):
+        build_map(minute, progress=decline)
+    assert told.count("occupancy grid") == 0

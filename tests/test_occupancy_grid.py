@@ -1,4 +1,5 @@
 import math
+import tracemalloc
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -10,7 +11,18 @@ from hypothesis import strategies as st
 from uwblite import se2
 from uwblite.bresenham import mark_rays
 from uwblite.errors import ConfigError, DataError
-from uwblite.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, GridGeometry, RayCounter, from_counts, from_scans
+from uwblite.occupancy_grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    GridConfig,
+    GridGeometry,
+    RayCounter,
+    Sweeps,
+    from_counts,
+    from_scans,
+    from_sweeps,
+)
 from uwblite.ray_counter import WEIGHT_UNIT
 from uwblite.scan_rays import empty_reach, extent, in_runs, moved_scans, scan_rays, seen_reach
 from uwblite.sensor_log import LaserScans
@@ -358,3 +370,20 @@ def test_misuse_is_named():
     for wrong in ({"p_hit": 0.4}, {"p_miss": 0.5}, {"resolution": 0.0}, {"clear_weight": 2.0}, {"clamp": 0.0}):
         with pytest.raises(ConfigError, match="grid"):
             GridConfig(**wrong)
+
+
+def test_a_grid_too_large_is_refused_before_it_is_allocated():
+    """One pose far off makes a map of 10^12 cells: the refusal says how large, what it would take and what to change."""
+    poses = drive(3)
+    poses[-1, :2] = 5e4
+    tracemalloc.start()
+    with pytest.raises(ConfigError, match=r"million cells, about \d+ MB.*grid\.resolution.*grid\.max_cells"):
+        from_scans(poses, room_scans(drive(3)), GridConfig())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+    told = []
+    sweeps = Sweeps(room_scans(drive(3)), drive(3))
+    grid = from_sweeps([sweeps], announce=told.append)
+    assert told[0].cells >= grid.geometry.cells
+    assert told[0].megabytes == pytest.approx(told[0].cells * 12e-6)

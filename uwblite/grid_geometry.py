@@ -32,6 +32,11 @@ class GridGeometry:
         return self.rows * self.cols
 
     @property
+    def megabytes(self) -> float:
+        """Memory of a map of this size while it is made, MB."""
+        return self.cells * BYTES_PER_CELL / 1e6
+
+    @property
     def corner(self) -> Floats:
         """(2,) upper right corner of the last cell, m."""
         return self.origin + self.resolution * np.array([self.cols, self.rows])

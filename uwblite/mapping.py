@@ -47,6 +47,7 @@ from .constraints import apply as apply_constraints
 from .errors import Cancelled, ConfigError
 from .first_estimate import GrowthConfig
 from .graph import Edges, Graph
+from .grid_geometry import GridGeometry
 from .icp import IcpConfig
 from .keyframes import KeyframeConfig
 from .map_result import MapResult, StageSummary
@@ -67,6 +68,8 @@ from .tracking import TrackingConfig
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+_LARGE_GRID = 5_000_000
+"""Cells from which on a grid's memory is announced."""
 _BLOCK = 32
 """Keyframes whose rays are held at once."""
 Progress = Callable[[str, int, int], object]
@@ -561,7 +564,14 @@ def _grid(
     sweeps = [_sweeps(session, graph) for session in drives.sessions if session.has_scans]
     if not sweeps:
         return None
-    grid = occupancy_grid.from_sweeps(sweeps, config.grid, executor=executor, progress=stages.teller("occupancy grid"))
+
+    def announce(geometry: GridGeometry) -> None:
+        """Say what a large grid will take; the caller may still stop."""
+        if geometry.cells >= _LARGE_GRID:
+            stages.tell(f"occupancy grid of {geometry.cells / 1e6:.0f} million cells, about {geometry.megabytes:.0f} MB", 0, 1)
+
+    teller = stages.teller("occupancy grid")
+    grid = occupancy_grid.from_sweeps(sweeps, config.grid, executor=executor, progress=teller, announce=announce)
     if config.crop is not None:
         grid = map_frame.cropped(grid, config.crop)
     stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)

@@ -183,15 +183,19 @@ def from_sweeps(
     geometry: GridGeometry | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
+    announce: Callable[[GridGeometry], object] | None = None,
 ) -> OccupancyGrid:
-    """Make one map of the scans of all recordings; see from_scans."""
+    """Make one map of the scans of all recordings; see from_scans. `announce` is told the grid before it is allocated."""
     if not any(len(sweeps.first) for sweeps in recordings):
         raise DataError("there are no scans to make a map of")
     tasks = [_task(sweeps, config) for sweeps in recordings if len(sweeps.first)]
     count = sum(len(task.chosen) for task in tasks)
     boxes = [task.extent() for task in tasks]
     low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
-    counter = RayCounter(geometry or GridGeometry.around(low, high, config.resolution, config.max_cells), config.clear_weight)
+    grid = geometry or GridGeometry.around(low, high, config.resolution, config.max_cells)
+    if announce is not None:
+        announce(grid)
+    counter = RayCounter(grid, config.clear_weight)
     clears = config.max_clear_distance > 0 and config.clear_weight > 0
 
     def trace(walls: Bools | None, before: int) -> None:

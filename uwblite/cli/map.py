@@ -141,11 +141,17 @@ def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Const
     from . import console
 
     progress = console.Progress()
+
+    def told(stage: str, done: int, total: int) -> None:
+        if stage.startswith("occupancy grid of"):
+            console.note(f"uwblite: {stage}")
+        progress(stage, done, total)
+
     log = logs[0] if len(logs) == 1 else logs
     try:
         with _workers(jobs) as executor:
             clock = time.perf_counter
-            return build_map(log, config, constraints=constraints, progress=progress, executor=executor, clock=clock)
+            return build_map(log, config, constraints=constraints, progress=told, executor=executor, clock=clock)
     finally:
         progress.close()
 
