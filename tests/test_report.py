@@ -64,7 +64,7 @@ def test_everything_that_belongs_in_it_is_there():
     words = " ".join(Page(text).words)
     for wanted in (
         "uwblite map run.log --out map/", "5C0B", "+0.460", "mirror-ambiguous", "overlap too small", "1 of 3 candidates kept",
-        "odometry_scale", "\u22120.0120", "the robot hardly turns", "0.800", "anchor 91A3 may be mirrored",
+        "odometry_scale", "\u22121.20", "the robot hardly turns", "0.800", "anchor 91A3 may be mirrored",
     ):  # fmt: skip
         assert wanted in words, wanted
     assert {"map-view", "anchors", "calibration", "loop-closures", "range-residuals", "stages", "warnings"} <= Page(text).ids

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .map_result import AnchorEstimate, MapResult
+from .map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from .report_map import draw, number, shown_closures, sigma, thin
 from .report_page import PAGE, SCRIPT, STYLE
 
@@ -124,19 +124,20 @@ def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
 
 
 def _calibration_table(result: MapResult) -> str:
-    head = ("name", "value", "\u00b1", "unit", "meaning", "state")
-    rows = [
-        (
-            c.name,
-            number(c.value, 4, True),
-            number(c.sigma, 4),
-            c.unit,
-            c.meaning,
-            f"{c.state}: {c.reason}" if c.reason else c.state,
-        )
-        for c in result.calibration
-    ]
-    return _table(head, rows, "Nothing was calibrated.")
+    """Return what was calibrated, and, folded away, what the recording does not show."""
+    head = ("name", "value", "\u00b1", "unit", "meaning")
+    found = [_calibration_row(c) for c in result.calibration if c.state == "estimated"]
+    text = _table(head, found, "Nothing was calibrated.")
+    if silent := [(*_calibration_row(c), c.reason) for c in result.calibration if c.state != "estimated"]:
+        rest = _table((*head, "why it stays at what was assumed"), silent, "")
+        text += f"<details><summary>{len(silent)} more that the recording does not show</summary>{rest}</details>"
+    return text
+
+
+def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
+    """Return name, value, sigma, unit and meaning; ratios in per cent."""
+    scale, digits, unit = (100.0, 2, "%") if value.unit == "1" else (1.0, 4, value.unit)
+    return (value.name, number(scale * value.value, digits, True), number(scale * value.sigma, digits), unit, value.meaning)
 
 
 def _closure_table(result: MapResult) -> str:
