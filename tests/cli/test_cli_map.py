@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from uwblite.cli import main
+from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 
 FILES = {
@@ -277,3 +278,12 @@ def test_localize_in_a_map_without_anchors_goes_by_its_walls(mapped, room_log, t
     (bare / "map.yaml").unlink()
     assert main(["localize", str(part), "--map", str(bare), "--out", str(tmp_path / "q.tum")]) == 1
     assert "no anchor in it has a place" in capsys.readouterr().err
+
+
+def test_every_third_scan_makes_a_map_too(room_log, tmp_path, capsys):
+    """What is not read is counted and not held; the command in the report says so."""
+    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--every-nth-scan", "3"]) in (0, 3)
+    report = json.loads((tmp_path / "map" / "report.json").read_text())
+    whole = read_log(room_log).scans
+    assert report["recording"]["scans"] == -(-len(whole.stamps) // 3)
+    assert "--every-nth-scan=3" in report["command"]

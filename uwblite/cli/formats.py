@@ -25,20 +25,28 @@ def format_of(path: str) -> str:
     return "log" if path == "-" else "csv" if path.endswith(os.sep) else (GRAPHS | LOGS).get(ending, "")
 
 
-def read_recording(path: str) -> "SensorLog":
-    """Read a recording of any kind: a CARMEN log, a ROS bag or a folder of CSV files."""
+def read_recording(path: str, every_nth_scan: int = 1) -> "SensorLog":
+    """Read a recording of any kind: a CARMEN log, a ROS bag or a folder of CSV files; of its scans every n-th."""
     kind = format_of(path)
     if kind == "csv":
         from ..io.csv_folder import read_csv_folder
 
-        return read_csv_folder(path)
+        return _with_every_nth(read_csv_folder(path), every_nth_scan)
     if kind == "bag":
         from ..io.rosbag import read_bag
 
-        return read_bag(path)
+        return _with_every_nth(read_bag(path), every_nth_scan)
     from ..io.carmen import read_log
 
-    return read_log(path)
+    return read_log(path, every_nth_scan=every_nth_scan)
+
+
+def _with_every_nth(log: "SensorLog", n: int) -> "SensorLog":
+    from dataclasses import replace
+
+    if log.scans is None or n == 1:
+        return log
+    return replace(log, scans=replace(log.scans, stamps=log.scans.stamps[::n], ranges=log.scans.ranges[::n].copy()))
 
 
 def graph_format(path: str) -> str:

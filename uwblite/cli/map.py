@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from .options import add_mounting_arguments, add_settings_arguments, numbers
@@ -47,6 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dry-run", action="store_true", help="read, check and estimate time and memory; write nothing")
     without = parser.add_argument("--without", action="append", default=[], choices=("uwb", "loops", "lidar"))
     without.help = "leave out a sensor or the loop closures, to see what they give; repeatable"
+    text = "read every n-th laser scan only; the others take neither time nor memory (1)"
+    parser.add_argument("--every-nth-scan", metavar="N", type=_count, default=1, help=text)
     parser.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes for the heavy stages (1)")
     output = parser.add_argument_group("map")
     output.add_argument("--resolution", metavar="M", type=float, help="edge of a cell, m: short for --set grid.resolution=M")
@@ -88,7 +91,8 @@ def run(args: argparse.Namespace) -> int:
     config, constraints = _settings(args), _known(args)
     began = time.perf_counter()
     with _workers(args.jobs if len(args.logs) > 1 else 1) as executor:
-        logs = [apply_mounting(log, args) for log in in_order(read_recording, args.logs, executor)]
+        read = partial(read_recording, every_nth_scan=args.every_nth_scan)
+        logs = [apply_mounting(log, args) for log in in_order(read, args.logs, executor)]
     reading = time.perf_counter() - began
     _tell_reader_warnings(logs)
     if args.dry_run:
@@ -199,6 +203,8 @@ def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
 def repeat_command(args: argparse.Namespace) -> str:
     """Return the command that makes the same map again, from the config.toml beside the result."""
     words = ["uwblite", "map", *args.logs, "--config", "config.toml"]
+    if args.every_nth_scan > 1:
+        words.append(f"--every-nth-scan={args.every_nth_scan}")
     for option, value in (("--constraints", args.constraints), ("--anchors-from", args.anchors_from)):
         words += [option, value] if value else []
     if args.laser_pose is not None:
