@@ -136,12 +136,23 @@ def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]
     cell -= cell.min(axis=0, initial=0)
     wide, high = cell.max(axis=0, initial=0) + 1
     key = (rays.keyframe * wide + cell[:, 0]) * high + cell[:, 1]
+    one, mean = mean_by_key(key, np.concatenate([rays.points, rays.origins], axis=1))
+    return rays.keyframe[one], mean[:, :2], mean[:, 2:]
+
+
+def mean_by_key(key: Ints, values: Floats) -> tuple[Ints, Floats]:
+    """Average the rows of values (p, v) that share a key (p,).
+
+    Returns
+    -------
+    One row of each key (m,), by key, and the means (m, v).
+    """
     order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) > 0])) if len(key) else np.zeros(0, dtype=np.int64)
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    if not len(first):
+        return first, values
     count = np.diff(np.append(first, len(key)))[:, None]
-    both = np.concatenate([rays.points, rays.origins], axis=1)[order]
-    mean = np.add.reduceat(both, first, axis=0) / count if len(key) else both
-    return rays.keyframe[order][first], mean[:, :2], mean[:, 2:]
+    return order[first], np.add.reduceat(values[order], first, axis=0) / count
 
 
 def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) -> tuple[Lines, Floats]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import se2
-from .clouds import Clouds
+from .clouds import Clouds, mean_by_key
 from .point_cloud import radius_outlier_filter, statistical_outlier_filter
 
 Floats = NDArray[np.float64]
@@ -93,7 +93,7 @@ def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: Su
 
 
 def _merge(
-    owner: Ints, points: Floats, normals: Floats, scatter: Floats, size: float
+    owner: Ints, points: Floats, normals: Floats, scatter: NDArray[np.floating], size: float
 ) -> tuple[Ints, Floats, Floats, Floats]:
     """Average points, normals and their variances by cell; the two sides of a wall stay apart by facing."""
     cell = np.floor(points / size).astype(np.int64)
@@ -102,12 +102,8 @@ def _merge(
     facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
     wide, high = cell.max(axis=0, initial=0) + 1
     key = ((owner * wide + cell[:, 0]) * high + cell[:, 1]) * 4 + facing
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) > 0]))[: len(key)]
-    both = np.concatenate([points, normals, scatter[:, None]], axis=1)[order]
-    count = np.diff(np.append(first, len(key)))[:, None]
-    mean = np.add.reduceat(both, first, axis=0) / count if len(key) else both
+    one, mean = mean_by_key(key, np.concatenate([points, normals, scatter[:, None]], axis=1))
     length = np.hypot(mean[:, 2], mean[:, 3])
     clear = length > 0.5
     normal = np.where(clear[:, None], mean[:, 2:4] / np.where(clear, length, 1.0)[:, None], 0.0)
-    return owner[order][first], mean[:, :2], normal, mean[:, 4]
+    return owner[one], mean[:, :2], normal, mean[:, 4]
