@@ -4,7 +4,7 @@
     python tools/bench.py                                   everything that takes seconds and needs no recording
     python tools/bench.py graphs --repeats 21               pose graphs, against GTSAM (pip install gtsam)
     python tools/bench.py icp                               registration, against small_gicp and Open3D
-    python tools/bench.py map --log hall=/tmp/hall/run.log  whole runs of `uwblite map`; --log may be repeated
+    python tools/bench.py map --log hall=recordings/hall/run.log  whole runs of `uwblite map`; --log may be repeated
     python tools/bench.py start                             import and --help above bare python
     python tools/bench.py hundred                           75,000 poses grown from their odometry: minutes
 
