@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from uwblite.bitmap_font import HEIGHT, WIDTH, text_mask
 from uwblite.drawing import Canvas
@@ -107,3 +109,26 @@ def test_recordings_have_colours_of_their_own():
     colours = {tuple(c) for c in image.reshape(-1, 3).tolist()}
     assert {PATHS[0], PATHS[1]} <= colours
     assert PATHS[1] not in {tuple(c) for c in draw_map(None, one).reshape(-1, 3).tolist()}
+
+
+@given(st.integers(0, 10_000), st.floats(0.5, 3000.0))
+@settings(max_examples=30)
+def test_a_polygon_is_what_lies_within_all_its_edges(seed, size):
+    rng = np.random.default_rng(seed)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 9)))[:: rng.choice([-1, 1])]
+    corners = rng.uniform(0, 40, 2) + size * np.stack([np.cos(angle), 0.7 * np.sin(angle)], axis=1)
+    image = np.zeros((30, 40, 3), dtype=np.uint8)
+    Canvas(image).polygon(corners, (255, 255, 255))
+    fine = (np.stack(np.meshgrid(np.arange(120), np.arange(90)), axis=-1) + 0.5) / 3
+    edge, ahead = np.roll(corners, -1, axis=0) - corners, fine[:, :, None] - corners
+    turn = edge[:, 0] * ahead[..., 1] - edge[:, 1] * ahead[..., 0]
+    within = (turn >= 0).all(axis=-1) | (turn <= 0).all(axis=-1)
+    cover = within.reshape(30, 3, 40, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(image[:, :, 0] / 255, cover, atol=2 / 255)
+
+
+def test_an_anchor_that_may_stand_anywhere_takes_no_longer_than_others():
+    """Its ellipse is many times the picture; only what is in the picture is looked at."""
+    anchor = PictureAnchor("far", np.array([0.0, 3.0]), np.diag([1e6, 1e4]))
+    image = draw_map(room(), PATH_IN_ROOM, anchors=[anchor])
+    assert share(image, ANCHOR, 40) > 0

@@ -67,13 +67,8 @@ class Canvas:
         if x1 <= x0 or y1 <= y0:
             return
         x = x0 + (np.arange((x1 - x0) * _FINE) + 0.5) / _FINE
-        y = y0 + (np.arange((y1 - y0) * _FINE) + 0.5)[:, None] / _FINE
-        edges = np.roll(points, -1, axis=0) - points
-        side = np.sign(np.sum(points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1))) or 1.0
-        inside = np.ones((y.shape[0], len(x)), dtype=np.bool_)
-        for (px, py), (ex, ey) in zip(points, edges, strict=True):
-            inside &= side * (ex * (y - py) - ey * (x - px)) >= 0
-        self._lay(inside, x0, y0, colour, opacity)
+        low, high = _span(points, y0 + (np.arange((y1 - y0) * _FINE) + 0.5) / _FINE)
+        self._lay((x >= low[:, None]) & (x <= high[:, None]), x0, y0, colour, opacity)
 
     def text(self, x: float, y: float, text: str, colour: Colour, scale: int = 2, halo: Colour | None = None) -> None:
         """Write a line of text with its top left corner at (x, y), on a halo of another colour where one is given."""
@@ -129,3 +124,15 @@ class Canvas:
         area = self.image[y + top : y + top + part.shape[0], x + left : x + left + part.shape[1]]
         share = (part * np.float32(opacity))[:, :, None]
         area[:] = np.rint(area + share * (np.array(colour, dtype=np.float32) - area)).astype(np.uint8)
+
+
+def _span(points: Floats, rows: Floats) -> tuple[Floats, Floats]:
+    """Return from where to where (r,) a convex polygon (n, 2) reaches on each row (r,); inf to -inf where it does not."""
+    one, other = points, np.roll(points, -1, axis=0)
+    rise = other[:, 1] - one[:, 1]
+    # An edge counts for the rows from its lower end up to, not including, its upper one; a level edge for none.
+    bottom, top = np.minimum(one[:, 1], other[:, 1]), np.maximum(one[:, 1], other[:, 1])
+    crossed = (rows[:, None] >= bottom) & (rows[:, None] < top)
+    share = (rows[:, None] - one[:, 1]) / np.where(rise == 0.0, 1.0, rise)
+    x = one[:, 0] + share * (other[:, 0] - one[:, 0])
+    return np.where(crossed, x, np.inf).min(axis=1), np.where(crossed, x, -np.inf).max(axis=1)
