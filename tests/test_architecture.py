@@ -33,7 +33,7 @@ FLOORS = (
     # files in, files out: types and text, no stages
     ("plain_closures", "landmarks"),
     ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
-    ("diagnostics", "report_map", "report", "summary"),
+    ("diagnostics", "report_map", "report", "suspicions", "summary"),
     # the walk
     ("mapping",),
     ("localize", "presets", "io/results"),

@@ -209,9 +209,7 @@ def real(args: argparse.Namespace) -> str:
         error = evaluate_trajectory(result.stamps, result.trajectory, *truth, max_gap=30.0).ate.rmse
         note = ""
         if name == "labyrinth":
-            note = "wheels say all turns the other way round: judged up to the mirror image"
-            mirrored = (truth[0], truth[1] * [1.0, -1.0, 1.0])
-            error = min(error, evaluate_trajectory(result.stamps, result.trajectory, *mirrored, max_gap=30.0).ate.rmse)
+            note = "no heading in the truth; " + ("; ".join(result.doubts) or "no doubts")
         wheels = evaluate_trajectory(log.odometry.stamps, log.odometry.poses, *truth, max_gap=30.0).ate.rmse
         rows.append([name, wheels, error, f"{REAL[name]:g}", "yes" if error <= REAL[name] else "**no**", note])
         print(f"{name}: {error:.4f}", file=sys.stderr, flush=True)
@@ -234,14 +232,24 @@ def halves(config: MappingConfig) -> str:
     """Return how the anchors' biases of the two halves of a recording agree."""
     log = read_log(SHARED / KASDORF / "run.log.gz")
     middle = float(log.odometry.stamps[0] + log.odometry.stamps[-1]) / 2.0
+    whole = build_map(log, config)
     parts = (log.crop(end=middle), log.crop(start=middle))
-    found = [{a.id: (a.bias, a.bias_sigma) for a in build_map(part, config).anchors} for part in parts]
-    rows = [
-        [i, *(f"{found[k][i][0]:.3f} +- {found[k][i][1]:.3f}" for k in (0, 1)), abs(found[0][i][0] - found[1][i][0])]
-        for i in sorted(set(found[0]) & set(found[1]))
-    ]
-    return "Kasdorf, no truth: the anchors' biases from its two halves, m (bar 0.15).\n\n" + table(
-        ["anchor", "first half", "second half", "difference"], rows
+    alone = [{a.id: (a.bias, a.bias_sigma) for a in build_map(part, config).anchors} for part in parts]
+    rows = []
+    for k, anchor in enumerate(whole.anchors):
+        ranges = whole.range_table
+        own = (ranges["anchor"] == k) & (ranges["weight"] > 0)
+        first, second = (
+            anchor.bias - float(np.median(ranges["residual"][own & half]))
+            for half in (ranges["stamp"] < middle, ranges["stamp"] >= middle)
+        )
+        told = [f"{alone[n][anchor.id][0]:.2f} +- {alone[n][anchor.id][1]:.2f}" for n in (0, 1)]
+        rows.append([anchor.id, f"{anchor.bias:.2f} +- {anchor.bias_sigma:.2f}", first, second, abs(first - second), *told])
+    return (
+        "Kasdorf, no truth: the anchors' biases, m; bar 0.15 on the difference between the halves of the recording. In 4 m of\n"
+        "driving neither half alone parts an anchor's bias from its place, as the stated sigmas say, so they are compared\n"
+        "at the anchors' places in the whole map; the last two columns are of maps of either half alone.\n\n"
+        + table(["anchor", "whole", "first half", "second half", "difference", "first alone", "second alone"], rows)
     )
 
 

@@ -89,6 +89,12 @@ def ambiguous(hypotheses: list[AnchorHypothesis], config: AnchorConfig) -> bool:
     return len(hypotheses) > 1 and hypotheses[1].cost - hypotheses[0].cost < config.ambiguity
 
 
+def agreement(path: Floats, ranges: Floats, place: Floats, width: float = 0.4) -> float:
+    """Return the largest share of ranges (m,) that agree with a place (2,) up to one common bias, within a width, m."""
+    error = np.sort(ranges - np.hypot(*(place - path).T))
+    return float(np.max(np.searchsorted(error, error + width, "right") - np.arange(len(error)))) / len(error)
+
+
 def _raster_search(path: Floats, ranges: Floats, config: AnchorConfig) -> tuple[Floats, float]:
     """Return the best raster cells (s, 2) and the cell size, m."""
     reach = float(np.quantile(ranges, 0.9)) + config.bias_sigma

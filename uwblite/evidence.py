@@ -47,7 +47,8 @@ def choose_widths(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
         return graph
     try:
         covariance = calibration_covariance(graph.with_edges(*edges))[np.ix_(which, which)]
-    except SolverError:
+        np.linalg.cholesky(covariance)
+    except (SolverError, np.linalg.LinAlgError):
         return graph
     mean, before = graph.calibration.values[which], sigma[which]
     scales = _between(config.range_scale_sound, config.range_scale, 2) if len(scale) else [1.0]

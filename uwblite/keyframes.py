@@ -73,6 +73,12 @@ class AttachedRanges:
     """(m,) rad."""
     velocity: Floats
     """(m, 2) velocity of the tag in the keyframe's frame, m/s."""
+    inside: NDArray[np.bool_]
+    """(m,) whether the range was made while there was odometry; elsewhere nobody knows where the robot was."""
+
+
+OUTSIDE = 0.2
+"""Stamps so far outside the odometry's time still count as inside, s: a period of slow odometry."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,6 +170,7 @@ def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframe
         arm[:, :2],
         arm[:, 2],
         se2.rotate(arm[:, 2], in_base),
+        (log_ranges.stamps >= odometry.stamps[0] - OUTSIDE) & (log_ranges.stamps <= odometry.stamps[-1] + OUTSIDE),
     )
 
 

@@ -52,7 +52,7 @@ from .icp import IcpConfig
 from .keyframes import KeyframeConfig
 from .map_result import MapResult, StageSummary
 from .marginals import JointCovariance, marginals
-from .measurement import OdometryNoiseConfig, learn_noise, range_edges, wheel_edges
+from .measurement import OdometryNoiseConfig, learn_noise, range_edges, relocate, wheel_edges
 from .occupancy_grid import GridConfig, OccupancyGrid, Sweeps
 from .pair_matching import CloudRasters
 from .range_noise import RangeNoiseConfig, short_term_sigma
@@ -189,6 +189,7 @@ def build_map(
         part = replace(part, graph=_free(part.graph, *_LASER))
         if config.tracking.on:
             part, tracked = _track(part, scans, drives, config, stages)
+            part = _heard_anew(part, tracked, config, stages)
         if config.use_loops:
             held = part.edges if tracked is None else (*part.edges, tracked.edges)
             close = _close_loops if config.loops.method == "search" else _close_loops_plainly
@@ -295,9 +296,11 @@ def _grown(part: Part, drives: Drives, number: int, config: MappingConfig, stage
     first = first_estimate.grow(part.graph, part.wheels, radio, path - path[0], growth, config.anchors)
     whose = {"recording": number + 1} if len(drives) > 1 else {}
     stages.end("first estimate", range_sigma=round(sigma, 4), placed=int(first.placed.sum()), **whose)
-    graph = replace(_estimates(part.graph, first.graph), fixed_anchors=~first.placed)
+    # It grew from the middle; the map begins where the odometry did.
+    back = se2.compose(part.graph.poses[0], se2.inverse(first.graph.poses[0]))
+    graph = replace(_estimates(part.graph, map_frame.moved(first.graph, back)), fixed_anchors=~first.placed)
     radio = replace(radio, weights=(alive & first.placed[radio.anchor]).astype(np.float64))
-    return replace(part, graph=graph, radio=radio, first=first)
+    return replace(part, graph=graph, radio=radio, first=sessions.moved_hypotheses(first, back))
 
 
 def _settled(part: Part, config: MappingConfig, stages: Stages) -> Part:
@@ -415,6 +418,29 @@ def _track(part: Part, scans: _Scans, drives: Drives, config: MappingConfig, sta
         sigma=round(refined.sigma, 4), rounds=refined.rounds,
     )
     return replace(part, graph=graph), refined
+
+
+def _heard_anew(part: Part, tracked: Refined, config: MappingConfig, stages: Stages) -> Part:
+    """Judge the ranges anew on the trajectory that neighbouring clouds have stiffened.
+
+    Wheels alone are soft enough to be bent until anchors that lie for minutes seem to tell the truth. On the stiffer
+    chain, softly pulled at first, lies stand out.
+    """
+    graph, radio = part.graph, part.radio
+    if radio is None:
+        return part
+    for softness in _SOFTNESS:
+        soft = replace(radio, sigma=radio.sigma * softness)
+        graph = _estimates(graph, optimize(graph.with_edges(part.wheels, soft, tracked.edges), config.solver)[0])
+        graph = relocate(radio, graph, ~np.asarray(graph.fixed_anchors), config.anchors)
+        radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
+    graph = _estimates(graph, optimize(graph.with_edges(part.wheels, radio, tracked.edges), config.solver)[0])
+    stages.end("ranges judged anew")
+    return replace(part, graph=_hold_negative_heights(graph), radio=radio)
+
+
+_SOFTNESS = (10.0, 3.0)
+"""Factors on the ranges' standard deviations, lap by lap."""
 
 
 def _close_loops(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import range_mixture, se2
-from .anchors import AnchorConfig, usable
+from .anchors import AnchorConfig, agreement, locate, usable
 from .calibration import odometry_indices, range_indices
 from .graph import Calibration, Graph, OdometryEdges, RangeEdges, RelativePoseEdges
 from .keyframes import AttachedRanges, Keyframes
@@ -16,6 +16,7 @@ from .sensor_log import SensorMounting
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 _STEPS = Kernel("cauchy", 5.0)
 _RANGES = Kernel("cauchy", 2.5)
@@ -62,7 +63,7 @@ def range_edges(
     attached: AttachedRanges, first: int, anchor_ids: tuple[str, ...], mounting: SensorMounting,
     calibration: Calibration, sigma: float, search: AnchorConfig, kernel: Kernel = _RANGES,
 ) -> RangeEdges:
-    """Return one edge per range; readings that cannot be distances get weight 0.
+    """Return one edge per range; readings that cannot be distances, or were made without odometry, get weight 0.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ def range_edges(
         told[attached.anchor],
         range_indices(calibration, attached.anchor, anchor_ids),
         kernel,
-        usable(attached.ranges, search).astype(np.float64),
+        (usable(attached.ranges, search) & attached.inside).astype(np.float64),
         attached.stamps,
     )
 
@@ -93,6 +94,33 @@ def tag_positions(edges: RangeEdges, poses: Floats) -> Floats:
     """Return where the tag was at each range (m, 2), map frame."""
     arm = edges.lever_arm + se2.rotate(edges.turn, edges.tag)
     return se2.transform(poses[edges.pose], arm)
+
+
+def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: AnchorConfig) -> Graph:
+    """Return the graph with anchors moved to where clearly more of their ranges agree, its poses being trusted.
+
+    Parameters
+    ----------
+    edges : ranges; those of weight 0 do not count. placed : (a,) anchors that may be moved.
+    """
+    positions, anchors = tag_positions(edges, graph.poses), graph.anchors.copy()
+    alive = np.ones(len(edges), dtype=bool) if edges.weights is None else edges.weights > 0
+    for anchor in np.flatnonzero(placed):
+        own = np.flatnonzero(alive & (edges.anchor == anchor))
+        level = np.sqrt(np.maximum(edges.ranges[own] ** 2 - edges.height[own] ** 2, 1e-4))
+        found = locate(positions[own], level, search, _TRUSTED)
+        if not found:
+            continue
+        here, there = (agreement(positions[own], level, p) for p in (anchors[anchor], found[0].position))
+        if there > here + _CLEARLY:
+            anchors[anchor] = found[0].position
+    return replace(graph, anchors=anchors)
+
+
+_TRUSTED = 0.15
+"""Error of a path that the lidar holds, m."""
+_CLEARLY = 0.1
+"""Share of its ranges that must agree more with another place before an anchor is moved there."""
 
 
 def learn_noise(

@@ -5,9 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from . import suspicions
 from .calibration import CalibrationConfig, Unknown, unknowns
 from .closures import Closures
 from .graph import Graph, RangeEdges
+from .keyframes import OUTSIDE
 from .map_result import AnchorEstimate, CalibrationEstimate, MapResult, StageSummary
 from .marginals import Marginals
 from .occupancy_grid import OccupancyGrid
@@ -42,6 +44,9 @@ def summarise(
         "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
     }
     more, own_doubts = _doubts(drives, anchors, closures, grid)
+    more += suspicions.unusual(calibrated, listed) + suspicions.out_of_time(drives, OUTSIDE)
+    more += suspicions.lies(table, part.anchor_ids, float(drives.stamps[0])) if table else []
+    own_doubts += suspicions.mirrored(graph, drives, config)
     fits = [float(stage.figures["chi2_per_dof"]) for stage in stages if "chi2_per_dof" in stage.figures]
     if fits and fits[-1] > _POOR:
         times = float(np.sqrt(fits[-1]))
