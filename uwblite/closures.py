@@ -24,6 +24,8 @@ class LoopClosureConfig:
     """Candidates per sub-map and round, best expected overlap first."""
     rounds: int = 4
     """Most rounds of searching and solving; ends early when a round finds nothing new."""
+    enough: float = 5.0
+    """Closures per sub-map, on average, after which no further round is made."""
     direct: float = 0.5
     """Matching starts from the graph's guess when its uncertainty (3 sigma) is below this, m; else a search comes first."""
     reach: float = 6.0
@@ -58,7 +60,8 @@ class LoopClosureConfig:
     correlation: float = 24.0
     """Matches that together weigh as one: they share the bending of both sub-maps."""
     through: float = 0.12
-    """Largest share of one sub-map's points that may stand where the other saw free space; people and drift leave some."""
+    """Largest share of one sub-map's points that may stand where the other saw free space. Where sub-maps driven one after
+    the other disagree more, because people walk about, it is by how much these do."""
     places: int = 3
     """Places found by a search that are matched before one is chosen."""
 

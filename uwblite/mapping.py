@@ -470,7 +470,8 @@ def _close_loops(
             f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(candidates.target),
             accepted=len(new.edges), standing=len(found.edges),
         )
-        if len(new.edges) < 0.05 * len(found.edges) and not missed - {(a, b) for a, b, searched in tried if searched}:
+        tied = len(found.edges) >= config.loops.enough * len(pieces)
+        if (tied or len(new.edges) < 0.05 * len(found.edges)) and not missed - {(a, b) for a, b, searched in tried if searched}:
             break
     return replace(part, graph=_estimates(part.graph, base)), found
 
