@@ -81,6 +81,12 @@ class Clouds:
         offsets = np.append(first, counts.sum()).astype(np.int64)
         return Clouds(offsets, self.points[rows], self.normals[rows], owner, self.normal_variance[rows])
 
+    def only(self, kept: NDArray[np.bool_]) -> "Clouds":
+        """Return the clouds with some of their points (p,) alone."""
+        counts = np.bincount(self.owner[kept], minlength=len(self))
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        return Clouds(offsets, self.points[kept], self.normals[kept], self.owner[kept], self.normal_variance[kept])
+
 
 def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     """Average rays in cells, drop lone points, estimate normals and order each cloud by bearing.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from . import se2
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,23 +53,18 @@ def free_space(
     return FreeSpace(np.asarray(poses, dtype=np.float64).reshape(-1, 3), free, angle_min, angle_increment)
 
 
-def contradiction(free: FreeSpace, points: Floats, margin: float, least: int = 1) -> tuple[float, float]:
-    """Tell what share of points lies where free space was seen.
+def looked_through(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, Ints]:
+    """Count for each point the scans that looked through it, and those to which it was in view.
 
     Parameters
     ----------
-    free : of the other cloud.
-    points : (m, 2) m, in that cloud's frame.
-    margin : m; a point contradicts a bearing if it lies nearer than the bearing was free by more than that.
-    least : how many scans a point must contradict.
+    free : of a cloud. points : (m, 2) m, in its frame.
+    margin : m; a scan looked through a point if the bearing was free for more than that beyond it.
 
     Returns
     -------
-    contradicting : share of the seen points that contradict, 0..1; 0 where none was seen.
-    seen : share of the points that lie within the seen free space or up to margin behind it, 0..1.
+    through (m,), in_view (m,) : the latter within the seen free space or up to margin behind it.
     """
-    if len(points) == 0 or len(free.poses) == 0:
-        return 0.0, 0.0
     local = se2.transform(se2.inverse(free.poses)[:, None, :], points[None, :, :])
     distance = np.hypot(local[..., 0], local[..., 1])
     bearing = se2.bearing(local)
@@ -77,7 +73,26 @@ def contradiction(free: FreeSpace, points: Floats, margin: float, least: int = 1
     scan = np.arange(len(free.poses))[:, None]
     width = free.ranges.shape[1]
     until = np.where(bins < width, free.ranges[scan, np.minimum(bins, width - 1)], 0.0)
-    through = (until > 0.0) & (distance < until - margin)
-    seen = ((until > 0.0) & (distance < until + margin)).any(axis=0)
-    contradicting = (through.sum(axis=0) >= least) & seen
-    return float(contradicting.sum() / max(int(seen.sum()), 1)), float(seen.mean())
+    known = until > 0.0
+    through, in_view = known & (distance < until - margin), known & (distance < until + margin)
+    return through.sum(axis=0), in_view.sum(axis=0)
+
+
+def contradiction(free: FreeSpace, points: Floats, margin: float, least: int = 1) -> tuple[float, float]:
+    """Tell what share of points lies where free space was seen.
+
+    Parameters
+    ----------
+    free : of the other cloud. points : (m, 2) m, in that cloud's frame. margin : m, see looked_through.
+    least : how many scans a point must contradict.
+
+    Returns
+    -------
+    contradicting : share of the points in view that contradict, 0..1; 0 where none was.
+    seen : share of the points that were in view, 0..1.
+    """
+    if len(points) == 0 or len(free.poses) == 0:
+        return 0.0, 0.0
+    through, in_view = looked_through(free, points, margin)
+    seen = in_view > 0
+    return float(np.sum((through >= least) & seen) / max(int(seen.sum()), 1)), float(seen.mean())

@@ -456,12 +456,14 @@ def _close_loops(
     held = part.radio is not None
     for lap in range(config.loops.rounds):
         pieces = submaps.build(scans.clouds, base.poses, drives.path, session, config.submaps)
+        free = sight.seen_free(scans.clouds, pieces, base.poses)
+        pieces = sight.still(pieces, free)
         known = JointCovariance(base.with_edges(found.edges), pieces.reference)
         candidates = closure_candidates.propose(base, known, pieces, session, tried, missed, held, config.loops)
         tried |= candidates.names(config.loops)
-        free = sight.seen_free(scans.clouds, pieces, base.poses)
         teller = stages.teller("loop closure")
-        new = loop_closure.find(candidates, pieces, config.loops, config.search, teller, free, executor)
+        rules = replace(config.loops, through=max(config.loops.through, sight.unrest(pieces, free, base.poses, session)))
+        new = loop_closure.find(candidates, pieces, rules, config.search, teller, free, executor)
         new = _without_forbidden(new, scans)
         missed |= set() if held else closure_candidates.missed(candidates, new, config.loops)
         found = closures.merged(found, new)

@@ -5,13 +5,16 @@ people, glass and doors leave a few per cent. Of clouds in a wrong place, half o
 """
 
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from . import se2
 from .clouds import Clouds
-from .free_space import FreeSpace, contradiction, free_space
+from .free_space import FreeSpace, contradiction, free_space, looked_through
 from .submaps import Submaps
 
 Floats = NDArray[np.float64]
@@ -64,6 +67,19 @@ def seen_free(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace
     return free
 
 
+def still(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
+    """Return sub-maps without what moved: points through which most of their own keyframes looked to which they were in view.
+
+    People who walk beside the robot leave trails in a sub-map that no other sub-map shows.
+    """
+    kept = np.ones(len(submaps.clouds.points), dtype=bool)
+    for k, own in enumerate(free):
+        rows = slice(submaps.clouds.offsets[k], submaps.clouds.offsets[k + 1])
+        through, in_view = looked_through(own, submaps.clouds.cloud(k)[0], _MARGIN)
+        kept[rows] = 2 * through <= in_view
+    return replace(submaps, clouds=submaps.clouds.only(kept))
+
+
 def sees_through(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, points_b: Floats, T_a_b: Floats) -> float:
     """Return the larger share of either sub-map's points that would stand in what the other saw to be free, 0..1.
 
@@ -75,6 +91,28 @@ def sees_through(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, points_
     one, _ = contradiction(free_a, se2.transform(T_a_b, points_b), _MARGIN)
     other, _ = contradiction(free_b, se2.transform(se2.inverse(T_a_b), points_a), _MARGIN)
     return max(one, other)
+
+
+def unrest(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, session: Ints) -> float:
+    """Return how much of a sub-map the next one sees through where nothing but people, glass and drift can be the cause.
+
+    Parameters
+    ----------
+    free : see seen_free. poses : (k, 3) T_map_base of the keyframes. session : (k,) recording of each.
+
+    Returns
+    -------
+    The share that one pair in ten of sub-maps driven one after the other exceeds, 0..1; 0 where there is no such pair.
+    """
+    reference = submaps.reference
+    pairs = np.flatnonzero(np.diff(session[reference]) == 0)
+    steps = se2.between(poses[reference[pairs]], poses[reference[pairs + 1]])
+    points = [submaps.clouds.cloud(k)[0] for k in range(len(submaps))]
+    shares = [
+        sees_through(free[k], points[k], free[k + 1], points[k + 1], step)
+        for k, step in zip(pairs.tolist(), steps, strict=True)
+    ]
+    return float(np.quantile(shares, 0.9)) if shares else 0.0
 
 
 def disagreement(clouds: Clouds, poses: Floats, path: Floats, session: Ints) -> tuple[float, int]:

@@ -81,15 +81,13 @@ def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: Su
     normals = se2.rotate(relative[:, 2], clouds.normals)
     owner, points, normals, scatter = _merge(piece[clouds.owner], points, normals, clouds.normal_variance, config.voxel)
     kept = np.ones(len(owner), dtype=bool)
-    offsets = np.searchsorted(owner, np.arange(len(first) + 1))
+    offsets = np.searchsorted(owner, np.arange(len(first) + 1)).astype(np.int64)
     for a, b in itertools.pairwise(offsets):
         if b > a:
             kept[a:b] = statistical_outlier_filter(points[a:b], config.neighbours, config.std_ratio)
             inner = np.flatnonzero(kept[a:b]) + a
             kept[inner] = radius_outlier_filter(points[inner], config.radius, config.min_neighbours)
-    owner, points, normals, scatter = owner[kept], points[kept], normals[kept], scatter[kept]
-    offsets = np.searchsorted(owner, np.arange(len(first) + 1)).astype(np.int64)
-    return Submaps(first, last, reference, Clouds(offsets, points, normals, owner, scatter))
+    return Submaps(first, last, reference, Clouds(offsets, points, normals, owner, scatter).only(kept))
 
 
 def _merge(
