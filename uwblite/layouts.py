@@ -99,7 +99,7 @@ class SparseLayout:
             has = own & (k < width)
             tall[column[has] + k] = in_blocks[column[has]] + blocks.full
         indptr = np.concatenate([[0], np.cumsum(tall)])
-        indices, source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.int64)
+        indices, source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.int32)
         for h, w in _SHAPES:
             some = np.nonzero((height == h) & (width == w))[0]
             r, own_some, at_column = row[some], own[some], column[some]
@@ -142,8 +142,8 @@ class IterativeLayout:
         self._local = LocalPlaces(self._sparse.matrix(np.zeros(blocks.full_start + blocks.full * blocks.size + 1)), pieces)
 
     def factor(self, values: Floats) -> TwoLevelFactor:
-        """Prepare to solve with these values."""
-        return TwoLevelFactor(self._sparse.matrix(values).copy(), self._pieces, self._local)
+        """Prepare to solve with these values, up to the next call."""
+        return TwoLevelFactor(self._sparse.matrix(values), self._pieces, self._local)
 
 
 class BandedLayout:

@@ -93,34 +93,37 @@ class JointCovariance:
         With the chosen poses last, H = L D L^T ends in a dense block L2 D2 L2^T, their information once all others are
         marginalised out, and its inverse is W^T W with W = D2^-1/2 L2^-1.
         """
-        linearized = linearize(graph)
-        normal = NormalEquations(graph, linearized, last=poses)
-        normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
-        factor = _factor(normal)
-        number = normal.unknowns.number["poses"]
-        # Behind the chosen poses stand only anchors and calibration.
-        scalars = np.setdiff1d(number[poses], [-1])
-        late = np.arange(int(np.sum(number >= 0)) - len(scalars), normal.unknowns.size)
-        place = factor.perm_c[late].astype(np.int64)
-        order = np.argsort(place)
-        inside = place[order]
-        lower = factor.L[inside][:, inside].toarray(order="F")
-        whitened = np.tril(lapack.dtrtri(lower, lower=1, unitdiag=1, overwrite_c=1)[0])
-        whitened /= np.sqrt(factor.U.diagonal()[inside])[:, None]
-        whitened = whitened[:, np.argsort(order)[: len(scalars)]]
+        number, size, lower, pivots, place = _last_block(graph, poses)
+        whitened = lapack.dtrtri(lower, lower=1, unitdiag=1, overwrite_c=1)[0]
+        whitened /= np.sqrt(pivots)[:, None]
         self._graph = graph
-        self._covariance: Floats = np.zeros((len(scalars) + 1, len(scalars) + 1))
-        self._covariance[:-1, :-1] = whitened.T @ whitened
-        self._row = np.where(np.isin(number, scalars), number - (late[0] if len(late) else 0), len(scalars))
+        self._covariance: Floats = whitened.T @ whitened
+        self._row = np.where(number >= size, place[np.maximum(number - size, 0)], -1)
 
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
         i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
 
         def among(a: Ints, b: Ints) -> Floats:
-            return np.asarray(self._covariance[self._row[a][:, :, None], self._row[b][:, None, :]])
+            row, column = self._row[a][:, :, None], self._row[b][:, None, :]
+            return np.asarray(self._covariance[row, column] * ((row >= 0) & (column >= 0)))
 
         return _relative(self._graph, i, j, among(i, i), among(j, j), among(i, j))
+
+
+def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
+    """Return the end of the factor with these poses last: their places among the unknowns (k, 3), -1 = held, and what it
+    takes to read it: where the block begins, L2 (n, n), the diagonal of D2 (n,), and each unknown's row in them (n,)."""
+    linearized = linearize(graph)
+    normal = NormalEquations(graph, linearized, last=poses)
+    normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
+    factor, number = _factor(normal), normal.unknowns.number["poses"]
+    # Behind the chosen poses stand only anchors and calibration.
+    first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
+    place = factor.perm_c[np.arange(first, normal.unknowns.size)].astype(np.int64)
+    inside = np.sort(place)
+    lower = factor.L[inside][:, inside].toarray(order="F")
+    return number, first, lower, factor.U.diagonal()[inside], np.searchsorted(inside, place)
 
 
 def _relative(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross: Floats) -> Floats:

@@ -52,7 +52,9 @@ class RefinementConfig:
     shrink: float = 0.7
     """Gate of a round as a share of the one before."""
     partners: int = 6
-    """Clouds from other times that each cloud is matched with."""
+    """Clouds from other times that each cloud is matched with; fewer, but two at least, where that makes too many."""
+    most: int = 40_000
+    """Pairs of clouds from different times that are too many: recordings of hours are tied richly by less."""
     epoch: float = 2.0
     """Travelled distance within which only the best partner counts, m."""
     neighbours: tuple[int, ...] = (1, 2, 4)
@@ -132,6 +134,7 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, session: Ints, config: Re
     size = np.maximum(np.diff(seen.indptr), 1)
     epoch = (path / config.epoch).astype(np.int64)
     across, found = seen.T.tocsr(), []
+    partners = min(config.partners, max(2, config.most // seen.shape[0]))
     for first in range(0, seen.shape[0], _CLOUDS_AT_ONCE):
         common = (seen[first : first + _CLOUDS_AT_ONCE] @ across).tocoo()
         i, j = common.row.astype(np.int64) + first, common.col.astype(np.int64)
@@ -144,7 +147,7 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, session: Ints, config: Re
         i, j, share = i[fresh], j[fresh], share[fresh]
         order = np.lexsort((j, -share, i))
         i, j = i[order], j[order]
-        best = np.arange(len(i)) - np.searchsorted(i, i) < config.partners
+        best = np.arange(len(i)) - np.searchsorted(i, i) < partners
         found.append((i[best], j[best]))
     i, j = (np.concatenate(part) for part in zip(*found, strict=True))
     return i, j
