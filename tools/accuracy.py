@@ -225,7 +225,8 @@ def true_path(folder: Path, log: SensorLog) -> tuple[np.ndarray, np.ndarray]:
             return read_tum(folder / name)
     assert log.scans is not None
     rows = np.loadtxt(folder / "reference_poses_matched.csv", delimiter=",", skiprows=1)
-    return log.scans.stamps[rows[:, 1].astype(int)], rows[:, 2:5]
+    # Its steps count the scans of this log; its scan index those of the thinned log it was matched with.
+    return log.scans.stamps[rows[:, 0].astype(int)], rows[:, 2:5]
 
 
 def halves(config: MappingConfig) -> str:
