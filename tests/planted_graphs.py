@@ -36,7 +36,7 @@ def every_kind(seed, calibrated=True, edges=8):
     kinds = {
         "relative pose": RelativePoseEdges(i, j, poses, L),
         "odometry": OdometryEdges(i, j, poses, rng.normal(size=e), rng.uniform(size=e), L, which(0, 1, 2, 3)),
-        "scan": ScanEdges(i, j, poses, L, rng.normal(size=(e, 3)), rng.normal(size=(e, 3)), laser),
+        "scan": ScanEdges(i, j, poses, L, rng.normal(size=(e, 3)), rng.normal(size=(e, 3)), laser, 0.3),
         "range": RangeEdges(
             pose=i,
             anchor=rng.integers(0, a, e),

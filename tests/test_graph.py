@@ -78,7 +78,7 @@ def test_scan_poses_follow_the_base_for_the_delay_and_carry_the_mounting():
     x, y, theta, delay = graph.calibration.values[4:8]
     for e, seen in enumerate(edges.relative(graph)):
         sensor = [
-            se2.compose(se2.compose(graph.poses[p], se2.exp(twist * delay)), [x, y, theta])
+            se2.compose(se2.compose(graph.poses[p], se2.exp(twist * (delay - edges.made_with))), [x, y, theta])
             for p, twist in ((edges.i[e], edges.twist_i[e]), (edges.j[e], edges.twist_j[e]))
         ]
         np.testing.assert_allclose(seen, se2.between(*sensor), atol=1e-12)

@@ -312,6 +312,15 @@ def test_intel_is_closed(shared_data):
     assert ate(result, (stamps, table[:, 2:5])) < 0.3
 
 
+def test_a_lidar_whose_clock_is_late_is_found_out(log, truth, result):
+    late = build_map(log.with_later_scans(0.25))
+    delay = next(c for c in late.calibration if c.name == "laser_delay")
+    usual = next(c for c in result.calibration if c.name == "laser_delay")
+    assert delay.state == "estimated"
+    assert delay.value == pytest.approx(usual.value - 0.25, abs=0.015 + 3.0 * delay.sigma)
+    assert ate(late, truth) < 1.5 * ROOM_ATE
+
+
 def test_a_large_grid_is_announced_and_may_be_declined(minute, monkeypatch):
     monkeypatch.setattr("uwblite.mapping._LARGE_GRID", 100)
     told = []

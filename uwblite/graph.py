@@ -281,8 +281,9 @@ _LEAST_SCALE = 0.1
 class ScanEdges:
     """Pose of cloud j in cloud i by scan matching, with the lidar's mounting and clock as unknowns.
 
-    Clouds stand in the base frame through the nominal mounting and clock. The true frame of cloud i is
-    ``S_i = X_i o exp(twist_i delay) o C`` with the mounting correction C = (x, y, theta); the edge measures S_i^-1 S_j.
+    Clouds stand in the base frame through the nominal mounting and the clock they were made with. The true frame of cloud
+    i is ``S_i = X_i o exp(twist_i (delay - made_with)) o C`` with the mounting correction C = (x, y, theta); the edge
+    measures S_i^-1 S_j.
     """
 
     i: Ints
@@ -297,6 +298,8 @@ class ScanEdges:
     """(e, 3) velocity at cloud j."""
     calibration: Ints
     """(4,) indices of C's x, y, theta and of the delay, s, in the calibration block; -1 = not an unknown (taken as 0)."""
+    made_with: float = 0.0
+    """Delay with which the clouds were made, s."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
@@ -311,7 +314,7 @@ class ScanEdges:
         if not np.any(self.calibration >= 0):
             return x, x[:, 2]
         padded = np.append(graph.calibration.values, 0.0)
-        moved = se2.compose(x, se2.exp(twist * padded[self.calibration[3]]))
+        moved = se2.compose(x, se2.exp(twist * (padded[self.calibration[3]] - self.made_with)))
         return se2.compose(moved, padded[self.calibration[:3]]), moved[:, 2]
 
     def relative(self, graph: Graph) -> Floats:

@@ -188,7 +188,7 @@ def build_map(
         stages.end("clouds", points=len(scans.clouds.points))
         part = replace(part, graph=_free(part.graph, *_LASER))
         if config.tracking.on:
-            part, tracked = _track(part, scans, drives, config, stages)
+            part, tracked, scans = _track_on_time(part, scans, drives, config, stages)
             part = _heard_anew(part, tracked, config, stages)
         if config.use_loops:
             held = part.edges if tracked is None else (*part.edges, tracked.edges)
@@ -353,23 +353,25 @@ class _Scans:
     twist: Floats
     clock: Clock
     known: Constraints
+    delay: float
+    """Of the lidar's clock, s, with which the clouds were made."""
 
     def may_meet(self, i: Ints, j: Ints) -> Bools:
         """Tell which pairs of keyframes the user has not forbidden to match."""
         return self.known.allowed(self.clock, i, j)
 
     @classmethod
-    def of(cls, drives: Drives, known: Constraints, config: MappingConfig) -> "_Scans | None":
+    def of(cls, drives: Drives, known: Constraints, config: MappingConfig, delay: float = 0.0) -> "_Scans | None":
         if not any(session.has_scans for session in drives.sessions):
             return None
-        built = clouds.joined([block for session in drives.sessions for block in _clouds(session, config)])
-        reach = max(config.refinement.first_gate, 0.2)
-        return cls(built, pair_matching.paint(built, config.clouds.raster, reach), drives.twist, drives.clock, known)
+        built = clouds.joined([block for session in drives.sessions for block in _clouds(session, config, delay)])
+        raster = pair_matching.paint(built, config.clouds.raster, max(config.refinement.first_gate, 0.2))
+        return cls(built, raster, drives.twist, drives.clock, known, delay)
 
 
-def _clouds(session: Session, config: MappingConfig) -> list[Clouds]:
+def _clouds(session: Session, config: MappingConfig, delay: float) -> list[Clouds]:
     """Return the clouds of a recording's keyframes, a block at a time; empty ones without lidar."""
-    log, frames = session.log, session.frames
+    log, frames = session.log.with_later_scans(delay), session.frames
     if log.scans is None:
         none = np.zeros(0, dtype=np.int64)
         return [Clouds(np.zeros(len(frames) + 1, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))]
@@ -390,7 +392,8 @@ def _match_round(
     kept = scans.may_meet(i, j)
     i, j = i[kept], j[kept]
     refined = refinement.refine(
-        graph.with_edges(*edges), scans.clouds, scans.raster, scans.twist, i, j, settings, config.solver, stages.teller(stage)
+        graph.with_edges(*edges), scans.clouds, scans.raster, scans.twist, i, j, settings, config.solver, stages.teller(stage),
+        scans.delay,
     )
     return _estimates(graph, refined.graph), refined
 
@@ -429,9 +432,10 @@ def _heard_anew(part: Part, tracked: Refined, config: MappingConfig, stages: Sta
     graph, radio = part.graph, part.radio
     if radio is None:
         return part
+    roughly = replace(config.solver, max_iterations=min(config.solver.max_iterations, _ROUGHLY))
     for softness in _SOFTNESS:
         soft = replace(radio, sigma=radio.sigma * softness)
-        graph = _estimates(graph, optimize(graph.with_edges(part.wheels, soft, tracked.edges), config.solver)[0])
+        graph = _estimates(graph, optimize(graph.with_edges(part.wheels, soft, tracked.edges), roughly)[0])
         graph = relocate(radio, graph, ~np.asarray(graph.fixed_anchors), config.anchors)
         radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
     graph = _estimates(graph, optimize(graph.with_edges(part.wheels, radio, tracked.edges), config.solver)[0])
@@ -439,8 +443,31 @@ def _heard_anew(part: Part, tracked: Refined, config: MappingConfig, stages: Sta
     return replace(part, graph=_hold_negative_heights(graph), radio=radio)
 
 
+_ROUGHLY = 12
+"""Iterations of an optimisation that another follows."""
 _SOFTNESS = (10.0, 3.0)
 """Factors on the ranges' standard deviations, lap by lap."""
+
+
+def _track_on_time(
+    part: Part, scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages
+) -> tuple[Part, Refined, _Scans]:
+    """Track; where the lidar's clock turns out to be off by much, make the clouds anew with that and track again."""
+    part, tracked = _track(part, scans, drives, config, stages)
+    for _ in range(_RETIMINGS):
+        delay = part.graph.calibration.get("laser_delay")
+        again = None if abs(delay - scans.delay) < _LATE else _Scans.of(drives, scans.known, config, delay)
+        if again is None:
+            break
+        scans = again
+        stages.end("clouds made anew", laser_delay=round(delay, 4))
+        part, tracked = _track(part, scans, drives, config, stages)
+    return part, tracked, scans
+
+
+_LATE = 0.015
+"""s; the clouds' clock may be off by this much: a robot's velocity hardly changes meanwhile."""
+_RETIMINGS = 3
 
 
 def _close_loops(

@@ -163,6 +163,7 @@ def refine(
     config: RefinementConfig,
     solver: SolverConfig,
     on_round: Callable[[int, int], None] | None = None,
+    delay: float = 0.0,
 ) -> Refined:
     """Match all pairs and solve the graph, round by round.
 
@@ -173,6 +174,7 @@ def refine(
     twist : (k, 3) velocity of the base at each keyframe.
     i, j : (e,) pairs, see choose_pairs.
     on_round : called with (round, rounds).
+    delay : of the lidar's clock, s, with which the clouds were made.
     """
     # Lines seen obliquely lean a little, so the cloud that gives the points seems shifted towards where it was seen from:
     # half a millimetre per pair, always to the same side. Every other pair the other way round, that averages out.
@@ -181,7 +183,7 @@ def refine(
     points = pair_points(clouds, j, config.points)
     names = scan_indices(graph.calibration)
     gate, sigma, moved, rounds = config.first_gate, config.sigma, np.inf, 0
-    empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names)
+    empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names, delay)
     probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j], kernel=Kernel("cauchy", 5.0))
     normal: NormalEquations | None = None
     brief = replace(solver, max_iterations=3, relative_decrease=1e-3)

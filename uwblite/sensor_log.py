@@ -148,6 +148,12 @@ class SensorLog:
         """Return the same recording with a sensor left out."""
         return replace(self, ranges=None if uwb else self.ranges, scans=None if lidar else self.scans)
 
+    def with_later_scans(self, delay: float) -> "SensorLog":
+        """Return the same recording with every scan later by delay, s."""
+        if self.scans is None or delay == 0.0:
+            return self
+        return replace(self, scans=replace(self.scans, stamps=self.scans.stamps + delay))
+
     def crop(self, start: float = -np.inf, end: float = np.inf) -> "SensorLog":
         """Return the part of the recording with start <= stamp <= end, s."""
 

@@ -73,7 +73,7 @@ def calibrated_graph(seed=0):
         i, j, T, np.ones(8), np.ones(8), roots(rng, 8, 3), np.broadcast_to(np.array([0, -1, -1, -1]), (8, 4))
     )
     twist = rng.normal(size=(2, 8, 3))
-    scans = ScanEdges(i, j, T, roots(rng, 8, 3), twist[0], twist[1], np.array([1, -1, 2, 3]))
+    scans = ScanEdges(i, j, T, roots(rng, 8, 3), twist[0], twist[1], np.array([1, -1, 2, 3]), 0.01)
     pose, anchor = rng.integers(0, len(X), 20), rng.integers(0, len(A), 20)
     cal = np.full((20, 6), -1)
     cal[:, 1] = 4

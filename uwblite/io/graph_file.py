@@ -132,7 +132,7 @@ def _between_bases(edges: RelativePoseEdges | OdometryEdges | ScanEdges, graph: 
     # S = X o A, so Z' = A_i Z A_j^-1 and, to first order, e' = A_j e A_j^-1 = M e.
     calibration = np.append(graph.calibration.values, 0.0)
     correction, delay = calibration[edges.calibration[:3]], calibration[edges.calibration[3]]
-    A_i, A_j = (se2.compose(se2.exp(twist * delay), correction) for twist in (edges.twist_i, edges.twist_j))
+    A_i, A_j = (se2.compose(se2.exp(twist * (delay - edges.made_with)), correction) for twist in (edges.twist_i, edges.twist_j))
     T = se2.compose(se2.compose(A_i, edges.T_i_j), se2.inverse(A_j))
     M = _turned(A_j[:, 2])
     M[:, 0, 2], M[:, 1, 2] = A_j[:, 1], -A_j[:, 0]
