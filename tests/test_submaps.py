@@ -79,7 +79,8 @@ def test_the_two_sides_of_a_thin_wall_stay_apart_whatever_its_direction(turn):
     made = build(clouds, np.zeros((1, 3)), np.zeros(1), np.zeros(1, dtype=np.int64), KEEP)
     points, normals = se2.rotate(-turn, made.clouds.points), se2.rotate(-turn, made.clouds.normals)
     assert np.all(np.abs(normals[:, 1]) > 0.9)
-    np.testing.assert_allclose(points[:, 1], 0.04 + 0.015 * np.sign(normals[:, 1]), atol=1e-9)
+    single = 8.0 * 2.0**-23  # clouds are kept in single precision, these within 8 m
+    np.testing.assert_allclose(points[:, 1], 0.04 + 0.015 * np.sign(normals[:, 1]), atol=single)
 
 
 def test_lone_points_are_filtered():

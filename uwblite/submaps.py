@@ -10,11 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import se2
-from .clouds import Clouds, mean_by_key
+from .clouds import Clouds, joined, mean_by_key
 from .point_cloud import radius_outlier_filter, statistical_outlier_filter
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+_AT_ONCE = 32
+"""Sub-maps merged at once; a bound on the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,20 +78,32 @@ def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: Su
     """
     first, last = cut(path, session, config.epsilon)
     reference = (first + last - 1) // 2
+    parts = []
+    for block in range(0, len(first), _AT_ONCE):
+        own = slice(block, block + _AT_ONCE)
+        parts.append(_built(clouds, poses, first[own], last[own], reference[own], config))
+    return Submaps(first, last, reference, joined(parts))
+
+
+def _built(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Clouds:
+    """Return the clouds of neighbouring sub-maps, which begin with the keyframes first (s,) and end before last (s,)."""
+    keyframes = slice(int(first[0]), int(last[-1]))
+    rows = slice(int(clouds.offsets[keyframes.start]), int(clouds.offsets[keyframes.stop]))
     piece = np.repeat(np.arange(len(first)), last - first)
-    middle = reference[piece]
-    relative = se2.between(poses[middle], poses)[clouds.owner]
-    points = se2.transform(relative, clouds.points)
-    normals = se2.rotate(relative[:, 2], clouds.normals)
-    owner, points, normals, scatter = _merge(piece[clouds.owner], points, normals, clouds.normal_variance, config.voxel)
-    kept = np.ones(len(owner), dtype=bool)
-    offsets = np.searchsorted(owner, np.arange(len(first) + 1)).astype(np.int64)
+    owner = clouds.owner[rows] - keyframes.start
+    relative = se2.between(poses[reference[piece]], poses[keyframes])[owner]
+    points = se2.transform(relative, clouds.points[rows])
+    normals = se2.rotate(relative[:, 2], clouds.normals[rows])
+    scatter = clouds.normal_variance[rows]
+    number, points, normals, scatter = _merge(piece[owner], points, normals, scatter, config.voxel)
+    kept = np.ones(len(number), dtype=bool)
+    offsets = np.searchsorted(number, np.arange(len(first) + 1)).astype(np.int64)
     for a, b in itertools.pairwise(offsets):
         if b > a:
             kept[a:b] = statistical_outlier_filter(points[a:b], config.neighbours, config.std_ratio)
             inner = np.flatnonzero(kept[a:b]) + a
             kept[inner] = radius_outlier_filter(points[inner], config.radius, config.min_neighbours)
-    return Submaps(first, last, reference, Clouds(offsets, points, normals, owner, scatter).only(kept))
+    return Clouds(offsets, points, normals, number, scatter).only(kept)
 
 
 def _merge(
