@@ -13,7 +13,15 @@ from uwblite.anchors import AnchorConfig
 from uwblite.calibration import CalibrationConfig, block, unknowns
 from uwblite.graph import Calibration, Graph, RelativePoseEdges
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
-from uwblite.measurement import OdometryNoiseConfig, learn_noise, learn_wheels, range_edges, tag_positions, wheel_edges
+from uwblite.measurement import (
+    OdometryNoiseConfig,
+    learn_noise,
+    learn_wheels,
+    range_edges,
+    relocate,
+    tag_positions,
+    wheel_edges,
+)
 from uwblite.range_noise import RangeNoiseConfig
 from uwblite.robust import SQUARED
 from uwblite.sensor_log import Odometry, SensorMounting
@@ -211,3 +219,15 @@ def test_noise_does_not_draw_the_wheels_scale(calibration):
     reach = sigma[0] / np.sqrt((wheels.motion**2).sum(axis=0))
     assert solved.calibration.get("odometry_scale") == pytest.approx(scale, abs=4 * reach[0])
     assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])
+
+
+def test_an_anchor_in_the_wrong_place_goes_where_its_ranges_agree_and_others_stay():
+    _, truth, frames, places, _, edges = world(4, metres=80.0, sigma=0.03)
+    wrong = places.copy()
+    wrong[0] += [2.0, -1.0]
+    graph = Graph(truth[frames.index], wrong)
+    found = relocate(edges, graph, np.ones(len(places), dtype=bool), AnchorConfig())
+    assert np.hypot(*(found.anchors[0] - places[0])) < 0.3
+    np.testing.assert_array_equal(found.anchors[1:], wrong[1:])
+    held = relocate(edges, graph, np.zeros(len(places), dtype=bool), AnchorConfig())
+    np.testing.assert_array_equal(held.anchors, wrong)

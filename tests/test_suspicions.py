@@ -11,6 +11,7 @@ from uwblite.constraints import Constraints, KnownAnchor
 from uwblite.keyframes import OUTSIDE
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.sensor_log import SensorMounting
+from uwblite.suspicions import lying_stretches
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
 LEVEL = SensorMounting(anchor_height=0.0)
@@ -89,3 +90,29 @@ def test_the_map_begins_where_the_odometry_did(seed):
     moved = replace(log, odometry=replace(log.odometry, poses=se2.compose(np.array([3.0, -2.0, 1.0]), log.odometry.poses)))
     for some in (log, moved):
         np.testing.assert_allclose(build_map(some).trajectory[0], some.odometry.poses[0], atol=1e-9)
+
+
+def test_stretches_in_which_most_readings_disagree_are_found():
+    stamps = np.arange(400.0)
+    agrees = np.random.default_rng(0).random(400) < 0.95
+    assert lying_stretches(stamps, agrees) == []
+    agrees[100:200] = False
+    agrees[360:] = False
+    found = lying_stretches(stamps, agrees)
+    assert len(found) == 2
+    np.testing.assert_allclose(found, [(100, 199), (360, 399)], atol=20)
+    assert lying_stretches(stamps[:99], np.zeros(99, dtype=bool)) == []
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_anchors_that_lie_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed):
+    """Two of four anchors say 2 m too little for 40 % of the time each: wheels alone are soft enough to believe them."""
+    stamps, truth, log = run(seed, walls=np.concatenate([box(13, 13), box(3, 2) + 0.5]), metres=100.0)
+    radio, part = log.ranges, (log.ranges.stamps - stamps[0]) / np.ptp(stamps)
+    lie = (radio.anchor == 0) & (part > 0.1) & (part < 0.5) | (radio.anchor == 1) & (part > 0.5) & (part < 0.9)
+    honest, lied = (
+        aligned_error(build_map(replace(log, ranges=replace(radio, ranges=said))).trajectory[:, :2], truth[:, :2])
+        for said in (radio.ranges, np.maximum(radio.ranges - 2.0 * lie, 0.1))
+    )
+    assert honest < 0.03
+    assert lied < 0.05

@@ -277,7 +277,8 @@ def ablation(args: argparse.Namespace) -> str:
         if run != base and not worse:
             useless.append(run)
     verdict = f"Buys nothing on any of these drives (less than a twentieth in ATE and anchors): {', '.join(useless) or 'none'}."
-    return f"## What each ingredient buys\n\nEach left out in turn, seed {args.seed}.\n{text}\n{verdict}"
+    length = ", drives of 6 min" if args.quick else ""
+    return f"## What each ingredient buys\n\nEach left out in turn, seed {args.seed}{length}.\n{text}\n{verdict}"
 
 
 def injection(args: argparse.Namespace) -> str:

@@ -57,6 +57,7 @@ from .occupancy_grid import GridConfig, OccupancyGrid, Sweeps
 from .pair_matching import CloudRasters
 from .range_noise import RangeNoiseConfig, short_term_sigma
 from .refinement import Refined, RefinementConfig
+from .robust import SQUARED
 from .scan_search import SearchConfig
 from .sensor_log import SensorLog
 from .sessions import Drives, Part, Session
@@ -407,15 +408,17 @@ def _without_forbidden(found: Closures, scans: _Scans) -> Closures:
 def _track(part: Part, scans: _Scans, drives: Drives, config: MappingConfig, stages: Stages) -> tuple[Part, Refined]:
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
     rules = config.refinement
-    followed = tracking.follow(
-        scans.clouds, scans.raster, part.wheels, part.graph, rules.first_gate, config.tracking, config.search
-    )
-    part = replace(part, wheels=followed.wheels)
-    graph = _estimates(part.graph, optimize(part.graph.with_edges(*part.edges, followed.steps), config.solver)[0])
+    # Ranges that lie would tear neighbours apart; softly pulled, neighbours keep the wheels' word until clouds correct it.
+    soft = _softened(part)
+    whole = replace(soft, wheels=replace(soft.wheels, kernel=SQUARED))
+    graph = _estimates(part.graph, optimize(part.graph.with_edges(*whole.edges), config.solver)[0])
+    followed = tracking.follow(scans.clouds, scans.raster, part.wheels, graph, rules.first_gate, config.tracking, config.search)
+    part, soft = replace(part, wheels=followed.wheels), replace(soft, wheels=followed.wheels)
+    graph = _estimates(graph, optimize(graph.with_edges(*soft.edges, followed.steps), config.solver)[0])
     gate = float(np.clip(followed.miss, rules.later_gate, rules.first_gate))
     settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
     i, j = refinement.choose_pairs(scans.clouds, graph.poses, drives.path, drives.session, settings)
-    graph, refined = _match_round(graph, part.edges, scans, i, j, settings, config, stages, "tracking")
+    graph, refined = _match_round(graph, soft.edges, scans, i, j, settings, config, stages, "tracking")
     stages.end(
         "tracking", pairs=len(i), searched=followed.searched, used=int(refined.used.sum()), gate=round(gate, 3),
         sigma=round(refined.sigma, 4), rounds=refined.rounds,
@@ -427,26 +430,32 @@ def _heard_anew(part: Part, tracked: Refined, config: MappingConfig, stages: Sta
     """Judge the ranges anew on the trajectory that neighbouring clouds have stiffened.
 
     Wheels alone are soft enough to be bent until anchors that lie for minutes seem to tell the truth. On the stiffer
-    chain, softly pulled at first, lies stand out.
+    chain lies stand out.
     """
     graph, radio = part.graph, part.radio
     if radio is None:
         return part
     roughly = replace(config.solver, max_iterations=min(config.solver.max_iterations, _ROUGHLY))
-    for softness in _SOFTNESS:
-        soft = replace(radio, sigma=radio.sigma * softness)
-        graph = _estimates(graph, optimize(graph.with_edges(part.wheels, soft, tracked.edges), roughly)[0])
+    for solver in (roughly, config.solver):
         graph = relocate(radio, graph, ~np.asarray(graph.fixed_anchors), config.anchors)
         radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
-    graph = _estimates(graph, optimize(graph.with_edges(part.wheels, radio, tracked.edges), config.solver)[0])
+        graph = _estimates(graph, optimize(graph.with_edges(part.wheels, radio, tracked.edges), solver)[0])
     stages.end("ranges judged anew")
     return replace(part, graph=_hold_negative_heights(graph), radio=radio)
 
 
 _ROUGHLY = 12
 """Iterations of an optimisation that another follows."""
-_SOFTNESS = (10.0, 3.0)
-"""Factors on the ranges' standard deviations, lap by lap."""
+
+
+def _softened(part: Part) -> Part:
+    """Return the part with ranges that hold the trajectory only where nothing else does."""
+    radio = part.radio
+    return part if radio is None else replace(part, radio=replace(radio, sigma=radio.sigma * _SOFTNESS))
+
+
+_SOFTNESS = 10.0
+"""Factor on the ranges' standard deviations."""
 
 
 def _track_on_time(

@@ -111,7 +111,10 @@ def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: AnchorConfi
         found = locate(positions[own], level, search, _TRUSTED)
         if not found:
             continue
-        here, there = (agreement(positions[own], level, p) for p in (anchors[anchor], found[0].position))
+        here, there = (
+            agreement(positions[own], edges.ranges[own], place, edges.height[own])
+            for place in (anchors[anchor], found[0].position)
+        )
         if there > here + _CLEARLY:
             anchors[anchor] = found[0].position
     return replace(graph, anchors=anchors)
