@@ -35,6 +35,9 @@ FLOORS = (
     ("io/*", "map_frame", "diagnostics_odometry", "diagnostics_radio", "diagnostics_lidar", "drivers/recorder"),
     ("diagnostics", "report_map", "report", "suspicions", "summary"),
     # the walk
+    ("stages", "mapping_config"),
+    ("wheels_and_radio", "lidar_stages"),
+    ("closing",),
     ("mapping",),
     ("localize", "presets", "io/results"),
     ("cli/*", "__main__"),

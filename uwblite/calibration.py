@@ -5,10 +5,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .graph import Calibration, PriorEdges
+from .graph import Calibration, Graph, PriorEdges
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+WHEELS = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
+"""Unknowns of the wheels."""
+LASER = ("laser_x", "laser_y", "laser_theta", "laser_delay")
+"""Unknowns of the lidar."""
+RADIO = ("height2", "tag_x", "tag_y", "range_delay")
+"""Unknowns of the radio that a first estimate does without, by stem."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,10 +146,25 @@ def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str,
 
 def odometry_indices(calibration: Calibration, edges: int) -> Ints:
     """Return the (e, 4) calibration indices of OdometryEdges."""
-    names = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
-    return np.broadcast_to(indices(calibration, *names), (edges, 4))
+    return np.broadcast_to(indices(calibration, *WHEELS), (edges, 4))
 
 
 def scan_indices(calibration: Calibration) -> Ints:
     """Return the (4,) calibration indices of ScanEdges."""
-    return indices(calibration, "laser_x", "laser_y", "laser_theta", "laser_delay")
+    return indices(calibration, *LASER)
+
+
+def freed(graph: Graph, *names: str) -> Graph:
+    """Return the graph with calibration unknowns of these names (an anchor's or a recording's own by their stem) set free."""
+    assert graph.fixed_calibration is not None
+    named = np.array([stem(name) in names for name in graph.calibration.names], dtype=bool)
+    return replace(graph, fixed_calibration=graph.fixed_calibration & ~named)
+
+
+def with_real_heights(graph: Graph) -> Graph:
+    """Return the graph with squared heights that came out negative put back to 0 and held."""
+    names, values = graph.calibration.names, graph.calibration.values.copy()
+    below = np.array([n.startswith("height2:") for n in names], dtype=bool) & (values < 0.0)
+    values[below] = 0.0
+    fixed = np.asarray(graph.fixed_calibration) | below
+    return replace(graph.updated(graph.poses, graph.anchors, values), fixed_calibration=fixed)

@@ -107,6 +107,10 @@ class Graph:
         """Return the graph with new estimates."""
         return replace(self, poses=poses, anchors=anchors, calibration=replace(self.calibration, values=calibration))
 
+    def with_estimates_of(self, solved: "Graph") -> "Graph":
+        """Return the graph with the estimates of another, its own edges kept."""
+        return self.updated(solved.poses, solved.anchors, solved.calibration.values)
+
     def chi2(self) -> float:
         """Return the sum of squared whitened residuals, robust kernels and weights applied."""
         return sum(edge_cost(e, e.residuals(self)) for e in self.edges)

@@ -1,0 +1,54 @@
+"""All settings of the walk from recordings to a map."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from .anchors import AnchorConfig
+from .calibration import CalibrationConfig
+from .closures import LoopClosureConfig
+from .clouds import CloudConfig
+from .first_estimate import GrowthConfig
+from .icp import IcpConfig
+from .keyframes import KeyframeConfig
+from .measurement import OdometryNoiseConfig
+from .occupancy_grid import GridConfig
+from .range_noise import RangeNoiseConfig
+from .refinement import RefinementConfig
+from .scan_search import SearchConfig
+from .solver import SolverConfig
+from .submaps import SubmapConfig
+from .tracking import TrackingConfig
+
+
+@dataclass(frozen=True, slots=True)
+class MappingConfig:
+    """All settings, a group per stage."""
+
+    use_uwb: bool = True
+    """Use the ranges."""
+    use_lidar: bool = True
+    """Use the scans."""
+    use_loops: bool = True
+    """Search loop closures and match clouds of different times."""
+    turn_laser: bool = True
+    """Take the laser as mounted the other way up than told where its turns agree with the wheels' only so."""
+    align: Literal["odometry", "first-pose", "walls", "anchors"] = "odometry"
+    """Where the map's axes lie: where the odometry began; at the first pose; there, turned so that most walls run along x
+    and y; or at the first placed anchor, x towards the last."""
+    crop: tuple[float, float, float, float] | None = None
+    """Keep only this part of the grid: x0, y0, x1, y1, m, map frame."""
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
+    ranges: RangeNoiseConfig = field(default_factory=RangeNoiseConfig)
+    anchors: AnchorConfig = field(default_factory=AnchorConfig)
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    clouds: CloudConfig = field(default_factory=CloudConfig)
+    submaps: SubmapConfig = field(default_factory=SubmapConfig)
+    loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)
+    icp: IcpConfig = field(default_factory=IcpConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    grid: GridConfig = field(default_factory=GridConfig)
