@@ -14,7 +14,7 @@ from scipy import sparse
 
 from . import se2
 from .calibration import scan_indices
-from .clouds import Clouds, in_map
+from .clouds import Clouds
 from .graph import Graph, ScanEdges
 from .linear import NormalEquations
 from .pair_matching import CloudRasters, PairFactors, match, measured, pair_points
@@ -27,6 +27,8 @@ Bools = NDArray[np.bool_]
 
 _NEIGHBOURS = 4
 """Clouds no farther apart in the chain than this are neighbours."""
+_POINTS_AT_ONCE = 1 << 16
+"""Points brought into the map's frame at once."""
 _CLOUDS_AT_ONCE = 128
 """Clouds whose overlaps with all others are held at once; a bound on the memory."""
 
@@ -96,12 +98,17 @@ class Refined:
 
 def surface_cells(clouds: Clouds, poses: Floats, size: float = 0.5) -> sparse.csr_matrix:
     """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of 8 facings."""
-    points, normals = in_map(clouds, poses)
     usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
-    cell = np.floor(points[usable] / size).astype(np.int64)
-    facing = np.floor(se2.bearing(normals[usable]) * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
+    cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
+    for first in range(0, len(usable), _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        own = poses[clouds.owner[usable[part]]]
+        cell[part] = np.floor(se2.transform(own, clouds.points[usable[part]]) / size)
+        bearing = se2.bearing(se2.rotate(own[:, 2], clouds.normals[usable[part]]))
+        facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
     cell -= cell.min(axis=0, initial=0)
-    key = (cell[:, 0] * (cell[:, 1].max(initial=0) + 1) + cell[:, 1]) * 8 + facing
+    wide = int(cell[:, 1].max(initial=0)) + 1
+    key = (cell[:, 0].astype(np.int64) * wide + cell[:, 1]) * 8 + facing
     _, column = np.unique(key, return_inverse=True)
     shape = (len(clouds), int(column.max(initial=-1)) + 1)
     seen = sparse.csr_matrix((np.ones(len(column)), (clouds.owner[usable], column)), shape=shape)
