@@ -3,8 +3,10 @@
 import numpy as np
 
 from uwblite import se2
-from uwblite.graph import Calibration, Graph, OdometryEdges, PriorEdges, RangeEdges, RelativePoseEdges, ScanEdges
+from uwblite.graph import Calibration, Graph, PriorEdges
 from uwblite.landmark_edges import LandmarkEdges
+from uwblite.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+from uwblite.range_edges import RangeEdges
 
 NAMES = ("scale", "turn", "per_metre", "per_second", "x", "y", "theta", "delay")
 RANGE_NAMES = ("range_scale", "bias", "height2", "tag_x", "tag_y", "range_delay")

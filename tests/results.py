@@ -3,9 +3,11 @@
 import numpy as np
 
 from uwblite import se2
-from uwblite.graph import Graph, RangeEdges, RelativePoseEdges
+from uwblite.graph import Graph
 from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult, StageSummary
 from uwblite.occupancy_grid import GridGeometry, OccupancyGrid
+from uwblite.pose_edges import RelativePoseEdges
+from uwblite.range_edges import RangeEdges
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 
 EVIL = "<script>alert('x')</script>&\"\u202e"

@@ -20,7 +20,8 @@ FLOORS = (
     # what was measured, settings
     ("sensor_log", "config", "drivers/events"),
     # parts without a view of the whole
-    ("graph", "landmark_edges", "point_cloud", "nearest", "bresenham", "grid_geometry", "scan_rays", "ray_counter", "drawing"),
+    ("graph", "pose_edges", "range_edges", "landmark_edges"),
+    ("point_cloud", "nearest", "bresenham", "grid_geometry", "scan_rays", "ray_counter", "drawing"),
     ("evaluate", "occupancy_grid", "keyframes", "range_noise", "range_mixture", "anchors", "scan_search", "free_space"),
     ("factorization", "layouts", "selected_inverse", "two_level"),
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts"),

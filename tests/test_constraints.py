@@ -18,8 +18,10 @@ from uwblite.constraints import (
 )
 from uwblite.distance_edges import AnchorDistanceEdges
 from uwblite.errors import ConfigError, FormatError
-from uwblite.graph import Graph, RangeEdges, RelativePoseEdges
+from uwblite.graph import Graph
 from uwblite.io.constraints_file import parse_constraints, read_anchors
+from uwblite.pose_edges import RelativePoseEdges
+from uwblite.range_edges import RangeEdges
 from uwblite.solver import optimize
 
 IDS = ("A", "B", "C", "D")

@@ -8,7 +8,7 @@ from planted_graphs import loop, relative_edges
 from uwblite import se2
 from uwblite.errors import ConfigError
 from uwblite.gnc import GncConfig, optimize_gnc, truncated_weight
-from uwblite.graph import RelativePoseEdges
+from uwblite.pose_edges import RelativePoseEdges
 from uwblite.robust import Kernel
 from uwblite.solver import optimize
 

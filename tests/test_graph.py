@@ -4,7 +4,8 @@ from planted_graphs import every_kind
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.graph import Calibration, Graph, PriorEdges, RelativePoseEdges, edge_cost
+from uwblite.graph import Calibration, Graph, PriorEdges, edge_cost
+from uwblite.pose_edges import RelativePoseEdges
 from uwblite.robust import Kernel
 
 KINDS = sorted(every_kind(0)[1])

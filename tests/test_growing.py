@@ -6,9 +6,10 @@ from planted_graphs import plain_ranges, relative_edges
 
 from uwblite import se2
 from uwblite.errors import ConfigError
-from uwblite.graph import Calibration, Graph, PriorEdges, RelativePoseEdges
+from uwblite.graph import Calibration, Graph, PriorEdges
 from uwblite.growing import GrowingConfig, optimize_growing
 from uwblite.landmark_edges import LandmarkEdges
+from uwblite.pose_edges import RelativePoseEdges
 from uwblite.solver import optimize
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from planted import chain, drive, odometry, ranges, recording, scans, wander
 
 from uwblite import se2
-from uwblite.graph import Graph, RangeEdges
+from uwblite.graph import Graph
 from uwblite.keyframes import (
     KeyframeConfig,
     attach_ranges,
@@ -19,6 +19,7 @@ from uwblite.keyframes import (
     select,
     velocity_at,
 )
+from uwblite.range_edges import RangeEdges
 from uwblite.sensor_log import LaserScans, Odometry, SensorMounting
 
 CONFIG = KeyframeConfig(distance=0.4, angle=0.3, scans=2)

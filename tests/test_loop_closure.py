@@ -12,10 +12,11 @@ from uwblite import se2
 from uwblite.calibration import odometry_indices
 from uwblite.closure_candidates import Candidates, missed, propose
 from uwblite.closures import Closures, LoopClosureConfig, merged, no_closures
-from uwblite.graph import Calibration, Graph, OdometryEdges, RelativePoseEdges
+from uwblite.graph import Calibration, Graph
 from uwblite.loop_closure import find, reconcile
 from uwblite.map_result import LoopClosure
 from uwblite.marginals import marginals
+from uwblite.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.scan_search import SearchConfig
 from uwblite.solver import SolverConfig, optimize
 from uwblite.submaps import SubmapConfig, build

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.errors import ConfigError, DataError
-from uwblite.graph import Graph, PriorEdges, RelativePoseEdges
+from uwblite.graph import Graph, PriorEdges
 from uwblite.map_frame import ALIGNMENTS, alignment, cropped, moved, wall_direction
 from uwblite.occupancy_grid import GridGeometry, OccupancyGrid
+from uwblite.pose_edges import RelativePoseEdges
 
 RNG = np.random.default_rng(2)
 

@@ -11,7 +11,7 @@ from planted import odometry, ranges, wander
 from uwblite import se2
 from uwblite.anchors import AnchorConfig
 from uwblite.calibration import CalibrationConfig, block, unknowns
-from uwblite.graph import Calibration, Graph, RelativePoseEdges
+from uwblite.graph import Calibration, Graph
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
 from uwblite.measurement import (
     OdometryNoiseConfig,
@@ -22,6 +22,7 @@ from uwblite.measurement import (
     tag_positions,
     wheel_edges,
 )
+from uwblite.pose_edges import RelativePoseEdges
 from uwblite.range_noise import RangeNoiseConfig
 from uwblite.robust import SQUARED
 from uwblite.sensor_log import Odometry, SensorMounting

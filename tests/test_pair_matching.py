@@ -9,9 +9,10 @@ from scipy.spatial import cKDTree
 
 from uwblite import se2
 from uwblite.clouds import CloudConfig, Clouds, build
-from uwblite.graph import Graph, RelativePoseEdges
+from uwblite.graph import Graph
 from uwblite.keyframes import ScanPoints
 from uwblite.pair_matching import PairFactors, match, measured, paint, pair_points, trusted_step
+from uwblite.pose_edges import RelativePoseEdges
 
 ROOM = np.concatenate([box(8, 6), [[1.0, -1.0, 1.0, 1.0], [1.0, 1.0, 2.0, 1.5]]])
 CORRIDOR = np.array([[-40.0, -1.0, 40.0, -1.0], [40.0, 1.0, -40.0, 1.0]])

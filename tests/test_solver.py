@@ -7,9 +7,10 @@ from scipy.optimize import least_squares
 
 from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
-from uwblite.graph import Calibration, Graph, OdometryEdges, PriorEdges, RelativePoseEdges
+from uwblite.graph import Calibration, Graph, PriorEdges
 from uwblite.io.g2o import read_g2o
 from uwblite.linear import NormalEquations, moved, moved_along
+from uwblite.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.robust import Kernel
 from uwblite.solver import SolverConfig, edge_weights, linearize, optimize
 

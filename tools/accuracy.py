@@ -27,10 +27,12 @@ from uwblite import se2
 from uwblite.config import override
 from uwblite.evaluate import align, evaluate_trajectory
 from uwblite.gnc import optimize_gnc
-from uwblite.graph import Edges, Graph, RangeEdges, RelativePoseEdges
+from uwblite.graph import Edges, Graph
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.pose_edges import RelativePoseEdges
+from uwblite.range_edges import RangeEdges
 from uwblite.robust import SQUARED
 from uwblite.sensor_log import SensorLog
 

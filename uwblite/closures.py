@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .graph import RelativePoseEdges
 from .map_result import LoopClosure
+from .pose_edges import RelativePoseEdges
 
 Bools = NDArray[np.bool_]
 

@@ -16,7 +16,8 @@ from .config import setting
 from .distance_edges import AnchorDistanceEdges
 from .errors import ConfigError
 from .evaluate import align
-from .graph import Edges, Graph, PriorEdges, RelativePoseEdges
+from .graph import Edges, Graph, PriorEdges
+from .pose_edges import RelativePoseEdges
 from .robust import Kernel
 
 Floats = NDArray[np.float64]

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from . import se2
 from .anchors import AnchorConfig, AnchorHypothesis, ambiguous, locate
-from .graph import Calibration, Graph, OdometryEdges, RangeEdges
+from .graph import Calibration, Graph
+from .pose_edges import OdometryEdges
+from .range_edges import RangeEdges
 from .robust import Kernel
 from .solver import SolverConfig, optimize
 

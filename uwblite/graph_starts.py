@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from . import se2
 from .anchors import AnchorConfig, locate
-from .graph import Graph, RangeEdges
+from .graph import Graph
+from .range_edges import RangeEdges
 
 Floats = NDArray[np.float64]
 

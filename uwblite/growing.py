@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from . import se2
 from .anchors import AnchorConfig, ambiguous, locate
 from .errors import ConfigError
-from .graph import Edges, Graph, PriorEdges, RangeEdges, pick_rows
+from .graph import Edges, Graph, PriorEdges, pick_rows
 from .linear import free_unknowns
+from .range_edges import RangeEdges
 from .robust import Kernel
 from .solver import Progress, SolverConfig, SolverSummary, check, optimize
 

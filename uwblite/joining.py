@@ -18,8 +18,10 @@ from .anchors import AnchorHypothesis
 from .constraints import consensus
 from .errors import DataError
 from .first_estimate import FirstEstimate
-from .graph import Calibration, Graph, OdometryEdges, PriorEdges, RangeEdges
+from .graph import Calibration, Graph, PriorEdges
 from .marginals import marginals
+from .pose_edges import OdometryEdges
+from .range_edges import RangeEdges
 from .sessions import Drives, Joined, Part, Session, moved_hypotheses, moved_text, numbered
 
 Floats = NDArray[np.float64]

@@ -19,10 +19,11 @@ from .closure_candidates import Candidates
 from .closure_matching import Fits, fit
 from .closures import Closures, LoopClosureConfig, no_closures
 from .free_space import FreeSpace
-from .graph import Graph, RelativePoseEdges
+from .graph import Graph
 from .map_result import LoopClosure
 from .pair_alignment import Aligned
 from .pair_matching import measured
+from .pose_edges import RelativePoseEdges
 from .robust import Kernel
 from .scan_search import SearchConfig
 from .solver import SolverConfig, optimize

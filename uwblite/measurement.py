@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from . import range_mixture, se2
 from .anchors import AnchorConfig, agreement, locate, usable
 from .calibration import odometry_indices, range_indices
-from .graph import Calibration, Graph, OdometryEdges, RangeEdges, RelativePoseEdges
+from .graph import Calibration, Graph
 from .keyframes import AttachedRanges, Keyframes
+from .pose_edges import OdometryEdges, RelativePoseEdges
+from .range_edges import RangeEdges
 from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, steady_sigma
 from .robust import Kernel
 from .sensor_log import SensorMounting

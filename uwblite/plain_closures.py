@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from . import se2
 from .closures import Closures, LoopClosureConfig, no_closures
 from .clouds import Clouds
-from .graph import Graph, RelativePoseEdges
+from .graph import Graph
 from .icp import IcpConfig, Registration, align
 from .map_result import LoopClosure
 from .parallel import in_order
 from .point_cloud import make_cloud
+from .pose_edges import RelativePoseEdges
 from .submaps import Submaps
 
 Floats = NDArray[np.float64]

@@ -15,9 +15,10 @@ from scipy import sparse
 from . import se2
 from .calibration import scan_indices
 from .clouds import Clouds
-from .graph import Graph, ScanEdges
+from .graph import Graph
 from .linear import NormalEquations
 from .pair_matching import CloudRasters, PairFactors, match, measured, pair_points
+from .pose_edges import ScanEdges
 from .robust import Kernel
 from .solver import SolverConfig, SolverSummary, check, linearize, minimise
 

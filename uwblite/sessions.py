@@ -10,8 +10,10 @@ from . import keyframes, se2
 from .constraints import Clock
 from .errors import DataError
 from .first_estimate import FirstEstimate
-from .graph import Edges, Graph, OdometryEdges, RangeEdges
+from .graph import Edges, Graph
 from .keyframes import KeyframeConfig, Keyframes
+from .pose_edges import OdometryEdges
+from .range_edges import RangeEdges
 from .sensor_log import SensorLog
 
 Floats = NDArray[np.float64]

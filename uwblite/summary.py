@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from . import suspicions
 from .calibration import CalibrationConfig, Unknown, unknowns
 from .closures import Closures
-from .graph import Graph, RangeEdges
+from .graph import Graph
 from .keyframes import OUTSIDE
 from .map_result import AnchorEstimate, CalibrationEstimate, MapResult, StageSummary
 from .marginals import Marginals
 from .occupancy_grid import OccupancyGrid
+from .range_edges import RangeEdges
 from .sessions import Drives, Part, Session
 
 Floats = NDArray[np.float64]

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from . import se2
 from .clouds import Clouds
-from .graph import Graph, OdometryEdges, RelativePoseEdges
+from .graph import Graph
 from .measurement import learn_wheels
 from .pair_alignment import align_pairs
 from .pair_matching import CloudRasters, match, measured, pair_points
 from .point_cloud import make_cloud
+from .pose_edges import OdometryEdges, RelativePoseEdges
 from .scan_search import SearchConfig, search
 
 Floats = NDArray[np.float64]

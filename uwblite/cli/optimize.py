@@ -79,7 +79,7 @@ def _with_kernel(graph: "Graph", name: str, scale: float) -> "Graph":
 
     import numpy as np
 
-    from ..graph import RelativePoseEdges
+    from ..pose_edges import RelativePoseEdges
     from ..robust import Kernel
 
     kernel = Kernel(name, scale)
