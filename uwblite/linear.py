@@ -207,9 +207,11 @@ class NormalEquations:
         Where a and b are the same node, both their products are one entry, which counts twice on the diagonal.
         """
         full, following = np.array(len(self._base) - 1), iter(which)
-        gradient_rows, positions, twice = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-        count = 0
+        self._places: list[tuple[Ints, Ints, Ints]] = []
+        """Per kind of edges: places of the products, which of them count twice, and rows of the gradient."""
         for lin, nodes in zip(linearized, touched, strict=True):
+            none = np.zeros(0, dtype=np.int64)
+            gradient_rows, positions, twice, count = [none], [none], [none], 0
             widths = [jac.shape[2] for _, _, jac in lin.blocks]
             for p, (a, a_inner) in enumerate(nodes):
                 places = []
@@ -230,8 +232,7 @@ class NormalEquations:
                                 twice.append(same + count)
                             positions.append(place)
                             count += len(place)
-        self._gradient_rows, self._positions = np.concatenate(gradient_rows), np.concatenate(positions)
-        self._twice = np.concatenate(twice)
+            self._places.append((np.concatenate(positions), np.concatenate(twice), np.concatenate(gradient_rows)))
 
     def _steps(self, a: Ints, b: Ints, block: Ints) -> tuple[Ints, Ints, Ints]:
         """Return place of the first product of nodes with first scalars a, b, and its steps along either."""
@@ -242,21 +243,20 @@ class NormalEquations:
 
     def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
         """Fill H and g from whitened Jacobians and a weight per edge."""
-        products, slopes = np.empty(len(self._positions)), np.empty(len(self._gradient_rows))
-        at = slope_at = 0
-        for lin, weight in zip(linearized, weights, strict=True):
+        self.values, self.gradient = np.zeros(self._trash + 1), np.zeros(self.unknowns.size)
+        for lin, weight, (positions, twice, rows) in zip(linearized, weights, self._places, strict=True):
+            products, slopes, at = np.empty(len(positions)), np.empty(len(rows)), 0
             jacobian = _stacked(lin)
             weighted = jacobian if weight is None else jacobian * weight
             _, k, e = jacobian.shape
-            _contract(weighted, lin.residuals.T[:, None], slopes[slope_at : slope_at + k * e].reshape(k, e))
-            slope_at += k * e
+            _contract(weighted, lin.residuals.T[:, None], slopes.reshape(k, e))
             for row in range(k):
                 block = products[at : at + (row + 1) * e].reshape(row + 1, e)
                 _contract(weighted[:, row : row + 1], jacobian[:, : row + 1], block)
                 at += (row + 1) * e
-        products[self._twice] *= 2.0
-        self.values = np.bincount(self._positions, products, self._trash + 1).astype(np.float64, copy=False)
-        self.gradient = np.bincount(self._gradient_rows, slopes, self.unknowns.size + 1)[:-1].astype(np.float64, copy=False)
+            products[twice] *= 2.0
+            self.values += np.bincount(positions, products, self._trash + 1)
+            self.gradient += np.bincount(rows, slopes, self.unknowns.size + 1)[:-1]
 
     @property
     def diagonal(self) -> Floats:
