@@ -116,3 +116,11 @@ def test_anchors_that_lie_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed)
     )
     assert honest < 0.03
     assert lied < 0.05
+
+
+@pytest.mark.parametrize("radio_scale", [1.0, 1.08])
+def test_ranges_or_wheels_of_another_scale_are_told(radio_scale):
+    """Without a lidar nothing says which of the two is wrong, but that they differ is plain."""
+    told = said(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
+    assert len(told) == (radio_scale != 1.0)
+    assert all("scale of the wheels" in text for text in told)

@@ -45,7 +45,7 @@ def summarise(
         "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
     }
     more, own_doubts = _doubts(drives, anchors, closures, grid)
-    more += suspicions.unusual(calibrated, listed) + suspicions.out_of_time(drives, OUTSIDE)
+    more += suspicions.unusual(calibrated, listed, config) + suspicions.out_of_time(drives, OUTSIDE)
     more += suspicions.lies(table, part.anchor_ids, float(drives.stamps[0])) if table else []
     own_doubts += suspicions.mirrored(graph, drives, config)
     fits = [float(stage.figures["chi2_per_dof"]) for stage in stages if "chi2_per_dof" in stage.figures]

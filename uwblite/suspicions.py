@@ -15,26 +15,29 @@ Bools = NDArray[np.bool_]
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate is told."""
+_RADIO_OR_WHEELS = "check the radio's settings and, where no lidar measures the distances, the scale of the wheels"
 _WRONG_TURNS = 0.25
 """Relative error of the wheels' turns beyond which their sign is no longer sure."""
 
 
-def unusual(calibrated: Sequence[CalibrationEstimate], usual: dict[str, Unknown]) -> list[str]:
-    """Return a warning for each estimate far outside what is usual.
+def unusual(calibrated: Sequence[CalibrationEstimate], usual: dict[str, Unknown], config: CalibrationConfig) -> list[str]:
+    """Return a warning for each estimate clearly far outside what is usual.
 
     Parameters
     ----------
     calibrated : estimates.
     usual : unknowns with their prior standard deviations, by name.
+    config : says what scale of its ranges a sound radio has.
     """
     told = []
     for value in calibrated:
-        sigma = usual[value.name].sigma
-        if value.state == "estimated" and not value.name.startswith("height2") and abs(value.value) > _UNUSUAL * sigma:
+        sigma = config.range_scale_sound if value.name == "range_scale" else usual[value.name].sigma
+        clear = abs(value.value) > _UNUSUAL * max(sigma, value.sigma)
+        if value.state == "estimated" and not value.name.startswith("height2") and clear:
             unit = "" if value.unit == "1" else f" {value.unit}"
             told.append(
                 f"{value.meaning} came out as {value.value:+.3g} +- {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
-                "check that sensor and its settings"
+                + (_RADIO_OR_WHEELS if value.name == "range_scale" else "check that sensor and its settings")
             )
     return told
 
@@ -49,13 +52,14 @@ def mirrored(graph: Graph, drives: Drives, config: CalibrationConfig) -> list[st
     known = sum(len(e) for e in graph.edges if isinstance(e, PriorEdges) and e.block == "anchors")
     if known > 2 or config.heading_scale <= 0.0:
         return []
-    seeing = any(session.has_scans for session in drives.sessions)
+    if any(session.has_scans for session in drives.sessions):
+        return []
     factors = [
         1.0 + float(value)
         for name, value in zip(graph.calibration.names, graph.calibration.values, strict=True)
         if stem(name) == "heading_scale" and abs(value) > _WRONG_TURNS
     ]
-    return [] if seeing else [
+    return [
         f"the map may be mirrored: the wheels' turns agree with the ranges only when multiplied by {factor:.2f}, "
         f"and by {-factor:.2f} its mirror image fits as well; check sign and scale of the odometry's heading, "
         "or give the places of three anchors"
