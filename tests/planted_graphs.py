@@ -111,10 +111,11 @@ def dense_system(graph):
     for edges in graph.edges:
         linear = edges.linearize(graph)
         for e, weight in enumerate(edge_weights(edges, graph)):
-            J = np.zeros((linear.residuals.shape[1], size + 1))
-            for block, index, jacobian in linear.blocks:
-                for column, place in enumerate(number[block][index[e]]):
-                    J[:, place] += jacobian[e, :, column]
-            H += weight * J.T @ J
-            g += weight * J.T @ linear.residuals[e]
+            places = np.concatenate([number[block][index[e]] for block, index, _ in linear.blocks])
+            touched, column = np.unique(places, return_inverse=True)
+            # An edge may name one unknown twice: its derivatives add up.
+            J = np.zeros((linear.residuals.shape[1], len(touched)))
+            np.add.at(J.T, column, np.concatenate([jacobian[e] for _, _, jacobian in linear.blocks], axis=1).T)
+            H[np.ix_(touched, touched)] += weight * J.T @ J
+            g[touched] += weight * J.T @ linear.residuals[e]
     return H[:-1, :-1], g[:-1], number
