@@ -15,7 +15,6 @@ from uwblite.point_cloud import (
     make_tree,
     radius_outlier_filter,
     statistical_outlier_filter,
-    voxel_filter,
     voxel_labels,
     voxel_means,
 )
@@ -31,7 +30,7 @@ def _distances(points):
 
 @settings(max_examples=60, deadline=None)
 @given(clouds, st.sampled_from([0.05, 0.3, 2.0]))
-def test_voxel_filter_equals_brute_force(points, size):
+def test_voxel_means_equal_brute_force(points, size):
     cells = [tuple(c) for c in np.floor(points / size).astype(int)]
     expected = [np.mean([p for p, c in zip(points, cells, strict=True) if c == cell], axis=0) for cell in sorted(set(cells))]
     means, counts = voxel_means(points, size, points)
@@ -56,11 +55,10 @@ def test_voxel_means_carry_what_belongs_to_the_points():
     assert counts.tolist() == [2, 1]
 
 
-def test_voxel_filter_is_idempotent_on_what_it_made_coarser_twice_the_same_way():
+def test_centroids_of_voxels_stay_where_they_are():
     points = np.random.default_rng(1).normal(size=(500, 2))
-    once = voxel_filter(points, 0.2)
-    np.testing.assert_array_equal(once, voxel_filter(points.copy(), 0.2))
-    np.testing.assert_allclose(voxel_filter(once, 0.2), once)
+    once = voxel_means(points, 0.2, points)[0]
+    np.testing.assert_allclose(voxel_means(once, 0.2, once)[0], once)
 
 
 @settings(max_examples=60, deadline=None)

@@ -146,17 +146,16 @@ def test_trajectories_are_interpolated_in_time_and_held_at_their_ends():
     np.testing.assert_array_equal(se2.interpolate_trajectory(stamps[:1], path[:1], np.array([4.0])), path[:1])
 
 
-@pytest.mark.parametrize("function", [se2.compose, se2.between])
 @given(poses, poses)
-def test_jacobians_equal_differences(function, a, b):
-    by_a, by_b = getattr(se2, f"{function.__name__}_jacobians")(a, b)
+def test_jacobians_equal_differences(a, b):
+    by_a, by_b = se2.between_jacobians(a, b)
     step = 1e-6
     for k in range(3):
         d = np.zeros(3)
         d[k] = step
         for analytic, ahead, behind in (
-            (by_a, function(a + d, b), function(a - d, b)),
-            (by_b, function(a, b + d), function(a, b - d)),
+            (by_a, se2.between(a + d, b), se2.between(a - d, b)),
+            (by_b, se2.between(a, b + d), se2.between(a, b - d)),
         ):
             slope = ahead - behind
             slope[2] = se2.wrap_angle(slope[2])
@@ -185,4 +184,4 @@ def test_functions_broadcast_over_leading_axes():
         np.testing.assert_array_equal(both[2, 3], function(a[2, 0], b[3]))
     assert se2.exp(a).shape == se2.log(a).shape == se2.inverse(a).shape == (4, 1, 3)
     assert se2.transform(a, b[:, :2]).shape == (4, 5, 2)
-    assert se2.compose_jacobians(a, b)[1].shape == (4, 5, 3, 3)
+    assert se2.between_jacobians(a, b)[1].shape == (4, 5, 3, 3)

@@ -4,7 +4,6 @@ import os
 import re
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -29,7 +28,6 @@ from uwblite.io.carmen import read_log
 from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_tum
 from uwblite.map_result import MapResult
-from uwblite.mapping import MappingConfig, build_map
 from uwblite.sensor_log import SensorLog
 
 Floats = NDArray[np.float64]
@@ -143,11 +141,6 @@ def _pairs(in_map: LandmarkErrors | None, drawn: LandmarkErrors | None) -> tuple
     found = {} if in_map is None else dict(zip(in_map.pairs, in_map.errors.tolist(), strict=True))
     rows = zip(drawn.pairs, drawn.errors.tolist(), strict=True)
     return tuple((a, b, found.get((a, b), float("nan")), error) for (a, b), error in rows)
-
-
-def mapped(trial: Trial, config: MappingConfig) -> Figures:
-    """Map a trial and compare with the truth."""
-    return judged(build_map(trial.log, config, clock=time.perf_counter), trial)
 
 
 def spread_out(work: Callable[[Task], Answer], tasks: Sequence[Task], jobs: int) -> Iterator[Answer]:

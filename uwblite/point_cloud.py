@@ -78,11 +78,6 @@ def voxel_means(points: Floats, size: float, values: Floats) -> tuple[Floats, In
     return np.stack(sums, axis=-1) / counts[:, None], counts
 
 
-def voxel_filter(points: Floats, size: float) -> Floats:
-    """Return the centroid (m, 2) of the points in each occupied voxel of edge size, m; see voxel_means."""
-    return voxel_means(points, size, points)[0]
-
-
 def statistical_outlier_filter(
     points: Floats, neighbours: int, std_ratio: float, tree: cKDTree | None = None
 ) -> Bools:
@@ -234,7 +229,7 @@ def make_cloud(
 
     Parameters
     ----------
-    points : (n, 2), m; thin them to an even density first (voxel_filter).
+    points : (n, 2), m; thin them to an even density first (voxel_means).
     viewpoints : (n, 2) or (2,), where the sensor stood when it saw each point, m, same frame. None: not known;
         then walls match from both sides.
     normal_radius : neighbourhood of the lines, m; a few times the distance between points.

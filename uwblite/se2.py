@@ -129,21 +129,6 @@ def interpolate_trajectory(stamps: Floats, poses: Floats, query: ArrayLike) -> F
     return interpolate(poses[left], poses[left + 1], fraction)
 
 
-def compose_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
-    """Return the Jacobians (..., 3, 3) of compose(a, b) by the coordinates of a and of b."""
-    a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
-    c, s = cos_sin(a[..., 2])
-    da = np.zeros((*a.shape[:-1], 3, 3))
-    da[..., 0, 0] = da[..., 1, 1] = da[..., 2, 2] = 1.0
-    da[..., 0, 2] = -s * b[..., 0] - c * b[..., 1]
-    da[..., 1, 2] = c * b[..., 0] - s * b[..., 1]
-    db = np.zeros_like(da)
-    db[..., 0, 0] = db[..., 1, 1] = c
-    db[..., 0, 1], db[..., 1, 0] = -s, s
-    db[..., 2, 2] = 1.0
-    return da, db
-
-
 def between_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
     """Return the Jacobians (..., 3, 3) of between(a, b) by the coordinates of a and of b."""
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))

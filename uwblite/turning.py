@@ -38,8 +38,6 @@ class Turning:
     """The same with the laser mounted the other way up."""
     misfit: float
     """The same the way that is right."""
-    misfit_unshifted: float
-    """The same without a clock offset, rad."""
     clock_offset: float
     """Stamp of the laser minus that of the odometry for the same moment, s, where both agree best."""
     clock_clear: bool
@@ -84,7 +82,7 @@ def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
     clear = right.misfit[best] < 0.7 * right.misfit[centre] and gain.mean() > 2.0 * gain.std() / np.sqrt(gain.size)
     return Turning(
         len(first), float(np.median(np.abs(wheels[centre]))), float(told.misfit.min()), float(other.misfit.min()),
-        float(right.misfit[best]), float(right.misfit[centre]), float(-_LAGS[best]), bool(clear),
+        float(right.misfit[best]), float(-_LAGS[best]), bool(clear),
         *_ratio(right.turn, wheels[best]),
     )
 

@@ -117,10 +117,6 @@ def test_distances_that_no_module_sends_are_damage(readings):
 def test_requests():
     assert dwm1001.request("loc_get") == b"\x0c\x00" == dwm1001.LOC_GET
     assert dwm1001.request("status_get") == b"\x32\x00" == dwm1001.STATUS_GET
-    assert dwm1001.update_rate_request(0.1, 10.0) == bytes.fromhex("030401006400")
-    for bad in ((0.0, 1.0), (1.0, 0.1), (61.0, 100.0)):
-        with pytest.raises(ProtocolError):
-            dwm1001.update_rate_request(*bad)
     with pytest.raises(ProtocolError):
         dwm1001.request("explode")
     with pytest.raises(ProtocolError):

@@ -5,12 +5,12 @@ import random
 
 import pytest
 from driver_harness import check_transcript, feed_whole, good
-from emulators.kobuki_device import KobukiDevice
+from emulators.kobuki_device import KobukiDevice, encode_packet
 from emulators.world import Pose, RoomWorld, WorldClock
 
 from uwblite.drivers import kobuki
 from uwblite.drivers.events import Corrupt
-from uwblite.drivers.kobuki import Feedback, KobukiOdometer, KobukiProtocol, encode_packet
+from uwblite.drivers.kobuki import Feedback, KobukiOdometer, KobukiProtocol
 
 RNG = random.Random(7)
 NOISES = [b"", b"\x00", b"\xaa", b"\xaa\x55", b"\xaa\x55\x4d", b"\xaa\x55\xff\x01\x0f", b"\xaa\x55\x4d\x01\x0f" + bytes(20),

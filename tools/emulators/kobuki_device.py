@@ -90,8 +90,13 @@ class KobukiDevice:
             (0x0D, struct.pack("<BB6h", self._sent & 0xFF, 6, 0, 0, rate, 0, 0, rate)),
             (0x10, struct.pack("<H4H6x", 0, 4095, 4095, 4095, 4095)),
         ]
-        payload = b"".join(bytes((kind, len(data))) + data for kind, data in subs)
-        total = len(payload)
-        for byte in payload:
-            total ^= byte
-        return b"\xaa\x55" + bytes([len(payload)]) + payload + bytes([total])
+        return encode_packet(subs)
+
+
+def encode_packet(subs: list[tuple[int, bytes]]) -> bytes:
+    """Build a packet from sub-payloads (id, data), together at most 255 bytes with their headers."""
+    payload = b"".join(bytes((kind, len(data))) + data for kind, data in subs)
+    total = len(payload)
+    for byte in payload:
+        total ^= byte
+    return b"\xaa\x55" + bytes([len(payload)]) + payload + bytes([total])

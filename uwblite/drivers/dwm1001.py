@@ -174,27 +174,6 @@ def request(name: str, value: bytes = b"") -> bytes:
     return bytes((REQUESTS[name], len(value))) + value
 
 
-def update_rate_request(normal: float, stationary: float) -> bytes:
-    """Build upd_rate_set. It writes flash: send it only when the value differs.
-
-    Parameters
-    ----------
-    normal, stationary : s between fixes, 0.1 .. 60, stationary at least normal.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ProtocolError : out of range.
-    """
-    counts = round(normal * 10), round(stationary * 10)
-    if not 1 <= counts[0] <= counts[1] <= 1200 or counts[0] > 600:
-        raise ProtocolError(f"update periods {normal} s and {stationary} s: need 0.1 <= normal <= stationary, <= 60 s")
-    return b"\x03\x04" + struct.pack("<HH", *counts)
-
-
 def short_id(address: int) -> str:
     """Return the four hexadecimal digits by which PANS names a node: the low 16 bits of its address."""
     return f"{address & 0xFFFF:04X}"

@@ -143,7 +143,6 @@ class Lost:
 
 
 Action = Corrupt | Send | SetBaud | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | Lost
-Measurement = RangeEpoch | LaserScan | OdometryPose
 
 
 class Session(Protocol):

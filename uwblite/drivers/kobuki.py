@@ -67,21 +67,6 @@ class Feedback:
 Event = Feedback | Corrupt
 
 
-def encode_packet(subs: list[tuple[int, bytes]]) -> bytes:
-    """Build a packet from (id, data) pairs.
-
-    Parameters
-    ----------
-    subs : sub-payloads in order; together at most 255 bytes with their headers.
-
-    Returns
-    -------
-    bytes
-    """
-    payload = b"".join(bytes((kind, len(data))) + data for kind, data in subs)
-    return HEADER + bytes((len(payload),)) + payload + bytes((reduce(xor, payload, len(payload)),))
-
-
 class KobukiProtocol:
     """Bytes of the base in, Feedback and Corrupt out. Holds at most one packet.
 

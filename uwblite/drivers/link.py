@@ -22,7 +22,6 @@ class Counts:
     """Damaged frames and noise, by reason."""
     bytes: int = 0
     connects: int = 0
-    silences: int = 0
     silent_time: float = 0.0
     """s, sum of the pauses longer than SILENCE."""
     anchors: Counter[str] = field(default_factory=Counter)

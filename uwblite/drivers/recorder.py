@@ -259,7 +259,6 @@ class Recorder:
         silent = now - max(link.last_message, link.opened)
         if silent > SILENCE and not link.quiet:
             link.quiet = True
-            link.counts.silences += 1
             link.last_message = max(link.last_message, link.opened)
             if now - link.last_data < SILENCE:
                 why = "bytes come, but no good frame: wrong bit rate, wrong device or a bad cable"

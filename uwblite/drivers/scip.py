@@ -74,11 +74,6 @@ def checksum(data: bytes) -> int:
     return (sum(data) & 0x3F) + 0x30
 
 
-def encode_number(value: int, width: int) -> bytes:
-    """Code a number in `width` characters of six bits, most significant first."""
-    return bytes(((value >> 6 * i) & 0x3F) + 0x30 for i in reversed(range(width)))
-
-
 def decode_number(data: bytes) -> int:
     """Decode a number of any width."""
     value = 0

@@ -64,26 +64,6 @@ def text_command(name: str) -> bytes:
     return name.encode() + b"\n"
 
 
-def bit_rate_command(rate: int) -> bytes:
-    """Build ``SS``: set the bit rate of the RS-232 port.
-
-    Parameters
-    ----------
-    rate : bit/s, one of BAUD_RATES.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ProtocolError : a rate that the unit does not have.
-    """
-    if rate not in BAUD_RATES:
-        raise ProtocolError(f"bit rate {rate} is not one of {sorted(BAUD_RATES)}")
-    return b"SS%06d\n" % rate
-
-
 def scan_command(
     start: int = 44, end: int = 725, *, cluster: int = 1, skip: int = 0, count: int | None = 0, wide: bool = True,
     geometry: Geometry | None = None,

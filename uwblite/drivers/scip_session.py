@@ -62,7 +62,7 @@ class ScipSession:
         self._protocol = ScipProtocol()
         self._step, self._sent, self._tries, self._rounds = "drain", now, 0, 0
         self._due: float | None = now + DRAIN
-        self._rate_index, self._faults, self._good = 0, 0, now
+        self._rate_index, self._good = 0, now
         self._tm_reads: list[tuple[float, float]] = []
         self._tm_count = 0
         self._new_clock()
@@ -284,7 +284,6 @@ class ScipSession:
             self._step, self._due = "stream", now + 2.0
             self.ready = True
             return []
-        self._faults += 1
         return self._restart(now, f"{reply.command[:2]} refused, {text}")
 
     # ---- scans
