@@ -1,9 +1,9 @@
 """Emulate a URG-04LX, a DWM1001 tag and a Kobuki base on pseudo-terminals or TCP ports.
 
-    python tools/emulate.py --lidar /tmp/lidar --uwb /tmp/uwb --kobuki /tmp/base
-    python tools/emulate.py --lidar /tmp/lidar --uwb /tmp/uwb --kobuki /tmp/base --play run.log --speed 2 --truth t.jsonl
+    python tools/emulate.py --lidar ./lidar --uwb ./uwb --kobuki ./base
+    python tools/emulate.py --lidar ./lidar --uwb ./uwb --kobuki ./base --play run.log --speed 2 --truth t.jsonl
     python tools/emulate.py --lidar tcp:10940
-    python tools/emulate.py --lidar /tmp/lidar --scip1 --fault lidar:noise=0.01@10+20 --fault lidar:unplug@40+3
+    python tools/emulate.py --lidar ./lidar --scip1 --fault lidar:noise=0.01@10+20 --fault lidar:unplug@40+3
 
 Each device gets a path (a symbolic link to its pseudo-terminal) or ``tcp:[HOST:]PORT``. Without --play the robot drives a
 circle in a room of 8 x 6 m. With --play a CARMEN log is played: its scans, ranges and odometry come out of the devices at

@@ -1,8 +1,8 @@
 """Simulate a recording: a CARMEN log with odometry, laser scans and UWB ranges, and the truth beside it.
 
-    python tools/simulate.py hall --out /tmp/hall --seed 1
-    python tools/simulate.py hall --out /tmp/nlos --nlos heavy --nlos-anchors 3,4
-    python tools/simulate.py warehouse --out /tmp/warehouse --gzip
+    python tools/simulate.py hall --out hall --seed 1
+    python tools/simulate.py hall --out nlos --nlos heavy --nlos-anchors 3,4
+    python tools/simulate.py warehouse --out warehouse --gzip
 
 DIR/run.log or run.log.gz            what the robot recorded
 DIR/truth.tum                        true poses of the base at the odometry's stamps

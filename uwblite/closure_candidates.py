@@ -25,7 +25,9 @@ class Candidates:
     """Pairs of sub-maps to try."""
 
     target: Ints
+    """(c,) number of the sub-map that is matched against."""
     source: Ints
+    """(c,) number of the sub-map that is laid onto it."""
     guess: Floats
     """(c, 3) relative pose of the reference keyframes by the graph."""
     covariance: Floats

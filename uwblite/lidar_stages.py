@@ -36,10 +36,15 @@ class Scans:
     """Lidar of a run, ready for matching."""
 
     clouds: Clouds
+    """One per keyframe."""
     raster: CloudRasters
+    """Of the same clouds."""
     twist: Floats
+    """(k, 3) velocity of the base at each keyframe, own frame, m/s, m/s, rad/s."""
     clock: Clock
+    """When each keyframe was."""
     known: Constraints
+    """What the user told; some pairs may be forbidden."""
     delay: float
     """Of the lidar's clock, s, with which the clouds were made."""
 
@@ -49,6 +54,7 @@ class Scans:
 
     @classmethod
     def of(cls, drives: Drives, known: Constraints, config: MappingConfig, delay: float = 0.0) -> "Scans | None":
+        """Make clouds of all recordings, the lidar's clock taken as late by `delay` s; None without lidar."""
         if not any(session.has_scans for session in drives.sessions):
             return None
         built = clouds.joined([block for session in drives.sessions for block in _clouds(session, config, delay)])
@@ -106,7 +112,7 @@ def _track(part: Part, scans: Scans, drives: Drives, config: MappingConfig, stag
     gate = float(np.clip(followed.miss, rules.later_gate, rules.first_gate))
     settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
     i, j = refinement.choose_pairs(scans.clouds, graph.poses, drives.path, drives.session, settings)
-    graph, refined = match_round(graph, soft.edges, scans, i, j, settings, config, stages, "tracking")
+    graph, refined = _match_round(graph, soft.edges, scans, i, j, settings, config, stages, "tracking")
     stages.end(
         "tracking", pairs=len(i), searched=followed.searched, used=int(refined.used.sum()), gate=round(gate, 3),
         sigma=round(refined.sigma, 4), rounds=refined.rounds,
@@ -124,10 +130,11 @@ _SOFTNESS = 10.0
 """Factor on the ranges' standard deviations."""
 
 
-def match_round(
+def _match_round(
     graph: Graph, edges: tuple[Edges, ...], scans: Scans, i: Ints, j: Ints, settings: RefinementConfig,
     config: MappingConfig, stages: Stages, stage: str,
 ) -> tuple[Graph, Refined]:
+    """Refine a graph with these pairs of clouds (e,), (e,), those that the user has forbidden left out."""
     kept = scans.may_meet(i, j)
     i, j = i[kept], j[kept]
     refined = refinement.refine(
@@ -153,7 +160,7 @@ def refine_jointly(
         if lap > 0:
             settings = replace(settings, first_gate=settings.later_gate)
         before = graph.poses
-        graph, refined = match_round(graph, edges, scans, i, j, settings, config, stages, "joint refinement")
+        graph, refined = _match_round(graph, edges, scans, i, j, settings, config, stages, "joint refinement")
         graph = with_real_heights(graph)
         shift = float(np.sqrt(np.mean(np.sum((graph.poses - before)[:, :2] ** 2, axis=1))))
         if radio is not None:

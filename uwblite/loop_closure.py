@@ -43,7 +43,7 @@ def find(
 
     Parameters
     ----------
-    candidates : see propose. submaps : their clouds.
+    candidates : see closure_candidates.propose. submaps : their clouds.
     progress : called with (done, total).
     free : what each sub-map saw to be free, see sight.seen_free; None = no candidate is held to see through walls.
     executor : any concurrent.futures executor; the result does not depend on it.

@@ -4,7 +4,6 @@ Of two clouds in the right place to each other, hardly any surface of the one st
 people, glass and doors leave a few per cent. Of clouds in a wrong place, half of the surfaces do.
 """
 
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -38,6 +38,7 @@ class Stages:
 
 
 def solver_figures(result: SolverSummary) -> dict[str, object]:
+    """Return what a stage tells of its optimisation."""
     return {
         "converged": result.converged,
         "reason": result.reason,
