@@ -9,7 +9,8 @@ from emulators.dwm_device import BANNER, DwmDevice, DwmOptions
 from emulators.world import Epoch, WorldClock
 
 from uwblite.drivers import dwm1001
-from uwblite.drivers.dwm1001 import Answer, Distances, NodeConfig, Position, Status, TlvProtocol, UpdateRate, Value
+from uwblite.drivers.dwm1001 import TlvProtocol
+from uwblite.drivers.dwm1001_blocks import Answer, Distances, NodeConfig, Position, Status, UpdateRate, Value
 from uwblite.drivers.events import Corrupt, RangeReading
 from uwblite.errors import ProtocolError
 
@@ -127,8 +128,8 @@ def test_memory_is_bounded():
     protocol = TlvProtocol()
     for k in range(3000):
         protocol.feed(RNG.randbytes(997) if k % 3 else b"\x40\x01\x00\x49\xf1\x0c" * 100, 0.0)
-        assert len(protocol._buffer) < 800
-        assert len(protocol._marks) < 800
+        assert len(protocol._buffer.data) < 800
+        assert len(protocol._buffer._marks) < 800
 
 
 # ---- the emulator, against the guide

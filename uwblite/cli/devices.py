@@ -207,7 +207,7 @@ def _ask(port: "Port", session: "Session", sight: Sight) -> bool:
 
 
 def _judge_tag(tag: "Dwm1001Session", sight: Sight, pan_id: int | None) -> None:
-    from ..drivers.dwm1001 import short_id
+    from ..drivers.dwm1001_blocks import short_id
 
     node = tag.values.get("node_id")
     network = tag.values.get("pan_id", tag.info.pan_id)

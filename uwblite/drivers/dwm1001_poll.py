@@ -5,7 +5,8 @@ that short without polling all the time, polls are dense only around the moment 
 TLV has no checksum: on a link that has shown damage, and when an anchor is new, a fix is read twice and must agree.
 """
 
-from .dwm1001 import LOC_GET, STATUS_GET, Distances, Status
+from .dwm1001 import LOC_GET, STATUS_GET
+from .dwm1001_blocks import Distances, Status
 from .events import Action, Corrupt, Lost, RangeEpoch, RangeReading, Send
 from .fix_timer import FixTimer
 

@@ -5,22 +5,10 @@ stream of ``lec``; distances to 1 cm. Either way a module left in the other mode
 brought round. The polling itself is in ``dwm1001_poll``.
 """
 
-from .dwm1001 import (
-    BAUD,
-    ERRORS,
-    STATUS_GET,
-    Answer,
-    Distances,
-    NodeConfig,
-    Status,
-    TlvProtocol,
-    UpdateRate,
-    Value,
-    request,
-    short_id,
-)
-from .dwm1001 import Event as TlvEvent
+from .dwm1001 import BAUD, STATUS_GET, TlvProtocol, request
 from .dwm1001_advice import advise, not_joined
+from .dwm1001_blocks import ERRORS, Answer, Distances, NodeConfig, Status, UpdateRate, Value, short_id
+from .dwm1001_blocks import Event as TlvEvent
 from .dwm1001_poll import FixPoller
 from .dwm1001_shell import (
     ENTER,

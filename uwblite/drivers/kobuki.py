@@ -17,6 +17,7 @@ from operator import xor
 
 from .clock import ClockMap, Unwrapper
 from .events import Corrupt, OdometryPose, corrupt
+from .stamped_buffer import StampedBuffer
 
 BAUD = 115200
 PERIOD = 0.020
@@ -75,8 +76,7 @@ class KobukiProtocol:
     """
 
     def __init__(self) -> None:
-        self._buffer = bytearray()
-        self._marks: list[tuple[int, float]] = []
+        self._buffer = StampedBuffer()
         self._taken = 0
 
     def feed(self, data: bytes, stamp: float) -> list[Event]:
@@ -93,13 +93,12 @@ class KobukiProtocol:
         """
         events: list[Event] = []
         for start in range(0, len(data), 512):
-            self._marks.append((len(self._buffer), stamp))
-            self._buffer += data[start : start + 512]
+            self._buffer.append(data[start : start + 512], stamp)
             self._scan(events)
         return events
 
     def _scan(self, events: list[Event]) -> None:
-        buffer, at, noise = self._buffer, 0, 0
+        buffer, at, noise = self._buffer.data, 0, 0
         while at < len(buffer):
             size = _packet_size(buffer, at)
             if size == 0:
@@ -109,7 +108,7 @@ class KobukiProtocol:
                 continue
             self._report(noise, at, events)
             packet = bytes(buffer[at : at + size])
-            events.append(_decode(packet, self._stamp_at(at)))
+            events.append(_decode(packet, self._buffer.stamp_at(at)))
             at += size
             # The last bytes may be the head of the next packet if this one had lost as many: look at them again.
             again = next((k for k in (4, 3, 2, 1) if _may_begin(packet[-k:])), 0)
@@ -122,17 +121,11 @@ class KobukiProtocol:
     def _report(self, start: int, end: int, events: list[Event]) -> None:
         start = max(start, self._taken)
         if end > start:
-            events.append(corrupt(bytes(self._buffer[start:end]), "no packet"))
+            events.append(corrupt(bytes(self._buffer.data[start:end]), "no packet"))
 
     def _forget(self, count: int) -> None:
-        if count:
-            rest = len(self._buffer) - count
-            self._marks = [(0, self._stamp_at(count))] + [(i - count, t) for i, t in self._marks if i > count] if rest else []
-            del self._buffer[:count]
-            self._taken = max(0, self._taken - count)
-
-    def _stamp_at(self, offset: int) -> float:
-        return next(when for at, when in reversed(self._marks) if at <= offset)
+        self._buffer.drop(count)
+        self._taken = max(0, self._taken - count)
 
 
 def _may_begin(data: bytes) -> bool:

@@ -8,7 +8,23 @@ from .odometry_line import LineFormat, LineOdometer, OdometryLineProtocol
 Pose = tuple[float, float, float]
 
 
-class KobukiSession:
+class _Listener:
+    """What sessions share that only listen."""
+
+    def deadline(self) -> float | None:
+        """Nothing is ever due."""
+        return None
+
+    def tick(self, now: float) -> list[Action]:
+        """Nothing is ever due."""
+        return []
+
+    def stop(self) -> list[Action]:
+        """Nothing to stop."""
+        return []
+
+
+class KobukiSession(_Listener):
     """A Kobuki base; see `events.Session` for the methods. Read-only: nothing is ever sent.
 
     Parameters
@@ -27,18 +43,6 @@ class KobukiSession:
     def start(self, now: float) -> list[Action]:
         """Begin, or begin again after a reconnect: the base stayed on, its clock and encoders counted on."""
         self._protocol = KobukiProtocol()
-        return []
-
-    def deadline(self) -> float | None:
-        """Nothing is ever due."""
-        return None
-
-    def tick(self, now: float) -> list[Action]:
-        """Nothing is ever due."""
-        return []
-
-    def stop(self) -> list[Action]:
-        """Nothing to stop."""
         return []
 
     def feed(self, data: bytes, now: float) -> list[Action]:
@@ -65,7 +69,7 @@ class KobukiSession:
         return actions
 
 
-class LineSession:
+class LineSession(_Listener):
     """A base that prints text lines; see `events.Session` for the methods.
 
     Parameters
@@ -87,18 +91,6 @@ class LineSession:
         """Begin, or begin again after a reconnect."""
         self._protocol = OdometryLineProtocol(self._format)
         self._map, self._last = ClockMap(), None
-        return []
-
-    def deadline(self) -> float | None:
-        """Nothing is ever due."""
-        return None
-
-    def tick(self, now: float) -> list[Action]:
-        """Nothing is ever due."""
-        return []
-
-    def stop(self) -> list[Action]:
-        """Nothing to stop."""
         return []
 
     def feed(self, data: bytes, now: float) -> list[Action]:

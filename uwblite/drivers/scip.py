@@ -16,6 +16,7 @@ import re
 from dataclasses import dataclass
 
 from .events import Corrupt, corrupt
+from .stamped_buffer import StampedBuffer
 
 TIME_MODULUS = 1 << 24
 """The time stamp is a counter of 24 bit, 1 ms each: it wraps every 4 h 39 min 37 s."""
@@ -117,8 +118,7 @@ class ScipProtocol:
     """
 
     def __init__(self) -> None:
-        self._line = bytearray()
-        self._marks: list[tuple[int, float]] = []
+        self._line = StampedBuffer()
         self._frame: list[tuple[float, bytes]] = []
         self._text_owner = ""
 
@@ -138,16 +138,14 @@ class ScipProtocol:
         start = 0
         while start < len(data):
             end = data.find(b"\n", start)
-            self._marks.append((len(self._line), stamp))
-            self._line += data[start : end if end >= 0 else len(data)]
-            if len(self._line) > MAX_LINE:
+            self._line.append(data[start : end if end >= 0 else len(data)], stamp)
+            if len(self._line.data) > MAX_LINE:
                 self._shorten_line(events)
             if end < 0:
                 break
-            line = bytes(self._line).rstrip(b"\r")
+            line = bytes(self._line.data).rstrip(b"\r")
             self._take_line(line, events)
             self._line.clear()
-            self._marks.clear()
             start = end + 1
         return events
 
@@ -156,15 +154,9 @@ class ScipProtocol:
         if self._frame:
             events.append(corrupt(self._frame[0][1], "frame with a line too long"))
             self._frame = []
-        cut = len(self._line) - LONGEST_ECHO
-        events.append(corrupt(bytes(self._line[:cut]), "line too long"))
-        stamp = self._stamp_at(cut)
-        del self._line[:cut]
-        self._marks = [(0, stamp)] + [(at - cut, when) for at, when in self._marks if at > cut]
-
-    def _stamp_at(self, offset: int) -> float:
-        """Return the arrival of the byte at `offset` of the line; noise before an echo must not lend it its time."""
-        return next(when for at, when in reversed(self._marks) if at <= offset)
+        cut = len(self._line.data) - LONGEST_ECHO
+        events.append(corrupt(bytes(self._line.data[:cut]), "line too long"))
+        self._line.drop(cut)
 
     def _take_line(self, line: bytes, events: list[Event]) -> None:
         if not line:
@@ -175,15 +167,15 @@ class ScipProtocol:
             self._close(events, cut=True)
             if echo.start():
                 events.append(corrupt(line[: echo.start()], "noise before an echo"))
-            self._frame = [(self._stamp_at(echo.start()), line[echo.start() :])]
+            self._frame = [(self._line.stamp_at(echo.start()), line[echo.start() :])]
         elif self._frame:
-            self._frame.append((self._stamp_at(0), line))
+            self._frame.append((self._line.stamp_at(0), line))
             if len(self._frame) > MAX_LINES:
                 self._close(events)
         elif self._text_owner and re.match(rb"[A-Z]{4}:", line):
             # Some units print an empty line in the middle of VV; the rest still belongs to it.
             text = line.decode("ascii", "replace")
-            events.append(Reply(self._stamp_at(0), self._text_owner, "00", (_strip_sum(text),)))
+            events.append(Reply(self._line.stamp_at(0), self._text_owner, "00", (_strip_sum(text),)))
         else:
             events.append(corrupt(line, "line outside a frame"))
 

@@ -1,0 +1,212 @@
+"""Blocks in the answers of a DWM1001 with PANS R2: type, length, value; little-endian.
+
+A block is believed only with a known type, a length that fits it and values that a module can send.
+Sources: DWM1001 firmware API guide 2.3; the vendor's host code.
+"""
+
+import struct
+from dataclasses import dataclass
+
+from .events import Corrupt, RangeReading, corrupt
+
+MAX_RANGE_MM = 200_000
+"""mm; the radio reaches 60 m, anything above this is a damaged frame."""
+MAX_PLACE_MM = 10_000_000
+"""mm; nobody sets up anchors further than this from the origin."""
+
+ERRORS = {
+    0: "ok", 1: "unknown command or broken request", 2: "internal error", 3: "invalid parameter", 4: "busy",
+    5: "not permitted",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Head of an answer."""
+
+    stamp: float
+    """s, arrival of its first byte."""
+    error: int
+    """Key of ERRORS."""
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """The module's own estimate of a position; uwblite does not use it."""
+
+    stamp: float
+    x: float
+    y: float
+    z: float
+    """m."""
+    quality: int
+    """0..100."""
+
+
+@dataclass(frozen=True, slots=True)
+class Distances:
+    """Distances of the latest fix."""
+
+    stamp: float
+    """s, arrival of the block's first byte."""
+    readings: tuple[RangeReading, ...]
+    anchors: tuple[Position, ...] = ()
+    """Configured positions of the anchors, in the order of `readings`; empty when an anchor answers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Status word."""
+
+    stamp: float
+    bits: int
+
+    @property
+    def location_ready(self) -> bool:
+        """A fix has come since the last status request."""
+        return bool(self.bits & 1)
+
+    @property
+    def joined(self) -> bool:
+        """The module is part of a network."""
+        return bool(self.bits & 2)
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateRate:
+    """Periods of the fixes."""
+
+    stamp: float
+    normal: float
+    stationary: float
+    """s."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeConfig:
+    """Configuration word of cfg_get."""
+
+    stamp: float
+    anchor: bool
+    initiator: bool
+    bridge: bool
+    stationary_detection: bool
+    measurement_mode: int
+    """0 = two-way ranging."""
+    low_power: bool
+    location_engine: bool
+    encryption: bool
+    leds: bool
+    bluetooth: bool
+    firmware_update: bool
+    uwb_mode: int
+    """0 off, 1 passive, 2 active."""
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """Any other block that is a number."""
+
+    stamp: float
+    name: str
+    """"firmware", "configuration", "hardware", "pan_id", "node_id", "sensitivity", "interrupts", "ble_address"."""
+    value: int
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A block of a known type that is passed on undecoded (anchor list)."""
+
+    stamp: float
+    kind: int
+    data: bytes
+
+
+Event = Answer | Position | Distances | Status | UpdateRate | NodeConfig | Value | Block | Corrupt
+
+_VALUES = {
+    0x47: (2, "interrupts"), 0x4A: (1, "sensitivity"), 0x4D: (2, "pan_id"), 0x4E: (8, "node_id"),
+    0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware"), 0x5F: (6, "ble_address"),
+}  # fmt: skip
+_LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
+_STATUS_MASK = 0x01EF
+_HEAD_AS_STATUS = 0x0140
+"""``40 01``, the head of the next answer, read as a status: user data and an update pending in a node with no network."""
+_POSITION = struct.Struct("<iiiB")
+_TAG_ROW = struct.Struct("<HIBiiiB")
+_ANCHOR_ROW = struct.Struct("<QIB")
+
+
+def short_id(address: int) -> str:
+    """Return the four hexadecimal digits by which PANS names a node: the low 16 bits of its address."""
+    return f"{address & 0xFFFF:04X}"
+
+
+def block_length(head: bytes) -> int:
+    """Return the length in a block's head (type, length, count), 0 = not all here yet, -1 = no such block."""
+    kind = head[0]
+    if kind not in _LENGTHS and kind not in (0x48, 0x49, 0x56):
+        return -1
+    if len(head) < 2:
+        return 0
+    length = head[1]
+    if kind in _LENGTHS:
+        return length if length == _LENGTHS[kind] else -1
+    if kind == 0x56:
+        return length if length else -1
+    row, most = (13, 15) if kind == 0x48 else (20, 12)
+    count, rest = divmod(length - 1, row)
+    if rest or not 0 <= count <= most or (len(head) > 2 and head[2] != count):
+        return -1
+    return length if len(head) > 2 else 0
+
+
+def decode(piece: bytes, stamp: float) -> Event:
+    """Decode a head or a block of the right size."""
+    kind, value = piece[0], piece[2:]
+    if kind == 0x40:
+        return Answer(stamp, piece[2])
+    if kind == 0x41:
+        x, y, z, quality = _POSITION.unpack(value)
+        if quality > 100 or max(abs(x), abs(y), abs(z)) > MAX_PLACE_MM:
+            return corrupt(piece, "position or quality out of range")
+        return Position(stamp, x / 1000, y / 1000, z / 1000, quality)
+    if kind == 0x45:
+        normal, stationary = struct.unpack("<HH", value)
+        return UpdateRate(stamp, normal / 10, stationary / 10)
+    if kind == 0x46:
+        return _decode_config(value, stamp)
+    if kind == 0x5A:
+        bits = int.from_bytes(value, "little")
+        damaged = bits & ~_STATUS_MASK or bits == _HEAD_AS_STATUS
+        return corrupt(piece, "status that no module has") if damaged else Status(stamp, bits)
+    if kind in _VALUES:
+        return Value(stamp, _VALUES[kind][1], int.from_bytes(value, "little"))
+    if kind == 0x56:
+        return Block(stamp, kind, value)
+    return _decode_distances(piece, stamp)
+
+
+def _decode_config(value: bytes, stamp: float) -> NodeConfig:
+    low, high = value
+    return NodeConfig(
+        stamp, bool(high & 32), bool(high & 16), bool(high & 8), bool(high & 4), high & 3, bool(low & 128),
+        bool(low & 64), bool(low & 32), bool(low & 16), bool(low & 8), bool(low & 4), low & 3,
+    )  # fmt: skip
+
+
+def _decode_distances(piece: bytes, stamp: float) -> Event:
+    rows = piece[3:]
+    readings, anchors = [], []
+    if piece[0] == 0x49:
+        for address, distance, quality, x, y, z, position_quality in _TAG_ROW.iter_unpack(rows):
+            readings.append((address, distance, quality))
+            anchors.append(Position(stamp, x / 1000, y / 1000, z / 1000, position_quality))
+    else:
+        readings = list(_ANCHOR_ROW.iter_unpack(rows))
+    far = any(max(abs(a.x), abs(a.y), abs(a.z)) * 1000 > MAX_PLACE_MM for a in anchors)
+    if far or any(distance > MAX_RANGE_MM or quality > 100 for _, distance, quality in readings):
+        return corrupt(piece, "distance or quality out of range")
+    if len({address for address, _, _ in readings}) < len(readings):
+        return corrupt(piece, "one anchor twice in a fix")
+    return Distances(stamp, tuple([RangeReading(short_id(a), d / 1000, q) for a, d, q in readings]), tuple(anchors))
