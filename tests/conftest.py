@@ -42,6 +42,14 @@ def room_log():
     return ROOT / "tests" / "data" / "room.log.gz"
 
 
+@pytest.fixture(scope="session")
+def log(room_log):
+    """That recording, read."""
+    from uwblite.io.carmen import read_log
+
+    return read_log(room_log)
+
+
 def pytest_terminal_summary(terminalreporter):
     skipped = [report for report in terminalreporter.stats.get("skipped", []) if "recordings absent" in str(report.longrepr)]
     if skipped:

@@ -1,4 +1,6 @@
-"""A small, complete map result made by hand, for tests of what is done with results."""
+"""A small, complete map result made by hand, for tests of what is done with results, and what its folder holds."""
+
+from pathlib import Path
 
 import numpy as np
 
@@ -10,7 +12,18 @@ from uwblite.pose_edges import RelativePoseEdges
 from uwblite.range_edges import RangeEdges
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 
+FILES = {
+    "anchors.csv", "config.toml", "graph.g2o", "graph.pyfg", "graph_stamps.csv", "map.pgm", "map.png", "map.yaml",
+    "report.html", "report.json", "trajectory.tum", "trajectory_covariance.csv",
+}  # fmt: skip
+"""What `uwblite map` writes of one recording with lidar."""
+
 EVIL = "<script>alert('x')</script>&\"\u202e"
+
+
+def contents(folder):
+    """Return the bytes of every file of a folder by name."""
+    return {p.name: p.read_bytes() for p in Path(folder).iterdir()}
 
 
 def small_result(*, evil: str = "", lidar: bool = True, sessions: int = 1, seconds: float = 0.0) -> MapResult:

@@ -17,11 +17,6 @@ from uwblite.mapping import MappingConfig, build_map
 
 
 @pytest.fixture(scope="module")
-def log(room_log):
-    return read_log(room_log)
-
-
-@pytest.fixture(scope="module")
 def earlier(log):
     """A map of the room in a frame of its own."""
     start = float(log.odometry.stamps[0])

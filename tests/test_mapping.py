@@ -28,11 +28,6 @@ between them the odometry (20 mm per square root of a metre) bridges 0.3 m with 
 
 
 @pytest.fixture(scope="module")
-def log(room_log):
-    return read_log(room_log)
-
-
-@pytest.fixture(scope="module")
 def truth(room_log):
     return read_tum(room_log.parent / "room" / "truth.tum")
 

@@ -8,7 +8,6 @@ import pytest
 from uwblite.config import from_dict, to_dict
 from uwblite.errors import DataError
 from uwblite.evaluate import evaluate_trajectory
-from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pose_edges import OdometryEdges
@@ -34,11 +33,6 @@ def test_the_paper_s_figures_are_in_its_preset():
     assert (paper.icp.method, paper.icp.max_correspondence_distance) == ("point_to_point", 0.1)
     assert (paper.icp.fitness_sigma, paper.icp.max_iterations) == (0.1, 300)
     assert set(to_dict(paper.calibration).values()) == {0.0}
-
-
-@pytest.fixture(scope="module")
-def log(room_log):
-    return read_log(room_log)
 
 
 @pytest.fixture(scope="module")

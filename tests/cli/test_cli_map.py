@@ -6,19 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from results import FILES, contents
 
 from uwblite.cli import main
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
-
-FILES = {
-    "anchors.csv", "config.toml", "graph.g2o", "graph.pyfg", "graph_stamps.csv", "map.pgm", "map.png", "map.yaml",
-    "report.html", "report.json", "trajectory.tum", "trajectory_covariance.csv",
-}  # fmt: skip
-
-
-def contents(folder):
-    return {p.name: p.read_bytes() for p in Path(folder).iterdir()}
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from results import EVIL, small_log, small_result
+from results import EVIL, FILES, contents, small_log, small_result
 
 from uwblite.errors import ConfigError
 from uwblite.io import folders, results
@@ -22,15 +22,6 @@ from uwblite.io.results import check_target, is_of_result, mend_result, write_re
 from uwblite.io.tum import read_tum
 
 RECORD = RunRecord("uwblite map run.log --out map_again", "use_uwb = true\n", {"uwblite": "0.1.0"})
-FILES = {
-    "anchors.csv", "config.toml", "graph.g2o", "graph.pyfg", "graph_stamps.csv", "map.pgm", "map.png", "map.yaml",
-    "report.html", "report.json", "trajectory.tum", "trajectory_covariance.csv",
-}  # fmt: skip
-
-
-def contents(folder):
-    return {p.name: p.read_bytes() for p in Path(folder).iterdir()}
-
 
 def test_all_files_of_the_contract_are_written(tmp_path):
     names = write_result(tmp_path / "a" / "map", [small_log()], small_result(), RECORD)
