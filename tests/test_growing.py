@@ -107,7 +107,7 @@ def test_calibration_is_found_on_the_way():
     graph = replace(graph, edges=(odometry, ranges, prior), calibration=Calibration(("scale", "bias"), np.zeros(2)))
     found, summary = optimize_growing(graph)
     # Hundreds of ranges per anchor: the scale is known to about 0.1 %, the bias to about 1 cm.
-    np.testing.assert_allclose(found.calibration.values, [0.05, 0.2], atol=0.03)
+    np.testing.assert_array_less(np.abs(found.calibration.values - [0.05, 0.2]), [4e-3, 4e-2])
     best, at_best = optimize(replace(graph, poses=truth, anchors=anchors))
     assert rms(found.poses, best.poses) < 0.02
     assert summary.chi2 == pytest.approx(at_best.chi2, rel=1e-5)
