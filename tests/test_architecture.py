@@ -25,7 +25,7 @@ FLOORS = (
     ("evaluate", "occupancy_grid", "keyframes", "range_noise", "range_mixture", "anchors", "scan_search", "free_space"),
     ("factorization", "layouts", "selected_inverse", "two_level"),
     ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts"),
-    ("distance_edges", "constraints", "turning", "drivers/*"),
+    ("distance_edges", "constraints", "constraint_edges", "turning", "drivers/*"),
     # stages
     ("solver", "marginals", "evidence", "gnc", "icp", "pair_matching", "submaps", "pair_alignment", "sight", "closures"),
     ("first_estimate", "growing", "sessions", "thinning", "joining", "moved_anchors", "refinement", "tracking"),

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite import se2
+from uwblite.constraint_edges import apply
 from uwblite.constraints import (
     Clock,
     Constraints,
@@ -14,7 +15,6 @@ from uwblite.constraints import (
     KnownClosure,
     KnownDistance,
     KnownPose,
-    apply,
 )
 from uwblite.distance_edges import AnchorDistanceEdges
 from uwblite.errors import ConfigError, FormatError

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from . import calibration, se2
 from .anchors import AnchorHypothesis
-from .constraints import consensus
+from .constraint_edges import consensus
 from .errors import DataError
 from .first_estimate import FirstEstimate
 from .graph import Calibration, Graph, PriorEdges

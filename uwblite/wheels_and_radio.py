@@ -11,8 +11,8 @@ import numpy as np
 
 from . import calibration, evidence, first_estimate, joining, keyframes, map_frame, se2, sessions
 from .calibration import RADIO, WHEELS, freed, with_real_heights
+from .constraint_edges import apply as apply_constraints
 from .constraints import Constraints
-from .constraints import apply as apply_constraints
 from .errors import ConfigError
 from .graph import Edges, Graph
 from .mapping_config import MappingConfig
