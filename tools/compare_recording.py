@@ -88,6 +88,7 @@ def compare(log: Path, truth: Path) -> dict[str, dict[str, float]]:
 
 
 def main() -> int:
+    """Compare and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("log", type=Path)
     parser.add_argument("truth", type=Path)

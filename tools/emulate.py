@@ -80,6 +80,7 @@ class Plug:
 
 
 def parse_arguments(argv=None):
+    """Read the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__ + "\nfaults, --fault DEVICE:FAULT\n" + (faults.__doc__ or ""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -112,6 +113,7 @@ def parse_arguments(argv=None):
 
 
 def make_wire(place: str):
+    """Return what a device is plugged into: tcp:HOST:PORT, or a pseudo-terminal linked at a path."""
     if place.startswith("tcp:"):
         host, _, port = place[4:].rpartition(":")
         return TcpWire(host or "127.0.0.1", int(port))
@@ -119,6 +121,7 @@ def make_wire(place: str):
 
 
 def build(args, clock, world, truth) -> list[Plug]:
+    """Return the devices asked for, each with its wire and its faults."""
     chosen: dict[str, list] = {name: [] for name in DEVICES}
     for text in args.fault:
         name, _, fault = text.partition(":")
@@ -153,6 +156,7 @@ def build(args, clock, world, truth) -> list[Plug]:
 
 
 def run(plugs: list[Plug], args, clock, stop_world: float, leaving) -> None:
+    """Serve the devices until the world stops or somebody leaves."""
     began = time.monotonic()
     for plug in plugs:
         plug.follow_faults(began, began)
@@ -186,6 +190,7 @@ def run(plugs: list[Plug], args, clock, stop_world: float, leaving) -> None:
 
 
 def main(argv=None) -> int:
+    """Emulate until interrupted, or until the played log ends."""
     args = parse_arguments(argv)
     world = LogWorld(args.play) if args.play else RoomWorld()
     stop_world = world.length() if args.play and args.until_end else math.inf
