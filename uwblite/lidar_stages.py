@@ -97,6 +97,7 @@ def track(
 _LATE = 0.015
 """s; the clouds' clock may be off by this much: a robot's velocity hardly changes meanwhile."""
 _RETIMINGS = 3
+"""How often clouds are made anew, at most; each time a quarter of the error is left."""
 
 
 def _track(part: Part, scans: Scans, drives: Drives, config: MappingConfig, stages: Stages) -> tuple[Part, Refined]:
@@ -188,3 +189,4 @@ def look_again(part: Part, scans: Scans, drives: Drives, stages: Stages) -> None
 _DISAGREEMENT = 0.05
 """Share from which visits do not show the same place; people, glass and doors leave half of it."""
 _ENOUGH_VISITS = 10
+"""Views of another visit from which their disagreement counts."""

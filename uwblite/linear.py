@@ -57,8 +57,8 @@ def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: NDArray[
     """Return the graph moved by a step, poses link by link: each relative pose changes as the step says to first order,
     and the chain is put together again from these.
 
-    The same as `moved` to first order. Where a step turns poses by much, what was rigid between neighbours stays rigid
-    here, whatever the turn; what closes a loop stays closed there.
+    The same as `moved` to first order. Where a step turns poses by much, this keeps rigid what was rigid between neighbours,
+    whatever the turn; `moved` keeps closed what closes a loop.
 
     Parameters
     ----------
