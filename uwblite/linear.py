@@ -6,7 +6,7 @@ full rows for the calibration values, which touch nearly every pose and therefor
 are numbered in the order of elimination, so that vectors need no permutation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,8 +101,23 @@ def free_unknowns(graph: Graph) -> dict[str, NDArray[np.bool_]]:
     return free
 
 
+_AT_ONCE = 1 << 15
+"""Edges whose products are held at once; a bound on the memory."""
+_NONE = np.zeros(0, dtype=np.int64)
 _Touched = tuple[Ints, bool]
 """Node (e,) touched by each edge, -1 = held; and whether it takes part in the ordering."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places:
+    """Where the products of some edges of one kind land."""
+
+    products: NDArray[np.int32]
+    """Place of every product of two Jacobian columns among the values."""
+    twice: Ints
+    """Which of them count twice."""
+    rows: NDArray[np.int32]
+    """Row of the gradient of every product of a column with the residual."""
 
 
 class NormalEquations:
@@ -206,33 +221,45 @@ class NormalEquations:
         block, that is at a start plus i and j times a step; the lower triangle decides which of them is the row.
         Where a and b are the same node, both their products are one entry, which counts twice on the diagonal.
         """
-        full, following = np.array(len(self._base) - 1), iter(which)
-        self._places: list[tuple[Ints, Ints, Ints]] = []
-        """Per kind of edges: places of the products, which of them count twice, and rows of the gradient."""
+        following = iter(which)
+        self._places: list[list[_Places]] = []
         for lin, nodes in zip(linearized, touched, strict=True):
-            none = np.zeros(0, dtype=np.int64)
-            gradient_rows, positions, twice, count = [none], [none], [none], 0
             widths = [jac.shape[2] for _, _, jac in lin.blocks]
-            for p, (a, a_inner) in enumerate(nodes):
-                places = []
-                for b, b_inner in nodes[: p + 1]:
-                    same = np.nonzero((a == b) & (a >= 0))[0] if b is not a else a[:0]
-                    pair = full
-                    if a_inner and b_inner:
-                        pair = a if b is a else np.where(a == b, a, next(following))
-                    places.append((*self._steps(corner[a], corner[b], pair), same))
-                for i in range(widths[p]):
-                    gradient_rows.append(np.where(a >= 0, corner[a] + i, self.unknowns.size))
-                    for q, (start, by_a, by_b, same) in enumerate(places):
-                        for j in range(widths[q] if q < p else i + 1):
-                            place = start + i * by_a + j * by_b
-                            if len(same) and i < j:
-                                place[same] = (start + j * by_a + i * by_b)[same]
-                            if len(same) and i == j:
-                                twice.append(same + count)
-                            positions.append(place)
-                            count += len(place)
-            self._places.append((np.concatenate(positions), np.concatenate(twice), np.concatenate(gradient_rows)))
+            blocks = [self._blocks_of(nodes[: p + 1], following) for p in range(len(nodes))]
+            self._places.append(
+                [
+                    self._place_some(widths, [a[part] for a, _ in nodes], [[b[part] for b in row] for row in blocks], corner)
+                    for part in _parts(len(lin.residuals))
+                ]
+            )
+
+    def _blocks_of(self, nodes: list[_Touched], following: Iterator[Ints]) -> list[Ints]:
+        """Return the block (e,) in which the last of the nodes meets each one up to itself."""
+        a, a_inner = nodes[-1]
+        full = np.full(len(a), len(self._base) - 1)
+        meet = [np.where(a == b, a, next(following)) if a_inner and b_inner else full for b, b_inner in nodes[:-1]]
+        return [*meet, a if a_inner else full]
+
+    def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: Ints) -> "_Places":
+        """Find the places of some edges' products; nodes are (e,), the block of nodes p and q is blocks[p][q] (e,)."""
+        rows: list[NDArray[np.int32]] = []
+        products: list[NDArray[np.int32]] = []
+        twice, count = [_NONE], 0
+        for p, a in enumerate(nodes):
+            steps = [self._steps(corner[a], corner[b], block) for b, block in zip(nodes, blocks[p], strict=False)]
+            equal = [np.flatnonzero((a == b) & (a >= 0)) for b in nodes[:p]] + [_NONE]
+            for i in range(widths[p]):
+                rows.append(np.where(a >= 0, corner[a] + i, self.unknowns.size).astype(np.int32))
+                for q, ((start, by_a, by_b), same) in enumerate(zip(steps, equal, strict=True)):
+                    for j in range(widths[q] if q < p else i + 1):
+                        place = start + i * by_a + j * by_b
+                        if len(same) and i < j:
+                            place[same] = (start + j * by_a + i * by_b)[same]
+                        if len(same) and i == j:
+                            twice.append(same + count)
+                        products.append(place.astype(np.int32))
+                        count += len(place)
+        return _Places(np.concatenate(products), np.concatenate(twice), np.concatenate(rows))
 
     def _steps(self, a: Ints, b: Ints, block: Ints) -> tuple[Ints, Ints, Ints]:
         """Return place of the first product of nodes with first scalars a, b, and its steps along either."""
@@ -244,19 +271,23 @@ class NormalEquations:
     def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
         """Fill H and g from whitened Jacobians and a weight per edge."""
         self.values, self.gradient = np.zeros(self._trash + 1), np.zeros(self.unknowns.size)
-        for lin, weight, (positions, twice, rows) in zip(linearized, weights, self._places, strict=True):
-            products, slopes, at = np.empty(len(positions)), np.empty(len(rows)), 0
-            jacobian = _stacked(lin)
-            weighted = jacobian if weight is None else jacobian * weight
-            _, k, e = jacobian.shape
-            _contract(weighted, lin.residuals.T[:, None], slopes.reshape(k, e))
-            for row in range(k):
-                block = products[at : at + (row + 1) * e].reshape(row + 1, e)
-                _contract(weighted[:, row : row + 1], jacobian[:, : row + 1], block)
-                at += (row + 1) * e
-            products[twice] *= 2.0
-            self.values += np.bincount(positions, products, self._trash + 1)
-            self.gradient += np.bincount(rows, slopes, self.unknowns.size + 1)[:-1]
+        for lin, weight, places in zip(linearized, weights, self._places, strict=True):
+            for part, place in zip(_parts(len(lin.residuals)), places, strict=True):
+                self._add(_stacked(lin, part), lin.residuals[part], None if weight is None else weight[part], place)
+
+    def _add(self, jacobian: Floats, residuals: Floats, weight: Floats | None, places: "_Places") -> None:
+        """Add the products of some edges' Jacobian columns (d, k, e) and residuals (e, d)."""
+        products, slopes, at = np.empty(len(places.products)), np.empty(len(places.rows)), 0
+        weighted = jacobian if weight is None else jacobian * weight
+        _, k, e = jacobian.shape
+        _contract(weighted, residuals.T[:, None], slopes.reshape(k, e))
+        for row in range(k):
+            block = products[at : at + (row + 1) * e].reshape(row + 1, e)
+            _contract(weighted[:, row : row + 1], jacobian[:, : row + 1], block)
+            at += (row + 1) * e
+        products[places.twice] *= 2.0
+        self.values += np.bincount(places.products, products, self._trash + 1)
+        self.gradient += np.bincount(places.rows, slopes, self.unknowns.size + 1)[:-1]
 
     @property
     def diagonal(self) -> Floats:
@@ -275,13 +306,18 @@ class NormalEquations:
         return self._layout.factor(values)
 
 
-def _stacked(lin: Linearization) -> Floats:
-    """Return the Jacobians of one kind side by side, (d, k, e): the edges, over which everything runs, come last."""
-    d = lin.residuals.shape[1]
-    stacked = np.empty((d, sum(jac.shape[2] for _, _, jac in lin.blocks), len(lin.residuals)))
+def _parts(edges: int) -> list[slice]:
+    """Return the edges whose products are held at once."""
+    return [slice(first, first + _AT_ONCE) for first in range(0, max(edges, 1), _AT_ONCE)]
+
+
+def _stacked(lin: Linearization, part: slice) -> Floats:
+    """Return the Jacobians of some edges side by side, (d, k, e): the edges, over which everything runs, come last."""
+    residuals = lin.residuals[part]
+    stacked = np.empty((residuals.shape[1], sum(jac.shape[2] for _, _, jac in lin.blocks), len(residuals)))
     first = 0
     for _, _, jac in lin.blocks:
-        stacked[:, first : first + jac.shape[2]] = jac.transpose(1, 2, 0)
+        stacked[:, first : first + jac.shape[2]] = jac[part].transpose(1, 2, 0)
         first += jac.shape[2]
     return stacked
 

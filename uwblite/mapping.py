@@ -29,6 +29,7 @@ from . import (
 )
 from .calibration import LASER, freed, with_real_heights
 from .closures import Closures
+from .clouds import Clouds
 from .constraints import Constraints
 from .errors import ConfigError
 from .graph import Edges, Graph
@@ -120,11 +121,13 @@ def build_map(
     if known.landmark_distances:
         part, refined = _measured_distances(part, found, tracked, refined, known, scans, drives, config, stages)
     part = _final(part, found, tracked, refined)
-    if refined is not None and part.radio is not None:
-        part = replace(part, graph=with_real_heights(optimize(part.graph, config.solver)[0]))
-    part = _aligned(part, scans, config)
+    walls = _walls(scans, config)
+    settled = refined is None or part.radio is None
     # What only matching needed is most of the memory.
     scans = tracked = refined = None
+    if not settled:
+        part = replace(part, graph=with_real_heights(optimize(part.graph, config.solver)[0]))
+    part = _aligned(part, walls, config)
 
     grid = _grid(drives, part.graph, config, executor, stages)
     uncertainty = marginals(refinement.with_fewer_pairs(part.graph))
@@ -168,7 +171,7 @@ def _measured_distances(
     if scans is None:
         raise ConfigError("constraints: distances between landmarks need the lidar, which sees them")
     held = _final(part, closures, tracked, refined)
-    poses = se2.compose(_alignment(held, scans, config), held.graph.poses)
+    poses = se2.compose(_alignment(held, _walls(scans, config), config), held.graph.poses)
     tied = landmarks.ties(known, scans.clouds, poses, drives.path)
     solved = optimize(held.graph.with_edges(tied.edges), config.solver)[0]
     part = replace(part, graph=part.graph.with_edges(tied.edges).with_estimates_of(solved))
@@ -180,18 +183,23 @@ def _measured_distances(
     return part, refined
 
 
-def _aligned(part: Part, scans: Scans | None, config: MappingConfig) -> Part:
+def _walls(scans: Scans | None, config: MappingConfig) -> Clouds | None:
+    """Return what shows the walls, where the map's axes are to follow them."""
+    return scans.clouds if scans is not None and config.align == "walls" else None
+
+
+def _aligned(part: Part, walls: Clouds | None, config: MappingConfig) -> Part:
     """Put the map's axes where the settings want them."""
-    motion = _alignment(part, scans, config)
+    motion = _alignment(part, walls, config)
     return replace(part, graph=map_frame.moved(part.graph, motion), first=sessions.moved_hypotheses(part.first, motion))
 
 
-def _alignment(part: Part, scans: Scans | None, config: MappingConfig) -> Floats:
+def _alignment(part: Part, walls: Clouds | None, config: MappingConfig) -> Floats:
     """Return T_new_map (3,), by which the map is turned to where the settings want its axes."""
     graph, normals = part.graph, np.zeros((0, 2))
     placed = np.zeros(len(graph.anchors), dtype=bool) if part.first is None else part.first.placed
-    if scans is not None and config.align == "walls":
-        normals = se2.rotate(graph.poses[scans.clouds.owner, 2], scans.clouds.normals)
+    if walls is not None:
+        normals = se2.rotate(graph.poses[walls.owner, 2], walls.normals)
     return map_frame.alignment(config.align, graph, placed, normals)
 
 

@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+_CLOUDS_AT_ONCE = 256
+"""Clouds whose rasters are painted at once."""
 _AT_ONCE = 16384
 """Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
 _SAME_FACING = float(np.sqrt(0.5))
@@ -68,10 +70,7 @@ def paint(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     ----------
     cell, reach : cell size and distance up to which a point is a neighbour, m.
     """
-    usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
-    owner = clouds.owner[usable]
-    x, y = (np.asarray(column, dtype=np.float64) for column in clouds.points[usable].T)
-    low, high = _boxes(np.stack([x, y]), owner, len(clouds))
+    low, high = _boxes(clouds)
     some = np.isfinite(low[:, 0])
     margin = reach + cell
     low = np.where(some[:, None], low - margin, 0.0)
@@ -79,25 +78,43 @@ def paint(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     size = shape[:, 0] * shape[:, 1]
     start = np.concatenate([[0], np.cumsum(size)[:-1]])
     narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
-    rows = (usable - clouds.offsets[owner]).astype(np.int16 if narrow else np.int32)
-    nearest = np.full(int(size.sum()), _NOBODY, dtype=rows.dtype)
-    stride = shape[owner, 1]
-    base = ((x - low[owner, 0]) / cell).astype(np.int64) * stride + ((y - low[owner, 1]) / cell).astype(np.int64) + start[owner]
+    raster = CloudRasters(cell, low, shape, start, np.full(int(size.sum()), _NOBODY, dtype=np.int16 if narrow else np.int32))
     steps = int(np.floor(reach / cell))
     offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
-    offsets = [o for o in offsets if np.hypot(*o) * cell <= reach]
-    for dx, dy in sorted(offsets, key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o)):
-        nearest[base + (dx * stride + dy)] = rows
-    return CloudRasters(cell, low, shape, start, nearest)
+    offsets = sorted((o for o in offsets if np.hypot(*o) * cell <= reach), key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o))
+    for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
+        _paint(clouds, slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds))), raster, offsets)
+    return raster
 
 
-def _boxes(points: Floats, owner: Ints, clouds: int) -> tuple[Floats, Floats]:
-    """Return the corners (k, 2) of a box around the points (2, p) of each cloud; inf where it has none."""
-    low, high = np.full((clouds, 2), np.inf), np.full((clouds, 2), -np.inf)
-    if len(owner):
-        first = np.flatnonzero(np.concatenate([[True], np.diff(owner) > 0]))
-        low[owner[first]] = np.minimum.reduceat(points, first, axis=1).T
-        high[owner[first]] = np.maximum.reduceat(points, first, axis=1).T
+def _paint(clouds: Clouds, some: slice, raster: CloudRasters, offsets: list[tuple[int, int]]) -> None:
+    """Let the points of some clouds claim the cells at these offsets from their own, the last offset with most right."""
+    usable, owner, x, y = _usable(clouds, some)
+    rows = (usable - clouds.offsets[owner]).astype(raster.nearest.dtype)
+    stride, low = raster.shape[owner, 1], raster.origin[owner]
+    cx, cy = ((x - low[:, 0]) / raster.cell).astype(np.int64), ((y - low[:, 1]) / raster.cell).astype(np.int64)
+    base = cx * stride + cy + raster.start[owner]
+    for dx, dy in offsets:
+        raster.nearest[base + (dx * stride + dy)] = rows
+
+
+def _usable(clouds: Clouds, some: slice) -> tuple[Ints, Ints, Floats, Floats]:
+    """Return rows, clouds and coordinates (p,) of the points with a normal of some clouds."""
+    first, end = clouds.offsets[some.start], clouds.offsets[some.stop]
+    usable = first + np.flatnonzero(np.any(clouds.normals[first:end] != 0.0, axis=1))
+    x, y = clouds.points[usable].T.astype(np.float64)
+    return usable, clouds.owner[usable], x, y
+
+
+def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
+    """Return the corners (k, 2) of a box around the points with a normal of each cloud; inf where it has none."""
+    low, high = np.full((len(clouds), 2), np.inf), np.full((len(clouds), 2), -np.inf)
+    for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
+        _, owner, x, y = _usable(clouds, slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds))))
+        if len(owner):
+            begins = np.flatnonzero(np.concatenate([[True], np.diff(owner) > 0]))
+            low[owner[begins]] = np.minimum.reduceat(np.stack([x, y]), begins, axis=1).T
+            high[owner[begins]] = np.maximum.reduceat(np.stack([x, y]), begins, axis=1).T
     return low, high
 
 

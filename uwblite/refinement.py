@@ -210,9 +210,8 @@ def refine(
         edges = replace(probe, T_i_j=z, sqrt_information=sqrt_information, weights=used.astype(np.float64))
         problem = graph.with_edges(edges)
         check(problem)
-        linearized = linearize(problem)
-        normal = normal or NormalEquations(problem, linearized)
-        solved, summary = minimise(problem, linearized, normal, brief)
+        normal = normal or NormalEquations(problem, linearize(problem))
+        solved, summary = minimise(problem, linearize(problem), normal, brief)
         moved = float(np.sqrt(np.mean(np.sum((solved.poses - graph.poses)[:, :2] ** 2, axis=1))))
         graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
         rounds += 1

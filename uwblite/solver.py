@@ -152,17 +152,19 @@ def minimise(
     factor: Factor | None = None
     linked = _linked(len(graph.poses), linearized)
     while not reason:
+        if len(history) == config.max_iterations:
+            reason = USED_UP
+            break
         reused = factor is not None
         if improved:
             normal.fill(linearized, [_or_none(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
+            # The normal equations hold it all now; Jacobians of hours are large.
+            linearized = []
             diagonal = normal.diagonal
             scale = np.where(diagonal > 0, diagonal, 1.0)
             if np.max(np.abs(normal.gradient) / np.sqrt(scale)) <= config.gradient_tolerance:
                 reason = GRADIENT
                 break
-        if len(history) == config.max_iterations:
-            reason = USED_UP
-            break
         factor, step, promised = _step(normal, damping * scale, factor)
         trial = _trial(graph, normal.unknowns, step, linked)
         trial_linearized = linearize(trial)
@@ -181,14 +183,14 @@ def minimise(
             graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3), _LEAST_DAMPING)
             growth = 2.0
-        elif 0 < promised <= 1e-3 * negligible and damping <= _FREE:
+        elif 0 < promised <= (1e-3 if reused else 1.0) * negligible and damping <= _FREE:
             reason = SETTLED
         else:
             factor = None
             if not reused:
                 damping, growth = max(damping * growth, _FIRST_BRAKE), growth * 2.0
-            if damping > _MOST_DAMPING:
-                reason = STUCK
+        if not reason and damping > _MOST_DAMPING:
+            reason = STUCK
     chi2_history, damping_history = np.array(history).reshape(-1, 2).T
     return graph, SolverSummary(
         converged=reason in (SETTLED, GRADIENT),
@@ -196,7 +198,7 @@ def minimise(
         iterations=len(history),
         chi2_initial=chi2_initial,
         chi2=chi2,
-        dof=_independent_residuals(graph, linearized) - normal.unknowns.size,
+        dof=_independent_residuals(graph, linearized or linearize(graph)) - normal.unknowns.size,
         damping=damping,
         chi2_history=chi2_history,
         damping_history=damping_history,

@@ -19,7 +19,7 @@ from .errors import SolverError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_PIECE = 16
+_PIECE = 24
 """Poses of a piece."""
 _ENOUGH = 1e-4
 """Error of a solution as a share of it: the next step of the descent takes it up."""
@@ -102,8 +102,7 @@ class TwoLevelFactor:
             self._local = np.linalg.inv(local.blocks(matrix.data))
         except np.linalg.LinAlgError as problem:
             raise SolverError(f"{_SINGULAR} ({problem})") from None
-        coarse = (pieces.basis.T @ (matrix @ pieces.basis)).toarray(order="F")
-        self._coarse, failed = lapack.dpotrf(coarse, lower=1, overwrite_a=1)
+        self._coarse, failed = lapack.dpotrf(_seen_by(matrix, pieces.basis), lower=1, overwrite_a=1)
         if failed:
             raise SolverError(_SINGULAR)
 
@@ -142,4 +141,16 @@ class TwoLevelFactor:
         return np.asarray(found[:-1] + self._pieces.basis @ coarse.ravel())
 
 
+def _seen_by(matrix: sparse.csc_matrix, basis: sparse.csr_matrix) -> Floats:
+    """Return basis^T matrix basis (c, c), nearly full, a few columns at a time."""
+    by_column, onto = basis.tocsc(), basis.T.tocsr()
+    seen = np.empty((basis.shape[1], basis.shape[1]), order="F")
+    for first in range(0, basis.shape[1], _COLUMNS_AT_ONCE):
+        part = slice(first, first + _COLUMNS_AT_ONCE)
+        seen[:, part] = (onto @ (matrix @ by_column[:, part])).toarray()
+    return seen
+
+
+_COLUMNS_AT_ONCE = 256
+"""Columns of the coarse matrix made at once; a bound on the memory."""
 _SINGULAR = "the normal equations are singular; add a prior or more measurements"
