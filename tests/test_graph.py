@@ -6,6 +6,7 @@ from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.graph import Calibration, Graph, PriorEdges, edge_cost
 from uwblite.pose_edges import RelativePoseEdges
+from uwblite.range_edges import RangeEdges
 from uwblite.robust import Kernel
 
 KINDS = sorted(every_kind(0)[1])
@@ -21,12 +22,7 @@ def moved(graph, block, unknown, scalar, step):
     return graph.updated(values["poses"], values["anchors"], values["calibration"][:, 0])
 
 
-@pytest.mark.parametrize("calibrated", [True, False])
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("kind", KINDS)
-def test_jacobians_equal_differences(kind, seed, calibrated):
-    graph, kinds = every_kind(seed, calibrated)
-    edges = kinds[kind]
+def assert_jacobians_equal_differences(graph, edges):
     linear = edges.linearize(graph)
     np.testing.assert_allclose(linear.residuals, edges.residuals(graph), atol=1e-12)
     step = 1e-6
@@ -40,6 +36,14 @@ def test_jacobians_equal_differences(kind, seed, calibrated):
             ahead, behind = (edges.residuals(moved(graph, block, unknown, scalar, s)) for s in (step, -step))
             # Second differences of residuals of size 10 over 1e-6 leave about 1e-8.
             np.testing.assert_allclose(analytic[:, :, unknown, scalar], (ahead - behind) / (2 * step), atol=1e-7)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", KINDS)
+def test_jacobians_equal_differences(kind, seed, calibrated):
+    graph, kinds = every_kind(seed, calibrated)
+    assert_jacobians_equal_differences(graph, kinds[kind])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -94,10 +98,39 @@ def test_ranges_are_slant_distances_of_the_moving_tag():
         tag = se2.rotate(edges.turn[e], edges.tag + np.array([tag_x, tag_y]))
         at = se2.transform(graph.poses[edges.pose[e]], edges.lever_arm[e] + tag + edges.velocity[e] * delay)
         away = at - graph.anchors[edges.anchor[e]]
-        distance = np.sqrt(away @ away + edges.height[e] ** 2 + q)
+        planar = away @ away + edges.height[e] ** 2
+        distance = np.sqrt(planar + q) if q >= 0.0 else 2.0 * np.sqrt(planar) - np.sqrt(planar - q)
         assert edges.distances(graph)[e] == pytest.approx(distance)
         expected = ((1 + scale) * distance + bias - edges.ranges[e]) / edges.sigma[e]
         assert edges.residuals(graph)[e, 0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("away", [0.05, 0.5, 5.0])
+def test_a_squared_height_below_zero_takes_off_what_one_above_adds(away):
+    edges, graph = one_range(away)
+
+    def distance(q):
+        return edges.distances(graph.updated(graph.poses, graph.anchors, np.array([q])))[0]
+
+    for q in (1e-6, 0.01, 1.0):
+        assert distance(q) + distance(-q) == pytest.approx(2.0 * away)
+    steps = np.linspace(-1.0, 1.0, 41)
+    assert np.all(np.diff([distance(q) for q in steps]) > 0.0)
+
+
+@pytest.mark.parametrize("q", [-1.0, -0.26, -0.01, 0.01, 1.0])
+def test_jacobians_near_an_anchor_equal_differences_whatever_the_squared_height(q):
+    edges, graph = one_range(0.5)
+    assert_jacobians_equal_differences(graph.updated(graph.poses, graph.anchors, np.array([q])), edges)
+
+
+def one_range(away):
+    """Return a range to an anchor that stands so far, m, in front of the robot, its squared height unknown; and the graph."""
+    graph = Graph(np.zeros((1, 3)), np.array([[away, 0.0]]), (), Calibration(("height2:A",), np.zeros(1)))
+    one, none = np.array([0]), np.zeros((1, 2))
+    height = np.array([[-1, -1, 0, -1, -1, -1]])
+    said, sigma, zero = np.array([away]), np.array([0.1]), np.zeros(1)
+    return RangeEdges(one, one, said, sigma, none, zero, none, np.zeros(2), zero, height), graph
 
 
 def test_a_tag_on_top_of_its_anchor_has_finite_derivatives():
