@@ -184,11 +184,13 @@ def trusted_step(information: Floats, feigned: Floats, gradient: Floats, degener
     return np.asarray(-vectors @ ((vectors.T @ gradient) / divisor))
 
 
+_FLOOR = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) * _FEIGNED_FLOOR
+"""Sums x and y, whatever the frame."""
+
+
 def _floor(information: Floats) -> Floats:
     """Return what keeps the diagonal (..., 3) of N from vanishing."""
-    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
-    xy = diagonal[..., 0] + diagonal[..., 1]
-    return np.stack([xy, xy, diagonal[..., 2]], axis=-1) * _FEIGNED_FLOOR + _TINY
+    return np.asarray(np.diagonal(information, axis1=-2, axis2=-1) @ _FLOOR + _TINY)
 
 
 def relative_eigen(information: Floats, feigned: Floats) -> tuple[Floats, Floats, Floats, Floats]:

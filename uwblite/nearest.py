@@ -59,14 +59,14 @@ def make_raster(points: Floats, reach: float, stride: int = 1, cells: int = 4) -
     cell, margin = reach / cells, cells + 1
     if len(chosen) == 0:
         return NearestRaster(np.zeros(2), cell, 1, 1, np.full(1, len(points), np.int32))
-    low, high = points[chosen].min(axis=0), points[chosen].max(axis=0)
+    x, y = np.ascontiguousarray(points[::stride].T)
+    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     origin = low - margin * cell
     size = np.floor((high - origin) / cell) + margin + 1
     if not size[0] * size[1] <= _MAX_CELLS:
         raise DataError(f"points spread over {high - low} m need too many cells of {cell} m; filter outliers first")
     width, height = int(size[0]), int(size[1])
-    column, row = ((points[chosen] - origin) / cell).astype(np.int64).T
-    base = row * width + column
+    base = ((y - origin[1]) / cell).astype(np.int64) * width + ((x - origin[0]) / cell).astype(np.int64)
     table = np.full(width * height, len(points), np.int32)
     table[base] = chosen
     last = table[base] == chosen

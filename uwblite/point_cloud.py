@@ -241,11 +241,11 @@ def make_cloud(
     straight = lines.linearity >= min_linearity
     normals = np.where(straight[:, None], lines.normals, 0.0)
     if viewpoints is not None:
-        towards = ((viewpoints - points) * normals).sum(axis=1)
+        towards = _along(viewpoints - points, normals)
         normals = np.where(towards[:, None] < 0.0, -normals, normals)
     surface = np.zeros((7, len(points) + 1))
     surface[:2, :-1] = normals.T
-    surface[2, :-1] = (normals * lines.centers).sum(axis=1)
+    surface[2, :-1] = _along(lines.centers, normals)
     surface[3:5, :-1] = lines.centers.T
     surface[3:5, -1] = _NOWHERE
     surface[5, :-1] = np.where(straight, lines.normal_variance, 0.0)
@@ -253,3 +253,8 @@ def make_cloud(
     return PointCloud(
         points, tree, lines.centers, normals, lines.linearity, lines.neighbours, viewpoints is not None, surface
     )
+
+
+def _along(vectors: Floats, normals: Floats) -> Floats:
+    """Return the parts (n,) of vectors (n, 2) along normals (n, 2)."""
+    return vectors[:, 0] * normals[:, 0] + vectors[:, 1] * normals[:, 1]
