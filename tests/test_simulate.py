@@ -214,7 +214,7 @@ def test_a_lying_anchor_lies_for_its_stretch_only():
 
 
 def test_same_seed_same_bytes_and_parts_do_not_disturb_each_other(room):
-    first, second = (logfile.log_text(simulate(SHORT)) for _ in range(2))
+    first, second = (b"".join(logfile.log_lines(simulate(SHORT))) for _ in range(2))
     assert first == second
     other = simulate(replace(SHORT, seed=4))
     assert not np.allclose(other.truth[-1], simulate(SHORT).truth[-1])

@@ -2,7 +2,8 @@
 
 import gzip
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +18,16 @@ Floats = NDArray[np.float64]
 def write(recording: Recording, directory: Path, compress: bool = False) -> None:
     """Write run.log(.gz) and the truth files."""
     directory.mkdir(parents=True, exist_ok=True)
-    text = log_text(recording)
-    if compress:
-        (directory / "run.log.gz").write_bytes(gzip.compress(text, 6, mtime=0))
-    else:
-        (directory / "run.log").write_bytes(text)
+    with (directory / ("run.log.gz" if compress else "run.log")).open("wb") as file:
+        if compress:
+            with gzip.GzipFile("", "wb", 6, file, mtime=0) as packed:
+                packed.writelines(log_lines(recording))
+        else:
+            file.writelines(log_lines(recording))
     plan, truth = recording.plan, recording.truth
     half = 0.5 * truth[:, 2]
     rows = np.column_stack([recording.stamps, truth[:, :2], np.sin(half), np.cos(half)])
-    _lines(directory / "truth.tum", "", (f"{t:.6f} {x:.5f} {y:.5f} 0 0 0 {z:.8f} {w:.8f}" for t, x, y, z, w in rows.tolist()))
+    _lines(directory / "truth.tum", "", (f"{t:.6f} {x:.5f} {y:.5f} 0 0 0 {z:.8f} {w:.8f}" for t, x, y, z, w in rows))
     anchors = zip(ANCHOR_IDS, recording.anchors.tolist(), strict=False)
     height = recording.settings.anchor_height
     _lines(directory / "truth_anchors.csv", "id,x,y,height", (f"{i},{x:.4f},{y:.4f},{height:.3f}" for i, (x, y) in anchors))
@@ -44,11 +46,12 @@ def _column_rows(plan: FloorPlan) -> list[str]:
 
 
 def _lines(path: Path, header: str, rows: Iterable[str]) -> None:
-    path.write_text("".join(line + "\n" for line in ([header] if header else []) + list(rows)))
+    with path.open("w") as file:
+        file.writelines(line + "\n" for line in chain([header] if header else [], rows))
 
 
-def log_text(recording: Recording) -> bytes:
-    """Return the recording as a CARMEN log, in the order in which a logger would have written it."""
+def log_lines(recording: Recording) -> Iterator[bytes]:
+    """Yield the lines of the recording as a CARMEN log, in the order in which a logger would have written them."""
     settings = recording.settings
     params = {
         "laser_time_increment": f"{settings.laser.time_increment:.8f}",
@@ -57,28 +60,31 @@ def log_text(recording: Recording) -> bytes:
     }
     if settings.tell_heights:
         params |= {"uwb_tag_height": f"{settings.tag_height:.3f}", "uwb_anchor_height": f"{settings.anchor_height:.3f}"}
-    lines = [b"# CARMEN Logfile\n", f"# simulated {settings.world}, seed {settings.seed}\n".encode()]
-    lines += [f"PARAM {name} {value} 0 sim 0\n".encode() for name, value in params.items()]
+    yield b"# CARMEN Logfile\n"
+    yield f"# simulated {settings.world}, seed {settings.seed}\n".encode()
+    yield from (f"PARAM {name} {value} 0 sim 0\n".encode() for name, value in params.items())
     # A logger writes what has arrived: a scan after its sweep, a range after its slot. Stamps therefore run out of order.
     written = np.concatenate([recording.stamps + 0.002, recording.scan_stamps + 0.102, recording.range_stamps + 0.03])
-    messages = _odometry_lines(recording) + _scan_lines(recording) + _range_lines(recording)
-    lines += [messages[i] for i in np.argsort(written, kind="stable")]
-    return b"".join(lines)
+    # The messages of one sensor come in their own order; each is made when its turn comes, for scans of hours are large.
+    kinds = (_odometry_lines(recording), _scan_lines(recording), _range_lines(recording))
+    kind = np.repeat(np.arange(3), [len(recording.stamps), len(recording.scan_stamps), len(recording.range_stamps)])
+    yield from (next(kinds[k]) for k in kind[np.argsort(written, kind="stable")].tolist())
 
 
 def _wrap(theta: Floats) -> Floats:
     return (theta + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def _odometry_lines(r: Recording) -> list[bytes]:
+def _odometry_lines(r: Recording) -> Iterator[bytes]:
     t, pose = r.stamps, r.odometry
     step = np.diff(pose, axis=0, append=pose[-1:]) * r.settings.odometry_rate
     forward = step[:, 0] * np.cos(pose[:, 2]) + step[:, 1] * np.sin(pose[:, 2])
-    rows = np.column_stack([pose[:, :2], _wrap(pose[:, 2]), forward, step[:, 2], t, t + 0.002]).tolist()
-    return [f"ODOM {x:.6f} {y:.6f} {a:.6f} {v:.4f} {w:.4f} 0 {s:.6f} sim {u:.6f}\n".encode() for x, y, a, v, w, s, u in rows]
+    rows = np.column_stack([pose[:, :2], _wrap(pose[:, 2]), forward, step[:, 2], t, t + 0.002])
+    for x, y, a, v, w, stamp, written in map(np.ndarray.tolist, rows):
+        yield f"ODOM {x:.6f} {y:.6f} {a:.6f} {v:.4f} {w:.4f} 0 {stamp:.6f} sim {written:.6f}\n".encode()
 
 
-def _scan_lines(r: Recording) -> list[bytes]:
+def _scan_lines(r: Recording) -> Iterator[bytes]:
     model, (mx, my, mt) = r.settings.laser, r.settings.laser_pose
     span = (model.beams - 1) * model.increment
     head = f"ROBOTLASER1 2 {model.angles[0]:.9f} {span:.9f} {model.increment:.9f} {model.max_range:.3f} 0.01 0 {model.beams} "
@@ -89,14 +95,11 @@ def _scan_lines(r: Recording) -> list[bytes]:
         [x + c * mx - s * my, y + s * mx + c * my, _wrap(r.scan_poses[:, 2] + mt), x, y, _wrap(r.scan_poses[:, 2])]
     )
     start = head.encode()
-    return [
-        start
-        + words[scan].tobytes()
-        + ("0 " + " ".join(f"{v:.6f}" for v in pose) + f" 0 0 0 0 0 {t:.6f} sim {t + 0.102:.6f}\n").encode()
-        for scan, pose, t in zip(r.scans, where.tolist(), r.scan_stamps.tolist(), strict=True)
-    ]
+    for scan, pose, t in zip(r.scans, map(np.ndarray.tolist, where), r.scan_stamps.tolist(), strict=True):
+        end = "0 " + " ".join(f"{v:.6f}" for v in pose) + f" 0 0 0 0 0 {t:.6f} sim {t + 0.102:.6f}\n"
+        yield start + words[scan].tobytes() + end.encode()
 
 
-def _range_lines(r: Recording) -> list[bytes]:
+def _range_lines(r: Recording) -> Iterator[bytes]:
     rows = zip(r.range_anchors.tolist(), r.ranges.tolist(), r.range_stamps.tolist(), strict=True)
-    return [f"UWB {ANCHOR_IDS[a]} {d:.3f} 100 {t:.6f} sim {t + 0.03:.6f}\n".encode() for a, d, t in rows]
+    return (f"UWB {ANCHOR_IDS[a]} {d:.3f} 100 {t:.6f} sim {t + 0.03:.6f}\n".encode() for a, d, t in rows)

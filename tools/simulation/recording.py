@@ -93,7 +93,7 @@ class Recording:
     """(k,) first ray, on the laser's clock."""
     scan_poses: Floats
     """(k, 3) odometry pose written into the scan."""
-    scans: NDArray[np.int64]
+    scans: NDArray[np.int32]
     """(k, beams) mm."""
     range_stamps: Floats
     """(m,) on the radio's clock."""
@@ -191,18 +191,18 @@ def _bodies(crowd: list[drive.Motion], times: Floats, robot: Floats) -> Floats:
 
 def _scan(
     settings: Settings, plan: FloorPlan, motion: drive.Motion, crowd: list[drive.Motion]
-) -> tuple[Floats, NDArray[np.int64]]:
+) -> tuple[Floats, NDArray[np.int32]]:
     """Return stamps (k,) on the odometry's clock and ranges (k, beams), mm."""
     model = settings.laser
     if "laser" in settings.without:
-        return np.empty(0), np.empty((0, model.beams), dtype=np.int64)
+        return np.empty(0), np.empty((0, model.beams), dtype=np.int32)
     rng = _rng(settings, 5)
     every = max(1, round(10.0 / settings.scan_rate))
     stamps = np.round(np.arange(0.037, motion.stamps[-1] - 0.1, 0.1 * every), 6)
     mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
     angles = mounting[2] + (-model.angles if settings.laser_flipped else model.angles)
     colour = model.surface_sd * rng.standard_normal(len(plan.walls) + len(plan.columns) + len(crowd))
-    out = np.empty((len(stamps), model.beams), dtype=np.int64)
+    out = np.empty((len(stamps), model.beams), dtype=np.int32)
     for first in range(0, len(stamps), _CHUNK):
         chunk = stamps[first : first + _CHUNK]
         times = (chunk[:, None] + model.time_increment * np.arange(model.beams)).ravel()
