@@ -23,8 +23,8 @@ FLOORS = (
     ("graph", "pose_edges", "range_edges", "landmark_edges"),
     ("point_cloud", "nearest", "bresenham", "grid_geometry", "scan_rays", "ray_counter", "drawing"),
     ("evaluate", "occupancy_grid", "keyframes", "range_noise", "range_mixture", "anchors", "scan_search", "free_space"),
-    ("factorization", "layouts", "selected_inverse", "two_level"),
-    ("calibration", "clouds", "line_factor", "linear", "measurement", "map_result", "map_picture", "graph_starts"),
+    ("factorization", "layouts", "selected_inverse", "two_level", "unknowns"),
+    ("calibration", "clouds", "line_factor", "normal_equations", "measurement", "map_result", "map_picture", "graph_starts"),
     ("distance_edges", "constraints", "constraint_edges", "turning", "drivers/*"),
     # stages
     ("solver", "marginals", "evidence", "gnc", "icp", "pair_matching", "submaps", "pair_alignment", "sight", "closures"),

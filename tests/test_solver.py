@@ -9,10 +9,11 @@ from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
 from uwblite.graph import Calibration, Graph, PriorEdges
 from uwblite.io.g2o import read_g2o
-from uwblite.linear import NormalEquations, moved, moved_along
+from uwblite.normal_equations import NormalEquations
 from uwblite.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.robust import Kernel
 from uwblite.solver import SolverConfig, edge_weights, linearize, optimize
+from uwblite.unknowns import moved, moved_along
 
 OPTIMA = {
     "efpno_input_M3500_original": 137.912951,

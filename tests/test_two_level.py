@@ -7,7 +7,7 @@ from planted_graphs import dense_system, relative_edges
 from uwblite import se2
 from uwblite.errors import SolverError
 from uwblite.graph import Graph
-from uwblite.linear import NormalEquations
+from uwblite.normal_equations import NormalEquations
 from uwblite.solver import linearize, optimize
 from uwblite.two_level import TwoLevelFactor
 

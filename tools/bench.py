@@ -97,7 +97,7 @@ def bench_stages(repeats: int) -> None:
     """Time the stages of one iteration."""
     import numpy as np
 
-    from uwblite.linear import NormalEquations
+    from uwblite.normal_equations import NormalEquations
     from uwblite.solver import linearize
 
     head("Stages of the optimiser, ms", "graph", "analyse (once)", "linearise", "fill", "factorise", "solve")

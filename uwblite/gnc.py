@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .errors import ConfigError
 from .graph import Edges, Graph, Linearization
-from .linear import NormalEquations
+from .normal_equations import NormalEquations
 from .robust import SQUARED
 from .solver import Progress, SolverConfig, SolverSummary, check, linearize, minimise
 

@@ -24,10 +24,10 @@ from . import se2
 from .anchors import AnchorConfig, ambiguous, locate
 from .errors import ConfigError
 from .graph import Edges, Graph, PriorEdges, pick_rows
-from .linear import free_unknowns
 from .range_edges import RangeEdges
 from .robust import Kernel
 from .solver import Progress, SolverConfig, SolverSummary, check, optimize
+from .unknowns import free_unknowns
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import SuperLU
 from . import se2
 from .errors import SolverError
 from .graph import Graph
-from .linear import NormalEquations
+from .normal_equations import NormalEquations
 from .selected_inverse import selected_inverse
 from .solver import edge_weights, linearize
 

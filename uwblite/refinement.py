@@ -16,7 +16,7 @@ from . import se2
 from .calibration import scan_indices
 from .clouds import Clouds
 from .graph import Graph
-from .linear import NormalEquations
+from .normal_equations import NormalEquations
 from .pair_matching import CloudRasters, PairFactors, match, measured, pair_points
 from .pose_edges import ScanEdges
 from .robust import Kernel

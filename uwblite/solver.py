@@ -40,7 +40,8 @@ from numpy.typing import NDArray
 from .errors import ConfigError, SolverError
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost
-from .linear import NormalEquations, Unknowns, free_unknowns, moved, moved_along
+from .normal_equations import NormalEquations
+from .unknowns import Unknowns, free_unknowns, moved, moved_along
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
