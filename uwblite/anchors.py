@@ -73,9 +73,10 @@ def locate(path: Floats, ranges: Floats, config: AnchorConfig, drift: float = 0.
     pick = np.unique(np.linspace(0, len(ranges) - 1, config.samples).astype(np.int64))
     path, ranges = path[pick], ranges[pick]
     starts, step = _raster_search(path, ranges, config)
-    refined = [_refine(path, ranges, start, step, drift, config) for start in starts]
-    floor = max(min(fit[3] for fit in refined), 0.5 * drift, 0.02)
-    scored = sorted((_score(path, ranges, fit, floor, config) for fit in refined), key=lambda h: h.cost)
+    states, covariances, sigmas = _refine(path, ranges, starts, step, drift, config)
+    floor = max(float(sigmas.min()), 0.5 * drift, 0.02)
+    fits = zip(states, covariances, sigmas.tolist(), strict=True)
+    scored = sorted((_score(path, ranges, *fit, floor, config) for fit in fits), key=lambda h: h.cost)
     distinct: list[AnchorHypothesis] = []
     for hypothesis in scored:
         apart = [np.hypot(*(hypothesis.position - other.position)) for other in distinct]
@@ -122,40 +123,46 @@ def _raster_search(path: Floats, ranges: Floats, config: AnchorConfig) -> tuple[
 
 
 def _refine(
-    path: Floats, ranges: Floats, start: Floats, step: float, drift: float, config: AnchorConfig
-) -> tuple[Floats, float, Floats, float]:
-    """Return position, bias, covariance (3, 3) for unit sigma and robust sigma after Gauss-Newton with a shrinking kernel."""
-    state = np.array([*start, 0.0])
-    scale = 1.5 * step
-    normal = np.eye(3)
-    error = np.zeros_like(ranges)
+    path: Floats, ranges: Floats, starts: Floats, step: float, drift: float, config: AnchorConfig
+) -> tuple[Floats, Floats, Floats]:
+    """Refine starts (s, 2) by Gauss-Newton with a shrinking kernel.
+
+    Returns
+    -------
+    Position and bias (s, 3), their covariances (s, 3, 3) for unit sigma, and robust sigmas (s,).
+    """
+    count = len(starts)
+    state = np.concatenate([starts, np.zeros((count, 1))], axis=1)
+    scale, normal = np.full(count, 1.5 * step), np.tile(np.eye(3), (count, 1, 1))
+    robust, on = np.zeros(count), np.arange(count)
     for _ in range(25):
-        offset = state[:2] - path
-        distance = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
-        error = ranges - distance - state[2]
-        weight = 1.0 / (1.0 + (error / scale) ** 2) ** 2
-        jacobian = np.concatenate([offset / distance[:, None], np.ones((len(ranges), 1))], axis=1)
-        normal = (jacobian * weight[:, None]).T @ jacobian
-        gradient = jacobian.T @ (weight * error)
-        prior = (scale / config.bias_sigma) ** 2
-        normal[2, 2] += prior
-        gradient[2] -= prior * state[2]
-        normal += 1e-3 * np.diag(np.diag(normal)) + 1e-9 * np.eye(3)
-        delta = np.linalg.solve(normal, gradient)
-        state = state + delta * min(1.0, 2.0 * step / max(np.hypot(delta[0], delta[1]), 1e-12))
-        robust = 1.4826 * float(np.median(np.abs(error)))
-        tight = max(2.0 * robust, drift, 0.05)
-        if scale <= tight * 1.01 and np.abs(delta).max() < 1e-3:
+        dx, dy = (state[on, k, None] - path[:, k] for k in (0, 1))
+        distance = np.maximum(np.hypot(dx, dy), 1e-6)
+        error = ranges - distance - state[on, 2:]
+        weight = 1.0 / (1.0 + (error / scale[on, None]) ** 2) ** 2
+        jacobian = np.stack([dx / distance, dy / distance, np.ones_like(dx)], axis=1)
+        equations = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
+        gradient = np.einsum("skm,sm->sk", jacobian, weight * error)
+        prior = (scale[on] / config.bias_sigma) ** 2
+        equations[:, 2, 2] += prior
+        gradient[:, 2] -= prior * state[on, 2]
+        equations += 1e-3 * equations * np.eye(3) + 1e-9 * np.eye(3)
+        delta = np.linalg.solve(equations, gradient[:, :, None])[:, :, 0]
+        state[on] += delta * np.minimum(1.0, 2.0 * step / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), 1e-12))[:, None]
+        normal[on], robust[on] = equations, 1.4826 * np.median(np.abs(error), axis=1)
+        tight = np.maximum(2.0 * robust[on], max(drift, 0.05))
+        done = (scale[on] <= tight * 1.01) & (np.abs(delta).max(axis=1) < 1e-3)
+        scale[on] = np.maximum(0.7 * scale[on], tight)
+        on = on[~done]
+        if not len(on):
             break
-        scale = max(0.7 * scale, tight)
-    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    return state[:2], float(state[2]), covariance, max(1.4826 * float(np.median(np.abs(error))), 1e-3)
+    return state, np.asarray(np.linalg.inv(normal), dtype=np.float64), np.maximum(robust, 1e-3)
 
 
 def _score(
-    path: Floats, ranges: Floats, fit: tuple[Floats, float, Floats, float], sigma: float, config: AnchorConfig
+    path: Floats, ranges: Floats, state: Floats, covariance: Floats, own: float, sigma: float, config: AnchorConfig
 ) -> AnchorHypothesis:
-    position, bias, covariance, own = fit
+    position, bias = state[:2], float(state[2])
     error = ranges - np.hypot(*(position - path).T) - bias
     cost = float(np.minimum((error / sigma) ** 2, config.outlier**2).mean()) + (bias / config.bias_sigma) ** 2 / len(ranges)
     spread = own * float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))

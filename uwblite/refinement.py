@@ -72,8 +72,9 @@ class RefinementConfig:
     """Standard deviation of a point-to-line distance before it is learnt, m."""
     correlation: float = 4.0
     """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
-    settled: float = 0.0007
-    """Rounds end early when the poses move by less than this (root mean square) at the last gate, m."""
+    settled: float = 0.0002
+    """Rounds end early when clouds move by less than this (root mean square) in the frames of their partners, at the last
+    gate, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +94,7 @@ class Refined:
     """Learnt standard deviation of a point-to-line distance, m."""
     rounds: int
     moved: float
-    """Root mean square move of the poses in the last round, m."""
+    """Root mean square move of clouds in the frames of their partners in the last round, m."""
     summary: SolverSummary
 
 
@@ -194,9 +195,10 @@ def refine(
     empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names, delay)
     probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j], kernel=Kernel("cauchy", 5.0))
     normal: NormalEquations | None = None
-    brief = replace(solver, max_iterations=3, relative_decrease=1e-3)
+    # The next round looks all matches up anew: one good step is enough.
+    brief = replace(solver, max_iterations=3, relative_decrease=0.5)
+    T_i_j = probe.relative(graph)
     while True:
-        T_i_j = probe.relative(graph)
         factors = match(clouds, raster, i, T_i_j, points, gate, max(gate / 3.0, 2.5 * sigma))
         used = (factors.matched >= config.min_matches) & (factors.matched >= config.min_share * factors.asked)
         if used.any() and gate < 0.25:
@@ -212,8 +214,9 @@ def refine(
         check(problem)
         normal = normal or NormalEquations(problem, linearize(problem))
         solved, summary = minimise(problem, linearize(problem), normal, brief)
-        moved = float(np.sqrt(np.mean(np.sum((solved.poses - graph.poses)[:, :2] ** 2, axis=1))))
         graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
+        before, T_i_j = T_i_j, probe.relative(graph)
+        moved = float(np.sqrt(np.mean(np.sum((T_i_j - before)[used, :2] ** 2, axis=1)))) if used.any() else 0.0
         rounds += 1
         if on_round is not None:
             on_round(rounds, config.rounds)
