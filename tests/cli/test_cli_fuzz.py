@@ -4,38 +4,12 @@ import gzip
 
 import numpy as np
 import pytest
+from small_files import ANCHORS, G2O, KNOWN, LOG, PYFG, SETTINGS
 
 from uwblite.cli import main
 
 pytestmark = pytest.mark.slow
 
-RECORDING = b"""PARAM uwb_tag_height 0.3 0 h 0
-ODOM 0 0 0 0 0 0 0.0 h 0
-ODOM 0.5 0 0.1 0 0 0 1.0 h 1
-UWB 5C0B 3.2 100 1.1 h 1.1
-ROBOTLASER1 2 -1.5 3.0 1.0 5.6 0.01 0 4 1.0 2.0 5.6 0.01 0 0.6 0 0 0.5 0 0.1 0 0 0 0 0 1.5 h 1.5
-ODOM 1.0 0.1 0.3 0 0 0 2.0 h 2
-UWB 5C0B 3.0 100 2.1 h 2.1
-FLASER 3 1 2 3 1 0.1 0.3 1 0.1 0.3 2.5 h 2.5
-ODOM 1.5 0.3 0.5 0 0 0 3.0 h 3
-"""
-GRAPH = b"""VERTEX_SE2 0 0 0 0
-VERTEX_SE2 1 1.1 0 0
-VERTEX_XY 7 3 3
-FIX 0
-EDGE_SE2 0 1 1 0 0 100 0 0 100 0 100
-EDGE_SE2_XY 1 7 2 3 10 0 10
-EDGE_RANGE_SE2_XY 0 7 4.2 25
-"""
-PYFG = b"""VERTEX_SE2 0 A0 0 0 0
-VERTEX_SE2 1 A1 1.1 0 0
-VERTEX_XY L0 3 3
-EDGE_SE2 0 A0 A1 1 0 0 0.01 0 0 0.01 0 0.01
-EDGE_RANGE 0 A0 L0 4.2 0.01
-"""
-SETTINGS = b'use_uwb = true\n[grid]\nresolution = 0.05\n[keyframes]\ndistance = 0.3\nangle = 0.35\n'
-KNOWN = b'[[anchor]]\nid = "5C0B"\nposition = [1, 2]\n[[pose]]\nstamp = 1\npose = [0, 0, 0]\n'
-ANCHORS = b"id,x,y,sigma_x,sigma_y,status\n5C0B,1,2,0.1,0.1,ok\n91A3,3,4,,,ok\n"
 ODDITIES = (*b"nan inf -inf 1e400 1e20 -1 0 999999999999999999999 ../../x".split(), b"", b"\0", b"\xff\xfe", b'"', b"[", b"=")
 
 
@@ -66,10 +40,10 @@ def mutations(whole, count, seed):
 
 
 CASES = {
-    "check": (RECORDING, "x.log", ["check", "{file}"]),
-    "map": (RECORDING, "x.log", ["map", "{file}", "--out", "{out}/map", "--force"]),
-    "convert": (RECORDING, "x.log", ["convert", "{file}", "{out}/y.log", "--force"]),
-    "g2o": (GRAPH, "x.g2o", ["optimize", "{file}", "--out", "{out}/y.pyfg", "--force"]),
+    "check": (LOG, "x.log", ["check", "{file}"]),
+    "map": (LOG, "x.log", ["map", "{file}", "--out", "{out}/map", "--force"]),
+    "convert": (LOG, "x.log", ["convert", "{file}", "{out}/y.log", "--force"]),
+    "g2o": (G2O, "x.g2o", ["optimize", "{file}", "--out", "{out}/y.pyfg", "--force"]),
     "pyfg": (PYFG, "x.pyfg", ["optimize", "{file}", "--out", "{out}/y.g2o", "--from-odometry", "--force"]),
     "settings": (SETTINGS, "x.toml", ["config", "--config", "{file}"]),
     "constraints": (KNOWN, "x.toml", ["map", "{log}", "--out", "{out}/map", "--force", "--constraints", "{file}"]),
@@ -81,7 +55,7 @@ CASES = {
 def test_a_damaged_file_is_at_worst_one_clear_line(case, tmp_path, capsys):
     whole, name, words = CASES[case]
     (tmp_path / "out").mkdir()
-    (tmp_path / "good.log").write_bytes(RECORDING)
+    (tmp_path / "good.log").write_bytes(LOG)
     names = {"file": str(tmp_path / name), "out": str(tmp_path / "out"), "log": str(tmp_path / "good.log")}
     for number, data in enumerate(mutations(whole, 150, seed=len(case))):
         (tmp_path / name).write_bytes(data)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from results import small_log, small_result
+from small_files import G2O, KNOWN, LOG, MAPPING, PYFG, SETTINGS, TABLE, TORO, TUM
 
 from uwblite.config import merge, parse_toml
 from uwblite.errors import UwbliteError
@@ -72,62 +73,6 @@ def damaged(whole, edits):
                 lines[k], lines[j] = lines[j], lines[k]
             whole = b"\n".join(lines)
     return whole
-
-
-LOG = b"""PARAM uwb_tag_height 0.3 0 h 0
-PARAM robot_front_laser_max 5.6 0 h 0
-ODOM 0 0 0 0 0 0 0.0 h 0
-UWB 5C0B 3.2 100 1.1 h 1.1
-ROBOTLASER1 2 -1.5 3.0 1.0 5.6 0.01 0 4 1.0 2.0 5.6 0.01 0 0.6 0 0 0.5 0 0.1 0 0 0 0 0 1.5 h 1.5
-RAWLASER1 0 -1.5 3 1 5.6 0.01 0 3 1 2 3 0 1.8 h 1.8
-ODOM 1.0 0.1 0.3 0 0 0 2.0 h 2
-FLASER 3 1 2 3 1 0.1 0.3 1 0.1 0.3 2.5 h 2.5
-"""
-G2O = b"""VERTEX_SE2 0 0 0 0
-VERTEX_SE2 1 1.1 0 0
-VERTEX_XY 7 3 3
-FIX 0
-EDGE_SE2 0 1 1 0 0 100 0 0 100 0 100
-EDGE_SE2_XY 1 7 2 3 10 0 10
-EDGE_RANGE_SE2_XY 0 7 4.2 25
-EDGE_PRIOR_SE2 0 0 0 0 1 0 0 1 0 1
-"""
-TORO = b"VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 100 0 100 100 0 0\n"
-PYFG = b"""VERTEX_SE2 0 A0 0 0 0
-VERTEX_SE2 1 A1 1.1 0 0
-VERTEX_XY L0 3 3
-VERTEX_SE2:PRIOR 0 A0 0 0 0 0.01 0 0 0.01 0 0.01
-EDGE_SE2 0 A0 A1 1 0 0 0.01 0 0 0.01 0 0.01
-EDGE_RANGE 0 A0 L0 4.2 0.01
-"""
-TUM = b"# stamp x y z qx qy qz qw\n1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0.1 0.995\n3 2 0 0 0 0 0 1\n"
-SETTINGS = b'use_uwb = true\ncrop = [0, 0, 1, 1]\nalign = "walls"\n[grid]\nresolution = 0.05\n[keyframes]\ndistance = 0.3\n'
-KNOWN = b"""[[anchor]]
-id = "5C0B"
-position = [1, 2]
-[[pose]]
-stamp = 1
-pose = [0, 0, 0]
-[[landmark]]
-name = "a"
-position = [1.0, 2.0]
-radius = 0.3
-[[landmark_distance]]
-landmarks = ["a", "b"]
-distance = 3.0
-[[forbidden_closure]]
-stamps = [1, 2]
-recordings = [1, 2]
-"""
-MAPPING = b'''[[uwb]]
-topic = "/r/*"
-readings = "ranges"
-anchor = "id"
-unit = 0.001
-anchor_format = "{:04X}"
-only = { tag = 3 }
-'''
-TABLE = b'name,x,y,radius,neighbours\nC1,2.1,1.7,0.15,"C2 C3"\n# remark\nC2,4.9,2.4,0.2,\n'
 
 
 def from_text(parse):
