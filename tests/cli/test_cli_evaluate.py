@@ -113,8 +113,8 @@ def test_errors_are_one_line(result, capsys):
     root, words = result
     assert main(["evaluate", str(root / "nowhere"), "--truth", str(root / "truth.tum")]) == 1
     assert "trajectory.tum" in capsys.readouterr().err
-    assert main([*words, "--delta", "-1"]) == 1
-    assert "--delta must be positive" in capsys.readouterr().err
+    assert main([*words, "--delta", "-1"]) == 2
+    assert "above 0" in capsys.readouterr().err
     (root / "anchors.csv").write_text("name,x,y\nA,1,2\n")
     assert main([*words, "--anchors", str(root / "anchors.csv")]) == 1
     assert "no column 'id'" in capsys.readouterr().err

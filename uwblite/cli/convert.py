@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ..errors import ConfigError
-from .options import add_mounting_arguments
+from .options import add_mounting_arguments, number
 
 if TYPE_CHECKING:
     from ..sensor_log import SensorLog
@@ -40,12 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     bag.add_argument("--uwb-mapping", metavar="FILE.toml", help="where ranges stand in messages, see docs/formats.md")
     bag.add_argument("--base-frame", metavar="FRAME", default="", help="frame of the robot (the odometry's child frame)")
     part = parser.add_argument_group("part and units")
-    part.add_argument("--start", metavar="S", type=float, help="leave out what is earlier, s after the first odometry")
-    part.add_argument("--end", metavar="S", type=float, help="leave out what is later, s after the first odometry")
-    part.add_argument("--odometry-unit", metavar="M", type=float, default=1.0, help="metres per unit of the odometry (1)")
-    part.add_argument("--angle-unit", metavar="RAD", type=float, default=1.0, help="radians per unit of its heading (1)")
-    part.add_argument("--range-unit", metavar="M", type=float, default=1.0, help="metres per unit of the ranges (1)")
-    part.add_argument("--laser-unit", metavar="M", type=float, default=1.0, help="metres per unit of the laser (1)")
+    unit = number(above=0)
+    part.add_argument("--start", metavar="S", type=number(), help="leave out what is earlier, s after the first odometry")
+    part.add_argument("--end", metavar="S", type=number(), help="leave out what is later, s after the first odometry")
+    part.add_argument("--odometry-unit", metavar="M", type=unit, default=1.0, help="metres per unit of the odometry (1)")
+    part.add_argument("--angle-unit", metavar="RAD", type=unit, default=1.0, help="radians per unit of its heading (1)")
+    part.add_argument("--range-unit", metavar="M", type=unit, default=1.0, help="metres per unit of the ranges (1)")
+    part.add_argument("--laser-unit", metavar="M", type=unit, default=1.0, help="metres per unit of the laser (1)")
     add_mounting_arguments(parser)
 
 

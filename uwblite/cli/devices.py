@@ -50,10 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Look at the ports and report."""
-    from ..drivers.transport import plugged_in
+    from ..drivers.transport import check_url, plugged_in
     from ..errors import DeviceError
 
     sights = []
+    for path in args.ports:
+        check_url(path)
     if args.ports:
         sights = [Sight(path) if args.list else look(path, "", args.pan_id) for path in args.ports]
     else:

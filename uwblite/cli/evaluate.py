@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .options import number
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -44,21 +46,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("dir", help="folder that uwblite map wrote: trajectory.tum, anchors.csv, map.yaml")
     parser.add_argument("--truth", metavar="FILE.tum", required=True, action="append", help="true poses; one per recording")
-    parser.add_argument("--recording", metavar="N", type=_number, help="the recording that a single truth is of (1)")
+    counted, length = number(above=0, whole=True), number(above=0)
+    parser.add_argument("--recording", metavar="N", type=counted, help="the recording that a single truth is of (1)")
     parser.add_argument("--anchors", metavar="FILE.csv", help="true anchors")
     parser.add_argument("--landmarks", metavar="FILE.csv", help="true columns")
     parser.add_argument("--walls", metavar="FILE.csv", help="true walls")
-    parser.add_argument("--delta", type=float, default=1.0, metavar="M", help="m of path per stretch of the RPE (1)")
-    parser.add_argument("--max-gap", type=float, default=1.0, metavar="S", help="leave out truth in longer gaps, s (1)")
-    parser.add_argument("--search-radius", type=float, default=1.0, metavar="M", help="m around a column's place (1)")
-    parser.add_argument("--tolerance", type=float, default=0.1, metavar="M", help="m from a wall that count as on it (0.1)")
+    parser.add_argument("--delta", type=length, default=1.0, metavar="M", help="m of path per stretch of the RPE (1)")
+    parser.add_argument("--max-gap", type=length, default=1.0, metavar="S", help="leave out truth in longer gaps, s (1)")
+    parser.add_argument("--search-radius", type=length, default=1.0, metavar="M", help="m around a column's place (1)")
+    parser.add_argument("--tolerance", type=length, default=0.1, metavar="M", help="m from a wall that count as on it (0.1)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
-
-
-def _number(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
-    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -68,9 +65,6 @@ def run(args: argparse.Namespace) -> int:
 
     if args.recording and len(args.truth) > 1:
         raise ConfigError("--recording is for a single --truth; several are of recording 1, 2, ...")
-    for name in ("delta", "max_gap", "search_radius", "tolerance"):
-        if not getattr(args, name) > 0:
-            raise ConfigError(f"--{name.replace('_', '-')} must be positive, not {getattr(args, name):g}")
     summary, lines = evaluate(args)
     if args.json:
         console.say_json(summary)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from .options import add_mounting_arguments, add_settings_arguments, numbers
+from .options import add_mounting_arguments, add_settings_arguments, number, numbers
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -49,8 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     without = parser.add_argument("--without", action="append", default=[], choices=("uwb", "loops", "lidar"))
     without.help = "leave out a sensor or the loop closures, to see what they give; repeatable"
     text = "read every n-th laser scan only; the others take neither time nor memory (1)"
-    parser.add_argument("--every-nth-scan", metavar="N", type=_count, default=1, help=text)
-    parser.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes for the heavy stages (1)")
+    counted = number(above=0, whole=True)
+    parser.add_argument("--every-nth-scan", metavar="N", type=counted, default=1, help=text)
+    parser.add_argument("--jobs", metavar="N", type=counted, default=1, help="processes for the heavy stages (1)")
     output = parser.add_argument_group("map")
     output.add_argument("--resolution", metavar="M", type=float, help="edge of a cell, m: short for --set grid.resolution=M")
     align = "where the axes lie: odometry (default), first-pose, walls (along x and y), anchors; short for --set align=HOW"
@@ -67,12 +68,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     beforehand.add_argument("--anchors-from", metavar="FILE.csv", help=text)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
-
-
-def _count(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
-    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -3,6 +3,8 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from .options import number
+
 if TYPE_CHECKING:
     from ..graph import Graph
     from ..io.graph_file import GraphFile
@@ -27,7 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trajectory", metavar="FILE", help="poses as a TUM trajectory, as evo reads it")
     parser.add_argument("--from-odometry", action="store_true", help="forget the file's estimates, start from the odometry")
     parser.add_argument("--kernel", metavar="NAME", default="none", help="robust kernel on edges that close loops, and ranges")
-    parser.add_argument("--kernel-scale", metavar="K", type=float, default=2.0, help="standard deviations where it bends (2)")
+    bend = "standard deviations where it bends (2)"
+    parser.add_argument("--kernel-scale", metavar="K", type=number(above=0), default=2.0, help=bend)
     setting = "solver setting, e.g. max_iterations=200; repeatable"
     parser.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=setting)
     parser.add_argument("--force", action="store_true", help="replace files that are already there")

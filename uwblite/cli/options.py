@@ -1,8 +1,9 @@
-"""Options that several verbs share: the settings of the mapper, and how the sensors are mounted."""
+"""Options that several verbs share: numbers, the settings of the mapper, and how the sensors are mounted."""
 
 import argparse
+import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ..mapping import MappingConfig
@@ -55,15 +56,35 @@ def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
     group.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
     group.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), help="UWB tag on the base, z above the floor: m")
-    group.add_argument("--anchor-height", metavar="H", type=float, help="height of all anchors above the floor, m")
+    group.add_argument("--anchor-height", metavar="H", type=number(), help="height of all anchors above the floor, m")
+
+
+def number(
+    least: float = -math.inf, most: float = math.inf, above: float = -math.inf, whole: bool = False
+) -> Callable[[str], Any]:
+    """Return a reader of a finite number from `least` to `most`, greater than `above`."""
+    wanted = "a whole number" if whole else "a number"
+    if math.isfinite(above):
+        wanted += f" above {above}"
+    elif math.isfinite(least):
+        wanted += f" from {least} to {most}" if math.isfinite(most) else f" of at least {least}"
+
+    def parse(text: str) -> Any:
+        try:
+            value = int(text) if whole else float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and least <= value <= most and value > above):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
+        return value
+
+    return parse
 
 
 def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
     """Return a reader of so many numbers separated by commas."""
 
     def parse(text: str) -> tuple[float, ...]:
-        import math
-
         try:
             values = tuple(float(part) for part in text.split(","))
         except ValueError:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .console import note, say, say_json
+from .options import number, numbers
 
 if TYPE_CHECKING:
     from ..drivers.events import Note, Session
@@ -50,20 +51,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument("--out", metavar="FILE", required=True, help="the log; must not exist unless --append")
     output.add_argument("--append", action="store_true", help="go on with a log that broke off")
     output.add_argument("--rotate", metavar="SIZE", type=_size, default=0, help="begin a new part at this size, e.g. 500M")
-    output.add_argument("--duration", metavar="S", type=float, help="stop after so many seconds")
-    output.add_argument("--sync", metavar="S", type=float, default=1.0, help="s between syncs to the disk (1; 0 = each write)")
+    output.add_argument("--duration", metavar="S", type=number(above=0), help="stop after so many seconds")
+    pause = "s between syncs to the disk (1; 0 = each write)"
+    output.add_argument("--sync", metavar="S", type=number(least=0), default=1.0, help=pause)
     output.add_argument("--json", action="store_true", help="summary as one JSON object on stdout")
     laser = parser.add_argument_group("lidar")
     laser.add_argument("--lidar-steps", metavar="A:B", type=_steps, help="first and last step, e.g. 128:640 (all: 44:725)")
-    laser.add_argument("--lidar-cluster", metavar="N", type=int, default=1, help="steps merged into one reading (1)")
-    laser.add_argument("--lidar-skip", metavar="N", type=int, default=0, help="scans left out between two (0)")
+    merged, skipped = number(1, 99, whole=True), number(0, 9, whole=True)
+    laser.add_argument("--lidar-cluster", metavar="N", type=merged, default=1, help="steps merged into one reading (1)")
+    laser.add_argument("--lidar-skip", metavar="N", type=skipped, default=0, help="scans left out between two (0)")
     laser.add_argument("--lidar-narrow", action="store_true", help="2-character readings up to 4.095 m, for slow RS-232")
-    laser.add_argument("--lidar-baud", metavar="N", type=int, default=115200, help="bit/s to try first on RS-232 (115200)")
+    speed = number(1200, 4_000_000, whole=True)
+    laser.add_argument("--lidar-baud", metavar="N", type=speed, default=115200, help="bit/s to try first on RS-232 (115200)")
     mounting = parser.add_argument_group("mounting, for the log")
-    mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=_three, help="laser on the base: m, m, rad")
+    mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
     mounting.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
-    mounting.add_argument("--tag", metavar="X,Y,Z", type=_three, help="UWB tag on the base, z above the floor: m")
-    mounting.add_argument("--anchor-height", metavar="H", type=float, help="height of the anchors above the floor, m")
+    mounting.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), help="UWB tag on the base, z above the floor: m")
+    mounting.add_argument("--anchor-height", metavar="H", type=number(), help="height of the anchors above the floor, m")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
     from ..drivers.link import Mounting
     from ..drivers.log_file import LogFile, last_state
     from ..drivers.recorder import Recorder
+    from ..drivers.transport import check_url
 
     if not (args.uwb or args.lidar or args.odometry):
         note("uwblite: error: name at least one of --uwb, --lidar, --odometry; `uwblite devices` lists what is there")
@@ -90,6 +95,8 @@ def run(args: argparse.Namespace) -> int:
             remark += f"; this computer's clock is {last - time.monotonic() - offset:.0f} s behind the log and was moved"
             offset = last + 1.0 - time.monotonic()
     links = _links(args, pose)
+    for link in links:
+        check_url(link.url)
     log = LogFile(path, append=args.append, rotate=args.rotate, sync=args.sync)
     mounting = Mounting(args.laser_pose or (0.0, 0.0, 0.0), tuple(_mounting_params(args, offset)))
     stopped: list[int] = []
@@ -190,8 +197,8 @@ def odometry_session(spec: str, pose: tuple[float, float, float]) -> tuple["Sess
         url, _, query = rest.partition("?")
         options = dict(parse_qsl(query, keep_blank_values=True))
         baud = options.pop("baud", "115200")
-        if not baud.isdigit():
-            raise ConfigError(f"--odometry: baud={baud!r} is not a number")
+        if not (baud.isascii() and baud.isdigit() and int(baud) > 0):
+            raise ConfigError(f"--odometry: baud={baud!r} is not a number above 0")
         return LineSession(parse_format(options), int(baud), pose), url
     raise ConfigError(f"--odometry {spec}: say kobuki:PORT, or line:PORT?columns=t,x,y,theta")
 
@@ -267,14 +274,6 @@ def _size(text: str) -> int:
 
 def _steps(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d+):(\d+)", text)
-    if not match:
+    if not match or int(match[1]) > int(match[2]):
         raise argparse.ArgumentTypeError(f"{text!r} is not two steps such as 128:640")
     return int(match[1]), int(match[2])
-
-
-def _three(text: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers separated by commas") from None
-    return x, y, z

@@ -7,9 +7,12 @@ There is no standard for what hobby controllers print, so the columns are told: 
 import math
 import re
 from dataclasses import dataclass
+from typing import TypeVar
 
 from ..errors import ConfigError
 from .events import Corrupt, OdometryPose, corrupt
+
+_Number = TypeVar("_Number", int, float)
 
 MAX_LINE = 256
 COLUMNS = ("t", "x", "y", "theta", "left", "right", "speed", "turn_rate", "-")
@@ -70,14 +73,18 @@ def parse_format(options: dict[str, str]) -> LineFormat:
             elif name == "prefix":
                 values[name] = text
             elif name == "tick_modulus":
-                values[name] = int(text)
-            elif name in ("time_unit", "length_unit", "angle_unit", "tick", "wheel_base"):
+                values[name] = _sensible(int(text), 0)
+            elif name in ("time_unit", "tick", "wheel_base"):
+                values[name] = _sensible(float(text), _TINY)
+            elif name in ("length_unit", "angle_unit"):
+                # Below 0 for an axis or a heading that counts the other way.
+                _sensible(abs(float(text)), _TINY)
                 values[name] = float(text)
             else:
                 known = "columns, prefix, time_unit, length_unit, angle_unit, tick, wheel_base, tick_modulus"
                 raise ConfigError(f"odometry line: unknown option {name!r}; known are {known}")
         except ValueError:
-            raise ConfigError(f"odometry line: {name}={text!r} is not a number") from None
+            raise ConfigError(f"odometry line: {name}={text!r} is not a number that makes sense here") from None
     spec = LineFormat(**values)  # type: ignore[arg-type]
     names = [column for column in spec.columns if column != "-"]
     unknown = [column for column in names if column not in COLUMNS]
@@ -89,6 +96,16 @@ def parse_format(options: dict[str, str]) -> LineFormat:
     if ticks and (spec.tick <= 0 or (spec.wheel_base <= 0 and "theta" not in names)):
         raise ConfigError("odometry line: left,right need tick=<m per tick> and wheel_base=<m>")
     return spec
+
+
+def _sensible(value: _Number, least: float) -> _Number:
+    """Return a finite number that is not too small, else raise ValueError."""
+    if not least <= value < math.inf:
+        raise ValueError
+    return value
+
+
+_TINY = 1e-12
 
 
 class OdometryLineProtocol:

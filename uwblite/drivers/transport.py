@@ -9,11 +9,39 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
-from ..errors import DeviceError
+from ..errors import ConfigError, DeviceError
 
 CHUNK = 65536
 BY_ID = Path("/dev/serial/by-id")
+
+
+def check_url(url: str) -> None:
+    """Refuse a port that will never open, plugged in or not; one that may come later passes.
+
+    Raises
+    ------
+    ConfigError : an unknown kind of URL, a socket without host and port, or a path that is no device.
+    """
+    kind, separator, _ = url.partition("://")
+    if not url or (separator and kind not in _KINDS):
+        raise ConfigError(f"{url!r} is no port; say a path such as /dev/ttyACM0, or socket://host:port")
+    if kind == "socket" and separator:
+        try:
+            place = urlsplit(url)
+            complete = bool(place.hostname) and bool(place.port)
+        except ValueError:
+            complete = False
+        if not complete:
+            raise ConfigError(f"{url}: say socket://host:port, the port a number up to 65535")
+    path = Path(url)
+    if not separator and path.exists() and not path.is_char_device():
+        raise ConfigError(f"{url} is not a serial port")
+
+
+_KINDS = ("alt", "cp2110", "hwgrep", "loop", "rfc2217", "socket", "spy")
+"""URLs that pyserial opens."""
 
 
 class Port:
@@ -131,6 +159,8 @@ def _explain(url: str, error: Exception) -> str:
         return f"{url}: no permission; run `sudo usermod -aG dialout $USER`, log out and in again"
     if "lock" in text or getattr(error, "errno", None) in (11, 16):
         return f"{url}: another program has it open (ModemManager, a terminal, another recorder); stop that first"
+    if path.is_char_device() and "configure port" in text:
+        return f"{url}: not a serial port"
     return f"{url}: cannot open ({text})"
 
 

@@ -1,0 +1,89 @@
+"""What `uwblite record` and `uwblite devices` say to mistakes: one clear line, at once, and no log is begun."""
+
+import socket
+
+import pytest
+
+from uwblite.cli import main
+from uwblite.drivers.transport import check_url
+from uwblite.errors import ConfigError
+
+REFUSED = {
+    "no device": [],
+    "no duration": ["--lidar", "/dev/null", "--duration", "nan"],
+    "over before it begins": ["--lidar", "/dev/null", "--duration", "-1"],
+    "sync": ["--lidar", "/dev/null", "--sync", "-1"],
+    "part size": ["--lidar", "/dev/null", "--rotate", "5X"],
+    "steps backwards": ["--lidar", "/dev/null", "--lidar-steps", "700:100"],
+    "steps that are none": ["--lidar", "/dev/null", "--lidar-steps", "a:b"],
+    "cluster": ["--lidar", "/dev/null", "--lidar-cluster", "0"],
+    "skip": ["--lidar", "/dev/null", "--lidar-skip", "10"],
+    "lidar baud": ["--lidar", "/dev/null", "--lidar-baud", "7"],
+    "mounting": ["--lidar", "/dev/null", "--laser-pose", "nan,0,0"],
+    "tag": ["--uwb", "/dev/null", "--tag", "1,2"],
+    "height": ["--uwb", "/dev/null", "--anchor-height", "inf"],
+    "a folder as port": ["--lidar", "."],
+    "a file as port": ["--uwb", "taken.log"],
+    "URL": ["--lidar", "carrier-pigeon://x"],
+    "socket without port": ["--lidar", "socket://localhost"],
+    "socket port": ["--lidar", "socket://localhost:99999"],
+    "odometry kind": ["--odometry", "/dev/null"],
+    "column": ["--odometry", "line:/dev/null?columns=t,up"],
+    "option": ["--odometry", "line:/dev/null?colums=t,x,y,theta"],
+    "no tick": ["--odometry", "line:/dev/null?columns=t,left,right"],
+    "tick": ["--odometry", "line:/dev/null?columns=t,left,right&tick=nan&wheel_base=0.3"],
+    "unit": ["--odometry", "line:/dev/null?columns=t,x,y,theta&length_unit=0"],
+    "baud": ["--odometry", "line:/dev/null?columns=t,x,y,theta&baud=0"],
+}
+
+
+@pytest.mark.parametrize("mistake", REFUSED)
+def test_a_mistake_is_told_before_anything_is_written(mistake, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken.log").write_text("not a port")
+    try:
+        code = main(["record", "--out", "new.log", *REFUSED[mistake]])
+    except SystemExit as ended:
+        code = ended.code
+    said = capfd.readouterr().err
+    assert code in (1, 2)
+    assert "error: " in said
+    assert "Traceback" not in said
+    assert [p.name for p in tmp_path.iterdir()] == ["taken.log"]
+
+
+def test_an_earlier_log_is_not_touched(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken.log").write_text("precious")
+    with pytest.raises(SystemExit) as ended:
+        raise SystemExit(main(["record", "--lidar", "/dev/null", "--out", "taken.log", "--duration", "1"]))
+    assert ended.value.code == 1
+    assert (tmp_path / "taken.log").read_text() == "precious"
+
+
+def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path):
+    out = tmp_path / "run.log"
+    assert main(["record", "--lidar", str(tmp_path / "ttyLATER"), "--out", str(out), "--duration", "0.2"]) == 3
+    assert "no such port" in out.read_text()
+
+
+@pytest.mark.parametrize("url", ["/dev/ttyACM9", "socket://robot.local:2001", "loop://", "rfc2217://host:7000", "/dev/null"])
+def test_ports_that_may_open_pass(url):
+    check_url(url)
+
+
+@pytest.mark.parametrize("url", ["", "bogus://x", "socket://:1", "socket://host:0", "socket://host:x", "socket://[::1"])
+def test_ports_that_never_will_do_not(url):
+    with pytest.raises(ConfigError, match="port"):
+        check_url(url)
+
+
+def test_devices_refuses_what_is_no_port_and_reports_what_does_not_answer(tmp_path, capfd):
+    plain = tmp_path / "notes.txt"
+    plain.write_text("")
+    assert main(["devices", str(plain)]) == 1
+    assert "not a serial port" in capfd.readouterr().err
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        assert main(["devices", f"socket://127.0.0.1:{free.getsockname()[1]}"]) == 3
+    assert "cannot open" in capfd.readouterr().out
