@@ -160,7 +160,7 @@ class NormalEquations:
         meet = [np.where(a == b, a, next(following)) if a_inner and b_inner else full for b, b_inner in nodes[:-1]]
         return [*meet, a if a_inner else full]
 
-    def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: Ints) -> "_Places":
+    def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: Ints) -> _Places:
         """Find the places of some edges' products; nodes are (e,), the block of nodes p and q is blocks[p][q] (e,)."""
         rows: list[NDArray[np.int32]] = []
         products: list[NDArray[np.int32]] = []
@@ -195,7 +195,7 @@ class NormalEquations:
             for part, place in zip(_parts(len(lin.residuals)), places, strict=True):
                 self._add(_stacked(lin, part), lin.residuals[part], None if weight is None else weight[part], place)
 
-    def _add(self, jacobian: Floats, residuals: Floats, weight: Floats | None, places: "_Places") -> None:
+    def _add(self, jacobian: Floats, residuals: Floats, weight: Floats | None, places: _Places) -> None:
         """Add the products of some edges' Jacobian columns (d, k, e) and residuals (e, d)."""
         products, slopes, at = np.empty(len(places.products)), np.empty(len(places.rows)), 0
         weighted = jacobian if weight is None else jacobian * weight

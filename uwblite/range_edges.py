@@ -18,8 +18,8 @@ class RangeEdges:
     distance D = |x + R(theta) u - a|, the radio is expected to say ``(1 + scale) sqrt(D^2 + height^2 + q) + bias``.
 
     A squared height q below 0 is none, but descent may pass there, or end there and be put back to 0. The root of a
-    negative number being no distance, what q adds for q > 0 is then taken off: with P^2 = D^2 + height^2, the slant
-    distance is ``2 P - sqrt(P^2 - q)``, smooth at q = 0.
+    negative number being no distance, what q adds for q > 0 is then taken off: with P^2 = D^2 + height^2, the radio is
+    taken to measure ``2 P - sqrt(P^2 - q)``, smooth at q = 0; right at the anchor that is below 0.
     """
 
     pose: Ints
@@ -68,7 +68,7 @@ class RangeEdges:
         return arm, offset, np.sqrt(np.maximum(np.stack([squared, squared + np.abs(cal[2])]), _NEAREST**2)), cal
 
     def distances(self, graph: Graph) -> Floats:
-        """Return the slant distances (e,) between tag and anchors at the present estimates, m."""
+        """Return what the radio is taken to measure (e,), m, before scale and bias: the slant distances."""
         _, _, reach, cal = self._geometry(graph)
         return _slant(reach, cal)
 

@@ -73,8 +73,8 @@ class RefinementConfig:
     correlation: float = 4.0
     """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
     settled: float = 0.0002
-    """Rounds end early when clouds move by less than this (root mean square) in the frames of their partners, at the last
-    gate, m."""
+    """Rounds end early when the places of clouds in the frames of their partners change by less than this (root mean
+    square) at the last gate, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +94,7 @@ class Refined:
     """Learnt standard deviation of a point-to-line distance, m."""
     rounds: int
     moved: float
-    """Root mean square move of clouds in the frames of their partners in the last round, m."""
+    """Root mean square change of the clouds' places in the frames of their partners in the last round, m."""
     summary: SolverSummary
 
 

@@ -153,19 +153,20 @@ def minimise(
     factor: Factor | None = None
     linked = _linked(len(graph.poses), linearized)
     while not reason:
-        if len(history) == config.max_iterations:
-            reason = USED_UP
-            break
         reused = factor is not None
         if improved:
             normal.fill(linearized, [_or_none(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
-            # The normal equations hold it all now; Jacobians of hours are large.
+            # The normal equations hold it all now; the Jacobians of a recording of hours are large.
             linearized = []
             diagonal = normal.diagonal
             scale = np.where(diagonal > 0, diagonal, 1.0)
             if np.max(np.abs(normal.gradient) / np.sqrt(scale)) <= config.gradient_tolerance:
                 reason = GRADIENT
                 break
+        if len(history) == config.max_iterations:
+            reason = USED_UP
+            break
+        trial_linearized: list[Linearization] = []
         factor, step, promised = _step(normal, damping * scale, factor)
         trial = _trial(graph, normal.unknowns, step, linked)
         trial_linearized = linearize(trial)
@@ -184,7 +185,7 @@ def minimise(
             graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3), _LEAST_DAMPING)
             growth = 2.0
-        elif 0 < promised <= (1e-3 if reused else 1.0) * negligible and damping <= _FREE:
+        elif 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * chi2) and damping <= _FREE:
             reason = SETTLED
         else:
             factor = None
@@ -216,6 +217,8 @@ _LARGE_TURN = 0.05
 """rad; the square of a smaller turn of a pose is nothing beside its first order."""
 _NOTHING = 1e-12
 """chi2, in standard deviations squared, that never matters."""
+_LITTLE = 1e-4
+"""Share of chi2 beyond which a promise that failed is no sign of a minimum, however coarse the search."""
 _FREE = 1e-2
 """lambda up to which small steps mean a minimum and not just a strong brake."""
 _NEAR = 1e-2
@@ -247,14 +250,14 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
     ----------
     factor : of a step before, to be used again; None = factorise anew.
     """
-    if factor is not None:
-        step = factor.solve(-normal.gradient)
-        return factor, step, -float(step @ normal.gradient)
     try:
+        if factor is not None:
+            step = factor.solve(-normal.gradient)
+            return factor, step, -float(step @ normal.gradient)
         factor = normal.factor(damping)
+        step = factor.solve(-normal.gradient)
     except SolverError:
         return None, np.zeros(len(damping)), -1.0
-    step = factor.solve(-normal.gradient)
     return factor, step, float(step @ (damping * step - normal.gradient))
 
 

@@ -54,9 +54,9 @@ def run(args: argparse.Namespace) -> int:
     from ..errors import DeviceError
 
     sights = []
-    for path in args.ports:
-        check_url(path)
     if args.ports:
+        for path in args.ports:
+            check_url(path)
         sights = [Sight(path) if args.list else look(path, "", args.pan_id) for path in args.ports]
     else:
         for port in plugged_in():

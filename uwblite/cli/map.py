@@ -53,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every-nth-scan", metavar="N", type=counted, default=1, help=text)
     parser.add_argument("--jobs", metavar="N", type=counted, default=1, help="processes for the heavy stages (1)")
     output = parser.add_argument_group("map")
-    output.add_argument("--resolution", metavar="M", type=float, help="edge of a cell, m: short for --set grid.resolution=M")
+    edge = "edge of a cell, m: short for --set grid.resolution=M"
+    output.add_argument("--resolution", metavar="M", type=number(above=0), help=edge)
     align = "where the axes lie: odometry (default), first-pose, walls (along x and y), anchors; short for --set align=HOW"
     output.add_argument("--align", metavar="HOW", choices=("odometry", "first-pose", "walls", "anchors"), help=align)
     box = "keep this part of the grid, m: short for --set crop=[...]"

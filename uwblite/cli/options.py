@@ -72,9 +72,10 @@ def number(
     def parse(text: str) -> Any:
         try:
             value = int(text) if whole else float(text)
-        except ValueError:
-            value = math.nan
-        if not (math.isfinite(value) and least <= value <= most and value > above):
+            good = math.isfinite(value) and least <= value <= most and value > above
+        except (ValueError, OverflowError):
+            good = False
+        if not good:
             raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
         return value
 

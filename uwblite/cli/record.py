@@ -41,6 +41,10 @@ computer's monotonic clock, s).
 """
 
 
+BAUD = (1200, 4_000_000)
+"""bit/s that a serial port may have."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     devices = parser.add_argument_group("devices")
@@ -61,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     laser.add_argument("--lidar-cluster", metavar="N", type=merged, default=1, help="steps merged into one reading (1)")
     laser.add_argument("--lidar-skip", metavar="N", type=skipped, default=0, help="scans left out between two (0)")
     laser.add_argument("--lidar-narrow", action="store_true", help="2-character readings up to 4.095 m, for slow RS-232")
-    speed = number(1200, 4_000_000, whole=True)
+    speed = number(*BAUD, whole=True)
     laser.add_argument("--lidar-baud", metavar="N", type=speed, default=115200, help="bit/s to try first on RS-232 (115200)")
     mounting = parser.add_argument_group("mounting, for the log")
     mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
@@ -105,15 +109,15 @@ def run(args: argparse.Namespace) -> int:
         mounting=mounting, on_note=_show_note,
     )  # fmt: skip
     endings = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, lambda n, _f: stopped.append(n)) for number in endings}
+    before = {ending: signal.signal(ending, lambda n, _f: stopped.append(n)) for ending in endings}
     try:
         recorder.begin(_head(args, remark))
         _suggest_names(links)
         recorder.run(duration=args.duration, stopping=lambda: bool(stopped), on_status=_status_line(recorder))
     finally:
         log.close()
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for ending, handler in before.items():
+            signal.signal(ending, handler)
     return _finish(recorder, args.json, bool(stopped) and stopped[0] == signal.SIGINT)
 
 
@@ -196,10 +200,11 @@ def odometry_session(spec: str, pose: tuple[float, float, float]) -> tuple["Sess
     if kind == "line" and rest:
         url, _, query = rest.partition("?")
         options = dict(parse_qsl(query, keep_blank_values=True))
-        baud = options.pop("baud", "115200")
-        if not (baud.isascii() and baud.isdigit() and int(baud) > 0):
-            raise ConfigError(f"--odometry: baud={baud!r} is not a number above 0")
-        return LineSession(parse_format(options), int(baud), pose), url
+        try:
+            baud = number(*BAUD, whole=True)(options.pop("baud", "115200"))
+        except argparse.ArgumentTypeError as problem:
+            raise ConfigError(f"--odometry: baud={problem}") from None
+        return LineSession(parse_format(options), baud, pose), url
     raise ConfigError(f"--odometry {spec}: say kobuki:PORT, or line:PORT?columns=t,x,y,theta")
 
 
@@ -273,7 +278,7 @@ def _size(text: str) -> int:
 
 
 def _steps(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+):(\d+)", text)
+    match = re.fullmatch(r"(\d{1,4}):(\d{1,4})", text)
     if not match or int(match[1]) > int(match[2]):
         raise argparse.ArgumentTypeError(f"{text!r} is not two steps such as 128:640")
     return int(match[1]), int(match[2])

@@ -6,6 +6,7 @@ There is no standard for what hobby controllers print, so the columns are told: 
 
 import math
 import re
+import sys
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -73,8 +74,10 @@ def parse_format(options: dict[str, str]) -> LineFormat:
             elif name == "prefix":
                 values[name] = text
             elif name == "tick_modulus":
-                values[name] = _sensible(int(text), 0)
-            elif name in ("time_unit", "tick", "wheel_base"):
+                values[name] = _sensible(int(text), 0, 1 << 64)
+            elif name in ("tick", "wheel_base"):
+                values[name] = _sensible(float(text), 0.0)
+            elif name == "time_unit":
                 values[name] = _sensible(float(text), _TINY)
             elif name in ("length_unit", "angle_unit"):
                 # Below 0 for an axis or a heading that counts the other way.
@@ -98,9 +101,9 @@ def parse_format(options: dict[str, str]) -> LineFormat:
     return spec
 
 
-def _sensible(value: _Number, least: float) -> _Number:
-    """Return a finite number that is not too small, else raise ValueError."""
-    if not least <= value < math.inf:
+def _sensible(value: _Number, least: float, most: float = sys.float_info.max) -> _Number:
+    """Return a number within bounds, else raise ValueError."""
+    if not least <= value <= most:
         raise ValueError
     return value
 

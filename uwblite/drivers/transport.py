@@ -25,9 +25,9 @@ def check_url(url: str) -> None:
     ConfigError : an unknown kind of URL, a socket without host and port, or a path that is no device.
     """
     kind, separator, _ = url.partition("://")
-    if not url or (separator and kind not in _KINDS):
+    if not url or (separator and kind.lower() not in _KINDS):
         raise ConfigError(f"{url!r} is no port; say a path such as /dev/ttyACM0, or socket://host:port")
-    if kind == "socket" and separator:
+    if kind.lower() == "socket" and separator:
         try:
             place = urlsplit(url)
             complete = bool(place.hostname) and bool(place.port)
@@ -96,7 +96,7 @@ class Port:
         DeviceError : the device is gone.
         """
         try:
-            if self.url.startswith("socket://"):
+            if self.url.lower().startswith("socket://"):
                 return self._read_socket()
             if "://" in self.url:
                 return bytes(self._serial.read(self._serial.in_waiting))
