@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Repeat the experiments of the paper on simulated buildings, with its plain settings and with the defaults.
 
-    python tools/reproduce_paper.py            docs/paper.md and docs/images/paper_*.png; half an hour on two busy cores
+    python tools/reproduce_paper.py            docs/paper.md and docs/images/paper_*.png; ten minutes on two cores
     python tools/reproduce_paper.py --quick --out paper-out    drives of 6 min, one seed, a few minutes
 
 Liu et al., Cost-effective Mapping of Mobile Robot Based on the Fusion of UWB and Short-range 2D LiDAR (CITATION.cff):
