@@ -213,6 +213,17 @@ def test_sub_maps_of_different_places_are_rejected_with_a_reason(hall):
     assert all(c.reason and not c.accepted for c in found.candidates)
 
 
+@pytest.mark.parametrize("lost", [slice(None), slice(1, None)])
+def test_where_the_search_finds_no_place_at_all_that_is_the_reason(hall, closures, lost):
+    pairs = accepted_pairs(hall, closures)[:4]
+    one = given(hall, pairs, np.zeros((len(pairs), 3)), [0.5, 0.5, 0.15])
+    guess = true_poses(hall, one)
+    guess[lost, 0] += 200.0
+    found = find(replace(one, guess=guess), hall[3], CONFIG, SEARCH)
+    assert [c.reason for c in found.candidates][lost] == ["the search found no place for it"] * len(pairs[lost])
+    assert not any(c.accepted for c in found.candidates[lost])
+
+
 def test_a_wide_uncertainty_is_searched(hall, closures):
     """Guesses off by up to 1 m and 0.3 rad, believed to 0.5 m: most are found again, none wrongly."""
     pairs = accepted_pairs(hall, closures)[:8]

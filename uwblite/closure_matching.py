@@ -103,11 +103,12 @@ def _fit(batch: _Batch) -> Fits:
     points = pair_points(clouds, candidates.source[row], config.points)
     tries = align_pairs(clouds, raster, candidates.target[row], candidates.source[row], guess, points, 0.5, config.gate)
     place, second = _best_places(row, tries, len(candidates.target))
-    pose = np.where((place >= 0)[:, None], tries.pose[place], candidates.guess)
+    found, pose = place >= 0, candidates.guess.copy()
+    pose[found] = tries.pose[place[found]]
     points = pair_points(clouds, candidates.source, config.points)
     factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
     best = Aligned(pose, factors)
-    return Fits(best, place >= 0, second, _see_through(batch, best))
+    return Fits(best, found, second, _see_through(batch, best))
 
 
 def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
