@@ -1,17 +1,20 @@
 """What tells against a result: turns of the wrong sign, values far from usual, ranges out of time; and where the map begins."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from planted import aligned_error, box, odometry, ranges, recording, scans, wander
 
 from uwblite import se2
+from uwblite.calibration import CalibrationConfig
 from uwblite.constraints import Constraints, KnownAnchor
+from uwblite.graph import Calibration, Graph
 from uwblite.keyframes import OUTSIDE
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.sensor_log import SensorMounting
-from uwblite.suspicions import lying_stretches
+from uwblite.suspicions import lying_stretches, mirrored
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
 LEVEL = SensorMounting(anchor_height=0.0)
@@ -47,6 +50,13 @@ def test_gross_turns_leave_the_mirror_image_open(turn_scale):
 def test_wheels_that_turn_rightly_and_lasers_vouch_for_the_sign():
     assert not said(build_map(run()[2]).doubts, "mirrored")
     assert not said(build_map(run(turn_scale=2.0, walls=box(12, 12), metres=40.0)[2]).doubts, "mirrored")
+
+
+@pytest.mark.parametrize(("error", "doubted"), [(-1.9, True), (-1.1, True), (-0.4, False), (0.0, False), (1.0, False)])
+def test_wheels_that_turn_against_the_laser_are_doubted(error, doubted):
+    graph = Graph(np.zeros((1, 3)), calibration=Calibration(("heading_scale",), np.array([error])))
+    seeing = SimpleNamespace(sessions=[SimpleNamespace(has_scans=True)])
+    assert len(said(mirrored(graph, seeing, CalibrationConfig()), "upside down")) == doubted
 
 
 def test_known_anchors_vouch_for_the_sign():

@@ -54,6 +54,17 @@ def test_the_wheels_turn_scale_is_found(scale):
     assert seen.agree
 
 
+@pytest.mark.parametrize("mounting", [UP, DOWN])
+def test_scans_that_see_nothing_have_no_say(mounting):
+    """In a large bare hall most scans see no wall: any turn fits two of them."""
+    log, _ = turner(mounting)
+    ranges = log.scans.ranges.copy()
+    ranges[np.arange(len(ranges)) % 20 < 13] = np.inf
+    seen = compare(replace(log, scans=replace(log.scans, ranges=ranges)))
+    assert seen.agree
+    assert seen.turned_over is (mounting is DOWN)
+
+
 def test_a_robot_that_never_turns_says_nothing():
     stamps, truth = drive([(0.5, 0.0, 0.0)], [20.0])
     log = recording(odometry(stamps, truth), None, scans(stamps, truth, box(40, 6)))

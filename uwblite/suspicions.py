@@ -43,22 +43,28 @@ def unusual(calibrated: Sequence[CalibrationEstimate], usual: dict[str, Unknown]
 
 
 def mirrored(graph: Graph, drives: Drives, config: CalibrationConfig) -> list[str]:
-    """Return a doubt for each recording whose ranges fit only where the wheels' turns are scaled grossly.
+    """Return a doubt for each recording whose ranges or scans fit only where the wheels' turns are scaled grossly.
 
     Ranges alone do not tell a map from its mirror image: a drive mirrored together with its anchors has the same ranges.
     Only the sign of the wheels' turns does, and a laser, or anchors known beforehand. Where turns must be scaled by a
-    factor far from 1, by minus that factor the mirror image fits as well, and nothing vouches for the sign.
+    factor far from 1, by minus that factor the mirror image fits as well, and nothing vouches for the sign. A laser that
+    sees the turns go the other way may itself be upside down.
     """
     known = sum(len(e) for e in graph.edges if isinstance(e, PriorEdges) and e.block == "anchors")
     if known > 2 or config.heading_scale <= 0.0:
-        return []
-    if any(session.has_scans for session in drives.sessions):
         return []
     factors = [
         1.0 + float(value)
         for name, value in zip(graph.calibration.names, graph.calibration.values, strict=True)
         if stem(name) == "heading_scale" and abs(value) > _WRONG_TURNS
     ]
+    if any(session.has_scans for session in drives.sessions):
+        return [
+            f"the map may be mirrored: the wheels' turns agree with the laser's only when multiplied by {factor:.2f}; "
+            "is the laser upside down (--laser-flipped), or does the odometry's heading count the other way?"
+            for factor in factors
+            if factor < 0.0
+        ]
     return [
         f"the map may be mirrored: the wheels' turns agree with the ranges only when multiplied by {factor:.2f}, "
         f"and by {-factor:.2f} its mirror image fits as well; check sign and scale of the odometry's heading, "

@@ -114,7 +114,8 @@ class _Agreement:
     @staticmethod
     def of(log: SensorLog, scans: LaserScans, first: Ints, second: Ints, wheels: Floats, sign: float) -> "_Agreement":
         turn, sharp = _matched_turn(scans, first, second, _laser_shift(log, scans, first, second) * (1.0, sign))
-        clear = sharp >= np.quantile(sharp, 0.5)
+        some = sharp > 0.0
+        clear = some & (sharp >= np.quantile(sharp[some], 0.5)) if some.any() else ~some
         # A wrong track width makes all turns wrong by one factor; that is no disagreement on which way they go.
         said, seen = wheels[len(wheels) // 2], sign * turn
         large = clear & (np.abs(said) > 0.05)
@@ -122,6 +123,10 @@ class _Agreement:
         return _Agreement(seen, np.minimum(np.abs(factor * wheels[:, clear] - seen[clear]), 0.3))
 
 
+_NOISE = 0.02
+"""Mean difference of ranges that means nothing, m."""
+_LEAST_SEEN = 0.05
+"""Share of beams that must see something."""
 _WIDEST = 3.0
 """Factor by which the wheels' turns may be wrong."""
 
@@ -182,7 +187,10 @@ def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -
     rows = np.arange(len(first))
     left, middle, right = cost[rows, best - 1], cost[rows, best], cost[rows, best + 1]
     fine = best - most + 0.5 * (left - right) / np.maximum(left - 2.0 * middle + right, 1e-9)
-    clear = 1.0 - middle / np.maximum(np.median(cost, axis=1), 1e-9)
+    # Scans that see nothing fit every turn alike, to the bit, and a lone wall fits best where it leaves the view.
+    clear = 1.0 - (middle + _NOISE) / (np.median(cost, axis=1) + _NOISE)
+    seen = np.mean(profile < reach, axis=1) > _LEAST_SEEN
+    clear *= seen[place[: len(first)]] & seen[place[len(first) :]]
     return np.asarray(fine * every * scans.angle_increment, dtype=np.float64), clear
 
 
