@@ -122,10 +122,10 @@ def build_map(
         part, refined = _measured_distances(part, found, tracked, refined, known, scans, drives, config, stages)
     part = _final(part, found, tracked, refined)
     walls = _walls(scans, config)
-    settled = refined is None or part.radio is None
+    weighed_anew = refined is not None and part.radio is not None
     # What only matching needed is most of the memory.
     scans = tracked = refined = None
-    if not settled:
+    if weighed_anew:
         part = replace(part, graph=with_real_heights(optimize(part.graph, config.solver)[0]))
     part = _aligned(part, walls, config)
 

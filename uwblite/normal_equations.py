@@ -166,7 +166,7 @@ class NormalEquations:
         products: list[NDArray[np.int32]] = []
         twice, count = [_NONE], 0
         for p, a in enumerate(nodes):
-            steps = [self._steps(corner[a], corner[b], block) for b, block in zip(nodes, blocks[p], strict=False)]
+            steps = [self._steps(corner[a], corner[b], block) for b, block in zip(nodes[: p + 1], blocks[p], strict=True)]
             equal = [np.flatnonzero((a == b) & (a >= 0)) for b in nodes[:p]] + [_NONE]
             for i in range(widths[p]):
                 rows.append(np.where(a >= 0, corner[a] + i, self.unknowns.size).astype(np.int32))

@@ -5,6 +5,7 @@ million points is a handful of array operations and no tree. A pair's matches ar
 of its relative pose (3 x 3), which is all that the graph needs to know of them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -71,10 +72,10 @@ def paint(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     cell, reach : cell size and distance up to which a point is a neighbour, m.
     """
     low, high = _boxes(clouds)
-    some = np.isfinite(low[:, 0])
+    filled = np.isfinite(low[:, :1])
     margin = reach + cell
-    low = np.where(some[:, None], low - margin, 0.0)
-    shape = np.where(some[:, None], np.ceil((high + margin - low) / cell), 0.0).astype(np.int64) + some[:, None]
+    low = np.where(filled, low - margin, 0.0)
+    shape = np.where(filled, np.ceil((high + margin - low) / cell), 0.0).astype(np.int64) + filled
     size = shape[:, 0] * shape[:, 1]
     start = np.concatenate([[0], np.cumsum(size)[:-1]])
     narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
@@ -82,9 +83,15 @@ def paint(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     steps = int(np.floor(reach / cell))
     offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
     offsets = sorted((o for o in offsets if np.hypot(*o) * cell <= reach), key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o))
-    for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
-        _paint(clouds, slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds))), raster, offsets)
+    for some in _blocks(clouds):
+        _paint(clouds, some, raster, offsets)
     return raster
+
+
+def _blocks(clouds: Clouds) -> Iterator[slice]:
+    """Yield the clouds a bounded number at a time."""
+    for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
+        yield slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds)))
 
 
 def _paint(clouds: Clouds, some: slice, raster: CloudRasters, offsets: list[tuple[int, int]]) -> None:
@@ -109,8 +116,8 @@ def _usable(clouds: Clouds, some: slice) -> tuple[Ints, Ints, Floats, Floats]:
 def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
     """Return the corners (k, 2) of a box around the points with a normal of each cloud; inf where it has none."""
     low, high = np.full((len(clouds), 2), np.inf), np.full((len(clouds), 2), -np.inf)
-    for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
-        _, owner, x, y = _usable(clouds, slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds))))
+    for some in _blocks(clouds):
+        _, owner, x, y = _usable(clouds, some)
         if len(owner):
             begins = np.flatnonzero(np.concatenate([[True], np.diff(owner) > 0]))
             low[owner[begins]] = np.minimum.reduceat(np.stack([x, y]), begins, axis=1).T

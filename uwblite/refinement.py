@@ -93,8 +93,6 @@ class Refined:
     sigma: float
     """Learnt standard deviation of a point-to-line distance, m."""
     rounds: int
-    moved: float
-    """Root mean square change of the clouds' places in the frames of their partners in the last round, m."""
     summary: SolverSummary
 
 
@@ -191,7 +189,7 @@ def refine(
     i, j = np.where(turned, j, i), np.where(turned, i, j)
     points = pair_points(clouds, j, config.points)
     names = scan_indices(graph.calibration)
-    gate, sigma, moved, rounds = config.first_gate, config.sigma, np.inf, 0
+    gate, sigma, rounds = config.first_gate, config.sigma, 0
     empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names, delay)
     probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j], kernel=Kernel("cauchy", 5.0))
     normal: NormalEquations | None = None
@@ -222,7 +220,7 @@ def refine(
             on_round(rounds, config.rounds)
         last = gate <= config.last_gate * 1.001
         if rounds >= config.rounds or (last and moved < config.settled):
-            return Refined(graph, _only(edges, used), i, j, factors, used, sigma, rounds, moved, summary)
+            return Refined(graph, _only(edges, used), i, j, factors, used, sigma, rounds, summary)
         gate = max(gate * config.shrink, config.last_gate)
 
 

@@ -41,8 +41,8 @@ computer's monotonic clock, s).
 """
 
 
-BAUD = (1200, 4_000_000)
-"""bit/s that a serial port may have."""
+SPEEDS = (1200, 4_000_000)
+"""bit/s, least and most, that a serial port is opened with."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     laser.add_argument("--lidar-cluster", metavar="N", type=merged, default=1, help="steps merged into one reading (1)")
     laser.add_argument("--lidar-skip", metavar="N", type=skipped, default=0, help="scans left out between two (0)")
     laser.add_argument("--lidar-narrow", action="store_true", help="2-character readings up to 4.095 m, for slow RS-232")
-    speed = number(*BAUD, whole=True)
+    speed = number(*SPEEDS, whole=True)
     laser.add_argument("--lidar-baud", metavar="N", type=speed, default=115200, help="bit/s to try first on RS-232 (115200)")
     mounting = parser.add_argument_group("mounting, for the log")
     mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
@@ -201,7 +201,7 @@ def odometry_session(spec: str, pose: tuple[float, float, float]) -> tuple["Sess
         url, _, query = rest.partition("?")
         options = dict(parse_qsl(query, keep_blank_values=True))
         try:
-            baud = number(*BAUD, whole=True)(options.pop("baud", "115200"))
+            baud = number(*SPEEDS, whole=True)(options.pop("baud", "115200"))
         except argparse.ArgumentTypeError as problem:
             raise ConfigError(f"--odometry: baud={problem}") from None
         return LineSession(parse_format(options), baud, pose), url
