@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 from simulate import parser, settings_from
 from simulation import drive, floorplans, laser, logfile, radio, recording, wheels
 from simulation.fields import smooth_field
+from simulation.plans import PLANS
 from simulation.recording import Lie, Settings, simulate
 
 from uwblite import se2
@@ -141,15 +142,15 @@ def test_motion_is_what_a_differential_drive_can_do(room):
     assert np.abs(np.diff(turn)).max() < 2.5 / 20**2
 
 
-@pytest.mark.parametrize("world", floorplans.PLANS)
+@pytest.mark.parametrize("world", PLANS)
 def test_drives_keep_clear_of_everything(world):
-    plan = floorplans.PLANS[world]()
+    plan = PLANS[world]()
     motion = drive.follow(drive.wander(plan, np.random.default_rng(7), 60.0), plan.start[2], 0.2, 300.0)
     for x, y, _ in motion.poses[::20]:
         walls, columns = laser.near(plan.walls, plan.columns, np.array([x, y]), 0.25)
         assert not len(walls)
         assert not len(columns)
-    assert len(plan.anchors) <= len(floorplans.ANCHOR_IDS)
+    assert len(plan.anchors) <= len(set(plan.anchor_ids))
     assert all(name in plan.landmarks for pair in plan.pairs for name in pair)
 
 
@@ -287,3 +288,28 @@ def test_command_line_reaches_every_setting():
     assert settings.without == ("uwb",)
     assert (settings.slips, settings.people, settings.minutes, settings.laser_flipped) == (3, 2, 2.0, True)
     assert settings.speed == Settings().speed
+
+
+def test_a_building_and_a_robot_stay_what_they_are():
+    first, again, elsewhere = (
+        simulate(replace(SHORT, world="hall", seed=s, robot=1, building=b, without=("laser",)))
+        for s, b in ((1, 2), (3, 2), (3, 4))
+    )
+    assert first.calibration["odometry"] == again.calibration["odometry"] == elsewhere.calibration["odometry"]
+    assert first.calibration["uwb"]["bias"] == again.calibration["uwb"]["bias"] != elsewhere.calibration["uwb"]["bias"]
+    assert not np.allclose(first.truth, again.truth)
+
+
+def test_overnight_one_anchor_of_the_site_moved_and_one_is_new():
+    before, after = PLANS["site"](), PLANS["site_next_day"]()
+    shift = np.hypot(*(after.anchors - before.anchors).T)
+    renamed = [a != b for a, b in zip(before.anchor_ids, after.anchor_ids, strict=True)]
+    assert np.count_nonzero(shift) == np.count_nonzero(renamed) == 1
+    assert shift.max() > 2.0
+
+
+@pytest.mark.parametrize(("world", "least", "most"), [("arena", 3.0, 5.0), ("tunnel", 3.0, 5.0), ("site", 3.0, 5.0)])
+def test_few_anchors_are_heard_at_a_time_in_large_places(world, least, most):
+    made = simulate(Settings(world=world, seed=1, minutes=10.0, speed=0.5, without=("laser",)))
+    heard = [np.unique(made.range_anchors[np.abs(made.range_stamps - t) < 10.0]).size for t in range(10, 590, 20)]
+    assert least <= np.mean(heard) <= most

@@ -16,8 +16,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from simulation.floorplans import PLANS
 from simulation.logfile import write
+from simulation.plans import PLANS
 from simulation.radio import NLOS_LEVELS, RadioModel
 from simulation.recording import Lie, Settings, simulate, with_overrides
 
@@ -74,6 +74,8 @@ def parser() -> argparse.ArgumentParser:
     add("--laser-flipped", action="store_true", help="laser upside down, and the log does not say so")
     add("--uwb-delay", type=float, help="s, stamp minus true time (0)")
     add("--laser-delay", type=float, help="s, stamp minus true time (0)")
+    add("--robot", type=int, help="which robot, for several recordings of the same one; default: one of the seed's own")
+    add("--building", type=int, help="which building of this plan; default: one of the seed's own")
     add("--people", type=int, help="people walking about (0)")
     add("--without", action="append", choices=["uwb", "laser"], help="leave a sensor out; repeatable")
     radio = p.add_argument_group("radio")

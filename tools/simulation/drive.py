@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
 
 from .fields import smooth_field
 from .floorplans import FloorPlan
@@ -112,7 +113,7 @@ def wander(
         typical = visits.mean() + 1.0
         best = int(np.argmin(visits[choice] / typical - 0.7 * ahead + rng.uniform(0, 0.5, len(choice))))
         leg = legs[best]
-        visits += (((places[:, None] - leg[None, ::4]) ** 2).sum(axis=2) < 1.5**2).sum(axis=1)
+        visits += cKDTree(leg[::4]).query_ball_point(places, 1.5, return_length=True)
         travelled += np.hypot(*np.diff(leg, axis=0).T).sum()
         track.append(leg[1:])
         course, here = _unit(leg[-1] - leg[max(0, len(leg) - 6)]), leg[-1]

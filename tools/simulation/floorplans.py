@@ -1,6 +1,5 @@
-"""The buildings: straight walls, round columns, anchors. Adding one is a function of ten lines and a row in PLANS."""
+"""The buildings: straight walls, round columns, anchors. Adding one is a function of ten lines and a row in plans.py."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -9,7 +8,12 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-ANCHOR_IDS = ("DD07", "5C0B", "91A3", "1E05", "0F42", "C8D6", "4B19", "A27E", "0093", "E610", "7D3C", "36F8")
+# fmt: off
+ANCHOR_IDS = (
+    "DD07", "5C0B", "91A3", "1E05", "0F42", "C8D6", "4B19", "A27E", "0093", "E610", "7D3C", "36F8",
+    "AD31", "1B77", "C402", "8F5E",
+)
+# fmt: on
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,10 @@ class FloorPlan:
     """How much one obstacle disturbs a radio ray: 1 = concrete, 0 = air."""
     pairs: tuple[tuple[str, str], ...] = field(default=())
     """Pairs of landmarks whose distance is judged; empty = all of them."""
+    anchor_ids: tuple[str, ...] = ANCHOR_IDS
+    """Names of the anchors, at least as many as there are."""
+    radio_range: float = np.inf
+    """Distance from which on no anchor is heard in this place, m; a radio may reach less."""
 
 
 def box(x: float, y: float, width: float, depth: float) -> list[list[float]]:
@@ -157,6 +165,3 @@ def room() -> FloorPlan:
         start=(3.5, 1.0, 0.0),
         minutes=4.0,
     )
-
-
-PLANS: dict[str, Callable[[], FloorPlan]] = {p.__name__: p for p in (hall, corridor, lab, warehouse, room)}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .floorplans import ANCHOR_IDS, FloorPlan
+from .floorplans import FloorPlan
 from .recording import Recording
 
 Floats = NDArray[np.float64]
@@ -28,7 +28,7 @@ def write(recording: Recording, directory: Path, compress: bool = False) -> None
     half = 0.5 * truth[:, 2]
     rows = np.column_stack([recording.stamps, truth[:, :2], np.sin(half), np.cos(half)])
     _lines(directory / "truth.tum", "", (f"{t:.6f} {x:.5f} {y:.5f} 0 0 0 {z:.8f} {w:.8f}" for t, x, y, z, w in rows))
-    anchors = zip(ANCHOR_IDS, recording.anchors.tolist(), strict=False)
+    anchors = zip(plan.anchor_ids, recording.anchors.tolist(), strict=False)
     height = recording.settings.anchor_height
     _lines(directory / "truth_anchors.csv", "id,x,y,height", (f"{i},{x:.4f},{y:.4f},{height:.3f}" for i, (x, y) in anchors))
     _lines(directory / "columns.csv", "name,x,y,radius,neighbours", _column_rows(plan))
@@ -102,4 +102,5 @@ def _scan_lines(r: Recording) -> Iterator[bytes]:
 
 def _range_lines(r: Recording) -> Iterator[bytes]:
     rows = zip(r.range_anchors.tolist(), r.ranges.tolist(), r.range_stamps.tolist(), strict=True)
-    return (f"UWB {ANCHOR_IDS[a]} {d:.3f} 100 {t:.6f} sim {t + 0.03:.6f}\n".encode() for a, d, t in rows)
+    ids = r.plan.anchor_ids
+    return (f"UWB {ids[a]} {d:.3f} 100 {t:.6f} sim {t + 0.03:.6f}\n".encode() for a, d, t in rows)

@@ -73,15 +73,19 @@ def crossings(tags: Floats, anchor: Floats, walls: Floats, columns: Floats) -> F
     return count
 
 
-def excess(shadow: Floats, points: Floats, level: str, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
+def excess(
+    shadow: Floats, points: Floats, level: str, rng: np.random.Generator, there: np.random.Generator | None = None
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the extra length (n,), m, of shadowed ranges and which of them are lost.
 
-    The excess is exponentially distributed and mostly the same for a slow robot behind the same obstacle.
+    The excess is exponentially distributed and mostly the same for a slow robot behind the same obstacle; `there` draws
+    what stays with the place.
     """
+    there = rng if there is None else there
     mean, unseen, lost = NLOS_LEVELS[level]
-    patch = smooth_field(rng, points, 2.0)
+    patch = smooth_field(there, points, 2.0)
     shadow = np.maximum(shadow, (ndtr(patch) < unseen).astype(np.float64))
-    correlated = 0.8 * smooth_field(rng, points, 0.7) + 0.6 * rng.standard_normal(len(points))
+    correlated = 0.8 * smooth_field(there, points, 0.7) + 0.6 * rng.standard_normal(len(points))
     depth = np.minimum(shadow, 2.0)
     extra = depth * mean * (0.2 - 0.8 * np.log(np.clip(1.0 - ndtr(correlated), 1e-3, 1.0)))
     return extra, rng.random(len(points)) < 1.0 - (1.0 - lost) ** depth

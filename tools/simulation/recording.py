@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from . import drive, laser, radio, wheels
 from .fields import smooth_field
-from .floorplans import ANCHOR_IDS, PLANS, FloorPlan
+from .floorplans import FloorPlan
 from .laser import LaserModel
+from .plans import PLANS
 from .radio import RadioModel
 
 Floats = NDArray[np.float64]
@@ -73,6 +74,10 @@ class Settings:
     people: int = 0
     without: tuple[str, ...] = ()
     """Sensors that are missing: uwb, laser."""
+    robot: int | None = None
+    """Which robot, so that several recordings are of the same one; None: one of the seed's own."""
+    building: int | None = None
+    """Which building of this plan: paint of walls, multipath, biases of anchors; None: one of the seed's own."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +115,11 @@ def _rng(settings: Settings, part: int) -> np.random.Generator:
     return np.random.default_rng([settings.seed, part])
 
 
+def _lasting(owner: int | None, part: int, rng: np.random.Generator) -> np.random.Generator:
+    """Return the generator of what a robot or a building keeps from recording to recording, a recording's own without one."""
+    return rng if owner is None else np.random.default_rng([owner, 1000 + part])
+
+
 def simulate(settings: Settings) -> Recording:
     """Simulate a drive."""
     plan = PLANS[settings.world]()
@@ -118,7 +128,7 @@ def simulate(settings: Settings) -> Recording:
     motion = drive.follow(track, plan.start[2], settings.speed, seconds)
     anchors = _place_anchors(settings, plan)
     stamps = np.round(np.arange(int(seconds * settings.odometry_rate) + 1) / settings.odometry_rate, 6)
-    faults = wheels.draw_errors(_rng(settings, 1), settings.odometry_scale)
+    faults = wheels.draw_errors(_lasting(settings.robot, 1, _rng(settings, 1)), settings.odometry_scale)
     slips = wheels.draw_slips(motion, _rng(settings, 2), settings.slips)
     said = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3))
     crowd = _people(settings, plan, seconds)
@@ -201,7 +211,8 @@ def _scan(
     stamps = np.round(np.arange(0.037, motion.stamps[-1] - 0.1, 0.1 * every), 6)
     mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
     angles = mounting[2] + (-model.angles if settings.laser_flipped else model.angles)
-    colour = model.surface_sd * rng.standard_normal(len(plan.walls) + len(plan.columns) + len(crowd))
+    surfaces = _lasting(settings.building, 5, rng)
+    colour = model.surface_sd * surfaces.standard_normal(len(plan.walls) + len(plan.columns) + len(crowd))
     out = np.empty((len(stamps), model.beams), dtype=np.int32)
     for first in range(0, len(stamps), _CHUNK):
         chunk = stamps[first : first + _CHUNK]
@@ -227,9 +238,9 @@ def _range(
 ) -> tuple[Floats, NDArray[np.int64], Floats, dict[str, Any]]:
     """Return stamps (m,), anchor indices (m,), ranges (m,) and what is true of the radio."""
     model, count = settings.radio, len(anchors)
-    bias = model.bias_sd * _rng(settings, 6).standard_normal(count)
+    bias = model.bias_sd * _lasting(settings.building, 6, _rng(settings, 6)).standard_normal(count)
     truth: dict[str, Any] = {
-        "bias": dict(zip(ANCHOR_IDS, bias.tolist(), strict=False)),
+        "bias": dict(zip(plan.anchor_ids, bias.tolist(), strict=False)),
         "scale": model.scale,
         "anchor_height": settings.anchor_height,
         "tag_height": settings.tag_height,
@@ -242,24 +253,25 @@ def _range(
     tag = pose[:, :2] + np.stack([c * settings.tag[0] - s * settings.tag[1], s * settings.tag[0] + c * settings.tag[1]], axis=1)
     bodies = _bodies(crowd, times, pose)
     ranges, heard, effort = (np.empty((len(times), count)) for _ in range(3))
-    pattern = _rng(settings, 7).integers(2**31)
+    pattern = _lasting(settings.robot, 7, _rng(settings, 7)).integers(2**31)
     for a, place in enumerate(anchors):
         rng = _rng(settings, 200 + a)
+        there = _lasting(settings.building, 200 + a, rng)
         ray = place - tag
         distance = np.sqrt((ray * ray).sum(axis=1) + (settings.anchor_height - settings.tag_height) ** 2)
         bearing = np.arctan2(ray[:, 1], ray[:, 0])
         # One antenna on the robot: every anchor meets the same pattern; each anchor has one of its own besides.
         antenna = radio.antenna_pattern(np.random.default_rng(pattern), bearing - pose[:, 2])
-        antenna = (antenna + radio.antenna_pattern(rng, bearing)) / np.sqrt(2.0)
-        field_ = smooth_field(rng, tag, model.multipath_length)
+        antenna = (antenna + radio.antenna_pattern(there, bearing)) / np.sqrt(2.0)
+        field_ = smooth_field(there, tag, model.multipath_length)
         shadow = plan.opacity * radio.crossings(tag, place, plan.walls, plan.columns)
         shadow += 0.5 * (radio.crossings(tag, place, np.empty((0, 4)), bodies) > 0)
         level = settings.nlos if not settings.nlos_anchors or a + 1 in settings.nlos_anchors else "normal"
-        extra, lost = radio.excess(shadow, tag, level, rng)
+        extra, lost = radio.excess(shadow, tag, level, rng, there)
         noise = model.noise_sd * rng.standard_normal(len(times))
         smooth = bias[a] + model.multipath_sd * field_ + model.antenna_sd * antenna
         ranges[:, a] = model.scale * distance + smooth + extra + noise
-        heard[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < model.max_range)
+        heard[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < min(model.max_range, plan.radio_range))
         effort[:, a] = distance + 6.0 * shadow
     rng = _rng(settings, 8)
     rank = np.argsort(np.argsort(effort + rng.uniform(0, 3, effort.shape), axis=1), axis=1)

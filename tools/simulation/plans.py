@@ -1,0 +1,10 @@
+"""All buildings by name."""
+
+from collections.abc import Callable
+
+from .floorplans import FloorPlan, corridor, hall, lab, room, warehouse
+from .large_places import arena, site, site_next_day, tunnel
+
+PLANS: dict[str, Callable[[], FloorPlan]] = {
+    p.__name__: p for p in (hall, corridor, lab, warehouse, room, arena, tunnel, site, site_next_day)
+}
