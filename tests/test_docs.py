@@ -101,6 +101,8 @@ def test_every_command_runs(document, workspace):
             if words[0] == "tools/quickstart":
                 assert " ".join(words) in (ROOT / ".ci" / "run").read_text()
                 continue
+            if words == [".", ".venv/bin/activate"]:
+                continue
             own = words[0] == "uwblite"
             tool = [sys.executable, "-m", "uwblite"] if own else [shutil.which(words[0]) or tool_beside(words[0])]
             environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "HOME": str(workspace)}
@@ -147,5 +149,5 @@ def test_the_generated_page_is_current():
 def test_first_screen_of_the_readme():
     head = (ROOT / "README.md").read_text().splitlines()[:25]
     assert any(line.startswith("![") for line in head)
-    assert "tools/quickstart test    # runs all checks and tests" in head
+    assert any(line.startswith("tools/quickstart test ") for line in head)
     assert any("What it is not" in line for line in head)
