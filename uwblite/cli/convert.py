@@ -21,7 +21,7 @@ examples:
   uwblite convert run.log part.log --start 60 --end 120
   uwblite convert graph.g2o graph.pyfg
 
-bags need the package rosbags: pip install 'uwblite[bag]'
+bags need the package rosbags, in the environment of uwblite (without it the error gives the command)
 """
 _TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg")
 

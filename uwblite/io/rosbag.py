@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..errors import ConfigError, FormatError, UwbliteError
 from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges
 from .bag_frames import Frames, planar
+from .optional_packages import missing_package
 from .uwb_mapping import KNOWN, UwbMapping
 
 Floats = NDArray[np.float64]
@@ -92,7 +93,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise ConfigError("reading bags needs the package rosbags: pip install 'uwblite[bag]'") from None
+        raise missing_package("rosbags", "reading bags") from None
     try:
         # The store serves bags that do not carry the definitions of their messages.
         with AnyReader([Path(name)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

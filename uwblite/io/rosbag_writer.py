@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import ConfigError
 from ..sensor_log import SensorLog, SensorMounting
+from .optional_packages import missing_package
 
 
 def write_bag(path: str | os.PathLike[str], log: SensorLog, *, storage: str = "mcap") -> None:
@@ -34,7 +35,7 @@ def write_bag(path: str | os.PathLike[str], log: SensorLog, *, storage: str = "m
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise ConfigError("writing bags needs the package rosbags: pip install 'uwblite[bag]'") from None
+        raise missing_package("rosbags", "writing bags") from None
     target = Path(path)
     if target.exists():
         raise ConfigError(f"{target} exists; choose another name or remove it")
