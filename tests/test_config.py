@@ -10,18 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.config import (
-    field_docs,
-    from_dict,
-    leaves,
-    merge,
-    override,
-    parse_toml,
-    setting,
-    to_dict,
-    to_toml,
-    toml_value,
-)
+from uwblite.config import field_docs, from_dict, leaves, merge, override, parse_toml, setting, to_dict, to_toml, toml_value
 from uwblite.errors import ConfigError
 
 

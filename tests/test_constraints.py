@@ -6,23 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.constraint_edges import apply
-from uwblite.constraints import (
-    Clock,
-    Constraints,
-    ForbiddenClosure,
-    KnownAnchor,
-    KnownClosure,
-    KnownDistance,
-    KnownPose,
-)
-from uwblite.distance_edges import AnchorDistanceEdges
+from uwblite.constraints import Clock, Constraints, ForbiddenClosure, KnownAnchor, KnownClosure, KnownDistance, KnownPose
 from uwblite.errors import ConfigError, FormatError
-from uwblite.graph import Graph
+from uwblite.graph.distance_edges import AnchorDistanceEdges
+from uwblite.graph.graph import Graph
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.solver import optimize
 from uwblite.io.constraints_file import parse_constraints, read_anchors
-from uwblite.pose_edges import RelativePoseEdges
-from uwblite.range_edges import RangeEdges
-from uwblite.solver import optimize
+from uwblite.pipeline.constraint_edges import apply
 
 IDS = ("A", "B", "C", "D")
 TRUE = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 6.0], [-1.0, 5.0]])

@@ -4,22 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.planted import chain, drive, odometry, ranges, recording, scans, wander
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planted import chain, drive, odometry, ranges, recording, scans, wander
 
 from uwblite import se2
-from uwblite.graph import Graph
-from uwblite.keyframes import (
-    KeyframeConfig,
-    attach_ranges,
-    choose_scans,
-    dense_trajectory,
-    scan_points,
-    select,
-    velocity_at,
-)
-from uwblite.range_edges import RangeEdges
+from uwblite.graph.graph import Graph
+from uwblite.graph.range_edges import RangeEdges
+from uwblite.keyframes import KeyframeConfig, attach_ranges, choose_scans, dense_trajectory, scan_points, select, velocity_at
 from uwblite.sensor_log import LaserScans, Odometry, SensorMounting
 
 CONFIG = KeyframeConfig(distance=0.4, angle=0.3, scans=2)

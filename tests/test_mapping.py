@@ -1,22 +1,17 @@
 """The whole walk: a simulated room, missing sensors, determinism, progress and cancellation, real recordings."""
 
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-
-from planted import box, odometry, ranges, recording, scans, wander
+from helpers.planted import box, odometry, ranges, recording, scans, wander
 from simulation import logfile
 from simulation.recording import Lie, Settings, simulate
 
 from uwblite import se2
 from uwblite.errors import Cancelled
-from uwblite.evaluate import evaluate_trajectory
+from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map

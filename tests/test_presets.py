@@ -7,12 +7,12 @@ import pytest
 
 from uwblite.config import from_dict, to_dict
 from uwblite.errors import DataError
-from uwblite.evaluate import evaluate_trajectory
+from uwblite.evaluation.trajectory import evaluate_trajectory
+from uwblite.graph.pose_edges import OdometryEdges
+from uwblite.graph.range_edges import RangeEdges
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.pose_edges import OdometryEdges
 from uwblite.presets import NAMES, preset
-from uwblite.range_edges import RangeEdges
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from planted import box, odometry, ranges, recording, scans, wander
+from helpers.planted import box, odometry, ranges, recording, scans, wander
 
 from uwblite.errors import DataError
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges

@@ -26,15 +26,15 @@ from trials import ROOT, SHARED, Figures, Trial, judged, made, spread_out, table
 
 from uwblite import se2
 from uwblite.config import override
-from uwblite.evaluate import align, evaluate_trajectory
-from uwblite.gnc import optimize_gnc
-from uwblite.graph import Edges, Graph
+from uwblite.evaluation.trajectory import align, evaluate_trajectory
+from uwblite.graph.gnc import optimize_gnc
+from uwblite.graph.graph import Edges, Graph
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.robust import SQUARED
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.pose_edges import RelativePoseEdges
-from uwblite.range_edges import RangeEdges
-from uwblite.robust import SQUARED
 from uwblite.sensor_log import SensorLog
 
 PARTS = ("simulated", "real", "ablation", "injection")
@@ -298,8 +298,8 @@ def injection(args: argparse.Namespace) -> str:
         rows.append([seed, clean, spoilt, spoilt / clean])
     text = table(["seed", "clean", "with 30 % lies", "ratio"], rows)
     return (
-        "## Lies among the measurements\n\nHall, 8 min: 30 % false closures, anywhere and of the true ones' weight, and 30 % "
-        f"of the ranges replaced\nby nonsense, then graduated non-convexity (`uwblite.gnc`); ATE of the key poses, m.\n\n{text}"
+        "## False measurements\n\nHall, 8 min: 30 % false closures, anywhere and of the true ones' weight, and 30 % of the "
+        f"ranges replaced\nby nonsense, then graduated non-convexity (`uwblite.graph.gnc`); ATE of the key poses, m.\n\n{text}"
     )
 
 

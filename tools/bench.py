@@ -83,7 +83,7 @@ def bench_graphs(repeats: int, large: bool = False) -> None:
     """Optimise pose graphs by uwblite and by GTSAM."""
     from bench_peers import gtsam_optimizer
 
-    from uwblite.solver import optimize
+    from uwblite.graph.solver import optimize
 
     head("Optimisation, ms", "graph", "poses", "edges", "uwblite", "iterations", "chi2", "GTSAM", "its chi2", "ratio")
     for name, graph in graphs_to_optimise(large).items():
@@ -97,8 +97,8 @@ def bench_stages(repeats: int) -> None:
     """Time the stages of one iteration."""
     import numpy as np
 
-    from uwblite.normal_equations import NormalEquations
-    from uwblite.solver import linearize
+    from uwblite.graph.normal_equations import NormalEquations
+    from uwblite.graph.solver import linearize
 
     head("Stages of the optimiser, ms", "graph", "analyse (once)", "linearise", "fill", "factorise", "solve")
     for name, graph in (graphs_to_optimise(False) | graphs_to_optimise(True)).items():
@@ -121,8 +121,8 @@ def bench_marginals(repeats: int) -> None:
     """Compute every pose's covariance, and the relative covariance of 300 pairs."""
     import numpy as np
 
-    from uwblite.marginals import marginals
-    from uwblite.solver import optimize
+    from uwblite.graph.marginals import marginals
+    from uwblite.graph.solver import optimize
 
     head("Marginal covariances, ms", "graph", "poses", "all blocks", "300 relative ones of 100 poses")
     for name, graph in (graphs_to_optimise(False) | graphs_to_optimise(True)).items():
@@ -138,8 +138,8 @@ def bench_gnc(repeats: int) -> None:
     """Sort out 30 % false closures and 30 % outlier ranges."""
     from bench_graphs import ate, paper_graph, spoilt
 
-    from uwblite.gnc import optimize_gnc
-    from uwblite.solver import optimize
+    from uwblite.graph.gnc import optimize_gnc
+    from uwblite.graph.solver import optimize
 
     head("30 % false closures, 30 % outlier ranges", "seed", "ms", "ATE clean", "ATE plain", "ATE GNC", "ratio to clean")
     for seed in range(3):
@@ -154,8 +154,8 @@ def bench_hundred() -> None:
     """Grow a hundred times the paper's graph from its odometry; compare with the minimum next to the truth."""
     from bench_graphs import ate, paper_graph, trilaterated
 
-    from uwblite.growing import optimize_growing
-    from uwblite.solver import optimize
+    from uwblite.graph.solver import optimize
+    from uwblite.radio.growing import optimize_growing
 
     head("Hundred times the paper", "from", "s", "iterations at the end", "chi2 / dof", "ATE, m")
     graph, truth = paper_graph(100)
@@ -174,8 +174,8 @@ def bench_icp(repeats: int) -> None:
     from bench_peers import open3d_align, small_gicp_align
 
     from uwblite import se2
-    from uwblite.icp import IcpConfig, align
-    from uwblite.point_cloud import make_cloud
+    from uwblite.lidar.point_cloud import make_cloud
+    from uwblite.lidar.point_to_point import IcpConfig, align
 
     columns = ("uwblite", "small_gicp ICP", "Open3D point to line")
     head("Registration, ms (error, mm), 8 pairs", "points", *columns, "ratio to small_gicp", "tree shared")

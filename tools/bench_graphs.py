@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblite import se2
-from uwblite.graph import Graph
-from uwblite.pose_edges import RelativePoseEdges
-from uwblite.range_edges import RangeEdges
+from uwblite.graph.graph import Graph
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.range_edges import RangeEdges
 
 Floats = NDArray[np.float64]
 

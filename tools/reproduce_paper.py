@@ -24,10 +24,10 @@ from trials import ROOT, Figures, Trial, judged, made, spread_out, table
 
 from uwblite.config import override
 from uwblite.io.png import write_png
-from uwblite.map_picture import PictureAnchor, draw_map
 from uwblite.map_result import MapResult
 from uwblite.mapping import build_map
 from uwblite.presets import preset
+from uwblite.report.picture import PictureAnchor, draw_map
 
 PRESETS = ("paper", "default")
 METHODS = {

@@ -22,8 +22,8 @@ from simulation.recording import Settings, simulate
 
 from uwblite import se2
 from uwblite.cli.evaluate import read_landmarks
-from uwblite.evaluate import evaluate_anchors, evaluate_trajectory
-from uwblite.evaluate_map import LandmarkErrors, Landmarks, find_columns, landmark_errors, landmark_errors_along
+from uwblite.evaluation.map import LandmarkErrors, Landmarks, find_columns, landmark_errors, landmark_errors_along
+from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory
 from uwblite.io.carmen import read_log
 from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_tum

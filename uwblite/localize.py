@@ -13,15 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from . import map_frame, se2
+from . import se2
 from .constraints import Constraints
 from .errors import DataError
-from .icp import IcpConfig, Registration, align
+from .grid.occupancy_grid import OccupancyGrid
+from .lidar.correlative_matching import SearchConfig, search
+from .lidar.point_cloud import PointCloud, make_cloud
+from .lidar.point_to_point import IcpConfig, Registration, align
 from .map_result import MapResult, StageSummary
 from .mapping import MappingConfig, Progress, build_map
-from .occupancy_grid import OccupancyGrid
-from .point_cloud import PointCloud, make_cloud
-from .scan_search import SearchConfig, search
+from .pipeline import map_frame
 from .sensor_log import SensorLog
 
 Floats = NDArray[np.float64]

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .graph import Graph
-from .occupancy_grid import OccupancyGrid
+from .graph.graph import Graph
+from .grid.occupancy_grid import OccupancyGrid
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -12,39 +12,29 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from . import (
-    closing,
-    closures,
-    landmarks,
-    lidar_stages,
-    map_frame,
-    moved_anchors,
-    occupancy_grid,
-    refinement,
-    se2,
-    sessions,
-    summary,
-    turning,
-    wheels_and_radio,
-)
-from .calibration import LASER, freed, with_real_heights
-from .closures import Closures
-from .clouds import Clouds
+from . import se2
 from .constraints import Constraints
 from .errors import ConfigError
-from .graph import Edges, Graph
-from .grid_geometry import GridGeometry
-from .lidar_stages import Scans
+from .graph.calibration import LASER, freed, with_real_heights
+from .graph.graph import Edges, Graph
+from .graph.marginals import marginals
+from .graph.solver import optimize
+from .grid import occupancy_grid
+from .grid.geometry import GridGeometry
+from .grid.occupancy_grid import OccupancyGrid, Sweeps
+from .lidar import joint_refinement, laser_mounting
+from .lidar.clouds import Clouds
+from .lidar.joint_refinement import Refined
+from .loop_closure import closures
+from .loop_closure.closures import Closures
 from .map_result import MapResult
 from .mapping_config import MappingConfig
-from .marginals import marginals
-from .occupancy_grid import OccupancyGrid, Sweeps
-from .refinement import Refined
+from .pipeline import closure_rounds, landmark_ties, lidar_stages, map_frame, moved_anchors, radio_stages, recordings, summary
+from .pipeline.lidar_stages import Scans
+from .pipeline.progress import Progress, Stages
+from .pipeline.recordings import Drives, Part, Session
+from .pipeline.scan_selection import thinned
 from .sensor_log import SensorLog
-from .sessions import Drives, Part, Session
-from .solver import optimize
-from .stages import Progress, Stages
-from .thinning import thinned
 
 __all__ = ["MappingConfig", "Progress", "build_map"]
 
@@ -86,16 +76,16 @@ def build_map(
     logs = [_upright(log, config, stages) for log in logs]
     logs = [thinned(log, config.keyframes, config.grid) for log in logs]
 
-    drives = sessions.gather(logs, config.keyframes)
+    drives = recordings.gather(logs, config.keyframes)
     travelled = sum(float(s.frames.path.sum()) for s in drives.sessions)
     stages.end("keyframes", keyframes=len(drives.stamps), travelled=round(travelled, 3))
 
-    parts = [wheels_and_radio.measurements(session, config) for session in drives.sessions]
+    parts = [radio_stages.measurements(session, config) for session in drives.sessions]
     ranges = sum(len(part.radio) for part in parts if part.radio is not None)
     stages.end("edges", odometry=sum(len(part.wheels) for part in parts), ranges=ranges)
 
-    part = wheels_and_radio.first_optimisation(parts, drives, config, stages)
-    part = wheels_and_radio.constrained(part, known, drives, config, stages)
+    part = radio_stages.first_optimisation(parts, drives, config, stages)
+    part = radio_stages.constrained(part, known, drives, config, stages)
 
     scans = Scans.of(drives, known, config)
     found = closures.no_closures()
@@ -106,12 +96,12 @@ def build_map(
         part = replace(part, graph=freed(part.graph, *LASER))
         if config.tracking.on:
             part, tracked, scans = lidar_stages.track(part, scans, drives, config, stages)
-            part = wheels_and_radio.heard_anew(part, tracked, config, stages)
+            part = radio_stages.heard_anew(part, tracked, config, stages)
         if config.use_loops:
             held = () if tracked is None else (tracked.edges,)
-            close = closing.close if config.loops.method == "search" else closing.close_plainly
+            close = closure_rounds.close if config.loops.method == "search" else closure_rounds.close_plainly
             part, found = close(part, (*part.edges, *held), scans, drives, config, stages, executor)
-            part = wheels_and_radio.weighed_anew(part, (*held, found.edges), config)
+            part = radio_stages.weighed_anew(part, (*held, found.edges), config)
             part, refined = lidar_stages.refine_jointly(part, scans, drives, config, stages)
             apart = moved_anchors.apart(part, drives, config.solver, config.ranges)
             if apart.warnings:
@@ -130,7 +120,7 @@ def build_map(
     part = _aligned(part, walls, config)
 
     grid = _grid(drives, part.graph, config, executor, stages)
-    uncertainty = marginals(refinement.with_fewer_pairs(part.graph))
+    uncertainty = marginals(joint_refinement.with_fewer_pairs(part.graph))
     result = summary.summarise(
         drives, part, uncertainty, found, grid, config.calibration, stages.done, stages.warnings, stages.doubts
     )
@@ -140,7 +130,7 @@ def build_map(
 
 def _upright(log: SensorLog, config: MappingConfig, stages: Stages) -> SensorLog:
     """Return the recording with the laser the way up that its turns show."""
-    seen = turning.compare(log, _TURNS) if config.turn_laser and log.scans is not None else None
+    seen = laser_mounting.compare(log, _TURNS) if config.turn_laser and log.scans is not None else None
     if seen is None or not (seen.agree and seen.turned_over):
         return log
     flipped = not log.mounting.laser_flipped
@@ -172,12 +162,12 @@ def _measured_distances(
         raise ConfigError("constraints: distances between landmarks need the lidar, which sees them")
     held = _final(part, closures, tracked, refined)
     poses = se2.compose(_alignment(held, _walls(scans, config), config), held.graph.poses)
-    tied = landmarks.ties(known, scans.clouds, poses, drives.path)
+    tied = landmark_ties.ties(known, scans.clouds, poses, drives.path)
     solved = optimize(held.graph.with_edges(tied.edges), config.solver)[0]
     part = replace(part, graph=part.graph.with_edges(tied.edges).with_estimates_of(solved))
     if refined is not None:
         part, refined = lidar_stages.refine_jointly(part, scans, drives, config, stages)
-    figures, warnings = landmarks.outcome(known, tied, part.graph)
+    figures, warnings = landmark_ties.outcome(known, tied, part.graph)
     stages.warnings += warnings
     stages.end("measured distances", distances=figures)
     return part, refined
@@ -191,7 +181,7 @@ def _walls(scans: Scans | None, config: MappingConfig) -> Clouds | None:
 def _aligned(part: Part, walls: Clouds | None, config: MappingConfig) -> Part:
     """Put the map's axes where the settings want them."""
     motion = _alignment(part, walls, config)
-    return replace(part, graph=map_frame.moved(part.graph, motion), first=sessions.moved_hypotheses(part.first, motion))
+    return replace(part, graph=map_frame.moved(part.graph, motion), first=recordings.moved_hypotheses(part.first, motion))
 
 
 def _alignment(part: Part, walls: Clouds | None, config: MappingConfig) -> Floats:

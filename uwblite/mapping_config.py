@@ -3,21 +3,21 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from .anchors import AnchorConfig
-from .calibration import CalibrationConfig
-from .closures import LoopClosureConfig
-from .clouds import CloudConfig
-from .first_estimate import GrowthConfig
-from .icp import IcpConfig
+from .graph.calibration import CalibrationConfig
+from .graph.solver import SolverConfig
+from .grid.occupancy_grid import GridConfig
 from .keyframes import KeyframeConfig
-from .measurement import OdometryNoiseConfig
-from .occupancy_grid import GridConfig
-from .range_noise import RangeNoiseConfig
-from .refinement import RefinementConfig
-from .scan_search import SearchConfig
-from .solver import SolverConfig
-from .submaps import SubmapConfig
-from .tracking import TrackingConfig
+from .lidar.clouds import CloudConfig
+from .lidar.correlative_matching import SearchConfig
+from .lidar.joint_refinement import RefinementConfig
+from .lidar.point_to_point import IcpConfig
+from .lidar.scan_to_scan import TrackingConfig
+from .lidar.submaps import SubmapConfig
+from .loop_closure.closures import LoopClosureConfig
+from .radio.bootstrap import GrowthConfig
+from .radio.range_measurements import OdometryNoiseConfig
+from .radio.range_noise import RangeNoiseConfig
+from .radio.trilateration import AnchorConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,17 @@
 """Named settings."""
 
-from .calibration import CalibrationConfig
-from .closures import LoopClosureConfig
-from .clouds import CloudConfig
 from .errors import DataError
-from .icp import IcpConfig
+from .graph.calibration import CalibrationConfig
+from .graph.robust import SQUARED
+from .lidar.clouds import CloudConfig
+from .lidar.joint_refinement import RefinementConfig
+from .lidar.point_to_point import IcpConfig
+from .lidar.scan_to_scan import TrackingConfig
+from .lidar.submaps import SubmapConfig
+from .loop_closure.closures import LoopClosureConfig
 from .mapping import MappingConfig
-from .measurement import OdometryNoiseConfig
-from .range_noise import RangeNoiseConfig
-from .refinement import RefinementConfig
-from .robust import SQUARED
-from .submaps import SubmapConfig
-from .tracking import TrackingConfig
+from .radio.range_measurements import OdometryNoiseConfig
+from .radio.range_noise import RangeNoiseConfig
 
 NAMES = ("default", "paper")
 

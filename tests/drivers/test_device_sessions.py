@@ -5,11 +5,11 @@ import math
 import random
 
 import pytest
-from driver_harness import of_kind, simulate
 from emulators.dwm_device import DwmDevice, DwmOptions
 from emulators.faults import FaultyLine, parse_fault
 from emulators.scip_device import ScipDevice, ScipOptions
 from emulators.world import Epoch, Scan, WorldClock
+from helpers.driver_harness import of_kind, simulate
 
 from uwblite.drivers.dwm1001_session import Dwm1001Session
 from uwblite.drivers.events import Corrupt, LaserScan, Lost, Note, Param, RangeEpoch, SetBaud

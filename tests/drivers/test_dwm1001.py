@@ -4,9 +4,9 @@ import random
 import struct
 
 import pytest
-from driver_harness import check_transcript, feed_whole, good
 from emulators.dwm_device import BANNER, DwmDevice, DwmOptions
 from emulators.world import Epoch, WorldClock
+from helpers.driver_harness import check_transcript, feed_whole, good
 
 from uwblite.drivers import dwm1001
 from uwblite.drivers.dwm1001 import TlvProtocol

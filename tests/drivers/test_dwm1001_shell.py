@@ -3,7 +3,7 @@
 import random
 
 import pytest
-from driver_harness import check_transcript, feed_split, feed_whole, good
+from helpers.driver_harness import check_transcript, feed_split, feed_whole, good
 
 from uwblite.drivers import dwm1001_shell
 from uwblite.drivers.dwm1001_shell import (

@@ -3,10 +3,10 @@
 import math
 
 import pytest
-from driver_harness import ROOT
 from emulators.faults import FaultyLine, parse_fault
 from emulators.wires import PtyWire
 from emulators.world import LogWorld, RoomWorld, WorldClock
+from helpers.driver_harness import ROOT
 
 from uwblite.drivers.scip_session import ScipSession
 from uwblite.drivers.transport import Port

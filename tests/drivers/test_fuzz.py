@@ -4,7 +4,7 @@ import random
 import sys
 
 import pytest
-from driver_harness import ROOT  # noqa: F401
+from helpers.driver_harness import ROOT  # noqa: F401
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -71,7 +71,7 @@ def test_protocols_take_anything(name, data):
 @given(data=st.data())
 def test_splits_do_not_matter_for_any_input(name, data):
     """The good events of any bytes are the same whole and byte by byte."""
-    from driver_harness import good
+    from helpers.driver_harness import good
 
     make, words = PROTOCOLS[name]
     stream = b"".join(data.draw(pieces(words)))

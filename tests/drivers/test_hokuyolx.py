@@ -9,7 +9,7 @@ import sys
 import time
 
 import pytest
-from driver_harness import ROOT
+from helpers.driver_harness import ROOT
 
 hokuyolx = pytest.importorskip("hokuyolx")
 from hokuyolx.exceptions import HokuyoException  # noqa: E402

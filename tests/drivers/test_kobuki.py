@@ -4,9 +4,9 @@ import math
 import random
 
 import pytest
-from driver_harness import check_transcript, feed_whole, good
 from emulators.kobuki_device import KobukiDevice, encode_packet
 from emulators.world import Pose, RoomWorld, WorldClock
+from helpers.driver_harness import check_transcript, feed_whole, good
 
 from uwblite.drivers import kobuki
 from uwblite.drivers.events import Corrupt

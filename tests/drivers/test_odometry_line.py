@@ -4,7 +4,7 @@ import math
 import random
 
 import pytest
-from driver_harness import check_transcript, feed_whole, good
+from helpers.driver_harness import check_transcript, feed_whole, good
 
 from uwblite.drivers.events import Corrupt
 from uwblite.drivers.odometry_line import MAX_LINE, LineFormat, LineOdometer, OdometryLineProtocol, parse_format

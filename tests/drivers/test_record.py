@@ -9,7 +9,7 @@ import threading
 import time
 
 import pytest
-from driver_harness import ROOT
+from helpers.driver_harness import ROOT
 
 sys.path.insert(0, str(ROOT / "tools"))
 from compare_recording import compare

@@ -4,9 +4,9 @@ import math
 import random
 
 import pytest
-from driver_harness import check_transcript, feed_whole, good
 from emulators.scip_device import ScipDevice, ScipOptions, data_lines, encode
 from emulators.world import RoomWorld, WorldClock
+from helpers.driver_harness import check_transcript, feed_whole, good
 
 from uwblite.drivers import scip, scip_codes, scip_commands
 from uwblite.drivers.events import Corrupt

@@ -8,10 +8,10 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from helpers.results import small_log, small_result
+from helpers.small_files import G2O, KNOWN, LOG, MAPPING, PYFG, SETTINGS, TABLE, TORO, TUM
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from results import small_log, small_result
-from small_files import G2O, KNOWN, LOG, MAPPING, PYFG, SETTINGS, TABLE, TORO, TUM
 
 from uwblite.config import merge, parse_toml
 from uwblite.errors import UwbliteError

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.errors import FormatError
-from uwblite.graph import Calibration, Graph, PriorEdges
+from uwblite.graph.graph import Calibration, Graph, PriorEdges
+from uwblite.graph.point_edges import LandmarkEdges
+from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.solver import optimize
 from uwblite.io.g2o import read_g2o, write_g2o
 from uwblite.io.graph_file import chained_poses, plain_edges, root
 from uwblite.io.pyfg import read_pyfg, write_pyfg
-from uwblite.landmark_edges import LandmarkEdges
-from uwblite.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
-from uwblite.range_edges import RangeEdges
-from uwblite.solver import optimize
 
 FORMATS = [
     (lambda path, graph: write_g2o(path, graph, ranges=True), read_g2o),

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite.errors import FormatError
+from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridGeometry, OccupancyGrid
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png, encode_png
 from uwblite.io.tum import write_tum
-from uwblite.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridGeometry, OccupancyGrid
 
 
 def sample(rows=7, cols=11, seed=0, origin=(-12.345678, 3.05)):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from results import EVIL, FILES, contents, small_log, small_result
+from helpers.results import EVIL, FILES, contents, small_log, small_result
 
 from uwblite.errors import ConfigError
 from uwblite.io import folders, results

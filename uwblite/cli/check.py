@@ -7,7 +7,7 @@ from .options import add_mounting_arguments
 from .wording import signed
 
 if TYPE_CHECKING:
-    from ..diagnostics import Diagnosis
+    from ..checks.recording import Diagnosis
     from ..sensor_log import SensorLog
 
 HELP = "say what is wrong with a recording and what to do about it, before mapping it"
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..diagnostics import diagnose
+    from ..checks.recording import diagnose
     from . import console
     from .formats import read_recording
     from .options import apply_mounting

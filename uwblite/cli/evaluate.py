@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..evaluate import AnchorErrors, ErrorStatistics, TrajectoryErrors
-    from ..evaluate_map import LandmarkErrors, Landmarks, WallErrors
+    from ..evaluation.map import LandmarkErrors, Landmarks, WallErrors
+    from ..evaluation.trajectory import AnchorErrors, ErrorStatistics, TrajectoryErrors
 
     Drive = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
     """Stamps (n,) s and poses (n, 3) of a result, and the true ones."""
@@ -79,8 +79,8 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     import numpy as np
 
     from .. import se2
-    from ..evaluate import evaluate_trajectory
-    from ..evaluate_map import find_columns, landmark_errors, landmark_errors_along
+    from ..evaluation.map import find_columns, landmark_errors, landmark_errors_along
+    from ..evaluation.trajectory import evaluate_trajectory
     from ..io.results import mend_result
 
     folder = Path(args.dir)
@@ -165,7 +165,7 @@ def in_order(stamps: "NDArray[np.float64]", poses: "NDArray[np.float64]") -> "tu
 
 
 def _anchors(path: Path, truth: str, T_truth_map: "NDArray[np.float64]") -> "AnchorErrors":
-    from ..evaluate import evaluate_anchors
+    from ..evaluation.trajectory import evaluate_anchors
     from ..io.csv_table import read_csv
 
     estimate, true = read_csv(path), read_csv(truth)
@@ -180,7 +180,7 @@ def read_landmarks(path: str) -> "tuple[Landmarks, tuple[tuple[str, str], ...] |
     import numpy as np
 
     from ..errors import FormatError
-    from ..evaluate_map import Landmarks
+    from ..evaluation.map import Landmarks
     from ..io.csv_table import read_csv
 
     table = read_csv(path)
@@ -209,7 +209,7 @@ def _walls(
     viewpoints: "NDArray[np.float64]",
     tolerance: float,
 ) -> "WallErrors":
-    from ..evaluate_map import wall_errors
+    from ..evaluation.map import wall_errors
     from ..io.csv_table import read_csv
 
     return wall_errors(occupied, read_csv(path).numbers("x1", "y1", "x2", "y2"), posts, viewpoints, tolerance=tolerance)

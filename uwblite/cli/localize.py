@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from .options import add_mounting_arguments, add_settings_arguments
 
 if TYPE_CHECKING:
+    from ..grid.occupancy_grid import OccupancyGrid
     from ..localize import Localization
-    from ..occupancy_grid import OccupancyGrid
 
 HELP = "find the trajectory of a new recording in an existing map, by its anchors and walls"
 EPILOG = """\
@@ -100,7 +100,7 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
 
 
 def _picture(found: "Localization", grid: "OccupancyGrid | None", caption: str) -> Any:
-    from ..map_picture import PictureAnchor, draw_map
+    from ..report.picture import PictureAnchor, draw_map
 
     anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in found.result.anchors]
     return draw_map(grid, found.result.trajectory, anchors=anchors, caption=caption)

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     from ..io.result_text import RunRecord
     from ..io.results import check_target, write_result
     from ..parallel import in_order
-    from ..thinning import thinned
+    from ..pipeline.scan_selection import thinned
     from . import console
     from .formats import read_recording
     from .options import apply_mounting
@@ -183,7 +183,7 @@ def _tell_reader_warnings(logs: list["SensorLog"]) -> None:
 
 
 def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
-    from ..diagnostics import diagnose
+    from ..checks.recording import diagnose
     from . import check, console
 
     diagnosis = diagnose(log)

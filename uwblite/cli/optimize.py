@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 from .options import number
 
 if TYPE_CHECKING:
-    from ..graph import Graph
+    from ..graph.graph import Graph
+    from ..graph.solver import SolverSummary
     from ..io.graph_file import GraphFile
-    from ..solver import SolverSummary
 
 HELP = "optimise a pose graph: g2o, TORO or PyFG in, optimised graph and trajectory out"
 EPILOG = """\
@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
 
     from ..config import override
-    from ..graph_starts import place_anchors
-    from ..solver import SolverConfig, optimize
+    from ..graph.solver import SolverConfig, optimize
+    from ..radio.anchor_starts import place_anchors
     from . import console
     from .formats import graph_format, read_graph, refuse_existing, write_graph
 
@@ -82,8 +82,8 @@ def _with_kernel(graph: "Graph", name: str, scale: float) -> "Graph":
 
     import numpy as np
 
-    from ..pose_edges import RelativePoseEdges
-    from ..robust import Kernel
+    from ..graph.pose_edges import RelativePoseEdges
+    from ..graph.robust import Kernel
 
     kernel = Kernel(name, scale)
     edges: list[Any] = []

@@ -10,19 +10,7 @@ import selectors
 from collections.abc import Callable
 
 from ..errors import DeviceError
-from .events import (
-    Action,
-    Corrupt,
-    LaserScan,
-    Lost,
-    Note,
-    OdometryPose,
-    Param,
-    RangeEpoch,
-    Reopen,
-    Send,
-    SetBaud,
-)
+from .events import Action, Corrupt, LaserScan, Lost, Note, OdometryPose, Param, RangeEpoch, Reopen, Send, SetBaud
 from .link import Counts, Link, Mounting, doubts, summary_lines
 from .log_file import LogFile, number_text, pose_line, range_lines, scan_line
 from .transport import Port

@@ -12,10 +12,10 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from .. import se2
 from ..errors import FormatError
-from ..graph import Graph, PriorEdges
-from ..landmark_edges import LandmarkEdges
-from ..pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
-from ..range_edges import RangeEdges
+from ..graph.graph import Graph, PriorEdges
+from ..graph.point_edges import LandmarkEdges
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+from ..graph.range_edges import RangeEdges
 from .records import RecordFile, Records
 
 Floats = NDArray[np.float64]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError
-from ..grid_geometry import GridGeometry
-from ..occupancy_grid import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_ABOVE, OccupancyGrid
+from ..grid.geometry import GridGeometry
+from ..grid.occupancy_grid import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_ABOVE, OccupancyGrid
 from .files import replacing, write_text
 from .png import SIGNATURE, decode_png, encode_png
 

@@ -21,7 +21,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..graph import Graph
+from ..graph.graph import Graph
 from .files import replacing
 from .graph_file import GraphFile, PlainEdges, assembled, plain_edges, read_matrices, told_places, upper_triangle
 from .records import Layout, RecordFile, Records, read_records

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigError
-from ..map_picture import PictureAnchor, draw_map
+from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import MapResult
-from ..occupancy_grid import OccupancyGrid
-from ..report import render
+from ..report.html import render
+from ..report.picture import PictureAnchor, draw_map
 from ..sensor_log import SensorLog
 from .files import write_text
 from .folders import mend, replacing_folder

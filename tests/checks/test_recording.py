@@ -1,0 +1,211 @@
+"""Findings: a sound recording has none that matter, and each fault put into it is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwblite import se2
+from uwblite.checks.recording import diagnose
+from uwblite.map_result import CalibrationEstimate
+from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges
+
+ROOM = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.5], [3.0, 4.5], [3.0, 5.5], [0.0, 5.5], [0.0, 0.0]])
+PER_RANGE = ("stamps", "anchor", "ranges", "quality")
+ANCHORS = {"A1": (0.5, 0.5), "B2": (5.5, 4.0), "C3": (0.5, 5.0)}
+
+
+def walls_seen(pose, bearings):
+    """Return the distance (b,) to the walls of ROOM along bearings in the laser's frame, m."""
+    a, b = ROOM[:-1], ROOM[1:]
+    direction = np.stack([np.cos(pose[2] + bearings), np.sin(pose[2] + bearings)], axis=1)
+    edge = b - a
+    cross = direction[:, None, 0] * edge[None, :, 1] - direction[:, None, 1] * edge[None, :, 0]
+    to = a - pose[:2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (to[None, :, 0] * edge[None, :, 1] - to[None, :, 1] * edge[None, :, 0]) / cross
+        part = (to[None, :, 0] * direction[:, None, 1] - to[None, :, 1] * direction[:, None, 0]) / cross
+    return np.where((along > 0) & (part >= 0) & (part <= 1), along, np.inf).min(axis=1)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Two rounds through a room from place to place, turning on the spot: true poses at 20 Hz."""
+    places = [(1.2, 1.2), (4.6, 0.9), (5.1, 3.2), (3.4, 2.2), (2.3, 4.6), (0.8, 3.9), (1.9, 2.4)] * 2
+    poses = [np.array([*places[-1], 0.4])]
+    for place in places:
+        here = poses[-1]
+        way = np.array(place) - here[:2]
+        turn = float(se2.wrap_angle(np.arctan2(way[1], way[0]) - here[2]))
+        for move, amount, speed in ((np.array([0, 0, 1.0]), turn, 0.6), (np.array([1.0, 0, 0]), np.hypot(*way), 0.25)):
+            steps = max(1, round(abs(amount) / speed * 20))
+            for _ in range(steps):
+                poses.append(se2.compose(poses[-1], move * amount / steps))
+    return np.array(poses)
+
+
+def recording(drive, *, flipped=False, lag=0.0):
+    stamps = 100.0 + 0.05 * np.arange(len(drive))
+    rng = np.random.default_rng(1)
+    ids = tuple(sorted(ANCHORS))
+    when = np.repeat(np.arange(100.0, stamps[-1], 0.5), len(ids))
+    where = se2.interpolate_trajectory(stamps, drive, when)[:, :2]
+    anchor = np.tile(np.arange(len(ids)), len(when) // len(ids))
+    ranges = np.hypot(*(where - np.array([ANCHORS[i] for i in ids])[anchor]).T) + rng.normal(0, 0.03, len(when))
+    scan_stamps = np.arange(100.0, stamps[-1], 0.2)
+    bearings = np.linspace(-2.0, 2.0, 161)
+    sign = -1.0 if flipped else 1.0
+    seen = [walls_seen(p, sign * bearings) for p in se2.interpolate_trajectory(stamps, drive, scan_stamps)]
+    readings = np.array(seen) + rng.normal(0, 0.01, (len(seen), len(bearings)))
+    scans = LaserScans(scan_stamps + lag, readings.astype(np.float32), -2.0, 0.025, 0.0, 0.02, 5.6)
+    return SensorLog(Odometry(stamps, drive), UwbRanges(when, anchor, ranges, np.full(len(when), 100.0), ids), scans)
+
+
+@pytest.fixture(scope="module")
+def sound(drive):
+    return recording(drive)
+
+
+def texts(log, **options):
+    return [f"{f.rank}: {f.what}" for f in diagnose(log, **options).findings]
+
+
+def assert_named(log, rank, part, **options):
+    found = texts(log, **options)
+    assert any(t.startswith(rank) and part in t for t in found), found
+
+
+def test_a_sound_recording_has_nothing_to_complain_about(sound):
+    diagnosis = diagnose(sound)
+    assert not [f for f in diagnosis.findings if f.rank != "note"]
+    figures = diagnosis.figures
+    assert figures["odometry"]["rate Hz"] == pytest.approx(20.0, abs=0.01)
+    assert figures["uwb"]["anchors"]["A1"]["noise m"] == pytest.approx(0.03, rel=0.3)
+    assert figures["uwb"]["coverage"]["at least 3"] > 0.95
+    assert figures["lidar"]["turning"]["turn by laser / turn by wheels"] == pytest.approx(1.0, abs=0.05)
+    assert abs(figures["lidar"]["turning"]["clock offset s"]) <= 0.04
+
+
+def test_a_laser_upside_down_is_named_and_so_is_a_needless_flip(drive, sound):
+    assert_named(recording(drive, flipped=True), "serious", "upside down")
+    assert "serious" not in str(texts(replace(recording(drive, flipped=True), mounting=SensorMounting(laser_flipped=True))))
+    assert_named(replace(sound, mounting=SensorMounting(laser_flipped=True)), "serious", "mounted upright")
+
+
+@pytest.mark.parametrize("lag", [0.3, -0.4])
+def test_a_clock_offset_of_the_laser_is_measured(drive, lag):
+    diagnosis = diagnose(recording(drive, lag=lag))
+    assert diagnosis.figures["lidar"]["turning"]["clock offset s"] == pytest.approx(lag, abs=0.04)
+    assert any("laser's clock" in f.what for f in diagnosis.findings)
+
+
+def with_poses(log, poses):
+    return replace(log, odometry=replace(log.odometry, poses=poses))
+
+
+def test_units_and_axes_of_the_wheels(sound):
+    poses = sound.odometry.poses
+    assert_named(with_poses(sound, poses * (1000, 1000, 1)), "serious", "millimetres")
+    assert_named(with_poses(sound, np.column_stack([poses[:, :2], np.degrees(poses[:, 2])])), "serious", "degrees")
+    assert_named(with_poses(sound, poses * (1, 1, -1)), "serious", "turns against the path")
+    assert_named(with_poses(sound, poses * (1e-3, 1e-3, 1)), "serious", "hardly moves")
+
+
+def test_wheels_that_turn_too_much(sound):
+    poses = sound.odometry.poses
+    steps = se2.between(poses[:-1], poses[1:]) * (1, 1, 1.4)
+    wrong = [poses[0]]
+    for step in steps:
+        wrong.append(se2.compose(wrong[-1], step))
+    assert_named(with_poses(sound, np.array(wrong)), "warning", "times the turns that the laser sees")
+
+
+def test_jumps_gaps_and_equal_stamps(sound):
+    jumped = sound.odometry.poses.copy()
+    jumped[700:] += (2.0, 0.0, 0.0)
+    assert_named(with_poses(sound, jumped), "warning", "1 jumps (the largest 2.00 m) at t = 34.9")
+    stamps = sound.odometry.stamps
+    late = replace(sound.odometry, stamps=stamps + np.where(np.arange(len(stamps)) > 700, 9.0, 0.0))
+    assert_named(replace(sound, odometry=late), "warning", "longest is 9.1 s")
+    coarse = replace(sound.odometry, stamps=np.floor(stamps * 5) / 5)
+    assert_named(replace(sound, odometry=coarse), "warning", "stamps equal the one before")
+
+
+def with_ranges(log, values):
+    return replace(log, ranges=replace(log.ranges, ranges=values))
+
+
+def test_ranges_zero_absurd_spiky_or_in_millimetres(sound):
+    values, mine = sound.ranges.ranges, sound.ranges.anchor == 1
+    rng = np.random.default_rng(2)
+    struck = mine & (rng.uniform(size=len(values)) < 0.2)
+    assert_named(with_ranges(sound, np.where(struck, 0.0, values)), "warning", "anchor B2: ")
+    figures = diagnose(with_ranges(sound, np.where(struck, 0.0, values))).figures["uwb"]["anchors"]["B2"]
+    assert figures["zeros"] == struck.sum()
+    negative = diagnose(with_ranges(sound, np.where(struck, -3.0, values))).figures["uwb"]["anchors"]["B2"]
+    assert negative["absurd"] == struck.sum()
+    few = mine & (np.arange(len(values)) % 30 == 1)
+    spiky = diagnose(with_ranges(sound, np.where(few, values + 4.0, values))).figures["uwb"]["anchors"]["B2"]
+    assert spiky["spikes"] == pytest.approx(few.sum(), abs=2)
+    assert_named(with_ranges(sound, values * 1000), "serious", "millimetres")
+
+
+def test_coverage_and_straight_paths(sound):
+    only = sound.ranges.anchor == 0
+    ranges = replace(sound.ranges, **{n: getattr(sound.ranges, n)[only] for n in PER_RANGE}, anchor_ids=("A1",))
+    assert_named(replace(sound, ranges=ranges), "note", "there is one anchor")
+    half = ranges.stamps < 110
+    short = replace(ranges, **{n: getattr(ranges, n)[half] for n in PER_RANGE})
+    straight = sound.odometry.poses * (1, 0, 0)
+    assert_named(replace(with_poses(sound, straight), ranges=short), "warning", "either side")
+
+
+def test_scans_in_millimetres_degrees_or_dark(sound):
+    scans = sound.scans
+    far = replace(scans, ranges=scans.ranges * 1000, range_max=5600.0, range_min=20.0)
+    assert_named(replace(sound, scans=far), "serious", "millimetres")
+    assert_named(replace(sound, scans=replace(scans, angle_increment=1.5, angle_min=-120.0)), "serious", "degrees")
+    dark = replace(scans, ranges=np.full_like(scans.ranges, np.inf))
+    assert_named(replace(sound, scans=dark), "warning", "only 0 % of the beams")
+    assert_named(
+        replace(sound, scans=replace(scans, ranges=np.full_like(scans.ranges, 1.5))), "serious", "all readings are equal"
+    )
+
+
+def test_clocks_that_have_nothing_in_common(sound):
+    scans = replace(sound.scans, stamps=sound.scans.stamps + 5000)
+    assert_named(replace(sound, scans=scans), "serious", "the clocks differ by about 5000")
+
+
+def test_missing_sensors_and_notes_of_the_reader(sound):
+    assert_named(sound.without(uwb=True), "note", "no UWB ranges")
+    assert_named(sound.without(lidar=True), "note", "no laser scans")
+    notes = LogNotes(lines=1000, broken=30, broken_lines=((17, "not a number"),), warnings=("3 messages out of order",))
+    assert_named(replace(sound, notes=notes), "warning", "30 of 1000 lines are broken and were skipped (line 17: not a number)")
+    assert_named(replace(sound, notes=notes), "warning", "3 messages out of order")
+
+
+def test_what_the_radio_says_of_the_wheels(sound):
+    scale = CalibrationEstimate("odometry_scale", 0.06, 0.004, "1", "error of travelled distance", "estimated")
+    assert_named(sound, "warning", "the wheels are off against the radio by +6.0%", calibration=(scale,))
+    unsure = replace(scale, sigma=0.05)
+    assert not [t for t in texts(sound, calibration=(unsure,)) if "wheels are off" in t]
+
+
+def test_findings_are_ranked_and_json_ready(sound):
+    import json
+
+    log = with_poses(sound.without(uwb=True), sound.odometry.poses * (1000, 1000, 1))
+    diagnosis = diagnose(log)
+    ranks = [f.rank for f in diagnosis.findings]
+    assert ranks == sorted(ranks, key=["serious", "warning", "note"].index)
+    assert diagnosis.serious
+    json.dumps(diagnosis.figures, allow_nan=False)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3, 6])
+def test_the_shortest_recordings_are_examined_too(sound, samples):
+    odometry = Odometry(sound.odometry.stamps[:samples], sound.odometry.poses[:samples])
+    ranges = replace(sound.ranges, **{n: getattr(sound.ranges, n)[:samples] for n in PER_RANGE})
+    scans = replace(sound.scans, stamps=sound.scans.stamps[:samples], ranges=sound.scans.ranges[:samples])
+    assert diagnose(SensorLog(odometry, ranges, scans)).serious

@@ -1,0 +1,154 @@
+"""uwblite evaluate on results whose errors are known."""
+
+import json
+
+import numpy as np
+import pytest
+
+from uwblite import se2
+from uwblite.cli import main
+from uwblite.evaluation.map import sample_surfaces
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
+from uwblite.io.map_server import write_map
+from uwblite.io.tum import read_tum, write_tum
+
+COLUMNS = np.array([[2.0, 2.0, 0.3], [6.0, 2.0, 0.3], [2.0, 5.0, 0.25]])
+WALLS = np.array([[0.0, 0, 8, 0], [8, 0, 8, 7], [8, 7, 0, 7], [0, 7, 0, 0]])
+T_MAP_TRUTH = np.array([3.0, -1.0, 0.8])
+
+
+@pytest.fixture
+def result(tmp_path):
+    """Write a perfect result in another frame, with its truth; return the folder and the words of the command."""
+    angle = np.linspace(0, 2 * np.pi, 400)
+    truth = np.stack([4 + 1.2 * np.cos(angle), 3.5 + 1.2 * np.sin(angle), se2.wrap_angle(angle + np.pi / 2)], axis=1)
+    stamps = 100.0 + 0.1 * np.arange(400)
+    folder = tmp_path / "map"
+    folder.mkdir()
+    write_tum(folder / "trajectory.tum", stamps, se2.compose(T_MAP_TRUTH, truth))
+    write_tum(tmp_path / "truth.tum", stamps, truth)
+    anchors = {"DD07": (0.0, 0.0), "1E05": (8.0, 0.0), "91A3": (8.0, 7.0)}
+    (tmp_path / "anchors.csv").write_text("id,x,y\n" + "".join(f"{k},{x},{y}\n" for k, (x, y) in anchors.items()))
+    moved = {k: se2.transform(T_MAP_TRUTH, xy) for k, xy in anchors.items() if k != "1E05"}
+    moved["DD07"] = moved["DD07"] + [0.3, 0.4]
+    (folder / "anchors.csv").write_text("id,x,y,sigma_x\n" + "".join(f"{k},{x},{y},0.1\n" for k, (x, y) in moved.items()))
+    rows = [f"C{i},{x},{y},{r},{'C2 C3' if i == 1 else ''}\n" for i, (x, y, r) in enumerate(COLUMNS, 1)]
+    (tmp_path / "columns.csv").write_text("name,x,y,radius,neighbours\n" + "".join(rows))
+    (tmp_path / "walls.csv").write_text("x1,y1,x2,y2\n" + "".join(",".join(map(str, w)) + "\n" for w in WALLS))
+    draw_map(folder)
+    return tmp_path, ["evaluate", str(folder), "--truth", str(tmp_path / "truth.tum")]
+
+
+def draw_map(folder, resolution=0.04):
+    points = se2.transform(T_MAP_TRUTH, sample_surfaces(WALLS, COLUMNS, 0.01))
+    geometry = GridGeometry.around(points.min(axis=0), points.max(axis=0), resolution, 10**7)
+    odds = np.zeros((geometry.rows, geometry.cols), dtype=np.float32)
+    odds[geometry.cell_of(points)] = 4.0
+    write_map(folder, OccupancyGrid(geometry, odds))
+
+
+def options(root):
+    return [
+        w
+        for name in ("anchors", "columns", "walls")
+        for w in (f"--{name.replace('columns', 'landmarks')}", str(root / f"{name}.csv"))
+    ]
+
+
+def test_everything_in_json(result, capsys):
+    root, words = result
+    assert main([*words, *options(root), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["trajectory"]["ate"]["rmse"] < 1e-5
+    assert found["trajectory"]["heading"]["rmse"] < 1e-6
+    assert found["trajectory"]["compared"] == 400
+    np.testing.assert_allclose(found["trajectory"]["T_truth_map"], se2.inverse(T_MAP_TRUTH), atol=1e-5)
+    assert found["anchors"]["missing"] == ["1E05"]
+    assert found["anchors"]["errors"]["DD07"] == pytest.approx(0.5, abs=1e-4)
+    assert found["anchors"]["errors"]["91A3"] == pytest.approx(0.0, abs=1e-4)
+    assert [(p["a"], p["b"]) for p in found["landmarks"]["pairs"]] == [("C1", "C2"), ("C1", "C3")]
+    assert found["landmarks"]["mean"] < 0.02
+    assert found["landmarks_along_trajectory"]["mean"] < 1e-4
+    assert found["walls"]["precision"] == 1.0
+    assert found["walls"]["recall"] > 0.99
+
+
+def test_table(result, capsys):
+    root, words = result
+    assert main([*words, *options(root)]) == 0
+    text = capsys.readouterr().out
+    for part in (
+        "position (ATE)",
+        "heading",
+        "relative (RPE)",
+        "400 of 400",
+        "anchors: rmse 0.354 m",
+        "C1 - C2",
+        "without an estimate: 1E05",
+    ):
+        assert part in text
+
+
+def test_trajectory_alone(result, capsys):
+    root, words = result
+    (root / "map" / "map.yaml").unlink()
+    assert main(words) == 0
+    assert "columns" not in capsys.readouterr().out
+    assert main([*words, *options(root)]) == 0
+    assert "no map.yaml" in capsys.readouterr().out
+
+
+def test_truth_without_heading(result, capsys):
+    root, words = result
+    lines = (root / "truth.tum").read_text().splitlines()
+    (root / "truth.tum").write_text("".join(" ".join([*line.split()[:4], "0 0 0 1"]) + "\n" for line in lines))
+    assert main([*words, "--json", "--landmarks", str(root / "columns.csv")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["trajectory"]["heading"] is None
+    assert "landmarks_along_trajectory" not in found
+
+
+def test_errors_are_one_line(result, capsys):
+    root, words = result
+    assert main(["evaluate", str(root / "nowhere"), "--truth", str(root / "truth.tum")]) == 1
+    assert "trajectory.tum" in capsys.readouterr().err
+    assert main([*words, "--delta", "-1"]) == 2
+    assert "above 0" in capsys.readouterr().err
+    (root / "anchors.csv").write_text("name,x,y\nA,1,2\n")
+    assert main([*words, "--anchors", str(root / "anchors.csv")]) == 1
+    assert "no column 'id'" in capsys.readouterr().err
+    assert main(["evaluate", str(root / "map")]) == 2
+
+
+def test_each_recording_of_a_joint_map_and_all_together(result, capsys):
+    """The second recording lies askew in the common frame: alone it is perfect, together they are not."""
+    root, words = result
+    stamps, truth = read_tum(root / "truth.tum")
+    askew = se2.compose(np.array([0.2, 0.0, 0.0]), se2.compose(T_MAP_TRUTH, truth))
+    write_tum(root / "map" / "trajectory_2.tum", stamps - 95.0, askew)
+    write_tum(root / "truth_2.tum", stamps - 95.0, truth)
+    second = ["--truth", str(root / "truth_2.tum")]
+    assert main([*words, *second, "--json", "--anchors", str(root / "anchors.csv")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["trajectory"]["compared"] == 800
+    assert found["trajectory"]["ate"]["rmse"] == pytest.approx(0.1, abs=1e-4)
+    assert [own["ate"]["rmse"] < 1e-5 for own in found["recordings"]] == [True, True]
+    assert main([*words[:2], *second, "--recording", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["trajectory"]["ate"]["rmse"] < 1e-5
+    assert main([*words, *second]) == 0
+    text = capsys.readouterr().out
+    assert "together" in text
+    assert "recording 2 alone" in text
+    assert main([*words[:2], *second, "--recording", "3"]) == 1
+    assert "has no trajectory_3.tum" in capsys.readouterr().err
+    assert main([*words, *second, "--recording", "2"]) == 1
+    assert "--recording is for a single --truth" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("row", ["C1,1,2,0", "C1,1,2,-1", "C1,nan,2,0.3", "C1,1e300,2,0.3"])
+def test_columns_that_cannot_be_are_refused(result, capsys, row):
+    root, words = result
+    (root / "odd.csv").write_text(f"name,x,y,radius\n{row}\nC2,1,1,0.2\n")
+    assert main([*words, "--landmarks", str(root / "odd.csv")]) == 1
+    assert capsys.readouterr().err.startswith("uwblite: error: ")

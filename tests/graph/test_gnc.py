@@ -1,0 +1,121 @@
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.planted_graphs import loop, relative_edges
+
+from uwblite import se2
+from uwblite.errors import ConfigError
+from uwblite.graph.gnc import GncConfig, optimize_gnc, truncated_weight
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.robust import Kernel
+from uwblite.graph.solver import optimize
+
+ODOMETRY, CLOSURES, RANGES = 0, 1, 2
+THRESHOLDS = {CLOSURES: 4.0, RANGES: 3.5}
+
+
+def spoilt(seed, share=0.3):
+    """Return a loop with a share of false closures and of gross range errors, which those are, and the clean graph."""
+    clean, truth, _ = loop(seed, n=200)
+    rng = np.random.default_rng(seed)
+    odometry, closures, ranges = clean.edges
+    count = int(len(closures) * share / (1.0 - share))
+    i = rng.integers(0, 90, count)
+    j = i + rng.integers(20, 100, count)
+    false = relative_edges(truth, i, j, [0.03, 0.03, 0.01])
+    measured = np.column_stack([rng.normal(size=(count, 2)), rng.uniform(-np.pi, np.pi, count)])
+    mixed = RelativePoseEdges(
+        np.concatenate([closures.i, i]),
+        np.concatenate([closures.j, j]),
+        np.concatenate([closures.T_i_j, measured]),
+        np.concatenate([closures.sqrt_information, false.sqrt_information]),
+    )
+    bad = rng.random(len(ranges)) < share
+    off = np.where(rng.random(len(ranges)) < 0.7, 1.0, -1.0) * rng.uniform(1.0, 8.0, len(ranges))
+    graph = replace(clean, edges=(odometry, mixed, replace(ranges, ranges=ranges.ranges + off * bad)))
+    return graph, np.arange(len(mixed)) >= len(closures), bad, clean, truth
+
+
+def ate(poses, truth):
+    """Return the rms distance after the best rigid alignment, m."""
+    a, b = poses[:, :2] - poses[:, :2].mean(axis=0), truth[:, :2] - truth[:, :2].mean(axis=0)
+    dot, cross = np.sum(a * b), np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return np.sqrt(np.mean(np.sum((se2.rotate(np.arctan2(cross, dot), a) - b) ** 2, axis=1)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_false_closures_and_ranges_do_not_bend_the_map(seed):
+    graph, false, bad, clean, truth = spoilt(seed)
+    reference = ate(optimize(clean)[0].poses, truth)
+    found, summary, weights = optimize_gnc(graph, THRESHOLDS)
+    assert summary.converged
+    assert not weights[CLOSURES][false].any()
+    assert weights[CLOSURES][~false].mean() > 0.97
+    assert weights[RANGES][bad].mean() < 0.03
+    assert weights[RANGES][~bad].mean() > 0.97
+    assert ate(found.poses, truth) <= 1.2 * reference
+    assert ate(optimize(graph)[0].poses, truth) > 3.0 * reference
+    assert 0.8 < summary.chi2_per_dof < 1.2
+
+
+def test_the_returned_edges_carry_the_weights():
+    graph, _, _, _, _ = spoilt(0)
+    own = np.linspace(0.5, 1.0, len(graph.edges[CLOSURES]))
+    closures = replace(graph.edges[CLOSURES], weights=own, kernel=Kernel("cauchy", 1.0))
+    found, _, weights = optimize_gnc(replace(graph, edges=(graph.edges[0], closures, graph.edges[2])), {CLOSURES: 4.0})
+    assert set(weights) == {CLOSURES}
+    np.testing.assert_array_equal(found.edges[CLOSURES].weights, own * weights[CLOSURES])
+    assert found.edges[CLOSURES].kernel.name == "none"
+    assert found.edges[RANGES] is graph.edges[RANGES]
+    assert graph.edges[CLOSURES].weights is None
+
+
+def test_clean_graphs_keep_nearly_every_edge():
+    """A threshold of 4 leaves out 1.1e-3 of Gaussian closures, 3.5 leaves out 4.7e-4 of ranges."""
+    clean, _, _ = loop(5, n=200)
+    plain, _ = optimize(clean)
+    found, _, weights = optimize_gnc(clean, THRESHOLDS)
+    assert weights[CLOSURES].sum() >= len(clean.edges[CLOSURES]) - 2
+    assert weights[RANGES].sum() >= len(clean.edges[RANGES]) - 5
+    np.testing.assert_allclose(found.poses, plain.poses, atol=0.02)
+
+
+def test_weights_follow_the_truncated_square():
+    s = np.linspace(0.0, 4.0, 2001)
+    for mu in (1e-3, 0.1, 1.0, 30.0):
+        weight = truncated_weight(s, mu)
+        assert np.all(np.diff(weight) <= 1e-15)
+        assert np.all(weight[s <= mu / (mu + 1.0)] == 1.0)
+        assert np.all(weight[s >= (mu + 1.0) / mu] == 0.0)
+        # The weight minimises w s + mu (1 - w) / (mu + w), Yang et al.'s penalty.
+        w = np.linspace(0.0, 1.0, 4001)
+        k = np.searchsorted(s, 1.0 + 0.3 / (1.0 + mu))
+        best = w[np.argmin(w * s[k] + mu * (1.0 - w) / (mu + w))]
+        assert weight[k] == pytest.approx(best, abs=5e-4)
+    np.testing.assert_array_equal(truncated_weight(np.array([0.5, 2.0]), 1e6), [1.0, 0.0])
+
+
+def test_progress_is_told():
+    calls = []
+    graph, _, _, _, _ = spoilt(1)
+    optimize_gnc(graph, THRESHOLDS, progress=lambda done, most: calls.append((done, most)))
+    assert calls[-1][0] == calls[-1][1]
+    assert all(a[0] < b[0] for a, b in pairwise(calls))
+
+
+def test_results_are_the_same_every_time():
+    graph, _, _, _, _ = spoilt(2)
+    first, second = (optimize_gnc(graph, THRESHOLDS)[0] for _ in range(2))
+    assert first.poses.tobytes() == second.poses.tobytes()
+
+
+def test_settings_are_checked():
+    graph, _, _ = loop(0)
+    for wrong in ({3: 4.0}, {-1: 4.0}, {0: 0.0}):
+        with pytest.raises(ConfigError, match="threshold"):
+            optimize_gnc(graph, wrong)
+    for name, value in (("growth", 1.0), ("steps_per_mu", 0), ("reach", 0.5)):
+        with pytest.raises(ConfigError, match=name):
+            GncConfig(**{name: value})

@@ -1,0 +1,190 @@
+import numpy as np
+import pytest
+from helpers.planted_graphs import every_kind
+
+from uwblite import se2
+from uwblite.errors import DataError
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, edge_cost
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.robust import Kernel
+
+KINDS = sorted(every_kind(0)[1])
+
+
+def values_of(graph):
+    return {"poses": graph.poses, "anchors": graph.anchors, "calibration": graph.calibration.values[:, None]}
+
+
+def moved(graph, block, unknown, scalar, step):
+    values = {name: value.copy() for name, value in values_of(graph).items()}
+    values[block][unknown, scalar] += step
+    return graph.updated(values["poses"], values["anchors"], values["calibration"][:, 0])
+
+
+def assert_jacobians_equal_differences(graph, edges):
+    linear = edges.linearize(graph)
+    np.testing.assert_allclose(linear.residuals, edges.residuals(graph), atol=1e-12)
+    step = 1e-6
+    for block, values in values_of(graph).items():
+        analytic = np.zeros((*linear.residuals.shape, *values.shape))
+        for name, index, jacobian in linear.blocks:
+            if name == block:
+                for e, unknown in enumerate(index):
+                    analytic[e, :, unknown] += jacobian[e]
+        for unknown, scalar in np.ndindex(values.shape):
+            ahead, behind = (edges.residuals(moved(graph, block, unknown, scalar, s)) for s in (step, -step))
+            # Second differences of residuals of size 10 over 1e-6 leave about 1e-8.
+            np.testing.assert_allclose(analytic[:, :, unknown, scalar], (ahead - behind) / (2 * step), atol=1e-7)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", KINDS)
+def test_jacobians_equal_differences(kind, seed, calibrated):
+    graph, kinds = every_kind(seed, calibrated)
+    assert_jacobians_equal_differences(graph, kinds[kind])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_unknown_of_an_edge_has_an_index_and_a_jacobian_of_its_width(kind):
+    graph, kinds = every_kind(1)
+    linear = kinds[kind].linearize(graph)
+    width = {"poses": 3, "anchors": 2, "calibration": 1}
+    for block, index, jacobian in linear.blocks:
+        assert index.shape == (len(kinds[kind]),)
+        assert jacobian.shape == (*linear.residuals.shape, width[block])
+        assert index.min() >= 0
+        assert index.max() < len(values_of(graph)[block])
+
+
+def test_relative_pose_residual_is_the_chart_of_g2o():
+    graph, kinds = every_kind(2)
+    edges = kinds["relative pose"]
+    for e, whitened in enumerate(edges.residuals(graph)):
+        seen = se2.compose(se2.inverse(graph.poses[edges.i[e]]), graph.poses[edges.j[e]])
+        error = se2.compose(se2.inverse(edges.T_i_j[e]), seen)
+        np.testing.assert_allclose(whitened, edges.sqrt_information[e] @ error, atol=1e-12)
+
+
+def test_calibrated_odometry_stretches_and_turns_the_motion():
+    graph, kinds = every_kind(3)
+    edges = kinds["odometry"]
+    s, k, b, g = graph.calibration.values[:4] * (edges.calibration >= 0)[0]
+    x, y, turn = edges.motion[0]
+    extra = k * turn + b * edges.length[0] + g * edges.duration[0]
+    straight = se2.rotate(extra / 2, np.array([x, y]) * (1 + s))
+    np.testing.assert_allclose(edges.corrected(graph)[0], [*straight, turn + extra], atol=1e-12)
+
+
+def test_scan_poses_follow_the_base_for_the_delay_and_carry_the_mounting():
+    graph, kinds = every_kind(4)
+    edges = kinds["scan"]
+    x, y, theta, delay = graph.calibration.values[4:8]
+    for e, seen in enumerate(edges.relative(graph)):
+        sensor = [
+            se2.compose(se2.compose(graph.poses[p], se2.exp(twist * (delay - edges.made_with))), [x, y, theta])
+            for p, twist in ((edges.i[e], edges.twist_i[e]), (edges.j[e], edges.twist_j[e]))
+        ]
+        np.testing.assert_allclose(seen, se2.between(*sensor), atol=1e-12)
+
+
+def test_ranges_are_slant_distances_of_the_moving_tag():
+    graph, kinds = every_kind(5)
+    edges = kinds["range"]
+    padded = np.append(graph.calibration.values, 0.0)
+    for e in range(len(edges)):
+        scale, bias, q, tag_x, tag_y, delay = padded[edges.calibration[e]]
+        tag = se2.rotate(edges.turn[e], edges.tag + np.array([tag_x, tag_y]))
+        at = se2.transform(graph.poses[edges.pose[e]], edges.lever_arm[e] + tag + edges.velocity[e] * delay)
+        away = at - graph.anchors[edges.anchor[e]]
+        planar = away @ away + edges.height[e] ** 2
+        distance = np.sqrt(planar + q) if q >= 0.0 else 2.0 * np.sqrt(planar) - np.sqrt(planar - q)
+        assert edges.distances(graph)[e] == pytest.approx(distance)
+        expected = ((1 + scale) * distance + bias - edges.ranges[e]) / edges.sigma[e]
+        assert edges.residuals(graph)[e, 0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("away", [0.05, 0.5, 5.0])
+def test_a_squared_height_below_zero_takes_off_what_one_above_adds(away):
+    edges, graph = one_range(away)
+
+    def distance(q):
+        return edges.distances(graph.updated(graph.poses, graph.anchors, np.array([q])))[0]
+
+    for q in (1e-6, 0.01, 1.0):
+        assert distance(q) + distance(-q) == pytest.approx(2.0 * away)
+    steps = np.linspace(-1.0, 1.0, 41)
+    assert np.all(np.diff([distance(q) for q in steps]) > 0.0)
+
+
+@pytest.mark.parametrize("q", [-1.0, -0.26, -0.01, 0.01, 1.0])
+def test_jacobians_near_an_anchor_equal_differences_whatever_the_squared_height(q):
+    edges, graph = one_range(0.5)
+    assert_jacobians_equal_differences(graph.updated(graph.poses, graph.anchors, np.array([q])), edges)
+
+
+def one_range(away):
+    """Return a range to an anchor that stands so far, m, in front of the robot, its squared height unknown; and the graph."""
+    graph = Graph(np.zeros((1, 3)), np.array([[away, 0.0]]), (), Calibration(("height2:A",), np.zeros(1)))
+    one, none = np.array([0]), np.zeros((1, 2))
+    height = np.array([[-1, -1, 0, -1, -1, -1]])
+    said, sigma, zero = np.array([away]), np.array([0.1]), np.zeros(1)
+    return RangeEdges(one, one, said, sigma, none, zero, none, np.zeros(2), zero, height), graph
+
+
+def test_a_tag_on_top_of_its_anchor_has_finite_derivatives():
+    graph, kinds = every_kind(6, calibrated=False)
+    edges = kinds["range"]
+    tag = edges.lever_arm[0] + se2.rotate(edges.turn[0], edges.tag)
+    anchors = graph.anchors.copy()
+    anchors[edges.anchor[0]] = se2.transform(graph.poses[edges.pose[0]], tag)
+    graph = graph.updated(graph.poses, anchors, graph.calibration.values)
+    linear = edges.linearize(graph)
+    assert all(np.isfinite(jacobian).all() for _, _, jacobian in linear.blocks)
+
+
+def test_residuals_of_headings_are_wrapped():
+    graph = Graph(np.array([[0.0, 0.0, np.pi - 0.01], [0.0, 0.0, -np.pi + 0.01]]))
+    identity = np.eye(3)[None]
+    relative = RelativePoseEdges(np.array([0]), np.array([1]), np.zeros((1, 3)), identity)
+    assert relative.residuals(graph)[0, 2] == pytest.approx(0.02)
+    prior = PriorEdges("poses", np.array([1]), np.array([[0.0, 0.0, np.pi]]), identity)
+    assert prior.residuals(graph)[0, 2] == pytest.approx(0.01)
+
+
+def test_chi2_sums_robust_weighted_costs():
+    graph, kinds = every_kind(7)
+    weights = np.linspace(0.0, 1.0, len(kinds["scan"]))
+    kernel = Kernel("cauchy", 1.5)
+    edges = type(kinds["relative pose"])(
+        kinds["relative pose"].i,
+        kinds["relative pose"].j,
+        kinds["relative pose"].T_i_j,
+        kinds["relative pose"].sqrt_information,
+        kernel,
+        weights,
+    )
+    residuals = edges.residuals(graph)
+    expected = sum(w * kernel.rho(np.array(r @ r)) for w, r in zip(weights, residuals, strict=True))
+    assert edge_cost(edges, residuals) == pytest.approx(expected)
+    both = graph.with_edges(edges, kinds["range"])
+    assert both.chi2() == pytest.approx(expected + np.sum(kinds["range"].residuals(graph) ** 2))
+
+
+def test_graphs_are_extended_not_changed():
+    graph, kinds = every_kind(8)
+    empty = RelativePoseEdges(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    assert len(graph.with_edges(kinds["range"], empty).edges) == 1
+    assert graph.edges == ()
+
+
+def test_calibration_by_name():
+    calibration = Calibration(("a", "b"), np.array([1.0, 2.0]))
+    assert (calibration.index("b"), calibration.index("c")) == (1, -1)
+    assert (calibration.get("b"), calibration.get("c"), calibration.get("c", 7.0)) == (2.0, 0.0, 7.0)
+
+
+def test_a_prior_on_an_unknown_block_is_refused():
+    with pytest.raises(DataError, match="anchor"):
+        PriorEdges("anchor", np.array([0]), np.zeros((1, 2)), np.eye(2)[None])

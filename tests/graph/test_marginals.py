@@ -1,0 +1,152 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.planted_graphs import dense_system, loop, relative_edges
+
+from uwblite import se2
+from uwblite.graph.graph import Calibration, Graph, PriorEdges
+from uwblite.graph.marginals import JointCovariance, marginals
+from uwblite.graph.robust import Kernel
+from uwblite.graph.solver import optimize
+
+
+def dense_covariance(graph):
+    """Return the covariance of every block of unknowns with every other, zero where held, by a dense inverse."""
+    H, _, number = dense_system(graph)
+    padded = np.zeros((len(H) + 1, len(H) + 1))
+    padded[:-1, :-1] = np.linalg.inv(H)
+    return lambda a, i, b, j: padded[np.ix_(number[a][i], number[b][j])]
+
+
+def calibrated(seed=0, n=60):
+    """Return an optimised graph whose ranges have a common scale and bias, with a prior on both, and robust closures."""
+    graph, truth, _ = loop(seed, n=n)
+    odometry, closures, ranges = graph.edges
+    ranges = replace(ranges, calibration=np.tile([0, 1, -1, -1, -1, -1], (len(ranges), 1)))
+    prior = PriorEdges("calibration", np.arange(2), np.zeros((2, 1)), np.array([[[50.0]], [[5.0]]]))
+    closures = replace(closures, kernel=Kernel("cauchy", 2.0))
+    graph = replace(graph, calibration=Calibration(("scale", "bias"), np.zeros(2)), edges=(odometry, closures, ranges, prior))
+    return optimize(graph)[0], truth
+
+
+@pytest.mark.parametrize("n", [8, 60, 300])
+def test_marginals_are_blocks_of_the_dense_inverse(n):
+    graph, _ = calibrated(n=n)
+    covariance, found = dense_covariance(graph), marginals(graph)
+    for i in range(n):
+        np.testing.assert_allclose(found.poses[i], covariance("poses", i, "poses", i), rtol=1e-6, atol=1e-14)
+    for a in range(3):
+        np.testing.assert_allclose(found.anchors[a], covariance("anchors", a, "anchors", a), rtol=1e-6)
+    sigmas = [np.sqrt(covariance("calibration", c, "calibration", c)[0, 0]) for c in range(2)]
+    np.testing.assert_allclose(found.calibration, sigmas, rtol=1e-6)
+
+
+def test_held_unknowns_have_no_covariance():
+    graph, _ = calibrated()
+    held = replace(graph, fixed_poses=np.arange(60) % 7 == 0, fixed_anchors=np.array([False, True, False]))
+    covariance, found = dense_covariance(held), marginals(held)
+    assert not found.poses[7].any()
+    assert not found.anchors[1].any()
+    np.testing.assert_allclose(found.poses[8], covariance("poses", 8, "poses", 8), rtol=1e-6)
+    np.testing.assert_allclose(found.anchors[2], covariance("anchors", 2, "anchors", 2), rtol=1e-6)
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_relative_covariances_follow_from_the_joint_one(few):
+    graph, _ = calibrated()
+    rng = np.random.default_rng(0)
+    i, j = rng.integers(0, 3 if few else 60, 200), rng.integers(0, 60, 200)
+    i[:2], j[:2] = [0, 5], [5, 0]  # from and to the held pose
+    covariance, found = dense_covariance(graph), marginals(graph)
+    for a, b, relative in zip(i, j, found.relative(i, j), strict=True):
+        J = np.hstack(se2.between_jacobians(graph.poses[a], graph.poses[b]))
+        joint = np.block([[covariance("poses", p, "poses", q) for q in (a, b)] for p in (a, b)])
+        np.testing.assert_allclose(relative, J @ joint @ J.T, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(found.relative(j, i)[2], found.relative(j[2], i[2])[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("chosen", [np.arange(0, 60, 7), np.array([40, 3, 17]), np.array([5]), np.array([0]), np.arange(60)])
+def test_joint_covariances_of_chosen_poses_are_those_of_all(chosen):
+    graph, _ = calibrated()
+    i, j = np.meshgrid(chosen, chosen)
+    i, j = i.ravel(), j.ravel()
+    joint = JointCovariance(graph, chosen)
+    np.testing.assert_allclose(joint.relative(i, j), marginals(graph).relative(i, j), rtol=1e-6, atol=1e-12)
+
+
+def test_joint_covariances_where_something_is_not_measured():
+    graph, _, _ = loop(2)
+    lonely = replace(graph, anchors=np.vstack([graph.anchors, [9.0, 9.0]]))
+    i, j = np.array([3, 5]), np.array([5, 9])
+    found, expected = (JointCovariance(g, np.array([9, 3, 5])).relative(i, j) for g in (lonely, graph))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_relative_covariance_of_neighbours_is_that_of_their_odometry():
+    truth = np.cumsum(np.full((5, 3), 0.2), axis=0)
+    sigma = np.array([0.1, 0.05, 0.02])
+    graph = Graph(truth, edges=(relative_edges(truth, range(4), range(1, 5), sigma),))
+    relative = marginals(graph).relative([1, 2, 3], [2, 3, 4])
+    # The edge's error Z^-1 (Xi^-1 Xj) stands in the frame of pose j, which is turned by 0.2 against that of pose i.
+    c, s = np.cos(0.2), np.sin(0.2)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(relative, np.tile(turn @ np.diag(sigma**2) @ turn.T, (3, 1, 1)), atol=1e-12)
+
+
+def test_covariances_are_those_of_repeated_experiments():
+    """300 graphs that differ by their noise: errors over predicted sigmas have mean square 1 to sqrt(2 / 300) each."""
+    sums, repeats = np.zeros(3), 300
+    for seed in range(repeats):
+        graph, truth, anchors = loop(1, n=16)
+        rng = np.random.default_rng(1000 + seed)
+        odometry, closures, ranges = graph.edges
+        odometry = relative_edges(truth, odometry.i, odometry.j, [0.05, 0.02, 0.02], rng)
+        closures = relative_edges(truth, closures.i, closures.j, [0.03, 0.03, 0.01], rng)
+        distance = np.hypot(*(truth[ranges.pose, :2] - anchors[ranges.anchor]).T)
+        ranges = replace(ranges, ranges=distance + rng.normal(scale=0.1, size=len(ranges)))
+        graph, _ = optimize(Graph(truth, anchors, (odometry, closures, ranges)))
+        found = marginals(graph)
+        error = graph.poses[8] - truth[8]
+        error[2] = se2.wrap_angle(error[2])
+        across = se2.between(graph.poses[3], graph.poses[12]) - se2.between(truth[3], truth[12])
+        away = graph.anchors[0] - anchors[0]
+        sums += [
+            error @ np.linalg.solve(found.poses[8], error) / 3,
+            across @ np.linalg.solve(found.relative([3], [12])[0], across) / 3,
+            away @ np.linalg.solve(found.anchors[0], away) / 2,
+        ]
+    np.testing.assert_allclose(sums / repeats, 1.0, atol=4.0 * np.sqrt(2.0 / 2 / repeats))
+
+
+def test_what_nothing_measures_is_infinitely_uncertain():
+    graph, _, _ = loop(2)
+    lonely = replace(graph, poses=np.vstack([graph.poses, np.zeros(3)]), anchors=np.vstack([graph.anchors, [9.0, 9.0]]))
+    found, without = marginals(lonely), marginals(graph)
+    assert np.all(np.isinf(np.diag(found.poses[-1])))
+    assert np.all(np.isinf(np.diag(found.anchors[-1])))
+    np.testing.assert_allclose(found.poses[:-1], without.poses, rtol=1e-6, atol=1e-14)
+
+
+def test_a_floating_part_is_very_uncertain_and_the_rest_is_not():
+    graph, _, _ = loop(3, anchors=0)
+    n = len(graph.poses)
+    apart = relative_edges(graph.poses + 1.0, [0, 1], [1, 2], [0.1, 0.1, 0.1])
+    joined = Graph(
+        np.vstack([graph.poses, graph.poses[:3] + 1.0]), edges=(*graph.edges[:2], replace(apart, i=apart.i + n, j=apart.j + n))
+    )
+    found, without = marginals(joined), marginals(replace(graph, edges=graph.edges[:2]))
+    assert np.all(np.sqrt(np.diagonal(found.poses[n:], axis1=1, axis2=2)) > 1e3)
+    np.testing.assert_allclose(found.poses[:n], without.poses, rtol=1e-5, atol=1e-14)
+
+
+def test_an_anchor_seen_from_one_place_is_uncertain_along_the_circle_only():
+    graph, truth, _ = loop(4, anchors=1)
+    ranges = graph.edges[2]
+    first = replace(ranges, weights=(ranges.pose == 0).astype(float))
+    found = marginals(replace(graph, poses=truth, edges=(*graph.edges[:2], first)))
+    towards = graph.anchors[0] - truth[0, :2]
+    towards /= np.linalg.norm(towards)
+    along = np.array([-towards[1], towards[0]])
+    assert towards @ found.anchors[0] @ towards == pytest.approx(0.1**2, rel=1e-3)
+    assert along @ found.anchors[0] @ along > 1e3

@@ -1,0 +1,82 @@
+"""Two-level conjugate gradients against a factorisation, on chains tied together everywhere."""
+
+import numpy as np
+import pytest
+from helpers.planted_graphs import dense_system, relative_edges
+
+from uwblite import se2
+from uwblite.errors import SolverError
+from uwblite.graph.graph import Graph
+from uwblite.graph.normal_equations import NormalEquations
+from uwblite.graph.schwarz_cg import TwoLevelFactor
+from uwblite.graph.solver import linearize, optimize
+
+
+def tied(n, each=5, seed=0, held=()):
+    """Return a graph of n poses wandering in a room, each tied to others near by, started 2 cm and 10 mrad off."""
+    rng = np.random.default_rng(seed)
+    truth = np.column_stack([4.0 * np.cos(0.37 * np.arange(n)), 4.0 * np.sin(0.23 * np.arange(n)), rng.uniform(-3, 3, n)])
+    steps = relative_edges(truth, np.arange(n - 1), np.arange(1, n), [0.05, 0.05, 0.02], rng)
+    i, j = rng.integers(0, n, (2, each * n))
+    near = (i < j - 1) & (np.hypot(*(truth[i, :2] - truth[j, :2]).T) < 4.0)
+    ties = relative_edges(truth, i[near], j[near], [0.02, 0.02, 0.01], rng)
+    start = se2.compose(truth, rng.normal(0, 1, (n, 3)) * [0.02, 0.02, 0.01])
+    start[0] = truth[0]
+    fixed = np.isin(np.arange(n), [0, *held])
+    return Graph(start, edges=(steps, ties), fixed_poses=fixed), truth
+
+
+def system(graph):
+    """Return normal equations filled at the graph's estimates."""
+    linearized = linearize(graph)
+    normal = NormalEquations(graph, linearized)
+    normal.fill(linearized, [None] * len(linearized))
+    return normal
+
+
+@pytest.mark.parametrize("held", [(), (5, 17, 40), (599,)])
+def test_solutions_are_those_of_the_dense_matrix(held):
+    graph, _ = tied(600, 20, held=held)
+    normal = system(graph)
+    factor = normal.factor(np.zeros(normal.unknowns.size))
+    assert isinstance(factor, TwoLevelFactor)
+    H, g, number = dense_system(graph)
+    np.testing.assert_array_equal(number["poses"], normal.unknowns.number["poses"])
+    exact = np.linalg.solve(H, -g)
+    found = factor.solve(-np.asarray(normal.gradient))
+    error = found - exact
+    assert error @ H @ error < (3e-4) ** 2 * (exact @ H @ exact)
+    both = factor.solve(np.stack([-np.asarray(normal.gradient), np.ones(len(g))], axis=1))
+    np.testing.assert_array_equal(both[:, 0], found)
+
+
+def test_the_number_of_iterations_hardly_grows_with_the_length():
+    counts = []
+    for n in (600, 2400):
+        normal = system(tied(n, 20)[0])
+        factor = normal.factor(np.zeros(normal.unknowns.size))
+        calls = []
+        nearly = factor._nearly
+        factor._nearly = lambda residual, nearly=nearly, calls=calls: (calls.append(1), nearly(residual))[1]
+        factor.solve(-np.asarray(normal.gradient))
+        counts.append(len(calls))
+    assert counts[1] < 1.5 * counts[0]
+
+
+def test_the_minimum_is_that_of_the_factorisation(monkeypatch):
+    graph, truth = tied(700, 20)
+    found, summary = optimize(graph)
+    monkeypatch.setattr("uwblite.graph.factorization._MANY", 10_000)
+    expected, direct = optimize(graph)
+    assert summary.converged
+    assert summary.chi2 == pytest.approx(direct.chi2, rel=1e-6)
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-4)
+    # A tie alone would know a pose to 0.02 m either way.
+    assert np.sqrt(np.mean(np.sum((found.poses - truth)[:, :2] ** 2, axis=1))) < 0.02 * np.sqrt(2.0)
+
+
+def test_an_indefinite_matrix_is_refused():
+    graph, _ = tied(600, 20)
+    normal = system(graph)
+    with pytest.raises(SolverError, match="singular"):
+        normal.factor(-2.0 * np.asarray(normal.diagonal))

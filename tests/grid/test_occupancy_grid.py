@@ -1,0 +1,389 @@
+import math
+import tracemalloc
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uwblite import se2
+from uwblite.errors import ConfigError, DataError
+from uwblite.grid.bresenham import mark_rays
+from uwblite.grid.occupancy_grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    GridConfig,
+    GridGeometry,
+    RayCounter,
+    Sweeps,
+    from_counts,
+    from_scans,
+    from_sweeps,
+)
+from uwblite.grid.ray_counter import WEIGHT_UNIT
+from uwblite.grid.scan_rays import empty_reach, extent, in_runs, moved_scans, scan_rays, seen_reach
+from uwblite.sensor_log import LaserScans
+
+
+def bresenham(row, col, row_end, col_end):
+    """Bresenham's line with the integer error term, cell by cell, first cell included, last excluded."""
+    d_row, d_col = row_end - row, col_end - col
+    n, d = max(abs(d_row), abs(d_col)), min(abs(d_row), abs(d_col))
+    steep = abs(d_row) > abs(d_col)
+    cells, error = [], 0
+    for _ in range(n):
+        cells.append((row, col))
+        error += 2 * d
+        aside = error >= n
+        if aside:
+            error -= 2 * n
+        if steep or aside:
+            row += int(np.sign(d_row))
+        if not steep or aside:
+            col += int(np.sign(d_col))
+    return cells
+
+
+def counted(geometry, origins, endpoints, hit, scan, weak, walls):
+    """Hits and misses by looping over scans, rays and cells."""
+    hits = np.zeros((geometry.rows, geometry.cols), int)
+    misses = np.zeros_like(hits)
+    for number in sorted(set(scan.tolist())):
+        said = {}
+        for ray in np.flatnonzero(scan == number):
+            begin, end = geometry.cell_of(origins[ray]), geometry.cell_of(endpoints[ray])
+            weight = WEIGHT_UNIT if hit[ray] else weak
+            for cell in bresenham(*map(int, begin), *map(int, end)):
+                if not hit[ray] and geometry.inside(*cell) and walls[cell]:
+                    break
+                said[cell] = max(said.get(cell, 0), weight)
+        for ray in np.flatnonzero((scan == number) & hit):
+            said[tuple(map(int, geometry.cell_of(endpoints[ray])))] = "hit"
+        for (row, col), what in said.items():
+            if 0 <= row < geometry.rows and 0 <= col < geometry.cols:
+                if what == "hit":
+                    hits[row, col] += 1
+                else:
+                    misses[row, col] += what
+    return hits, misses
+
+
+def geometry_of(size, resolution=0.1):
+    return GridGeometry(resolution, np.array([-1.0, -0.5]), size, size + 3)
+
+
+@pytest.mark.parametrize("reach", [1, 2, 3, 7, 30])
+def test_lines_are_bresenhams_in_every_direction(reach):
+    size = 2 * reach + 1
+    for row in range(-reach, reach + 1):
+        cols = np.arange(-reach, reach + 1)
+        marks = np.zeros((len(cols), size, size), np.uint8)
+        start = np.arange(len(cols)) * size * size + reach * size + reach
+        mark_rays(marks.reshape(-1), start, np.full(len(cols), row), cols, size, 9)
+        for slot, col in enumerate(cols):
+            expected = np.zeros((size, size), np.uint8)
+            for r, c in bresenham(reach, reach, reach + row, reach + int(col)):
+                expected[r, c] = 9
+            np.testing.assert_array_equal(marks[slot], expected)
+
+
+def test_long_lines_round_exactly_in_both_precisions():
+    rng = np.random.default_rng(1)
+    for n in (255, 256, 257, 2000, 9999):
+        d = np.unique(np.concatenate([[0, 1, n // 2, n - 1, n], rng.integers(0, n, 3)]))
+        marks = np.zeros((n + 1) * (n + 1), np.uint8)
+        for shorter in d:
+            marks[:] = 0
+            mark_rays(marks, np.array([0]), np.array([shorter]), np.array([n]), n + 1, 1)
+            k = np.arange(n)
+            expected = (2 * k * int(shorter) + n) // (2 * n) * (n + 1) + k
+            np.testing.assert_array_equal(np.flatnonzero(marks), np.sort(expected))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 5))
+@settings(max_examples=60, deadline=None)
+def test_counts_equal_a_loop_over_cells(seed, rays, scans):
+    rng = np.random.default_rng(seed)
+    geometry = geometry_of(18)
+    # Some rays leave the grid and come back to it; some end where they begin.
+    origins = rng.uniform(-2.0, 2.0, (rays, 2))
+    endpoints = origins + rng.choice([0.0, 0.3, 2.0], (rays, 1)) * rng.normal(size=(rays, 2))
+    hit = rng.random(rays) < 0.7
+    scan = np.sort(rng.integers(0, scans, rays))
+    counter = RayCounter(geometry, 0.25)
+    walls = rng.random((geometry.rows, geometry.cols)) < rng.choice([0.0, 0.05, 0.5])
+    counter.insert_rays(origins, endpoints, hit, scan, walls)
+    hits, misses = counted(geometry, origins, endpoints, hit, scan, 4, walls)
+    np.testing.assert_array_equal(counter.hits, hits)
+    np.testing.assert_array_equal(counter.misses, misses)
+
+
+def test_counts_do_not_depend_on_working_memory(monkeypatch):
+    rng = np.random.default_rng(2)
+    origins = rng.uniform(0, 1, (400, 2))
+    endpoints, hit, scan = origins + rng.normal(size=(400, 2)), rng.random(400) < 0.8, np.arange(400) // 7
+    results = []
+    for cells in (1, 3000, 1 << 22):
+        monkeypatch.setattr("uwblite.grid.ray_counter._SCRATCH_CELLS", cells)
+        counter = RayCounter(geometry_of(30), 0.25)
+        counter.insert_rays(origins, endpoints, hit, scan)
+        results.append((counter.hits, counter.misses))
+    for hits, misses in results[1:]:
+        np.testing.assert_array_equal(hits, results[0][0])
+        np.testing.assert_array_equal(misses, results[0][1])
+
+
+def test_geometry_turns_cells_into_metres_and_back():
+    geometry = GridGeometry.around(np.array([-3.21, 4.0]), np.array([7.77, 9.99]), 0.05, 10**6)
+    row, col = (a.reshape(-1) for a in np.mgrid[: geometry.rows, : geometry.cols])
+    back = geometry.cell_of(geometry.centre_of(row, col))
+    np.testing.assert_array_equal(back[0], row)
+    np.testing.assert_array_equal(back[1], col)
+    inside = geometry.inside(*geometry.cell_of(np.array([[-3.21, 4.0], [7.77, 9.99], [7.77, 4.0]])))
+    assert inside.all()
+    np.testing.assert_allclose(geometry.origin / 0.05, np.round(geometry.origin / 0.05), atol=1e-9)
+    assert geometry.centre_of(np.array(0), np.array(0))[1] < geometry.centre_of(np.array(1), np.array(0))[1]
+
+
+def test_too_large_a_map_is_refused_before_memory_is_taken():
+    with pytest.raises(ConfigError, match=r"million cells.*grid\.resolution"):
+        GridGeometry.around(np.zeros(2), np.full(2, 1e7), 0.05, 10**6)
+    with pytest.raises(ConfigError):
+        GridGeometry.around(np.zeros(2), np.array([np.nan, 1.0]), 0.05, 10**6)
+
+
+def room_scans(poses, half=2.0, beams=360, noise=0.0, range_max=10.0, seed=0):
+    """Scans of the square room |x|, |y| <= half from poses inside it."""
+    increment = 2.0 * math.pi / beams
+    bearing = poses[:, 2:] + (-math.pi + increment * np.arange(beams))
+    direction = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.where(direction == 0, np.inf, (half * np.sign(direction) - poses[:, None, :2]) / direction)
+    ranges = reach.min(axis=-1) + noise * np.random.default_rng(seed).normal(size=bearing.shape)
+    ranges = np.where(ranges > range_max, np.inf, ranges).astype(np.float32)
+    stamps = 0.1 * np.arange(len(poses))
+    return LaserScans(stamps, ranges, -math.pi, increment, 0.0, 0.02, range_max)
+
+
+def drive(scans=40):
+    t = np.linspace(0.0, 2.0 * math.pi, scans)
+    return np.stack([0.8 * np.cos(t), 0.8 * np.sin(t), t], axis=1)
+
+
+def test_a_room_comes_out_as_a_room():
+    poses = drive()
+    grid = from_scans(poses, room_scans(poses, noise=0.01), GridConfig(move_distance=0.0))
+    states, geometry = grid.states(), grid.geometry
+    row, col = (a.astype(np.int64) for a in np.mgrid[: geometry.rows, : geometry.cols])
+    centre = geometry.centre_of(row, col)
+    depth = 2.0 - np.abs(centre).max(axis=-1)
+    # Noise of 1 cm moves the wall by less than two cells of 5 cm.
+    assert (states[depth > 0.1] == FREE).all()
+    assert (states[depth < -0.1] == UNKNOWN).all()
+    wall = grid.occupied_points()
+    assert np.abs(np.abs(wall).max(axis=1) - 2.0).max() < 0.1
+    along = np.floor(wall[np.abs(wall[:, 0] - 2.0) < 0.1, 1] / 0.05)
+    assert len(set(along)) > 0.95 * 80
+
+
+def test_someone_who_stood_there_for_a_while_is_gone():
+    poses = np.repeat(np.array([[0.0, 0.0, 0.0]]), 60, axis=0)
+    scans = room_scans(poses)
+    scans.ranges[:6, 170:190] = 1.0
+    grid = from_scans(poses, scans, GridConfig(move_distance=0.0))
+    row, col = grid.geometry.cell_of(np.array([[0.999, 0.0]]))
+    assert grid.states()[row, col] == FREE
+    first = replace(scans, stamps=scans.stamps[:6], ranges=scans.ranges[:6])
+    few = from_scans(poses[:6], first, GridConfig(move_distance=0.0))
+    assert few.states()[few.geometry.cell_of(np.array([[0.999, 0.0]]))] != FREE
+
+
+def test_beams_that_saw_nothing_never_draw_and_clear_only_so_far():
+    # Bresenham's lines from one cell leave gaps between them; a robot that moves a little fills them.
+    poses = 0.05 * np.random.default_rng(0).normal(size=(100, 3)).clip(-2, 2)
+    scans = room_scans(poses, half=5.0, beams=1440, range_max=3.0)
+    assert not np.isfinite(scans.ranges).any()
+    grid = from_scans(poses, scans, GridConfig(move_distance=0.0, max_clear_distance=2.0))
+    states, geometry = grid.states(), grid.geometry
+    assert (states != OCCUPIED).all()
+    row, col = (a.astype(np.int64) for a in np.mgrid[: geometry.rows, : geometry.cols])
+    far = np.linalg.norm(geometry.centre_of(row, col), axis=-1)
+    assert (states[far > 2.25] == UNKNOWN).all()
+    assert (states[far < 1.8] == FREE).all()
+    none = from_scans(poses, scans, GridConfig(move_distance=0.0, max_clear_distance=0.0))
+    assert (none.states() == UNKNOWN).all()
+
+
+def test_beams_that_saw_nothing_do_not_clear_behind_walls():
+    # Every second scan a dark stretch of the wall swallows its beams.
+    poses = drive(60)
+    scans = room_scans(poses, half=1.5)
+    bearing = se2.wrap_angle(poses[:, 2:] + scans.angles)
+    scans.ranges[(np.abs(bearing) < 0.4) & (np.arange(60) % 2 == 0)[:, None]] = np.inf
+    grid = from_scans(poses, scans, GridConfig(move_distance=0.0, clear_weight=1.0))
+    row, col = (a.astype(np.int64) for a in np.mgrid[: grid.geometry.rows, : grid.geometry.cols])
+    outside = np.abs(grid.geometry.centre_of(row, col)).max(axis=-1) > 1.6
+    assert (grid.states()[outside] == UNKNOWN).all()
+    assert grid.states()[grid.geometry.cell_of(np.array([1.51, 0.0]))] == OCCUPIED
+    end = scan_rays(scans, room_scans(poses, half=1.5).ranges, poses).endpoints.reshape(60, -1, 2)
+    scans.ranges[(end[:, :, 0] > 1.49) & (np.abs(end[:, :, 1]) < 0.5)] = np.inf
+    grid = from_scans(poses, scans, GridConfig(move_distance=0.0, clear_weight=1.0))
+    assert grid.states()[grid.geometry.cell_of(np.array([2.0, 0.0]))] == FREE
+
+
+def test_weak_clearing_needs_more_scans_than_strong():
+    config = GridConfig(move_distance=0.0, max_clear_distance=2.0, clear_weight=0.25)
+    poses = np.zeros((8, 3))
+    grid = from_scans(poses, room_scans(poses, half=5.0, range_max=3.0), config)
+    seen = from_scans(poses, room_scans(poses, half=1.5), config)
+    assert grid.probability()[grid.geometry.cell_of(np.array([1.0, 0.0]))] > 0.196
+    assert seen.probability()[seen.geometry.cell_of(np.array([1.0, 0.0]))] < 0.196
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=40), st.integers(1, 8))
+def test_runs_equal_a_loop(flags, least):
+    expected, start = [False] * len(flags), 0
+    for i in range(len(flags) + 1):
+        if i == len(flags) or not flags[i]:
+            if i - start >= least:
+                expected[start:i] = [True] * (i - start)
+            start = i + 1
+    np.testing.assert_array_equal(in_runs(np.array([flags]), least)[0], expected)
+
+
+def test_rays_start_where_the_laser_was_at_their_time():
+    scans = room_scans(np.zeros((1, 3)), beams=5)
+    first, last = np.array([[0.0, 0.0, 3.1]]), np.array([[0.4, -0.2, -3.1]])
+    rays = scan_rays(scans, scans.ranges, first, last)
+    np.testing.assert_allclose(rays.origins, np.linspace(0, 1, 5)[:, None] * [0.4, -0.2], atol=1e-12)
+    turn = 3.1 + np.linspace(0, 1, 5) * (2 * math.pi - 6.2)
+    for ray in range(5):
+        pose = np.array([*rays.origins[ray], turn[ray]])
+        angle, reach = scans.angles[ray], scans.ranges[0, ray]
+        expected = se2.transform(pose, reach * np.array([math.cos(angle), math.sin(angle)]))
+        np.testing.assert_allclose(rays.endpoints[ray], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_the_extent_holds_all_rays(flipped):
+    rng = np.random.default_rng(4)
+    poses = rng.uniform(-1.0, 1.0, (20, 3)) * [1.0, 1.0, np.pi]
+    last = poses + rng.normal(scale=0.05, size=(20, 3))
+    scans = room_scans(poses, noise=0.01, range_max=2.2)
+    chosen = np.arange(20)
+    reach = np.maximum(seen_reach(scans, chosen, 2.1), empty_reach(scans, chosen, 1.5, 3))
+    assert (reach == 1.5).any()
+    assert reach.max() > 1.6
+    rays = scan_rays(scans, reach, poses, last, flipped=flipped)
+    low, high = extent(scans, reach, poses, last, flipped=flipped)
+    points = np.concatenate([rays.origins, rays.endpoints])
+    assert (points >= low).all()
+    assert (points <= high).all()
+    still = scan_rays(scans, reach, poses, flipped=flipped)
+    low, high = extent(scans, reach, poses, flipped=flipped)
+    assert (still.endpoints.min(axis=0) - low < 2e-4).all()
+    assert (high - still.endpoints.max(axis=0) < 2e-4).all()
+
+
+def test_the_grid_ends_where_knowledge_ends():
+    poses = drive(30)
+    grid = from_scans(poses, room_scans(poses), last=np.add(poses, [0.0, 0.0, 0.5]))
+    known = grid.log_odds != 0
+    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    assert (rows[0], cols[0]) == (2, 2)
+    assert (len(known) - rows[-1], known.shape[1] - cols[-1]) == (3, 3)
+    # The frame is where it was: cells of a larger grid have the same values.
+    wide = GridGeometry(0.05, np.array([-6.0, -6.0]), 240, 240)
+    whole = from_scans(poses, room_scans(poses), last=np.add(poses, [0.0, 0.0, 0.5]), geometry=wide)
+    row, col = wide.cell_of(grid.geometry.centre_of(np.array(0), np.array(0)))
+    part = whole.log_odds[int(row) :, int(col) :][: known.shape[0], : known.shape[1]]
+    np.testing.assert_array_equal(part, grid.log_odds)
+    np.testing.assert_array_equal(np.count_nonzero(part), np.count_nonzero(whole.log_odds))
+
+
+def test_a_flipped_laser_sees_the_mirror_image():
+    scans = room_scans(np.array([[0.5, 0.2, 0.0]]), beams=90)
+    there = scan_rays(scans, scans.ranges, np.zeros((1, 3))).endpoints
+    mirrored = scan_rays(scans, scans.ranges, np.zeros((1, 3)), flipped=True).endpoints
+    np.testing.assert_allclose(mirrored, there * [1, -1], atol=1e-5)
+
+
+def test_scans_that_did_not_move_are_not_traced_again():
+    poses = np.array([[0, 0, 0], [0.05, 0, 0], [0.11, 0, 0], [0.11, 0, 0.05], [0.11, 0, 0.2], [0.11, 0, 0.2 - 2 * np.pi]])
+    np.testing.assert_array_equal(moved_scans(poses, 0.1, 0.1), [0, 2, 4])
+    np.testing.assert_array_equal(moved_scans(poses, 0.0, 0.1), np.arange(6))
+    assert from_scans(poses, room_scans(poses), GridConfig()).scans_used == 3
+
+
+@pytest.mark.parametrize("pool", [ThreadPoolExecutor, ProcessPoolExecutor])
+def test_the_map_does_not_depend_on_the_executor(pool):
+    poses = drive(100)
+    scans = room_scans(poses, noise=0.02, range_max=2.4)
+    steps = []
+    alone = from_scans(poses, scans, last=poses + 0.01, progress=lambda done, total: steps.append((done, total)))
+    with pool(2) as executor:
+        split = from_scans(poses, scans, last=poses + 0.01, executor=executor)
+    assert alone.log_odds.tobytes() == split.log_odds.tobytes()
+    assert alone.scans_used == split.scans_used
+    assert steps[-1][0] == steps[-1][1]
+
+
+def test_scan_by_scan_insertion_makes_the_same_map():
+    poses = drive(30)
+    scans = room_scans(poses)
+    config = GridConfig(move_distance=0.0)
+    whole = from_scans(poses, scans, config)
+    counter = RayCounter(whole.geometry, config.clear_weight)
+    for k in range(30):
+        rays = scan_rays(scans, seen_reach(scans, np.array([k])), poses[k : k + 1])
+        counter.insert_rays(rays.origins, rays.endpoints, np.ones(len(rays.scan), bool))
+    assert from_counts(counter, config).log_odds.tobytes() == whole.log_odds.tobytes()
+
+
+def test_log_odds_are_bayes():
+    config = GridConfig(p_hit=0.7, p_miss=0.4, clamp=100.0)
+    counter = RayCounter(geometry_of(5), 0.25)
+    counter.hits[1, 1], counter.misses[1, 1] = 3, 7 * WEIGHT_UNIT
+    odds = (0.7 / 0.3) ** 3 * (0.4 / 0.6) ** 7
+    grid = from_counts(counter, config)
+    assert grid.probability()[1, 1] == pytest.approx(odds / (1 + odds), rel=1e-5)
+    assert grid.log_odds[0, 0] == 0.0
+    assert np.abs(from_counts(counter, GridConfig(clamp=0.1)).log_odds).max() == pytest.approx(0.1)
+
+
+def test_misuse_is_named():
+    scans = room_scans(drive(3))
+    with pytest.raises(DataError, match="poses"):
+        from_scans(drive(2), scans)
+    with pytest.raises(DataError, match="no scans"):
+        from_scans(np.zeros((0, 3)), LaserScans(np.zeros(0), np.zeros((0, 4), np.float32), 0.0, 0.1, 0.0, 0.02, 5.0))
+    with pytest.raises(DataError, match="belong together"):
+        RayCounter(geometry_of(5)).insert_rays(np.zeros((2, 2)), np.zeros((3, 2)), np.ones(2, bool))
+    one = np.zeros((1, 2)), np.ones((1, 2)), np.ones(1, bool)
+    with pytest.raises(DataError, match="walls"):
+        RayCounter(geometry_of(5)).insert_rays(*one, None, np.zeros((5, 5), bool))
+    with pytest.raises(DataError, match="too long"):
+        RayCounter(geometry_of(5)).insert_rays(np.zeros((1, 2)), np.full((1, 2), 1e6), np.ones(1, bool))
+    for wrong in ({"p_hit": 0.4}, {"p_miss": 0.5}, {"resolution": 0.0}, {"clear_weight": 2.0}, {"clamp": 0.0}):
+        with pytest.raises(ConfigError, match="grid"):
+            GridConfig(**wrong)
+
+
+def test_a_grid_too_large_is_refused_before_it_is_allocated():
+    """One pose far off makes a map of 10^12 cells: the refusal says how large, what it would take and what to change."""
+    poses = drive(3)
+    poses[-1, :2] = 5e4
+    tracemalloc.start()
+    with pytest.raises(ConfigError, match=r"million cells, about \d+ MB.*grid\.resolution.*grid\.max_cells"):
+        from_scans(poses, room_scans(drive(3)), GridConfig())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+    told = []
+    sweeps = Sweeps(room_scans(drive(3)), drive(3))
+    grid = from_sweeps([sweeps], announce=told.append)
+    assert told[0].cells >= grid.geometry.cells
+    assert told[0].megabytes == pytest.approx(told[0].cells * 12e-6)

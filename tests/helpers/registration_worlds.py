@@ -1,0 +1,31 @@
+"""Walls and columns with the noise of a small lidar, for the tests of registration."""
+
+import numpy as np
+
+from uwblite import se2
+from uwblite.lidar.point_cloud import PointCloud, make_cloud
+
+ROOM = np.array(
+    [[0, 0, 6, 0], [6, 0, 6, 4.2], [6, 4.2, 3.5, 4.2], [3.5, 4.2, 3.5, 5], [3.5, 5, 0, 5], [0, 5, 0, 0], [2, 2, 2.5, 2.3]],
+    dtype=float,
+)
+CORRIDOR = np.array([[-6, -1, 6, -1], [6, 1, -6, 1]], dtype=float)
+NOISE = 0.015
+
+
+def wall_points(walls, rng, spacing=0.05, noise=NOISE):
+    """Return points (n, 2) spread at random along walls (w, 4) x1, y1, x2, y2."""
+    lengths = np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
+    chosen = rng.choice(len(walls), int(lengths.sum() / spacing), p=lengths / lengths.sum())
+    share = rng.random(len(chosen))[:, None]
+    points = walls[chosen, :2] + share * (walls[chosen, 2:] - walls[chosen, :2])
+    return points + rng.normal(0.0, noise, points.shape)
+
+
+def pair(walls, truth, rng, centre, spacing=0.05, noise=NOISE) -> tuple[PointCloud, PointCloud]:
+    """Return target and source, two samples of the same walls, the source in the frame at the pose truth; both seen
+    from the same place, the centre."""
+    target = make_cloud(wall_points(walls, rng, spacing, noise), np.asarray(centre))
+    source = wall_points(walls, rng, spacing, noise)
+    back = se2.inverse(truth)
+    return target, make_cloud(se2.transform(back, source), se2.transform(back, np.asarray(centre)))

@@ -1,0 +1,139 @@
+"""Planted poses found from metres away, scores against brute force, ambiguity named."""
+
+import numpy as np
+import pytest
+from helpers.registration_worlds import CORRIDOR, ROOM, pair, wall_points
+
+from uwblite import se2
+from uwblite.lidar.correlative_matching import SearchConfig, _target_field, score_grid, search
+from uwblite.lidar.point_cloud import make_cloud
+from uwblite.lidar.point_to_point import align
+
+CENTRE = (3.0, 1.5)
+
+
+def _world(rng):
+    """Return walls (w, 4) of a crooked room with columns and partitions."""
+    corners = np.array([[0, 0], [8, 0], [8, 6], [0, 6]]) + rng.uniform(-1.0, 1.0, (4, 2))
+    walls = [[*corners[k], *corners[(k + 1) % 4]] for k in range(4)]
+    for _ in range(4):
+        x, y, size, turn = *rng.uniform([1.5, 1.5], [6.5, 4.5]), rng.uniform(0.2, 0.5), rng.uniform(0.0, np.pi)
+        box = se2.transform([x, y, turn], size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
+        walls += [[*box[k], *box[(k + 1) % 4]] for k in range(4)]
+    return np.array(walls)
+
+
+@pytest.mark.parametrize("oriented", [True, False])
+def test_scores_equal_brute_force(oriented):
+    rng = np.random.default_rng(0)
+    truth = np.array([0.4, 0.3, 0.2])
+    target, source = pair(ROOM, truth, rng, CENTRE, spacing=0.2)
+    if not oriented:
+        target, source = make_cloud(target.points), make_cloud(source.points)
+    config = SearchConfig(resolution=0.1, angle_step=0.05, spread=0.1)
+    guess = truth + np.array([0.13, -0.07, 0.01])
+    scores, headings, shift_x, shift_y = score_grid(target, source, guess, (0.6, 0.5, 0.1), config)
+    assert scores.shape == (5, 11, 13)
+    field, origin = _target_field(target, config, oriented)
+    for k, heading in enumerate(headings):
+        cells = np.floor((se2.transform([*guess[:2], heading], source.centers) - origin) / config.resolution).astype(int)
+        normals = se2.rotate(heading, source.normals)
+        for i, dy in enumerate(shift_y):
+            for j, dx in enumerate(shift_x):
+                column, row = (cells + np.array([dx, dy])).T
+                inside = (row >= 0) & (row < field.shape[0]) & (column >= 0) & (column < field.shape[1])
+                value = field[row[inside], column[inside]]
+                each = value.real
+                if oriented:
+                    each = value.real * normals[inside, 0] + value.imag * normals[inside, 1]
+                assert scores[k, i, j] == pytest.approx(each.sum() / len(source), abs=1e-5)
+
+
+def test_the_field_is_the_likelihood_of_the_nearest_point():
+    rng = np.random.default_rng(1)
+    config = SearchConfig(resolution=0.05, spread=0.1)
+    target = make_cloud(wall_points(ROOM, rng))
+    field, origin = _target_field(target, config, oriented=False)
+    rows, columns = np.indices(field.shape)
+    centres = origin + (np.stack([columns, rows], axis=-1).reshape(-1, 2) + 0.5) * config.resolution
+    distance = np.hypot(*(centres[:, None] - target.centers[None]).transpose(2, 0, 1)).min(axis=1)
+    expected = np.exp(-0.5 * (distance / config.spread) ** 2)
+    # The table of nearest points is right to a cell; beyond its reach of four cells the field is zero.
+    assert np.abs(field.real.ravel() - expected).max() < 0.25
+    assert np.abs(field.real.ravel() - expected).mean() < 0.01
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_planted_poses_are_found_from_metres_and_tens_of_degrees(seed):
+    rng = np.random.default_rng(seed)
+    truth = np.array([*rng.uniform(-3.0, 3.0, 2), rng.uniform(-np.pi, np.pi)])
+    target, source = pair(_world(rng), truth, rng, (4.0, 1.0))
+    guess = truth + rng.uniform(-1.0, 1.0, 3) * [3.0, 3.0, 0.5]
+    config = SearchConfig()
+    found = search(target, source, guess, (3.2, 3.2, 0.55), config)
+    e = se2.between(found.poses[0], truth)
+    assert np.hypot(e[0], e[1]) < 1.5 * config.resolution
+    assert abs(e[2]) < 1.5 * config.angle_step
+    assert found.scores[0] > 0.5
+    assert found.ambiguity < 0.9
+    assert (np.diff(found.scores) <= 0.0).all()
+    registration = align(target, source, found.poses[0])
+    assert registration.converged
+    assert np.hypot(*se2.between(registration.T_target_source, truth)[:2]) < 0.015
+
+
+def test_a_corridor_is_ambiguous_and_a_room_is_not():
+    rng = np.random.default_rng(2)
+    long = CORRIDOR * [2.0, 1.0, 2.0, 1.0]
+    along = search(*pair(long, np.zeros(3), rng, (0.0, 0.0)), np.zeros(3), (2.0, 1.0, 0.3))
+    room = search(*pair(ROOM, np.zeros(3), rng, CENTRE), np.zeros(3), (2.0, 1.0, 0.3))
+    assert along.ambiguity > 0.9
+    assert room.ambiguity < 0.75
+    separate = np.abs(along.poses[:, None] - along.poses[None]) + 1e-9 >= [0.5, 0.5, 0.2]
+    assert (separate.any(axis=-1) | np.eye(len(along.poses), dtype=bool)).all()
+
+
+def test_equal_rooms_are_both_found():
+    rng = np.random.default_rng(3)
+    box = np.array([[0, 0, 3, 0], [3, 0, 3, 2], [3, 2, 0, 2], [0, 2, 0, 0]], dtype=float)
+    target = make_cloud(np.vstack([wall_points(box, rng), wall_points(box + np.array([4.0, 0.0, 4.0, 0.0]), rng)]), None)
+    source = make_cloud(wall_points(box, rng), None)
+    found = search(target, source, np.array([2.0, 0.0, 0.0]), (2.5, 1.0, 0.2))
+    assert found.ambiguity > 0.9
+    np.testing.assert_allclose(np.sort(found.poses[:2, 0]), [0.0, 4.0], atol=0.2)
+
+
+def test_the_back_of_a_wall_does_not_match_its_front():
+    rng = np.random.default_rng(4)
+    wall = np.array([[0.0, 0.0, 5.0, 0.0], [2.0, 0.0, 2.0, 0.6]])
+    target = make_cloud(wall_points(wall, rng), np.array([3.0, 2.0]))
+    behind = make_cloud(wall_points(wall[:1], rng), np.array([3.0, -2.0]))
+    found = search(target, behind, np.zeros(3), (0.3, 0.3, 0.1))
+    assert found.scores.max(initial=0.0) < 0.05
+
+
+@pytest.mark.parametrize("sizes", [(0, 50), (50, 0), (0, 0), (1, 1)])
+def test_clouds_that_fit_nowhere_give_no_candidates(sizes):
+    rng = np.random.default_rng(5)
+    target, source = (make_cloud(rng.uniform(0.0, 2.0, (n, 2)) + k * 100.0) for k, n in enumerate(sizes))
+    found = search(target, source, np.zeros(3), (0.5, 0.5, 0.1))
+    assert found.poses.shape == (0, 3)
+    assert found.ambiguity == 0.0
+
+
+def test_headings_are_wrapped():
+    rng = np.random.default_rng(6)
+    truth = np.array([0.0, 0.0, -np.pi + 0.05])
+    target, source = pair(ROOM, truth, rng, CENTRE)
+    found = search(target, source, np.array([0.0, 0.0, np.pi - 0.05]), (0.4, 0.4, 0.3))
+    assert abs(found.poses[0, 2] - truth[2]) < 0.05
+    assert (np.abs(found.poses[:, 2]) <= np.pi).all()
+
+
+def test_the_same_input_gives_the_same_candidates():
+    results = []
+    for _ in range(2):
+        target, source = pair(ROOM, np.zeros(3), np.random.default_rng(7), CENTRE)
+        found = search(target, source, np.array([0.5, -0.5, 0.1]), (1.0, 1.0, 0.3))
+        results.append(found.poses.tobytes() + found.scores.tobytes())
+    assert results[0] == results[1]

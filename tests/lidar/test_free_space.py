@@ -1,0 +1,104 @@
+"""Seen free space contradicts what would stand in it, and nothing else."""
+
+import numpy as np
+import pytest
+
+from uwblite import se2
+from uwblite.lidar.free_space import contradiction, free_space
+
+INCREMENT = np.deg2rad(1.0)
+BEARINGS = np.deg2rad(np.arange(-120.0, 121.0))
+
+
+def _square_room(pose, half=2.0):
+    """Return ranges (b,) from a pose in a square room about the origin."""
+    angle = BEARINGS + pose[2]
+    with np.errstate(divide="ignore"):
+        x = np.where(np.cos(angle) > 0, half - pose[0], -half - pose[0]) / np.cos(angle)
+        y = np.where(np.sin(angle) > 0, half - pose[1], -half - pose[1]) / np.sin(angle)
+    return np.minimum(np.abs(x), np.abs(y))
+
+
+def _free(*poses, **options):
+    poses = np.array(poses, dtype=float)
+    return free_space(poses, np.stack([_square_room(p) for p in poses]), BEARINGS[0], INCREMENT, **options)
+
+
+def _walls(half=2.0):
+    side = np.linspace(-half, half, 81)
+    ends = [np.full_like(side, end) for end in (-half, half)]
+    return np.vstack([np.stack(xy, axis=-1) for end in ends for xy in ((side, end), (end, side))])
+
+
+def test_the_same_room_does_not_contradict_itself():
+    for pose in ([0.0, 0.0, 0.0], [0.7, -1.1, 2.0], [-1.5, 1.5, -3.0]):
+        share, seen = contradiction(_free(pose), _walls(), 0.1)
+        assert share == 0.0
+        # Near a corner much of the nearest walls is seen at a grazing angle only.
+        assert seen > 0.3
+
+
+def test_a_wall_through_the_room_contradicts():
+    inner = np.stack([np.full(40, 1.0), np.linspace(-1.0, 1.0, 40)], axis=-1)
+    share, seen = contradiction(_free([0.0, 0.0, 0.0]), inner, 0.1)
+    assert share == seen == 1.0
+
+
+def test_what_is_hidden_or_out_of_sight_says_nothing():
+    behind_wall = np.stack([np.full(40, 3.0), np.linspace(-1.0, 1.0, 40)], axis=-1)
+    behind_back = np.stack([np.full(40, -1.0), np.linspace(-0.2, 0.2, 40)], axis=-1)
+    for points in (behind_wall, behind_back):
+        assert contradiction(_free([0.0, 0.0, 0.0]), points, 0.1) == (0.0, 0.0)
+
+
+def test_the_margin_forgives_small_errors_of_the_pose():
+    walls = se2.transform([0.08, -0.05, 0.02], _walls())
+    assert contradiction(_free([0.0, 0.0, 0.0]), walls, 0.2)[0] == 0.0
+    assert contradiction(_free([0.0, 0.0, 0.0]), se2.transform([-1.0, 0.0, 0.0], _walls()), 0.2)[0] > 0.2
+
+
+def test_shares_equal_a_loop_over_points_and_scans():
+    rng = np.random.default_rng(0)
+    poses = np.array([[0.3, 0.2, 0.5], [-1.0, 0.4, 2.9]])
+    free, points, margin = _free(*poses), rng.uniform(-3.0, 3.0, (300, 2)), 0.15
+    bad = seen = 0
+    for point in points:
+        votes, visible = 0, False
+        for pose, ranges in zip(poses, free.ranges, strict=True):
+            x, y = se2.transform(se2.inverse(pose), point)
+            k = int(np.rint((np.arctan2(y, x) - BEARINGS[0]) / INCREMENT))
+            if 0 <= k < len(BEARINGS):
+                votes += np.hypot(x, y) < ranges[k] - margin
+                visible |= np.hypot(x, y) < ranges[k] + margin
+        seen += visible
+        bad += votes >= 1
+    assert contradiction(free, points, margin) == pytest.approx((bad / seen, seen / len(points)))
+
+
+def test_several_scans_must_agree_where_asked():
+    inner = np.array([[1.5, 0.0], [1.5, 0.1]])
+    away = [0.0, 0.0, np.pi]
+    free = _free([0.0, 0.0, 0.0], away)
+    assert contradiction(free, inner, 0.1, least=1)[0] == 1.0
+    assert contradiction(free, inner, 0.1, least=2)[0] == 0.0
+
+
+def test_rays_that_saw_nothing_clear_only_as_far_as_told():
+    ranges = np.full((1, len(BEARINGS)), np.inf)
+    points = np.array([[1.0, 0.0], [3.0, 0.0]])
+    silent = free_space(np.zeros((1, 3)), ranges, BEARINGS[0], INCREMENT)
+    assert contradiction(silent, points, 0.1) == (0.0, 0.0)
+    cleared = free_space(np.zeros((1, 3)), ranges, BEARINGS[0], INCREMENT, beyond=2.0)
+    assert contradiction(cleared, points, 0.1) == (1.0, 0.5)
+    broken = free_space(np.zeros((1, 3)), ranges * np.nan, BEARINGS[0], INCREMENT, beyond=2.0)
+    assert contradiction(broken, points, 0.1) == (0.0, 0.0)
+
+
+def test_blur_takes_the_nearest_of_the_neighbours():
+    ranges = np.array([[4.0, 4.0, 1.0, 4.0, 4.0, np.nan]])
+    assert free_space(np.zeros((1, 3)), ranges, 0.0, INCREMENT, blur=1).ranges.tolist() == [[4.0, 1.0, 1.0, 1.0, 0.0, 0.0]]
+
+
+def test_nothing_contradicts_nothing():
+    assert contradiction(_free([0.0, 0.0, 0.0]), np.zeros((0, 2)), 0.1) == (0.0, 0.0)
+    assert contradiction(free_space(np.zeros((0, 3)), np.zeros((0, 5)), 0.0, 0.1), np.ones((3, 2)), 0.1) == (0.0, 0.0)

@@ -1,0 +1,179 @@
+"""Joint refinement: pairs that see the same surfaces, noise-free rooms to a millimetre, noise told as it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.planted import aligned_error, box
+from lidar.test_scan_matching import CORRIDOR, ROOM, scanned
+from loop_closure.test_verification import chained, drifted, walked
+
+from uwblite import se2
+from uwblite.graph.graph import Graph
+from uwblite.graph.marginals import marginals
+from uwblite.graph.solver import SolverConfig
+from uwblite.lidar.clouds import in_map
+from uwblite.lidar.joint_refinement import RefinementConfig, choose_pairs, refine, surface_cells, with_fewer_pairs
+from uwblite.lidar.scan_matching import paint
+
+CONFIG = RefinementConfig()
+NOISE = np.array([0.01, 0.005, 0.006])
+
+
+def refined(graph, clouds, path, config=CONFIG, selections=2):
+    """Return the result of choosing pairs and refining, twice as the walk does."""
+    session = np.zeros(len(clouds), dtype=np.int64)
+    raster, twist, result = paint(clouds, 0.2 * config.first_gate, config.first_gate), np.zeros((len(clouds), 3)), None
+    for _ in range(selections):
+        i, j = choose_pairs(clouds, graph.poses, path, session, config)
+        result = refine(graph, clouds, raster, twist, i, j, config, SolverConfig())
+        graph = graph.updated(result.graph.poses, graph.anchors, graph.calibration.values)
+    return result
+
+
+def room(seed, noise=0.0, metres=25.0):
+    """Return true key poses, travelled distance and clouds of a walk in a room."""
+    truth, path, _ = walked(seed, ROOM, metres, half_width=1.8, spacing=8)
+    return truth, path, scanned(truth, ROOM, noise, seed, beams=400)
+
+
+def test_a_noise_free_room_is_found_to_a_millimetre():
+    """The wheels say the truth but are believed to 1 cm a step; the start is off by drift of that size. Asked to go on
+    until nothing moves, the rounds end at the truth."""
+    truth, path, clouds = room(1)
+    start = drifted(np.random.default_rng(2), truth, NOISE)
+    before = aligned_error(start.poses[:, :2], truth[:, :2])
+    exact = Graph(start.poses).with_edges(chained(truth, NOISE * 10))
+    result = refined(exact, clouds, path, replace(CONFIG, rounds=40, settled=1e-5))
+    after = aligned_error(result.graph.poses[:, :2], truth[:, :2])
+    assert before > 0.03
+    assert after < 1e-3
+    heading = se2.wrap_angle(result.graph.poses[:, 2] - truth[:, 2])
+    assert np.abs(heading - heading.mean()).max() < 1e-3
+    assert result.sigma < 0.01
+
+
+def test_noisy_clouds_and_wheels_reach_what_their_matches_allow():
+    """A pose is seen by some ten pairs of a hundred points; with 1 cm of noise and a fourth of them independent that is
+    0.01 sqrt(2) / sqrt(10 * 100 / 4) = 1 mm, and what loops leave over a room of 8 m is a few times that."""
+    errors = []
+    for seed in range(3):
+        truth, path, clouds = room(10 + seed, 0.01)
+        start = drifted(np.random.default_rng(seed), truth, NOISE)
+        result = refined(start, clouds, path)
+        errors.append(aligned_error(result.graph.poses[:, :2], truth[:, :2]))
+        assert result.sigma < 0.02
+        assert result.used.mean() > 0.8
+    assert np.median(errors) < 0.005
+    assert max(errors) < 0.01
+
+
+def test_a_corridor_leaves_the_way_along_it_to_the_wheels():
+    """Wheels that are 5 % long along a corridor stay so; across it and in heading the lidar has its say."""
+    n = 40
+    truth = np.column_stack([np.linspace(-6, 6, n), 0.2 * np.sin(np.arange(n) / 4), 0.1 * np.cos(np.arange(n) / 4)])
+    clouds = scanned(truth, CORRIDOR, 0.005, 3, beams=300, reach=5.0)
+    wheels = truth * [1.05, 1.0, 1.0]
+    bent = wheels + np.column_stack([np.zeros(n), np.linspace(0, 0.2, n), np.linspace(0, 0.03, n)])
+    graph = Graph(bent).with_edges(chained(wheels, NOISE))
+    result = refined(graph, clouds, wheels[:, 0] - wheels[0, 0])
+    solved = result.graph.poses
+    line = np.polyfit(truth[:, 0], solved[:, 1] - truth[:, 1], 1)
+    crooked = solved[:, 1] - truth[:, 1] - np.polyval(line, truth[:, 0])
+    assert np.abs(crooked).max() < 0.02
+    assert np.ptp(solved[:, 0]) == pytest.approx(1.05 * 12, rel=0.005)
+
+
+def test_pairs_are_ordered_unique_and_overlap():
+    truth, path, clouds = room(4)
+    session = np.zeros(len(truth), dtype=np.int64)
+    i, j = choose_pairs(clouds, truth, path, session, CONFIG)
+    assert np.all(i < j)
+    assert len(np.unique(i * len(truth) + j)) == len(i)
+    seen = surface_cells(clouds, truth)
+    common = np.asarray((seen @ seen.T).todense())
+    size = np.diff(seen.indptr)
+    near = np.isin(j - i, CONFIG.neighbours)
+    share = common[i, j] / np.minimum(size[i], size[j])
+    assert np.all(share[~near] > CONFIG.min_share)
+    assert np.all(np.abs(path[i] - path[j])[~near] > CONFIG.epoch)
+    for n in CONFIG.neighbours:
+        assert {(a, a + n) for a in range(len(truth) - n)} <= set(zip(i.tolist(), j.tolist(), strict=True))
+
+
+def test_clouds_take_turns_at_giving_the_lines():
+    """One way round only, what lines seen obliquely lean would add up over a path."""
+    truth, path, clouds = room(6)
+    start = Graph(truth).with_edges(chained(truth, NOISE))
+    edges = refined(start, clouds, path, selections=1).edges
+    for gap in CONFIG.neighbours:
+        apart = np.abs(edges.i - edges.j) == gap
+        assert 0.4 < np.mean(edges.i[apart] < edges.j[apart]) < 0.6
+
+
+def test_no_partners_are_only_neighbours():
+    truth, path, clouds = room(5)
+    session = np.zeros(len(truth), dtype=np.int64)
+    i, j = choose_pairs(clouds, truth, path, session, replace(CONFIG, partners=0))
+    assert set((j - i).tolist()) == set(CONFIG.neighbours)
+
+
+def test_neighbours_are_of_one_recording():
+    truth, path, clouds = room(6)
+    session = (np.arange(len(truth)) >= 20).astype(np.int64)
+    i, j = choose_pairs(clouds, truth, path, session, replace(CONFIG, partners=0))
+    assert np.all(session[i] == session[j])
+
+
+def test_surface_cells_tell_the_sides_of_a_wall_apart():
+    walls = np.array([[-3.0, 0.0, 3.0, 0.0]])
+    truth = np.array([[0.0, -1.5, 0.0], [0.0, 1.5, 0.0], [0.3, -1.4, 1.0]])
+    clouds = scanned(truth, walls)
+    seen = surface_cells(clouds, truth)
+    common = np.asarray((seen @ seen.T).todense())
+    assert common[0, 1] == 0
+    assert common[0, 2] > 5
+    assert seen.data.min() == seen.data.max() == 1.0
+    points, _ = in_map(clouds, truth)
+    assert seen.shape[0] == 3
+    assert len(points) == len(clouds.points)
+
+
+def test_keyframes_without_any_return_are_held_by_the_wheels():
+    truth = np.column_stack([np.arange(10) * 0.3, np.zeros(10), np.zeros(10)])
+    clouds = scanned(truth, box(400, 400))
+    graph = Graph(truth).with_edges(chained(truth, NOISE))
+    result = refined(graph, clouds, truth[:, 0])
+    assert not result.used.any()
+    np.testing.assert_allclose(result.graph.poses, truth, atol=1e-9)
+
+
+def test_rounds_are_told_and_bounded():
+    truth, path, clouds = room(7, 0.01, 8.0)
+    graph = drifted(np.random.default_rng(1), truth, NOISE)
+    session, told = np.zeros(len(truth), dtype=np.int64), []
+    i, j = choose_pairs(clouds, graph.poses, path, session, CONFIG)
+    config = replace(CONFIG, rounds=3)
+    raster = paint(clouds, 0.1, 0.5)
+    result = refine(graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig(), lambda *a: told.append(a))
+    assert result.rounds == 3
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert len(result.edges) == result.used.sum()
+    again = refine(graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig())
+    assert again.graph.poses.tobytes() == result.graph.poses.tobytes()
+
+
+
+def test_fewer_pairs_tell_nearly_as_much():
+    """With a fourth of the pairs every pose is held by some ties still; what lies between them is a little less sure."""
+    truth, path, clouds = room(5, 0.01)
+    graph = Graph(truth).with_edges(chained(truth, NOISE))
+    result = refined(graph, clouds, path, selections=1)
+    whole = result.graph.with_edges(result.edges)
+    far = np.abs(result.edges.i - result.edges.j) > 4
+    fewer = with_fewer_pairs(whole, int(far.sum()) // 4)
+    assert np.sum(np.abs(fewer.edges[-1].i - fewer.edges[-1].j) > 4) <= far.sum() // 4
+    assert with_fewer_pairs(whole, int(far.sum())).edges[-1] is result.edges
+    ratio = np.sqrt(marginals(fewer).poses[1:, [0, 1, 2], [0, 1, 2]] / marginals(whole).poses[1:, [0, 1, 2], [0, 1, 2]])
+    assert np.all(np.median(ratio, axis=0) > 0.9)
+    assert np.all(np.median(ratio, axis=0) < 1.7)

@@ -1,0 +1,96 @@
+"""Turns by laser and wheels: which way up the laser is, how the clocks differ, what the track width is wrong by."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.planted import box, drive, odometry, recording, scans, wander
+
+from uwblite.evaluation.trajectory import evaluate_trajectory
+from uwblite.lidar.laser_mounting import LEAST_PAIRS, compare
+from uwblite.mapping import MappingConfig, build_map
+from uwblite.sensor_log import SensorMounting
+
+ROOM = np.concatenate([box(14, 11), box(3, 1) + np.array([2, 1, 2, 1]), box(1, 2) - np.array([4, 2, 4, 2])])
+TURNS = [(0.0, 0.0, 0.6), (0.4, 0.0, 0.0), (0.0, 0.0, -0.5), (0.3, 0.0, 0.0), (0.0, 0.0, 0.4)] * 2
+UP, DOWN = SensorMounting(), SensorMounting(laser_flipped=True)
+
+
+def turner(mounting=UP, lag=0.0, turn_scale=1.0, seed=0):
+    """A recording of a robot that turns on the spot now and then; its log says nothing of how the laser hangs."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = drive(TURNS, [4.0] * len(TURNS))
+    seen = scans(stamps, truth, ROOM, rate=10.0, noise=0.01, rng=rng, mounting=mounting)
+    seen = replace(seen, stamps=seen.stamps + lag)
+    return recording(odometry(stamps, truth, rng, noise=0.005, turn_noise=0.01, turn_scale=turn_scale), None, seen), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_way_up_shows_in_the_turns(seed):
+    for mounting, over in ((UP, False), (DOWN, True)):
+        seen = compare(turner(mounting, seed=seed)[0])
+        assert seen.agree
+        assert seen.turned_over is over
+
+
+def test_who_told_the_way_up_rightly_is_not_contradicted():
+    log, _ = turner(DOWN)
+    assert not compare(replace(log, mounting=DOWN)).turned_over
+    assert compare(replace(turner(UP)[0], mounting=DOWN)).turned_over
+
+
+@pytest.mark.parametrize("lag", [0.3, -0.2])
+def test_the_clock_offset_is_found(lag):
+    """Turns are measured to about a beam's tenth; with 0.5 rad/s that is 0.01 s, and offsets are tried every 0.02 s."""
+    seen = compare(turner(lag=lag)[0])
+    assert seen.clock_offset == pytest.approx(lag, abs=0.041)
+    assert seen.clock_clear
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_the_wheels_turn_scale_is_found(scale):
+    seen = compare(turner(turn_scale=scale)[0])
+    assert 1.0 / seen.ratio == pytest.approx(scale, rel=0.05)
+    assert seen.agree
+
+
+@pytest.mark.parametrize("mounting", [UP, DOWN])
+def test_scans_that_see_nothing_have_no_say(mounting):
+    """In a large bare hall most scans see no wall: any turn fits two of them."""
+    log, _ = turner(mounting)
+    ranges = log.scans.ranges.copy()
+    ranges[np.arange(len(ranges)) % 20 < 13] = np.inf
+    seen = compare(replace(log, scans=replace(log.scans, ranges=ranges)))
+    assert seen.agree
+    assert seen.turned_over is (mounting is DOWN)
+
+
+def test_a_robot_that_never_turns_says_nothing():
+    stamps, truth = drive([(0.5, 0.0, 0.0)], [20.0])
+    log = recording(odometry(stamps, truth), None, scans(stamps, truth, box(40, 6)))
+    assert compare(log) is None
+    assert compare(replace(log, scans=replace(log.scans, stamps=log.scans.stamps[:5], ranges=log.scans.ranges[:5]))) is None
+
+
+def test_a_robot_that_turns_only_while_driving_still_says_it():
+    rng = np.random.default_rng(1)
+    stamps, truth = drive([(0.6, 0.0, 0.35)] * 3, [10.0] * 3)
+    seen = scans(stamps, truth, ROOM, rate=10.0, noise=0.01, rng=rng, mounting=DOWN)
+    found = compare(recording(odometry(stamps, truth), None, seen))
+    assert found.pairs >= LEAST_PAIRS
+    assert found.turned_over
+
+
+def test_a_laser_upside_down_is_mapped_and_said():
+    rng = np.random.default_rng(2)
+    stamps, truth = wander(rng, 25.0)
+    seen = scans(stamps, truth, ROOM, rate=5.0, noise=0.01, rng=rng, mounting=DOWN)
+    log = recording(odometry(stamps, truth, rng, noise=0.005, turn_noise=0.005), None, seen)
+    result = build_map(log)
+    assert [w for w in result.warnings if "upside down" in w]
+    assert evaluate_trajectory(stamps, result.trajectory, stamps, truth).ate.rmse < 0.03
+    told = build_map(replace(log, mounting=DOWN))
+    assert not [w for w in told.warnings if "upside down" in w]
+    np.testing.assert_array_equal(told.trajectory, result.trajectory)
+    believed = build_map(log, MappingConfig(turn_laser=False))
+    assert not [w for w in believed.warnings if "upside down" in w]

@@ -1,0 +1,173 @@
+"""Filters against brute force, normals against known walls."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from uwblite import se2
+from uwblite.lidar.point_cloud import (
+    estimate_normals,
+    make_cloud,
+    make_tree,
+    radius_outlier_filter,
+    statistical_outlier_filter,
+    voxel_labels,
+    voxel_means,
+)
+
+clouds = hnp.arrays(
+    np.float64, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5.0, 5.0, allow_subnormal=False)
+)
+
+
+def _distances(points):
+    return np.sqrt(((points[:, None] - points[None, :]) ** 2).sum(axis=-1))
+
+
+@settings(max_examples=60, deadline=None)
+@given(clouds, st.sampled_from([0.05, 0.3, 2.0]))
+def test_voxel_means_equal_brute_force(points, size):
+    cells = [tuple(c) for c in np.floor(points / size).astype(int)]
+    expected = [np.mean([p for p, c in zip(points, cells, strict=True) if c == cell], axis=0) for cell in sorted(set(cells))]
+    means, counts = voxel_means(points, size, points)
+    assert counts.tolist() == [cells.count(cell) for cell in sorted(set(cells))]
+    np.testing.assert_allclose(means, np.reshape(expected, (-1, 2)), atol=1e-12)
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e4, 1e12], ids=["counted", "sorted", "beyond 64 bits"])
+def test_voxel_labels_agree_however_wide_the_cloud_is(spread):
+    rng = np.random.default_rng(0)
+    near = rng.uniform(0.0, 1.0, (200, 2))
+    labels, _ = voxel_labels(near, 0.1)
+    with_far, count = voxel_labels(np.vstack([near, [[-spread, -spread], [spread, spread]]]), 0.1)
+    assert count == labels.max() + 3
+    np.testing.assert_array_equal(with_far[:-2] - 1, labels)
+
+
+def test_voxel_means_carry_what_belongs_to_the_points():
+    points = np.array([[0.1, 0.1], [0.3, 0.1], [1.1, 0.2]])
+    means, counts = voxel_means(points, 1.0, np.array([[1.0, 0.0, 5.0], [3.0, 0.0, 7.0], [9.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(means, [[2.0, 0.0, 6.0], [9.0, 1.0, 0.0]])
+    assert counts.tolist() == [2, 1]
+
+
+def test_centroids_of_voxels_stay_where_they_are():
+    points = np.random.default_rng(1).normal(size=(500, 2))
+    once = voxel_means(points, 0.2, points)[0]
+    np.testing.assert_allclose(voxel_means(once, 0.2, once)[0], once)
+
+
+@settings(max_examples=60, deadline=None)
+@given(clouds, st.integers(1, 8), st.floats(0.0, 3.0))
+def test_statistical_filter_equals_brute_force(points, neighbours, ratio):
+    keep = statistical_outlier_filter(points, neighbours, ratio)
+    if len(points) < 2:
+        assert keep.all()
+        return
+    k = min(neighbours, len(points) - 1)
+    mean = np.sort(_distances(points), axis=1)[:, 1 : k + 1].mean(axis=1)
+    threshold = mean.mean() + ratio * mean.std()
+    clear = np.abs(mean - threshold) > 1e-9
+    np.testing.assert_array_equal(keep[clear], (mean <= threshold)[clear])
+
+
+@settings(max_examples=60, deadline=None)
+@given(clouds, st.floats(0.05, 3.0), st.integers(0, 5))
+def test_radius_filter_equals_brute_force(points, radius, least):
+    distances = _distances(points)
+    others = (distances <= radius).sum(axis=1) - 1
+    clear = (np.abs(distances - radius) > 1e-9).all(axis=1)
+    np.testing.assert_array_equal(radius_outlier_filter(points, radius, least)[clear], (others >= least)[clear])
+
+
+def test_radius_filter_counts_a_neighbour_at_exactly_the_radius():
+    points = np.array([[0.0, 0.0], [0.5, 0.0]])
+    assert radius_outlier_filter(points, 0.5, 1).all()
+    assert not radius_outlier_filter(points, 0.499, 1).any()
+
+
+def test_filters_take_a_lone_outlier_and_leave_the_wall():
+    wall = np.stack([np.linspace(0.0, 3.0, 61), np.zeros(61)], axis=-1)
+    points = np.vstack([wall, [[1.5, 1.0]]])
+    for keep in (statistical_outlier_filter(points, 6, 3.0), radius_outlier_filter(points, 0.2, 2)):
+        assert keep.tolist() == [True] * 61 + [False]
+
+
+@settings(max_examples=30, deadline=None)
+@given(clouds, st.floats(0.1, 3.0))
+def test_lines_equal_the_eigenvectors_of_each_neighbourhood(points, radius):
+    lines = estimate_normals(points, make_tree(points), radius)
+    distances = _distances(points)
+    if (np.abs(distances - radius) < 1e-9).any():
+        return
+    for k in range(len(points)):
+        near = points[distances[k] <= radius]
+        assert lines.neighbours[k] == len(near)
+        np.testing.assert_allclose(lines.centers[k], near.mean(axis=0), atol=1e-9)
+        covariance = np.cov(near.T, bias=True) if len(near) > 1 else np.zeros((2, 2))
+        values, vectors = np.linalg.eigh(covariance)
+        if len(near) < 3 or values[1] == 0.0:
+            assert (lines.normals[k] == 0.0).all()
+            assert lines.linearity[k] == 0.0
+            continue
+        assert lines.linearity[k] == pytest.approx(1.0 - max(values[0], 0.0) / values[1], abs=1e-6 / values[1])
+        if values[1] - values[0] > 1e-6:
+            assert abs(lines.normals[k] @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_linearity_tells_walls_from_corners_and_lone_points():
+    along = np.arange(0.0, 1.001, 0.05)
+    corner = np.vstack([np.stack([along, 0 * along], -1), np.stack([0 * along, along + 0.05], -1), [[5.0, 5.0]]])
+    lines = estimate_normals(corner, make_tree(corner), 0.2)
+    assert lines.linearity[10] > 0.999
+    assert lines.linearity[0] < 0.8
+    assert lines.linearity[-1] == 0.0
+
+
+def test_variance_of_normals_is_what_the_scatter_makes_it():
+    rng = np.random.default_rng(2)
+    angles, predicted = [], []
+    for _ in range(400):
+        wall = np.stack([np.arange(-0.3, 0.301, 0.05), rng.normal(0.0, 0.01, 13)], axis=-1)
+        lines = estimate_normals(wall, make_tree(wall), 0.21)
+        angles.append(np.arctan2(lines.normals[6, 0], abs(lines.normals[6, 1])))
+        predicted.append(lines.normal_variance[6])
+    # 400 draws know a variance to about 7 %.
+    assert np.mean(predicted) == pytest.approx(np.var(angles), rel=0.25)
+
+
+def test_normals_point_to_the_viewpoint_in_any_frame():
+    rng = np.random.default_rng(3)
+    wall = np.stack([np.arange(0.0, 2.0, 0.04), rng.normal(0.0, 0.005, 50)], axis=-1)
+    for side in (1.0, -1.0):
+        pose = np.array([3.0, -2.0, 2.5])
+        cloud = make_cloud(se2.transform(pose, wall), se2.transform(pose, np.array([1.0, side])))
+        assert cloud.oriented
+        assert (se2.rotate(-pose[2], cloud.normals)[:, 1] * side > 0.9).all()
+
+
+def test_a_cloud_is_the_same_whatever_is_asked_of_it_first():
+    points = np.random.default_rng(4).uniform(0.0, 3.0, (300, 2))
+    one, two = make_cloud(points), make_cloud(points)
+    one.raster(0.3, 2)
+    np.testing.assert_array_equal(one.raster(0.2).table, two.raster(0.2).table)
+    assert one.raster(0.2) is one.raster(0.2)
+
+
+def test_a_cloud_goes_to_another_process_and_back():
+    cloud = make_cloud(np.random.default_rng(5).uniform(0.0, 3.0, (100, 2)), np.ones(2))
+    copy = pickle.loads(pickle.dumps(cloud))
+    np.testing.assert_array_equal(copy.surface, cloud.surface)
+    np.testing.assert_array_equal(copy.tree.query(cloud.points, k=3)[1], cloud.tree.query(cloud.points, k=3)[1])
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_tiny_clouds_have_no_lines(n):
+    cloud = make_cloud(np.zeros((n, 2)))
+    assert len(cloud) == n
+    assert (cloud.surface[:2] == 0.0).all()
+    assert (cloud.surface[6] == 0.0).all()

@@ -1,0 +1,264 @@
+"""Matching of pairs: the raster against a tree, the condensed cost against numbers, known motions, blind directions."""
+
+import numpy as np
+import pytest
+from helpers.planted import box, cast
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from uwblite import se2
+from uwblite.graph.graph import Graph
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.keyframes import ScanPoints
+from uwblite.lidar.clouds import CloudConfig, Clouds, build
+from uwblite.lidar.scan_matching import PairFactors, match, measured, paint, pair_points, trusted_step
+
+ROOM = np.concatenate([box(8, 6), [[1.0, -1.0, 1.0, 1.0], [1.0, 1.0, 2.0, 1.5]]])
+CORRIDOR = np.array([[-40.0, -1.0, 40.0, -1.0], [40.0, 1.0, -40.0, 1.0]])
+
+
+def scanned(poses, walls, noise=0.0, seed=0, beams=360, reach=8.0) -> Clouds:
+    """Return the clouds that a laser sees from poses (k, 3)."""
+    rng = np.random.default_rng(seed)
+    bearings = np.tile(np.linspace(-np.pi, np.pi, beams, endpoint=False), len(poses))
+    owner = np.repeat(np.arange(len(poses)), beams)
+    distance = cast(poses[owner], bearings, walls) + noise * rng.standard_normal(len(owner))
+    hit = np.isfinite(distance) & (distance < reach)
+    points = distance[hit, None] * np.column_stack([np.cos(bearings[hit]), np.sin(bearings[hit])])
+    nothing = np.zeros(hit.sum(), dtype=np.int64)
+    rays = ScanPoints(owner[hit], points, np.zeros_like(points), nothing, nothing)
+    return build(rays, len(poses), CloudConfig(voxel=0.02, normal_radius=0.3))
+
+
+def scattered(rng, counts) -> Clouds:
+    """Return random clouds, every point with a random normal but a tenth without."""
+    n = int(np.sum(counts))
+    angle = rng.uniform(-np.pi, np.pi, n)
+    normals = np.column_stack([np.cos(angle), np.sin(angle)]) * (rng.random(n) > 0.1)[:, None]
+    owner = np.repeat(np.arange(len(counts)), counts)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Clouds(offsets, rng.uniform(-2, 3, (n, 2)), normals, owner, np.full(n, 1e-3))
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 1000))
+def test_the_raster_names_the_nearest_point_to_a_cell(seed):
+    rng = np.random.default_rng(seed)
+    clouds, cell, reach = scattered(rng, [40, 0, 1, 80]), 0.05, 0.3
+    raster = paint(clouds, cell, reach)
+    usable = np.any(clouds.normals != 0.0, axis=1)
+    for k in range(4):
+        own = np.flatnonzero(usable & (clouds.owner == k))
+        cells = raster.nearest[raster.start[k] : raster.start[k] + raster.shape[k].prod()].reshape(raster.shape[k])
+        if not len(own):
+            assert np.all(cells == -1)
+            continue
+        grid = np.stack(np.meshgrid(*(np.arange(s) for s in cells.shape), indexing="ij"), axis=-1)
+        centres = raster.origin[k] + (grid + 0.5) * cell
+        nearest, _ = cKDTree(clouds.points[own]).query(centres)
+        painted = cells >= 0
+        # A point stands for the centre of its cell: off by at most half the diagonal, for the point named and for the true one.
+        slack = cell * np.sqrt(2) / 2
+        assert np.all(painted[nearest < reach - slack])
+        assert not np.any(painted[nearest > reach + slack])
+        named_rows = clouds.offsets[k] + cells[painted]
+        named = np.hypot(*(clouds.points[named_rows] - centres[painted]).T)
+        assert np.all(named <= nearest[painted] + 2 * slack + 1e-9)
+        assert np.isin(named_rows, own).all()
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 1000), st.integers(1, 60))
+def test_pair_points_are_spread_over_the_points_with_normals(seed, limit):
+    rng = np.random.default_rng(seed)
+    clouds = scattered(rng, [30, 0, 3, 100])
+    j = np.array([3, 1, 0, 2, 3])
+    points = pair_points(clouds, j, limit)
+    for pair, cloud in enumerate(j):
+        rows = points.of(pair)
+        own = np.flatnonzero((clouds.owner == cloud) & np.any(clouds.normals != 0.0, axis=1))
+        assert len(rows) == min(limit, len(own))
+        assert np.isin(rows, own).all()
+        assert len(np.unique(rows)) == len(rows)
+        if len(rows):
+            gaps = np.diff(np.searchsorted(own, rows), append=len(own))
+            assert gaps.max() <= -(-len(own) // len(rows)) + 1
+
+
+def by_hand(clouds, raster, i, pose, rows, gate, scale):
+    """Return the matches of one pair by a loop: source points (m, 2), target points, normals."""
+    found = []
+    for row in rows:
+        at = se2.transform(pose, clouds.points[row])
+        cx, cy = np.floor((at - raster.origin[i]) / raster.cell).astype(int)
+        if not (0 <= cx < raster.shape[i, 0] and 0 <= cy < raster.shape[i, 1]):
+            continue
+        number = raster.nearest[raster.start[i] + cx * raster.shape[i, 1] + cy]
+        target = clouds.offsets[i] + number
+        if number < 0 or np.hypot(*(at - clouds.points[target])) > gate:
+            continue
+        if clouds.normals[target] @ se2.rotate(pose[2], clouds.normals[row]) > np.sqrt(0.5):
+            found.append((clouds.points[row], clouds.points[target], clouds.normals[target]))
+    return [np.array(part) for part in zip(*found, strict=True)]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
+    rng = np.random.default_rng(seed)
+    truth = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
+    clouds = scanned(truth, ROOM, 0.01, seed)
+    raster, gate, scale = paint(clouds, 0.05, 0.4), 0.3, 0.08
+    i, j = np.array([0, 0, 2]), np.array([1, 2, 1])
+    pose = se2.between(truth[i], truth[j]) + rng.normal(0, 0.03, (3, 3))
+    points = pair_points(clouds, j, 120)
+    factors = match(clouds, raster, i, pose, points, gate, scale)
+    for e in range(3):
+        rows = points.of(e)
+        source, target, normal = by_hand(clouds, raster, i[e], pose[e], rows, gate, scale)
+        assert factors.asked[e] == len(rows)
+        assert factors.matched[e] == len(source)
+
+        def residual(x, source=source, target=target, normal=normal):
+            return np.einsum("pi,pi->p", normal, se2.transform(x, source) - target)
+
+        r, step = residual(pose[e]), 1e-6
+        jacobian = np.column_stack([(residual(pose[e] + d) - residual(pose[e] - d)) / (2 * step) for d in step * np.eye(3)])
+        w = (1 + (r / scale) ** 2) ** -2
+        np.testing.assert_allclose(factors.hessian[e], (jacobian * w[:, None]).T @ jacobian, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(factors.gradient[e], jacobian.T @ (w * r), rtol=1e-5, atol=1e-7)
+        assert factors.squared[e] == pytest.approx(np.sum(w * r * r))
+        assert factors.weight[e] == pytest.approx(np.sum(w))
+
+        def cost(x, residual=residual):
+            s = residual(x) ** 2
+            return 0.5 * np.sum(s / (1 + s / scale**2))
+
+        slope = [(cost(pose[e] + d) - cost(pose[e] - d)) / (2 * step) for d in step * np.eye(3)]
+        np.testing.assert_allclose(factors.gradient[e], slope, rtol=1e-4, atol=1e-6)
+
+
+def settled(clouds, raster, i, j, guess, gates=(0.4, 0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1)):
+    """Return the poses after rounds of matching and stepping, and the last factors and measurement."""
+    points, pose = pair_points(clouds, j, 200), guess.copy()
+    for gate in gates:
+        factors = match(clouds, raster, i, pose, points, gate, gate / 2)
+        before = pose
+        pose, root = measured(factors, pose, np.ones(len(i)))
+    return before, factors, pose, root
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_known_motions_are_recovered(noise):
+    rng = np.random.default_rng(5)
+    truth = np.column_stack([rng.uniform(-1.5, 0.5, 8), rng.uniform(-1.5, 1.5, 8), rng.uniform(-3, 3, 8)])
+    clouds = scanned(truth, ROOM, noise, 6)
+    i, j = np.triu_indices(8, 1)
+    exact = se2.between(truth[i], truth[j])
+    guess = exact + np.column_stack([rng.uniform(-0.15, 0.15, (len(i), 2)), rng.uniform(-0.08, 0.08, len(i))])
+    _, factors, pose, root = settled(clouds, paint(clouds, 0.04, 0.4), i, j, guess)
+    error = se2.between(exact, pose)
+    # Noise-free: what is left comes from averaging in cells of 0.02 m on slanting walls and at corners.
+    variance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
+    # Two clouds err, each point and the line it is matched with, which neighbouring matches share.
+    sigma = np.sqrt(np.einsum("eii->ei", variance)) * noise * np.sqrt(2 * 4)
+    assert np.all(np.abs(error) < 0.002 + 4 * sigma)
+    assert np.all(factors.matched > 0.4 * factors.asked)
+
+
+def test_a_corridor_constrains_across_and_not_along():
+    truth = np.array([[0.0, 0.1, 0.3], [0.7, -0.2, 1.5]])
+    clouds = scanned(truth, CORRIDOR)
+    i, j = np.array([0]), np.array([1])
+    exact = se2.between(truth[0], truth[1])
+    along = se2.rotate(-truth[0, 2], np.array([1.0, 0.0]))
+    guess = exact + np.array([*(0.1 * along), 0.0])
+    _, _, pose, root = settled(clouds, paint(clouds, 0.04, 0.4), i, j, guess[None])
+    information = root[0].T @ root[0]
+    shift = se2.rotate(-pose[0, 2], along)
+    assert np.array([*shift, 0.0]) @ information @ np.array([*shift, 0.0]) < 1e-9 * np.trace(information)
+    assert np.linalg.matrix_rank(information, tol=1e-6 * np.trace(information)) == 2
+    moved = se2.rotate(truth[0, 2], pose[0, :2] - exact[:2])
+    assert moved[0] == pytest.approx(0.1, abs=0.01)
+    assert abs(moved[1]) < 0.002
+    assert abs(pose[0, 2] - exact[2]) < 0.002
+
+
+def factors_of(hessian, gradient, feigned=None) -> PairFactors:
+    """Return the factors of one pair with this quadratic form."""
+    one = np.ones(1)
+    feigned = np.zeros((3, 3)) if feigned is None else feigned
+    return PairFactors(hessian[None], feigned[None], gradient[None], one.astype(int), one.astype(int), one, one)
+
+
+def quadratic_form(rng, rank):
+    """Return hessian and gradient of random residuals whose Jacobian has this rank."""
+    jacobian = rng.normal(size=(40, rank)) @ rng.normal(size=(rank, 3)) * [1.0, 1.0, 2.0]
+    return jacobian.T @ jacobian, jacobian.T @ rng.normal(0, 0.01, 40)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10_000), st.integers(1, 3))
+def test_a_measurement_has_the_cost_of_its_factors(seed, rank):
+    """For any pose T near the one matched at, |L e(T)|^2 differs from the quadratic form by a constant."""
+    rng = np.random.default_rng(seed)
+    at, variance = rng.uniform(-3, 3, 3), 0.3
+    hessian, gradient = quadratic_form(rng, rank)
+    z, root = measured(factors_of(hessian, gradient), at[None], np.array([variance]))
+    edge = RelativePoseEdges(np.array([0]), np.array([1]), z, root)
+    steps = rng.normal(0, 0.02, (6, 3))
+    quadratic = [(s @ hessian @ s + 2 * gradient @ s) / variance for s in steps]
+    errors = [edge.residuals(Graph(np.array([np.zeros(3), at + s])))[0] for s in steps]
+    got = [e @ e for e in errors]
+    np.testing.assert_allclose(np.diff(got), np.diff(quadratic), rtol=1e-6, atol=1e-6 * np.abs(quadratic).max())
+    assert np.linalg.matrix_rank(root[0], tol=1e-6 * np.abs(root[0]).max()) == rank
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10_000))
+def test_what_scatter_feigns_is_taken_off_and_never_more(seed):
+    """0 <= information <= H, and a direction in which H is less than what scatter feigns twice says nothing."""
+    rng = np.random.default_rng(seed)
+    (hessian, gradient), (feigned, _) = quadratic_form(rng, 3), quadratic_form(rng, 3)
+    feigned *= 10 ** rng.uniform(-3, 1)
+    step, root = trusted_step(factors_of(hessian, gradient, feigned))
+    information = root[0].T @ root[0]
+    size = np.trace(hessian)
+    assert np.linalg.eigvalsh(hessian - information).min() > -1e-6 * size
+    lost = np.linalg.eigvals(np.linalg.solve(feigned, hessian)).real < 2.0
+    assert np.linalg.matrix_rank(information, tol=1e-9 * size) == 3 - lost.sum()
+    if not lost.any():
+        np.testing.assert_allclose(step[0], -np.linalg.solve(hessian, gradient), rtol=1e-5, atol=1e-8)
+
+
+def test_headings_are_wrapped():
+    factors = factors_of(np.eye(3) * 100.0, np.array([0.0, 0.0, -10.0]))
+    z, _ = measured(factors, np.array([[0.0, 0.0, np.pi - 0.05]]), np.ones(1))
+    assert z[0, 2] == pytest.approx(-np.pi + 0.05)
+
+
+def test_nothing_to_match_is_no_information():
+    clouds = scattered(np.random.default_rng(0), [5, 0, 5])
+    raster = paint(clouds, 0.1, 0.3)
+    none = np.zeros(0, dtype=np.int64)
+    empty = match(clouds, raster, none, np.zeros((0, 3)), pair_points(clouds, none, 10), 0.3, 0.1)
+    assert measured(empty, np.zeros((0, 3)), np.zeros(0))[1].shape == (0, 3, 3)
+    i, j, far = np.array([0, 1, 0]), np.array([1, 0, 2]), np.full((3, 3), 50.0)
+    factors = match(clouds, raster, i, far, pair_points(clouds, j, 10), 0.3, 0.1)
+    assert factors.matched.tolist() == [0, 0, 0]
+    z, root = measured(factors, far, np.ones(3))
+    assert np.all(root == 0.0)
+    np.testing.assert_array_equal(z[:, :2], far[:, :2])
+    assert np.isfinite(z).all()
+
+
+def test_opposite_sides_of_a_thin_wall_do_not_match():
+    """Two lasers on either side of a wall 2 cm thick see the same line; their normals tell the sides apart."""
+    walls = np.array([[-3.0, 0.0, 3.0, 0.0], [-3.0, 0.02, 3.0, 0.02]])
+    truth = np.array([[0.0, -1.5, 0.0], [0.0, 1.5, 0.0], [0.5, -1.5, 0.0]])
+    clouds = scanned(truth, walls)
+    i, j = np.array([0, 0]), np.array([1, 2])
+    points = pair_points(clouds, j, 100)
+    factors = match(clouds, paint(clouds, 0.04, 0.3), i, se2.between(truth[i], truth[j]), points, 0.2, 0.1)
+    assert factors.matched[0] == 0
+    assert factors.matched[1] > 50

@@ -1,0 +1,117 @@
+"""Free space and the surfaces that stand in it: maps that fit together, and maps that were folded on purpose."""
+
+import numpy as np
+import pytest
+from loop_closure.test_verification import walked
+
+from uwblite import se2
+from uwblite.lidar.clouds import Clouds
+from uwblite.lidar.submaps import SubmapConfig, build
+from uwblite.lidar.visibility import disagreement, nearest_by_bearing, seen_free, sees_through, still, unrest
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return walked(3)
+
+
+def test_nearest_by_bearing_is_the_nearest_point_of_every_direction(drive):
+    clouds = drive[2]
+    nearest = nearest_by_bearing(clouds)
+    bins = nearest.shape[1]
+    points = clouds.cloud(7)[0]
+    bearing = np.arctan2(points[:, 1], points[:, 0])
+    for k in range(0, bins, 17):
+        within = (bearing >= 2 * np.pi * k / bins - np.pi) & (bearing < 2 * np.pi * (k + 1) / bins - np.pi)
+        expected = np.hypot(*points[within].T).min() if within.any() else np.inf
+        assert nearest[7, k] == pytest.approx(expected)
+
+
+def test_visits_agree_where_every_pose_is_true(drive):
+    truth, path, clouds = drive
+    share, visits = disagreement(clouds, truth, path, np.zeros(len(truth), dtype=np.int64))
+    assert visits > 20
+    assert share < 0.01
+
+
+@pytest.mark.parametrize("error", [(2.0, 1.0, 0.0), (0.0, 0.0, 0.5)])
+def test_visits_disagree_where_half_of_the_drive_lies_elsewhere(drive, error):
+    truth, path, clouds = drive
+    poses, half = truth.copy(), len(truth) // 2
+    poses[half:] = se2.compose(np.array(error), truth[half:])
+    assert disagreement(clouds, poses, path, np.zeros(len(truth), dtype=np.int64))[0] > 0.05
+
+
+def test_one_visit_has_nothing_to_compare_with(drive):
+    truth, path, clouds = drive
+    assert disagreement(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.int64)) == (0.0, 0)
+
+
+def test_recordings_are_visits_of_their_own(drive):
+    truth, path, clouds = drive
+    session = (np.arange(len(truth)) >= len(truth) // 2).astype(np.int64)
+    assert disagreement(clouds, truth, 0.01 * path, session)[1] > 0
+
+
+def test_sub_maps_in_their_place_see_through_nothing_and_elsewhere_through_walls(drive):
+    truth, path, clouds = drive
+    pieces = build(clouds, truth, path, np.zeros(len(truth), dtype=np.int64), SubmapConfig(epsilon=4.0))
+    free = seen_free(clouds, pieces, truth)
+    where = truth[pieces.reference]
+    pairs = ((a, b) for a in range(len(where)) for b in range(a + 2, len(where)))
+    a, b = next((a, b) for a, b in pairs if np.hypot(*(where[a] - where[b])[:2]) < 2.0)
+    points = [pieces.clouds.cloud(k)[0] for k in (a, b)]
+    T_a_b = se2.between(where[a], where[b])
+    assert sees_through(free[a], points[0], free[b], points[1], T_a_b) < 0.05
+    assert sees_through(free[a], points[0], free[b], points[1], se2.compose(T_a_b, [1.5, 1.0, 0.0])) > 0.12
+
+
+
+
+def with_a_walker(truth, clouds):
+    """Return clouds in each of which a person stands, 2 m ahead of where the robot is and each time somewhere else."""
+    parts = []
+    for k in range(len(truth)):
+        points, normals = clouds.cloud(k)
+        angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+        body = [2.0 + 0.3 * (k % 3), 0.4 * (k % 5) - 0.8] + 0.2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        hidden = np.abs(np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(body[:, 1].mean(), body[:, 0].mean())) < 0.2
+        parts.append((np.concatenate([points[~hidden], body]), np.concatenate([normals[~hidden], np.zeros_like(body)])))
+    counts = np.array([len(points) for points, _ in parts])
+    points, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
+    owner = np.repeat(np.arange(len(parts), dtype=np.int32), counts)
+    return Clouds(np.concatenate([[0], np.cumsum(counts)]), points, normals, owner, np.zeros(len(points)))
+
+
+def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(drive):
+    truth, path, clouds = drive
+    session = np.zeros(len(truth), dtype=np.int64)
+    settings = SubmapConfig(epsilon=4.0)
+    quiet = build(clouds, truth, path, session, settings)
+    busy_clouds = with_a_walker(truth, clouds)
+    busy = build(busy_clouds, truth, path, session, settings)
+    kept = [still(pieces, seen_free(own, pieces, truth)) for own, pieces in ((clouds, quiet), (busy_clouds, busy))]
+    assert len(kept[0].clouds.points) > 0.98 * len(quiet.clouds.points)
+    walkers = [len(pieces.clouds.points) - len(quiet.clouds.points) for pieces in (busy, kept[1])]
+    assert walkers[0] > 100
+    # Not all: some stood where no other view of the sub-map looked.
+    assert walkers[1] < 0.7 * walkers[0]
+
+
+def test_unrest_is_nothing_in_an_empty_hall_and_something_among_people(drive):
+    truth, path, clouds = drive
+    session = np.zeros(len(truth), dtype=np.int64)
+
+    def of(own):
+        pieces = build(own, truth, path, session, SubmapConfig(epsilon=4.0))
+        return unrest(pieces, seen_free(own, pieces, truth), truth, session)
+
+    assert of(clouds) < 0.05
+    assert of(with_a_walker(truth, clouds)) > of(clouds) + 0.05
+
+
+def test_sub_maps_of_different_recordings_do_not_follow_each_other(drive):
+    truth, path, clouds = drive
+    session = np.arange(len(truth))
+    pieces = build(clouds, truth, path, session, SubmapConfig(epsilon=4.0))
+    assert unrest(pieces, seen_free(clouds, pieces, truth), truth, session) == 0.0

@@ -1,0 +1,343 @@
+"""Loop closures: planted ones are accepted, false ones rejected for a stated reason, contradicting ones dropped."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.planted import box, chain, wander
+from lidar.test_scan_matching import scanned
+from scipy.spatial import cKDTree
+
+from uwblite import se2
+from uwblite.graph.calibration import odometry_indices
+from uwblite.graph.graph import Calibration, Graph
+from uwblite.graph.marginals import marginals
+from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
+from uwblite.graph.solver import SolverConfig, optimize
+from uwblite.lidar.correlative_matching import SearchConfig
+from uwblite.lidar.submaps import SubmapConfig, build
+from uwblite.loop_closure.candidates import Candidates, missed, propose
+from uwblite.loop_closure.closures import Closures, LoopClosureConfig, merged, no_closures
+from uwblite.loop_closure.verification import find, reconcile
+from uwblite.map_result import LoopClosure
+
+HALL = np.concatenate([
+    box(16, 12),
+    [[-3.0, -6.0, -3.0, -1.0], [2.0, 6.0, 2.0, 1.5], [4.0, -1.0, 6.5, -2.5], [-6.0, 2.0, -4.5, 4.0], [-5.5, -3.0, -5.0, -3.4]],
+])
+"""A hall whose corners and inner walls all look different."""
+PERIOD = 1.2
+TWINS = np.concatenate([
+    [[-26.0, -2.0, 26.0, -2.0], [26.0, 2.0, -26.0, 2.0]],
+    *([[PERIOD * k, 2.0, PERIOD * k, 1.2], [PERIOD * k, -2.0, PERIOD * k, -1.2]] for k in range(-20, 21)),
+])
+"""A corridor with equal pillars all along."""
+SOLVER, SEARCH = SolverConfig(), SearchConfig()
+CONFIG = LoopClosureConfig()
+
+
+def chained(poses, noise) -> OdometryEdges:
+    """Return exact edges between consecutive poses, with standard deviations noise (3,) each."""
+    n = len(poses) - 1
+    motion = se2.between(poses[:-1], poses[1:])
+    root = np.tile(np.diag(1.0 / np.asarray(noise)), (n, 1, 1))
+    i = np.arange(n)
+    return OdometryEdges(i, i + 1, motion, motion[:, 0], np.ones(n), root, odometry_indices(Calibration(), n))
+
+
+def drifted(rng, truth, noise) -> Graph:
+    """Return the graph of a chain whose steps err by the noise that its edges state."""
+    steps = se2.between(truth[:-1], truth[1:])
+    poses = chain(truth[0], steps + rng.standard_normal(steps.shape) * noise)
+    return Graph(poses).with_edges(chained(poses, noise))
+
+
+def walked(seed, walls=HALL, metres=60.0, half_width=4.0, spacing=6, **settings):
+    """Return true key poses (k, 3), travelled distance and clouds of a walk through walls with lidar noise of 1 cm."""
+    rng = np.random.default_rng(seed)
+    _, truth = wander(rng, metres, half_width=half_width, **settings)
+    truth = truth[::spacing]
+    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    return truth, path, scanned(truth, walls, 0.01, seed, beams=300, reach=5.6)
+
+
+NOISE = np.array([0.01, 0.005, 0.006])
+
+
+@pytest.fixture(scope="module")
+def hall():
+    """A walk of 60 m in the hall, its drifting chain, its sub-maps and what was proposed."""
+    truth, path, clouds = walked(3)
+    graph = drifted(np.random.default_rng(4), truth, NOISE)
+    session = np.zeros(len(truth), dtype=np.int64)
+    pieces = build(clouds, graph.poses, path, session, SubmapConfig(epsilon=4.0))
+    known = marginals(graph)
+    return truth, graph, known, pieces, session, propose(graph, known, pieces, session, set(), set(), True, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def closures(hall):
+    return find(hall[5], hall[3], CONFIG, SEARCH)
+
+
+def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess(hall):
+    _, graph, known, pieces, _, candidates = hall
+    assert len(candidates.target) > 5
+    assert np.all(candidates.source - candidates.target > 1)
+    i, j = pieces.reference[candidates.target], pieces.reference[candidates.source]
+    np.testing.assert_allclose(candidates.guess, se2.between(graph.poses[i], graph.poses[j]))
+    np.testing.assert_allclose(candidates.covariance, known.relative(i, j))
+    pairs = list(zip(candidates.target.tolist(), candidates.source.tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs)
+    assert len(pairs) <= 2 * CONFIG.partners * len(pieces)
+
+
+def test_what_was_tried_is_not_proposed_again(hall):
+    _, graph, known, pieces, session, candidates = hall
+    tried = candidates.names(CONFIG)
+    again = propose(graph, known, pieces, session, tried, set(), True, CONFIG)
+    assert not tried & again.names(CONFIG)
+
+
+def test_pairs_that_missed_are_searched_with_slack(hall, closures):
+    """After wheels have slipped the graph is sure and wrong: what did not match is proposed once more, with a wide search."""
+    truth, graph, known, pieces, session, candidates = hall
+    sure = replace(candidates, spread=np.zeros(len(candidates.target)))
+    gone = missed(sure, closures, CONFIG)
+    few = {(int(a), int(b)) for a, b, c in zip(sure.target, sure.source, closures.candidates, strict=True)
+           if c.overlap < CONFIG.overlap}
+    assert gone == few
+    assert gone
+    assert not missed(replace(candidates, spread=np.full(len(candidates.target), 9.0)), closures, CONFIG)
+    again = propose(graph, known, pieces, session, sure.names(CONFIG), gone, True, replace(CONFIG, partners=99))
+    for a, b, spread in zip(again.target.tolist(), again.source.tolist(), again.spread, strict=True):
+        assert (a, b) not in gone or spread > 3 * CONFIG.slip * 0.99
+    assert gone & set(zip(again.target.tolist(), again.source.tolist(), strict=True))
+    assert len(truth) == len(graph.poses)
+
+
+def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
+    _, graph, known, pieces, session, _ = hall
+    half = (np.arange(len(session)) >= pieces.first[len(pieces) // 2]).astype(np.int64)
+    candidates = propose(graph, known, pieces, half, set(), set(), True, replace(CONFIG, partners=99))
+    close = candidates.source - candidates.target == 1
+    assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
+
+
+def true_overlap(hall, candidates) -> np.ndarray:
+    """Return the share (c,) of the source's points that lie within 0.15 m of the target's, both at their true poses."""
+    pieces, share = hall[3], []
+    for a, b, pose in zip(candidates.target, candidates.source, true_poses(hall, candidates), strict=True):
+        target, source = pieces.clouds.cloud(a)[0], se2.transform(pose, pieces.clouds.cloud(b)[0])
+        share.append(np.mean(cKDTree(target).query(source)[0] < 0.15))
+    return np.array(share)
+
+
+def test_true_closures_are_accepted_and_measure_the_truth(hall, closures):
+    """Of the pairs that truly overlap most are found; nothing accepted is wrong, and errors are as large as stated."""
+    truth, candidates = hall[0], hall[5]
+    edges = closures.edges
+    assert len(closures.candidates) == len(candidates.target)
+    assert sum(c.accepted for c in closures.candidates) == len(edges)
+    accepted = np.array([c.accepted for c in closures.candidates])
+    share = true_overlap(hall, candidates)
+    assert np.sum(share > 0.7) > 10
+    assert accepted[share > 0.7].mean() > 0.7
+    error = se2.between(se2.between(truth[edges.i], truth[edges.j]), edges.T_i_j)
+    # A sub-map of 4 m bends with the chain: its ends lie off its middle by up to sqrt(2 m / 0.3 m) steps of noise.
+    bent = np.sqrt(2.0 / 0.3) * (NOISE[:2].max() + 2.0 * NOISE[2])
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 3 * bent
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.3
+    assert np.abs(error[:, 2]).max() < 3 * np.sqrt(2.0 / 0.3) * NOISE[2]
+
+
+def test_every_candidate_tells_its_story(closures):
+    for c in closures.candidates:
+        assert c.reason
+        assert 0.0 <= c.overlap <= 1.0
+        assert np.all(np.linalg.eigvalsh(c.information) >= -1e-6 * np.trace(c.information))
+        if c.accepted:
+            assert c.fitness <= CONFIG.sigma
+            assert c.overlap >= CONFIG.overlap
+
+
+def test_closures_take_the_drift_out(hall, closures):
+    truth, graph = hall[0], hall[1]
+    solved, left = reconcile(graph, closures, CONFIG, SOLVER)
+    assert solved.edges == graph.edges
+    before = np.hypot(*(graph.poses - truth)[:, :2].T)
+    after = np.hypot(*(solved.poses - truth)[:, :2].T)
+    assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
+    assert len(left.edges) >= 0.8 * len(closures.edges)
+
+
+def given(hall, pairs, guess, sigma) -> Candidates:
+    """Return candidates for pairs (c, 2) of sub-maps with guesses (c, 3) believed to be right to sigma (3,)."""
+    covariance = np.tile(np.diag(np.asarray(sigma) ** 2), (len(pairs), 1, 1))
+    target, source = np.asarray(pairs).T
+    return Candidates(target, source, guess, covariance, np.full(len(pairs), 3.0 * max(sigma[:2])))
+
+
+def true_poses(hall, candidates) -> np.ndarray:
+    truth, pieces = hall[0], hall[3]
+    return se2.between(truth[pieces.reference[candidates.target]], truth[pieces.reference[candidates.source]])
+
+
+def accepted_pairs(hall, closures) -> np.ndarray:
+    candidates = hall[5]
+    good = [k for k, c in enumerate(closures.candidates) if c.accepted]
+    return np.column_stack([candidates.target, candidates.source])[good]
+
+
+def test_a_match_that_the_graph_rules_out_is_rejected(hall, closures):
+    """A guess that is off by 0.25 m but believed to 1 cm: the match is right, and one of the two must be wrong."""
+    pairs = accepted_pairs(hall, closures)
+    one = given(hall, pairs, np.zeros((len(pairs), 3)), [0.01, 0.01, 0.004])
+    guess = true_poses(hall, one) + np.array([0.18, 0.18, 0.0])
+    found = find(replace(one, guess=guess), hall[3], CONFIG, SEARCH)
+    assert not any(c.accepted for c in found.candidates)
+    assert sum("Mahalanobis" in c.reason for c in found.candidates) > 0.6 * len(pairs)
+
+
+def test_sub_maps_of_different_places_are_rejected_with_a_reason(hall):
+    """Pairs that have no surface in common, claimed to lie on top of each other and believed to 0.1 m."""
+    truth, pieces = hall[0], hall[3]
+    a, b = np.triu_indices(len(pieces), 2)
+    apart = np.hypot(*(truth[pieces.reference[a], :2] - truth[pieces.reference[b], :2]).T) > 6.0
+    pairs = np.column_stack([a, b])[apart]
+    assert len(pairs) >= 5
+    rng = np.random.default_rng(9)
+    guess = np.column_stack([rng.normal(0, 0.3, (len(pairs), 2)), rng.uniform(-3, 3, len(pairs))])
+    found = find(given(hall, pairs, guess, [0.1, 0.1, 0.05]), pieces, CONFIG, SEARCH)
+    assert len(found.edges) == 0
+    assert all(c.reason and not c.accepted for c in found.candidates)
+
+
+@pytest.mark.parametrize("lost", [slice(None), slice(1, None)])
+def test_where_the_search_finds_no_place_at_all_that_is_the_reason(hall, closures, lost):
+    pairs = accepted_pairs(hall, closures)[:4]
+    one = given(hall, pairs, np.zeros((len(pairs), 3)), [0.5, 0.5, 0.15])
+    guess = true_poses(hall, one)
+    guess[lost, 0] += 200.0
+    found = find(replace(one, guess=guess), hall[3], CONFIG, SEARCH)
+    assert [c.reason for c in found.candidates][lost] == ["the search found no place for it"] * len(pairs[lost])
+    assert not any(c.accepted for c in found.candidates[lost])
+
+
+def test_a_wide_uncertainty_is_searched(hall, closures):
+    """Guesses off by up to 1 m and 0.3 rad, believed to 0.5 m: most are found again, none wrongly."""
+    pairs = accepted_pairs(hall, closures)[:8]
+    rng = np.random.default_rng(10)
+    one = given(hall, pairs, np.zeros((len(pairs), 3)), [0.5, 0.5, 0.15])
+    exact = true_poses(hall, one)
+    off = np.column_stack([rng.uniform(-0.8, 0.8, (len(pairs), 2)), rng.uniform(-0.3, 0.3, len(pairs))])
+    one = replace(one, guess=exact + off)
+    told = []
+    found = find(one, hall[3], CONFIG, SEARCH, lambda done, total: told.append((done, total)))
+    assert told == [(len(pairs), len(pairs))]
+    assert len(found.edges) >= len(pairs) // 2
+    good = [k for k, c in enumerate(found.candidates) if c.accepted]
+    error = se2.between(exact[good], found.edges.T_i_j)
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.3
+
+
+def test_equal_pillars_are_recognised_as_ambiguous():
+    """The same stretch driven there and back: where every 1.2 m look the same, a search over 3 m may not choose."""
+    truth = np.zeros((60, 3))
+    truth[:30, 0], truth[30:, 0] = np.linspace(-7, 2, 30), np.linspace(2, -7, 30)
+    truth[30:, 2] = np.pi
+    path = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(truth[:, 0])))])
+    clouds = scanned(truth, TWINS, 0.01, 5, beams=300, reach=8.0)
+    pieces = build(clouds, truth, path, np.zeros(60, dtype=np.int64), SubmapConfig(epsilon=4.5))
+    a, b = np.array([0, 1]), np.array([3, 2])
+    poses = truth[pieces.reference]
+    covariance = np.tile(np.diag([1.0**2, 0.3**2, 0.02**2]), (2, 1, 1))
+    unsure = Candidates(a, b, se2.between(poses[a], poses[b]) + np.array([0.4, 0.0, 0.0]), covariance, np.full(2, 3.0))
+    found = find(unsure, pieces, CONFIG, SEARCH)
+    assert all("another place" in c.reason for c in found.candidates)
+    sure = Candidates(a, b, se2.between(poses[a], poses[b]), covariance / 1e4, np.full(2, 0.03))
+    assert all(c.accepted for c in find(sure, pieces, CONFIG, SEARCH).candidates)
+
+
+def planted_closures(rng, truth, count, false_share) -> tuple[Closures, np.ndarray]:
+    """Return closures between random poses with 1 cm of noise, some of them wrong by metres, and which are."""
+    i = rng.integers(0, len(truth) // 2, count)
+    j = i + rng.integers(len(truth) // 4, len(truth) // 2, count)
+    pose = se2.between(truth[i], truth[j]) + rng.standard_normal((count, 3)) * [0.01, 0.01, 0.004]
+    false = rng.random(count) < false_share
+    pose[false] += rng.uniform(0.5, 2.0, (false.sum(), 3)) * [1.0, 1.0, 0.2]
+    root = np.tile(np.diag([100.0, 100.0, 250.0]), (count, 1, 1))
+    information = root @ root
+    story = tuple(
+        LoopClosure(int(a), int(b), z, h, 0.01, 0.9, True, "planted")
+        for a, b, z, h in zip(i, j, pose, information, strict=True)
+    )
+    return Closures(RelativePoseEdges(i, j, pose, root), story), false
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_contradicting_closures_are_dropped_with_a_reason(seed):
+    rng = np.random.default_rng(seed)
+    truth, _, _ = walked(seed, metres=40.0)
+    graph = drifted(rng, truth, NOISE)
+    closures, false = planted_closures(rng, truth, 30, 0.3)
+    solved, left = reconcile(graph, closures, CONFIG, SOLVER)
+    kept = {(int(a), int(b)) for a, b in zip(left.edges.i, left.edges.j, strict=True)}
+    pairs = list(zip(closures.edges.i.tolist(), closures.edges.j.tolist(), strict=True))
+    assert not kept & {p for p, f in zip(pairs, false, strict=True) if f}
+    assert len(kept) >= 0.9 * np.sum(~false)
+    for c, f in zip(left.candidates, false, strict=True):
+        assert c.accepted == ((c.i, c.j) in kept)
+        assert not f or "contradicts" in c.reason
+    clean = reconcile(graph, planted_closures(np.random.default_rng(seed), truth, 30, 0.0)[0], CONFIG, SOLVER)[0]
+    error = [np.sqrt(np.mean(np.sum((g.poses - truth)[:, :2] ** 2, axis=1))) for g in (solved, clean)]
+    assert error[0] < 1.2 * error[1] + 0.02
+
+
+def test_a_pair_that_was_matched_twice_has_two_fates(hall):
+    """Tried directly and later after a search: the right measurement stands, the wrong one goes, and each says so."""
+    rng = np.random.default_rng(1)
+    truth = hall[0]
+    graph = drifted(rng, truth, NOISE)
+    closures, _ = planted_closures(rng, truth, 12, 0.0)
+    wrong = closures.edges.T_i_j + np.array([1.0, -1.0, 0.0])
+    again = Closures(
+        replace(closures.edges, i=closures.edges.i[:2], j=closures.edges.j[:2], T_i_j=wrong[:2],
+                sqrt_information=closures.edges.sqrt_information[:2]),
+        tuple(replace(c, T_i_j=z) for c, z in zip(closures.candidates[:2], wrong[:2], strict=True)),
+    )
+    _, left = reconcile(graph, merged(closures, again), CONFIG, SOLVER)
+    assert [c.accepted for c in left.candidates] == [True] * 12 + [False] * 2
+    np.testing.assert_array_equal(left.edges.T_i_j, closures.edges.T_i_j)
+
+
+def test_no_closures_change_nothing(hall):
+    graph = hall[1]
+    solved, left = reconcile(graph, no_closures(), CONFIG, SOLVER)
+    assert solved is graph
+    assert len(left.edges) == 0
+    assert left.candidates == ()
+    none = np.zeros(0, dtype=np.int64)
+    empty = Candidates(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
+    assert find(empty, hall[3], CONFIG, SEARCH).candidates == ()
+
+
+def test_merged_collections_keep_their_order(closures):
+    both = merged(closures, closures)
+    assert both.candidates == closures.candidates * 2
+    n = len(closures.edges)
+    np.testing.assert_array_equal(both.edges.T_i_j[n:], closures.edges.T_i_j)
+    np.testing.assert_array_equal(merged(no_closures(), closures).edges.i, closures.edges.i)
+
+
+def test_a_robot_that_never_returns_has_no_candidates():
+    truth = np.column_stack([np.arange(60) * 0.3, np.zeros(60), np.zeros(60)])
+    walls = np.array([[-5.0, -2.0, 30.0, -2.0], [30.0, 3.0, -5.0, 3.0]])
+    clouds = scanned(truth, walls, 0.01, 1, reach=5.6)
+    graph = drifted(np.random.default_rng(1), truth, NOISE / 10)
+    session = np.zeros(60, dtype=np.int64)
+    pieces = build(clouds, graph.poses, truth[:, 0], session, SubmapConfig(epsilon=8.0))
+    far = propose(graph, marginals(graph), pieces, session, set(), set(), True, replace(CONFIG, reach=6.0, search_limit=1.0))
+    apart = np.hypot(*(truth[pieces.reference[far.target], :2] - truth[pieces.reference[far.source], :2]).T)
+    assert np.all(apart < 7.0)
+    assert optimize(graph, SOLVER)[1].converged

@@ -1,0 +1,237 @@
+"""Distances between landmarks: edges that are right, landmarks that are found, a map that becomes as long as it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import planted
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwblite import build_map, se2
+from uwblite.constraints import Constraints, KnownLandmark, KnownLandmarkDistance
+from uwblite.errors import ConfigError
+from uwblite.graph.distance_edges import PointDistanceEdges
+from uwblite.graph.graph import Graph
+from uwblite.io.constraints_file import parse_constraints
+from uwblite.lidar import clouds
+from uwblite.lidar.scan_to_scan import TrackingConfig
+from uwblite.mapping import MappingConfig
+from uwblite.pipeline.landmark_ties import sightings, ties
+from uwblite.sensor_log import Odometry
+
+LONG, SCALE = 24.0, 0.96
+"""m between the two columns, and what the wheels make of a metre."""
+
+
+def random_graph(seed):
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack([rng.uniform(-5, 5, (6, 2)), rng.uniform(-np.pi, np.pi, 6)])
+    points = rng.uniform(-3, 3, (2, 3, 2))
+    edges = PointDistanceEdges(
+        np.array([0, 1, 2]), np.array([3, 4, 5]), points[0], points[1], rng.uniform(1, 9, 3), rng.uniform(0.01, 0.5, 3)
+    )
+    return Graph(poses), edges
+
+
+@given(st.integers(0, 10_000))
+def test_the_jacobian_is_that_of_differences(seed):
+    graph, edges = random_graph(seed)
+    lin = edges.linearize(graph)
+    np.testing.assert_allclose(lin.residuals, edges.residuals(graph))
+    for _, index, jacobian in lin.blocks:
+        for axis in range(3):
+            step = np.zeros_like(graph.poses)
+            step[index, axis] = 1e-6
+            up, down = (edges.residuals(graph.updated(graph.poses + s, graph.anchors, np.zeros(0))) for s in (step, -step))
+            tolerance = 1e-5 * max(1.0, float(np.abs(jacobian).max()))
+            np.testing.assert_allclose(jacobian[:, :, axis], (up - down) / 2e-6, atol=tolerance)
+
+
+@given(st.integers(0, 10_000), st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-np.pi, np.pi)))
+def test_a_distance_does_not_care_where_the_frame_lies(seed, T):
+    graph, edges = random_graph(seed)
+    moved = Graph(se2.compose(np.array(T), graph.poses))
+    np.testing.assert_allclose(edges.residuals(graph), edges.residuals(moved), atol=1e-8)
+
+
+def post(x, y, radius=0.3, sides=12):
+    """A round column as a polygon about its circle."""
+    angle = 2 * np.pi * np.arange(sides + 1) / sides
+    ring = np.array([x, y]) + radius / np.cos(np.pi / sides / 2) * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.hstack([ring[:-1], ring[1:]])
+
+
+WALLS = np.vstack([
+    [[-30.0, 1.5, 60.0, 1.5], [-30.0, -1.5, 60.0, -1.5]], post(2.0, 0.9), post(2.0 + LONG, 0.9),
+])  # fmt: skip
+"""A corridor without end or feature, but for two columns out of sight of each other."""
+
+
+def drive_along(scale):
+    """There and back along it, with wheels that make of a metre at x what scale(x) says."""
+    turn = ((0.0, 0.0, 0.4), np.pi / 0.4)
+    legs = [((0.4, 0.0, 0.0), (LONG + 3.0) / 0.4), turn, ((0.4, 0.0, 0.0), (LONG + 3.0) / 0.4)]
+    stamps, truth = planted.drive([t for t, _ in legs], [s for _, s in legs])
+    rng = np.random.default_rng(5)
+    said = planted.odometry(stamps, truth, rng, noise=0.002, turn_noise=0.002)
+    motion = se2.between(said.poses[:-1], said.poses[1:])
+    motion[:, :2] *= scale(truth[:-1, 0])[:, None]
+    lidar = planted.scans(stamps, truth, WALLS, range_max=4.0, noise=0.01, rng=rng)
+    return planted.recording(Odometry(stamps, planted.chain(np.zeros(3), motion)), lidar=lidar), stamps, truth
+
+
+@pytest.fixture(scope="module")
+def carpet():
+    """Wheels that slip where there is nothing to see."""
+    return drive_along(lambda x: np.where((x > 7.0) & (x < 21.0), 0.93, 1.0))
+
+
+@pytest.fixture(scope="module")
+def wrong_wheels():
+    """Wheels that are smaller than the robot believes, everywhere."""
+    return drive_along(lambda x: np.full(len(x), SCALE))
+
+
+def known(far, distance=LONG, sigma=0.02, radius=0.3):
+    places = {"near": (2.0, 0.9), "far": (far, 0.9)}
+    return Constraints(
+        landmarks=tuple(KnownLandmark(name, place, radius) for name, place in places.items()),
+        landmark_distances=(KnownLandmarkDistance(("near", "far"), distance, sigma),),
+    )
+
+
+def stretch(result, stamps, truth):
+    """How long the map's path is against the true one, end to end of the way there."""
+    there = np.argmax(truth[:, 0])
+    ends = se2.interpolate_trajectory(result.stamps, result.trajectory, stamps[[0, there]])
+    return np.hypot(*(ends[1] - ends[0])[:2]) / np.hypot(*(truth[there] - truth[0])[:2])
+
+
+def test_a_measured_distance_gives_the_map_its_true_length(carpet):
+    log, stamps, truth = carpet
+    before = stretch(build_map(log), stamps, truth)
+    assert before < 0.98
+    after = build_map(log, constraints=known(2.0 + LONG * before))
+    # The tape's sigma, and a centimetre or two of each column's place.
+    assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=3 * np.hypot(0.02, 0.02) / LONG)
+    told = next(s for s in after.stages if s.name == "measured distances").figures["distances"]
+    assert told[0]["map"] == pytest.approx(LONG, abs=0.06)
+    assert not [w for w in after.warnings if "measured" in w]
+
+
+def test_a_measured_distance_calibrates_the_wheels(wrong_wheels):
+    """Scans are not matched with each other here: wheels and tape are all there is."""
+    log, stamps, truth = wrong_wheels
+    blind = MappingConfig(use_loops=False, tracking=TrackingConfig(on=False))
+    assert stretch(build_map(log, blind), stamps, truth) == pytest.approx(SCALE, abs=0.003)
+    names = zip(("near", "far"), (2.0, 2.0 + LONG), strict=True)
+    shrunk = replace(known(0.0), landmarks=tuple(KnownLandmark(name, (SCALE * x, 0.9), 0.3) for name, x in names))
+    after = build_map(log, blind, constraints=shrunk)
+    told = next(s for s in after.stages if s.name == "measured distances").figures["distances"]
+    assert told[0]["map"] == pytest.approx(LONG, abs=0.06)
+    # The way there alone may bend a little: the tape holds both ways together.
+    assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=0.015)
+    scale = next(c for c in after.calibration if c.name == "odometry_scale")
+    assert scale.value == pytest.approx(1 / SCALE - 1, abs=2 * scale.sigma)
+    assert scale.sigma < 0.01
+
+
+def test_places_are_those_of_the_map_as_it_is_turned(carpet):
+    log, stamps, truth = carpet
+    plain = build_map(log, MappingConfig(align="first-pose"))
+    walls = build_map(log, MappingConfig(align="walls"))
+    turn = se2.compose(walls.graph.poses[0], se2.inverse(plain.graph.poses[0]))
+    places = se2.transform(turn, np.array([[2.0, 0.9], [2.0 + LONG * stretch(plain, stamps, truth), 0.9]])).tolist()
+    names = zip(("near", "far"), places, strict=True)
+    told = replace(known(0.0), landmarks=tuple(KnownLandmark(name, tuple(place), 0.3) for name, place in names))
+    after = build_map(log, MappingConfig(align="walls"), constraints=told)
+    assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=3 * np.hypot(0.02, 0.02) / LONG)
+
+
+def test_a_distance_that_all_else_contradicts_is_named():
+    stamps, truth = planted.drive([(0.3, 0.0, 0.15)], [45.0], start=(0.0, -2.0, 0.0))
+    rng = np.random.default_rng(2)
+    lidar = planted.scans(stamps, truth, np.vstack([planted.box(9, 7), post(3, 2), post(-3, 2)]), noise=0.01, rng=rng)
+    log = planted.recording(planted.odometry(stamps, truth, rng, noise=0.002, turn_noise=0.002), lidar=lidar)
+    here = se2.transform(se2.inverse(truth[0]), np.array([[3.0, 2.0], [-3.0, 2.0]])).tolist()
+    wrong = Constraints(
+        landmarks=(KnownLandmark("a", tuple(here[0]), 0.3), KnownLandmark("b", tuple(here[1]), 0.3)),
+        landmark_distances=(KnownLandmarkDistance(("a", "b"), 7.0, 0.05),),
+    )
+    result = build_map(log, MappingConfig(), constraints=wrong)
+    assert [w for w in result.warnings if "a - b" in w and "7.000 m" in w]
+
+
+def test_what_is_not_there_is_said(carpet):
+    log, _, _ = carpet
+    nowhere, alone = KnownLandmark("x", (12.0, 9.0)), KnownLandmarkDistance(("x", "x"), 1.0)
+    lost = Constraints(landmarks=(nowhere,), landmark_distances=(alone,))
+    with pytest.raises(ConfigError, match="saw nothing within"):
+        build_map(log, MappingConfig(use_loops=False), constraints=lost)
+    with pytest.raises(ConfigError, match="need the lidar"):
+        build_map(log, MappingConfig(use_lidar=False), constraints=known(26.0))
+
+
+def one_cloud(points):
+    points = np.asarray(points, dtype=float)
+    n = len(points)
+    return clouds.Clouds(np.array([0, n]), points, np.zeros((n, 2)), np.zeros(n, dtype=np.int64), np.zeros(n))
+
+
+def test_a_column_is_found_beside_its_told_place():
+    angle = np.linspace(0, 2 * np.pi, 60)
+    ring = np.column_stack([4.0 + 0.3 * np.cos(angle), 1.0 + 0.3 * np.sin(angle)])
+    pose = np.array([[1.0, 2.0, 0.7]])
+    told = tuple(se2.transform(pose[0], np.array([4.15, 0.9])).tolist())
+    found = sightings(KnownLandmark("c", told, 0.3), one_cloud(ring), pose, np.zeros(1))
+    np.testing.assert_allclose(found.position, [[4.0, 1.0]], atol=0.01)
+    plain = sightings(KnownLandmark("c", told), one_cloud(ring), pose, np.zeros(1))
+    np.testing.assert_allclose(plain.position, [[4.15, 0.9]], atol=1e-12)
+    with pytest.raises(ConfigError, match=r"no column of radius 0\.6"):
+        sightings(KnownLandmark("c", told, 0.6), one_cloud(ring), pose, np.zeros(1))
+
+
+def test_all_ties_of_a_distance_weigh_as_much_as_it_does():
+    cloud = one_cloud([[1.0, 0.0]] * 5)
+    n = 5
+    many = clouds.Clouds(
+        np.arange(n + 1) * 5, np.tile(cloud.points, (n, 1)), np.zeros((5 * n, 2)), np.repeat(np.arange(n), 5), np.zeros(5 * n)
+    )
+    told = Constraints(
+        landmarks=(KnownLandmark("a", (1.0, 0.0)), KnownLandmark("b", (1.1, 0.0))),
+        landmark_distances=(KnownLandmarkDistance(("a", "b"), 3.0, 0.1), KnownLandmarkDistance(("b", "a"), 3.0, 0.2)),
+    )
+    tied = ties(told, many, np.zeros((n, 3)), 10.0 * np.arange(n))
+    for number, sigma in enumerate((0.1, 0.2)):
+        own = tied.edges.sigma[tied.measured == number]
+        assert np.sum(own**-2.0) == pytest.approx(sigma**-2.0)
+
+
+def test_the_file_names_landmarks_and_distances():
+    text = """
+[[landmark]]
+name = "C1"
+position = [4.0, 6.5]
+radius = 0.35
+[[landmark]]
+name = "C2"
+position = [8.0, 6.5]
+[[landmark_distance]]
+landmarks = ["C1", "C2"]
+distance = 4.0
+"""
+    read = parse_constraints(text)
+    assert [(k.name, k.radius) for k in read.landmarks] == [("C1", 0.35), ("C2", 0.0)]
+    assert read.landmark_distances[0].sigma == 0.02
+    assert read + Constraints() == read
+    for wrong, said in (
+        (text.replace("distance = 4.0", "distance = -4.0"), "distance"),
+        (text.replace("name = ", "nmae = ", 1), "name"),
+        (text.replace('["C1", "C2"]', '["C1"]'), "landmarks"),
+        (text.replace("radius = 0.35", "radius = nan"), "radius"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            parse_constraints(wrong)
+    with pytest.raises(ConfigError, match="no \\[\\[landmark\\]\\]"):
+        ties(Constraints(landmark_distances=read.landmark_distances), one_cloud([[0, 0]]), np.zeros((1, 3)), np.zeros(1))

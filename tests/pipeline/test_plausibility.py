@@ -1,0 +1,136 @@
+"""What tells against a result: turns of the wrong sign, values far from usual, ranges out of time; and where the map begins."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.planted import aligned_error, box, odometry, ranges, recording, scans, wander
+
+from uwblite import se2
+from uwblite.constraints import Constraints, KnownAnchor
+from uwblite.graph.calibration import CalibrationConfig
+from uwblite.graph.graph import Calibration, Graph
+from uwblite.keyframes import OUTSIDE
+from uwblite.mapping import MappingConfig, build_map
+from uwblite.pipeline.plausibility import lying_stretches, mirrored
+from uwblite.sensor_log import SensorMounting
+
+PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
+LEVEL = SensorMounting(anchor_height=0.0)
+
+
+def run(seed=3, walls=None, scale=1.0, turn_scale=1.0, metres=80.0, radio_scale=1.0):
+    """Return stamps, truth and the recording of a drive among four anchors."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, metres)
+    wheels = odometry(stamps, truth, rng, scale=scale, turn_scale=turn_scale, noise=0.01, turn_noise=0.01)
+    radio = ranges(rng, stamps, truth, PLACES, rate=1.0, sigma=0.04)
+    radio = replace(radio, ranges=radio.ranges * radio_scale)
+    lidar = None if walls is None else scans(stamps, truth, walls, rate=2.0, noise=0.01, rng=rng)
+    return stamps, truth, recording(wheels, radio, lidar, LEVEL)
+
+
+def said(texts, words):
+    return [t for t in texts if words in t]
+
+
+@pytest.mark.parametrize("turn_scale", [-2.0, 2.0, 0.5])
+def test_gross_turns_leave_the_mirror_image_open(turn_scale):
+    """By minus the factor that makes the turns agree, the mirror image fits as well: the ranges do not say which it is."""
+    _, truth, log = run(turn_scale=turn_scale)
+    result = build_map(log)
+    doubt = said(result.doubts, "may be mirrored")
+    assert len(doubt) == 1
+    assert "odometry's heading" in doubt[0]
+    error = [aligned_error(result.trajectory[:, :2], truth[:, :2], mirrored=m) for m in (False, True)]
+    assert min(error) < 0.3
+
+
+def test_wheels_that_turn_rightly_and_lasers_vouch_for_the_sign():
+    assert not said(build_map(run()[2]).doubts, "mirrored")
+    assert not said(build_map(run(turn_scale=2.0, walls=box(12, 12), metres=40.0)[2]).doubts, "mirrored")
+
+
+@pytest.mark.parametrize(("error", "doubted"), [(-1.9, True), (-1.1, True), (-0.4, False), (0.0, False), (1.0, False)])
+def test_wheels_that_turn_against_the_laser_are_doubted(error, doubted):
+    graph = Graph(np.zeros((1, 3)), calibration=Calibration(("heading_scale",), np.array([error])))
+    seeing = SimpleNamespace(sessions=[SimpleNamespace(has_scans=True)])
+    assert len(said(mirrored(graph, seeing, CalibrationConfig()), "upside down")) == doubted
+
+
+def test_known_anchors_vouch_for_the_sign():
+    log = run(turn_scale=2.0)[2]
+    known = Constraints(
+        anchors=tuple(KnownAnchor(name, tuple(place), 0.05) for name, place in zip(log.ranges.anchor_ids, PLACES, strict=True))
+    )
+    result = build_map(log, constraints=known)
+    assert not said(result.doubts, "mirrored")
+
+
+def test_a_value_far_from_usual_is_told():
+    tight = replace(MappingConfig().calibration, odometry_scale=0.02, range_scale_sound=0.001, range_scale=0.002)
+    result = build_map(run(scale=1.12)[2], MappingConfig(calibration=tight))
+    assert said(result.warnings, "relative error of travelled distance came out as")
+    assert not said(build_map(run(scale=1.01)[2]).warnings, "came out as")
+
+
+def test_ranges_without_odometry_are_left_out_and_counted():
+    _, _, log = run()
+    late = log.ranges.stamps > log.odometry.stamps[-1] - 20.0
+    # A robot that drove on without odometry: these ranges were made who knows where.
+    cut = replace(log, odometry=replace(
+        log.odometry, stamps=log.odometry.stamps[:-200], poses=log.odometry.poses[:-200]
+    ))
+    outside = cut.ranges.stamps > cut.odometry.stamps[-1] + OUTSIDE
+    assert 30 < outside.sum() <= late.sum()
+    result = build_map(cut)
+    assert said(result.warnings, f"{outside.sum()} of {len(outside)} ranges were stamped outside the odometry's time")
+    np.testing.assert_array_equal(result.range_table["weight"][outside], 0.0)
+    without = replace(cut, ranges=replace(cut.ranges, **{
+        n: getattr(cut.ranges, n)[~outside] for n in ("stamps", "anchor", "ranges", "quality")
+    }))
+    np.testing.assert_allclose(build_map(without).trajectory, result.trajectory, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_map_begins_where_the_odometry_did(seed):
+    """Wherever the first estimate grew from."""
+    log = run(seed)[2]
+    moved = replace(log, odometry=replace(log.odometry, poses=se2.compose(np.array([3.0, -2.0, 1.0]), log.odometry.poses)))
+    for some in (log, moved):
+        np.testing.assert_allclose(build_map(some).trajectory[0], some.odometry.poses[0], atol=1e-9)
+
+
+def test_stretches_in_which_most_readings_disagree_are_found():
+    stamps = np.arange(400.0)
+    agrees = np.random.default_rng(0).random(400) < 0.95
+    assert lying_stretches(stamps, agrees) == []
+    agrees[100:200] = False
+    agrees[360:] = False
+    found = lying_stretches(stamps, agrees)
+    assert len(found) == 2
+    np.testing.assert_allclose(found, [(100, 199), (360, 399)], atol=20)
+    assert lying_stretches(stamps[:99], np.zeros(99, dtype=bool)) == []
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_anchors_that_lie_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed):
+    """Two of four anchors say 2 m too little for 40 % of the time each: wheels alone are soft enough to believe them."""
+    stamps, truth, log = run(seed, walls=np.concatenate([box(13, 13), box(3, 2) + 0.5]), metres=100.0)
+    radio, part = log.ranges, (log.ranges.stamps - stamps[0]) / np.ptp(stamps)
+    lie = (radio.anchor == 0) & (part > 0.1) & (part < 0.5) | (radio.anchor == 1) & (part > 0.5) & (part < 0.9)
+    honest, lied = (
+        aligned_error(build_map(replace(log, ranges=replace(radio, ranges=said))).trajectory[:, :2], truth[:, :2])
+        for said in (radio.ranges, np.maximum(radio.ranges - 2.0 * lie, 0.1))
+    )
+    assert honest < 0.03
+    assert lied < 0.05
+
+
+@pytest.mark.parametrize("radio_scale", [1.0, 1.08])
+def test_ranges_or_wheels_of_another_scale_are_told(radio_scale):
+    """Without a lidar nothing says which of the two is wrong, but that they differ is plain."""
+    told = said(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
+    assert len(told) == (radio_scale != 1.0)
+    assert all("scale of the wheels" in text for text in told)

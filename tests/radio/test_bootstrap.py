@@ -1,0 +1,194 @@
+"""Starting values from nothing: planted worlds are grown from bent odometry and unknown anchors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.planted import aligned_error, odometry, ranges, wander
+
+from uwblite import se2
+from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
+from uwblite.graph.graph import Graph
+from uwblite.keyframes import KeyframeConfig, attach_ranges, select
+from uwblite.radio.bootstrap import FirstEstimate, GrowthConfig, grow
+from uwblite.radio.range_measurements import OdometryNoiseConfig, range_edges, wheel_edges
+from uwblite.radio.trilateration import AnchorConfig
+from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
+
+SIGMA = 0.05
+WELL = 0.3
+"""m. Ranges of 0.05 m hold a pose to a few centimetres where three anchors are heard; between ranges odometry drifts. A
+grown trajectory is good enough as a start when it lies well within the width of the kernels that follow."""
+
+
+def start(wheels: Odometry, radio: UwbRanges) -> tuple[FirstEstimate, np.ndarray]:
+    """Grow from one recording; return the estimate and the keyframes' stamps."""
+    frames = select(wheels, KeyframeConfig())
+    ids = radio.anchor_ids
+    listed = unknowns(CalibrationConfig(anchor_height=0.0), ids, np.zeros(len(ids), dtype=bool))
+    calibration = block(listed)
+    free = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate", "bias", "range_scale")
+    held = np.array([name.split(":")[0] not in free for name in calibration.names])
+    graph = Graph(frames.odometry, np.zeros((len(ids), 2)), (prior_edges(listed),), calibration, fixed_calibration=held)
+    mounting = SensorMounting()
+    attached = attach_ranges(radio, wheels, frames, mounting)
+    edges = range_edges(attached, 0, ids, mounting, calibration, 0.1, AnchorConfig())
+    path = np.concatenate([[0.0], np.cumsum(frames.path)])
+    config = GrowthConfig(range_sigma=1.5 * SIGMA)
+    grown = grow(graph, wheel_edges(frames, 0, OdometryNoiseConfig(), calibration), edges, path, config, AnchorConfig())
+    return grown, frames.stamps
+
+
+def judged(grown, keyframe_stamps, stamps, truth, places) -> tuple[float, float]:
+    """Return the error of poses and of placed anchors, m, after one rigid motion that fits the poses."""
+    at = se2.interpolate_trajectory(stamps, truth, keyframe_stamps)[:, :2]
+    poses, anchors = grown.graph.poses[:, :2], grown.graph.anchors[grown.placed]
+    p, q = poses - poses.mean(axis=0), at - at.mean(axis=0)
+    angle = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
+    moved = se2.rotate(angle, anchors - poses.mean(axis=0)) + at.mean(axis=0)
+    return aligned_error(poses, at), float(np.hypot(*(moved - places[grown.placed]).T).max(initial=0.0))
+
+
+def places_around(rng, count) -> np.ndarray:
+    """Return anchors (count, 2) in and around the driven square, at least 2 m apart."""
+    places: list[np.ndarray] = []
+    while len(places) < count:
+        place = rng.uniform(-8, 8, 2)
+        if all(np.hypot(*(place - other)) > 2.0 for other in places):
+            places.append(place)
+    return np.array(places)
+
+
+WHEELS = {
+    "good": {"scale": 1.01, "turn_scale": 1.01, "noise": 0.01, "turn_noise": 0.01},
+    "drifts by more than 90 degrees": {"drift": 0.015, "noise": 0.01, "turn_noise": 0.01},
+    "noisy heading": {"noise": 0.02, "turn_noise": 0.06},
+    "track width twice too wide": {"turn_scale": 2.0, "noise": 0.01, "turn_noise": 0.01},
+    "track width half": {"turn_scale": 0.5, "noise": 0.01, "turn_noise": 0.01},
+}
+
+
+@pytest.mark.parametrize("fault", WHEELS)
+@pytest.mark.parametrize("seed", [2, pytest.param(1, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
+def test_a_bent_trajectory_and_unknown_anchors_are_recovered(fault, seed):
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, 150.0)
+    places = places_around(rng, 4)
+    wheels = odometry(stamps, truth, rng, **WHEELS[fault])
+    bent = aligned_error(wheels.poses[:, :2], truth[:, :2])
+    bias = rng.uniform(-0.2, 0.5, 4)
+    grown, at = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, bias=bias, outliers=0.1))
+    error, anchor_error = judged(grown, at, stamps, truth, places)
+    assert grown.placed.all()
+    assert not grown.ambiguous.any()
+    assert error < WELL, f"odometry alone {bent:.2f} m"
+    assert anchor_error < 2 * WELL
+    assert bent > 3 * error
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 12])
+def test_any_number_of_anchors_serves(count):
+    """One or two anchors leave the odometry to hold the rest: the result may not be worse than the odometry alone."""
+    rng = np.random.default_rng(10 + count)
+    stamps, truth = wander(rng, 150.0)
+    places = places_around(rng, count)
+    wheels = odometry(stamps, truth, rng, scale=0.99, turn_scale=1.02, drift=0.004, noise=0.01, turn_noise=0.01)
+    radio = ranges(rng, stamps, truth, places, rate=max(0.5, 2.0 / count), sigma=SIGMA, outliers=0.1)
+    grown, at = start(wheels, radio)
+    error, anchor_error = judged(grown, at, stamps, truth, places)
+    bent = aligned_error(wheels.poses[:, :2], truth[:, :2])
+    assert grown.placed.all()
+    assert error < (WELL if count >= 3 else max(2 * WELL, bent / 2))
+    assert anchor_error < (2 * WELL if count >= 3 else 4 * WELL)
+
+
+def test_anchors_that_are_heard_part_of_the_time_are_placed_when_they_come():
+    rng = np.random.default_rng(21)
+    stamps, truth = wander(rng, 200.0)
+    end = stamps[-1]
+    heard = np.array([[0, 0.45], [0, 0.45], [0.05, 0.5], [0.35, 1.0], [0.4, 1.0], [0.55, 1.0]]) * end
+    places = places_around(rng, 6)
+    wheels = odometry(stamps, truth, rng, drift=0.008, noise=0.01, turn_noise=0.02)
+    grown, at = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, outliers=0.1, heard=heard))
+    error, anchor_error = judged(grown, at, stamps, truth, places)
+    assert grown.placed.all()
+    assert error < WELL
+    assert anchor_error < 2 * WELL
+
+
+def reversed_in_time(wheels: Odometry, radio: UwbRanges) -> tuple[Odometry, UwbRanges]:
+    """Return the recording run backwards: the base drives the same way in reverse."""
+    end = wheels.stamps[-1]
+    back = UwbRanges(
+        (end - radio.stamps)[::-1], radio.anchor[::-1].copy(), radio.ranges[::-1].copy(), radio.quality, radio.anchor_ids
+    )
+    return Odometry((end - wheels.stamps)[::-1], wheels.poses[::-1].copy()), back
+
+
+@pytest.mark.parametrize("seed", [31, pytest.param(32, marks=pytest.mark.slow)])
+def test_the_result_does_not_depend_on_where_the_run_starts(seed):
+    """Forwards, backwards and without its first third, the same drive gives the same places."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, 150.0)
+    places = places_around(rng, 4)
+    wheels = odometry(stamps, truth, rng, drift=0.012, noise=0.01, turn_noise=0.02)
+    radio = ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, outliers=0.1)
+    cut = stamps[-1] / 3
+    late, heard = wheels.stamps >= cut, radio.stamps >= cut
+    shorter = Odometry(wheels.stamps[late], wheels.poses[late])
+    fewer = UwbRanges(radio.stamps[heard], radio.anchor[heard], radio.ranges[heard], radio.quality[heard], radio.anchor_ids)
+    back = reversed_in_time(wheels, radio)
+    for (one, other), said, true in (
+        ((wheels, radio), stamps, truth), (back, stamps, truth[::-1]), ((shorter, fewer), stamps, truth),
+    ):
+        grown, at = start(one, other)
+        error, anchor_error = judged(grown, at, said, true, places)
+        assert grown.placed.all()
+        assert error < WELL
+        assert anchor_error < 2 * WELL
+
+
+def test_a_straight_run_says_that_its_anchors_are_ambiguous():
+    rng = np.random.default_rng(41)
+    stamps = np.arange(800) * 0.1
+    truth = np.column_stack([0.3 * stamps, 0.003 * np.sin(stamps), np.zeros(800)])
+    places = np.array([[5.0, 3.0], [15.0, -4.0], [22.0, 2.0]])
+    wheels = odometry(stamps, truth, rng, noise=0.005, turn_noise=0.001)
+    grown, _ = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA))
+    assert grown.ambiguous.all()
+    assert all(len(h) >= 2 for h in grown.hypotheses)
+    for k, place in enumerate(places):
+        found = np.array([h.position for h in grown.hypotheses[k][:2]])
+        # Ranges fix how far along and how far aside; on which side is a guess, and both guesses are told.
+        sides = np.array([[place[0], abs(place[1])], [place[0], -abs(place[1])]])
+        gap = np.hypot(*(found[:, None] - sides[None]).transpose(2, 0, 1))
+        assert gap.min(axis=0).max() < 1.0
+
+
+def test_ranges_of_no_weight_and_none_at_all_leave_the_odometry():
+    rng = np.random.default_rng(51)
+    stamps, truth = wander(rng, 20.0)
+    wheels = odometry(stamps, truth, rng, noise=0.01)
+    radio = ranges(rng, stamps, truth, np.zeros((2, 2)))
+    nothing = replace(radio, ranges=np.zeros(len(radio.ranges)))
+    grown, at = start(wheels, nothing)
+    assert not grown.placed.any()
+    np.testing.assert_allclose(grown.graph.poses, se2.interpolate_trajectory(stamps, wheels.poses, at), atol=1e-9)
+
+
+def test_a_robot_that_stands_places_nothing_for_sure():
+    rng = np.random.default_rng(61)
+    stamps, truth = np.arange(300) * 0.1, np.zeros((300, 3))
+    grown, _ = start(Odometry(stamps, truth), ranges(rng, stamps, truth, np.array([[3.0, 1.0], [-2.0, 4.0]]), rate=2.0))
+    assert grown.ambiguous.all() or not grown.placed.any()
+    assert np.isfinite(grown.graph.poses).all()
+
+
+def test_equal_inputs_give_equal_bytes():
+    rng = np.random.default_rng(71)
+    stamps, truth = wander(rng, 60.0)
+    wheels = odometry(stamps, truth, rng, drift=0.01, noise=0.01)
+    radio = ranges(rng, stamps, truth, places_around(rng, 3), rate=1.0, outliers=0.2)
+    one, other = start(wheels, radio)[0], start(wheels, radio)[0]
+    assert one.graph.poses.tobytes() == other.graph.poses.tobytes()
+    assert one.graph.anchors.tobytes() == other.graph.anchors.tobytes()

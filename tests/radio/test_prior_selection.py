@@ -1,0 +1,104 @@
+"""Widths of priors by the evidence: the formula against an integral, and the choice on planted radios."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.planted import ranges, wander
+from scipy.stats import multivariate_normal
+
+from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
+from uwblite.graph.graph import Graph
+from uwblite.graph.solver import optimize
+from uwblite.keyframes import KeyframeConfig, attach_ranges, select
+from uwblite.radio.prior_selection import choose_widths, log_evidence
+from uwblite.radio.range_measurements import range_edges
+from uwblite.radio.trilateration import AnchorConfig
+from uwblite.sensor_log import Odometry, SensorMounting
+
+LEVEL = SensorMounting(anchor_height=0.0)
+CONFIG = CalibrationConfig()
+PLACES = np.array([[6.0, 4.5], [-6.0, 4.0], [5.5, -4.5], [-5.0, -4.0]])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_evidence_is_the_integral_over_the_unknowns(seed):
+    """Linear measurements y = A x + noise: log N(y; 0, A D A^T + R) under either prior, and their difference."""
+    rng = np.random.default_rng(seed)
+    a, noise = rng.normal(size=(7, 3)), 0.3
+    before, after = rng.uniform(0.3, 2.0, 3), rng.uniform(0.05, 2.0, 3)
+    y = a @ (rng.normal(size=3) * after) + noise * rng.normal(size=7)
+    covariance = np.linalg.inv(a.T @ a / noise**2 + np.diag(before**-2.0))
+    mean = covariance @ a.T @ y / noise**2
+
+    def direct(width):
+        return multivariate_normal.logpdf(y, np.zeros(7), a @ np.diag(width**2) @ a.T + noise**2 * np.eye(7))
+
+    assert log_evidence(mean, covariance, before, after) == pytest.approx(direct(after) - direct(before), abs=1e-8)
+
+
+def test_the_prior_in_use_is_the_measure_of_others():
+    covariance, width = np.array([[0.04, 0.01], [0.01, 0.09]]), np.array([0.5, 0.7])
+    assert log_evidence(np.array([0.3, -0.1]), covariance, width, width) == pytest.approx(0.0, abs=1e-12)
+
+
+def solved(seed, bias=(0.0,) * 4, scale=1.0):
+    """Return the graph of a drive whose poses are known, solved for anchors, scale and biases, and its edges."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, 60.0)
+    radio = ranges(rng, stamps, truth, PLACES, sigma=0.05, bias=bias)
+    radio = replace(radio, ranges=(radio.ranges - np.array(bias)[radio.anchor]) * scale + np.array(bias)[radio.anchor])
+    wheels = Odometry(stamps, truth)
+    frames, ids = select(wheels, KeyframeConfig()), radio.anchor_ids
+    listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
+    attached = attach_ranges(radio, wheels, frames, LEVEL)
+    edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, AnchorConfig())
+    held = np.array([u.name.split(":")[0] not in ("range_scale", "bias") for u in listed])
+    fixed = np.ones(len(frames), dtype=bool)
+    graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, None, held)
+    done = optimize(graph.with_edges(edges))[0]
+    return graph.updated(done.poses, done.anchors, done.calibration.values), edges
+
+
+def widths(graph):
+    sigma = 1.0 / graph.edges[0].sqrt_information[:, 0, 0]
+    return dict(zip(graph.calibration.names, sigma, strict=True))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sound_radio_gets_narrow_priors(seed):
+    graph, edges = solved(seed)
+    found = widths(choose_widths(graph, (edges,), CONFIG))
+    assert found["range_scale"] < 2.0 * CONFIG.range_scale_sound
+    assert CONFIG.range_bias_sound < found["bias:A00"] == found["bias:A03"] < 2.0 * CONFIG.range_bias_sound
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_radio_with_large_biases_gets_wide_ones(seed):
+    graph, edges = solved(seed, bias=(0.9, 0.4, 1.3, 0.7))
+    found = widths(choose_widths(graph, (edges,), CONFIG))
+    assert found["bias:A02"] > 3 * CONFIG.range_bias_sound
+    assert found["odometry_scale"] == CONFIG.odometry_scale
+
+
+@pytest.mark.parametrize("scale", [1.07, 0.93])
+def test_a_radio_with_another_idea_of_the_metre_gets_a_wide_scale(scale):
+    graph, edges = solved(0, scale=scale)
+    assert widths(choose_widths(graph, (edges,), CONFIG))["range_scale"] > 0.9 * CONFIG.range_scale
+
+
+def test_nothing_free_leaves_the_graph_alone():
+    graph, edges = solved(0)
+    held = replace(graph, fixed_calibration=np.ones(len(graph.calibration.values), dtype=bool))
+    assert choose_widths(held, (edges,), CONFIG) is held
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_of_the_two_may_be_held():
+    graph, edges = solved(1, bias=(0.9, 0.4, 1.3, 0.7))
+    scale = graph.calibration.index("range_scale")
+    held = np.asarray(graph.fixed_calibration).copy()
+    held[scale] = True
+    found = widths(choose_widths(replace(graph, fixed_calibration=held), (edges,), CONFIG))
+    assert found["range_scale"] == CONFIG.range_scale
+    assert found["bias:A02"] > 3 * CONFIG.range_bias_sound

@@ -1,0 +1,234 @@
+"""From keyframes to edges: noise that grows as stated, ranges tied to the right unknowns, noise learnt per anchor."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.planted import odometry, ranges, wander
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uwblite import se2
+from uwblite.graph.calibration import CalibrationConfig, block, unknowns
+from uwblite.graph.graph import Calibration, Graph
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.robust import SQUARED
+from uwblite.graph.solver import optimize
+from uwblite.keyframes import KeyframeConfig, attach_ranges, select
+from uwblite.radio.range_measurements import (
+    OdometryNoiseConfig,
+    learn_noise,
+    learn_wheels,
+    range_edges,
+    relocate,
+    tag_positions,
+    wheel_edges,
+)
+from uwblite.radio.range_noise import RangeNoiseConfig
+from uwblite.radio.trilateration import AnchorConfig
+from uwblite.sensor_log import Odometry, SensorMounting
+
+NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
+MOUNTING = SensorMounting(tag_position=np.array([0.2, -0.1, 0.4]), anchor_height=2.4)
+
+
+def world(seed, metres=40.0, anchors=3, **settings):
+    """Return stamps, truth, keyframes, places of anchors and edges of a drive with exact odometry."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, metres)
+    places = rng.uniform(-6, 6, (anchors, 2))
+    radio = ranges(rng, stamps, truth, places, tag=MOUNTING.tag_position[:2], **settings)
+    wheels = Odometry(stamps, truth)
+    frames = select(wheels, KeyframeConfig())
+    attached = attach_ranges(radio, wheels, frames, MOUNTING)
+    edges = range_edges(attached, 0, radio.anchor_ids, MOUNTING, Calibration(), 0.3, AnchorConfig())
+    return stamps, truth, frames, places, radio, edges
+
+
+def test_wheel_edges_hold_the_chain_and_name_the_calibration():
+    rng = np.random.default_rng(0)
+    stamps, truth = wander(rng, 20.0)
+    frames = select(odometry(stamps, truth, rng, noise=0.02), KeyframeConfig())
+    calibration = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
+    edges = wheel_edges(frames, 7, NOISE, calibration)
+    assert edges.i.tolist() == list(range(7, 7 + len(frames) - 1))
+    np.testing.assert_array_equal(edges.j, edges.i + 1)
+    graph = Graph(np.concatenate([np.zeros((7, 3)), frames.odometry]), calibration=calibration)
+    np.testing.assert_allclose(edges.residuals(graph), 0.0, atol=1e-8)
+    assert edges.calibration.shape == (len(edges), 4)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 1000))
+def test_the_wheels_variance_adds_up_along_the_way(seed):
+    """Variances of stretches add to that of the whole but for the standing part: cutting the way otherwise changes nothing."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, 12.0)
+    wheels = Odometry(stamps, truth)
+    totals = []
+    for distance in (0.2, 0.5):
+        edges = wheel_edges(select(wheels, KeyframeConfig(distance=distance)), 0, NOISE, Calibration())
+        variance = 1.0 / np.einsum("eii->ei", edges.sqrt_information) ** 2
+        totals.append((variance - NOISE.standing**2).sum(axis=0))
+    np.testing.assert_allclose(totals[0], totals[1], rtol=1e-6)
+    assert totals[0][0] == pytest.approx(NOISE.distance**2 * 12.0, rel=1e-3)
+
+
+def test_range_edges_say_the_slant_distance_of_tag_and_anchor():
+    stamps, truth, frames, places, radio, edges = world(1, sigma=0.0)
+    height = MOUNTING.height_difference(radio.anchor_ids[0])
+    tag = se2.transform(se2.interpolate_trajectory(stamps, truth, radio.stamps), MOUNTING.tag_position[:2])
+    np.testing.assert_allclose(tag_positions(edges, truth[frames.index]), tag, atol=1e-9)
+    expected = np.hypot(np.hypot(*(tag - places[radio.anchor]).T), height)
+    np.testing.assert_allclose(edges.distances(Graph(truth[frames.index], places)), expected, atol=1e-9)
+    np.testing.assert_array_equal(edges.sigma, 0.3)
+    np.testing.assert_array_equal(edges.stamps, radio.stamps)
+
+
+def test_range_edges_of_a_later_recording_are_shifted():
+    rng = np.random.default_rng(2)
+    stamps, truth = wander(rng, 10.0)
+    radio, wheels = ranges(rng, stamps, truth, np.zeros((1, 2))), Odometry(stamps, truth)
+    frames = select(wheels, KeyframeConfig())
+    attached = attach_ranges(radio, wheels, frames, MOUNTING)
+    edges = range_edges(attached, 100, radio.anchor_ids, MOUNTING, Calibration(), 0.1, AnchorConfig())
+    np.testing.assert_array_equal(edges.pose, attached.keyframe + 100)
+
+
+def test_readings_that_cannot_be_distances_weigh_nothing():
+    rng = np.random.default_rng(3)
+    stamps, truth = wander(rng, 10.0)
+    radio, wheels = ranges(rng, stamps, truth, np.zeros((1, 2))), Odometry(stamps, truth)
+    radio.ranges[:4] = [0.0, -1.0, 1e6, 0.001]
+    attached = attach_ranges(radio, wheels, select(wheels, KeyframeConfig()), MOUNTING)
+    edges = range_edges(attached, 0, radio.anchor_ids, MOUNTING, Calibration(), 0.1, AnchorConfig())
+    assert edges.weights.tolist() == [0.0] * 4 + [1.0] * (len(radio.ranges) - 4)
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3])
+def test_each_anchor_gets_the_noise_of_its_own(outliers):
+    """White noise of 0.05 and 0.25 m. A fifth of the tag's places is visited again and again, so sigma may exceed the noise
+    of one range by the slow part that pure chance shows; it never falls below it, and outliers do not swell it."""
+    _, truth, frames, places, _, edges = world(4, 150.0, 2, sigma=0.0, rate=4.0)
+    rng = np.random.default_rng(5)
+    noise = np.array([0.05, 0.25])[edges.anchor] * rng.standard_normal(len(edges))
+    noise += np.where(rng.random(len(edges)) < outliers, rng.uniform(2, 6, len(edges)), 0.0)
+    graph = Graph(truth[frames.index], places)
+    noisy = replace(edges, ranges=edges.distances(graph) + noise)
+    learnt, noises = learn_noise(noisy, graph, 2, RangeNoiseConfig())
+    # 30 % outliers shift the quartiles: 1.4826 MAD grows by up to a factor 1.7, and those beyond thrice that are left out.
+    assert [n.sigma for n in noises] == [pytest.approx(s, rel=0.12 + outliers) for s in (0.05, 0.25)]
+    for k, sigma in enumerate((0.05, 0.25)):
+        assert np.all(learnt.sigma[learnt.anchor == k] > (0.85 - outliers / 2) * sigma)
+    assert np.median(learnt.sigma[learnt.anchor == 1]) > 2 * np.median(learnt.sigma[learnt.anchor == 0])
+
+
+def test_an_anchor_with_hardly_any_range_keeps_the_assumption():
+    _, truth, frames, places, _, edges = world(8, 40.0, 2)
+    weights = np.where(edges.anchor == 0, 1.0, 0.0)
+    weights[np.flatnonzero(edges.anchor == 1)[:3]] = 1.0
+    config = RangeNoiseConfig(sigma=0.4)
+    _, noises = learn_noise(replace(edges, weights=weights), Graph(truth[frames.index], places), 2, config)
+    assert noises[1].sigma == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("position", "heading"), [(3.0, 0.8), (1.0, 5.0), (100.0, 1.0)])
+def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
+    """Wheels that err so many times as much as stated; most steps are measured, exactly, and some of those are lies."""
+    rng = np.random.default_rng(1)
+    stamps, truth = wander(rng, 300.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    exact = wheel_edges(frames, 0, NOISE, Calibration())
+    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
+    wrong = se2.compose(exact.motion, rng.standard_normal((len(exact), 3)) * sigma * [position, position, heading])
+    wheels, graph = replace(exact, motion=wrong), Graph(frames.odometry)
+    some = np.sort(rng.permutation(len(exact))[: len(exact) // 2])
+    said = exact.motion[some] + (rng.random(len(some)) < 0.1)[:, None] * np.array([0.5, 0.5, 0.3])
+    steps = RelativePoseEdges(some, some + 1, said, np.tile(np.eye(3), (len(some), 1, 1)))
+    learnt = learn_wheels(wheels, steps, graph)
+    factor = np.einsum("eii->ei", exact.sqrt_information / learnt.sqrt_information.clip(1e-12))
+    # Medians of 500 steps are known to 5 %; a tenth of lies moves them by 12 %.
+    assert np.median(factor[:, 0]) == pytest.approx(np.clip(position, 0.5, 10.0), rel=0.3)
+    assert np.median(factor[:, 2]) == pytest.approx(np.clip(heading, 0.5, 10.0), rel=0.3)
+    few = RelativePoseEdges(some[:5], some[:5] + 1, said[:5], steps.sqrt_information[:5])
+    assert learn_wheels(wheels, few, graph) is wheels
+
+
+def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
+    """Steps in a corridor repeat the wheels' own word along it; across and in heading the wheels err four times as much."""
+    rng = np.random.default_rng(2)
+    stamps, truth = wander(rng, 300.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    exact = wheel_edges(frames, 0, NOISE, Calibration())
+    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
+    off = rng.standard_normal((len(exact), 3)) * sigma * 4.0
+    wheels = replace(exact, motion=se2.compose(exact.motion, off))
+    said = se2.compose(wheels.motion, np.column_stack([np.zeros(len(off)), se2.inverse(off)[:, 1:]]))
+    blind = np.tile(np.diag([0.0, 100.0, 100.0]), (len(exact), 1, 1))
+    learnt = learn_wheels(wheels, RelativePoseEdges(exact.i, exact.j, said, blind), Graph(frames.odometry))
+    factor = np.einsum("eii->ei", exact.sqrt_information)[0] / np.einsum("eii->ei", learnt.sqrt_information)[0]
+    assert factor == pytest.approx([1.0, 4.0, 4.0], rel=0.2)
+
+
+def test_a_range_is_an_outlier_by_what_one_range_scatters():
+    """A hundred alike ranges weigh little each, yet one that is 10 sigma off hardly pulls."""
+    rng = np.random.default_rng(6)
+    stamps, truth = wander(rng, 60.0, half_width=2.0)
+    places = np.array([[8.0, 0.0]])
+    radio = ranges(rng, stamps, truth, places, sigma=0.05, rate=8.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    attached = attach_ranges(radio, Odometry(stamps, truth), frames, SensorMounting())
+    edges = range_edges(attached, 0, radio.anchor_ids, SensorMounting(), Calibration(), 0.3, AnchorConfig())
+    slow = 0.15 * np.sin(tag_positions(edges, truth[frames.index]).sum(axis=1))
+    edges = replace(edges, ranges=edges.ranges + slow + np.where(np.arange(len(edges)) == 40, 2.0, 0.0))
+    graph = Graph(truth[frames.index], places)
+    learnt, (noise,) = learn_noise(edges, graph, 1, RangeNoiseConfig())
+    np.testing.assert_allclose(learnt.sigma, noise.sigma)
+    assert np.median(learnt.weights) < 0.3
+    assert learnt.weights[40] < 0.05 * np.median(learnt.weights)
+
+
+def test_late_ranges_pull_less_than_early_ones():
+    _, truth, frames, places, _, edges = world(9, 150.0, 1, sigma=0.0, rate=4.0)
+    rng, graph = np.random.default_rng(7), Graph(truth[frames.index], places)
+    late = np.where(rng.random(len(edges)) < 0.3, rng.exponential(0.6, len(edges)), 0.0)
+    noisy = replace(edges, ranges=edges.distances(graph) + 0.05 * rng.standard_normal(len(edges)) + late)
+    learnt, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig())
+    off = noisy.ranges - edges.distances(graph)
+    mean = learnt.weights @ off / learnt.weights.sum()
+    assert abs(mean) < 0.03 < np.median(off) + 0.01 < np.mean(off)
+    plain, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig(learn=False))
+    assert plain.weights @ off / plain.weights.sum() > 0.1
+
+
+@pytest.mark.parametrize("calibration", [(0.04, 0.06), (-0.05, -0.3)])
+def test_noise_does_not_draw_the_wheels_scale(calibration):
+    """Errors in variables: the noise of a step is as large as the step. Fitted to the true poses, scale and turn come out
+    within four standard deviations of what was planted, sigma / sqrt(sum of squared steps)."""
+    scale, turn = calibration
+    rng = np.random.default_rng(8)
+    stamps, truth = wander(rng, 600.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    names = unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool))
+    exact = wheel_edges(frames, 0, OdometryNoiseConfig(distance=0.3, heading_per_metre=0.5), block(names))
+    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
+    noise = rng.standard_normal((len(exact), 3)) * sigma
+    wheels = replace(exact, motion=exact.motion / [1 + scale, 1 + scale, 1 + turn] + noise)
+    graph = Graph(truth[frames.index], calibration=block(names), fixed_poses=np.ones(len(frames), dtype=bool))
+    held = np.array([n not in ("odometry_scale", "heading_scale") for n in graph.calibration.names])
+    solved, _ = optimize(replace(graph, fixed_calibration=held).with_edges(replace(wheels, kernel=SQUARED)))
+    reach = sigma[0] / np.sqrt((wheels.motion**2).sum(axis=0))
+    assert solved.calibration.get("odometry_scale") == pytest.approx(scale, abs=4 * reach[0])
+    assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])
+
+
+def test_an_anchor_in_the_wrong_place_goes_where_its_ranges_agree_and_others_stay():
+    _, truth, frames, places, _, edges = world(4, metres=80.0, sigma=0.03)
+    wrong = places.copy()
+    wrong[0] += [2.0, -1.0]
+    graph = Graph(truth[frames.index], wrong)
+    found = relocate(edges, graph, np.ones(len(places), dtype=bool), AnchorConfig())
+    assert np.hypot(*(found.anchors[0] - places[0])) < 0.3
+    np.testing.assert_array_equal(found.anchors[1:], wrong[1:])
+    held = relocate(edges, graph, np.zeros(len(places), dtype=bool), AnchorConfig())
+    np.testing.assert_array_equal(held.anchors, wrong)

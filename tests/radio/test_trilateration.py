@@ -1,0 +1,145 @@
+"""First positions of anchors: planted ones are found among lies, mirrors are named."""
+
+import numpy as np
+import pytest
+from helpers.planted import wander
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uwblite import se2
+from uwblite.radio.trilateration import AnchorConfig, agreement, ambiguous, locate, usable
+
+CONFIG = AnchorConfig()
+
+
+def measured(rng, path, anchor, sigma=0.05, bias=0.0, outliers=0.0):
+    """Return ranges (m,) from a path to an anchor; outliers are 0.5 to 8 m off, four fifths of them long."""
+    said = np.hypot(*(path - anchor).T) + bias + sigma * rng.standard_normal(len(path))
+    wild = rng.uniform(0.5, 8.0, len(path)) * np.where(rng.random(len(path)) < 0.8, 1.0, -1.0)
+    return np.abs(said + np.where(rng.random(len(path)) < outliers, wild, 0.0))
+
+
+def loop_path(rng, count=150, metres=60.0):
+    """Return (count, 2) places of a tag that wanders about."""
+    return wander(rng, metres)[1][np.linspace(0, metres / 0.05, count).astype(int), :2]
+
+
+def expected_sigma(path, anchor, sigma, outliers, samples):
+    """Return the larger standard deviation (m) of the position, its bias unknown, from the clean ranges that are used."""
+    away = anchor - path
+    jacobian = np.column_stack([away / np.hypot(*away.T)[:, None], np.ones(len(path))])
+    normal = jacobian.T @ jacobian * min(1.0, samples / len(path)) * (1.0 - outliers)
+    return sigma * np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal)[:2, :2])[-1])
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 0.3, 0.4]), st.floats(-0.3, 1.5))
+def test_planted_anchors_are_found_among_lies(seed, outliers, bias):
+    rng = np.random.default_rng(seed)
+    path = loop_path(rng)
+    anchor = rng.uniform(-9, 9, 2)
+    found = locate(path, measured(rng, path, anchor, 0.05, bias, outliers), CONFIG)
+    # A weak prior pulls the bias towards 0 by less than its own uncertainty; a kernel that drops lies costs a half.
+    tolerance = 5 * 1.5 * expected_sigma(path, anchor, 0.05, outliers, CONFIG.samples)
+    assert np.hypot(*(found[0].position - anchor)) < max(tolerance, 0.05)
+    assert abs(found[0].bias - bias) < max(tolerance, 0.05)
+    assert found[0].cost <= min(h.cost for h in found)
+
+
+def test_position_sigma_tells_the_scatter():
+    rng = np.random.default_rng(1)
+    path, anchor = loop_path(rng), np.array([7.0, -3.0])
+    found = [locate(path, measured(rng, path, anchor, 0.1), CONFIG)[0] for _ in range(60)]
+    scatter = np.sqrt(np.linalg.eigvalsh(np.cov(np.array([h.position for h in found]).T))[-1])
+    # Sixty draws know a standard deviation to 9 %; the robust kernel and its 1.4826 MAD add their own.
+    assert np.median([h.position_sigma for h in found]) == pytest.approx(scatter, rel=0.5)
+    assert np.median([h.sigma for h in found]) == pytest.approx(0.1, rel=0.2)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 1000), st.floats(1.5, 8.0), st.floats(-np.pi, np.pi))
+def test_a_straight_path_leaves_two_mirrored_places(seed, aside, heading):
+    rng = np.random.default_rng(seed)
+    path = np.column_stack([np.linspace(-8, 8, 160), 0.005 * rng.standard_normal(160)])
+    anchor = np.array([rng.uniform(-5, 5), aside])
+    turn = np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), heading])
+    found = locate(se2.transform(turn, path), measured(rng, path, anchor, 0.05, 0.3), CONFIG)
+    assert ambiguous(found, CONFIG)
+    both = se2.transform(turn, np.array([anchor, anchor * [1, -1]]))
+    gap = np.hypot(*(both[:, None] - np.array([h.position for h in found[:2]])[None]).transpose(2, 0, 1))
+    # Each of the two true places has its hypothesis; the distance from the line, with an unknown bias, is what is least sure.
+    assert np.all(gap.min(axis=1) < 1.0)
+    assert gap.argmin(axis=1).tolist() in ([0, 1], [1, 0])
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 1000), st.booleans())
+def test_a_corner_in_the_path_settles_the_mirror(seed, left):
+    rng = np.random.default_rng(seed)
+    leg = np.linspace(0, 8, 80)
+    path = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([8 + 0 * leg, leg if left else -leg])])
+    anchor = np.array([rng.uniform(0, 6), rng.choice([-1, 1]) * rng.uniform(2, 6)])
+    found = locate(path, measured(rng, path, anchor, 0.05, 0.2), CONFIG)
+    assert not ambiguous(found, CONFIG)
+    assert np.hypot(*(found[0].position - anchor)) < 5 * expected_sigma(path, anchor, 0.05, 0.0, CONFIG.samples)
+
+
+def test_the_outcome_turns_with_the_path():
+    rng = np.random.default_rng(3)
+    path, anchor = loop_path(rng), np.array([3.0, 6.0])
+    said, move = measured(rng, path, anchor), np.array([100.0, -50.0, 2.0])
+    here, there = locate(path, said, CONFIG)[0], locate(se2.transform(move, path), said, CONFIG)[0]
+    np.testing.assert_allclose(there.position, se2.transform(move, here.position), atol=0.01)
+
+
+def test_a_path_that_drifts_is_trusted_as_far_as_it_drifts():
+    """A path bent by 0.4 m still gives a place near the anchor, and no second one within the drift."""
+    rng = np.random.default_rng(4)
+    path, anchor = loop_path(rng), np.array([4.0, -7.0])
+    said = measured(rng, path, anchor)
+    bent = path + 0.4 * np.linspace(0, 1, len(path))[:, None] * [0.7, 0.7]
+    found = locate(bent, said, CONFIG, drift=0.4)
+    assert np.hypot(*(found[0].position - anchor)) < 0.4
+    assert not ambiguous(found, CONFIG)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_too_few_ranges_place_nothing(count):
+    assert locate(np.zeros((count, 2)), np.ones(count), CONFIG) == []
+    assert not ambiguous([], CONFIG)
+
+
+def test_a_robot_that_stands_places_nothing_for_sure():
+    rng = np.random.default_rng(5)
+    found = locate(np.zeros((50, 2)), 4.0 + 0.05 * rng.standard_normal(50), CONFIG)
+    assert len(found) > 1
+    assert ambiguous(found, CONFIG)
+
+
+def test_hypotheses_are_distinct_and_in_order():
+    rng = np.random.default_rng(6)
+    path = loop_path(rng, metres=12.0)
+    found = locate(path, measured(rng, path, np.array([5.0, 5.0]), 0.2, outliers=0.3), CONFIG)
+    costs = [h.cost for h in found]
+    assert costs == sorted(costs)
+    places = np.array([h.position for h in found])
+    apart = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(places))
+    assert apart.min() > 0.06
+
+
+def test_usable_readings_are_positive_finite_and_not_absurd():
+    config = AnchorConfig(max_range=100.0)
+    readings = np.array([0.0, -3.0, 0.01, 0.5, 99.0, 101.0, np.inf, np.nan])
+    assert usable(readings, config).tolist() == [False, False, False, True, True, False, False, False]
+
+
+@pytest.mark.parametrize("lies", [0.0, 0.3])
+@pytest.mark.parametrize("bias", [0.0, 1.2])
+def test_agreement_is_the_share_of_ranges_that_fit_a_place_whatever_the_bias(lies, bias):
+    rng = np.random.default_rng(7)
+    path, place = loop_path(rng, metres=30.0), np.array([4.0, -3.0])
+    said = np.hypot(*(place - path).T) + bias + 0.02 * rng.standard_normal(len(path))
+    wrong = np.arange(len(path)) < lies * len(path)
+    said = said + 3.0 * wrong
+    assert agreement(path, said, place) == pytest.approx(1.0 - wrong.mean(), abs=0.02)
+    assert agreement(path, said, np.array([8.0, 2.0])) < 0.6

@@ -1,0 +1,202 @@
+"""The HTML report: all that belongs in it, nothing that does not, and a real browser that opens it."""
+
+import re
+import shutil
+import struct
+import subprocess
+import zlib
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from helpers.results import EVIL, small_result
+
+from uwblite.report.html import render
+
+VOID = {"meta", "link", "input", "br", "img"}
+
+
+class Page(HTMLParser):
+    """Checks that elements close in order and gathers what is asked about."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.ids, self.words, self.tags, self.links = [], set(), [], [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.ids |= {value for name, value in attrs if name == "id"}
+        self.links += [value for name, value in attrs if name in ("href", "src", "action")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def png():
+    rows = b"".join(b"\0" + bytes([205]) * 100 for _ in range(80))
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    head = struct.pack(">IIBBBBB", 100, 80, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+def page(**options):
+    return render(small_result(**options), title="run.log", command="uwblite map run.log --out map/", grid_png=png())
+
+
+def test_everything_that_belongs_in_it_is_there():
+    text = page()
+    words = " ".join(Page(text).words)
+    for wanted in (
+        "uwblite map run.log --out map/", "5C0B", "+0.460", "mirror-ambiguous", "overlap too small", "1 of 3 candidates kept",
+        "odometry_scale", "\u22121.20", "the robot hardly turns", "0.800", "anchor 91A3 may be mirrored",
+    ):  # fmt: skip
+        assert wanted in words, wanted
+    assert {"map-view", "anchors", "calibration", "loop-closures", "range-residuals", "stages", "warnings"} <= Page(text).ids
+    assert text.count("<ellipse") == 2
+    assert 'class="mirror"' in text
+
+
+def test_marked_ranges_are_those_that_disagree():
+    result = small_result()
+    text = page()
+    for index in (0, 1):
+        mine = result.range_table["anchor"] == index
+        share = 100 * np.mean(result.range_table["agrees"][mine] == 0)
+        assert f"{share:.0f} % marked" in text
+    drawn = sum(figure.count("M") for figure in re.findall(r'class="(?:los|nlos)" d="([^"]*)"', text))
+    assert drawn == len(result.range_table["stamp"])
+    joint = page(sessions=2)
+    assert "one recording after another" in joint
+    xs = [float(x) for x in re.findall(r"M([\d.]+) [\d.]+h0", joint)]
+    assert (min(xs), max(xs)) == (0.0, 1000.0)
+
+
+def test_reasons_that_differ_in_figures_only_are_counted_together():
+    result = small_result()
+    more = [replace(result.closures[1], reason=f"only {k}% of its points match (least 40%)") for k in (3, 12, 37)]
+    text = render(replace(result, closures=(*result.closures, *more)), title="a", command="b")
+    assert "only \u2026% of its points match (least \u2026%)</td><td>3</td>" in text
+    assert "only 12% of its points" in text
+
+
+def test_nothing_comes_from_elsewhere():
+    for link in Page(page()).links:
+        assert link.startswith("data:"), link
+    assert "default-src 'none'" in page()
+
+
+def test_text_of_a_log_stays_text():
+    evil = page(evil=EVIL)
+    assert EVIL not in evil
+    assert Page(evil).tags.count("script") == Page(page()).tags.count("script") == 1
+    titled = render(small_result(), title=EVIL, command=EVIL, facts=((EVIL, EVIL),))
+    assert Page(titled).tags.count("script") == 1
+
+
+def test_same_result_same_bytes_unless_timings_are_asked_for():
+    assert page(seconds=1.0) == page(seconds=2.0)
+    one, two = (render(small_result(seconds=s), title="a", command="b", timings=True) for s in (1.0, 2.0))
+    assert one != two
+    assert "seconds" in one
+
+
+def test_works_without_lidar_and_without_radio():
+    bare = replace(small_result(lidar=False), anchors=(), range_table={}, closures=(), calibration=(), warnings=())
+    text = render(bare, title="a", command="b")
+    assert "No warnings." in text
+    assert "<image" not in text
+
+
+def test_an_unplaced_anchor_is_listed_and_not_drawn():
+    result = small_result()
+    lost = replace(
+        result.anchors[0], id="lost", position=np.full(2, np.nan), covariance=np.full((2, 2), np.nan), status="unplaced"
+    )
+    text = render(replace(result, anchors=(*result.anchors, lost)), title="a", command="b")
+    assert "unplaced" in text
+    assert "nan" not in text
+    assert text.count("<ellipse") == 2
+
+
+def test_the_ellipse_has_two_sigma_along_the_right_axis():
+    ellipse = re.findall(r'<ellipse [^>]*rx="([\d.]+)" ry="([\d.]+)" transform="rotate\(([-\d.]+)', page())
+    first, second = ([float(v) for v in e] for e in ellipse)
+    assert first[:2] == [0.08, 0.04]
+    assert abs(first[2]) % 180 == 0
+    # Positive correlation: the long axis points to the upper right, which SVG's y downwards calls -45 degrees.
+    assert second[2] % 180 == pytest.approx(135)
+    assert second[:2] == pytest.approx([2 * np.sqrt(0.014), 2 * np.sqrt(0.006)], abs=1e-4)
+
+
+CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update"),
+    *("--enable-logging=stderr", "--v=0", "--virtual-time-budget=3000"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is absent")
+@pytest.mark.parametrize("size", ["1200,900", "390,844"])
+def test_chromium_shows_it_without_complaint(tmp_path, size):
+    file, picture = tmp_path / "report.html", tmp_path / "shot.png"
+    file.write_text(page(evil=EVIL))
+    base = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={size}"]
+    shown = subprocess.run([*base, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=120, check=False)
+    assert 'id="map-view"' in shown.stdout
+    assert "</svg>" in shown.stdout
+    assert "CONSOLE" not in shown.stderr, shown.stderr
+    subprocess.run([*base, f"--screenshot={picture}", file.as_uri()], capture_output=True, timeout=120, check=True)
+    width, height = struct.unpack(">II", picture.read_bytes()[16:24])
+    assert (width, height) == tuple(map(int, size.split(",")))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is absent")
+def test_the_script_zooms_and_toggles(tmp_path):
+    """The page's own controls are pressed by a script put in for the test; it writes what happened into the title."""
+    probe = """<script>
+      var svg = document.getElementById('map-view'), before = svg.getAttribute('viewBox');
+      document.getElementById('zoom-in').click();
+      var zoomed = svg.viewBox.baseVal.width, whole = parseFloat(before.split(' ')[2]);
+      document.getElementById('zoom-all').click();
+      var back = svg.viewBox.baseVal.width;
+      var box = document.querySelector('[data-layer=rejected]'), layer = document.querySelector('.rejected');
+      var hidden = layer.classList.contains('hidden');
+      box.click();
+      var at = svg.getBoundingClientRect();
+      svg.dispatchEvent(new PointerEvent('pointermove', {clientX: at.x + at.width / 2, clientY: at.y + at.height / 2}));
+      var said = document.getElementById('place').textContent;
+      document.title = [/^x -?[0-9.]+ m, y -?[0-9.]+ m$/.test(said),
+        Math.abs(zoomed * 1.5 - whole) < 1e-3, Math.abs(back - whole) < 1e-3,
+        hidden, !layer.classList.contains('hidden')].join();
+    </script></body>"""
+    file = tmp_path / "report.html"
+    file.write_text(page().replace("</body>", probe))
+    base = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path / 'profile'}"]
+    shown = subprocess.run([*base, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=120, check=False)
+    assert "<title>true,true,true,true,true</title>" in shown.stdout
+
+
+def test_kept_and_rejected_closures_are_told_apart():
+    groups = dict(re.findall(r'<g class="closure (kept|rejected)(?: hidden)?">(.*?)</g>', page(), re.S))
+    assert groups["kept"].count("<path") == 1
+    assert "consistent with the others" in groups["kept"]
+    assert groups["rejected"].count("<path") == 2

@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
+from uwblite.io.png import decode_png, encode_png
+from uwblite.report.bitmap_font import HEIGHT, WIDTH, text_mask
+from uwblite.report.canvas import Canvas
+from uwblite.report.picture import ANCHOR, CLOSURE, PAPER, PATH, PATHS, WALL, PictureAnchor, _round_length, draw_map
+
+
+def room(rows=80, cols=120, resolution=0.05):
+    log_odds = np.full((rows, cols), -5.0, np.float32)
+    log_odds[[0, -1], :] = log_odds[:, [0, -1]] = 5.0
+    log_odds[5:10, 5:10] = 0.0
+    return OccupancyGrid(GridGeometry(resolution, np.array([-2.0, 1.0]), rows, cols), log_odds)
+
+
+def share(image, colour, tolerance=12):
+    return (np.abs(image.astype(int) - colour).max(axis=-1) <= tolerance).mean()
+
+
+PATH_IN_ROOM = np.stack([np.linspace(-1.0, 3.0, 50), np.linspace(2.0, 4.0, 50), np.zeros(50)], axis=1)
+
+
+def test_everything_is_on_it():
+    anchors = [PictureAnchor("5C0B", np.array([0.0, 3.0]), np.diag([0.04, 0.01])), PictureAnchor("lost", np.full(2, np.nan))]
+    image = draw_map(room(), PATH_IN_ROOM, anchors=anchors, closures=np.array([[0.0, 2.0, 2.0, 4.0]]), caption="a room")
+    assert image.dtype == np.uint8
+    for colour in (WALL, PAPER, (255, 255, 255), ANCHOR):
+        assert share(image, colour) > 1e-4
+    for colour in (PATH, CLOSURE):
+        assert share(image, colour, 60) > 1e-4
+    np.testing.assert_array_equal(decode_png(encode_png(image)), image)
+    again = draw_map(room(), PATH_IN_ROOM, anchors=anchors, closures=np.array([[0.0, 2.0, 2.0, 4.0]]), caption="a room")
+    np.testing.assert_array_equal(again, image)
+
+
+def test_what_is_north_is_on_top_and_the_path_lies_on_its_cells():
+    grid = room()
+    grid.log_odds[:40], grid.log_odds[40:] = -5.0, 5.0
+    image = draw_map(grid, np.array([[-1.0, 1.5, 0.0], [-1.0, 1.6, 0.0]]), size=600)
+    dark = np.abs(image.astype(int) - WALL).max(axis=-1) < 12
+    rows = np.flatnonzero(dark.mean(axis=1) > 0.5)
+    below = image[rows.max() + 5 : -50]
+    assert rows.mean() < image.shape[0] / 2
+    assert share(below, PATH, 60) > 0
+    assert share(image[: rows.max()], PATH, 60) == 0
+
+
+@pytest.mark.parametrize("size", [240, 300, 2000])
+@pytest.mark.parametrize("resolution", [0.01, 0.05, 0.3])
+def test_thin_walls_survive_every_scale(size, resolution):
+    image = draw_map(room(200, 300, resolution), PATH_IN_ROOM[:1], size=size)[:-44]
+    dark = np.abs(image.astype(int) - WALL).max(axis=-1) < 12
+    assert (dark.any(axis=0).mean(), dark.any(axis=1).mean()) > (0.3, 0.3)
+    assert image.shape[0] <= size * 1.2 + 44
+
+
+def test_parts_may_be_missing():
+    assert draw_map(None, PATH_IN_ROOM).shape[2] == 3
+    assert draw_map(None, np.zeros((0, 3))).shape[2] == 3
+    assert draw_map(room(), np.zeros((0, 3)), closures=np.zeros((0, 4))).shape[2] == 3
+    parted = PATH_IN_ROOM.copy()
+    parted[25] = np.nan
+    assert share(draw_map(room(), parted), PATH, 60) > 0
+
+
+def test_round_lengths():
+    assert [_round_length(x) for x in (0.99, 1.0, 4.9, 5.0, 37.0, 0.03)] == [0.5, 1.0, 2.0, 5.0, 20.0, 0.02]
+
+
+def test_a_stroke_has_its_width_and_smooth_edges():
+    canvas = Canvas(np.full((40, 60, 3), 255, np.uint8))
+    canvas.lines(np.array([[10.0, 20.0, 50.0, 20.0]]), 4.0, (0, 0, 0))
+    ink = (255.0 - canvas.image[:, 30, 0]) / 255.0
+    assert ink.sum() == pytest.approx(4.0, abs=0.7)
+    canvas = Canvas(np.full((40, 60, 3), 255, np.uint8))
+    canvas.polygon(np.array([[5.0, 5.0], [25.0, 5.0], [25.0, 15.0], [5.0, 15.0]]), (0, 0, 0))
+    assert (255.0 - canvas.image[:, :, 0]).sum() / 255.0 == pytest.approx(200.0, rel=0.02)
+
+
+def test_drawing_outside_is_harmless():
+    canvas = Canvas(np.full((20, 30, 3), 255, np.uint8))
+    canvas.discs(np.array([[-50.0, 5.0], [1e9, 3.0], [np.nan, 0.0]]), 5.0, (0, 0, 0))
+    canvas.polygon(np.array([[-9.0, -9.0], [-5.0, -9.0], [-7.0, -5.0]]), (0, 0, 0))
+    canvas.text(500, 500, "far", (0, 0, 0), halo=(255, 0, 0))
+    assert (canvas.image == 255).all()
+    canvas.lines(np.array([[-1e7, 10.0, 1e7, 10.0]]), 2.0, (0, 0, 0))
+    canvas.discs(np.array([[0.0, 0.0]]), 3.0, (0, 0, 0))
+    canvas.text(-8, -3, "edge", (0, 0, 0))
+    assert (canvas.image != 255).any()
+
+
+def test_letters_differ_and_unknown_ones_become_boxes():
+    letters = [chr(c) for c in range(33, 127) if text_mask(chr(c)).tobytes() != text_mask("\u20ac").tobytes()]
+    assert {*"0123456789ABCDEFabcdef.-:_", *"xyz"} <= set(letters)
+    assert len({text_mask(c).tobytes() for c in letters}) == len(letters)
+    assert text_mask("ab", 3).shape == (3 * HEIGHT, 3 * (2 * WIDTH + 1))
+    assert text_mask("\u20ac").any()
+    assert text_mask("").shape[0] == HEIGHT
+
+
+def test_recordings_have_colours_of_their_own():
+    one, two = np.array([[0.0, 0.0], [4.0, 0.0]]), np.array([[0.0, 3.0], [4.0, 3.0]])
+    gap = np.full((1, 2), np.nan)
+    image = draw_map(None, np.vstack([one, gap, two, gap]))
+    colours = {tuple(c) for c in image.reshape(-1, 3).tolist()}
+    assert {PATHS[0], PATHS[1]} <= colours
+    assert PATHS[1] not in {tuple(c) for c in draw_map(None, one).reshape(-1, 3).tolist()}
+
+
+@given(st.integers(0, 10_000), st.floats(0.5, 3000.0))
+@settings(max_examples=30)
+def test_a_polygon_is_what_lies_within_all_its_edges(seed, size):
+    rng = np.random.default_rng(seed)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 9)))[:: rng.choice([-1, 1])]
+    corners = rng.uniform(0, 40, 2) + size * np.stack([np.cos(angle), 0.7 * np.sin(angle)], axis=1)
+    image = np.zeros((30, 40, 3), dtype=np.uint8)
+    Canvas(image).polygon(corners, (255, 255, 255))
+    fine = (np.stack(np.meshgrid(np.arange(120), np.arange(90)), axis=-1) + 0.5) / 3
+    edge, ahead = np.roll(corners, -1, axis=0) - corners, fine[:, :, None] - corners
+    turn = edge[:, 0] * ahead[..., 1] - edge[:, 1] * ahead[..., 0]
+    within = (turn >= 0).all(axis=-1) | (turn <= 0).all(axis=-1)
+    cover = within.reshape(30, 3, 40, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(image[:, :, 0] / 255, cover, atol=2 / 255)
+
+
+def test_an_anchor_that_may_stand_anywhere_takes_no_longer_than_others():
+    """Its ellipse is many times the picture; only what is in the picture is looked at."""
+    anchor = PictureAnchor("far", np.array([0.0, 3.0]), np.diag([1e6, 1e4]))
+    image = draw_map(room(), PATH_IN_ROOM, anchors=[anchor])
+    assert share(image, ANCHOR, 40) > 0

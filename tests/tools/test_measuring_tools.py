@@ -1,0 +1,116 @@
+"""The tools that measure: normalised errors of known covariances, drives with fewer anchors, pages written in sections."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import accuracy
+import consistency
+import numpy as np
+import pytest
+import reproduce_paper
+import trials
+from simulation.recording import Settings
+
+from uwblite.config import override
+from uwblite.evaluation.trajectory import evaluate_trajectory
+from uwblite.mapping import MappingConfig, build_map
+from uwblite.presets import preset
+
+SHORT = Settings(world="room", seed=3, minutes=1.0, scan_rate=5.0)
+COARSE = ("grid.resolution=0.2",)
+
+
+@pytest.fixture(scope="module")
+def trial():
+    return trials.made(SHORT)
+
+
+@pytest.fixture(scope="module")
+def result(trial):
+    return build_map(trial.log, override(MappingConfig(), COARSE))
+
+
+def test_normalised_errors_of_true_covariances_are_chi_square():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(3, 3))
+    errors = rng.standard_normal((4000, 3)) @ root.T
+    values = consistency.nees(errors, np.tile(root @ root.T, (4000, 1, 1)))
+    # The mean of 4,000 values of variance 6 is known to 0.04.
+    assert values.mean() == pytest.approx(3.0, abs=0.16)
+
+
+def test_errors_are_taken_in_the_frame_of_the_first_pose(trial, result):
+    """The frame of the truth does not matter; an error of the first pose would show in all others."""
+    one = consistency.compare("", result, trial)
+    assert one.poses.shape == one.heading.shape == (len(result.keyframe_stamps) - 1,)
+    assert len(one.anchors) == sum(a.status == "ok" for a in result.anchors)
+    assert one.error > evaluate_trajectory(result.stamps, result.trajectory, trial.stamps, trial.poses).ate.mean * 0.5
+    turned = replace(result, keyframe_covariances=4.0 * result.keyframe_covariances)
+    np.testing.assert_allclose(consistency.compare("", turned, trial).poses, one.poses / 4.0)
+
+
+def test_a_trial_is_judged_by_all_figures(trial, result):
+    found = trials.judged(result, trial)
+    assert 0.0 < found.ate < 0.1
+    assert found.closures[0] <= found.closures[1]
+    assert {i for i, _ in found.anchor_errors} == set(trial.anchors)
+    assert len(found.pairs) == 3
+    assert found.drawn < 0.1
+
+
+def test_fewer_anchors_are_as_if_the_others_had_not_been_there(trial):
+    some = reproduce_paper.heard(trial, (2, 4))
+    ids = list(trial.anchors)
+    assert set(some.anchors) == set(some.log.ranges.anchor_ids) == {ids[1], ids[3]}
+    for name in some.anchors:
+        kept, all_of_them = (
+            t.log.ranges.ranges[t.log.ranges.anchor == t.log.ranges.anchor_ids.index(name)] for t in (some, trial)
+        )
+        np.testing.assert_array_equal(kept, all_of_them)
+    assert reproduce_paper.heard(trial, ()) is trial
+
+
+def test_rays_can_be_told_as_of_one_time(trial):
+    flat = accuracy.flat(trial.log).scans
+    middle = trial.log.scans.stamps + 0.5 * trial.log.scans.time_increment * (trial.log.scans.ranges.shape[1] - 1)
+    np.testing.assert_allclose(flat.stamps, middle)
+    assert flat.time_increment == 0.0
+
+
+def test_every_setting_that_the_tools_change_exists():
+    for changes in accuracy.INGREDIENTS.values():
+        override(MappingConfig(), [c for c in changes if c != "deskew"])
+    for row in accuracy.ROWS.values():
+        override(MappingConfig(), row.changes)
+    args = type("Args", (), {"quick": False, "seeds": 1})()
+    for task in reproduce_paper.planned(args, Path()):
+        for run in task.runs:
+            override(preset(run.preset), run.changes)
+
+
+def test_lies_are_put_among_the_measurements(result):
+    rng = np.random.default_rng(0)
+    clean = accuracy.plain(result.graph)
+    spoilt = accuracy.wronged(result.graph, rng)
+    assert all(e.kernel.name == "none" for e in clean.edges)
+    pairs = [(a, b) for a, b in zip(clean.edges, spoilt.edges, strict=True) if type(a).__name__ == "RangeEdges"]
+    assert np.mean(pairs[0][0].ranges != pairs[0][1].ranges) == pytest.approx(0.3, abs=0.1)
+
+
+def test_sections_of_a_page_are_replaced_and_the_rest_is_left(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# Title\n")
+    trials.write_section(page, "one", "first")
+    trials.write_section(page, "two", "second")
+    whole = page.read_text()
+    trials.write_section(page, "one", "first")
+    assert page.read_text() == whole
+    trials.write_section(page, "one", r"anew \1")
+    assert r"anew \1" in page.read_text()
+    assert "first" not in page.read_text()
+    assert page.read_text().startswith("# Title")
+    assert page.read_text().index("anew") < page.read_text().index("second")
+
+
+def test_tables_say_what_is_not_known():
+    assert trials.table(["a", "b"], [[1, float("nan")], ["x", 0.12345]]) == "| a | b |\n|---|---|\n| 1 | - |\n| x | 0.123 |\n"

@@ -1,0 +1,1 @@
+"""Findings about a recording before it is mapped: ``uwblite check``."""

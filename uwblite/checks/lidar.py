@@ -1,0 +1,120 @@
+"""Checks of the scans: rhythm, valid beams, units, field of view, and whether laser and wheels agree on turning."""
+
+from typing import Any
+
+import numpy as np
+
+from ..lidar.laser_mounting import Turning, compare
+from ..sensor_log import LaserScans, SensorLog
+from .findings import Findings, Floats, timing
+
+
+def check_scans(log: SensorLog, found: Findings) -> dict[str, Any]:
+    """Check the scans and return their figures."""
+    scans = log.scans
+    assert scans is not None
+    figures: dict[str, Any] = timing(scans.stamps, "lidar", found, expected_gap=1.0)
+    beams = scans.ranges.shape[1]
+    view = abs(scans.angle_increment) * (beams - 1)
+    figures |= {
+        "beams": beams,
+        "field of view deg": round(float(np.degrees(view)), 1),
+        "range max m": round(scans.range_max, 3),
+    }
+    sample = scans.ranges[:: max(1, len(scans.ranges) // 400)].astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        hit = (sample >= scans.range_min) & (sample <= scans.range_max)
+    figures["share of beams that hit"] = round(float(hit.mean()), 3)
+    figures["share that saw nothing"] = round(float(np.isposinf(sample).mean()), 3)
+    figures["share that is invalid"] = round(float(np.isnan(sample).mean()), 3)
+    _check_units(sample[hit], scans, view, found)
+    _check_valid(hit, figures, found)
+    if beams >= 30 and len(scans.stamps) >= 20:
+        figures["turning"] = _check_turning(log, found)
+    return figures
+
+
+def _check_units(seen: Floats, scans: LaserScans, view: float, found: Findings) -> None:
+    if view > 2.0 * np.pi + 0.1:
+        found.serious(
+            "lidar",
+            f"the field of view is {np.degrees(view):.0f} degrees: the angles look like degrees taken for radians",
+            "angles must be radians",
+        )
+    if len(seen) and np.median(seen) > 150.0:
+        found.serious(
+            "lidar", f"the usual reading is {np.median(seen):.0f} m: they look like millimetres", "write metres into the log"
+        )
+    elif len(seen) and np.quantile(seen, 0.95) < 0.05:
+        found.serious("lidar", f"95 % of the readings are below {np.quantile(seen, 0.95):.3f} m", "check the unit: metres")
+    if len(seen) and np.ptp(seen) == 0.0:
+        found.serious("lidar", "all readings are equal", "the laser is off, covered, or not the laser")
+
+
+def _check_valid(hit: np.ndarray[Any, np.dtype[np.bool_]], figures: dict[str, Any], found: Findings) -> None:
+    share = figures["share of beams that hit"]
+    if share < 0.1:
+        found.warning(
+            "lidar",
+            f"only {100 * share:.0f} % of the beams hit anything within {figures['range max m']:.1f} m",
+            "the place is wider than the laser reaches: drive along the walls; the radio must hold the middle",
+        )
+    elif figures["share that is invalid"] > 0.4:
+        found.note(
+            "lidar",
+            f"{100 * figures['share that is invalid']:.0f} % of the readings are error codes",
+            "dark or slanting surfaces; they are left out and clear no space",
+        )
+    blocked = (hit.mean(axis=0) > 0.999) if len(hit) > 20 else np.zeros(1, dtype=bool)
+    if 0.02 < float(blocked.mean()) < 0.5 and share < 0.95:
+        found.note(
+            "lidar",
+            f"{int(blocked.sum())} beams hit in every scan",
+            "parts of the robot may stand in the laser's view; readings below range_min are left out",
+        )
+
+
+def _check_turning(log: SensorLog, found: Findings) -> dict[str, float]:
+    turning = compare(log)
+    if turning is None:
+        found.note("lidar", "the robot hardly turns in place", "clock offset and mounting of the laser cannot be checked")
+        return {}
+    figures = {
+        "pairs": turning.pairs,
+        "misfit rad": round(turning.told, 4),
+        "misfit if mounted the other way up rad": round(turning.other, 4),
+        "clock offset s": round(turning.clock_offset, 3),
+    }
+    if not turning.agree:
+        found.warning(
+            "lidar",
+            f"laser and wheels disagree on turning (typically by {turning.misfit:.2f} rad of {turning.typical:.2f} rad)",
+            "check the stamps, the beam order and the wheels' heading",
+        )
+        return figures
+    if turning.turned_over:
+        found.serious(
+            "lidar",
+            f"the laser is mounted {'upright' if log.mounting.laser_flipped else 'upside down'}: that way its turns agree"
+            f" {turning.told / max(turning.other, 1e-6):.0f} times better with the wheels",
+            "leave out --laser-flipped" if log.mounting.laser_flipped else "use --laser-flipped",
+        )
+    if abs(turning.clock_offset) > 0.06 and turning.clock_clear:
+        found.warning(
+            "lidar",
+            f"the laser's clock is {turning.clock_offset:+.2f} s off the odometry's",
+            "uwblite corrects small offsets; stamp both with one clock, each when its reading begins",
+        )
+    if np.isfinite(turning.ratio):
+        _check_scale(turning, figures, found)
+    return figures
+
+
+def _check_scale(turning: Turning, figures: dict[str, float], found: Findings) -> None:
+    figures["turn by laser / turn by wheels"] = round(turning.ratio, 3)
+    if abs(turning.ratio - 1.0) > max(0.12, 4.0 * turning.ratio_sigma):
+        found.warning(
+            "odometry",
+            f"the wheels say about {1.0 / turning.ratio:.2f} times the turns that the laser sees",
+            "set the track width of the base; uwblite corrects it where the recording shows it",
+        )

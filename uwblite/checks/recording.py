@@ -1,0 +1,99 @@
+"""Findings about a recording before anyone maps it: what is wrong, how much, and what to do about it.
+
+Each finding is ranked: ``serious`` spoils the map or stops it, ``warning`` costs accuracy, ``note`` is good to know.
+The checks ask for no calibration and no map; where the recording itself can tell a fault from its absence (heading in
+degrees, a laser upside down, clocks that differ), it is asked.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..sensor_log import SensorLog
+from .findings import Finding, Findings
+from .lidar import check_scans
+from .odometry import check_odometry
+from .radio import check_calibration, check_ranges
+
+__all__ = ["Diagnosis", "Finding", "diagnose"]
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What the checks found."""
+
+    findings: tuple[Finding, ...]
+    """Worst first."""
+    figures: dict[str, Any] = field(default_factory=dict)
+    """By sensor: rates, gaps, shares, counts (JSON-ready)."""
+
+    @property
+    def serious(self) -> tuple[Finding, ...]:
+        """The findings that spoil the map or stop it."""
+        return tuple(f for f in self.findings if f.rank == "serious")
+
+
+def diagnose(
+    log: SensorLog, *, anchors: tuple[AnchorEstimate, ...] = (), calibration: tuple[CalibrationEstimate, ...] = ()
+) -> Diagnosis:
+    """Examine a recording.
+
+    Parameters
+    ----------
+    log : the recording.
+    anchors, calibration : what a map from wheels and radio alone says, where there is one: it tells the wheels' scale,
+        the clock offset of the radio and the bias of each anchor.
+    """
+    found = Findings()
+    _check_notes(log, found)
+    odometry = check_odometry(log.odometry, found)
+    figures: dict[str, Any] = {"odometry": odometry}
+    if log.ranges is None or len(log.ranges.stamps) == 0:
+        found.note("radio", "there are no UWB ranges", "the map rests on wheels and lidar; check the tag if that is not meant")
+    else:
+        figures["uwb"] = check_ranges(log, found)
+        figures["radio calibration"] = check_calibration(anchors, calibration, found)
+    if log.scans is None or len(log.scans.stamps) == 0:
+        found.note("lidar", "there are no laser scans", "there will be a trajectory and anchors, but no map")
+    else:
+        figures["lidar"] = check_scans(log, found)
+        _check_overlap(log, "lidar", log.scans.stamps, found)
+    if log.ranges is not None and len(log.ranges.stamps):
+        _check_overlap(log, "radio", log.ranges.stamps, found)
+    return Diagnosis(found.ranked(), figures)
+
+
+def _check_notes(log: SensorLog, found: Findings) -> None:
+    notes = log.notes
+    if notes.broken:
+        first = "; ".join(f"line {number}: {why}" for number, why in notes.broken_lines[:3])
+        share = notes.broken / max(notes.lines, 1)
+        found.add(
+            "warning" if share > 0.001 else "note",
+            "log",
+            f"{notes.broken} of {notes.lines} lines are broken and were skipped ({first})",
+            "a recorder that was cut off leaves one; more point to a bad disk, cable or writer",
+        )
+    for warning in notes.warnings:
+        found.warning("log", warning, "the readings are used in the order of their stamps")
+
+
+def _check_overlap(log: SensorLog, topic: str, stamps: np.ndarray[Any, Any], found: Findings) -> None:
+    """A sensor whose stamps lie outside the odometry's time has another clock."""
+    start, end = float(log.odometry.stamps[0]), float(log.odometry.stamps[-1])
+    outside = float(np.mean((stamps < start - 0.5) | (stamps > end + 0.5)))
+    if outside > 0.5:
+        shift = float(np.median(stamps) - 0.5 * (start + end))
+        found.serious(
+            topic,
+            f"{100 * outside:.0f} % of the stamps lie outside the odometry's time; the clocks differ by about {shift:.1f} s",
+            "record all sensors with one clock (uwblite record does), or shift the stamps",
+        )
+    elif outside > 0.02:
+        found.warning(
+            topic,
+            f"{100 * outside:.0f} % of the stamps lie outside the odometry's time",
+            "they are tied to the first or last pose; start the odometry first and stop it last",
+        )

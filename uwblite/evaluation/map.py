@@ -1,0 +1,279 @@
+"""How far a map is from the truth: distances between named columns, and how well its cells lie on the walls.
+
+The mean absolute error of distances between columns is the figure of the paper's Table I. It needs no alignment of the
+frames to speak of: distances are the same in all of them. The alignment only says where to look for a column.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .. import se2
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """Named round columns."""
+
+    names: tuple[str, ...]
+    positions: Floats
+    """(n, 2) m; nan where a column was not found."""
+    radii: Floats
+    """(n,) m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkErrors:
+    """Distances between columns in the map against the true ones."""
+
+    pairs: tuple[tuple[str, str], ...]
+    """Pairs whose columns were both found."""
+    true_distances: Floats
+    """(p,) m."""
+    distances: Floats
+    """(p,) m, in the map."""
+    errors: Floats
+    """(p,) m, absolute error of each distance."""
+    mean: float
+    """Mean absolute error, m: the paper's figure; nan where no pair was found."""
+    missing: tuple[str, ...]
+    """Columns that were not found in the map."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WallErrors:
+    """Occupied cells against the true surfaces."""
+
+    tolerance: float
+    """m."""
+    precision: float
+    """Share of the occupied cells that lie within the tolerance of a true surface."""
+    recall: float
+    """Share of the visible true surface that has an occupied cell within the tolerance."""
+    distance_rms: float
+    """m, rms distance of the occupied cells that lie within 5 tolerances of a true surface."""
+
+
+def find_columns(occupied: Floats, expected: Landmarks, *, search_radius: float = 1.0, cell: float = 0.05) -> Landmarks:
+    """Return where the columns stand in a map, by the place whose circle catches most cells and whose surroundings least.
+
+    Parameters
+    ----------
+    occupied : (n, 2) m, centres of the occupied cells, in the frame of the expected places.
+    expected : where the columns should be, and their radii.
+    search_radius : m; cut to 0.45 of the distance to the nearest other column, lest one is taken for the other.
+    cell : m, size of a cell.
+    """
+    tree = cKDTree(occupied) if len(occupied) else None
+    found = np.full_like(expected.positions, np.nan)
+    for k, (place, radius) in enumerate(zip(expected.positions, expected.radii, strict=True)):
+        others = np.delete(expected.positions, k, axis=0)
+        nearest = np.hypot(*(others - place).T).min() if len(others) else np.inf
+        reach = min(search_radius, 0.45 * nearest)
+        cells = occupied[tree.query_ball_point(place, reach + radius + 0.5)] if tree is not None else occupied
+        found[k] = _find_column(cells, place, radius, reach, cell)
+    return Landmarks(expected.names, found, expected.radii)
+
+
+_LEAST_ARC = 0.35
+"""Share of the circle's cells that must be there: a column seen from one side shows about half of it."""
+
+
+def _find_column(cells: Floats, place: Floats, radius: float, reach: float, cell: float) -> Floats:
+    """Return the centre (2,) of a circle of known radius among cells (n, 2), nan where there is none."""
+    ticks = np.arange(-reach, reach + 0.5 * cell, 0.5 * cell)
+    lattice = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 2)
+    lattice = lattice[np.hypot(*lattice.T) <= reach] + place
+    if not len(cells) or not len(lattice):
+        return np.full(2, np.nan)
+    score, arc = _scores(lattice, cells, radius, cell)
+    score = score - 0.02 * np.hypot(*(lattice - place).T) / cell
+    best = int(np.argmax(np.where(arc >= _LEAST_ARC, score, -np.inf)))
+    if arc[best] < _LEAST_ARC or score[best] <= 0.0:
+        return np.full(2, np.nan)
+    return fit_circle(cells, lattice[best], radius, 1.5 * cell)
+
+
+def _scores(centres: Floats, cells: Floats, radius: float, cell: float) -> tuple[Floats, Floats]:
+    """Return for each centre (m,) its score, and the share of the circle's directions in which a cell lies on it."""
+    tree, directions = cKDTree(cells), 24
+    angle = 2.0 * np.pi * np.arange(directions) / directions
+    rim = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    on_rim = tree.query((centres[:, None] + rim).reshape(-1, 2), distance_upper_bound=cell)[0]
+    arc = np.isfinite(on_rim).reshape(len(centres), directions).mean(axis=1)
+    clear = (radius + 3.0 * cell) / radius * rim
+    in_clear = tree.query((centres[:, None] + clear).reshape(-1, 2), distance_upper_bound=cell)[0]
+    spoilt = np.isfinite(in_clear).reshape(len(centres), directions).mean(axis=1)
+    offset = np.where(np.isfinite(on_rim), on_rim, cell).reshape(len(centres), directions).mean(axis=1)
+    return arc - 0.7 * spoilt - 0.5 * offset / cell, arc
+
+
+def fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Floats:
+    """Return the centre (2,) after Gauss-Newton on the distances to the circle with Tukey's weights within the gate."""
+    for _ in range(20):
+        ray = cells - centre
+        distance = np.hypot(*ray.T)
+        residual = distance - radius
+        near = np.abs(residual) < gate
+        if near.sum() < 3:
+            return centre
+        weight = (1.0 - (residual[near] / gate) ** 2) ** 2
+        unit = ray[near] / np.maximum(distance[near], 1e-9)[:, None]
+        # A column seen from one side says little across the line of sight: the start holds it there.
+        normal = (weight[:, None, None] * unit[:, :, None] * unit[:, None, :]).sum(axis=0) + 0.01 * np.eye(2)
+        step = np.linalg.solve(normal, (weight * residual[near]) @ unit)
+        centre = centre + step
+        if np.hypot(*step) < 1e-5:
+            break
+    return centre
+
+
+def landmark_errors(found: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, str], ...] | None = None) -> LandmarkErrors:
+    """Compare distances between columns found in a map with the true ones; `pairs` of names, None = all pairs."""
+    place = dict(zip(found.names, found.positions, strict=True))
+    missing = tuple(name for name in truth.names if name not in place or not np.isfinite(place[name]).all())
+    sightings = {name: place[name][None] for name in truth.names if name not in missing}
+    return _distance_errors(sightings, truth, pairs, missing)
+
+
+def landmark_errors_along(
+    truth: Landmarks,
+    true_poses: Floats,
+    poses: Floats,
+    pairs: tuple[tuple[str, str], ...] | None = None,
+    *,
+    sight: float = 4.0,
+    most: int = 200,
+) -> LandmarkErrors:
+    """Compare distances between columns as a trajectory would draw them with the true ones.
+
+    Every sighting draws a column once more. The error of a pair is the mean over all combinations of a sighting of one
+    with a sighting of the other, so it needs no map and also judges one too smeared to find a column in it.
+
+    Parameters
+    ----------
+    truth : true columns, frame of the truth.
+    true_poses, poses : (n, 3) T_truth_base and T_map_base at the same stamps.
+    pairs : names; None = all pairs.
+    sight : m, distance up to which a column counts as in sight.
+    most : sightings used of each column, evenly spread.
+    """
+    sightings = {}
+    for name, place in zip(truth.names, truth.positions, strict=True):
+        from_base = se2.transform(se2.inverse(true_poses), place)
+        seen = np.flatnonzero(np.hypot(*from_base.T) <= sight)
+        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(most, len(seen))).astype(np.int64))]
+        if len(seen):
+            sightings[name] = se2.transform(poses[seen], from_base[seen])
+    return _distance_errors(sightings, truth, pairs, tuple(name for name in truth.names if name not in sightings))
+
+
+def _distance_errors(
+    sightings: dict[str, Floats],
+    truth: Landmarks,
+    pairs: tuple[tuple[str, str], ...] | None,
+    missing: tuple[str, ...],
+) -> LandmarkErrors:
+    if pairs is None:
+        pairs = tuple((a, b) for i, a in enumerate(truth.names) for b in truth.names[i + 1 :])
+    judged = tuple((a, b) for a, b in pairs if a in sightings and b in sightings)
+    true_place = dict(zip(truth.names, truth.positions, strict=True))
+    true_distances = np.array([np.hypot(*(true_place[a] - true_place[b])) for a, b in judged])
+    said = [np.hypot(*(sightings[a][:, None] - sightings[b][None]).transpose(2, 0, 1)) for a, b in judged]
+    errors = np.array([np.mean(np.abs(d - t)) for d, t in zip(said, true_distances, strict=True)])
+    distances = np.array([np.mean(d) for d in said])
+    mean = float(np.mean(errors)) if judged else float("nan")
+    return LandmarkErrors(judged, true_distances, distances, errors, mean, missing)
+
+
+def wall_errors(
+    occupied: Floats,
+    walls: Floats,
+    columns: Floats,
+    viewpoints: Floats,
+    *,
+    tolerance: float = 0.10,
+    sight: float = 4.0,
+    step: float = 0.05,
+) -> WallErrors:
+    """Compare occupied cells with the true surfaces.
+
+    Parameters
+    ----------
+    occupied : (n, 2) m, centres of the occupied cells, frame of the truth.
+    walls : (w, 4) m, x1, y1, x2, y2 of straight surfaces.
+    columns : (c, 3) m, x, y, radius of round ones.
+    viewpoints : (v, 2) m, the true path; only surface that can be seen from it within `sight` m counts for the recall.
+    tolerance : m.
+    step : m, spacing of the samples on the surfaces.
+    """
+    surface = sample_surfaces(walls, columns, step)
+    if not len(occupied) or not len(surface):
+        return WallErrors(tolerance, 0.0, 0.0, float("nan"))
+    distance = cKDTree(surface).query(occupied)[0]
+    visible = surface[visible_from(surface, walls, columns, viewpoints, sight)]
+    covered = cKDTree(occupied).query(visible)[0] <= tolerance if len(visible) else np.zeros(1, dtype=bool)
+    near = distance[distance <= 5.0 * tolerance]
+    rms = float(np.sqrt(np.mean(near**2))) if len(near) else float("nan")
+    return WallErrors(tolerance, float(np.mean(distance <= tolerance)), float(np.mean(covered)), rms)
+
+
+def sample_surfaces(walls: Floats, columns: Floats, step: float) -> Floats:
+    """Return points (n, 2), m, on walls (w, 4) and around columns (c, 3), about `step` m apart."""
+    points = [np.empty((0, 2))]
+    for x1, y1, x2, y2 in walls:
+        n = max(1, round(float(np.hypot(x2 - x1, y2 - y1)) / step))
+        u = (np.arange(n) + 0.5) / n
+        points.append(np.stack([x1 + u * (x2 - x1), y1 + u * (y2 - y1)], axis=1))
+    for x, y, radius in columns:
+        n = max(8, round(2.0 * np.pi * radius / step))
+        angle = 2.0 * np.pi * np.arange(n) / n
+        points.append(np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], axis=1))
+    return np.concatenate(points)
+
+
+_VIEWS = 24
+"""Nearest viewpoints tried for each point of a surface."""
+
+
+def visible_from(points: Floats, walls: Floats, columns: Floats, viewpoints: Floats, sight: float) -> Bools:
+    """Return which points (n,) on surfaces one of the nearest viewpoints (v, 2) sees, m; surfaces hide one another."""
+    if not len(viewpoints):
+        return np.zeros(len(points), dtype=bool)
+    # Viewpoints half a metre apart: the nearest ones then differ in direction, not only in time.
+    coarse = viewpoints[np.unique(np.round(viewpoints / 0.5).astype(np.int64), axis=0, return_index=True)[1]]
+    count = min(_VIEWS, len(coarse))
+    distance, view = cKDTree(coarse).query(points, k=count, distance_upper_bound=sight)
+    point, rank = np.nonzero(np.isfinite(np.atleast_2d(distance.reshape(len(points), count))))
+    start = coarse[view.reshape(len(points), count)[point, rank]]
+    # The ray stops short of the surface, which otherwise would hide itself.
+    gap = points[point] - start
+    end = start + gap * (1.0 - 0.02 / np.maximum(np.hypot(*gap.T), 0.04))[:, None]
+    free = ~_blocked(start, end, walls, columns)
+    seen = np.zeros(len(points), dtype=bool)
+    seen[point[free]] = True
+    return seen
+
+
+def _blocked(start: Floats, end: Floats, walls: Floats, columns: Floats) -> Bools:
+    """Return which of the straight ways (n,) from start (n, 2) to end (n, 2) cross a wall or a column."""
+    way = end - start
+    blocked = np.zeros(len(start), dtype=bool)
+    for x1, y1, x2, y2 in walls:
+        wall, first = np.array([x2 - x1, y2 - y1]), np.array([x1, y1])
+        side_start = (start - first) @ np.array([-wall[1], wall[0]])
+        side_end = (end - first) @ np.array([-wall[1], wall[0]])
+        turn_first = way[:, 0] * (y1 - start[:, 1]) - way[:, 1] * (x1 - start[:, 0])
+        turn_last = way[:, 0] * (y2 - start[:, 1]) - way[:, 1] * (x2 - start[:, 0])
+        blocked |= (side_start * side_end < 0) & (turn_first * turn_last < 0)
+    length2 = np.maximum((way * way).sum(axis=1), 1e-12)
+    for x, y, radius in columns:
+        centre = np.array([x, y])
+        u = np.clip(((centre - start) * way).sum(axis=1) / length2, 0.0, 1.0)
+        blocked |= np.hypot(*(start + u[:, None] * way - centre).T) < radius - 0.02
+    return blocked

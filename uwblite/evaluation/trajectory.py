@@ -1,0 +1,200 @@
+"""How far an estimate is from the truth: trajectory (ATE, RPE, heading) and anchors. Maps: see evaluate_map.
+
+The estimate's frame is arbitrary: it is first laid over the truth by the rigid motion that fits the positions best
+(Umeyama 1991 without scale). Stamps are associated by interpolation: the estimate, which has a pose per odometry stamp, is
+read at the stamps of the truth; where it has no pose within `max_gap`, that stamp of the truth is left out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..errors import DataError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorStatistics:
+    """Figures of a set of non-negative errors, all in the errors' unit."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    max: float
+    count: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrajectoryErrors:
+    """A trajectory against the truth."""
+
+    T_truth_map: Floats
+    """(3,) rigid motion that lays the estimate over the truth."""
+    matched: Ints
+    """(m,) indices of the true poses that were compared."""
+    position: Floats
+    """(m,) m, distance between true and aligned position."""
+    ate: ErrorStatistics
+    """Of `position`, m: the absolute trajectory error (its rmse is what is usually quoted)."""
+    heading: ErrorStatistics | None
+    """Of |heading difference| after alignment, rad; None where the truth has no heading."""
+    rpe_delta: float
+    """Length of the stretches of the relative pose error, m of the true path."""
+    rpe_position: ErrorStatistics | None
+    """m per stretch; None where the truth has no heading or is shorter than one stretch."""
+    rpe_heading: ErrorStatistics | None
+    """rad per stretch; None likewise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnchorErrors:
+    """Estimated anchors against the true ones, laid over by the alignment of the trajectory."""
+
+    ids: tuple[str, ...]
+    """Anchors that were compared, in the order of the truth."""
+    distances: Floats
+    """(a,) m."""
+    rmse: float
+    """m; nan where nothing was compared."""
+    missing: tuple[str, ...]
+    """True anchors without an estimate."""
+
+
+def statistics(errors: Floats) -> ErrorStatistics:
+    """Return the figures of the errors (n,), n >= 1."""
+    return ErrorStatistics(
+        rmse=float(np.sqrt(np.mean(errors**2))),
+        mean=float(np.mean(errors)),
+        median=float(np.median(errors)),
+        std=float(np.std(errors)),
+        max=float(np.max(errors)),
+        count=len(errors),
+    )
+
+
+def align(source: Floats, target: Floats) -> Floats:
+    """Return T_target_source (3,), the rigid motion that minimises the squared distances of paired points.
+
+    Parameters
+    ----------
+    source, target : (n, 2) m, point k of one belongs to point k of the other.
+
+    Notes
+    -----
+    Closed form of Umeyama (1991) in the plane: with centred points p, q the angle is atan2(sum p x q, sum p . q).
+    """
+    p, q = source - source.mean(axis=0), target - target.mean(axis=0)
+    theta = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
+    shift = target.mean(axis=0) - se2.rotate(theta, source.mean(axis=0))
+    return np.array([shift[0], shift[1], float(theta)])
+
+
+def evaluate_trajectory(
+    stamps: Floats,
+    poses: Floats,
+    true_stamps: Floats,
+    true_poses: Floats,
+    *,
+    max_gap: float = 1.0,
+    rpe_delta: float = 1.0,
+    truth_has_heading: bool | None = None,
+) -> TrajectoryErrors:
+    """Compare a trajectory with the truth.
+
+    Parameters
+    ----------
+    stamps, poses : (n,) s and (n, 3) T_map_base, the estimate.
+    true_stamps, true_poses : (k,) s and (k, 3) T_truth_base.
+    max_gap : s; a true stamp between estimated poses farther apart, or outside them by more, is left out.
+    rpe_delta : m of true path per stretch of the relative pose error; stretches follow one another without overlap.
+    truth_has_heading : None = it has unless all true headings are equal (files of positions write the identity).
+
+    Raises
+    ------
+    DataError : fewer than two true stamps lie within the estimate.
+    """
+    matched = _covered(stamps, true_stamps, max_gap)
+    if len(matched) < 2:
+        raise DataError(
+            f"only {len(matched)} of {len(true_stamps)} true stamps ({_span(true_stamps)}) lie within the trajectory"
+            f" ({_span(stamps)}): are both of the same recording and clock?"
+        )
+    truth = true_poses[matched]
+    estimate = se2.interpolate_trajectory(stamps, poses, true_stamps[matched])
+    T_truth_map = align(estimate[:, :2], truth[:, :2])
+    estimate = se2.compose(T_truth_map, estimate)
+    position = np.hypot(*(estimate[:, :2] - truth[:, :2]).T)
+    if truth_has_heading is None:
+        truth_has_heading = bool(np.ptp(true_poses[:, 2]) > 0)
+    heading = rpe_position = rpe_heading = None
+    if truth_has_heading:
+        heading = statistics(np.abs(se2.wrap_angle(estimate[:, 2] - truth[:, 2])))
+        rpe_position, rpe_heading = _relative_errors(estimate, truth, rpe_delta)
+    return TrajectoryErrors(T_truth_map, matched, position, statistics(position), heading, rpe_delta, rpe_position, rpe_heading)
+
+
+def _covered(stamps: Floats, queries: Floats, max_gap: float) -> Ints:
+    """Return the indices of queries that lie between stamps at most max_gap apart, or at a stamp."""
+    right = np.clip(np.searchsorted(stamps, queries), 1, max(1, len(stamps) - 1))
+    if len(stamps) < 2:
+        return np.empty(0, dtype=np.int64)
+    before, after = stamps[right - 1], stamps[right]
+    inside = (queries >= before) & (queries <= after) & (after - before <= max_gap)
+    # Rounded stamps may stick out by a little; a pose held for longer than that would be invented.
+    edge = 1e-3
+    at_a_stamp = (np.abs(queries - before) <= edge) | (np.abs(queries - after) <= edge)
+    return np.flatnonzero(inside | at_a_stamp)
+
+
+def _span(stamps: Floats) -> str:
+    return f"{stamps[0]:.3f} .. {stamps[-1]:.3f} s" if len(stamps) else "none"
+
+
+def _relative_errors(estimate: Floats, truth: Floats, delta: float) -> tuple[ErrorStatistics | None, ErrorStatistics | None]:
+    """Return the figures of E = (truth_i^-1 truth_j)^-1 (estimate_i^-1 estimate_j) over stretches i..j of the path."""
+    ends = stretches(truth[:, :2], delta)
+    if len(ends) < 2:
+        return None, None
+    i, j = ends[:-1], ends[1:]
+    error = se2.between(se2.between(truth[i], truth[j]), se2.between(estimate[i], estimate[j]))
+    return statistics(np.hypot(error[:, 0], error[:, 1])), statistics(np.abs(error[:, 2]))
+
+
+def stretches(positions: Floats, delta: float) -> Ints:
+    """Return indices (k,) that cut a path (n, 2) into stretches: each is the shortest that is at least delta long."""
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))])
+    ends = [0]
+    while True:
+        # Rounding of the running sum must not make a stretch of exactly delta one sample longer.
+        after = int(np.searchsorted(way, way[ends[-1]] + delta - 1e-9 * delta))
+        after = max(after, ends[-1] + 1)
+        if after >= len(way):
+            return np.array(ends, dtype=np.int64)
+        ends.append(after)
+
+
+def evaluate_anchors(
+    ids: tuple[str, ...], positions: Floats, true_ids: tuple[str, ...], true_positions: Floats, T_truth_map: Floats
+) -> AnchorErrors:
+    """Compare anchors by name; estimates that are nan count as missing.
+
+    Parameters
+    ----------
+    ids, positions : names and (a, 2) m in the map frame.
+    true_ids, true_positions : names and (b, 2) m in the frame of the truth.
+    T_truth_map : (3,) alignment of the trajectory.
+    """
+    place = {name: xy for name, xy in zip(ids, positions, strict=True) if np.all(np.isfinite(xy))}
+    found = tuple(name for name in true_ids if name in place)
+    missing = tuple(name for name in true_ids if name not in place)
+    if not found:
+        return AnchorErrors((), np.empty(0), float("nan"), missing)
+    truth = np.array([true_positions[true_ids.index(name)] for name in found])
+    estimate = se2.transform(T_truth_map, np.array([place[name] for name in found]))
+    distances = np.hypot(*(estimate - truth).T)
+    return AnchorErrors(found, distances, float(np.sqrt(np.mean(distances**2))), missing)

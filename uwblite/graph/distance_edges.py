@@ -1,0 +1,97 @@
+"""Distances that somebody measured, with a tape say: between anchors, and between what poses saw. Two kinds of edges."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from .graph import Graph, Linearization
+from .robust import SQUARED, Kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnchorDistanceEdges:
+    """Distance between two anchors: e = |a_i - a_j| - d."""
+
+    i: Ints
+    """(e,) index of one anchor."""
+    j: Ints
+    """(e,) index of the other."""
+    distance: Floats
+    """(e,) m."""
+    sigma: Floats
+    """(e,) m."""
+    kernel: Kernel = SQUARED
+    weights: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def _offset(self, graph: Graph) -> tuple[Floats, Floats]:
+        offset = graph.anchors[self.i] - graph.anchors[self.j]
+        return offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
+
+    def residuals(self, graph: Graph) -> Floats:
+        """Return whitened residuals (e, 1)."""
+        return ((self._offset(graph)[1] - self.distance) / self.sigma)[:, None]
+
+    def linearize(self, graph: Graph) -> Linearization:
+        """Return whitened residuals and Jacobians by both anchors."""
+        offset, length = self._offset(graph)
+        by_i = (offset / (length * self.sigma)[:, None])[:, None, :]
+        residuals = ((length - self.distance) / self.sigma)[:, None]
+        return Linearization(residuals, (("anchors", self.i, by_i), ("anchors", self.j, -by_i)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointDistanceEdges:
+    """Distance between two points that are fixed to poses: e = |X_i p_i - X_j p_j| - d.
+
+    The points are landmarks as the two poses saw them: between them the map has to have the measured length.
+    """
+
+    i: Ints
+    """(e,) index of one pose."""
+    j: Ints
+    """(e,) index of the other."""
+    point_i: Floats
+    """(e, 2) m, in the frame of pose i."""
+    point_j: Floats
+    """(e, 2) m, in the frame of pose j."""
+    distance: Floats
+    """(e,) m."""
+    sigma: Floats
+    """(e,) m."""
+    kernel: Kernel = SQUARED
+    weights: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def _arms(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return both points as seen from their poses, turned into the map (e, 2), their offset (e, 2) and distance (e,)."""
+        one, other = graph.poses[self.i], graph.poses[self.j]
+        arm_i, arm_j = se2.rotate(one[:, 2], self.point_i), se2.rotate(other[:, 2], self.point_j)
+        offset = one[:, :2] + arm_i - other[:, :2] - arm_j
+        return arm_i, arm_j, offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
+
+    def lengths(self, graph: Graph) -> Floats:
+        """Return the distances (e,), m, as the graph has them."""
+        return self._arms(graph)[3]
+
+    def residuals(self, graph: Graph) -> Floats:
+        """Return whitened residuals (e, 1)."""
+        return ((self.lengths(graph) - self.distance) / self.sigma)[:, None]
+
+    def linearize(self, graph: Graph) -> Linearization:
+        """Return whitened residuals and Jacobians by both poses."""
+        arm_i, arm_j, offset, length = self._arms(graph)
+        along = offset / (length * self.sigma)[:, None]
+        by_i = np.column_stack([along, along[:, 1] * arm_i[:, 0] - along[:, 0] * arm_i[:, 1]])[:, None, :]
+        by_j = np.column_stack([-along, along[:, 0] * arm_j[:, 1] - along[:, 1] * arm_j[:, 0]])[:, None, :]
+        residuals = ((length - self.distance) / self.sigma)[:, None]
+        return Linearization(residuals, (("poses", self.i, by_i), ("poses", self.j, by_j)))

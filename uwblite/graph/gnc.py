@@ -1,0 +1,127 @@
+"""Graduated non-convexity: decide which edges of chosen kinds are outliers while optimising.
+
+The truncated square min(r^2, c^2) is approached from a nearly convex surrogate as mu grows from about 0; each edge's
+weight follows in closed form from its residual (H. Yang, P. Antonante, V. Tzoumas, L. Carlone, Graduated Non-Convexity
+for Robust Spatial Perception, RA-L 2020, equation 14)::
+
+    w = 0                             r^2 >= (mu + 1) / mu c^2
+    w = 1                             r^2 <= mu / (mu + 1) c^2
+    w = c / r sqrt(mu (mu + 1)) - mu  between
+
+Two things are our own: the search starts from the residuals of the estimate it is given instead of an optimum that
+trusts every edge, and one or two Gauss-Newton steps per mu are enough, since the next mu follows closely.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError
+from .graph import Edges, Graph, Linearization
+from .normal_equations import NormalEquations
+from .robust import SQUARED
+from .solver import Progress, SolverConfig, SolverSummary, check, linearize, minimise
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class GncConfig:
+    """How fast to become strict."""
+
+    growth: float = 2.0
+    """Factor on mu from step to step."""
+    steps_per_mu: int = 1
+    """Linear systems solved per mu."""
+    reach: float = 100.0
+    """Residual, in thresholds, beyond which an edge starts with weight 0; it may still come back."""
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    """Of the last optimisation, with the weights decided."""
+
+    def __post_init__(self) -> None:
+        if not self.growth > 1.0:
+            raise ConfigError(f"growth must be above 1, not {self.growth}")
+        if self.steps_per_mu < 1:
+            raise ConfigError(f"steps_per_mu must be at least 1, not {self.steps_per_mu}")
+        if not self.reach > 1.0:
+            raise ConfigError(f"reach must be above 1, not {self.reach}")
+
+
+def truncated_weight(squared: Floats, mu: float) -> Floats:
+    """Return the weights (e,) of residuals whose squares (e,) are given in units of the squared threshold."""
+    between = np.sqrt(mu * (mu + 1.0) / np.maximum(squared, 1e-300)) - mu
+    return np.clip(np.where(squared >= (mu + 1.0) / mu, 0.0, between), 0.0, 1.0)
+
+
+def optimize_gnc(
+    graph: Graph, thresholds: Mapping[int, float], config: GncConfig = GncConfig(), progress: Progress | None = None
+) -> tuple[Graph, SolverSummary, dict[int, Floats]]:
+    """Optimise a graph and find the outliers among chosen kinds of edges.
+
+    Parameters
+    ----------
+    graph : estimates to start from and edges; a kind's own weights stay as factors, its kernel is not used.
+    thresholds : by position in ``graph.edges``, the whitened norm, in standard deviations, above which an edge is an
+        outlier: the root of a chi-square quantile, 3 for ranges, 4 for poses.
+    progress : called with (done, most) after every step, `most` being an estimate.
+
+    Returns
+    -------
+    The graph, its chosen edges carrying the weights found; the summary of the last optimisation; and by position the
+    weights (e,) themselves, 0 = outlier, 1 = inlier.
+    """
+    check(graph)
+    _check_thresholds(graph, thresholds)
+    edges = tuple(replace(e, kernel=SQUARED) if k in thresholds else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
+    plain = replace(graph, edges=edges)
+    linearized = linearize(plain)
+    normal = NormalEquations(plain, linearized)
+    worst = max((float(np.max(s)) for s in _squared(plain, thresholds).values() if len(s)), default=0.0)
+    mu = 1.0 / max(2.0 * min(worst, config.reach**2) - 1.0, 1e-3)
+    few = replace(config.solver, max_iterations=config.steps_per_mu)
+    most = max(1, int(np.ceil(np.log(_STRICT / mu) / np.log(config.growth))))
+    current = plain
+    for step in range(most):
+        weights = {k: truncated_weight(s, mu) for k, s in _squared(current, thresholds).items()}
+        current, _ = minimise(*_weighted(current, plain, weights), normal, few)
+        if progress is not None:
+            progress(step + 1, most + 1)
+        mu *= config.growth
+        if all(np.all((w == 0.0) | (w == 1.0)) for w in weights.values()):
+            break
+    weights = {k: (s < 1.0).astype(np.float64) for k, s in _squared(current, thresholds).items()}
+    current, summary = minimise(*_weighted(current, plain, weights), normal, config.solver)
+    if progress is not None:
+        progress(most + 1, most + 1)
+    return current, summary, weights
+
+
+_STRICT = 100.0
+"""mu at which the surrogate is the truncated square to within a per cent of the threshold."""
+
+
+def _check_thresholds(graph: Graph, thresholds: Mapping[int, float]) -> None:
+    for position, threshold in thresholds.items():
+        if not 0 <= position < len(graph.edges):
+            raise ConfigError(f"threshold for edges {position}: the graph has {len(graph.edges)} kinds of edges")
+        if not threshold > 0:
+            raise ConfigError(f"threshold for edges {position} must be positive, not {threshold}")
+
+
+def _squared(graph: Graph, thresholds: Mapping[int, float]) -> dict[int, Floats]:
+    """Return the squared residuals of the chosen kinds in units of their squared thresholds."""
+    residuals = {k: graph.edges[k].residuals(graph) for k in thresholds}
+    return {k: np.einsum("ed,ed->e", r, r) / thresholds[k] ** 2 for k, r in residuals.items()}
+
+
+def _weighted(current: Graph, plain: Graph, weights: Mapping[int, Floats]) -> tuple[Graph, list[Linearization]]:
+    """Return the present estimates with the plain graph's edges weighted, and their linearisation."""
+    edges = tuple(_reweighted(e, weights[k]) if k in weights else e for k, e in enumerate(plain.edges))
+    graph = replace(current, edges=edges)
+    return graph, linearize(graph)
+
+
+def _reweighted(edges: Edges, weights: Floats) -> Edges:
+    return replace(edges, weights=weights if edges.weights is None else weights * edges.weights)  # type: ignore[type-var]

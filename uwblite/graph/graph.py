@@ -1,0 +1,165 @@
+"""The pose graph: what is unknown (poses, anchors, calibration) and what edges that measure it offer.
+
+Edges of one kind are one dataclass of arrays. Each kind offers ``residuals(graph)`` and ``linearize(graph)``; both
+are whitened, so that the sum of squares is chi2 in units of the measurements' standard deviations. A new sensor is
+one more dataclass and one more row in the numeric-Jacobian test; the solver does not change. ``pose_edges`` and
+``range_edges`` hold what wheels, lidar and radio measure; knowledge of an unknown itself, a prior, stands here.
+
+Unknowns live in three blocks: ``poses`` (n, 3) T_map_base, ``anchors`` (a, 2) in the map frame and ``calibration``
+(c,), a vector of named scalars. They are updated by addition (angles wrapped). Pose residuals use the chart of g2o,
+e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's.
+"""
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..errors import DataError
+from .robust import SQUARED, Kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Block = tuple[str, Ints, Floats]
+"""(block name, index (e,) of the unknown in that block, Jacobian (e, d, k) of the whitened residual by it)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearization:
+    """Whitened residuals of one kind of edges and their Jacobians."""
+
+    residuals: Floats
+    """(e, d), in standard deviations."""
+    blocks: tuple[Block, ...]
+    """An edge may name several unknowns of one block; each is an entry of its own."""
+
+
+def pick_rows(edges: Any, which: Ints) -> Any:
+    """Return some of the edges of a kind (rows of every array but those its SHARED names); kernel and kind stay."""
+    shared = getattr(edges, "SHARED", ())
+    own = {f.name: getattr(edges, f.name) for f in fields(edges)}
+    arrays = {n: v for n, v in own.items() if isinstance(v, np.ndarray) and len(v) and n not in shared}
+    per_edge = {n: v[which] for n, v in arrays.items()}
+    return replace(edges, **per_edge)
+
+
+class Edges(Protocol):
+    """What every kind of edges offers."""
+
+    @property
+    def kernel(self) -> Kernel:
+        """Robust kernel applied to each edge's squared whitened norm."""
+
+    @property
+    def weights(self) -> Floats | None:
+        """(e,) factors on each edge's cost (0 switches it off), None = all 1."""
+
+    def __len__(self) -> int: ...
+
+    def residuals(self, graph: "Graph") -> Floats:
+        """Return whitened residuals (e, d)."""
+
+    def linearize(self, graph: "Graph") -> Linearization:
+        """Return whitened residuals and Jacobians."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Named scalar unknowns."""
+
+    names: tuple[str, ...] = ()
+    values: Floats = field(default_factory=lambda: np.zeros(0))
+    """(c,), unit by name: see calibration.py."""
+
+    def index(self, name: str) -> int:
+        """Return the position of a name, -1 where it is not an unknown of this graph."""
+        return self.names.index(name) if name in self.names else -1
+
+    def get(self, name: str, default: float = 0.0) -> float:
+        """Return the value of a name, or the default where it is not an unknown of this graph."""
+        i = self.index(name)
+        return default if i < 0 else float(self.values[i])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Graph:
+    """Estimates, what of them is held fixed, and the measurements between them."""
+
+    poses: Floats
+    """(n, 3) T_map_base."""
+    anchors: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    """(a, 2) m, map frame."""
+    edges: tuple[Edges, ...] = ()
+    calibration: Calibration = field(default_factory=Calibration)
+    fixed_poses: NDArray[np.bool_] | None = None
+    """(n,) True = held; None = the first pose is held (gauge)."""
+    fixed_anchors: NDArray[np.bool_] | None = None
+    """(a,) True = held; None = all free."""
+    fixed_calibration: NDArray[np.bool_] | None = None
+    """(c,) True = held; None = all free."""
+
+    def with_edges(self, *edges: Edges) -> "Graph":
+        """Return the graph with further edges; empty ones are left out."""
+        return replace(self, edges=self.edges + tuple(e for e in edges if len(e)))
+
+    def updated(self, poses: Floats, anchors: Floats, calibration: Floats) -> "Graph":
+        """Return the graph with new estimates."""
+        return replace(self, poses=poses, anchors=anchors, calibration=replace(self.calibration, values=calibration))
+
+    def with_estimates_of(self, solved: "Graph") -> "Graph":
+        """Return the graph with the estimates of another, its own edges kept."""
+        return self.updated(solved.poses, solved.anchors, solved.calibration.values)
+
+    def chi2(self) -> float:
+        """Return the sum of squared whitened residuals, robust kernels and weights applied."""
+        return sum(edge_cost(e, e.residuals(self)) for e in self.edges)
+
+
+def edge_cost(edges: Edges, residuals: Floats) -> float:
+    """Return the robust, weighted cost of whitened residuals (e, d) of these edges."""
+    rho = edges.kernel.rho(np.einsum("ed,ed->e", residuals, residuals))
+    return float(np.sum(rho if edges.weights is None else rho * edges.weights))
+
+
+def whiten(sqrt_information: Floats, values: Floats) -> Floats:
+    """Return values (e, 3, ...) or vectors (e, d) times each edge's square root of information (e, d, d)."""
+    return np.einsum("eij,ej...->ei...", sqrt_information, values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PriorEdges:
+    """Direct knowledge of unknowns of one block: a surveyed anchor, a pinned pose, a plausible calibration."""
+
+    block: str
+    """'poses', 'anchors' or 'calibration'."""
+    index: Ints
+    """(e,) which unknown."""
+    value: Floats
+    """(e, k) with k = 3, 2, 1 by block; angles in rad."""
+    sqrt_information: Floats
+    """(e, k, k) L with information = L^T L."""
+    kernel: Kernel = SQUARED
+    weights: Floats | None = None
+
+    def __post_init__(self) -> None:
+        if self.block not in ("poses", "anchors", "calibration"):
+            raise DataError(f"a prior on {self.block!r}: it must be on poses, anchors or calibration")
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def residuals(self, graph: Graph) -> Floats:
+        """Return whitened residuals (e, k)."""
+        if self.block == "calibration":
+            error = graph.calibration.values[self.index][:, None] - self.value
+        else:
+            error = (graph.poses if self.block == "poses" else graph.anchors)[self.index] - self.value
+        if self.block == "poses":
+            error[:, 2] = se2.wrap_angle(error[:, 2])
+        return whiten(self.sqrt_information, error)
+
+    def linearize(self, graph: Graph) -> Linearization:
+        """Return whitened residuals and Jacobians."""
+        return Linearization(self.residuals(graph), ((self.block, self.index, self.sqrt_information),))

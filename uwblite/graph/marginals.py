@@ -1,0 +1,177 @@
+"""Marginal covariances of an optimised graph, from the sparse factor of its normal equations."""
+
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lapack
+from scipy.sparse.linalg import SuperLU
+
+from .. import se2
+from ..errors import SolverError
+from .graph import Graph
+from .normal_equations import NormalEquations
+from .selected_inverse import selected_inverse
+from .solver import edge_weights, linearize
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_AT_ONCE = 300
+"""Right-hand sides solved together: bounds the memory."""
+_DEPENDENT = 1e-13
+"""Pivot, as a share of its diagonal entry, below which a direction counts as measured by nothing."""
+
+
+class Marginals:
+    """Covariances of the unknowns of a graph given all its measurements.
+
+    Zero where an unknown is held fixed, infinite on the diagonal where no edge touches it. A direction that edges
+    leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
+    """
+
+    def __init__(self, graph: Graph, normal: NormalEquations) -> None:
+        self._graph, self._unknowns = graph, normal.unknowns
+        self._factor = _factor(normal)
+        unseen = np.append(normal.diagonal <= 0, False)
+        blocks = self._block_diagonal(unseen)
+        self.poses = blocks["poses"]
+        """(n, 3, 3) of x, y, theta, map frame, m and rad."""
+        self.anchors = blocks["anchors"]
+        """(a, 2, 2) m^2, map frame."""
+        self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
+        """(c,) standard deviations, unit by name."""
+
+    def _block_diagonal(self, unseen: NDArray[np.bool_]) -> dict[str, Floats]:
+        """Return by block of unknowns the covariance of each with itself."""
+        numbers = self._unknowns.number
+        rows = {name: np.broadcast_to(n[:, :, None], (*n.shape, n.shape[1])) for name, n in numbers.items()}
+        columns = {name: np.broadcast_to(n[:, None, :], (*n.shape, n.shape[1])) for name, n in numbers.items()}
+        row, column = (np.concatenate([part[name].ravel() for name in numbers]) for part in (rows, columns))
+        free = row >= 0
+        values = np.zeros(len(row))
+        values[free] = selected_inverse(self._factor, row[free], column[free])
+        values[unseen[row] & (row == column)] = np.inf
+        ends = np.cumsum([part.size for part in rows.values()])[:-1]
+        return {name: v.reshape(rows[name].shape) for name, v in zip(numbers, np.split(values, ends), strict=True)}
+
+    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
+        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""
+        i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
+        return _relative(self._graph, i, j, self.poses[i], self.poses[j], self._cross(i, j))
+
+    def _cross(self, i: Ints, j: Ints) -> Floats:
+        """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the fewer of them."""
+        if len(np.unique(i)) < len(np.unique(j)):
+            return self._cross(j, i).transpose(0, 2, 1)
+        number = self._unknowns.number["poses"]
+        cross = np.zeros((len(i), 3, 3))
+        sources = np.unique(j)
+        for first in range(0, len(sources), _AT_ONCE // 3):
+            part = sources[first : first + _AT_ONCE // 3]
+            here = np.nonzero((j >= part[0]) & (j <= part[-1]))[0]
+            columns = self._columns(number[part].ravel())
+            at = 3 * np.searchsorted(part, j[here])[:, None, None] + np.arange(3)
+            cross[here] = columns[number[i[here]][:, :, None], at]
+        return cross
+
+    def _columns(self, numbers: Ints) -> Floats:
+        """Return columns (size + 1, m) of the covariance; the last row and the columns of held scalars (-1) are 0."""
+        right = np.zeros((self._unknowns.size + 1, len(numbers)))
+        right[numbers, np.arange(len(numbers))] = 1.0
+        right[-1] = 0.0
+        right[:-1] = self._factor.solve(right[:-1])
+        return right
+
+
+class JointCovariance:
+    """Covariances among some poses of a graph given all its measurements: of all their pairs at once."""
+
+    def __init__(self, graph: Graph, poses: Ints) -> None:
+        """Eliminate everything else; the rest of the factor is that of the poses' own information matrix.
+
+        With the chosen poses last, H = L D L^T ends in a dense block L2 D2 L2^T, their information once all others are
+        marginalised out, and its inverse is W^T W with W = D2^-1/2 L2^-1.
+        """
+        number, size, lower, pivots, place = _last_block(graph, poses)
+        whitened = lapack.dtrtri(lower, lower=1, unitdiag=1, overwrite_c=1)[0]
+        whitened /= np.sqrt(pivots)[:, None]
+        self._graph = graph
+        self._covariance: Floats = whitened.T @ whitened
+        self._row = np.where(number >= size, place[np.maximum(number - size, 0)], -1)
+
+    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
+        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
+        i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
+
+        def among(a: Ints, b: Ints) -> Floats:
+            row, column = self._row[a][:, :, None], self._row[b][:, None, :]
+            return np.asarray(self._covariance[row, column] * ((row >= 0) & (column >= 0)))
+
+        return _relative(self._graph, i, j, among(i, i), among(j, j), among(i, j))
+
+
+def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
+    """Return the end of the factor with these poses last: their places among the unknowns (k, 3), -1 = held, and what it
+    takes to read it: where the block begins, L2 (n, n), the diagonal of D2 (n,), and each unknown's row in them (n,)."""
+    normal = _filled(graph, last=poses)
+    factor, number = _factor(normal), normal.unknowns.number["poses"]
+    # Behind the chosen poses stand only anchors and calibration.
+    first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
+    place = factor.perm_c[np.arange(first, normal.unknowns.size)].astype(np.int64)
+    inside = np.sort(place)
+    lower = factor.L[inside][:, inside].toarray(order="F")
+    return number, first, lower, factor.U.diagonal()[inside], np.searchsorted(inside, place)
+
+
+def _relative(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross: Floats) -> Floats:
+    """Return the covariances (m, 3, 3) of between(X_i, X_j) by the poses' own and mutual ones."""
+    by_i, by_j = se2.between_jacobians(graph.poses[i], graph.poses[j])
+    mixed = by_i @ cross @ by_j.transpose(0, 2, 1)
+    own = by_i @ of_i @ by_i.transpose(0, 2, 1) + by_j @ of_j @ by_j.transpose(0, 2, 1)
+    return own + mixed + mixed.transpose(0, 2, 1)
+
+
+def _filled(graph: Graph, subtrees: bool = False, last: Ints | None = None) -> NormalEquations:
+    """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations."""
+    linearized = linearize(graph)
+    normal = NormalEquations(graph, linearized, subtrees, last)
+    normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
+    return normal
+
+
+def _factor(normal: NormalEquations) -> SuperLU:
+    """Factorise H itself where it is regular, else with a trace of damping that leaves open directions open."""
+    diagonal = normal.diagonal
+    seen = diagonal > 0
+    try:
+        factor = cast(SuperLU, normal.factor(np.where(seen, 0.0, 1.0)))
+        pivots = factor.U.diagonal()[factor.perm_c]
+        if np.all(pivots > _DEPENDENT * np.where(seen, diagonal, 1.0)):
+            return factor
+    except SolverError:
+        pass
+    return cast(SuperLU, normal.factor(np.where(seen, 1e-12 * diagonal, 1.0)))
+
+
+def marginals(graph: Graph) -> Marginals:
+    """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand."""
+    return Marginals(graph, _filled(graph, subtrees=True))
+
+
+def calibration_covariance(graph: Graph) -> Floats:
+    """Return the covariance (c, c) of the calibration values at the graph's estimates; 0 where they are held.
+
+    Raises
+    ------
+    SolverError : the measurements leave a direction open.
+    """
+    normal = _filled(graph)
+    number = normal.unknowns.number["calibration"][:, 0]
+    free = np.flatnonzero(number >= 0)
+    right = np.zeros((normal.unknowns.size, len(free)))
+    right[number[free], np.arange(len(free))] = 1.0
+    columns = normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0)).solve(right)
+    covariance = np.zeros((len(number), len(number)))
+    covariance[np.ix_(free, free)] = columns[number[free]]
+    return covariance

@@ -1,0 +1,189 @@
+"""Where the values of a symmetric matrix, kept as blocks of its lower triangle, go before they are factorised.
+
+The places are found once; each factorisation then gathers the values with one indexing operation.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU
+
+from .factorization import BandedFactor, BorderedFactor, Factor, Ordering, superlu
+from .schwarz_cg import LocalPlaces, Pieces, TwoLevelFactor
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class Layout(Protocol):
+    """Places of the values."""
+
+    def factor(self, values: Floats) -> Factor:
+        """Factorise the matrix with these values; raise SolverError where a factorisation meets a pivot it cannot use."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """The lower triangle of a symmetric matrix as one array: blocks row by row, then full rows at the end."""
+
+    row: Ints
+    """(b,) first row of each block; a block on the diagonal is square and only its lower triangle counts."""
+    column: Ints
+    """(b,) first column."""
+    height: Ints
+    """(b,) rows, at most 3."""
+    width: Ints
+    """(b,) columns, at most 3."""
+    start: Ints
+    """(b,) place of the first value."""
+    size: int
+    """Rows of the matrix."""
+    full: int
+    """How many of them, the last, are full."""
+    full_start: int
+    """Place of the first value of the full rows."""
+
+    def inside(self, size: int) -> "Blocks":
+        """Return the blocks within the first rows and columns; no block lies across."""
+        keep = self.row < size
+        row, column, height, width, start = (a[keep] for a in (self.row, self.column, self.height, self.width, self.start))
+        return Blocks(row, column, height, width, start, size, 0, 0)
+
+    def full_entries(self) -> tuple[Ints, Ints, Ints]:
+        """Return row, column and place of every value of the full rows in the lower triangle."""
+        row, column = np.divmod(np.arange(self.full * self.size), self.size)
+        inside = column <= row + self.size - self.full
+        return row[inside] + self.size - self.full, column[inside], self.full_start + np.nonzero(inside)[0]
+
+    def entries(self) -> tuple[Ints, Ints, Ints]:
+        """Return row, column and place of every value in the lower triangle."""
+        found = [self.full_entries()]
+        for i, j in np.ndindex(3, 3):
+            has = (i < self.height) & (j < self.width) & (self.row + i >= self.column + j)
+            found.append((self.row[has] + i, self.column[has] + j, self.start[has] + i * self.width[has] + j))
+        rows, columns, places = (np.concatenate(part) for part in zip(*found, strict=True))
+        return rows, columns, places
+
+
+_SHAPES = ((3, 3), (2, 3), (3, 2), (2, 2))
+"""Shapes of blocks between poses and anchors."""
+
+
+def _both_triangles(blocks: Blocks) -> tuple[Ints, ...]:
+    """Return row, column, height, width, start and step down and across of the blocks of both triangles, by column."""
+    apart = blocks.row != blocks.column
+    one, start = np.ones_like(blocks.row), blocks.start
+    lower = (blocks.row, blocks.column, blocks.height, blocks.width, start, blocks.width, one)
+    upper = (blocks.column, blocks.row, blocks.width, blocks.height, start, one, blocks.width)
+    both = [np.concatenate([a, b[apart]]) for a, b in zip(lower, upper, strict=True)]
+    order = np.argsort(both[1] * blocks.size + both[0])
+    return tuple(a[order] for a in both)
+
+
+class SparseLayout:
+    """Both triangles in compressed columns."""
+
+    def __init__(self, blocks: Blocks) -> None:
+        """Find for every entry of the compressed columns its place among the values."""
+        n, inner = blocks.size, blocks.size - blocks.full
+        row, column, height, width, start, down, across = _both_triangles(blocks)
+        own = row == column
+        above = np.cumsum(height) - height
+        above -= np.maximum.accumulate(np.where(np.diff(column, prepend=-1) > 0, above, 0))
+        in_blocks = np.bincount(column, height, n).astype(np.int64)
+        tall = np.full(n, n)
+        for k in range(3):
+            has = own & (k < width)
+            tall[column[has] + k] = in_blocks[column[has]] + blocks.full
+        indptr = np.concatenate([[0], np.cumsum(tall)])
+        indices, source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.int32)
+        for h, w in _SHAPES:
+            some = np.nonzero((height == h) & (width == w))[0]
+            r, own_some, at_column = row[some], own[some], column[some]
+            for i, j in np.ndindex(h, w):
+                at = indptr[at_column + j] + (above[some] + i)
+                indices[at] = r + i
+                place = start[some] + (i * down[some] + j * across[some])
+                if i < j:
+                    place = np.where(own_some, start[some] + (j * down[some] + i * across[some]), place)
+                source[at] = place
+        full = blocks.full_start + np.arange(blocks.full)[:, None] * n
+        each = np.arange(n)
+        for f in range(blocks.full):
+            at = indptr[1 : inner + 1] - blocks.full + f
+            indices[at], source[at] = inner + f, full[f] + each[:inner]
+            at = indptr[inner + f] + each
+            indices[at], source[at] = (
+                each,
+                np.where(each <= inner + f, full[f] + each, full[np.maximum(each - inner, 0), 0] + inner + f),
+            )
+        self._source = source
+        self._matrix = sparse.csc_matrix((np.zeros(len(indices)), indices, indptr), shape=(n, n))
+
+    def factor(self, values: Floats) -> SuperLU:
+        """Factorise the matrix with these values; it is used up by the next call."""
+        return superlu(self.matrix(values), "NATURAL")
+
+    def matrix(self, values: Floats) -> sparse.csc_matrix:
+        """Return the matrix with these values; it is used up by the next call."""
+        np.take(values, self._source, out=self._matrix.data)
+        return self._matrix
+
+
+class IterativeLayout:
+    """Both triangles in compressed columns, and where their pieces are."""
+
+    def __init__(self, blocks: Blocks, pieces: Pieces) -> None:
+        """Find the places of the values in the matrix, and of its entries in the pieces' blocks."""
+        self._sparse, self._pieces = SparseLayout(blocks), pieces
+        self._local = LocalPlaces(self._sparse.matrix(np.zeros(blocks.full_start + blocks.full * blocks.size + 1)), pieces)
+
+    def factor(self, values: Floats) -> TwoLevelFactor:
+        """Prepare to solve with these values, up to the next call."""
+        return TwoLevelFactor(self._sparse.matrix(values), self._pieces, self._local)
+
+
+class BandedLayout:
+    """LAPACK's lower band."""
+
+    def __init__(self, blocks: Blocks) -> None:
+        """Find where in the band each value goes."""
+        rows, columns, self._from = blocks.entries()
+        self._half = int(np.max(rows - columns, initial=0)) + 1
+        self._to = (rows - columns) + columns * self._half
+        self._size = blocks.size
+
+    def factor(self, values: Floats) -> BandedFactor:
+        """Factorise the matrix with these values."""
+        band = np.zeros(self._size * self._half)
+        band[self._to] = values[self._from]
+        return BandedFactor(band.reshape(self._size, self._half))
+
+
+class BorderedLayout:
+    """A large matrix inside, and a border of few rows that are full."""
+
+    def __init__(self, inside: Layout, blocks: Blocks, size: int) -> None:
+        """Find where in the border each value goes; the first `size` rows are inside."""
+        rows, columns, places = blocks.entries()
+        below = rows >= size
+        self._inside, self._shape = inside, (blocks.size - size, blocks.size)
+        self._from, self._to = places[below], columns[below] + (rows[below] - size) * blocks.size
+
+    def factor(self, values: Floats) -> BorderedFactor:
+        """Factorise the matrix with these values."""
+        border = np.zeros(self._shape)
+        border.ravel()[self._to] = values[self._from]
+        return BorderedFactor(self._inside.factor(values), border)
+
+
+def make_layout(blocks: Blocks, ordering: Ordering, poses: int) -> Layout:
+    """Return the layout that an ordering asks for; the first `poses` rows are those of poses."""
+    if not ordering.bordered:
+        return SparseLayout(blocks)
+    inside = blocks.inside(poses)
+    layout: Layout = BandedLayout(inside) if ordering.banded else SparseLayout(inside)
+    return layout if poses == blocks.size else BorderedLayout(layout, blocks, poses)

@@ -1,0 +1,249 @@
+"""Normal equations of a graph: where every product of Jacobians lands is analysed once, the values are filled often.
+
+A *node* is one free unknown: a pose (3 scalars), an anchor (2) or a calibration value (1). The lower triangle of
+H = J^T W J is kept as one array: the blocks between nodes that share an edge, one after the other, then the *border*,
+full rows for the calibration values, which touch nearly every pose and therefore take no part in the ordering. Scalars
+are numbered in the order of elimination, so that vectors need no permutation.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .factorization import Factor, choose_ordering
+from .graph import Graph, Linearization
+from .matrix_layout import Blocks, IterativeLayout, Layout, make_layout
+from .schwarz_cg import cut
+from .unknowns import WIDTHS, Unknowns, free_unknowns
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_AT_ONCE = 1 << 15
+"""Edges whose products are held at once; a bound on the memory."""
+_NONE = np.zeros(0, dtype=np.int64)
+_Touched = tuple[Ints, bool]
+"""Node (e,) touched by each edge, -1 = held; and whether it takes part in the ordering."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places:
+    """Where the products of some edges of one kind land."""
+
+    products: NDArray[np.int32]
+    """Place of every product of two Jacobian columns among the values."""
+    twice: Ints
+    """Which of them count twice."""
+    rows: NDArray[np.int32]
+    """Row of the gradient of every product of a column with the residual."""
+
+
+class NormalEquations:
+    """H = J^T W J and g = J^T W r of a graph's edges; rows and columns are the free scalars."""
+
+    def __init__(
+        self, graph: Graph, linearized: Sequence[Linearization], subtrees: bool = False, last: Ints | None = None
+    ) -> None:
+        """Number the unknowns and find where every product lands.
+
+        Parameters
+        ----------
+        graph : what is free.
+        linearized : of every kind of edges; only the indices and shapes of its blocks are read.
+        subtrees : order for the selected inverse, not for speed.
+        last : poses to be eliminated after all others.
+        """
+        free = free_unknowns(graph)
+        counts = [int(mask.sum()) for mask in free.values()]
+        self._inner = counts[0] + counts[1]
+        width = np.repeat(list(WIDTHS.values()), counts)
+        node, first = {}, 0
+        for (name, mask), count in zip(free.items(), counts, strict=True):
+            node[name] = np.where(mask, first + np.cumsum(mask) - 1, -1)
+            first += count
+        touched = [[(node[name][index], name != "calibration") for name, index, _ in lin.blocks] for lin in linearized]
+        pairs, which = self._pairs(touched)
+        among_poses = pairs[(pairs < counts[0]).all(axis=1)]
+        late = None if last is None else node["poses"][last]
+        ordering = choose_ordering(among_poses, counts[0], int(width[counts[0] :].sum()), subtrees, late)
+        order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
+        corner = np.full(len(width) + 1, -1)
+        corner[order] = np.cumsum(width[order]) - width[order]
+        scalars = {
+            name: np.where(node[name] >= 0, corner[node[name]] + np.arange(w)[:, None], -1) for name, w in WIDTHS.items()
+        }
+        self.unknowns = Unknowns({name: s.T for name, s in scalars.items()}, int(width.sum()))
+        blocks = self._place_blocks(pairs, corner, width)
+        self._place_products(linearized, touched, which, corner)
+        if ordering.iterative:
+            number = self.unknowns.number["poses"]
+            chain = number[:, 0] >= 0
+            self._layout: Layout = IterativeLayout(blocks, cut(number[chain], graph.poses[chain], self.unknowns.size))
+        else:
+            self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
+        self.values: Floats = np.zeros(self._trash + 1)
+        self.gradient: Floats = np.zeros(self.unknowns.size)
+
+    def _pairs(self, touched: list[list[_Touched]]) -> tuple[Ints, list[Ints]]:
+        """Return the pairs (b, 2) of inner nodes that share an edge, every node with itself first; and each edge's pair."""
+        m = self._inner
+        keys = [np.array([m * m])]
+        for nodes in touched:
+            for p, (a, a_inner) in enumerate(nodes):
+                for b, b_inner in nodes[:p]:
+                    if a_inner and b_inner:
+                        low, high = np.minimum(a, b), np.maximum(a, b)
+                        keys.append(np.where((low >= 0) & (low < high), low * m + high, m * m))
+        unique, which = np.unique(np.concatenate(keys), return_inverse=True)
+        apart = np.stack(np.divmod(unique[:-1], max(m, 1)), axis=1)
+        pairs = np.concatenate([np.repeat(np.arange(m), 2).reshape(m, 2), apart])
+        ends = np.cumsum([len(k) for k in keys])
+        return pairs, [part + m for part in np.split(which, ends)[1:-1]]
+
+    def _place_blocks(self, pairs: Ints, corner: Ints, width: Ints) -> Blocks:
+        """Lay the blocks out in the array of values."""
+        swap = corner[pairs[:, 0]] < corner[pairs[:, 1]]
+        lower, left = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
+        height, across = width[lower], width[left]
+        ends = np.cumsum(height * across)
+        full = len(width) - self._inner
+        blocks = Blocks(
+            corner[lower],
+            corner[left],
+            height,
+            across,
+            ends - height * across,
+            int(width.sum()),
+            full,
+            int(np.sum(height * across)),
+        )
+        first_full = blocks.size - blocks.full
+        self._base = np.append(
+            blocks.start - blocks.row * blocks.width - blocks.column, blocks.full_start - first_full * blocks.size
+        )
+        self._stride = np.append(blocks.width, blocks.size)
+        self._trash = blocks.full_start + blocks.full * blocks.size
+        each = np.repeat(np.arange(len(width)), width)
+        scalar = np.repeat(corner[:-1] - np.cumsum(width) + width, width) + np.arange(blocks.size)
+        block = np.where(each < self._inner, each, len(pairs))
+        self._diagonal = np.empty(blocks.size, dtype=np.int64)
+        self._diagonal[scalar] = self._base[block] + scalar * (self._stride[block] + 1)
+        return blocks
+
+    def _place_products(
+        self, linearized: Sequence[Linearization], touched: list[list[_Touched]], which: list[Ints], corner: Ints
+    ) -> None:
+        """Find the place of every product of two Jacobian columns of one edge.
+
+        The product of column i of node a and column j of node b lands at ``base + row stride + column`` of their
+        block, that is at a start plus i and j times a step; the lower triangle decides which of them is the row.
+        Where a and b are the same node, both their products are one entry, which counts twice on the diagonal.
+        """
+        following = iter(which)
+        self._places: list[list[_Places]] = []
+        for lin, nodes in zip(linearized, touched, strict=True):
+            widths = [jac.shape[2] for _, _, jac in lin.blocks]
+            blocks = [self._blocks_of(nodes[: p + 1], following) for p in range(len(nodes))]
+            self._places.append(
+                [
+                    self._place_some(widths, [a[part] for a, _ in nodes], [[b[part] for b in row] for row in blocks], corner)
+                    for part in _parts(len(lin.residuals))
+                ]
+            )
+
+    def _blocks_of(self, nodes: list[_Touched], following: Iterator[Ints]) -> list[Ints]:
+        """Return the block (e,) in which the last of the nodes meets each one up to itself."""
+        a, a_inner = nodes[-1]
+        full = np.full(len(a), len(self._base) - 1)
+        meet = [np.where(a == b, a, next(following)) if a_inner and b_inner else full for b, b_inner in nodes[:-1]]
+        return [*meet, a if a_inner else full]
+
+    def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: Ints) -> _Places:
+        """Find the places of some edges' products; nodes are (e,), the block of nodes p and q is blocks[p][q] (e,)."""
+        rows: list[NDArray[np.int32]] = []
+        products: list[NDArray[np.int32]] = []
+        twice, count = [_NONE], 0
+        for p, a in enumerate(nodes):
+            steps = [self._steps(corner[a], corner[b], block) for b, block in zip(nodes[: p + 1], blocks[p], strict=True)]
+            equal = [np.flatnonzero((a == b) & (a >= 0)) for b in nodes[:p]] + [_NONE]
+            for i in range(widths[p]):
+                rows.append(np.where(a >= 0, corner[a] + i, self.unknowns.size).astype(np.int32))
+                for q, ((start, by_a, by_b), same) in enumerate(zip(steps, equal, strict=True)):
+                    for j in range(widths[q] if q < p else i + 1):
+                        place = start + i * by_a + j * by_b
+                        if len(same) and i < j:
+                            place[same] = (start + j * by_a + i * by_b)[same]
+                        if len(same) and i == j:
+                            twice.append(same + count)
+                        products.append(place.astype(np.int32))
+                        count += len(place)
+        return _Places(np.concatenate(products), np.concatenate(twice), np.concatenate(rows))
+
+    def _steps(self, a: Ints, b: Ints, block: Ints) -> tuple[Ints, Ints, Ints]:
+        """Return place of the first product of nodes with first scalars a, b, and its steps along either."""
+        low, high, stride = np.minimum(a, b), np.maximum(a, b), self._stride[block]
+        free = low >= 0
+        start = np.where(free, self._base[block] + high * stride + low, self._trash)
+        return start, np.where(a >= b, stride, 1) * free, np.where(a >= b, 1, stride) * free
+
+    def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
+        """Fill H and g from whitened Jacobians and a weight per edge."""
+        self.values, self.gradient = np.zeros(self._trash + 1), np.zeros(self.unknowns.size)
+        for lin, weight, places in zip(linearized, weights, self._places, strict=True):
+            for part, place in zip(_parts(len(lin.residuals)), places, strict=True):
+                self._add(_stacked(lin, part), lin.residuals[part], None if weight is None else weight[part], place)
+
+    def _add(self, jacobian: Floats, residuals: Floats, weight: Floats | None, places: _Places) -> None:
+        """Add the products of some edges' Jacobian columns (d, k, e) and residuals (e, d)."""
+        products, slopes, at = np.empty(len(places.products)), np.empty(len(places.rows)), 0
+        weighted = jacobian if weight is None else jacobian * weight
+        _, k, e = jacobian.shape
+        _contract(weighted, residuals.T[:, None], slopes.reshape(k, e))
+        for row in range(k):
+            block = products[at : at + (row + 1) * e].reshape(row + 1, e)
+            _contract(weighted[:, row : row + 1], jacobian[:, : row + 1], block)
+            at += (row + 1) * e
+        products[places.twice] *= 2.0
+        self.values += np.bincount(places.products, products, self._trash + 1)
+        self.gradient += np.bincount(places.rows, slopes, self.unknowns.size + 1)[:-1]
+
+    @property
+    def diagonal(self) -> Floats:
+        """The diagonal of H."""
+        return self.values[self._diagonal]
+
+    def factor(self, damping: Floats) -> Factor:
+        """Factorise H + diag(damping).
+
+        Raises
+        ------
+        SolverError : a pivot cannot be used. (SuperLU goes on through negative ones: the step then promises no decrease.)
+        """
+        values = self.values.copy()
+        values[self._diagonal] += damping
+        return self._layout.factor(values)
+
+
+def _parts(edges: int) -> list[slice]:
+    """Return the edges whose products are held at once."""
+    return [slice(first, first + _AT_ONCE) for first in range(0, max(edges, 1), _AT_ONCE)]
+
+
+def _stacked(lin: Linearization, part: slice) -> Floats:
+    """Return the Jacobians of some edges side by side, (d, k, e): the edges, over which everything runs, come last."""
+    residuals = lin.residuals[part]
+    stacked = np.empty((residuals.shape[1], sum(jac.shape[2] for _, _, jac in lin.blocks), len(residuals)))
+    first = 0
+    for _, _, jac in lin.blocks:
+        stacked[:, first : first + jac.shape[2]] = jac[part].transpose(1, 2, 0)
+        first += jac.shape[2]
+    return stacked
+
+
+def _contract(a: Floats, b: Floats, out: Floats) -> None:
+    """Put the sum over the first axis of a b into out."""
+    np.multiply(a[0], b[0], out=out)
+    for left, right in zip(a[1:], b[1:], strict=True):
+        out += left * right

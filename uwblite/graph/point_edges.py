@@ -1,0 +1,56 @@
+"""Landmarks seen from poses as points: a kind of edge that other people's graphs hold (g2o EDGE_SE2_XY)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from .graph import Graph, Linearization
+from .robust import SQUARED, Kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkEdges:
+    """Position of a landmark, kept among the anchors, in the frame of a pose: e = X^-1 a - z."""
+
+    pose: Ints
+    """(e,) index of the pose that saw it."""
+    anchor: Ints
+    """(e,) index of the landmark."""
+    position: Floats
+    """(e, 2) measured position in the frame of the pose, m."""
+    sqrt_information: Floats
+    """(e, 2, 2) L with information = L^T L."""
+    kernel: Kernel = SQUARED
+    weights: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def _seen(self, graph: Graph) -> Floats:
+        poses = graph.poses[self.pose]
+        return se2.rotate(-poses[:, 2], graph.anchors[self.anchor] - poses[:, :2])
+
+    def residuals(self, graph: Graph) -> Floats:
+        """Return whitened residuals (e, 2)."""
+        return np.einsum("eij,ej->ei", self.sqrt_information, self._seen(graph) - self.position)
+
+    def linearize(self, graph: Graph) -> Linearization:
+        """Return whitened residuals and Jacobians by pose and landmark."""
+        seen = self._seen(graph)
+        theta = graph.poses[self.pose, 2]
+        c, s = np.cos(theta), np.sin(theta)
+        by_anchor = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
+        by_theta = np.stack([seen[:, 1], -seen[:, 0]], axis=1)
+        by_pose = np.concatenate([-by_anchor, by_theta[:, :, None]], axis=2)
+        return Linearization(
+            np.einsum("eij,ej->ei", self.sqrt_information, seen - self.position),
+            (
+                ("poses", self.pose, self.sqrt_information @ by_pose),
+                ("anchors", self.anchor, self.sqrt_information @ by_anchor),
+            ),
+        )

@@ -1,0 +1,246 @@
+"""Edges between two poses: matched scans and loop closures, wheels, and a lidar whose mounting is unknown.
+
+Residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, cast
+
+import numpy as np
+
+from .. import se2
+from .graph import Block, Floats, Graph, Ints, Linearization, pick_rows, whiten
+from .robust import SQUARED, Kernel
+
+# An edge between poses has the error e = Z^-1 (Xi^-1 Xj); with m = tj - ti - R(theta_i) z its plane part is
+# R(theta_i + theta_z)^T m. All its whitened derivatives are combinations of three columns, those by x, y and theta of
+# Xj in the map frame: below they are the *axes*, (3, e) each. Edges run along the last, contiguous axis: ten times the
+# speed of one small matrix product per edge.
+
+
+def _map_axes(sqrt_information: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the columns (3, e) of L [R(heading)^T 0; 0 1]."""
+    x, y, turn = np.ascontiguousarray(sqrt_information.transpose(2, 1, 0))
+    c, s = se2.cos_sin(heading)
+    return x * c - y * s, x * s + y * c, turn
+
+
+def _relative_residuals(
+    axes: tuple[Floats, Floats, Floats], z: Floats, xi: Floats, xj: Floats
+) -> tuple[Floats, tuple[Floats, Floats]]:
+    """Return whitened residuals (3, e) and the vector m (2, e); poses are (3, e)."""
+    c, s = se2.cos_sin(xi[2])
+    mx = xj[0] - xi[0] - (c * z[0] - s * z[1])
+    my = xj[1] - xi[1] - (s * z[0] + c * z[1])
+    return axes[0] * mx + axes[1] * my + axes[2] * se2.wrap_angle(xj[2] - xi[2] - z[2]), (mx, my)
+
+
+def _turned_about(axes: tuple[Floats, Floats, Floats], pivot: Floats, point: Floats) -> Floats:
+    """Return the derivative (3, e) by the heading of a pose at the pivot whose edge ends at the point."""
+    return axes[0] * (point[1] - pivot[1]) - axes[1] * (point[0] - pivot[0]) - axes[2]
+
+
+def _by_pose(*columns: Floats) -> Floats:
+    """Return a Jacobian (e, d, k) from its columns (d, e)."""
+    return np.stack(columns).transpose(2, 1, 0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePoseEdges:
+    """Pose j as seen from pose i: loop closures, scan matches, and edges read from files."""
+
+    i: Ints
+    """(e,) index of the pose measured from."""
+    j: Ints
+    """(e,) index of the pose measured."""
+    T_i_j: Floats
+    """(e, 3) measured pose."""
+    sqrt_information: Floats
+    """(e, 3, 3) L with information = L^T L in the chart e = Z^-1 (Xi^-1 Xj); may be singular."""
+    kernel: Kernel = SQUARED
+    weights: Floats | None = None
+
+    SHARED: ClassVar[tuple[str, ...]] = ()
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def rows(self, which: Ints) -> "RelativePoseEdges":
+        """Return the edges with these indices."""
+        return cast(RelativePoseEdges, pick_rows(self, which))
+
+    def residuals(self, graph: Graph) -> Floats:
+        """Return whitened residuals (e, 3)."""
+        return whiten(self.sqrt_information, se2.between(self.T_i_j, se2.between(graph.poses[self.i], graph.poses[self.j])))
+
+    def linearize(self, graph: Graph) -> Linearization:
+        """Return whitened residuals and Jacobians by both poses."""
+        xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
+        axes = _map_axes(self.sqrt_information, xi[2] + self.T_i_j[:, 2])
+        residuals, _ = _relative_residuals(axes, self.T_i_j.T, xi, xj)
+        by_i, by_j = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, xj)), _by_pose(*axes)
+        return Linearization(residuals.T, (("poses", self.i, by_i), ("poses", self.j, by_j)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryEdges:
+    """Motion from pose i to pose j by the wheels, corrected by the wheels' calibration.
+
+    With distance scale 1 + s and heading error delta = k dtheta + b length + g duration, the measured motion
+    (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s in
+    x and y and by 1 + k in heading: it is the wheels' own, before the correction. Without that, noise alone would
+    draw s and k towards wheels that count less (errors in variables).
+    """
+
+    i: Ints
+    j: Ints
+    motion: Floats
+    """(e, 3) T_i_j by the raw odometry."""
+    length: Floats
+    """(e,) signed distance travelled, m."""
+    duration: Floats
+    """(e,) s."""
+    sqrt_information: Floats
+    """(e, 3, 3)."""
+    calibration: Ints
+    """(e, 4) indices of s, k, b (rad/m), g (rad/s) in the calibration block; -1 = not an unknown (taken as 0)."""
+    kernel: Kernel = SQUARED
+    weights: Floats | None = None
+
+    SHARED: ClassVar[tuple[str, ...]] = ()
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def corrected(self, graph: Graph) -> Floats:
+        """Return the motion (e, 3) with the present calibration applied."""
+        return self._corrected(graph)[0]
+
+    def own_scale(self, graph: Graph) -> Floats:
+        """Return by what (e, 3) an error of the corrected motion is divided to be one of the wheels' own."""
+        s, k, _, _ = np.append(graph.calibration.values, 0.0)[self.calibration].T
+        return np.maximum(np.stack([1.0 + s, 1.0 + s, 1.0 + k], axis=1), _LEAST_SCALE)
+
+    def _corrected(self, graph: Graph) -> tuple[Floats, Floats, Floats]:
+        padded = np.append(graph.calibration.values, 0.0)
+        s, k, b, g = padded[self.calibration].T
+        delta = k * self.motion[:, 2] + b * self.length + g * self.duration
+        direction = se2.rotate(delta / 2.0, self.motion[:, :2])
+        z = np.concatenate([direction * (1.0 + s)[:, None], (self.motion[:, 2] + delta)[:, None]], axis=1)
+        return z, direction, s
+
+    def rows(self, which: Ints) -> "OdometryEdges":
+        """Return the edges with these indices."""
+        return cast(OdometryEdges, pick_rows(self, which))
+
+    def residuals(self, graph: Graph) -> Floats:
+        """Return whitened residuals (e, 3)."""
+        d = se2.between(graph.poses[self.i], graph.poses[self.j])
+        return whiten(self.sqrt_information, se2.between(self.corrected(graph), d) / self.own_scale(graph))
+
+    def linearize(self, graph: Graph) -> Linearization:
+        """Return whitened residuals and Jacobians by both poses and the calibration in use."""
+        xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
+        z, direction, s = self._corrected(graph)
+        stretch = self.own_scale(graph)
+        axes = _map_axes(self.sqrt_information / stretch[:, None, :], xi[2] + z[:, 2])
+        residuals, m = _relative_residuals(axes, z.T, xi, xj)
+        by_i, by_j = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, xj)), _by_pose(*axes)
+        blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
+        if np.any(self.calibration >= 0):
+            nx, ny = se2.rotate(xi[2], direction).T
+            half = 0.5 * (1.0 + s)
+            shift = axes[0] * m[0] + axes[1] * m[1]
+            # A scale held at its least no longer changes what errors are divided by.
+            across, turning = np.where(stretch[:, 1:] > _LEAST_SCALE, 1.0 / stretch[:, 1:], 0.0).T
+            by_scale = -axes[0] * nx - axes[1] * ny - shift * across
+            by_delta = axes[0] * (m[1] + half * ny) - axes[1] * (m[0] + half * nx) - axes[2]
+            by_turn = by_delta * self.motion[:, 2] - (residuals - shift) * turning
+            columns = (by_scale, by_turn, by_delta * self.length, by_delta * self.duration)
+            for index, column in zip(self.calibration.T, columns, strict=True):
+                if np.any(index >= 0):
+                    blocks.append(("calibration", np.maximum(index, 0), _by_pose(np.where(index >= 0, column, 0.0))))
+        return Linearization(residuals.T, tuple(blocks))
+
+
+_LEAST_SCALE = 0.1
+"""Wheels that count more than ten times what they do are not believed: nothing is divided by less."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanEdges:
+    """Pose of cloud j in cloud i by scan matching, with the lidar's mounting and clock as unknowns.
+
+    Clouds stand in the base frame through the nominal mounting and the clock they were made with. The true frame of cloud
+    i is ``S_i = X_i o exp(twist_i (delay - made_with)) o C`` with the mounting correction C = (x, y, theta); the edge
+    measures S_i^-1 S_j.
+    """
+
+    i: Ints
+    j: Ints
+    T_i_j: Floats
+    """(e, 3) measured pose of cloud j in cloud i."""
+    sqrt_information: Floats
+    """(e, 3, 3) in the chart e = Z^-1 (Si^-1 Sj); singular along what the scans cannot see."""
+    twist_i: Floats
+    """(e, 3) velocity of the base at cloud i in its own frame, m/s, m/s, rad/s."""
+    twist_j: Floats
+    """(e, 3) velocity at cloud j."""
+    calibration: Ints
+    """(4,) indices of C's x, y, theta and of the delay, s, in the calibration block; -1 = not an unknown (taken as 0)."""
+    made_with: float = 0.0
+    """Delay with which the clouds were made, s."""
+    kernel: Kernel = SQUARED
+    weights: Floats | None = None
+
+    SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def _sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, Floats]:
+        """Return S (e, 3), and the heading (e,) of the base at the true time of the cloud."""
+        x = graph.poses[poses]
+        if not np.any(self.calibration >= 0):
+            return x, x[:, 2]
+        padded = np.append(graph.calibration.values, 0.0)
+        moved = se2.compose(x, se2.exp(twist * (padded[self.calibration[3]] - self.made_with)))
+        return se2.compose(moved, padded[self.calibration[:3]]), moved[:, 2]
+
+    def relative(self, graph: Graph) -> Floats:
+        """Return the pose (e, 3) of cloud j in cloud i at the present estimates."""
+        si = self._sensor_poses(graph, self.i, self.twist_i)[0]
+        return se2.between(si, self._sensor_poses(graph, self.j, self.twist_j)[0])
+
+    def residuals(self, graph: Graph) -> Floats:
+        """Return whitened residuals (e, 3)."""
+        return whiten(self.sqrt_information, se2.between(self.T_i_j, self.relative(graph)))
+
+    def linearize(self, graph: Graph) -> Linearization:
+        """Return whitened residuals and Jacobians by both poses and the calibration in use."""
+        xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
+        from_pose, heading_i = self._sensor_poses(graph, self.i, self.twist_i)
+        to_pose, heading_j = self._sensor_poses(graph, self.j, self.twist_j)
+        si, sj = from_pose.T, to_pose.T
+        axes = _map_axes(self.sqrt_information, si[2] + self.T_i_j[:, 2])
+        residuals, _ = _relative_residuals(axes, self.T_i_j.T, si, sj)
+        by_i = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, sj))
+        by_j = _by_pose(axes[0], axes[1], -_turned_about(axes, xj, sj))
+        blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
+        if np.any(self.calibration >= 0):
+            c, s = (to - at for at, to in zip(se2.cos_sin(heading_i), se2.cos_sin(heading_j), strict=True))
+            by_turn = axes[2] + _turned_about(axes, si, sj)
+            by_delay = self._along(axes, graph, heading_j, self.twist_j) - self._along(axes, graph, heading_i, self.twist_i)
+            by_delay += by_turn * self.twist_i[:, 2]
+            columns = (axes[0] * c + axes[1] * s, axes[1] * c - axes[0] * s, by_turn, by_delay)
+            for index, column in zip(self.calibration, columns, strict=True):
+                if index >= 0:
+                    blocks.append(("calibration", np.full(len(self), index), _by_pose(column)))
+        return Linearization(residuals.T, tuple(blocks))
+
+    def _along(self, axes: tuple[Floats, Floats, Floats], graph: Graph, heading: Floats, twist: Floats) -> Floats:
+        """Return the derivative (3, e) by the time for which S moves with a base of these headings (e,)."""
+        c, s = se2.cos_sin(heading)
+        x, y = np.append(graph.calibration.values, 0.0)[self.calibration[:2]]
+        vx, vy = twist[:, 0] - twist[:, 2] * y, twist[:, 1] + twist[:, 2] * x
+        return axes[0] * (c * vx - s * vy) + axes[1] * (s * vx + c * vy) + axes[2] * twist[:, 2]

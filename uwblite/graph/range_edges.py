@@ -1,0 +1,115 @@
+"""Edges between a pose and an anchor: what the radio measures."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, cast
+
+import numpy as np
+
+from .. import se2
+from .graph import Block, Floats, Graph, Ints, Linearization, pick_rows
+from .robust import SQUARED, Kernel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeEdges:
+    """Distance between the tag, carried by a pose, and an anchor (paper: UWB distance edges).
+
+    The tag stands at ``u = lever_arm + R(turn) tag + velocity delay`` in the frame of the pose; with the planar
+    distance D = |x + R(theta) u - a|, the radio is expected to say ``(1 + scale) sqrt(D^2 + height^2 + q) + bias``.
+
+    A squared height q below 0 is none, but descent may pass there, or end there and be put back to 0. The root of a
+    negative number being no distance, what q adds for q > 0 is then taken off: with P^2 = D^2 + height^2, the radio is
+    taken to measure ``2 P - sqrt(P^2 - q)``, smooth at q = 0; right at the anchor that is below 0.
+    """
+
+    pose: Ints
+    """(e,) keyframe before the range."""
+    anchor: Ints
+    """(e,)."""
+    ranges: Floats
+    """(e,) m, measured."""
+    sigma: Floats
+    """(e,) m."""
+    lever_arm: Floats
+    """(e, 2) position of the base at the moment of ranging in the frame of the pose, m: the lever arm in time."""
+    turn: Floats
+    """(e,) heading of the base at the moment of ranging in the frame of the pose, rad."""
+    velocity: Floats
+    """(e, 2) velocity of the tag in the frame of the pose, m/s."""
+    tag: Floats
+    """(2,) nominal position of the tag on the base, m."""
+    height: Floats
+    """(e,) height of the anchor above the tag, m, where it was told, else 0."""
+    calibration: Ints
+    """(e, 6) indices of scale, bias (m), q (m^2, unknown squared height), tag x, tag y (m, corrections) and delay (s);
+    -1 = not an unknown (taken as 0)."""
+    kernel: Kernel = SQUARED
+    weights: Floats | None = None
+    stamps: Floats = field(default_factory=lambda: np.zeros(0))
+    """(e,) s, where known; not used by the graph."""
+
+    SHARED: ClassVar[tuple[str, ...]] = ("tag",)
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def _geometry(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return R(theta) u (2, e), the vector anchor -> tag (2, e), P and sqrt(P^2 + |q|) (2, e), the calibration (6, e)."""
+        cal = np.append(graph.calibration.values, 0.0)[self.calibration.T]
+        pose, anchor = graph.poses[self.pose].T, graph.anchors[self.anchor].T
+        c, s = se2.cos_sin(self.turn)
+        tx, ty = self.tag[0] + cal[3], self.tag[1] + cal[4]
+        ux = self.lever_arm[:, 0] + (c * tx - s * ty) + self.velocity[:, 0] * cal[5]
+        uy = self.lever_arm[:, 1] + (s * tx + c * ty) + self.velocity[:, 1] * cal[5]
+        c, s = se2.cos_sin(pose[2])
+        arm = np.stack([c * ux - s * uy, s * ux + c * uy])
+        offset = pose[:2] + arm - anchor
+        squared = offset[0] ** 2 + offset[1] ** 2 + self.height**2
+        return arm, offset, np.sqrt(np.maximum(np.stack([squared, squared + np.abs(cal[2])]), _NEAREST**2)), cal
+
+    def distances(self, graph: Graph) -> Floats:
+        """Return what the radio is taken to measure (e,), m, before scale and bias: the slant distances."""
+        _, _, reach, cal = self._geometry(graph)
+        return _slant(reach, cal)
+
+    def rows(self, which: Ints) -> "RangeEdges":
+        """Return the edges with these indices."""
+        return cast(RangeEdges, pick_rows(self, which))
+
+    def residuals(self, graph: Graph) -> Floats:
+        """Return whitened residuals (e, 1), expected minus measured."""
+        _, _, reach, cal = self._geometry(graph)
+        return (((1.0 + cal[0]) * _slant(reach, cal) + cal[1] - self.ranges) / self.sigma)[:, None]
+
+    def linearize(self, graph: Graph) -> Linearization:
+        """Return whitened residuals and Jacobians by pose, anchor and the calibration in use."""
+        arm, offset, reach, cal = self._geometry(graph)
+        distance, scale = _slant(reach, cal), (1.0 + cal[0]) / self.sigma
+        direction = offset * (scale * np.where(cal[2] < 0.0, 2.0 / reach[0] - 1.0 / reach[1], 1.0 / reach[1]))
+        by_theta = direction[1] * arm[0] - direction[0] * arm[1]
+        by_pose = np.stack([direction[0], direction[1], by_theta])[None].transpose(2, 0, 1)
+        blocks: list[Block] = [("poses", self.pose, by_pose), ("anchors", self.anchor, -direction[None].transpose(2, 0, 1))]
+        if np.any(self.calibration >= 0):
+            columns = self._by_calibration(graph.poses[self.pose, 2], direction, distance, scale / (2.0 * reach[1]))
+            for index, column in zip(self.calibration.T, columns, strict=True):
+                if np.any(index >= 0):
+                    blocks.append(("calibration", np.maximum(index, 0), np.where(index >= 0, column, 0.0)[:, None, None]))
+        residuals = (((1.0 + cal[0]) * distance + cal[1] - self.ranges) / self.sigma)[:, None]
+        return Linearization(residuals, tuple(blocks))
+
+    def _by_calibration(self, theta: Floats, direction: Floats, distance: Floats, by_q: Floats) -> tuple[Floats, ...]:
+        """Return the derivatives (e,) by scale, bias, q, tag x, tag y and delay."""
+        (x, y), (vx, vy) = direction, self.velocity.T
+        c, s = se2.cos_sin(theta)
+        ct, st = se2.cos_sin(theta + self.turn)
+        by_delay = (c * x + s * y) * vx + (c * y - s * x) * vy
+        return distance / self.sigma, 1.0 / self.sigma, by_q, ct * x + st * y, ct * y - st * x, by_delay
+
+
+def _slant(reach: Floats, calibration: Floats) -> Floats:
+    """Return the slant distances (e,) from P and sqrt(P^2 + |q|) (2, e) and the calibration (6, e)."""
+    return np.where(calibration[2] < 0.0, 2.0 * reach[0] - reach[1], reach[1])
+
+
+_NEAREST = 1e-3
+"""Tag on top of an anchor, m: nearer than this the direction is not defined, and the distance is held here."""

@@ -1,0 +1,60 @@
+"""Robust kernels: rho(s) replaces the squared whitened norm s of a residual, weight(s) = rho'(s) scales its normal equations.
+
+Laws: rho(s) ~ s for small s, weight(0) = 1, weight is the derivative of rho, both fall towards the kernel's limit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError
+
+Floats = NDArray[np.float64]
+
+KERNELS = ("none", "huber", "cauchy", "geman-mcclure", "tukey")
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """A robust kernel and its scale."""
+
+    name: str = "none"
+    """One of KERNELS."""
+    scale: float = 1.0
+    """Whitened norm (in standard deviations) at which the kernel departs from the square."""
+
+    def __post_init__(self) -> None:
+        if self.name not in KERNELS:
+            raise ConfigError(f"unknown robust kernel {self.name!r}; choose one of {', '.join(KERNELS)}")
+        if not self.scale > 0:
+            raise ConfigError(f"a robust kernel's scale must be positive, not {self.scale}")
+
+    def rho(self, s: Floats) -> Floats:
+        """Return the robust cost of squared whitened norms s (...)."""
+        k2 = self.scale**2
+        if self.name == "huber":
+            return np.where(s <= k2, s, 2.0 * self.scale * np.sqrt(s) - k2)
+        if self.name == "cauchy":
+            return k2 * np.log1p(s / k2)
+        if self.name == "geman-mcclure":
+            return s / (1.0 + s / k2)
+        if self.name == "tukey":
+            return np.where(s <= k2, k2 / 3.0 * (1.0 - (1.0 - s / k2) ** 3), k2 / 3.0)
+        return s
+
+    def weight(self, s: Floats) -> Floats:
+        """Return the derivative of rho at squared whitened norms s (...); in [0, 1]."""
+        k2 = self.scale**2
+        if self.name == "huber":
+            return self.scale / np.sqrt(np.maximum(s, k2))
+        if self.name == "cauchy":
+            return 1.0 / (1.0 + s / k2)
+        if self.name == "geman-mcclure":
+            return 1.0 / (1.0 + s / k2) ** 2
+        if self.name == "tukey":
+            return np.where(s <= k2, (1.0 - s / k2) ** 2, 0.0)
+        return np.ones_like(s)
+
+
+SQUARED = Kernel()

@@ -1,0 +1,156 @@
+"""Conjugate gradients for long chains of poses that are tied together everywhere.
+
+Where thousands of poses share a few rooms and each is matched with many others, a factorisation fills up: the 14,000
+poses of five hours in one hall need 100 million entries and minutes. Their least squares is well solved by iteration,
+if errors of all lengths are taken out together: short ones piece by piece of the chain, long ones by moving whole
+pieces as rigid bodies (a two-level additive Schwarz method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996).
+The number of iterations hardly depends on the length of the chain. Anchors and calibration belong to the coarse level.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import lapack
+
+from ..errors import SolverError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_PIECE = 24
+"""Poses of a piece."""
+_ENOUGH = 1e-4
+"""Error of a solution as a share of it: the next step of the descent takes it up."""
+_MOST = 300
+"""Iterations; what is found by then is still a step downhill."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pieces:
+    """A chain cut into pieces."""
+
+    number: Ints
+    """(p, w) places of each piece's unknowns in the vector of all; the length of that vector where there are fewer."""
+    basis: sparse.csr_matrix
+    """(n, c) motions of the coarse level: three of each piece as a rigid body, and each unknown that is no pose."""
+
+
+def cut(number: Ints, poses: Floats, size: int) -> Pieces:
+    """Cut the free poses of a graph into pieces.
+
+    Parameters
+    ----------
+    number : (k, 3) place of each pose's x, y, theta in the vector of unknowns, in the order of the chain.
+    poses : (k, 3) about which they move.
+    size : n, length of the vector.
+    """
+    piece, within = np.divmod(np.arange(len(number)), _PIECE)
+    pieces = len(number) // _PIECE + (len(number) % _PIECE > 0)
+    places = np.full((pieces, 3 * _PIECE), size)
+    places[piece[:, None], 3 * within[:, None] + np.arange(3)] = number
+    centre = np.stack([np.bincount(piece, column) for column in poses[:, :2].T], axis=1) / np.bincount(piece)[:, None]
+    arm = poses[:, :2] - centre[piece]
+    other = np.setdiff1d(np.arange(size), number)
+    one = np.ones(len(number))
+    # A turn about the middle moves a pose at the arm (u, v) by (-v, u).
+    rows = np.concatenate([*number.T, number[:, 0], number[:, 1], other])
+    columns = np.concatenate([3 * piece, 3 * piece + 1, *[3 * piece + 2] * 3, 3 * pieces + np.arange(len(other))])
+    values = np.concatenate([one, one, one, -arm[:, 1], arm[:, 0], np.ones(len(other))])
+    return Pieces(places, sparse.csr_matrix((values, (rows, columns)), shape=(size, 3 * pieces + len(other))))
+
+
+class LocalPlaces:
+    """Where the entries of a sparse matrix stand in the dense blocks of the pieces."""
+
+    def __init__(self, matrix: sparse.csc_matrix, pieces: Pieces) -> None:
+        """Find the entries whose row and column belong to one piece."""
+        count, self._width = pieces.number.shape
+        owner, within = np.full(matrix.shape[0] + 1, -1), np.zeros(matrix.shape[0] + 1, dtype=np.int64)
+        owner[pieces.number] = np.arange(count)[:, None]
+        within[pieces.number] = np.arange(self._width)
+        owner[-1] = -1
+        column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+        self._source = np.flatnonzero((owner[column] >= 0) & (owner[matrix.indices] == owner[column]))
+        row, column = matrix.indices[self._source], column[self._source]
+        self._target = (owner[row] * self._width + within[row]) * self._width + within[column]
+        self._nobody = pieces.number == matrix.shape[0]
+
+    def blocks(self, data: Floats) -> Floats:
+        """Return the blocks (p, w, w) by the matrix's data; 1 on the diagonal where a piece has no unknown."""
+        found = np.zeros(self._nobody.size * self._width)
+        found[self._target] = data[self._source]
+        found = found.reshape(len(self._nobody), self._width, self._width)
+        each = np.arange(self._width)
+        found[:, each, each] += self._nobody
+        return found
+
+
+class TwoLevelFactor:
+    """Solves with a symmetric, positive definite matrix by conjugate gradients."""
+
+    def __init__(self, matrix: sparse.csc_matrix, pieces: Pieces, local: LocalPlaces) -> None:
+        """Invert the pieces' blocks and factorise the coarse matrix.
+
+        Raises
+        ------
+        SolverError : one of them is singular.
+        """
+        self._matrix, self._pieces = matrix, pieces
+        try:
+            self._local = np.linalg.inv(local.blocks(matrix.data))
+        except np.linalg.LinAlgError as problem:
+            raise SolverError(f"{_SINGULAR} ({problem})") from None
+        self._coarse, failed = lapack.dpotrf(_seen_by(matrix, pieces.basis), lower=1, overwrite_a=1)
+        if failed:
+            raise SolverError(_SINGULAR)
+
+    def solve(self, right: Floats) -> Floats:
+        """Solve for right-hand sides (n,) or (n, m).
+
+        Raises
+        ------
+        SolverError : the matrix is not positive definite.
+        """
+        if right.ndim == 2:
+            return np.stack([self.solve(column) for column in right.T], axis=1)
+        solution, residual = np.zeros(len(right)), right.copy()
+        direction = self._nearly(residual)
+        energy = first = float(residual @ direction)
+        for _ in range(_MOST):
+            if not energy > _ENOUGH**2 * first:
+                break
+            image = self._matrix @ direction
+            curvature = float(direction @ image)
+            if not curvature > 0.0:
+                raise SolverError(_SINGULAR)
+            solution += (energy / curvature) * direction
+            residual -= (energy / curvature) * image
+            near = self._nearly(residual)
+            before, energy = energy, float(residual @ near)
+            direction = near + (energy / before) * direction
+        return solution
+
+    def _nearly(self, residual: Floats) -> Floats:
+        """Return what the two levels make of a residual: an approximate solution."""
+        number = self._pieces.number
+        found = np.zeros(len(residual) + 1)
+        found[number] = (self._local @ np.append(residual, 0.0)[number][:, :, None])[:, :, 0]
+        coarse = lapack.dpotrs(self._coarse, self._pieces.basis.T @ residual, lower=1)[0]
+        return np.asarray(found[:-1] + self._pieces.basis @ coarse.ravel())
+
+
+def _seen_by(matrix: sparse.csc_matrix, basis: sparse.csr_matrix) -> Floats:
+    """Return basis^T matrix basis (c, c), nearly full, a few columns at a time."""
+    by_column, onto = basis.tocsc(), basis.T.tocsr()
+    seen = np.empty((basis.shape[1], basis.shape[1]), order="F")
+    for first in range(0, basis.shape[1], _COLUMNS_AT_ONCE):
+        part = slice(first, first + _COLUMNS_AT_ONCE)
+        seen[:, part] = (onto @ (matrix @ by_column[:, part])).toarray()
+    return seen
+
+
+_COLUMNS_AT_ONCE = 256
+"""Columns of the coarse matrix made at once; a bound on the memory."""
+_SINGULAR = "the normal equations are singular; add a prior or more measurements"

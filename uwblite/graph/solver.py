@@ -1,0 +1,333 @@
+"""Sparse Levenberg-Marquardt over stacked edges.
+
+The cost is F(x) = sum_e w_e rho(|r_e(x)|^2) with whitened residuals r_e. One iteration replaces it by the quadratic
+
+    q(h) = F + 2 g^T h + h^T H h,    g = sum J_e^T w_e rho' r_e,    H = sum J_e^T w_e rho' J_e,
+
+that is, iteratively reweighted least squares: rho' = weight(|r|^2) is taken where the step starts and its own derivative
+is left out, so H stays positive semi-definite whatever the kernel. The step solves
+
+    (H + lambda D) h = -g,    D = diag(H) (1 where an unknown is measured by nothing),
+
+which is Marquardt's scaling: it makes lambda a pure number, the same for metres, radians and scale factors, and it
+keeps the matrix positive definite where the measurements leave a direction open (an anchor never heard, a closure
+whose information is singular): such a direction simply does not move. The model promises the decrease
+h^T (lambda D h - g); the ratio of what F really does to that promise decides. A step that decreases F is taken, and
+lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dropped and lambda is multiplied by
+nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05; K. Madsen, H. B. Nielsen,
+O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
+
+Where a step turns poses by much, it is tried in two ways that agree to first order, each pose on its own and link by
+link along the trajectory, and the cheaper one counts: a fault of the wheels that bends a drive of hundreds of metres is
+taken up in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard, S. Teller, Fast
+iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
+
+Next to the minimum H hardly changes any more: a step that follows one of little effect takes the factor of that one.
+
+The search ends, and says why, when the decrease still to come is a negligible fraction of F, when every component of
+the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up.
+Without robust kernels the decrease to come is extrapolated from the last two as a geometric series: exact where
+convergence is linear, far on the safe side where it is quadratic, and it spares the last iteration or two that would
+only confirm. With them, reweighting converges linearly at an unknown rate, and the last decrease itself is the measure.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError, SolverError
+from .factorization import Factor
+from .graph import Edges, Graph, Linearization, edge_cost
+from .normal_equations import NormalEquations
+from .unknowns import Unknowns, free_unknowns, moved, moved_along
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Progress = Callable[[int, int], None]
+"""Called as progress(iterations done, most iterations)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SolverConfig:
+    """When to stop, and how carefully to start."""
+
+    max_iterations: int = 100
+    """Most linear systems solved."""
+    relative_decrease: float = 1e-7
+    """Stop when chi2 is about to decrease by no more than this fraction of it."""
+    gradient_tolerance: float = 1e-9
+    """Stop when no gradient component exceeds this, in standard deviations: max |g_i| / sqrt(H_ii)."""
+    initial_damping: float = 1e-10
+    """First lambda; 1e-10 starts with a Gauss-Newton step, 1e-3 distrusts the starting values."""
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1:
+            raise ConfigError(f"max_iterations must be at least 1, not {self.max_iterations}")
+        for name in ("relative_decrease", "gradient_tolerance", "initial_damping"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolverSummary:
+    """What an optimisation did and why it ended."""
+
+    converged: bool
+    """False only when the iterations were used up or no step helped."""
+    reason: str
+    """Which rule ended the search."""
+    iterations: int
+    """Linear systems solved."""
+    chi2_initial: float
+    """Robust, weighted cost at the start."""
+    chi2: float
+    """Robust, weighted cost at the end."""
+    dof: int
+    """Independent residuals of the edges in use minus free unknowns."""
+    damping: float
+    """Last lambda."""
+    chi2_history: Floats = field(default_factory=lambda: np.zeros(0))
+    """(iterations,) cost tried by each step."""
+    damping_history: Floats = field(default_factory=lambda: np.zeros(0))
+    """(iterations,) lambda of each step."""
+    unobserved: dict[str, Ints] = field(default_factory=dict)
+    """By block: indices of free unknowns that no edge measures; they stay where they were."""
+
+    @property
+    def chi2_per_dof(self) -> float:
+        """About 1 where the noise model holds; nan without redundancy."""
+        return self.chi2 / self.dof if self.dof > 0 else float("nan")
+
+
+def edge_weights(edges: Edges, graph: Graph) -> Floats:
+    """Return each edge's share (e,) in the normal equations at these estimates: its own weight times the kernel's."""
+    return _weights(edges, edges.residuals(graph))
+
+
+def _weights(edges: Edges, residuals: Floats) -> Floats:
+    kernel = edges.kernel.weight(np.einsum("ed,ed->e", residuals, residuals))
+    return kernel if edges.weights is None else kernel * edges.weights
+
+
+def _or_none(edges: Edges, residuals: Floats) -> Floats | None:
+    return None if edges.weights is None and edges.kernel.name == "none" else _weights(edges, residuals)
+
+
+def optimize(
+    graph: Graph, config: SolverConfig = SolverConfig(), progress: Progress | None = None
+) -> tuple[Graph, SolverSummary]:
+    """Return the graph at the nearest minimum of its cost, and how the search went.
+
+    Parameters
+    ----------
+    graph : estimates to start from, what is held fixed, and the edges; it is not changed.
+    config : stopping rules.
+    progress : called after every iteration with (done, most).
+
+    Raises
+    ------
+    SolverError : nothing is free, there is no edge, or estimates or measurements are not finite.
+    """
+    check(graph)
+    linearized = linearize(graph)
+    return minimise(graph, linearized, NormalEquations(graph, linearized), config, progress)
+
+
+def minimise(
+    graph: Graph,
+    linearized: list[Linearization],
+    normal: NormalEquations,
+    config: SolverConfig,
+    progress: Progress | None = None,
+) -> tuple[Graph, SolverSummary]:
+    """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
+    chi2 = chi2_initial = _cost(graph, linearized)
+    if not np.isfinite(chi2):
+        raise SolverError(_what_is_not_finite(graph, linearized))
+    damping, growth, last_decrease = config.initial_damping, 2.0, np.inf
+    history: list[tuple[float, float]] = []
+    to_come = _extrapolated if all(edges.kernel.name == "none" for edges in graph.edges) else _as_much_again
+    reason, improved = "", True
+    factor: Factor | None = None
+    linked = _linked(len(graph.poses), linearized)
+    while not reason:
+        reused = factor is not None
+        if improved:
+            normal.fill(linearized, [_or_none(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
+            # The normal equations hold it all now; the Jacobians of a recording of hours are large.
+            linearized = []
+            diagonal = normal.diagonal
+            scale = np.where(diagonal > 0, diagonal, 1.0)
+            if np.max(np.abs(normal.gradient) / np.sqrt(scale)) <= config.gradient_tolerance:
+                reason = GRADIENT
+                break
+        if len(history) == config.max_iterations:
+            reason = USED_UP
+            break
+        trial_linearized: list[Linearization] = []
+        factor, step, promised = _step(normal, damping * scale, factor)
+        trial = _trial(graph, normal.unknowns, step, linked)
+        trial_linearized = linearize(trial)
+        trial_chi2 = _cost(trial, trial_linearized)
+        history.append((trial_chi2, damping))
+        if progress is not None:
+            progress(len(history), config.max_iterations)
+        decrease = chi2 - trial_chi2
+        improved = promised > 0 and decrease >= 0
+        negligible = config.relative_decrease * chi2 + _NOTHING
+        if improved:
+            if to_come(decrease, last_decrease, promised) <= negligible and damping <= _FREE:
+                reason = SETTLED
+            near = not reused and decrease <= _NEAR * chi2 and damping <= _NEARLY_FREE
+            factor = factor if near else None
+            graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
+            damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3), _LEAST_DAMPING)
+            growth = 2.0
+        elif 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * chi2) and damping <= _FREE:
+            reason = SETTLED
+        else:
+            factor = None
+            if not reused:
+                damping, growth = max(damping * growth, _FIRST_BRAKE), growth * 2.0
+        if not reason and damping > _MOST_DAMPING:
+            reason = STUCK
+    chi2_history, damping_history = np.array(history).reshape(-1, 2).T
+    return graph, SolverSummary(
+        converged=reason in (SETTLED, GRADIENT),
+        reason=reason,
+        iterations=len(history),
+        chi2_initial=chi2_initial,
+        chi2=chi2,
+        dof=_independent_residuals(graph, linearized or linearize(graph)) - normal.unknowns.size,
+        damping=damping,
+        chi2_history=chi2_history,
+        damping_history=damping_history,
+        unobserved=_unobserved(normal.unknowns, normal.diagonal),
+    )
+
+
+SETTLED = "chi2 no longer decreases"
+GRADIENT = "gradient negligible"
+STUCK = "no step decreases chi2"
+USED_UP = "iterations used up"
+
+_LARGE_TURN = 0.05
+"""rad; the square of a smaller turn of a pose is nothing beside its first order."""
+_NOTHING = 1e-12
+"""chi2, in standard deviations squared, that never matters."""
+_LITTLE = 1e-4
+"""Share of chi2 beyond which a promise that failed is no sign of a minimum, however coarse the search."""
+_FREE = 1e-2
+"""lambda up to which small steps mean a minimum and not just a strong brake."""
+_NEAR = 1e-2
+"""A step that decreased chi2 by less than this fraction of it changed H so little that the next one takes its factor."""
+_NEARLY_FREE = 1e-6
+"""lambda up to which that holds."""
+_LEAST_DAMPING = 1e-14
+_FIRST_BRAKE = 1e-5
+"""Least lambda after a step that failed."""
+_MOST_DAMPING = 1e12
+
+
+def _extrapolated(decrease: float, last: float, promised: float) -> float:
+    """Return the sum of the geometric series that the last two decreases begin."""
+    if not np.isfinite(last):
+        return max(decrease, promised)
+    return decrease**2 / (last - decrease) if decrease < last else np.inf
+
+
+def _as_much_again(decrease: float, last: float, promised: float) -> float:
+    """Return what is still to come where every step halves it, as a robust kernel's reweighting does at best."""
+    return max(decrease, promised)
+
+
+def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tuple[Factor | None, Floats, float]:
+    """Return the factor used, the step and the decrease it promises (not positive: the factorisation failed).
+
+    Parameters
+    ----------
+    factor : of a step before, to be used again; None = factorise anew.
+    """
+    try:
+        if factor is not None:
+            step = factor.solve(-normal.gradient)
+            return factor, step, -float(step @ normal.gradient)
+        factor = normal.factor(damping)
+        step = factor.solve(-normal.gradient)
+    except SolverError:
+        return None, np.zeros(len(damping)), -1.0
+    return factor, step, float(step @ (damping * step - normal.gradient))
+
+
+def _trial(graph: Graph, unknowns: Unknowns, step: Floats, linked: NDArray[np.bool_]) -> Graph:
+    """Return the graph moved by a step; where that turns poses by much, by whichever way of moving them costs less."""
+    straight = moved(graph, unknowns, step)
+    if np.abs(unknowns.spread("poses", step)[:, 2]).max(initial=0.0) < _LARGE_TURN or not linked.any():
+        return straight
+    along = moved_along(graph, unknowns, step, linked)
+    costs = [sum(edge_cost(e, e.residuals(g)) for e in g.edges) for g in (straight, along)]
+    return straight if not costs[1] < costs[0] else along
+
+
+def _linked(poses: int, linearized: list[Linearization]) -> NDArray[np.bool_]:
+    """Tell which poses (n - 1,) are measured from the one before them."""
+    linked = np.zeros(max(poses - 1, 0), dtype=bool)
+    for lin in linearized:
+        ends = [number for name, number, _ in lin.blocks if name == "poses"]
+        if len(ends) == 2:
+            linked[ends[0][ends[1] == ends[0] + 1]] = True
+    return linked
+
+
+def linearize(graph: Graph) -> list[Linearization]:
+    """Linearise every kind of edges."""
+    return [edges.linearize(graph) for edges in graph.edges]
+
+
+def _cost(graph: Graph, linearized: list[Linearization]) -> float:
+    return sum(edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True))
+
+
+def check(graph: Graph) -> None:
+    """Raise SolverError where nothing is free, nothing is measured, or a starting value is not finite."""
+    if not any(mask.any() for mask in free_unknowns(graph).values()):
+        raise SolverError("nothing to optimise: every pose, anchor and calibration value is held fixed")
+    if not sum(len(edges) for edges in graph.edges):
+        raise SolverError("nothing to optimise: the graph has no edges")
+    for name, values in (
+        ("poses", graph.poses),
+        ("anchors", graph.anchors),
+        ("calibration", graph.calibration.values[:, None]),
+    ):
+        bad = np.nonzero(~np.isfinite(values).all(axis=1))[0]
+        if len(bad):
+            raise SolverError(f"starting values are not finite: {name}[{bad[0]}] = {values[bad[0]]} ({len(bad)} in all)")
+
+
+def _what_is_not_finite(graph: Graph, linearized: list[Linearization]) -> str:
+    for edges, lin in zip(graph.edges, linearized, strict=True):
+        bad = np.nonzero(~np.isfinite(lin.residuals).all(axis=1))[0]
+        if len(bad):
+            kind = type(edges).__name__
+            return f"residuals are not finite: edge {bad[0]} of {kind} ({len(bad)} in all); remove such measurements"
+    return "the cost is not finite although every residual is: weights or residuals are too large"
+
+
+def _independent_residuals(graph: Graph, linearized: list[Linearization]) -> int:
+    """Count the residuals of edges in use; an edge whose information is singular counts by its rank."""
+    total = 0
+    for edges, lin in zip(graph.edges, linearized, strict=True):
+        used = slice(None) if edges.weights is None else edges.weights > 0
+        jacobians = np.concatenate([jac for _, _, jac in lin.blocks], axis=2)[used]
+        gram = jacobians @ jacobians.transpose(0, 2, 1)
+        total += gram.shape[0] * gram.shape[1]
+        doubtful = gram[np.abs(np.linalg.det(gram)) <= 1e-12 * np.prod(np.einsum("eii->ei", gram), axis=1)]
+        total -= int(np.sum(gram.shape[1] - np.linalg.matrix_rank(doubtful, hermitian=True)))
+    return total
+
+
+def _unobserved(unknowns: Unknowns, diagonal: Floats) -> dict[str, Ints]:
+    zero = np.append(diagonal <= 0, False)
+    return {name: np.nonzero(zero[number].any(axis=1))[0] for name, number in unknowns.number.items()}

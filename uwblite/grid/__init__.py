@@ -1,0 +1,1 @@
+"""The occupancy grid (paper: step 3): geometry, rays, binary Bayes filter."""

@@ -1,0 +1,87 @@
+"""Where the cells of a map are: the only place that turns metres into cells and back."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+BYTES_PER_CELL = 12
+"""Memory of a map while it is made: two counts and the log-odds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridGeometry:
+    """A regular grid of square cells; row 0 has the smallest y, column 0 the smallest x."""
+
+    resolution: float
+    """Edge of a cell, m."""
+    origin: Floats
+    """(2,) lower left corner of cell (0, 0), m, map frame."""
+    rows: int
+    cols: int
+
+    @property
+    def cells(self) -> int:
+        """Number of cells."""
+        return self.rows * self.cols
+
+    @property
+    def megabytes(self) -> float:
+        """Memory of a map of this size while it is made, MB."""
+        return self.cells * BYTES_PER_CELL / 1e6
+
+    @property
+    def corner(self) -> Floats:
+        """(2,) upper right corner of the last cell, m."""
+        return self.origin + self.resolution * np.array([self.cols, self.rows])
+
+    def cell_of(self, points: Floats) -> tuple[Ints, Ints]:
+        """Return row and column (...) of the cells that hold points (..., 2), m; outside the grid they run on."""
+        cell = np.floor((points - self.origin) / self.resolution).astype(np.int64)
+        return cell[..., 1], cell[..., 0]
+
+    def centre_of(self, row: Ints, col: Ints) -> Floats:
+        """Return the centres (..., 2) of cells, m."""
+        return self.origin + self.resolution * (np.stack([col, row], axis=-1) + 0.5)
+
+    def inside(self, row: Ints, col: Ints) -> Bools:
+        """Tell which cells belong to the grid."""
+        return (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
+
+    def window(self, row: int, col: int, rows: int, cols: int) -> "GridGeometry":
+        """Return the part of the grid whose first cell is (row, col)."""
+        return GridGeometry(self.resolution, self.origin + self.resolution * np.array([col, row]), rows, cols)
+
+    @staticmethod
+    def around(low: Floats, high: Floats, resolution: float, max_cells: int, margin: int = 2) -> "GridGeometry":
+        """Return the grid that holds a box, with cell edges at multiples of the resolution.
+
+        Parameters
+        ----------
+        low, high : (2,) corners of the box, m.
+        resolution : edge of a cell, m.
+        max_cells : most cells allowed.
+        margin : cells added on every side.
+
+        Raises
+        ------
+        ConfigError : the grid would be larger than max_cells; nothing has been allocated.
+        """
+        first = np.floor(low / resolution) - margin
+        last = np.floor(high / resolution) + 1 + margin
+        width, height = (last - first).tolist()
+        if not width * height <= max_cells:
+            coarser = resolution * np.sqrt(width * height / max_cells) * 1.1
+            extent = high - low
+            raise ConfigError(
+                f"the map would be {extent[0]:.0f} x {extent[1]:.0f} m, {width * height / 1e6:.0f} million cells, about "
+                f"{width * height * BYTES_PER_CELL / 1e6:.0f} MB at {resolution:g} m resolution; set grid.resolution to "
+                f"{coarser:.2g} or more, or a smaller grid.max_range, or raise grid.max_cells"
+            )
+        return GridGeometry(resolution, first * resolution, int(height), int(width))

@@ -1,0 +1,1 @@
+"""Scans as clouds and sub-maps, scan matching, joint refinement, visibility."""

@@ -1,0 +1,185 @@
+"""Lidar clouds of all keyframes as one array: averaged in small cells, with normals that face the laser.
+
+One flat array with offsets instead of a list of clouds: every step below runs once over all keyframes. Single precision,
+a few micrometres at the reach of a lidar, and coordinates in one piece each: hours of clouds fit into memory.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..keyframes import ScanPoints
+from .point_cloud import Lines, estimate_normals, make_tree
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+_BLOCK = 32
+"""Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class CloudConfig:
+    """How rays become the cloud of a keyframe."""
+
+    voxel: float = 0.05
+    """Cell over which points are averaged, m."""
+    normal_radius: float = 0.2
+    """Neighbourhood of a normal, m."""
+    min_neighbours: int = 3
+    """Points with fewer neighbours are left out as noise."""
+    linearity: float = 0.7
+    """Least share of a neighbourhood's spread that lies along the line for its normal to count, 0..1. A right angle has
+    about 0.75: corners say where along a corridor the robot is."""
+    raster: float = 0.1
+    """Cell of the tables of nearest points, m; smaller takes memory with the square and gains nothing on lines."""
+    range_max: float = 30.0
+    """Longer readings do not enter clouds, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clouds:
+    """Clouds of k keyframes; cloud c owns rows offsets[c]:offsets[c + 1]."""
+
+    offsets: Ints
+    """(k + 1,)."""
+    points: NDArray[np.floating]
+    """(p, 2) m, base frame of the keyframe, ordered by bearing within a cloud. Where there is a line, the mean of the
+    neighbourhood: that takes out noise, and on curved surfaces every cloud errs alike."""
+    normals: NDArray[np.floating]
+    """(p, 2) unit, towards the laser; 0 where the neighbourhood is no line."""
+    owner: NDArray[np.signedinteger]
+    """(p,) keyframe."""
+    normal_variance: NDArray[np.floating]
+    """(p,) rad^2, variance of the normal's angle by scatter about its line."""
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    @property
+    def counts(self) -> Ints:
+        """(k,) points of each cloud."""
+        return np.diff(self.offsets)
+
+    def cloud(self, k: int) -> tuple[Floats, Floats]:
+        """Return points and normals of one cloud, in double precision."""
+        rows = slice(self.offsets[k], self.offsets[k + 1])
+        return self.points[rows].astype(np.float64), self.normals[rows].astype(np.float64)
+
+    def chosen(self, which: Ints) -> "Clouds":
+        """Return some clouds (s,), in this order."""
+        counts = self.counts[which]
+        first = np.cumsum(counts) - counts
+        rows = np.repeat(self.offsets[which] - first, counts) + np.arange(int(counts.sum()))
+        owner = np.repeat(np.arange(len(which), dtype=np.int32), counts)
+        offsets = np.append(first, counts.sum()).astype(np.int64)
+        return Clouds(offsets, self.points[rows], self.normals[rows], owner, self.normal_variance[rows])
+
+    def only(self, kept: NDArray[np.bool_]) -> "Clouds":
+        """Return the clouds with some of their points (p,) alone."""
+        counts = np.bincount(self.owner[kept], minlength=len(self))
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        return Clouds(offsets, self.points[kept], self.normals[kept], self.owner[kept], self.normal_variance[kept])
+
+
+def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
+    """Average rays in cells, drop lone points, estimate normals and order each cloud by bearing.
+
+    Parameters
+    ----------
+    rays : points of all keyframes of a block, numbered from 0.
+    keyframes : k, number of keyframes.
+    """
+    owner, points, origins = _average_cells(rays, config.voxel)
+    bearing = se2.bearing(points)
+    order = np.lexsort((bearing, owner))
+    owner, points, origins = owner[order], points[order], origins[order]
+    lines, normals = _lines(owner, points, origins, config)
+    straight = lines.linearity >= config.linearity
+    kept = lines.neighbours > config.min_neighbours
+    normals = np.where(straight[:, None], normals, 0.0)[kept]
+    centres = np.where(straight[:, None], lines.centers, points)[kept]
+    owner = owner[kept]
+    offsets = np.searchsorted(owner, np.arange(keyframes + 1))
+    return Clouds(
+        offsets.astype(np.int64),
+        centres.astype(np.float32, order="F"),
+        normals.astype(np.float32, order="F"),
+        owner.astype(np.int32),
+        lines.normal_variance[kept].astype(np.float32),
+    )
+
+
+def joined(parts: Sequence[Clouds]) -> Clouds:
+    """Return the clouds of blocks of keyframes, one after the other, as one."""
+    starts = np.cumsum([0] + [len(p) for p in parts])
+    counts = np.concatenate([p.counts for p in parts] or [np.zeros(0, dtype=np.int64)])
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    size = int(offsets[-1])
+    whole = Clouds(
+        offsets,
+        np.empty((size, 2), dtype=np.float32, order="F"),
+        np.empty((size, 2), dtype=np.float32, order="F"),
+        np.empty(size, dtype=np.int32),
+        np.empty(size, dtype=np.float32),
+    )
+    for part, first in zip(parts, starts.tolist(), strict=False):
+        rows = slice(int(offsets[first]), int(offsets[first]) + len(part.points))
+        whole.points[rows], whole.normals[rows], whole.normal_variance[rows] = part.points, part.normals, part.normal_variance
+        whole.owner[rows] = part.owner + first
+    return whole
+
+
+def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:
+    """Return owner, mean point and mean origin of each cell of each keyframe."""
+    cell = np.floor(rays.points / size).astype(np.int64)
+    cell -= cell.min(axis=0, initial=0)
+    wide, high = cell.max(axis=0, initial=0) + 1
+    key = (rays.keyframe * wide + cell[:, 0]) * high + cell[:, 1]
+    one, mean = mean_by_key(key, np.concatenate([rays.points, rays.origins], axis=1))
+    return rays.keyframe[one], mean[:, :2], mean[:, 2:]
+
+
+def mean_by_key(key: Ints, values: Floats) -> tuple[Ints, Floats]:
+    """Average the rows of values (p, v) that share a key (p,).
+
+    Returns
+    -------
+    One row of each key (m,), by key, and the means (m, v).
+    """
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    if not len(first):
+        return first, values
+    count = np.diff(np.append(first, len(key)))[:, None]
+    return order[first], np.add.reduceat(values[order], first, axis=0) / count
+
+
+def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) -> tuple[Lines, Floats]:
+    """Fit lines to all neighbourhoods; return them and normals (p, 2) turned towards the laser.
+
+    A block of clouds shares one tree: a third coordinate keeps them apart.
+    """
+    parts = []
+    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=-1) + 1 + _BLOCK, _BLOCK))
+    for first, last in pairwise(blocks):
+        block = points[first:last]
+        apart = np.column_stack([block, owner[first:last] * (4.0 * config.normal_radius)])
+        parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
+    if not parts:
+        parts.append(estimate_normals(points, make_tree(points), config.normal_radius))
+    lines = Lines(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lines)))
+    facing = np.einsum("pi,pi->p", lines.normals, origins - points)
+    return lines, lines.normals * np.where(facing < 0, -1.0, 1.0)[:, None]
+
+
+def in_map(clouds: Clouds, poses: Floats) -> tuple[Floats, Floats]:
+    """Return all points and normals (p, 2) in the map frame, given keyframe poses (k, 3)."""
+    own = poses[clouds.owner]
+    return se2.transform(own, clouds.points), se2.rotate(own[:, 2], clouds.normals)

@@ -1,0 +1,179 @@
+"""Correlative search: where a cloud fits into another one when the guess may be out by metres and tens of degrees.
+
+The target becomes a field that at each cell holds exp(-d^2 / 2 spread^2) times the nearest surface's normal as a complex
+number; the source becomes an image of its normals. For one heading the scores of all shifts are one correlation,
+
+    score(T) = mean over source points of exp(-d^2 / 2 spread^2) cos(angle between normals),
+
+done by FFT (after Olson, Real-time correlative scan matching, ICRA 2009, which evaluates it shift by shift). A wall
+seen from its other side counts against a pose. Every pose of the grid is scored: nothing is pruned, nothing missed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from .. import se2
+from ..config import setting
+from .point_cloud import PointCloud
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Singles = NDArray[np.float32]
+
+_CELLS_PER_REACH = 4
+
+
+@dataclass(frozen=True, slots=True)
+class SearchConfig:
+    """Grid of poses and what is made of its scores."""
+
+    resolution: float = setting(0.15, above=0.0)
+    """Step of x and y, m; time goes with its inverse square."""
+    angle_step: float = setting(0.03, above=0.0)
+    """Step of the heading, rad; at the source's far points about the resolution."""
+    spread: float = setting(0.12, above=0.0)
+    """Standard deviation of a point about the target's surface, m; about the resolution."""
+    candidates: int = setting(5, minimum=1)
+    """Most poses that are returned."""
+    separation: float = 0.5
+    """m; poses closer than that and than separation_angle are one candidate."""
+    separation_angle: float = 0.2
+    """rad."""
+    least_share: float = 0.5
+    """Of the best score, that another candidate must reach."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchResult:
+    """Peaks of the score, the best first."""
+
+    poses: Floats
+    """(c, 3) T_target_source; m, m, rad; on the grid."""
+    scores: Floats
+    """(c,) at most 1; mean agreement of the source's points."""
+    ambiguity: float
+    """Score of the second candidate / score of the first, 0..1: near 1 the clouds do not tell the two apart (equal
+    rooms, or the length of a corridor)."""
+
+
+def search(
+    target: PointCloud,
+    source: PointCloud,
+    T_target_source: Floats,
+    window: tuple[float, float, float],
+    config: SearchConfig | None = None,
+) -> SearchResult:
+    """Score every pose of a grid around a guess and return the best few.
+
+    Parameters
+    ----------
+    target, source : clouds, each in its own frame; normals count where both have viewpoints.
+    T_target_source : (3,) centre of the grid; m, m, rad.
+    window : half widths of the grid in x, y, m, and heading, rad.
+    config : defaults where None.
+
+    Returns
+    -------
+    SearchResult; without candidates where nothing fits at all.
+    """
+    config = config or SearchConfig()
+    scores, headings, shift_x, shift_y = score_grid(target, source, T_target_source, window, config)
+    found = _peaks(scores, config)
+    poses = np.stack(
+        [
+            T_target_source[0] + shift_x[found[:, 2]] * config.resolution,
+            T_target_source[1] + shift_y[found[:, 1]] * config.resolution,
+            se2.wrap_angle(headings[found[:, 0]]),
+        ],
+        axis=-1,
+    )
+    best = scores[tuple(found.T)].astype(np.float64)
+    return SearchResult(poses, best, float(best[1] / best[0]) if len(best) > 1 else 0.0)
+
+
+def score_grid(
+    target: PointCloud,
+    source: PointCloud,
+    T_target_source: Floats,
+    window: tuple[float, float, float],
+    config: SearchConfig,
+) -> tuple[Singles, Floats, Ints, Ints]:
+    """Score every pose of the grid.
+
+    Returns
+    -------
+    scores : (h, r, c) by heading, shift along y, shift along x.
+    headings : (h,) rad.
+    shift_x, shift_y : (c,), (r,) cells from the guess.
+    """
+    half = [int(np.ceil(w / config.resolution - 1e-9)) for w in window[:2]]
+    turns = int(np.ceil(window[2] / config.angle_step - 1e-9))
+    headings = T_target_source[2] + np.arange(-turns, turns + 1) * config.angle_step
+    shift_x, shift_y = (np.arange(-n, n + 1) for n in half)
+    scores = np.zeros((len(headings), len(shift_y), len(shift_x)), np.float32)
+    if len(target) and len(source):
+        oriented = target.oriented and source.oriented
+        field, origin = _target_field(target, config, oriented)
+        # Points that no shift brings onto the field are left out; of the rest none may wrap around onto it.
+        shape = tuple(fft.next_fast_len(field.shape[k] + 2 * half[1 - k]) for k in (0, 1))
+        spectrum = fft.fft2(field, shape)
+        normals = source.normals[:, 0] + 1j * source.normals[:, 1]
+        weight = normals if oriented else np.ones(len(source), complex)
+        for k, heading in enumerate(headings):
+            image = _source_image(source, weight, heading, T_target_source, origin, field.shape, half, shape, config)
+            product = np.conj(fft.fft2(image)) * spectrum
+            if oriented:
+                product *= np.complex64(np.exp(-1j * heading))
+            rows = fft.ifft(product, axis=0)[shift_y]
+            scores[k] = fft.ifft(rows, axis=1)[:, shift_x].real
+        scores /= len(source)
+    return scores, headings, shift_x, shift_y
+
+
+def _target_field(target: PointCloud, config: SearchConfig, oriented: bool) -> tuple[NDArray[np.complex64], Floats]:
+    """Return the field (rows, columns) and the place of its lower left corner, m."""
+    raster = target.raster(_CELLS_PER_REACH * config.resolution)
+    index = raster.table.reshape(raster.height, raster.width)
+    x = raster.origin[0] + (np.arange(raster.width) + 0.5) * raster.cell
+    y = raster.origin[1] + (np.arange(raster.height) + 0.5) * raster.cell
+    normal_x, normal_y, _, near_x, near_y = target.surface[:5].take(index, axis=1)
+    square = (x - near_x) ** 2 + (y[:, None] - near_y) ** 2
+    field = np.exp(-0.5 * np.minimum(square / config.spread**2, 200.0)) * (index < len(target))
+    return (field * (normal_x + 1j * normal_y) if oriented else field).astype(np.complex64), raster.origin
+
+
+def _source_image(
+    source: PointCloud, weight: NDArray[np.complex128], heading: float, guess: Floats, origin: Floats,
+    field: tuple[int, ...], half: list[int], shape: tuple[int, ...], config: SearchConfig,
+) -> NDArray[np.complex64]:
+    """Return the source turned to the heading and put at the guess, as weights in the cells of the target's field."""
+    c, s = np.cos(heading), np.sin(heading)
+    x, y = source.centers.T
+    column = np.floor((c * x - s * y + guess[0] - origin[0]) / config.resolution).astype(np.int64)
+    row = np.floor((s * x + c * y + guess[1] - origin[1]) / config.resolution).astype(np.int64)
+    inside = (column >= -half[0]) & (column < field[1] + half[0]) & (row >= -half[1]) & (row < field[0] + half[1])
+    cell = (row[inside] % shape[0]) * shape[1] + column[inside] % shape[1]
+    image = np.empty(shape[0] * shape[1], np.complex64)
+    image.real = np.bincount(cell, weight.real[inside], len(image))
+    image.imag = np.bincount(cell, weight.imag[inside], len(image))
+    return image.reshape(shape)
+
+
+def _peaks(scores: Singles, config: SearchConfig) -> Ints:
+    """Return indices (c, 3) of local maxima, the best first, none within the separation of a better one."""
+    around = scores
+    for axis in range(3):
+        low, high = np.roll(around, 1, axis), np.roll(around, -1, axis)
+        around = np.maximum(around, np.maximum(low, high))
+    best = scores.max(initial=0.0)
+    peaks = np.argwhere((scores == around) & (scores >= config.least_share * best) & (scores > 0.0))
+    peaks = peaks[np.argsort(-scores[tuple(peaks.T)], kind="stable")]
+    unit = np.array([config.separation_angle / config.angle_step, *[config.separation / config.resolution] * 2])
+    chosen: list[Ints] = []
+    while len(peaks) and len(chosen) < config.candidates:
+        chosen.append(peaks[0])
+        peaks = peaks[(np.abs(peaks - peaks[0]) >= unit).any(axis=1)]
+    return np.array(chosen, dtype=np.int64).reshape(-1, 3)

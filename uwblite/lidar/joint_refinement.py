@@ -1,0 +1,258 @@
+"""Joint refinement: all overlapping clouds pull on all poses at once.
+
+Every round looks up matches of every pair of clouds that see the same surfaces, condenses each pair into one
+relative-pose edge and solves the whole graph again, wheels, radio and calibration included; the gate shrinks from
+round to round. Both poses of a pair are free, so errors spread over the loop instead of piling up in one scan.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from .. import se2
+from ..graph.calibration import scan_indices
+from ..graph.graph import Graph
+from ..graph.normal_equations import NormalEquations
+from ..graph.pose_edges import ScanEdges
+from ..graph.robust import Kernel
+from ..graph.solver import SolverConfig, SolverSummary, check, linearize, minimise
+from .clouds import Clouds
+from .scan_matching import CloudRasters, PairFactors, match, measured, pair_points
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_NEIGHBOURS = 4
+"""Clouds no farther apart in the chain than this are neighbours."""
+_POINTS_AT_ONCE = 1 << 16
+"""Points brought into the map's frame at once."""
+_CLOUDS_AT_ONCE = 128
+"""Clouds whose overlaps with all others are held at once; a bound on the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class RefinementConfig:
+    """Matching of clouds in the joint refinement."""
+
+    rounds: int = 12
+    """Most rounds of matching and solving; 0 = no joint refinement (the paper)."""
+    track_rounds: int = 12
+    """Most rounds of matching neighbouring clouds before loops are sought."""
+    selections: int = 3
+    """How often, at most, the pairs are chosen anew and refined."""
+    same_pairs: float = 0.04
+    """The pairs are not chosen anew when the poses moved by less than this (root mean square) since they were, m."""
+    first_gate: float = 0.5
+    """Farthest match in the first round, m."""
+    later_gate: float = 0.2
+    """Farthest match in the first round where the poses are good already: after tracking, and when pairs are chosen anew."""
+    last_gate: float = 0.12
+    """Farthest match in the last rounds, m."""
+    shrink: float = 0.7
+    """Gate of a round as a share of the one before."""
+    partners: int = 6
+    """Clouds from other times that each cloud is matched with; fewer, but two at least, where that makes too many."""
+    most: int = 40_000
+    """Pairs of clouds from different times that are too many: recordings of hours are tied richly by less."""
+    epoch: float = 2.0
+    """Travelled distance within which only the best partner counts, m."""
+    neighbours: tuple[int, ...] = (1, 2, 4)
+    """Following keyframes that each cloud is matched with."""
+    points: int = 60
+    """Points looked up per pair."""
+    min_matches: int = 15
+    """Pairs with fewer matches do not count."""
+    min_share: float = 0.3
+    """Pairs that match a smaller share of the points looked up do not count."""
+    sigma: float = 0.02
+    """Standard deviation of a point-to-line distance before it is learnt, m."""
+    correlation: float = 4.0
+    """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
+    settled: float = 0.0002
+    """Rounds end early when the places of clouds in the frames of their partners change by less than this (root mean
+    square) at the last gate, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """Result of the joint refinement."""
+
+    graph: Graph
+    """Solved."""
+    edges: ScanEdges
+    """The scan edges of the last round."""
+    i: Ints
+    j: Ints
+    factors: PairFactors
+    used: NDArray[np.bool_]
+    """(e,) pairs that counted in the last round."""
+    sigma: float
+    """Learnt standard deviation of a point-to-line distance, m."""
+    rounds: int
+    summary: SolverSummary
+
+
+def surface_cells(clouds: Clouds, poses: Floats, size: float = 0.5) -> sparse.csr_matrix:
+    """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of 8 facings."""
+    usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
+    cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
+    for first in range(0, len(usable), _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        own = poses[clouds.owner[usable[part]]]
+        cell[part] = np.floor(se2.transform(own, clouds.points[usable[part]]) / size)
+        bearing = se2.bearing(se2.rotate(own[:, 2], clouds.normals[usable[part]]))
+        facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
+    cell -= cell.min(axis=0, initial=0)
+    wide = int(cell[:, 1].max(initial=0)) + 1
+    key = (cell[:, 0].astype(np.int64) * wide + cell[:, 1]) * 8 + facing
+    _, column = np.unique(key, return_inverse=True)
+    shape = (len(clouds), int(column.max(initial=-1)) + 1)
+    seen = sparse.csr_matrix((np.ones(len(column)), (clouds.owner[usable], column)), shape=shape)
+    seen.data[:] = 1.0
+    return seen
+
+
+def choose_pairs(
+    clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: RefinementConfig
+) -> tuple[Ints, Ints]:
+    """Choose the pairs (i < j) of clouds to be matched: following keyframes, and the best views from other times.
+
+    Parameters
+    ----------
+    poses : (k, 3). path : (k,) travelled distance, m. session : (k,) recording of each keyframe.
+    """
+    k = len(clouds)
+    near_i = np.concatenate([np.arange(k - n) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
+    near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
+    joined = (session[near_i] == session[near_j]) & (path[near_j] - path[near_i] < 3.0)
+    near_i, near_j = near_i[joined], near_j[joined]
+    i, j = _best_views(surface_cells(clouds, poses), path, session, config) if config.partners else (near_i[:0], near_j[:0])
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    pairs = np.unique(np.concatenate([low, near_i]) * k + np.concatenate([high, near_j]))
+    return pairs // k, pairs % k
+
+
+def _best_views(seen: sparse.csr_matrix, path: Floats, session: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
+    """Return for every cloud i the clouds j from other times that share most with it, one of each epoch."""
+    size = np.maximum(np.diff(seen.indptr), 1)
+    epoch = (path / config.epoch).astype(np.int64)
+    across, found = seen.T.tocsr(), []
+    partners = min(config.partners, max(2, config.most // seen.shape[0]))
+    for first in range(0, seen.shape[0], _CLOUDS_AT_ONCE):
+        common = (seen[first : first + _CLOUDS_AT_ONCE] @ across).tocoo()
+        i, j = common.row.astype(np.int64) + first, common.col.astype(np.int64)
+        share = common.data / np.minimum(size[i], size[j])
+        kept = np.flatnonzero((np.abs(path[i] - path[j]) > config.epoch) & (share > config.min_share) & (common.data >= 4))
+        i, j, share = i[kept], j[kept], share[kept]
+        order = np.lexsort((j, -share, epoch[j], session[j], i))
+        i, j, share = i[order], j[order], share[order]
+        fresh = np.flatnonzero(np.diff(np.stack([i, epoch[j], session[j]]), axis=1, prepend=-1).any(axis=0))
+        i, j, share = i[fresh], j[fresh], share[fresh]
+        order = np.lexsort((j, -share, i))
+        i, j = i[order], j[order]
+        best = np.arange(len(i)) - np.searchsorted(i, i) < partners
+        found.append((i[best], j[best]))
+    i, j = (np.concatenate(part) for part in zip(*found, strict=True))
+    return i, j
+
+
+def refine(
+    graph: Graph,
+    clouds: Clouds,
+    raster: CloudRasters,
+    twist: Floats,
+    i: Ints,
+    j: Ints,
+    config: RefinementConfig,
+    solver: SolverConfig,
+    on_round: Callable[[int, int], None] | None = None,
+    delay: float = 0.0,
+) -> Refined:
+    """Match all pairs and solve the graph, round by round.
+
+    Parameters
+    ----------
+    graph : wheels, radio, priors and other edges; scan edges come from here.
+    clouds, raster : see clouds.build and pair_matching.paint; the raster's reach bounds the gate.
+    twist : (k, 3) velocity of the base at each keyframe.
+    i, j : (e,) pairs, see choose_pairs.
+    on_round : called with (round, rounds).
+    delay : of the lidar's clock, s, with which the clouds were made.
+    """
+    # Lines seen obliquely lean a little, so the cloud that gives the points seems shifted towards where it was seen from:
+    # half a millimetre per pair, always to the same side. Every other pair the other way round, that averages out.
+    turned = i % 2 == 1
+    i, j = np.where(turned, j, i), np.where(turned, i, j)
+    points = pair_points(clouds, j, config.points)
+    names = scan_indices(graph.calibration)
+    gate, sigma, rounds = config.first_gate, config.sigma, 0
+    empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names, delay)
+    probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j], kernel=Kernel("cauchy", 5.0))
+    normal: NormalEquations | None = None
+    # The next round looks all matches up anew: one good step is enough.
+    brief = replace(solver, max_iterations=3, relative_decrease=0.5)
+    T_i_j = probe.relative(graph)
+    while True:
+        factors = match(clouds, raster, i, T_i_j, points, gate, max(gate / 3.0, 2.5 * sigma))
+        used = (factors.matched >= config.min_matches) & (factors.matched >= config.min_share * factors.asked)
+        if used.any() and gate < 0.25:
+            sigma = float(np.sqrt(factors.squared[used].sum() / max(factors.weight[used].sum(), 1.0)))
+            sigma = max(sigma, 0.25 * config.sigma)
+        degree = np.bincount(i[used], minlength=len(clouds)) + np.bincount(j[used], minlength=len(clouds))
+        shared = 0.5 * (degree[i] + degree[j])
+        variance = sigma**2 * config.correlation * np.maximum(shared / 2.0, 1.0)
+        z, sqrt_information = measured(factors, T_i_j, variance)
+        # Pairs that do not count stay in with no weight: then all rounds share one pattern, analysed once.
+        edges = replace(probe, T_i_j=z, sqrt_information=sqrt_information, weights=used.astype(np.float64))
+        problem = graph.with_edges(edges)
+        check(problem)
+        normal = normal or NormalEquations(problem, linearize(problem))
+        solved, summary = minimise(problem, linearize(problem), normal, brief)
+        graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
+        before, T_i_j = T_i_j, probe.relative(graph)
+        moved = float(np.sqrt(np.mean(np.sum((T_i_j - before)[used, :2] ** 2, axis=1)))) if used.any() else 0.0
+        rounds += 1
+        if on_round is not None:
+            on_round(rounds, config.rounds)
+        last = gate <= config.last_gate * 1.001
+        if rounds >= config.rounds or (last and moved < config.settled):
+            return Refined(graph, _only(edges, used), i, j, factors, used, sigma, rounds, summary)
+        gate = max(gate * config.shrink, config.last_gate)
+
+
+def _only(edges: ScanEdges, used: Bools) -> ScanEdges:
+    """Return the edges that counted."""
+    return replace(
+        edges, i=edges.i[used], j=edges.j[used], T_i_j=edges.T_i_j[used], sqrt_information=edges.sqrt_information[used],
+        twist_i=edges.twist_i[used], twist_j=edges.twist_j[used], weights=None,
+    )
+
+
+def with_fewer_pairs(graph: Graph, most: int = 12000) -> Graph:
+    """Return the graph with at most so many scan edges between clouds of different times, each for several like it.
+
+    The uncertainty of thousands of poses tied together everywhere would need a factor of hundreds of millions of
+    entries. Every m-th pair, weighing as m, and a chain of single steps tell as much, a little less at every pose: standard
+    deviations come out up to a third too large.
+    """
+    return replace(graph, edges=tuple(_every_nth(e, most) if isinstance(e, ScanEdges) else e for e in graph.edges))
+
+
+def _every_nth(edges: ScanEdges, most: int) -> ScanEdges:
+    gap = np.abs(edges.i - edges.j)
+    near, far = np.flatnonzero(gap <= _NEIGHBOURS), np.flatnonzero(gap > _NEIGHBOURS)
+    each = -(-len(far) // most)
+    if each <= 1:
+        return edges
+    weights = np.ones(len(edges)) if edges.weights is None else edges.weights.copy()
+    # A chain of single steps fills nothing up.
+    steps, kept = near[gap[near] == 1], far[each // 2 :: each]
+    weights[steps] *= len(near) / max(len(steps), 1)
+    weights[kept] *= len(far) / max(len(kept), 1)
+    chosen = np.zeros(len(edges), dtype=bool)
+    chosen[steps] = chosen[kept] = True
+    return replace(_only(edges, chosen), weights=weights[chosen])

@@ -1,0 +1,207 @@
+"""Turning as the laser sees it and as the wheels say it, from scans a moment apart; no map is needed.
+
+When the robot turns left by a, everything the laser sees moves right by a. Matching two scans by a shift of beams
+measures the turn; the wheels tell another. From many such pairs follow whether the laser is mounted upside down (the
+sign), the clock offset (the lag at which both agree best) and the wheels' heading scale (the ratio).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..sensor_log import LaserScans, SensorLog
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+PAIRS = 1000
+"""Scan pairs matched at most."""
+LEAST_PAIRS = 20
+"""Fewer pairs say nothing."""
+_LAGS = np.arange(-1.0, 1.001, 0.02)
+"""Clock offsets tried, s."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turning:
+    """What laser and wheels say of the same turns."""
+
+    pairs: int
+    """Scan pairs that were matched."""
+    typical: float
+    """Median turn between them by the wheels, rad."""
+    told: float
+    """Mean difference of turns, laser mounted as told, at the best clock offset, rad."""
+    other: float
+    """The same with the laser mounted the other way up."""
+    misfit: float
+    """The same the way that is right."""
+    clock_offset: float
+    """Stamp of the laser minus that of the odometry for the same moment, s, where both agree best."""
+    clock_clear: bool
+    """Without the offset the turns agree clearly less."""
+    ratio: float
+    """Turn by the laser / turn by the wheels; nan where there are too few clear turns."""
+    ratio_sigma: float
+
+    @property
+    def agree(self) -> bool:
+        """Whether laser and wheels see the same turns at all, one way up or the other."""
+        return self.misfit <= 0.5 * self.typical
+
+    @property
+    def turned_over(self) -> bool:
+        """Whether the laser is mounted the other way up than told."""
+        return self.other < 0.5 * self.told
+
+
+def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
+    """Compare the turns that laser and wheels see; None where the scans are too few or the robot hardly turns in place.
+
+    Parameters
+    ----------
+    log : with scans.
+    pairs : scan pairs to match at most.
+    """
+    scans = log.scans
+    assert scans is not None
+    if scans.ranges.shape[1] < 30 or len(scans.stamps) < LEAST_PAIRS:
+        return None
+    first, second = _turning_pairs(log, scans, pairs)
+    if len(first) < LEAST_PAIRS:
+        return None
+    middle = 0.5 * scans.time_increment * scans.ranges.shape[1]
+    wheels = np.stack([_wheel_turn(log, scans, first, second, middle + lag) for lag in _LAGS])
+    sign = -1.0 if log.mounting.laser_flipped else 1.0
+    told, other = (_Agreement.of(log, scans, first, second, wheels, s * sign) for s in (1.0, -1.0))
+    right = other if other.misfit.min() < 0.5 * told.misfit.min() else told
+    best, centre = int(np.argmin(right.misfit)), len(_LAGS) // 2
+    gain = right.errors[centre] - right.errors[best]
+    clear = right.misfit[best] < 0.7 * right.misfit[centre] and gain.mean() > 2.0 * gain.std() / np.sqrt(gain.size)
+    return Turning(
+        len(first), float(np.median(np.abs(wheels[centre]))), float(told.misfit.min()), float(other.misfit.min()),
+        float(right.misfit[best]), float(-_LAGS[best]), bool(clear),
+        *_ratio(right.turn, wheels[best]),
+    )
+
+
+def _ratio(laser: Floats, wheels: Floats) -> tuple[float, float]:
+    """Return the median ratio of turns and its standard deviation; nan where there are too few clear ones."""
+    clear = np.abs(wheels) > 0.1
+    if clear.sum() < LEAST_PAIRS:
+        return float("nan"), float("nan")
+    ratio = laser[clear] / wheels[clear]
+    middle = float(np.median(ratio))
+    return middle, float(1.2533 * 1.4826 * np.median(np.abs(ratio - middle)) / np.sqrt(clear.sum()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Agreement:
+    """Turns by the laser under one assumption of its mounting, and how well the wheels agree."""
+
+    turn: Floats
+    """(p,) rad, counter-clockwise."""
+    errors: Floats
+    """(lags, pairs) differences to the wheels without their sign, of the clearer half of the pairs, rad; at most 0.3."""
+
+    @property
+    def misfit(self) -> Floats:
+        """(lags,) mean difference, rad."""
+        return np.asarray(self.errors.mean(axis=1), dtype=np.float64)
+
+    @staticmethod
+    def of(log: SensorLog, scans: LaserScans, first: Ints, second: Ints, wheels: Floats, sign: float) -> "_Agreement":
+        turn, sharp = _matched_turn(scans, first, second, _laser_shift(log, scans, first, second) * (1.0, sign))
+        some = sharp > 0.0
+        clear = some & (sharp >= np.quantile(sharp[some], 0.5)) if some.any() else ~some
+        # A wrong track width makes all turns wrong by one factor; that is no disagreement on which way they go.
+        said, seen = wheels[len(wheels) // 2], sign * turn
+        large = clear & (np.abs(said) > 0.05)
+        factor = float(np.clip(np.median(seen[large] / said[large]), 1.0 / _WIDEST, _WIDEST)) if large.any() else 1.0
+        return _Agreement(seen, np.minimum(np.abs(factor * wheels[:, clear] - seen[clear]), 0.3))
+
+
+_NOISE = 0.02
+"""Mean difference of ranges that means nothing, m."""
+_LEAST_SEEN = 0.05
+"""Share of beams that must see something."""
+_WIDEST = 3.0
+"""Factor by which the wheels' turns may be wrong."""
+
+
+def _turning_pairs(log: SensorLog, scans: LaserScans, pairs: int) -> tuple[Ints, Ints]:
+    """Choose scan pairs about half a second apart between which the robot turns and hardly drives, or drives least."""
+    step = max(1, round(0.5 / max(float(np.median(np.diff(scans.stamps))), 1e-3)))
+    first = np.arange(len(scans.stamps) - step)
+    second = first + step
+    near = scans.stamps[second] - scans.stamps[first] < 2.0
+    start, end = (se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps[k]) for k in (first, second))
+    motion = se2.between(start, end)
+    turn, drive = np.abs(motion[:, 2]), np.hypot(motion[:, 0], motion[:, 1])
+    view = abs(scans.angle_increment) * scans.ranges.shape[1]
+    clear = near & (turn > 0.05) & (turn < 0.4 * view)
+    chosen = np.flatnonzero(clear & (drive < 0.15 + 0.3 * turn))
+    if len(chosen) < LEAST_PAIRS:
+        driving = np.flatnonzero(clear & (drive < 1.0))
+        chosen = np.sort(driving[np.argsort(drive[driving] - 0.3 * turn[driving], kind="stable")[: 2 * LEAST_PAIRS]])
+    chosen = chosen[:: max(1, len(chosen) // pairs)]
+    return first[chosen], second[chosen]
+
+
+def _wheel_turn(log: SensorLog, scans: LaserScans, first: Ints, second: Ints, lag: float) -> Floats:
+    heading = np.unwrap(log.odometry.poses[:, 2])
+    at = [np.interp(scans.stamps[k] + lag, log.odometry.stamps, heading) for k in (first, second)]
+    return np.asarray(at[1] - at[0], dtype=np.float64)
+
+
+def _laser_shift(log: SensorLog, scans: LaserScans, first: Ints, second: Ints) -> Floats:
+    """Return where the laser is at the second scan in its own frame at the first (p, 2), m, by the wheels."""
+    base = (se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps[k]) for k in (first, second))
+    start, end = (se2.compose(pose, log.mounting.T_base_laser) for pose in base)
+    return se2.between(start, end)[:, :2]
+
+
+def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -> tuple[Floats, Floats]:
+    """Return the turn (p,) between scans by the shift of beams that matches best, rad, and how clear it is (0..1).
+
+    The first scan is seen from where the laser moved (p, 2), so that only the turn is left; the mean absolute
+    difference of clipped ranges is taken over all turns up to 40 % of the beams.
+    """
+    every = max(1, scans.ranges.shape[1] // 180)
+    reach = min(scans.range_max, 12.0)
+    angles = scans.angles[::every]
+    used, place = np.unique(np.concatenate([first, second]), return_inverse=True)
+    profile = np.nan_to_num(scans.ranges[used, ::every].astype(np.float64), nan=reach, posinf=reach)
+    profile = np.where(profile < scans.range_min, reach, np.minimum(profile, reach))
+    before = _seen_from(profile[place[: len(first)]], angles, shift, reach)
+    after = profile[place[len(first) :]]
+    beams, most = len(angles), int(0.4 * len(angles))
+    turns = range(-most, most + 1)
+    cost = np.empty((len(first), len(turns)))
+    for column, turn in enumerate(turns):
+        low, high = max(0, -turn), min(beams, beams - turn)
+        cost[:, column] = np.abs(after[:, low:high] - before[:, low + turn : high + turn]).mean(axis=1)
+    best = np.clip(np.argmin(cost, axis=1), 1, len(turns) - 2)
+    rows = np.arange(len(first))
+    left, middle, right = cost[rows, best - 1], cost[rows, best], cost[rows, best + 1]
+    fine = best - most + 0.5 * (left - right) / np.maximum(left - 2.0 * middle + right, 1e-9)
+    # Scans that see nothing fit every turn alike, to the bit, and a lone wall fits best where it leaves the view.
+    clear = 1.0 - (middle + _NOISE) / (np.median(cost, axis=1) + _NOISE)
+    seen = np.mean(profile < reach, axis=1) > _LEAST_SEEN
+    clear *= seen[place[: len(first)]] & seen[place[len(first) :]]
+    return np.asarray(fine * every * scans.angle_increment, dtype=np.float64), clear
+
+
+def _seen_from(profile: Floats, angles: Floats, shift: Floats, reach: float) -> Floats:
+    """Return range profiles (p, b) as seen from a laser moved by shift (p, 2), m, its heading kept; at most reach, m."""
+    x = profile * np.cos(angles) - shift[:, :1]
+    y = profile * np.sin(angles) - shift[:, 1:]
+    moved = np.arctan2(y, x)
+    # The same turn of the circle as before; what is hidden now keeps the order of the beams.
+    moved = angles + se2.wrap_angle(moved - angles)
+    order = np.sign(angles[-1] - angles[0])
+    moved = order * np.maximum.accumulate(order * moved, axis=1)
+    ranges = np.where(profile >= reach, reach, np.minimum(np.hypot(x, y), reach))
+    return np.stack([np.interp(order * angles, order * a, r) for a, r in zip(moved, ranges, strict=True)])

@@ -1,0 +1,57 @@
+"""Point-to-line ICP of many pairs of clouds at once, each pair on its own."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from .clouds import Clouds
+from .scan_matching import CloudRasters, PairFactors, PairPoints, match, trusted_step
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """Where pairs came to lie."""
+
+    pose: Floats
+    """(e, 3) T_i_j."""
+    factors: PairFactors
+    """Of the last matches."""
+
+    @property
+    def share(self) -> Floats:
+        """Share of the points looked up that found a match (e,), 0..1."""
+        return self.factors.matched / np.maximum(self.factors.asked, 1)
+
+    @property
+    def rms(self) -> Floats:
+        """Root mean square distance of the matches (e,), m."""
+        return np.sqrt(self.factors.squared / np.maximum(self.factors.weight, 1e-9))
+
+
+def align_pairs(
+    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, guess: Floats, points: PairPoints, first_gate: float,
+    last_gate: float, iterations: int = 20,
+) -> Aligned:
+    """Align many pairs of clouds at once, each on its own: point-to-line ICP with a shrinking gate.
+
+    Parameters
+    ----------
+    i, j : (e,) target and source clouds. guess : (e, 3) start poses.
+    points : see pair_points. first_gate, last_gate : farthest match in the first and last iteration, m.
+    """
+    pose, gate = guess.copy(), first_gate
+    for _ in range(iterations):
+        factors = match(clouds, raster, i, pose, points, gate, gate / 2.0)
+        step = trusted_step(factors)[0]
+        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / 0.3, np.abs(step[:, 2]) / 0.15)
+        pose += step / np.maximum(reach, 1.0)[:, None]
+        pose[:, 2] = se2.wrap_angle(pose[:, 2])
+        if gate <= last_gate and np.abs(step).max(initial=0.0) < 1e-4:
+            break
+        gate = max(0.8 * gate, last_gate)
+    return Aligned(pose, match(clouds, raster, i, pose, points, last_gate, last_gate / 2.0))

@@ -1,0 +1,295 @@
+"""Point-to-line matching of many pairs of clouds at once.
+
+Nearest neighbours come from one raster per cloud, painted so that each cell names the nearest point: looking up a
+million points is a handful of array operations and no tree. A pair's matches are condensed into the quadratic form
+of its relative pose (3 x 3), which is all that the graph needs to know of them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from .clouds import Clouds
+from .line_factor import relative_eigen
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+_CLOUDS_AT_ONCE = 256
+"""Clouds whose rasters are painted at once."""
+_AT_ONCE = 16384
+"""Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
+_SAME_FACING = float(np.sqrt(0.5))
+"""Least cosine between the normals of two matched points."""
+_NOBODY = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudRasters:
+    """A raster for every cloud: which of its points is nearest to each cell around it."""
+
+    cell: float
+    """m."""
+    origin: Floats
+    """(k, 2) lower corner of each cloud's raster in its own frame, m."""
+    shape: Ints
+    """(k, 2) cells in x and y; the outermost ones name no point."""
+    start: Ints
+    """(k,) first cell of each raster in `nearest`."""
+    nearest: NDArray[np.signedinteger]
+    """(cells,) number of the nearest point within its cloud, -1 = none within reach; 16 bits where they suffice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairFactors:
+    """Matches of pairs (e) of clouds, condensed about their relative poses."""
+
+    hessian: Floats
+    """(e, 3, 3) sum of w J^T J of the point-to-line distances by T_i_j (x, y, theta), 1/m^2-like, unscaled by noise."""
+    feigned: Floats
+    """(e, 3, 3) part of it that the scatter of the normals alone would feign, see line_factor."""
+    gradient: Floats
+    """(e, 3) sum of w J^T r."""
+    matched: Ints
+    """(e,) points with a match."""
+    asked: Ints
+    """(e,) points that were looked up."""
+    squared: Floats
+    """(e,) sum of w r^2, m^2."""
+    weight: Floats
+    """(e,) sum of w."""
+
+
+def paint(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
+    """Build the rasters: each point with a normal claims the cells within reach, nearer cells last.
+
+    Parameters
+    ----------
+    cell, reach : cell size and distance up to which a point is a neighbour, m.
+    """
+    low, high = _boxes(clouds)
+    filled = np.isfinite(low[:, :1])
+    margin = reach + cell
+    low = np.where(filled, low - margin, 0.0)
+    shape = np.where(filled, np.ceil((high + margin - low) / cell), 0.0).astype(np.int64) + filled
+    size = shape[:, 0] * shape[:, 1]
+    start = np.concatenate([[0], np.cumsum(size)[:-1]])
+    narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
+    raster = CloudRasters(cell, low, shape, start, np.full(int(size.sum()), _NOBODY, dtype=np.int16 if narrow else np.int32))
+    steps = int(np.floor(reach / cell))
+    offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
+    offsets = sorted((o for o in offsets if np.hypot(*o) * cell <= reach), key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o))
+    for some in _blocks(clouds):
+        _paint(clouds, some, raster, offsets)
+    return raster
+
+
+def _blocks(clouds: Clouds) -> Iterator[slice]:
+    """Yield the clouds a bounded number at a time."""
+    for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
+        yield slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds)))
+
+
+def _paint(clouds: Clouds, some: slice, raster: CloudRasters, offsets: list[tuple[int, int]]) -> None:
+    """Let the points of some clouds claim the cells at these offsets from their own, the last offset with most right."""
+    usable, owner, x, y = _usable(clouds, some)
+    rows = (usable - clouds.offsets[owner]).astype(raster.nearest.dtype)
+    stride, low = raster.shape[owner, 1], raster.origin[owner]
+    cx, cy = ((x - low[:, 0]) / raster.cell).astype(np.int64), ((y - low[:, 1]) / raster.cell).astype(np.int64)
+    base = cx * stride + cy + raster.start[owner]
+    for dx, dy in offsets:
+        raster.nearest[base + (dx * stride + dy)] = rows
+
+
+def _usable(clouds: Clouds, some: slice) -> tuple[Ints, Ints, Floats, Floats]:
+    """Return rows, clouds and coordinates (p,) of the points with a normal of some clouds."""
+    first, end = clouds.offsets[some.start], clouds.offsets[some.stop]
+    usable = first + np.flatnonzero(np.any(clouds.normals[first:end] != 0.0, axis=1))
+    x, y = clouds.points[usable].T.astype(np.float64)
+    return usable, clouds.owner[usable], x, y
+
+
+def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
+    """Return the corners (k, 2) of a box around the points with a normal of each cloud; inf where it has none."""
+    low, high = np.full((len(clouds), 2), np.inf), np.full((len(clouds), 2), -np.inf)
+    for some in _blocks(clouds):
+        _, owner, x, y = _usable(clouds, some)
+        if len(owner):
+            begins = np.flatnonzero(np.concatenate([[True], np.diff(owner) > 0]))
+            low[owner[begins]] = np.minimum.reduceat(np.stack([x, y]), begins, axis=1).T
+            high[owner[begins]] = np.maximum.reduceat(np.stack([x, y]), begins, axis=1).T
+    return low, high
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairPoints:
+    """The points that pairs look up: those of cloud j with a normal, thinned."""
+
+    row: NDArray[np.int32]
+    """(e, n) rows in the clouds' arrays, a pair's own in front; -1 behind them where a pair has fewer than others."""
+
+    @property
+    def count(self) -> Ints:
+        """(e,) points of each pair."""
+        return np.asarray((self.row >= 0).sum(axis=1))
+
+    def of(self, pair: int) -> Ints:
+        """Return the rows of one pair."""
+        rows = self.row[pair]
+        return np.asarray(rows[rows >= 0], dtype=np.int64)
+
+
+def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
+    """List up to `limit` evenly spaced points with normals of the source cloud j (e,) of each pair."""
+    usable = np.any(clouds.normals != 0.0, axis=1)
+    ranks = np.concatenate([[0], np.cumsum(usable)])
+    rows = np.append(np.flatnonzero(usable), _NOBODY).astype(np.int32)
+    begin, end = ranks[clouds.offsets[j]], ranks[clouds.offsets[j + 1]]
+    take = np.minimum(end - begin, limit)
+    rank = np.arange(take.max(initial=0))
+    picked = begin[:, None] + (rank * (end - begin)[:, None]) // np.maximum(take, 1)[:, None]
+    return PairPoints(rows[np.where(rank < take[:, None], picked, len(rows) - 1)])
+
+
+def match(
+    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float
+) -> PairFactors:
+    """Match the listed points of each pair's source cloud to lines of its target cloud i.
+
+    Parameters
+    ----------
+    i : (e,) target clouds. T_i_j : (e, 3) present relative poses.
+    points : what to look up, see pair_points.
+    gate : matches farther apart, and with normals more than 45 degrees apart, do not count, m.
+    scale : width of the Geman-McClure kernel on the point-to-line distance, m.
+
+    Returns
+    -------
+    PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
+    """
+    surface = _Surface.of(clouds)
+    at_once = max(_AT_ONCE // max(points.row.shape[1], 1), 1)
+    parts = [
+        _match(clouds, surface, raster, i[a : a + at_once], T_i_j[a : a + at_once], points.row[a : a + at_once], gate, scale)
+        for a in range(0, max(len(i), 1), at_once)
+    ]
+    return PairFactors(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PairFactors)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """Points, normals and variances of all clouds, each coordinate in one piece."""
+
+    x: Floats
+    y: Floats
+    nx: Floats
+    ny: Floats
+    variance: Floats
+
+    @classmethod
+    def of(cls, clouds: Clouds) -> "_Surface":
+        columns = (*clouds.points.T, *clouds.normals.T, clouds.normal_variance)
+        return cls(*(np.ascontiguousarray(column) for column in columns))
+
+
+def _match(
+    clouds: Clouds, surface: _Surface, raster: CloudRasters, i: Ints, T_i_j: Floats, row: NDArray[np.int32],
+    gate: float, scale: float,
+) -> PairFactors:
+    """Match pairs (e,) whose source points stand in a table (e, n): per-pair values are columns (e, 1)."""
+    c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
+    px, py = surface.x.take(row), surface.y.take(row)
+    rx, ry = c * px - s * py, s * px + c * py
+    x, y = rx + T_i_j[:, :1], ry + T_i_j[:, 1:2]
+    found = _look_up(raster, i, x, y)
+    near = found >= 0
+    target = found + clouds.offsets[i, None]
+    target *= near
+    nx, ny = surface.nx.take(target), surface.ny.take(target)
+    dx, dy = x - surface.x.take(target), y - surface.y.take(target)
+    sx, sy = surface.nx.take(row), surface.ny.take(row)
+    facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
+    good = near & (dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING) & (row >= 0)
+    r = nx * dx + ny * dy
+    root = good / (1.0 + np.square(r * (1.0 / scale)))
+    weighted = np.empty((len(i), 4, row.shape[1]))
+    wx, wy = np.multiply(root, nx, out=weighted[:, 0]), np.multiply(root, ny, out=weighted[:, 1])
+    weighted[:, 2] = wy * rx - wx * ry
+    weighted[:, 3] = root * r
+    summed = weighted @ weighted.transpose(0, 2, 1)
+    weighted[:, 2] = wx * rx + wy * ry
+    # The tangent (-ny, nx) stands where the normal stood; its variance weighs it once more.
+    tangent = np.stack([-wy, wx, weighted[:, 2]], axis=1)
+    scatter = surface.variance.take(target) + surface.variance.take(row)
+    feigned = (tangent * scatter[:, None]) @ tangent.transpose(0, 2, 1)
+    return PairFactors(
+        hessian=summed[:, :3, :3],
+        feigned=feigned,
+        gradient=summed[:, :3, 3],
+        matched=good.sum(axis=1),
+        asked=(row >= 0).sum(axis=1),
+        squared=summed[:, 3, 3],
+        weight=np.einsum("en,en->e", root, root),
+    )
+
+
+def _look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> Ints:
+    """Return the number (e, n) of the point of cloud i (e,) nearest to each x, y (e, n), m; -1 where none is near."""
+    per_cell = 1.0 / raster.cell
+    # Truncation takes what lies up to a cell below the raster into its rim, which names no point.
+    cx = ((x - raster.origin[i, :1]) * per_cell).astype(np.int32)
+    cy = ((y - raster.origin[i, 1:]) * per_cell).astype(np.int32)
+    wide, high = raster.shape[i, :1].astype(np.uint32), raster.shape[i, 1:].astype(np.uint32)
+    inside = (cx.view(np.uint32) < wide) & (cy.view(np.uint32) < high)
+    cell = cx * raster.shape[i, 1:] + cy
+    cell += raster.start[i, None]
+    cell *= inside
+    if not len(raster.nearest):
+        return np.full(x.shape, _NOBODY, dtype=np.int64)
+    return np.where(inside, raster.nearest.take(cell), _NOBODY).astype(np.int64)
+
+
+_TRUSTED = 2.0
+"""Multiple of the feigned information that a direction must exceed to have been measured."""
+
+
+def trusted_step(factors: PairFactors) -> tuple[Floats, Floats]:
+    """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with
+    L^T L the information in those directions (unscaled by noise).
+
+    In the basis B that diagonalises both, feigned = B B^T and hessian = B V diag(l) V^T B^T; l must exceed a multiple
+    of 1, see line_factor.trusted_part.
+    """
+    basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.feigned)
+    kept = np.maximum(values - _TRUSTED, 0.0)
+    divisor = np.where(kept > 0.0, values, np.inf)
+    within = np.swapaxes(vectors, 1, 2) @ inverse
+    step = -np.einsum("eji,ej->ei", within, np.einsum("eij,ej->ei", within, factors.gradient) / divisor)
+    return step, np.sqrt(kept)[:, :, None] * np.swapaxes(basis @ vectors, 1, 2)
+
+
+def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """Turn factors into relative-pose measurements.
+
+    Parameters
+    ----------
+    T_i_j : (e, 3) poses about which the factors were made.
+    variance : (e,) m^2, variance of one match.
+
+    Returns
+    -------
+    Z (e, 3) and sqrt_information (e, 3, 3) in the chart e = Z^-1 T; zero along what cannot be seen.
+    """
+    step, root = trusted_step(factors)
+    z = T_i_j + step
+    z[:, 2] = se2.wrap_angle(z[:, 2])
+    c, s = se2.cos_sin(z[:, 2])
+    turn = np.zeros((len(z), 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = c
+    turn[:, 0, 1], turn[:, 1, 0] = -s, s
+    turn[:, 2, 2] = 1.0
+    return z, root @ turn / np.sqrt(variance)[:, None, None]

@@ -1,0 +1,123 @@
+"""Sub-maps: the trajectory cut by travelled distance, each piece's clouds merged in the frame of its middle keyframe.
+
+(Paper, section on sub-maps: scans gathered while the travelled distance stays below epsilon, then filtered.)
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from .clouds import Clouds, joined, mean_by_key
+from .point_cloud import radius_outlier_filter, statistical_outlier_filter
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+_AT_ONCE = 32
+"""Sub-maps merged at once; a bound on the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class SubmapConfig:
+    """Size and cleaning of sub-maps."""
+
+    epsilon: float = 5.0
+    """Travelled distance of one sub-map, m (the paper's epsilon; it uses 9)."""
+    voxel: float = 0.08
+    """Cell over which points are averaged, m."""
+    neighbours: int = 8
+    """Statistical filter: nearest neighbours looked at."""
+    std_ratio: float = 3.0
+    """Statistical filter: a point whose neighbours lie farther than the mean by so many standard deviations goes."""
+    radius: float = 0.25
+    """Radius filter: m."""
+    min_neighbours: int = 2
+    """Radius filter: a point with fewer neighbours within the radius goes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Submaps:
+    """All sub-maps of a run."""
+
+    first: Ints
+    """(s,) first keyframe of each."""
+    last: Ints
+    """(s,) one past its last keyframe."""
+    reference: Ints
+    """(s,) keyframe in whose frame its points stand."""
+    clouds: Clouds
+    """s clouds, in the frames of the reference keyframes."""
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+def cut(path: Floats, session: Ints, epsilon: float) -> tuple[Ints, Ints]:
+    """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording.
+
+    Returns
+    -------
+    first (s,) and one past the last keyframe (s,) of each piece.
+    """
+    piece = np.floor((path - path[0]) / max(epsilon, 1e-9)).astype(np.int64) if epsilon > 0 else np.arange(len(path))
+    change = np.concatenate([[True], (np.diff(piece) != 0) | (np.diff(session) != 0)])
+    first = np.flatnonzero(change)
+    return first, np.append(first[1:], len(path))
+
+
+def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: SubmapConfig) -> Submaps:
+    """Merge the clouds of each piece of the trajectory and filter them: voxel, statistical, radius.
+
+    Parameters
+    ----------
+    clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. session : (k,).
+    """
+    first, last = cut(path, session, config.epsilon)
+    reference = (first + last - 1) // 2
+    parts = []
+    for block in range(0, len(first), _AT_ONCE):
+        own = slice(block, block + _AT_ONCE)
+        parts.append(_built(clouds, poses, first[own], last[own], reference[own], config))
+    return Submaps(first, last, reference, joined(parts))
+
+
+def _built(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Clouds:
+    """Return the clouds of neighbouring sub-maps, which begin with the keyframes first (s,) and end before last (s,)."""
+    keyframes = slice(int(first[0]), int(last[-1]))
+    rows = slice(int(clouds.offsets[keyframes.start]), int(clouds.offsets[keyframes.stop]))
+    piece = np.repeat(np.arange(len(first)), last - first)
+    owner = clouds.owner[rows] - keyframes.start
+    relative = se2.between(poses[reference[piece]], poses[keyframes])[owner]
+    points = se2.transform(relative, clouds.points[rows])
+    normals = se2.rotate(relative[:, 2], clouds.normals[rows])
+    scatter = clouds.normal_variance[rows]
+    number, points, normals, scatter = _merge(piece[owner], points, normals, scatter, config.voxel)
+    kept = np.ones(len(number), dtype=bool)
+    offsets = np.searchsorted(number, np.arange(len(first) + 1)).astype(np.int64)
+    for a, b in itertools.pairwise(offsets):
+        if b > a:
+            kept[a:b] = statistical_outlier_filter(points[a:b], config.neighbours, config.std_ratio)
+            inner = np.flatnonzero(kept[a:b]) + a
+            kept[inner] = radius_outlier_filter(points[inner], config.radius, config.min_neighbours)
+    return Clouds(offsets, points, normals, number, scatter).only(kept)
+
+
+def _merge(
+    owner: Ints, points: Floats, normals: Floats, scatter: NDArray[np.floating], size: float
+) -> tuple[Ints, Floats, Floats, Floats]:
+    """Average points, normals and their variances by cell; the two sides of a wall stay apart by facing."""
+    cell = np.floor(points / size).astype(np.int64)
+    cell -= cell.min(axis=0, initial=0)
+    # Four facings, not two: noise must not turn a normal from one side's facing into the other's, whatever way the wall runs.
+    facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
+    wide, high = cell.max(axis=0, initial=0) + 1
+    key = ((owner * wide + cell[:, 0]) * high + cell[:, 1]) * 4 + facing
+    one, mean = mean_by_key(key, np.concatenate([points, normals, scatter[:, None]], axis=1))
+    length = np.hypot(mean[:, 2], mean[:, 3])
+    clear = length > 0.5
+    normal = np.where(clear[:, None], mean[:, 2:4] / np.where(clear, length, 1.0)[:, None], 0.0)
+    return owner[one], mean[:, :2], normal, mean[:, 4]

@@ -1,0 +1,1 @@
+"""Loop closures (paper: step 2): candidates, matching, verification."""

@@ -1,0 +1,117 @@
+"""Which pairs of sub-maps are worth matching: those that may overlap for all the graph knows.
+
+Where the graph's own covariance of two sub-maps is small, they are candidates when they ought to share surfaces; where
+it is large, when they might.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..graph.graph import Graph
+from ..graph.marginals import JointCovariance
+from ..lidar.joint_refinement import surface_cells
+from ..lidar.submaps import Submaps
+from .closures import Closures, LoopClosureConfig
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Pairs of sub-maps to try."""
+
+    target: Ints
+    """(c,) number of the sub-map that is matched against."""
+    source: Ints
+    """(c,) number of the sub-map that is laid onto it."""
+    guess: Floats
+    """(c, 3) relative pose of the reference keyframes by the graph."""
+    covariance: Floats
+    """(c, 3, 3) of the guess."""
+    spread: Floats
+    """(c,) 3 sigma of its position, m."""
+    held: bool = True
+    """Radio or known anchors hold the trajectory, so that its covariance is to be believed."""
+
+    def rows(self, chosen: slice) -> "Candidates":
+        """Return some of them."""
+        return replace(
+            self, target=self.target[chosen], source=self.source[chosen], guess=self.guess[chosen],
+            covariance=self.covariance[chosen], spread=self.spread[chosen],
+        )
+
+    def renumbered(self, target: Ints, source: Ints) -> "Candidates":
+        """Return them with other numbers of sub-maps."""
+        return replace(self, target=target, source=source)
+
+    def names(self, config: LoopClosureConfig) -> set[tuple[int, int, bool]]:
+        """Return (target, source, searched) of each, to remember what was tried."""
+        doubtful = self.spread > config.direct
+        return {(int(a), int(b), bool(d)) for a, b, d in zip(self.target, self.source, doubtful, strict=True)}
+
+
+def propose(
+    graph: Graph, marginals: JointCovariance, submaps: Submaps, session: Ints, tried: set[tuple[int, int, bool]],
+    missed: set[tuple[int, int]], held: bool, config: LoopClosureConfig,
+) -> Candidates:
+    """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
+
+    Parameters
+    ----------
+    graph, marginals : present estimates, and the uncertainty of the sub-maps' reference keyframes.
+    session : (k,) recording of each keyframe.
+    tried : (target, source, searched) of earlier rounds; not proposed again.
+    held : the trajectory is held by radio.
+    missed : (target, source) that did not match from the graph's guess though the graph may be wrong: searched with slack.
+    """
+    s = len(submaps)
+    reference = submaps.reference
+    a, b = np.triu_indices(s, 1)
+    apart = (b - a > 1) | (session[reference[a]] != session[reference[b]])
+    a, b = a[apart], b[apart]
+    poses = graph.poses[reference]
+    distance = np.hypot(*(poses[a, :2] - poses[b, :2]).T)
+    near = distance < config.reach + config.search_limit
+    a, b, distance = a[near], b[near], distance[near]
+    if not len(a):
+        return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), held)
+    covariance = marginals.relative(reference[a], reference[b])
+    slack = np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
+    astray = np.array([(int(x), int(y)) in missed for x, y in zip(a, b, strict=True)])
+    covariance = covariance + astray[:, None, None] * slack
+    spread = 3.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
+    seen = surface_cells(submaps.clouds, poses)
+    common = np.asarray((seen @ seen.T).todense())[a, b]
+    size = np.maximum(np.diff(seen.indptr), 1)
+    expected = common / np.minimum(size[a], size[b])
+    doubtful = spread > config.direct
+    worth = np.where(doubtful & ~astray, 1.0 - distance / (config.reach + np.minimum(spread, config.search_limit)), expected)
+    possible = np.where(doubtful, worth > 0.0, expected > 0.25) & (size[a] > 5) & (size[b] > 5)
+    fresh = np.array([(int(x), int(y), bool(d)) not in tried for x, y, d in zip(a, b, doubtful, strict=True)])
+    kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
+    a, b = a[kept], b[kept]
+    return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept], held)
+
+
+def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
+    """Return rows such that every sub-map keeps its `limit` best partners; rows with worth <= 0 never."""
+    kept: set[int] = set()
+    for one in (a, b):
+        order = np.lexsort((-worth, one))
+        rank = np.arange(len(order)) - np.searchsorted(one[order], one[order])
+        kept.update(order[(rank < limit) & (worth[order] > 0.0)].tolist())
+    return np.array(sorted(kept), dtype=np.int64)
+
+
+def missed(candidates: Candidates, found: Closures, config: LoopClosureConfig) -> set[tuple[int, int]]:
+    """Return (target, source) of candidates that were matched from the graph's guess and shared too few points."""
+    direct = candidates.spread <= config.direct
+    return {
+        (int(a), int(b))
+        for a, b, d, story in zip(candidates.target, candidates.source, direct, found.candidates, strict=True)
+        if d and story.overlap < config.overlap
+    }

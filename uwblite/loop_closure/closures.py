@@ -1,0 +1,106 @@
+"""Loop closures found so far, and the settings that all who seek them share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..graph.pose_edges import RelativePoseEdges
+from ..map_result import LoopClosure
+
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosureConfig:
+    """Search and acceptance of loop closures."""
+
+    method: Literal["search", "icp"] = "search"
+    """search: candidates by the graph's own uncertainty, judged by all that follows here. icp: the paper's plain way, by
+    the settings of [icp]; of those here only rounds, partners and correlation count (see plain_closures)."""
+    partners: int = 4
+    """Candidates per sub-map and round, best expected overlap first."""
+    rounds: int = 4
+    """Most rounds of searching and solving; ends early when a round finds nothing new."""
+    enough: float = 5.0
+    """Closures per sub-map, on average, after which no further round is made."""
+    direct: float = 0.5
+    """Matching starts from the graph's guess when its uncertainty (3 sigma) is below this, m; else a search comes first."""
+    reach: float = 6.0
+    """Sub-maps whose middles lie farther apart than this, after the uncertainty is taken off, are no candidates, m."""
+    search_limit: float = 8.0
+    """Largest half-width of a search, m."""
+    search_angle: float = 0.7
+    """Largest half-width of a search, rad."""
+    gate: float = 0.15
+    """Outlier distance d of the final matching, m (the paper uses 0.1)."""
+    sigma: float = 0.05
+    """Fitness: greatest root mean square distance of matched points, m."""
+    overlap: float = 0.4
+    """Least share of points with a match when the graph's guess was good."""
+    overlap_after_search: float = 0.5
+    """Least share of points with a match after a search, which can be fooled."""
+    uniqueness: float = 0.85
+    """A second place that matches this share as well as the first makes a search ambiguous."""
+    slip: float = 1.0
+    """Standard deviation, m, added to the graph's guess where matching from it failed although the sub-maps ought to
+    overlap and no radio holds the trajectory: the wheels may have slipped. Such pairs are searched anew."""
+    slip_angle: float = 0.2
+    """The same for the heading, rad."""
+    consistency: float = 16.0
+    """Largest squared Mahalanobis distance between match and graph, and of an accepted match in the second optimisation (3
+    degrees of freedom; 16 = 0.1 %). Where no radio holds the trajectory, one slip or false step puts a chain of steps wrong
+    far beyond its covariance, and only the second counts."""
+    points: int = 250
+    """Points looked up per pair."""
+    match_sigma: float = 0.03
+    """Standard deviation of a match, m."""
+    correlation: float = 24.0
+    """Matches that together weigh as one: they share the bending of both sub-maps."""
+    through: float = 0.12
+    """Largest share of one sub-map's points that may stand where the other saw free space. Where sub-maps driven one after
+    the other disagree more, because people walk about, it is by how much these do."""
+    places: int = 3
+    """Places found by a search that are matched before one is chosen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closures:
+    """Closures found so far: accepted edges between keyframes, and every candidate's story."""
+
+    edges: RelativePoseEdges
+    """One per accepted candidate, in their order."""
+    candidates: tuple[LoopClosure, ...]
+
+    def without(self, keep: Bools, reasons: Sequence[str]) -> "Closures":
+        """Return the collection with some accepted candidates rejected.
+
+        Parameters
+        ----------
+        keep : (e,) of the edges. reasons : (e,) why each other one goes.
+        """
+        story, standing = list(self.candidates), [k for k, c in enumerate(self.candidates) if c.accepted]
+        for k in np.flatnonzero(~keep).tolist():
+            story[standing[k]] = replace(story[standing[k]], accepted=False, reason=reasons[k])
+        return Closures(self.edges.rows(np.flatnonzero(keep)), tuple(story))
+
+
+def no_closures() -> Closures:
+    """Return the empty collection."""
+    none = np.zeros(0, dtype=np.int64)
+    return Closures(RelativePoseEdges(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3))), ())
+
+
+def merged(one: Closures, other: Closures) -> Closures:
+    """Return both collections as one."""
+    a, b = one.edges, other.edges
+    edges = RelativePoseEdges(
+        np.concatenate([a.i, b.i]),
+        np.concatenate([a.j, b.j]),
+        np.concatenate([a.T_i_j, b.T_i_j]),
+        np.concatenate([a.sqrt_information, b.sqrt_information]),
+        b.kernel,
+    )
+    return Closures(edges, one.candidates + other.candidates)

@@ -1,0 +1,163 @@
+"""Where candidates for loop closures fit best: searched for, aligned, held against each other's free space.
+
+Candidates are matched a few at a time, each batch with the sub-maps it needs: by one process after the other or by
+several, with the same outcome.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..lidar.clouds import Clouds
+from ..lidar.correlative_matching import SearchConfig, search
+from ..lidar.free_space import FreeSpace
+from ..lidar.pair_alignment import Aligned, align_pairs
+from ..lidar.point_cloud import PointCloud, make_cloud
+from ..lidar.scan_matching import PairFactors, match, paint, pair_points
+from ..lidar.visibility import sees_through
+from ..parallel import in_order
+from .candidates import Candidates
+from .closures import LoopClosureConfig
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_AT_ONCE = 32
+"""Candidates of a batch."""
+_SAME_PLACE = 0.3
+"""Matches nearer than this, m and rad, are one place."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fits:
+    """How candidates (c,) fit."""
+
+    best: Aligned
+    """Where each fits best; the guess where no place was found."""
+    found: Bools
+    """(c,) a place was found."""
+    second: Floats
+    """(c,) what share of its matches another place reaches."""
+    through: Floats
+    """(c,) share of its points that would stand in free space."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Batch:
+    """Some candidates and all that matching them needs."""
+
+    candidates: Candidates
+    """Numbers of sub-maps are those of the batch."""
+    clouds: Clouds
+    free: Sequence[FreeSpace] | None
+    config: LoopClosureConfig
+    search: SearchConfig
+
+
+def fit(
+    candidates: Candidates, clouds: Clouds, config: LoopClosureConfig, search_config: SearchConfig,
+    free: Sequence[FreeSpace] | None = None, progress: Callable[[int, int], None] | None = None,
+    executor: Executor | None = None,
+) -> Fits:
+    """Find where each candidate fits.
+
+    Parameters
+    ----------
+    candidates : at least one. clouds : of all sub-maps.
+    free : what each sub-map saw to be free; None = not asked.
+    progress : called with (done, total). executor : see parallel.in_order.
+    """
+    total, done, parts = len(candidates.target), 0, []
+    for part in in_order(_fit, _batches(candidates, clouds, config, search_config, free), executor):
+        parts.append(part)
+        done += len(part.found)
+        if progress is not None:
+            progress(done, total)
+    factors = (np.concatenate([getattr(p.best.factors, f.name) for p in parts]) for f in fields(PairFactors))
+    best = Aligned(np.concatenate([p.best.pose for p in parts]), PairFactors(*factors))
+    return Fits(best, *(np.concatenate([getattr(p, name) for p in parts]) for name in ("found", "second", "through")))
+
+
+def _batches(
+    candidates: Candidates, clouds: Clouds, config: LoopClosureConfig, search_config: SearchConfig,
+    free: Sequence[FreeSpace] | None,
+) -> Iterator[_Batch]:
+    for first in range(0, len(candidates.target), _AT_ONCE):
+        part = candidates.rows(slice(first, first + _AT_ONCE))
+        used, number = np.unique(np.concatenate([part.target, part.source]), return_inverse=True)
+        target, source = np.split(number.reshape(-1).astype(np.int64), 2)
+        spaces = None if free is None else [free[k] for k in used.tolist()]
+        yield _Batch(part.renumbered(target, source), clouds.chosen(used), spaces, config, search_config)
+
+
+def _fit(batch: _Batch) -> Fits:
+    """Fit one batch; runs in a worker."""
+    candidates, clouds, config = batch.candidates, batch.clouds, batch.config
+    raster = paint(clouds, 0.1, 0.5)
+    row, guess = _guesses(batch)
+    points = pair_points(clouds, candidates.source[row], config.points)
+    tries = align_pairs(clouds, raster, candidates.target[row], candidates.source[row], guess, points, 0.5, config.gate)
+    place, second = _best_places(row, tries, len(candidates.target))
+    found, pose = place >= 0, candidates.guess.copy()
+    pose[found] = tries.pose[place[found]]
+    points = pair_points(clouds, candidates.source, config.points)
+    factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
+    best = Aligned(pose, factors)
+    return Fits(best, found, second, _see_through(batch, best))
+
+
+def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
+    """Return places to start matching from: candidate (g,) and pose (g, 3); several for those that are searched for."""
+    candidates, config = batch.candidates, batch.config
+    rows, guesses = [], []
+    prepared: dict[int, PointCloud] = {}
+    for k, searched in enumerate((candidates.spread > config.direct).tolist()):
+        poses = candidates.guess[k : k + 1]
+        if searched:
+            half_width = float(np.minimum(candidates.spread[k], config.search_limit))
+            turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[k, 2, 2]), 0.1, config.search_angle))
+            target, source = (_prepare(batch.clouds, int(c[k]), prepared) for c in (candidates.target, candidates.source))
+            poses = search(target, source, poses[0], (half_width, half_width, turn), batch.search).poses[: config.places]
+        rows.append(np.full(len(poses), k))
+        guesses.append(poses)
+    return np.concatenate(rows).astype(np.int64), np.concatenate(guesses)
+
+
+def _best_places(row: Ints, tries: Aligned, candidates: int) -> tuple[Ints, Floats]:
+    """Return the best try of each candidate (c,), -1 = none, and what share of its matches another place reaches (c,)."""
+    best, second = np.full(candidates, -1, dtype=np.int64), np.zeros(candidates)
+    share = tries.share
+    for k in np.unique(row):
+        own = np.flatnonzero(row == k)
+        first = own[np.argmax(share[own])]
+        best[k] = first
+        apart = se2.between(tries.pose[first], tries.pose[own])
+        other = own[(np.hypot(apart[:, 0], apart[:, 1]) > _SAME_PLACE) | (np.abs(apart[:, 2]) > _SAME_PLACE)]
+        second[k] = share[other].max(initial=0.0) / max(share[first], 1e-9)
+    return best, second
+
+
+def _prepare(clouds: Clouds, k: int, prepared: dict[int, PointCloud]) -> PointCloud:
+    """Return one sub-map's cloud ready for the search; its normals tell from which side it was seen."""
+    if k not in prepared:
+        points, normals = clouds.cloud(k)
+        prepared[k] = make_cloud(points, points + normals)
+    return prepared[k]
+
+
+def _see_through(batch: _Batch, best: Aligned) -> Floats:
+    """Return the larger share of points (c,) of either sub-map that would stand in what the other saw to be free."""
+    candidates, config, free = batch.candidates, batch.config, batch.free
+    through = np.zeros(len(candidates.target))
+    if free is None:
+        return through
+    promising = (best.share >= min(config.overlap, config.overlap_after_search)) & (best.rms <= config.sigma)
+    for k in np.flatnonzero(promising):
+        a, b = int(candidates.target[k]), int(candidates.source[k])
+        through[k] = sees_through(free[a], batch.clouds.cloud(a)[0], free[b], batch.clouds.cloud(b)[0], best.pose[k])
+    return through

@@ -1,0 +1,147 @@
+"""Loop closures as the paper finds them: ICP between sub-maps that overlap where the first optimisation puts them.
+
+One registration per pair, from the graph's guess; a pair is accepted when the fitness score, the mean squared distance
+of the source's points to the target, stays below a threshold. Nothing else is asked: no search, no uniqueness, no
+consistency among closures. ``loop_closure`` does what experience adds to that.
+"""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..graph.graph import Graph
+from ..graph.pose_edges import RelativePoseEdges
+from ..lidar.clouds import Clouds
+from ..lidar.point_cloud import make_cloud
+from ..lidar.point_to_point import IcpConfig, Registration, align
+from ..lidar.submaps import Submaps
+from ..map_result import LoopClosure
+from ..parallel import in_order
+from .closures import Closures, LoopClosureConfig, no_closures
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_CELL = 0.5
+"""m; two sub-maps overlap by the share of such squares of the smaller one that both have points in."""
+_LEAST_SHARED = 0.25
+"""Least such share of a candidate."""
+_AT_ONCE = 32
+"""Pairs of a batch."""
+
+
+def find(
+    graph: Graph, submaps: Submaps, session: Ints, config: LoopClosureConfig, icp: IcpConfig,
+    progress: Callable[[int, int], None] | None = None, executor: Executor | None = None,
+) -> Closures:
+    """Align every pair of sub-maps that overlap by the graph; keep all, with what became of them.
+
+    Parameters
+    ----------
+    graph : poses that place the sub-maps.
+    session : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
+    config : its partners bound the candidates per sub-map. icp : method, outlier distance, iterations and fitness.
+    progress : called with (done, total).
+    executor : any concurrent.futures executor; the result does not depend on it.
+    """
+    target, source = candidates(graph.poses, submaps, session, config.partners)
+    if not len(target):
+        return no_closures()
+    i, j = submaps.reference[target], submaps.reference[source]
+    guess = se2.between(graph.poses[i], graph.poses[j])
+    results: list[Registration] = []
+    for part in in_order(_align, _batches(submaps.clouds, target, source, guess, icp), executor):
+        results += part
+        if progress is not None:
+            progress(len(results), len(target))
+    information = [found.information / config.correlation for found in results]
+    story = [_story(int(i[k]), int(j[k]), found, information[k]) for k, found in enumerate(results)]
+    good = np.flatnonzero([c.accepted for c in story])
+    kept = [story[k] for k in good]
+    return Closures(
+        RelativePoseEdges(
+            np.array([c.i for c in kept], dtype=np.int64),
+            np.array([c.j for c in kept], dtype=np.int64),
+            np.array([c.T_i_j for c in kept]).reshape(-1, 3),
+            _root(np.array([information[k] for k in good]).reshape(-1, 3, 3)),
+        ),
+        tuple(story),
+    )
+
+
+def candidates(poses: Floats, submaps: Submaps, session: Ints, limit: int) -> tuple[Ints, Ints]:
+    """Return target (c,) and source (c,) of the pairs of sub-maps that share enough of their surface, a < b.
+
+    Parameters
+    ----------
+    poses : (k, 3) of the keyframes. session : (k,).
+    limit : most partners per sub-map, best overlap first.
+    """
+    shared = _shared(poses[submaps.reference], submaps)
+    a, b = np.triu_indices(len(submaps), 1)
+    first = session[submaps.reference]
+    worth = np.where((b - a > 1) | (first[a] != first[b]), shared[a, b], 0.0)
+    order = np.lexsort((b, a, -worth))
+    order = order[worth[order] >= _LEAST_SHARED]
+    # Best pairs first: a pair is kept while either of its sub-maps still has room.
+    used, kept = np.zeros(len(submaps), dtype=np.int64), []
+    for row in order.tolist():
+        if min(used[a[row]], used[b[row]]) < limit:
+            used[[a[row], b[row]]] += 1
+            kept.append(row)
+    rows = np.array(sorted(kept), dtype=np.int64)
+    return a[rows], b[rows]
+
+
+def _shared(poses: Floats, submaps: Submaps) -> Floats:
+    """Return (s, s) which share of the squares of the smaller sub-map the larger one has points in, too."""
+    owner = submaps.clouds.owner
+    points = se2.transform(poses[owner], submaps.clouds.points)
+    cell = np.floor(points / _CELL).astype(np.int64)
+    cell -= cell.min(axis=0, initial=0)
+    _, column = np.unique(cell[:, 0] * (cell[:, 1].max(initial=0) + 1) + cell[:, 1], return_inverse=True)
+    seen = np.zeros((len(submaps), int(column.max(initial=-1)) + 1), dtype=np.float32)
+    seen[owner, column] = 1.0
+    size = np.maximum(seen.sum(axis=1), 1.0)
+    return np.asarray(seen @ seen.T / np.minimum(size[:, None], size[None]), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Batch:
+    """Some pairs of sub-maps and their clouds."""
+
+    clouds: Clouds
+    target: Ints
+    source: Ints
+    guess: Floats
+    icp: IcpConfig
+
+
+def _batches(clouds: Clouds, target: Ints, source: Ints, guess: Floats, icp: IcpConfig) -> Iterator[_Batch]:
+    for first in range(0, len(target), _AT_ONCE):
+        rows = slice(first, first + _AT_ONCE)
+        used, number = np.unique(np.concatenate([target[rows], source[rows]]), return_inverse=True)
+        own_target, own_source = np.split(number.reshape(-1).astype(np.int64), 2)
+        yield _Batch(clouds.chosen(used), own_target, own_source, guess[rows], icp)
+
+
+def _align(batch: _Batch) -> list[Registration]:
+    """Align the pairs of a batch; runs in a worker."""
+    prepared = [make_cloud(batch.clouds.cloud(k)[0]) for k in range(len(batch.clouds))]
+    pairs = zip(batch.target.tolist(), batch.source.tolist(), batch.guess, strict=True)
+    return [align(prepared[a], prepared[b], guess, batch.icp) for a, b, guess in pairs]
+
+
+def _story(i: int, j: int, found: Registration, information: Floats) -> LoopClosure:
+    why = f"fitness score {found.fitness:.3g} m2 after {found.iterations} iterations" if found.converged else found.reason
+    return LoopClosure(i, j, found.T_target_source, information, found.rmse, found.overlap, found.converged, why)
+
+
+def _root(information: Floats) -> Floats:
+    """Return L (e, 3, 3) with L^T L = information (e, 3, 3), which may be singular."""
+    values, vectors = np.linalg.eigh(information)
+    return np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)

@@ -1,0 +1,133 @@
+"""Loop closures: which sub-maps show the same place, and what that says of their poses.
+
+Candidates come from where the graph believes the sub-maps to lie, widened by its own marginal covariance. Where that
+is small, matching starts from the graph's guess; where it is large, a correlative search over the whole uncertainty
+comes first. A match then has to explain enough points, closely enough, agree with the graph's own uncertainty, be the
+only good one, see through no wall, and finally live in peace with all other closures in the second optimisation.
+Every candidate is kept, with the reason for its fate.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..graph.graph import Graph
+from ..graph.pose_edges import RelativePoseEdges
+from ..graph.robust import Kernel
+from ..graph.solver import SolverConfig, optimize
+from ..lidar.correlative_matching import SearchConfig
+from ..lidar.free_space import FreeSpace
+from ..lidar.pair_alignment import Aligned
+from ..lidar.scan_matching import measured
+from ..lidar.submaps import Submaps
+from ..map_result import LoopClosure
+from .candidates import Candidates
+from .closures import Closures, LoopClosureConfig, no_closures
+from .matching import Fits, fit
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+def find(
+    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: SearchConfig,
+    progress: Callable[[int, int], None] | None = None, free: Sequence[FreeSpace] | None = None,
+    executor: Executor | None = None,
+) -> Closures:
+    """Match candidates and judge each on its own.
+
+    Parameters
+    ----------
+    candidates : see closure_candidates.propose. submaps : their clouds.
+    progress : called with (done, total).
+    free : what each sub-map saw to be free, see sight.seen_free; None = no candidate is held to see through walls.
+    executor : any concurrent.futures executor; the result does not depend on it.
+    """
+    if not len(candidates.target):
+        return no_closures()
+    fits = fit(candidates, submaps.clouds, config, search_config, free, progress, executor)
+    result = fits.best
+    variance = np.full(len(result.pose), config.match_sigma**2 * config.correlation)
+    z, sqrt_information = measured(result.factors, result.pose, variance)
+    why = _judge(candidates, fits, z, sqrt_information, config)
+    return _collect(candidates, submaps, result, z, sqrt_information, why)
+
+
+def _judge(
+    candidates: Candidates, fits: Fits, z: Floats, sqrt_information: Floats, config: LoopClosureConfig
+) -> list[str]:
+    """Return why each candidate is rejected; '' = accepted so far."""
+    result, searched = fits.best, candidates.spread > config.direct
+    error = se2.between(z, candidates.guess)
+    information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
+    seen = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+    # Only directions that the match can see are compared: project the error onto them.
+    onto = seen @ information
+    visible = np.einsum("eij,ej->ei", onto, error)
+    joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
+    distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), visible)
+    strength = np.linalg.eigvalsh(information)[:, 1]
+    most = config.consistency if candidates.held else np.inf
+    why: list[str] = []
+    for k in range(len(z)):
+        least = config.overlap_after_search if searched[k] else config.overlap
+        if not fits.found[k]:
+            text = "the search found no place for it"
+        elif result.share[k] < least:
+            text = f"only {result.share[k]:.0%} of its points match (least {least:.0%})"
+        elif result.rms[k] > config.sigma:
+            text = f"matches lie {result.rms[k]:.3f} m apart (most {config.sigma:g} m)"
+        elif fits.through[k] > config.through:
+            text = f"{fits.through[k]:.0%} of its points would stand where free space was seen (most {config.through:.0%})"
+        elif strength[k] < 1.0:
+            text = "the surfaces fix neither position nor heading"
+        elif searched[k] and fits.second[k] > config.uniqueness:
+            text = f"another place matches {fits.second[k]:.0%} as well"
+        elif distance[k] > most:
+            text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {most:g})"
+        else:
+            text = ""
+        why.append(text)
+    return why
+
+
+def _collect(
+    candidates: Candidates, submaps: Submaps, result: Aligned, z: Floats, sqrt_information: Floats, why: list[str]
+) -> Closures:
+    i, j = submaps.reference[candidates.target], submaps.reference[candidates.source]
+    information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
+    story = tuple(
+        LoopClosure(
+            int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), not why[k],
+            why[k] or f"{result.share[k]:.0%} of its points match within {result.rms[k]:.3f} m",
+        )
+        for k in range(len(z))
+    )
+    good = np.array([not text for text in why], dtype=bool)
+    return Closures(RelativePoseEdges(i[good], j[good], z[good], sqrt_information[good]), story)
+
+
+def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:
+    """Solve the graph with its closures under a kernel that tightens (graduated non-convexity) and drop those at odds.
+
+    Returns
+    -------
+    The solved graph (without the closure edges) and the closures that remain; the others carry the reason.
+    """
+    if not len(closures.edges):
+        return graph, closures
+    solved = graph
+    for scale in (30.0, 10.0, 4.0):
+        edges = replace(closures.edges, kernel=Kernel("geman-mcclure", scale))
+        solved = optimize(solved.with_edges(edges), replace(solver, relative_decrease=1e-5))[0]
+        solved = replace(solved, edges=graph.edges)
+    residuals = closures.edges.residuals(solved)
+    squared = np.einsum("ed,ed->e", residuals, residuals)
+    kept = squared < config.consistency
+    left = closures.without(kept, [f"contradicts the other closures: chi2 {chi2:.0f}" for chi2 in squared])
+    return solved, replace(left, edges=replace(left.edges, kernel=Kernel("cauchy", 3.0)))

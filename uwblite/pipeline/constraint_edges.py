@@ -1,0 +1,165 @@
+"""What the user knows beforehand, as edges of a graph in the user's frame.
+
+When the first estimate stands in the frame of the odometry, a rigid motion found from surveyed anchors and pinned poses
+brings it over; which of them agree is found at the same time, so that an anchor that was moved since does not bend the
+map but is named.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..constraints import Clock, Constraints, KnownAnchor
+from ..errors import ConfigError
+from ..evaluation.trajectory import align
+from ..graph.distance_edges import AnchorDistanceEdges
+from ..graph.graph import Edges, Graph, PriorEdges
+from ..graph.pose_edges import RelativePoseEdges
+from ..graph.robust import Kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Applied:
+    """A graph with what is known beforehand in it."""
+
+    graph: Graph
+    """In the user's frame, where that is known, with the further edges."""
+    motion: Floats
+    """(3,) T_new_old: what the frame was moved by."""
+    moved: dict[str, float]
+    """Anchors that are not where they were said to be, by id: how far off they are, m."""
+
+
+def apply(known: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
+    """Bring a first estimate into the user's frame and add what is known to its edges.
+
+    Parameters
+    ----------
+    known : what is known.
+    graph : first estimate; its first pose is held.
+    anchor_ids : (a,) names of its anchors.
+    placed : (a,) which of them have a position.
+    clock : when its poses were.
+
+    Raises
+    ------
+    ConfigError : an anchor is not in the recording, or a stamp lies outside it.
+    """
+    known = _present(known, anchor_ids)
+    index = {name: k for k, name in enumerate(anchor_ids)}
+    motion, moved = _fit(known, graph, index, placed, clock)
+    graph = replace(graph, poses=se2.compose(motion, graph.poses), anchors=se2.transform(motion, graph.anchors))
+    edges = [*_anchor_priors(known, index, moved), *_pose_priors(known, clock)]
+    edges += [*_distances(known, index), *_closures(known, clock)]
+    if known.places:
+        graph = replace(graph, fixed_poses=np.zeros(len(graph.poses), dtype=bool))
+        edges += _gauge(known, graph, moved)
+    return Applied(graph.with_edges(*edges), motion, moved)
+
+
+def _present(known: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
+    """Return what concerns this recording; anchors of an earlier map that are not heard any more are left out."""
+    wanted = {a.id for a in known.anchors if not a.movable} | {name for d in known.distances for name in d.anchors}
+    missing = sorted(wanted - set(anchor_ids))
+    if missing:
+        raise ConfigError(f"constraints: no ranges to anchor {missing[0]}; the recording has {', '.join(anchor_ids) or 'none'}")
+    return replace(known, anchors=tuple(a for a in known.anchors if a.id in anchor_ids))
+
+
+def _fit(
+    known: Constraints, graph: Graph, index: dict[str, int], placed: Bools, clock: Clock
+) -> tuple[Floats, dict[str, float]]:
+    """Return the rigid motion (3,) that brings most known places together, and anchors that do not join in."""
+    if known.poses:
+        first = min(known.poses, key=lambda p: p.sigma)
+        motion = se2.compose(np.array(first.pose), se2.inverse(graph.poses[clock.nearest(first.stamp, first.recording)]))
+        return motion, _strayed(known, graph, index, placed, motion)
+    anchors = [a for a in known.anchors if placed[index[a.id]]]
+    here = np.array([graph.anchors[index[a.id]] for a in anchors]).reshape(-1, 2)
+    there = np.array([a.position for a in anchors]).reshape(-1, 2)
+    if len(anchors) < 2:
+        shift = (there - here)[0] if len(anchors) else np.zeros(2)
+        return np.array([*shift, 0.0]), {}
+    motion = consensus(here, there, np.array([_tolerance(a) for a in anchors]))
+    return motion, _strayed(known, graph, index, placed, motion)
+
+
+def _tolerance(anchor: KnownAnchor) -> float:
+    """Return how far a first estimate may lie from a known place, m; biases are not yet known well then."""
+    return 3.0 * anchor.sigma + 0.6
+
+
+def consensus(here: Floats, there: Floats, tolerance: Floats) -> Floats:
+    """Return the motion of the pair of places that most others agree with, fitted to all of these."""
+    best: tuple[float, Bools] = (-np.inf, np.ones(len(here), dtype=bool))
+    for i, j in combinations(range(len(here)), 2):
+        motion = align(here[[i, j]], there[[i, j]])
+        error = np.hypot(*(se2.transform(motion, here) - there).T) / tolerance
+        worth = float(np.sum(np.maximum(1.0 - error**2, 0.0)))
+        if worth > best[0]:
+            best = (worth, error < 1.0)
+    agree = best[1] if best[1].sum() > 1 else np.ones(len(here), dtype=bool)
+    return align(here[agree], there[agree])
+
+
+def _strayed(known: Constraints, graph: Graph, index: dict[str, int], placed: Bools, motion: Floats) -> dict[str, float]:
+    strayed = {}
+    for a in known.anchors:
+        if a.movable and placed[index[a.id]]:
+            off = float(np.hypot(*(se2.transform(motion, graph.anchors[index[a.id]]) - np.array(a.position))))
+            if off > _tolerance(a):
+                strayed[a.id] = round(off, 3)
+    return strayed
+
+
+def _anchor_priors(known: Constraints, index: dict[str, int], moved: dict[str, float]) -> list[Edges]:
+    """Surveyed anchors are believed; those of an earlier map under a kernel that lets go of a moved one."""
+    edges: list[Edges] = []
+    for movable, kernel in ((False, Kernel()), (True, Kernel("geman-mcclure", 4.0))):
+        anchors = [a for a in known.anchors if a.movable == movable and a.id not in moved]
+        if anchors:
+            place = np.array([index[a.id] for a in anchors], dtype=np.int64)
+            value = np.array([a.position for a in anchors])
+            root = np.array([np.eye(2) / a.sigma for a in anchors])
+            edges.append(PriorEdges("anchors", place, value, root, kernel))
+    return edges
+
+
+def _pose_priors(known: Constraints, clock: Clock) -> list[Edges]:
+    if not known.poses:
+        return []
+    place = np.array([clock.nearest(p.stamp, p.recording) for p in known.poses], dtype=np.int64)
+    root = np.array([np.diag(1.0 / np.array(p.sigma)) for p in known.poses])
+    return [PriorEdges("poses", place, np.array([p.pose for p in known.poses]), root)]
+
+
+def _distances(known: Constraints, index: dict[str, int]) -> list[Edges]:
+    if not known.distances:
+        return []
+    ends = np.array([[index[name] for name in d.anchors] for d in known.distances], dtype=np.int64)
+    values = np.array([[d.distance, d.sigma] for d in known.distances])
+    return [AnchorDistanceEdges(ends[:, 0], ends[:, 1], values[:, 0], values[:, 1])]
+
+
+def _closures(known: Constraints, clock: Clock) -> list[Edges]:
+    if not known.closures:
+        return []
+    ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in known.closures]
+    i, j = np.array(ends, dtype=np.int64).T
+    root = np.array([np.diag(1.0 / np.array(c.sigma)) for c in known.closures])
+    return [RelativePoseEdges(i, j, np.array([c.pose for c in known.closures]), root)]
+
+
+def _gauge(known: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:
+    """Hold the heading of the first pose where one known place alone leaves it open."""
+    if known.poses or sum(a.id not in moved for a in known.anchors) > 1:
+        return []
+    root = np.diag([0.0, 0.0, 1e4])[None]
+    return [PriorEdges("poses", np.zeros(1, dtype=np.int64), graph.poses[:1].copy(), root)]

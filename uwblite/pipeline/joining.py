@@ -1,0 +1,210 @@
+"""Many recordings in one graph: anchors have ids, so drives of other days and robots share a frame.
+
+Each recording grows its own first estimate. The anchors that two have in common then say how one lies in the frame of
+the other; one that was moved in between does not join in, gets a place of its own for each recording (``5C0B`` and
+``5C0B#2``) and is named. Poses, wheels and ranges of all recordings become one graph with one numbering of poses.
+What is wrong with wheels, tag and ranges stays each recording's own, see calibration.unknowns.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..errors import DataError
+from ..graph import calibration
+from ..graph.graph import Calibration, Graph, PriorEdges
+from ..graph.marginals import marginals
+from ..graph.pose_edges import OdometryEdges
+from ..graph.range_edges import RangeEdges
+from ..radio.bootstrap import FirstEstimate
+from ..radio.trilateration import AnchorHypothesis
+from .constraint_edges import consensus
+from .recordings import Drives, Joined, Part, Session, moved_hypotheses, moved_text, numbered
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_FIRST_TOLERANCE = 0.5
+"""How far first estimates of one anchor may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""
+
+
+def join(parts: Sequence[Part], drives: Drives) -> Joined:
+    """Bring all recordings into the frame of the first, by the anchors they have in common, and make them one graph.
+
+    Recordings join in the order of how many anchors they share with those already in, so that a third may link two.
+
+    Parameters
+    ----------
+    parts : each recording's own estimates, in its own frame and numbering.
+    drives : the recordings.
+
+    Raises
+    ------
+    DataError : a recording shares fewer than two placed anchors with the others.
+    """
+    if len(parts) == 1:
+        return Joined(parts[0], ())
+    known = _places(parts[0])
+    motions = [np.zeros(3) for _ in parts]
+    names = [list(part.anchor_ids) for part in parts]
+    warnings: list[str] = []
+    waiting = list(range(1, len(parts)))
+    while waiting:
+        found = {n: _places(parts[n]) for n in waiting}
+        number = max(waiting, key=lambda n: (len(found[n].keys() & known.keys()), -n))
+        motions[number], moved = _laid_on(found[number], known, drives.sessions[number])
+        waiting.remove(number)
+        for k, name in enumerate(names[number]):
+            here, spread = found[number].get(name, (None, 0.0))
+            if here is None:
+                continue
+            here = se2.transform(motions[number], here)
+            if name in moved:
+                names[number][k] = _other_name(name, here, spread, number, known)
+                warnings.append(moved_text(name, moved[name], number, names[number][k]))
+            known.setdefault(names[number][k], (here, spread))
+    return Joined(_one_graph(parts, motions, names, drives), tuple(warnings))
+
+
+def _other_name(name: str, here: Floats, spread: float, number: int, known: dict[str, tuple[Floats, float]]) -> str:
+    """Return what to call an anchor that does not stand at its first place: as a recording that found it here does."""
+    for earlier in range(1, number):
+        other = numbered(name, earlier)
+        if other in known and np.hypot(*(known[other][0] - here)) < _FIRST_TOLERANCE + 2.0 * np.hypot(spread, known[other][1]):
+            return other
+    return numbered(name, number)
+
+
+def _places(part: Part) -> dict[str, tuple[Floats, float]]:
+    """Return place (2,) and standard deviation (m) of the anchors of a part that are clear; of all placed if these are few."""
+    if part.first is None:
+        return {}
+    placed = np.flatnonzero(part.first.placed & ~part.first.ambiguous)
+    if len(placed) < 2:
+        placed = np.flatnonzero(part.first.placed)
+    spread = marginals(part.graph.with_edges(*part.edges)).anchors
+    return {
+        part.anchor_ids[k]: (part.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, 25.0)))) for k in placed
+    }
+
+
+def _laid_on(
+    found: dict[str, tuple[Floats, float]], known: dict[str, tuple[Floats, float]], session: Session
+) -> tuple[Floats, dict[str, float]]:
+    """Return the motion (3,) of a recording into the common frame, and the anchors that do not join in, with how far off."""
+    common = sorted(found.keys() & known.keys())
+    if len(common) < 2:
+        raise DataError(
+            f"{session.name} shares {len(common)} placed anchors with the others ({', '.join(common) or 'none'}); two or more "
+            "are needed to bring it into their frame: map it alone, or record where common anchors are heard"
+        )
+    here, there = (np.array([side[name][0] for name in common]) for side in (found, known))
+    spread = np.array([np.hypot(found[name][1], known[name][1]) for name in common])
+    tolerance = _FIRST_TOLERANCE + 2.0 * spread
+    motion = consensus(here, there, tolerance)
+    off = np.hypot(*(se2.transform(motion, here) - there).T)
+    return motion, {name: float(d) for name, d, most in zip(common, off, tolerance, strict=True) if d > most}
+
+
+def _one_graph(parts: Sequence[Part], motions: Sequence[Floats], names: Sequence[Sequence[str]], drives: Drives) -> Part:
+    """Make the parts one, each moved by its motion, its anchors under the given names."""
+    ids = tuple(dict.fromkeys(name for own in names for name in own))
+    place = [np.array([ids.index(name) for name in own], dtype=np.int64) for own in names]
+    block, priors, fixed, at = _one_calibration([part.graph for part in parts])
+    poses = np.concatenate([se2.compose(m, part.graph.poses) for m, part in zip(motions, parts, strict=True)])
+    first = _one_first_estimate(parts, motions, place, len(ids))
+    anchors = np.zeros((len(ids), 2))
+    for part, motion, own in zip(reversed(parts), reversed(motions), reversed(place), strict=True):
+        known = np.zeros(len(own), dtype=bool) if part.first is None else part.first.placed
+        anchors[own[known]] = se2.transform(motion, part.graph.anchors[known])
+    graph = Graph(
+        poses, anchors, (priors,), block, fixed_anchors=None if first is None else ~first.placed, fixed_calibration=fixed
+    )
+    return replace(
+        parts[0], graph=graph, wheels=_one_wheels([p.wheels for p in parts], at, drives),
+        radio=_one_radio([p.radio for p in parts], at, place, drives), first=first, anchor_ids=ids,
+    )  # fmt: skip
+
+
+def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, Bools, list[Ints]]:
+    """Return the block of all recordings' unknowns, its priors, which are held, and where each graph's are in it."""
+    named = [tuple(calibration.of_recording(name, n) for name in graph.calibration.names) for n, graph in enumerate(graphs)]
+    names = tuple(dict.fromkeys(name for own in named for name in own))
+    block = Calibration(names, np.zeros(len(names)))
+    at = [calibration.indices(block, *own) for own in named]
+    values, roots, fixed = block.values, np.zeros((len(names), 1, 1)), np.ones(len(names), dtype=bool)
+    for graph, own in zip(reversed(graphs), reversed(at), strict=True):
+        assert graph.fixed_calibration is not None
+        fixed[own] &= graph.fixed_calibration
+        values[own] = graph.calibration.values
+        for edges in graph.edges:
+            if isinstance(edges, PriorEdges) and edges.block == "calibration":
+                roots[own[edges.index]] = edges.sqrt_information
+    return block, PriorEdges("calibration", np.arange(len(names)), np.zeros((len(names), 1)), roots), fixed, at
+
+
+def _one_first_estimate(
+    parts: Sequence[Part], motions: Sequence[Floats], place: Sequence[Ints], anchors: int
+) -> FirstEstimate | None:
+    """Return the first estimates as one: an anchor that one recording shows clearly is clear."""
+    placed, clear = np.zeros(anchors, dtype=bool), np.zeros(anchors, dtype=bool)
+    hypotheses: list[tuple[AnchorHypothesis, ...]] = [()] * anchors
+    some = [part.first for part in parts if part.first is not None]
+    for part, motion, own in zip(parts, motions, place, strict=True):
+        moved = moved_hypotheses(part.first, motion)
+        if moved is None:
+            continue
+        for k, here in enumerate(own.tolist()):
+            better = moved.placed[k] and not (placed[here] and (clear[here] or moved.ambiguous[k]))
+            if better or not hypotheses[here]:
+                hypotheses[here] = moved.hypotheses[k]
+            placed[here] |= moved.placed[k]
+            clear[here] |= bool(moved.placed[k] and not moved.ambiguous[k])
+    return replace(some[0], placed=placed, hypotheses=tuple(hypotheses), ambiguous=placed & ~clear) if some else None
+
+
+def _renamed(indices: Ints, at: Ints) -> Ints:
+    """Return indices into one block as indices into another, -1 left."""
+    return np.append(at, -1)[indices]
+
+
+def _one_wheels(wheels: Sequence[OdometryEdges], at: Sequence[Ints], drives: Drives) -> OdometryEdges:
+    first = [s.first for s in drives.sessions]
+    return replace(
+        wheels[0],
+        i=np.concatenate([w.i + f for w, f in zip(wheels, first, strict=True)]),
+        j=np.concatenate([w.j + f for w, f in zip(wheels, first, strict=True)]),
+        motion=np.concatenate([w.motion for w in wheels]),
+        length=np.concatenate([w.length for w in wheels]),
+        duration=np.concatenate([w.duration for w in wheels]),
+        sqrt_information=np.concatenate([w.sqrt_information for w in wheels]),
+        calibration=np.concatenate([_renamed(w.calibration, a) for w, a in zip(wheels, at, strict=True)]),
+    )
+
+
+def _one_radio(
+    radios: Sequence[RangeEdges | None], at: Sequence[Ints], place: Sequence[Ints], drives: Drives
+) -> RangeEdges | None:
+    """Return the ranges of all; what tags sit elsewhere than the first goes into the lever arms."""
+    moved = []
+    tag = next((r.tag for r in radios if r is not None), None)
+    for radio, session, own, rename in zip(radios, drives.sessions, place, at, strict=True):
+        if radio is not None and tag is not None:
+            arm = radio.lever_arm + se2.rotate(radio.turn, radio.tag - tag)
+            moved.append(
+                replace(
+                    radio, pose=radio.pose + session.first, anchor=own[radio.anchor], lever_arm=arm, tag=tag,
+                    calibration=_renamed(radio.calibration, rename),
+                )
+            )  # fmt: skip
+    if not moved:
+        return None
+    stacked = ("pose", "anchor", "ranges", "sigma", "lever_arm", "turn", "velocity", "height", "calibration", "stamps")
+    rows: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in moved]) for name in stacked}
+    rows["weights"] = np.concatenate([np.ones(len(r)) if r.weights is None else r.weights for r in moved])
+    return replace(moved[0], **rows)

@@ -1,0 +1,144 @@
+"""True distances between landmarks: what somebody measured between columns or corners makes the map as long as it says.
+
+A landmark is a place in the map as it comes out before its distances are heard. The keyframes that see what stands there
+carry it along: of each visit the one that saw most keeps the landmark's place in its own frame. A measured distance ties each
+visit of one landmark to each visit of the other, so that walls, wheels and calibration move with it; all ties together
+weigh as much as the one measurement that they are.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..constraints import Constraints, KnownLandmark
+from ..errors import ConfigError
+from ..evaluation.map import Landmarks, find_columns, fit_circle
+from ..graph.distance_edges import PointDistanceEdges
+from ..graph.graph import Graph
+from ..lidar.clouds import Clouds
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_NEAR = 0.4
+"""Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
+_LEAST_POINTS = 3
+"""Points of a cloud that make a sighting."""
+_ONE_VISIT = 3.0
+"""Sightings belong to one visit while less than this is travelled between two, m."""
+_VISITS = 4
+"""Visits used of a landmark, those with most points."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Where a landmark stands, seen from some keyframes."""
+
+    keyframe: Ints
+    """(v,) one of each visit."""
+    position: Floats
+    """(v, 2) m, in the frame of that keyframe."""
+
+
+def sightings(landmark: KnownLandmark, clouds: Clouds, poses: Floats, path: Floats) -> Sightings:
+    """Find the keyframes that see a landmark.
+
+    Parameters
+    ----------
+    landmark : its place, in the frame of the poses.
+    clouds : one per keyframe.
+    poses : (k, 3) T_map_base.
+    path : (k,) m travelled.
+
+    Raises
+    ------
+    ConfigError : no cloud has anything there, or no column of that radius.
+    """
+    points = se2.transform(poses[clouds.owner], clouds.points)
+    place = np.array(landmark.position)
+    near = np.abs(np.hypot(*(points - place).T)) < landmark.radius + _NEAR
+    where = f"constraints: landmark {landmark.name!r} at {place[0]:g}, {place[1]:g}"
+    if landmark.radius > 0.0:
+        column = Landmarks((landmark.name,), place[None], np.array([landmark.radius]))
+        place = find_columns(points[near], column, search_radius=_NEAR, cell=0.05).positions[0]
+        if not np.isfinite(place).all():
+            raise ConfigError(f"{where}: no column of radius {landmark.radius:g} m stands there; look up its place in the map")
+    count = np.bincount(clouds.owner[near], minlength=len(poses))
+    seen = np.flatnonzero(count >= _LEAST_POINTS)
+    if not len(seen):
+        raise ConfigError(f"{where}: the lidar saw nothing within {_NEAR:g} m of it; look up its place in the map")
+    visit = np.cumsum(np.concatenate([[0], np.diff(path[seen]) > _ONE_VISIT]))
+    weight = np.bincount(visit, count[seen])
+    best = np.sort(np.argsort(-weight, kind="stable")[:_VISITS])
+    best_view = np.array([seen[visit == v][int(np.argmax(count[seen[visit == v]]))] for v in best.tolist()], dtype=np.int64)
+    position = se2.transform(se2.inverse(poses[best_view]), place)
+    if landmark.radius > 0.0:
+        views = zip(best_view.tolist(), position, strict=True)
+        position = np.array([_column_in(clouds.cloud(k)[0], at, landmark.radius) for k, at in views])
+    return Sightings(best_view, position)
+
+
+def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
+    """Return where one cloud has a column (2,): the place of the whole map tells where to look, the cloud is what was seen."""
+    near = points[np.hypot(*(points - place).T) < radius + _NEAR]
+    centre = fit_circle(near, fit_circle(near, place, radius, 0.2), radius, 0.1)
+    return centre if np.hypot(*(centre - place)) < _NEAR else place
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ties:
+    """Measured distances as edges between the poses that see the landmarks."""
+
+    edges: PointDistanceEdges
+    measured: Ints
+    """(e,) which distance each is of."""
+
+
+def ties(known: Constraints, clouds: Clouds, poses: Floats, path: Floats) -> Ties:
+    """Find the landmarks and tie the poses that see them at the measured distances.
+
+    Parameters
+    ----------
+    known : landmarks and distances.
+    clouds, poses, path : see sightings; poses in the frame of the landmarks' places.
+
+    Raises
+    ------
+    ConfigError : a landmark is not told of, or is not there.
+    """
+    listed = {landmark.name: landmark for landmark in known.landmarks}
+    wanted = [name for d in known.landmark_distances for name in d.landmarks]
+    missing = sorted(set(wanted) - set(listed))
+    if missing:
+        raise ConfigError(f"constraints: [[landmark_distance]] names {missing[0]!r}, of which there is no [[landmark]]")
+    found = {name: sightings(listed[name], clouds, poses, path) for name in dict.fromkeys(wanted)}
+    rows: list[tuple[NDArray[Any], ...]] = []
+    for number, told in enumerate(known.landmark_distances):
+        one, other = (found[name] for name in told.landmarks)
+        a, b = np.indices((len(one.keyframe), len(other.keyframe))).reshape(2, -1)
+        flat = np.ones(len(a))
+        ends = (one.keyframe[a], other.keyframe[b], one.position[a], other.position[b])
+        # All ties of one measurement together weigh as much as it does.
+        rows.append((*ends, told.distance * flat, told.sigma * np.sqrt(len(a)) * flat, np.full(len(a), number)))
+    i, j, p, q, distance, sigma, measured = (np.concatenate(column) for column in zip(*rows, strict=True))
+    return Ties(PointDistanceEdges(i, j, p, q, distance, sigma), measured)
+
+
+def outcome(known: Constraints, tied: Ties, graph: Graph) -> tuple[list[dict[str, object]], list[str]]:
+    """Return the distances as a map has them, ready for a report, and in words those that it does not keep."""
+    lengths = tied.edges.lengths(graph)
+    figures: list[dict[str, object]] = []
+    warnings: list[str] = []
+    for number, told in enumerate(known.landmark_distances):
+        length = float(np.mean(lengths[tied.measured == number]))
+        names = " - ".join(told.landmarks)
+        figures.append({"landmarks": names, "measured": told.distance, "map": round(length, 4)})
+        if abs(length - told.distance) > 3.0 * told.sigma:
+            warnings.append(
+                f"the distance {names} is {length:.3f} m in the map, not the {told.distance:.3f} m that were measured: "
+                "everything else speaks against it"
+            )
+    return figures, warnings

@@ -1,0 +1,133 @@
+"""Where the map's axes lie, and which part of it is kept. The data are turned, so that the yaw of the map stays 0."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..errors import ConfigError, DataError
+from ..graph.graph import Graph, PriorEdges
+from ..grid.geometry import GridGeometry
+from ..grid.occupancy_grid import OccupancyGrid
+
+Floats = NDArray[np.float64]
+
+ALIGNMENTS = ("odometry", "first-pose", "walls", "anchors")
+"""odometry: the first pose is where the odometry began. first-pose: it is the origin, looking along x. walls: as
+first-pose, turned by at most 45 degrees so that most walls run along x and y. anchors: the first placed anchor (by id) is
+the origin and the last one lies along x."""
+
+
+def wall_direction(normals: Floats) -> float:
+    """Return the angle of the walls' main direction, rad in (-pi/4, pi/4]; walls at right angles count as one direction.
+
+    The mean direction of exp(4 i angle) finds the neighbourhood; a kernel of five degrees around it, tightened once, leaves
+    out whatever stands aslant.
+
+    Parameters
+    ----------
+    normals : (n, 2) unit normals of wall pieces, map frame; zero rows are left out.
+
+    Raises
+    ------
+    DataError : there are no normals.
+    """
+    normals = normals[np.hypot(normals[:, 0], normals[:, 1]) > 0.5]
+    if not len(normals):
+        raise DataError("no walls were seen to align the map with; choose another --align")
+    angle = np.arctan2(normals[:, 1], normals[:, 0])
+    bins = np.bincount(((angle % (np.pi / 2)) / (np.pi / 2) * _BINS).astype(np.int64) % _BINS, minlength=_BINS)
+    smooth = bins + np.roll(bins, 1) + np.roll(bins, -1)
+    main = (int(np.argmax(smooth)) + 0.5) / _BINS * np.pi / 2
+    for width in (np.radians(5.0), np.radians(2.0)):
+        apart = _quarter(angle - main)
+        weight = np.exp(-0.5 * (apart / width) ** 2)
+        main += float(np.sum(weight * apart) / np.sum(weight))
+    return float(_quarter(np.array(main)))
+
+
+_BINS = 90
+"""One degree each."""
+
+
+def _quarter(angle: Floats) -> Floats:
+    """Return the angle moved into (-pi/4, pi/4]."""
+    return np.asarray(-(np.remainder(-angle + np.pi / 4, np.pi / 2) - np.pi / 4), dtype=np.float64)
+
+
+def alignment(how: str, graph: Graph, placed: NDArray[np.bool_], normals: Floats) -> Floats:
+    """Return T_new_map (3,), the motion that turns the present map frame into the wished one.
+
+    Parameters
+    ----------
+    how : one of ALIGNMENTS.
+    graph : final estimates.
+    placed : (a,) anchors whose position is known.
+    normals : (n, 2) unit normals of wall pieces, map frame.
+
+    Raises
+    ------
+    ConfigError : there is no such alignment.
+    DataError : the recording has not what it needs.
+    """
+    if how == "odometry":
+        return np.zeros(3)
+    to_first = se2.inverse(graph.poses[0])
+    if how == "first-pose":
+        return to_first
+    if how == "walls":
+        turned = wall_direction(se2.rotate(to_first[2], normals))
+        return se2.compose(np.array([0.0, 0.0, -turned]), to_first)
+    if how == "anchors":
+        known = np.flatnonzero(placed)
+        if len(known) < 2:
+            raise DataError("two placed anchors are needed to align the map with; choose another --align")
+        first, last = graph.anchors[known[0]], graph.anchors[known[-1]]
+        return se2.inverse(np.array([*first, np.arctan2(*(last - first)[::-1])]))
+    raise ConfigError(f"unknown alignment {how!r}; choose one of {', '.join(ALIGNMENTS)}")
+
+
+def moved(graph: Graph, T_new_map: Floats) -> Graph:
+    """Return the graph in another map frame; priors on poses and anchors move along, so chi2 stays as it is."""
+    if not np.any(T_new_map):
+        return graph
+    edges = tuple(_moved_prior(e, T_new_map) if isinstance(e, PriorEdges) else e for e in graph.edges)
+    poses, anchors = se2.compose(T_new_map, graph.poses), se2.transform(T_new_map, graph.anchors)
+    return replace(graph, poses=poses, anchors=anchors, edges=edges)
+
+
+def _moved_prior(prior: PriorEdges, T_new_map: Floats) -> PriorEdges:
+    if prior.block == "calibration":
+        return prior
+    c, s = np.cos(T_new_map[2]), np.sin(T_new_map[2])
+    back = np.array([[c, s], [-s, c]])
+    if prior.block == "anchors":
+        return replace(prior, value=se2.transform(T_new_map, prior.value), sqrt_information=prior.sqrt_information @ back)
+    turn = np.eye(3)
+    turn[:2, :2] = back
+    return replace(prior, value=se2.compose(T_new_map, prior.value), sqrt_information=prior.sqrt_information @ turn)
+
+
+def cropped(grid: OccupancyGrid, box: tuple[float, float, float, float]) -> OccupancyGrid:
+    """Return the part of a map whose cells lie in a box x0, y0, x1, y1, m, map frame.
+
+    Raises
+    ------
+    ConfigError : the box is empty or lies outside the map.
+    """
+    x0, y0, x1, y1 = box
+    geometry = grid.geometry
+    low = np.clip(np.floor((np.array([x0, y0]) - geometry.origin) / geometry.resolution + 1e-6), 0, None).astype(np.int64)
+    high = np.ceil((np.array([x1, y1]) - geometry.origin) / geometry.resolution - 1e-6).astype(np.int64)
+    high = np.minimum(high, [geometry.cols, geometry.rows])
+    if not np.all(high > low):
+        (west, south), (east, north) = geometry.origin, geometry.corner
+        raise ConfigError(
+            f"a crop to {x0:g},{y0:g},{x1:g},{y1:g} holds no cell; "
+            f"the map reaches from {west:.1f},{south:.1f} to {east:.1f},{north:.1f}"
+        )
+    cols, rows = slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
+    origin = geometry.origin + geometry.resolution * low
+    part = GridGeometry(geometry.resolution, origin, rows.stop - rows.start, cols.stop - cols.start)
+    return replace(grid, geometry=part, log_odds=grid.log_odds[rows, cols].copy())

@@ -1,0 +1,49 @@
+"""Stage summaries in the making, and the wire to the caller: progress, clock, cancellation."""
+
+from collections.abc import Callable
+
+from ..errors import Cancelled
+from ..graph.solver import SolverSummary
+from ..map_result import StageSummary
+
+Progress = Callable[[str, int, int], object]
+"""progress(stage, done, total); returning False asks to stop, see errors.Cancelled."""
+
+
+class Stages:
+    """Stage summaries in the making: names, figures, the caller's clock and progress callback."""
+
+    def __init__(self, progress: Progress | None, clock: Callable[[], float] | None) -> None:
+        self._progress, self._clock = progress, clock
+        self._since = clock() if clock else 0.0
+        self.done: list[StageSummary] = []
+        self.warnings: list[str] = []
+        self.doubts: list[str] = []
+
+    def tell(self, stage: str, done: int, total: int) -> None:
+        """Report progress; raises Cancelled where the callback returns False."""
+        if self._progress is not None and self._progress(stage, done, total) is False:
+            raise Cancelled(f"stopped by the caller during {stage}")
+
+    def end(self, stage: str, **figures: object) -> None:
+        """Close a stage."""
+        now = self._clock() if self._clock else 0.0
+        self.done.append(StageSummary(stage, now - self._since, figures))
+        self._since = now
+        self.tell(stage, 1, 1)
+
+    def teller(self, stage: str) -> Callable[[int, int], None]:
+        """Return a callback (done, total) for one stage."""
+        return lambda done, total: self.tell(stage, done, total)
+
+
+def solver_figures(result: SolverSummary) -> dict[str, object]:
+    """Return what a stage tells of its optimisation."""
+    return {
+        "converged": result.converged,
+        "reason": result.reason,
+        "iterations": result.iterations,
+        "chi2": round(result.chi2, 4),
+        "dof": result.dof,
+        "chi2_per_dof": round(result.chi2_per_dof, 4),
+    }

@@ -1,0 +1,46 @@
+"""Scans that no map looks at: most of a recording's bytes, left out before the work begins.
+
+A map looks at the scans nearest to each keyframe, and traces one whenever the laser has moved far enough. Of a slow
+robot's recording that is every fifth scan or so.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import keyframes, se2
+from ..grid.occupancy_grid import GridConfig
+from ..grid.scan_rays import moved_scans
+from ..keyframes import KeyframeConfig
+from ..sensor_log import SensorLog
+
+_STEPS = 2
+"""Scans kept within the distance after which the grid traces the next one: odometry does not know that distance exactly."""
+
+
+def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorLog:
+    """Return the recording with the scans that a map of it may look at; the notes count the others.
+
+    What is left stays when it is thinned again with the same settings.
+
+    Parameters
+    ----------
+    log : any recording.
+    frames, grid : which scans make clouds and which are traced. ``grid.move_distance = 0`` keeps all.
+    """
+    scans = log.scans
+    if scans is None or not len(scans.stamps) or grid.move_distance <= 0.0:
+        return log
+    _, near = keyframes.choose_scans(scans, keyframes.select(log.odometry, frames), frames)
+    base = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps)
+    laser = se2.compose(base, log.mounting.T_base_laser)
+    traced = moved_scans(laser, grid.move_distance / _STEPS, grid.move_angle / _STEPS)
+    kept = np.union1d(near, traced)
+    if len(kept) == len(scans.stamps):
+        return log
+    left_out = log.notes.scans_left_out + len(scans.stamps) - len(kept)
+    return replace(
+        log,
+        scans=replace(scans, stamps=scans.stamps[kept], ranges=scans.ranges[kept]),
+        notes=replace(log.notes, scans_left_out=left_out),
+    )

@@ -1,0 +1,1 @@
+"""UWB ranges: trilateration, bootstrap of trajectory and anchors, range noise, NLOS."""

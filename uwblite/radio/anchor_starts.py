@@ -1,0 +1,52 @@
+"""Starting positions for the anchors of a graph that comes from elsewhere with ranges and no positions."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..graph.graph import Graph
+from ..graph.range_edges import RangeEdges
+from .trilateration import AnchorConfig, locate
+
+Floats = NDArray[np.float64]
+
+
+def place_anchors(graph: Graph, config: AnchorConfig | None = None) -> tuple[Graph, tuple[int, ...]]:
+    """Return the graph with a position for each anchor that has none, and the anchors that could not be placed.
+
+    The poses are taken as they are; anchors without a position are found from their ranges alone (anchors.locate).
+    Those that cannot be found are held at the origin with their ranges switched off.
+    """
+    missing = np.flatnonzero(~np.isfinite(graph.anchors).all(axis=1))
+    if not len(missing):
+        return graph, ()
+    anchors, lost = graph.anchors.copy(), []
+    for anchor in missing.tolist():
+        positions, ranges = _heard(graph, anchor)
+        found = locate(positions, ranges, config or AnchorConfig())
+        anchors[anchor] = found[0].position if found else 0.0
+        if not found:
+            lost.append(anchor)
+    fixed = np.zeros(len(anchors), dtype=bool) if graph.fixed_anchors is None else graph.fixed_anchors.copy()
+    fixed[lost] = True
+    edges = tuple(_without(e, lost) if isinstance(e, RangeEdges) and lost else e for e in graph.edges)
+    return replace(graph, anchors=anchors, fixed_anchors=fixed, edges=edges), tuple(lost)
+
+
+def _heard(graph: Graph, anchor: int) -> tuple[Floats, Floats]:
+    """Return positions (m, 2) of the tag and ranges (m,) of one anchor, m."""
+    positions, ranges = [np.zeros((0, 2))], [np.zeros(0)]
+    for edges in graph.edges:
+        if isinstance(edges, RangeEdges):
+            mine = edges.anchor == anchor
+            arm = edges.lever_arm[mine] + se2.rotate(edges.turn[mine], edges.tag)
+            positions.append(se2.transform(graph.poses[edges.pose[mine]], arm))
+            ranges.append(edges.ranges[mine])
+    return np.concatenate(positions), np.concatenate(ranges)
+
+
+def _without(edges: RangeEdges, anchors: list[int]) -> RangeEdges:
+    weights = np.ones(len(edges)) if edges.weights is None else edges.weights
+    return replace(edges, weights=np.where(np.isin(edges.anchor, anchors), 0.0, weights))

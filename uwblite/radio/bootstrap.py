@@ -1,0 +1,296 @@
+"""Starting values from nothing: the trajectory and the anchors grow together, outwards from the best stretch.
+
+Raw odometry of a long run is too bent to linearise about, and anchors of unknown position cannot straighten it
+before they are placed. So the stretch whose anchors are clearest comes first; from there the interval of known
+poses grows at both ends. Each piece is laid on by the calibrated odometry, pulled onto the anchors already placed
+(graduated kernel: wide first, then tight), and whenever the interval has grown by a share, all of it is solved
+again and anchors not yet placed are searched from the poses so far.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..graph.graph import Calibration, Graph
+from ..graph.pose_edges import OdometryEdges
+from ..graph.range_edges import RangeEdges
+from ..graph.robust import Kernel
+from ..graph.solver import SolverConfig, optimize
+from .trilateration import AnchorConfig, AnchorHypothesis, ambiguous, locate
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class GrowthConfig:
+    """How the first estimate grows."""
+
+    seed_distances: tuple[float, ...] = (25.0, 10.0, 4.0, 60.0, 150.0)
+    """Travelled distances of the first stretch, m, tried in this order until the anchors in it are clear; then all of it."""
+    piece: float = 0.3
+    """Distance laid on at once, as a share of the first stretch; more where the prediction holds."""
+    resolve_growth: float = 1.35
+    """All poses so far are solved again when their number has grown by this factor."""
+    range_sigma: float = 0.15
+    """Assumed standard deviation of ranges until it is learnt, m."""
+    least_sigma: float = 0.05
+    """Ranges are not trusted below this while it grows, m."""
+    drift: float = 0.015
+    """Assumed drift of the odometry per travelled metre, m/m."""
+    heading_scales: tuple[float, ...] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
+    """Relative heading errors of the odometry tried in this order until the ranges agree: a wrong track width in the
+    base's settings is the commonest gross fault, and a factor of two the commonest value."""
+    agreement: float = 2.0
+    """Ranges agree when their median error is below so many standard deviations."""
+    tear: float = 1.0
+    """No slip throws a step between keyframes off by more than this, m or rad: then a piece was laid on mirrored or in the
+    wrong place, however well its ranges agree."""
+    clear_enough: float = 0.35
+    """A first stretch is good when its anchors (up to three) are worth this each; 1 = placed without error, 0 = unclear."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstEstimate:
+    """Starting values for the first optimisation."""
+
+    graph: Graph
+    """Odometry edges of the whole path; ranges of placed anchors."""
+    placed: Bools
+    """(a,) anchors that have a position."""
+    hypotheses: tuple[tuple[AnchorHypothesis, ...], ...]
+    """By anchor: what the last search found, best first."""
+    ambiguous: Bools
+    """(a,) two positions explain the ranges about equally well."""
+
+
+def grow(
+    graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: GrowthConfig, search: AnchorConfig
+) -> FirstEstimate:
+    """Estimate poses and anchor positions without any guess of the anchors.
+
+    Where the ranges do not agree in the end, the growth is tried again with other hypotheses of a gross heading error;
+    the one that the ranges like best wins.
+
+    Parameters
+    ----------
+    graph : poses (k, 3) by dead reckoning, anchors (a, 2) of any value, calibration block; its edges (priors) stay.
+    odometry : k - 1 edges between consecutive poses.
+    ranges : all ranges; those that cannot be distances must have weight 0.
+    path : (k,) travelled distance at each pose, m.
+    config, search : settings.
+    """
+    best: _Growth | None = None
+    least = np.inf
+    for heading_scale in config.heading_scales:
+        calibration = _with(graph.calibration, "heading_scale", heading_scale)
+        if calibration is None:
+            continue
+        growth = _Growth(replace(graph, calibration=calibration), odometry, ranges, path, config, search)
+        growth.run()
+        misfit = growth.misfit()
+        if best is None or misfit < 0.8 * least:
+            best, least = growth, misfit
+        if misfit < config.agreement:
+            break
+    assert best is not None
+    return best.estimate()
+
+
+def _with(calibration: Calibration, name: str, value: float) -> Calibration | None:
+    """Return the calibration with one value set; None where that is not an unknown and the value is not nominal."""
+    index = calibration.index(name)
+    if index < 0:
+        return calibration if value == 0.0 else None
+    values = calibration.values.copy()
+    values[index] = value
+    return replace(calibration, values=values)
+
+
+class _Growth:
+    """One growth: the poses in [low, high) are known, the anchors in `placed` have a position."""
+
+    def __init__(
+        self, graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: GrowthConfig,
+        search: AnchorConfig,
+    ) -> None:
+        self.graph, self.odometry, self.ranges, self.path = graph, odometry, ranges, path
+        self.config, self.search = config, search
+        self.live = np.ones(len(ranges), dtype=bool) if ranges.weights is None else ranges.weights > 0
+        self.poses = _dead_reckon(graph.poses[0], odometry.corrected(graph))
+        self.anchors, self.calibration = graph.anchors.copy(), graph.calibration
+        self.placed = np.zeros(len(graph.anchors), dtype=bool)
+        self.sigma = np.full(len(graph.anchors), config.range_sigma)
+        self.hypotheses: dict[int, list[AnchorHypothesis]] = {}
+        self.low = self.high = 0
+
+    def run(self) -> None:
+        """Grow from the clearest stretch to the whole path."""
+        piece = self.config.piece * self._seed()
+        smallest = 0.3 * piece
+        if self.placed.any():
+            self._solve((10.0, 3.0))
+            solved = self.high - self.low
+            while not self._complete():
+                held = self._extend(piece)
+                piece = 1.5 * piece if held else max(0.8 * piece, smallest)
+                if self.high - self.low >= self.config.resolve_growth * solved or self._complete():
+                    self._solve((6.0, 3.0))
+                    solved = self.high - self.low
+                    if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
+                        self._solve((6.0, 3.0))
+        self.doubtful = np.array([self._unclear(self.hypotheses.get(k, [])) for k in range(len(self.placed))], dtype=bool)
+        for anchor, hypotheses in self.hypotheses.items():
+            if hypotheses and not self.placed[anchor]:
+                self._put(anchor, hypotheses[0])
+
+    def estimate(self) -> FirstEstimate:
+        """Return what was grown."""
+        final = replace(self.graph, poses=self.poses, anchors=self.anchors, calibration=self.calibration)
+        found = tuple(tuple(self.hypotheses.get(k, ())) for k in range(len(self.placed)))
+        return FirstEstimate(final, self.placed, found, self.doubtful)
+
+    def misfit(self) -> float:
+        """Return the median error of all ranges to placed anchors, in assumed standard deviations; 0 without any.
+
+        A trajectory that is torn somewhere never agrees.
+        """
+        part = self._part(0, len(self.path))
+        errors = [np.abs(e.residuals(part)[:, 0] * e.sigma) for e in part.edges if isinstance(e, RangeEdges)]
+        median = float(np.median(errors[0])) / (0.6745 * self.config.range_sigma) if errors else 0.0
+        steps = self.odometry.corrected(replace(self.graph, calibration=self.calibration))
+        off = se2.between(steps, se2.between(self.poses[:-1], self.poses[1:]))
+        return max(median, self.config.agreement) if np.any(np.abs(off) > self.config.tear) else median
+
+    def _complete(self) -> bool:
+        return self.low == 0 and self.high == len(self.path)
+
+    def _unclear(self, hypotheses: list[AnchorHypothesis]) -> bool:
+        return len(hypotheses) > 0 and ambiguous(hypotheses, self.search)
+
+    def _seed(self) -> float:
+        """Choose the stretch whose anchors are clearest and place them; return its length, m."""
+        best, most = None, -1.0
+        total, heard = float(self.path[-1]), min(len(np.unique(self.ranges.anchor[self.live])), 3)
+        for length in [d for d in self.config.seed_distances if d < total] + [total]:
+            places = 1 + max(0, min(5, int(2 * total / max(length, 1e-9)) - 2))
+            for start in np.linspace(0.0, total - length, places):
+                low = int(np.searchsorted(self.path, start))
+                high = int(np.searchsorted(self.path, start + length, "right"))
+                found = self._search(low, high, self.config.drift * length)
+                clear = [h[0] for h in found.values() if h and not self._unclear(h)]
+                worth = sum(1.0 / (1.0 + h.sigma / self.config.range_sigma + h.position_sigma) for h in clear)
+                if worth > most + 1e-9:
+                    best, most = (found, low, high), worth
+            if most > self.config.clear_enough * heard:
+                break
+        assert best is not None
+        found, self.low, self.high = best
+        self._adopt(found)
+        return float(self.path[self.high - 1] - self.path[self.low])
+
+    def _search(self, low: int, high: int, drift: float) -> dict[int, list[AnchorHypothesis]]:
+        """Search the anchors not yet placed from the poses in [low, high)."""
+        ranges, inside = self.ranges, self.live & (self.ranges.pose >= low) & (self.ranges.pose < high)
+        found = {}
+        for anchor in np.unique(ranges.anchor[inside]):
+            if not self.placed[anchor]:
+                which = inside & (ranges.anchor == anchor)
+                level = np.sqrt(np.maximum(ranges.ranges[which] ** 2 - ranges.height[which] ** 2, 1e-4))
+                arm = ranges.lever_arm[which] + se2.rotate(ranges.turn[which], ranges.tag)
+                tag = se2.transform(self.poses[ranges.pose[which]], arm)
+                found[int(anchor)] = locate(tag, level, self.search, drift)
+        return found
+
+    def _adopt(self, found: dict[int, list[AnchorHypothesis]]) -> bool:
+        """Place the anchors of which one hypothesis stands out; remember all; tell whether any was placed."""
+        any_new = False
+        for anchor, hypotheses in found.items():
+            if hypotheses:
+                self.hypotheses[anchor] = hypotheses
+                if not self._unclear(hypotheses):
+                    self._put(anchor, hypotheses[0])
+                    any_new = True
+        return any_new
+
+    def _put(self, anchor: int, hypothesis: AnchorHypothesis) -> None:
+        self.anchors[anchor] = hypothesis.position
+        self.sigma[anchor] = max(hypothesis.sigma, self.sigma[anchor])
+        self.placed[anchor] = True
+
+    def _extend(self, piece: float) -> bool:
+        """Lay on one piece at each open end by calibrated odometry; tell whether it agreed with the anchors as it was."""
+        motion = self.odometry.corrected(replace(self.graph, calibration=self.calibration))
+        held = True
+        if self.high < len(self.path):
+            old, new = self.high, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
+            self.high = max(min(new, len(self.path)), old + 1)
+            self.poses[old - 1 : self.high] = _dead_reckon(self.poses[old - 1], motion[old - 1 : self.high - 1])
+            held &= self._settle(old - 1, self.high, old - 1)
+        if self.low > 0:
+            old, new = self.low, int(np.searchsorted(self.path, self.path[self.low] - piece))
+            self.low = min(new, old - 1)
+            back = se2.inverse(motion[self.low : old])[::-1]
+            self.poses[self.low : old + 1] = _dead_reckon(self.poses[old], back)[::-1]
+            held &= self._settle(self.low, old + 1, old)
+        return held
+
+    def _settle(self, low: int, high: int, held: int) -> bool:
+        """Optimise the poses of [low, high) with one of them, the anchors and the calibration held.
+
+        Returns True where the ranges agreed with the prediction; then nothing is moved.
+        """
+        part = self._part(low, high)
+        errors = [e.residuals(part) for e in part.edges if isinstance(e, RangeEdges)]
+        if not errors or float(np.median(np.abs(errors[0]))) < 2.0:
+            return True
+        fixed = np.zeros(high - low, dtype=bool)
+        fixed[held - low] = True
+        everything = np.ones(len(self.anchors), dtype=bool)
+        unmoved = np.ones(len(self.calibration.values), dtype=bool)
+        part = replace(part, fixed_poses=fixed, fixed_anchors=everything, fixed_calibration=unmoved)
+        self.poses[low:high] = _anneal(part, (20.0, 6.0, 3.0)).poses
+        return False
+
+    def _solve(self, schedule: tuple[float, ...]) -> None:
+        """Optimise everything known so far and learn each anchor's spread."""
+        part = replace(self._part(self.low, self.high), fixed_anchors=~self.placed)
+        part = replace(part, fixed_calibration=self.graph.fixed_calibration).with_edges(*self.graph.edges)
+        solved = _anneal(part, schedule)
+        self.poses[self.low : self.high] = solved.poses
+        self.anchors, self.calibration = solved.anchors.copy(), solved.calibration
+        for edges in solved.edges:
+            if isinstance(edges, RangeEdges):
+                error = np.abs(edges.residuals(solved)[:, 0] * edges.sigma)
+                for anchor in np.unique(edges.anchor):
+                    spread = 1.4826 * float(np.median(error[edges.anchor == anchor]))
+                    self.sigma[anchor] = max(spread, self.config.range_sigma)
+
+    def _part(self, low: int, high: int) -> Graph:
+        """Return the graph of poses [low, high) with their odometry and their ranges to placed anchors."""
+        wheels = self.odometry.rows(np.arange(low, max(high - 1, low)))
+        wheels = replace(wheels, i=wheels.i - low, j=wheels.j - low)
+        which = self.live & (self.ranges.pose >= low) & (self.ranges.pose < high) & self.placed[self.ranges.anchor]
+        radio = self.ranges.rows(np.flatnonzero(which))
+        radio = replace(radio, pose=radio.pose - low, sigma=self.sigma[radio.anchor])
+        return Graph(self.poses[low:high], self.anchors, (), self.calibration).with_edges(wheels, radio)
+
+
+def _dead_reckon(start: Floats, motion: Floats) -> Floats:
+    """Chain motions (n-1, 3) from a start pose (3,) into poses (n, 3)."""
+    theta = start[2] + np.concatenate([[0.0], np.cumsum(motion[:, 2])])
+    steps = se2.rotate(theta[:-1], motion[:, :2])
+    xy = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return np.concatenate([xy, se2.wrap_angle(theta)[:, None]], axis=1)
+
+
+def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:
+    """Optimise with the ranges' kernel tightened step by step (graduated non-convexity)."""
+    quick = SolverConfig(max_iterations=15, relative_decrease=1e-4)
+    for scale in schedule:
+        kernel = Kernel("geman-mcclure", scale)
+        edges = tuple(replace(e, kernel=kernel) if isinstance(e, RangeEdges) else e for e in graph.edges)
+        graph = optimize(replace(graph, edges=edges), quick)[0]
+    return graph

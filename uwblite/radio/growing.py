@@ -1,0 +1,294 @@
+"""Optimising a graph whose guess is only locally right, by growing it in time.
+
+Dead reckoning over kilometres bends so far that no descent from it finds the minimum: with anchors trilaterated on a
+bent path, the basin is lost after a few thousand poses. But the guess of the next hundred poses, laid onto what is
+known already, is always near. So poses are added in pieces. Each time the last few hundred are optimised while older
+ones hold them; the whole is optimised again when it has grown by half, or when the last part does not fit.
+
+An anchor joins when the ranges heard so far place it, and leaves again when later ranges contradict it: the mirror
+image of an anchor passed on one side is often found, and is recognised only after a turn.
+
+A part fits when its chi2 per degree of freedom exceeds the usual by less than five standard deviations, chi2 over dof
+scattering by sqrt(2 / dof). What does not fit is tried, in this order, without the anchors that joined last, without
+the anchors most of whose ranges a robust kernel calls outliers, and with more and more of the older poses free.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..errors import ConfigError
+from ..graph.graph import Edges, Graph, PriorEdges, pick_rows
+from ..graph.range_edges import RangeEdges
+from ..graph.robust import Kernel
+from ..graph.solver import Progress, SolverConfig, SolverSummary, check, optimize
+from ..graph.unknowns import free_unknowns
+from .trilateration import AnchorConfig, ambiguous, locate
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class GrowingConfig:
+    """How a graph grows."""
+
+    piece: int = 100
+    """Poses added at once; over so many the guess may not bend by more than about a radian."""
+    window: int = 400
+    """Poses optimised after each piece, older ones held."""
+    widening: int = 4
+    """Factor on the window where it does not fit."""
+    resolve_growth: float = 1.5
+    """Everything is optimised again when the number of poses has grown by this factor."""
+    significance: float = 5.0
+    """Standard deviations by which chi2 may exceed the usual."""
+    probation: int = 400
+    """Poses after which an anchor that joined is no longer the first suspect."""
+    min_ranges: int = 20
+    """Ranges before an anchor is searched."""
+    max_position_sigma: float = 0.5
+    """An anchor less certain than this does not join yet, m."""
+    drift: float = 0.1
+    """Assumed error of the path over the ranges an anchor is searched from, m."""
+    outlier: float = 4.0
+    """Standard deviations beyond which a range is an outlier."""
+    outlier_share: float = 0.3
+    """An anchor with a larger share of outliers leaves."""
+    search: AnchorConfig = field(default_factory=lambda: AnchorConfig(ambiguity=0.7))
+    """How anchors are searched; stricter than usual, since another try comes soon."""
+    step: SolverConfig = field(default_factory=lambda: SolverConfig(max_iterations=30, relative_decrease=1e-4))
+    """Of the optimisations on the way."""
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    """Of the last optimisation."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("piece", 1), ("window", 1), ("widening", 2), ("min_ranges", 1)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        if not self.resolve_growth > 1.0:
+            raise ConfigError(f"resolve_growth must be above 1, not {self.resolve_growth}")
+
+
+def optimize_growing(
+    graph: Graph, config: GrowingConfig = GrowingConfig(), progress: Progress | None = None
+) -> tuple[Graph, SolverSummary]:
+    """Optimise a graph whose poses stand in the order of time and are guessed by dead reckoning.
+
+    Parameters
+    ----------
+    graph : its guess of the anchors is used only for those that are held, have a prior, or are in no range edges.
+    config : settings.
+    progress : called with (poses done, poses) after every piece.
+
+    Raises
+    ------
+    SolverError : nothing is free, nothing is measured, or a starting value is not finite.
+    """
+    check(graph)
+    growth = _Growth(graph, config)
+    for done in growth.run():
+        if progress is not None:
+            progress(done, len(graph.poses))
+    return optimize(growth.graph, config.solver)
+
+
+class _Kind(NamedTuple):
+    """One kind of edges, sorted by the latest pose each touches."""
+
+    edges: Edges
+    latest: Ints
+    """(e,) index of that pose, -1 = none."""
+    anchors: tuple[Ints, ...]
+    """(e,) each: anchors touched."""
+
+
+def _by_time(edges: Edges, graph: Graph) -> _Kind:
+    blocks = edges.linearize(graph).blocks
+    latest = np.max([np.full(len(edges), -1), *(index for name, index, _ in blocks if name == "poses")], axis=0)
+    order = np.argsort(latest, kind="stable")
+    return _Kind(pick_rows(edges, order), latest[order], tuple(i[order] for name, i, _ in blocks if name == "anchors"))
+
+
+class _Part(NamedTuple):
+    """A part of the graph, optimised."""
+
+    graph: Graph
+    fits: bool
+    chi2_per_dof: float
+
+
+class _Growth:
+    """What is known so far: `graph` with the poses done, and which anchors have joined."""
+
+    def __init__(self, graph: Graph, config: GrowingConfig) -> None:
+        self.graph, self.guess, self.config = graph, graph.poses, config
+        self.kinds = [_by_time(edges, graph) for edges in graph.edges]
+        self.free = free_unknowns(graph)
+        count = len(graph.anchors)
+        self.ranges = [(kind.edges, kind.latest) for kind in self.kinds if isinstance(kind.edges, RangeEdges)]
+        self.of_anchor = [_groups(edges.anchor, count) for edges, _ in self.ranges]
+        self.ranged = np.zeros(count, dtype=bool)
+        for edges, _ in self.ranges:
+            self.ranged[edges.anchor] = True
+        known = ~self.free["anchors"]
+        for prior in graph.edges:
+            if isinstance(prior, PriorEdges) and prior.block == "anchors":
+                known[prior.index] = True
+        self.ranged &= ~known
+        self.joined = ~self.ranged
+        self.joined_at = np.where(self.joined, -1, len(graph.poses))
+        self.tried = np.zeros(count, dtype=np.int64)
+        self.first_seen = self._first_seen(known)
+        self.usual = 1.0
+
+    def _first_seen(self, known: Bools) -> Ints:
+        """Return when each anchor that is neither ranged nor known appears: then it is carried along with the path."""
+        first = np.full(len(known), len(self.guess))
+        for kind in self.kinds:
+            for anchors in kind.anchors:
+                np.minimum.at(first, anchors, kind.latest)
+        return np.where(known | self.ranged, -1, first)
+
+    def run(self) -> Iterator[int]:
+        """Grow to the whole path, yielding the number of poses done."""
+        done, whole = 0, 0
+        while done < len(self.guess):
+            now = min(done + self.config.piece, len(self.guess))
+            self._lay_on(done, now)
+            everything = now == len(self.guess) or now >= self.config.resolve_growth * whole
+            part = self._fit(now, everything)
+            self.graph = replace(
+                self.graph,
+                poses=np.concatenate([part.graph.poses, self.graph.poses[now:]]),
+                anchors=part.graph.anchors,
+                calibration=part.graph.calibration,
+            )
+            if part.graph.fixed_calibration is self.graph.fixed_calibration:
+                whole = now
+                self.usual = max(1.0, part.chi2_per_dof) if np.isfinite(part.chi2_per_dof) else self.usual
+            self._search(now)
+            done = now
+            yield done
+
+    def _lay_on(self, done: int, now: int) -> None:
+        """Continue the path by the guess's own motion, and with it the anchors that are carried along."""
+        if not done:
+            return
+        poses, anchors = self.graph.poses.copy(), self.graph.anchors.copy()
+        poses[done:now] = se2.compose(poses[done - 1], se2.between(self.guess[done - 1], self.guess[done:now]))
+        new = np.nonzero((self.first_seen >= done) & (self.first_seen < now))[0]
+        at = self.first_seen[new]
+        anchors[new] = se2.transform(se2.compose(poses[at], se2.inverse(self.guess[at])), anchors[new])
+        self.graph = replace(self.graph, poses=poses, anchors=anchors)
+
+    def _fit(self, now: int, everything: bool) -> _Part:
+        """Optimise the last part, or as much more as it takes to fit."""
+        window = now if everything else self.config.window
+        while True:
+            low = max(0, now - window)
+            part = self._solve(low, now)
+            if not part.fits:
+                part = self._without_suspects(part, low, now)
+            if part.fits or low == 0:
+                return part
+            window *= self.config.widening
+
+    def _without_suspects(self, part: _Part, low: int, now: int) -> _Part:
+        """Return the part as it fits without some anchors, which then leave; or as it is."""
+        fresh = self.joined & self.ranged & (self.joined_at >= now - self.config.probation)
+        for accused in (fresh, None):
+            if accused is None:
+                accused = self._outlying(low, now)
+            if accused.any():
+                other = self._solve(low, now, without=accused)
+                if other.fits:
+                    self.joined &= ~accused
+                    self.joined_at[accused] = len(self.guess)
+                    return other
+        return part
+
+    def _outlying(self, low: int, now: int) -> Bools:
+        """Return the anchors most of whose ranges disagree with the rest, by a robust optimisation."""
+        robust = self._solve(low, now, kernel=Kernel("geman-mcclure", self.config.outlier + 1.0)).graph
+        heard, outliers = np.zeros(len(self.joined)), np.zeros(len(self.joined))
+        for edges in robust.edges:
+            if isinstance(edges, RangeEdges):
+                off = np.abs(edges.residuals(robust)[:, 0]) > self.config.outlier
+                heard += np.bincount(edges.anchor, minlength=len(heard))
+                outliers += np.bincount(edges.anchor, off, len(heard))
+        return self.ranged & (outliers > self.config.outlier_share * np.maximum(heard, 1.0))
+
+    def _solve(self, low: int, now: int, without: Bools | None = None, kernel: Kernel | None = None) -> _Part:
+        """Optimise poses low..now - 1 and the anchors that joined since; older ones hold them."""
+        use = self.joined if without is None else self.joined & ~without
+        held = {name: ~mask for name, mask in self.free.items()}
+        part = replace(
+            self.graph,
+            poses=self.graph.poses[:now],
+            edges=tuple(self._edges(low, now, use, kernel)),
+            fixed_poses=held["poses"][:now] | (np.arange(now) < low),
+            fixed_anchors=held["anchors"] | ~use | (self.joined_at < low) & (low > 0),
+            fixed_calibration=self.graph.fixed_calibration if low == 0 else np.ones_like(held["calibration"]),
+        )
+        if not part.edges or not any(mask.any() for mask in free_unknowns(part).values()):
+            return _Part(part, True, float("nan"))
+        solved, summary = optimize(part, self.config.step)
+        scatter = np.sqrt(2.0 / max(summary.dof, 1))
+        most = self.usual * (1.0 + self.config.significance * scatter)
+        return _Part(solved, not summary.chi2_per_dof > most, summary.chi2_per_dof)
+
+    def _edges(self, low: int, now: int, use: Bools, kernel: Kernel | None) -> Iterator[Edges]:
+        for kind in self.kinds:
+            first, end = np.searchsorted(kind.latest, [low if low else -1, now])
+            which = np.arange(first, end)
+            for anchors in kind.anchors:
+                which = which[use[anchors[which]]]
+            if len(which):
+                edges = pick_rows(kind.edges, which)
+                yield replace(edges, kernel=kernel) if kernel is not None and isinstance(edges, RangeEdges) else edges
+
+    def _search(self, now: int) -> None:
+        """Place the anchors that the ranges so far make clear; at the end also those that stay doubtful."""
+        last, config = now == len(self.guess), self.config
+        anchors = self.graph.anchors.copy()
+        for anchor in np.nonzero(~self.joined)[0]:
+            heard = self._heard(int(anchor), now)
+            count = sum(len(edges) for edges in heard)
+            if not last and (count < config.min_ranges or count < 1.2 * self.tried[anchor]):
+                continue
+            self.tried[anchor] = count
+            found = locate(*self._distances(heard), config.search, config.drift)
+            clear = bool(found) and not ambiguous(found, config.search)
+            if found and (last or (clear and found[0].position_sigma < config.max_position_sigma)):
+                anchors[anchor] = found[0].position
+                self.joined[anchor], self.joined_at[anchor] = True, now
+        self.graph = replace(self.graph, anchors=anchors)
+
+    def _heard(self, anchor: int, now: int) -> list[RangeEdges]:
+        """Return the ranges to an anchor so far."""
+        heard = []
+        for (edges, latest), groups in zip(self.ranges, self.of_anchor, strict=True):
+            which = groups[anchor]
+            heard.append(edges.rows(which[: np.searchsorted(latest[which], now)]))
+        return heard
+
+    def _distances(self, heard: list[RangeEdges]) -> tuple[Floats, Floats]:
+        """Return where the tag was (m, 2) at ranges, and the planar distances (m,) they measured."""
+        places, distances = [np.zeros((0, 2))], [np.zeros(0)]
+        for edges in heard:
+            tag = edges.lever_arm + se2.rotate(edges.turn, np.broadcast_to(edges.tag, (len(edges), 2)))
+            places.append(se2.transform(self.graph.poses[edges.pose], tag))
+            distances.append(np.sqrt(np.maximum(edges.ranges**2 - edges.height**2, 1e-4)))
+        return np.concatenate(places), np.concatenate(distances)
+
+
+def _groups(labels: Ints, count: int) -> list[Ints]:
+    """Return for each label 0..count - 1 where it stands, ascending."""
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.searchsorted(labels[order], np.arange(1, count)))

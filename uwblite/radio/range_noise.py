@@ -1,0 +1,184 @@
+"""How wrong ranges are, and how alike the errors of neighbouring ranges are.
+
+A radio's error is not white: multipath and antenna angle change slowly with the place, so a robot that stands or
+returns reads the same error again. Thousands of ranges taken as independent would outvote everything else. Here an
+anchor's residuals are split into a white part and a slow part that is alike within a correlation length in space
+(variogram: Matheron 1963); a range with n alike neighbours then gets the variance white + n slow, so that together
+they weigh what one draw of the slow part is worth.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..graph.robust import Kernel
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_ROBUST = Kernel("cauchy", 2.5)
+
+
+@dataclass(frozen=True, slots=True)
+class RangeNoiseConfig:
+    """Noise of ranges: the assumption before there are residuals, and how it is learnt from them."""
+
+    sigma: float = 0.12
+    """Assumed standard deviation, m, before it is learnt."""
+    slow_share: float = 0.5
+    """Assumed share of the variance that is slow."""
+    correlation_length: float = 1.5
+    """Distance over which the slow part stays alike, m, before it is learnt."""
+    min_sigma: float = 0.03
+    """No radio of this kind is trusted beyond this, m."""
+    steady: float = 0.06
+    """Standard deviation of what an anchor's errors have in common in one direction and at one distance from it, m: radiation
+    patterns and received power alone make so much, and no residual shows what a wrong place of the anchor explains as well."""
+    learn: bool = True
+    """Estimate white and slow part from the residuals."""
+    kernel: Kernel = _ROBUST
+    """Robust kernel: ranges through walls are long; none = squared errors (the paper)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeNoise:
+    """White and slow part of one anchor's errors."""
+
+    white: float
+    """Standard deviation of what is new in every range, m."""
+    slow: float
+    """Standard deviation of what stays alike, m."""
+    length: float
+    """Correlation length, m."""
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of one range, m."""
+        return float(np.hypot(self.white, self.slow))
+
+
+def assumed(config: RangeNoiseConfig) -> RangeNoise:
+    """Return the noise to start from."""
+    slow = config.sigma * float(np.sqrt(config.slow_share))
+    return RangeNoise(float(np.sqrt(config.sigma**2 - slow**2)), slow, config.correlation_length)
+
+
+def short_term_sigma(stamps: Floats, anchor: Ints, ranges: Floats, config: RangeNoiseConfig) -> float:
+    """Return a first guess of the noise of all ranges, m, without any position: how far each range lies off the line
+    between its neighbours in time, to the same anchor (median absolute value, so outliers do not count).
+
+    Parameters
+    ----------
+    stamps : (m,) s. anchor : (m,). ranges : (m,) m, usable ones.
+    config : bounds; its sigma holds where there are fewer than 20 such triples.
+    """
+    order = np.lexsort((stamps, anchor))
+    t, a, r = stamps[order], anchor[order], ranges[order]
+    if len(r) < 3:
+        return config.sigma
+    same = (a[2:] == a[:-2]) & (t[2:] > t[:-2])
+    span = np.where(same, t[2:] - t[:-2], 1.0)
+    w = (t[1:-1] - t[:-2]) / span
+    off = (r[1:-1] - (1.0 - w) * r[:-2] - w * r[2:]) / np.sqrt(1.0 + w**2 + (1.0 - w) ** 2)
+    same &= span < 4.0 * np.median(span[same]) if same.any() else same
+    if same.sum() < 20:
+        return config.sigma
+    return max(1.4826 * float(np.median(np.abs(off[same]))), config.min_sigma)
+
+
+def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNoiseConfig) -> RangeNoise:
+    """Split one anchor's residuals into white and slow part.
+
+    Parameters
+    ----------
+    positions : (m, 2) tag at the ranges, m.
+    residuals : (m,) m.
+    weights : (m,) 0..1, robust weights; ranges below 0.5 are outliers and left out.
+    config : assumption that holds where there is too little to learn from.
+    """
+    kept = weights > 0.5
+    prior = assumed(config)
+    if not config.learn or kept.sum() < 30:
+        return prior
+    p, e = positions[kept], residuals[kept] - np.median(residuals[kept])
+    spread = max(1.4826 * float(np.median(np.abs(e))), config.min_sigma)
+    e = np.clip(e, -3.0 * spread, 3.0 * spread)
+    variance = max(float(e @ e) / len(e), config.min_sigma**2)
+    edges = np.array([0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.0])
+    covariance, pairs = _covariance_by_distance(p, e, edges)
+    known = pairs >= 20
+    if known.sum() < 3 or not known[:2].any():
+        return prior
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    return _fit(middle[known], covariance[known], pairs[known], variance, prior, config)
+
+
+def _covariance_by_distance(p: Floats, e: Floats, edges: Floats) -> tuple[Floats, Floats]:
+    """Return mean products of residuals (b,) and pair counts (b,) by distance between the places."""
+    stride = max(1, len(e) // 1500)
+    p, e = p[::stride], e[::stride]
+    first, second = cKDTree(p).query_pairs(edges[-1], output_type="ndarray").T
+    distance = np.hypot(*(p[first] - p[second]).T)
+    bins = np.clip(np.searchsorted(edges, distance, "right") - 1, 0, len(edges) - 2)
+    pairs = np.bincount(bins, minlength=len(edges) - 1).astype(np.float64)
+    product = np.bincount(bins, e[first] * e[second], len(edges) - 1)
+    return product / np.maximum(pairs, 1.0), pairs
+
+
+def _fit(
+    distance: Floats, covariance: Floats, pairs: Floats, variance: float, prior: RangeNoise, config: RangeNoiseConfig
+) -> RangeNoise:
+    """Fit slow^2 exp(-d / length) to the covariances by a search over length; slow^2 follows linearly."""
+    weight = np.sqrt(pairs)
+    best = (np.inf, 0.0, prior.length)
+    for length in np.geomspace(0.3, 8.0, 15):
+        shape = np.exp(-distance / length)
+        slow2 = float(np.clip((weight * shape) @ covariance / ((weight * shape) @ shape), 0.0, 0.95 * variance))
+        misfit = float(weight @ (covariance - slow2 * shape) ** 2)
+        if misfit < best[0]:
+            best = (misfit, slow2, float(length))
+    slow = float(np.sqrt(best[1]))
+    white = float(np.sqrt(max(variance - best[1], (0.5 * config.min_sigma) ** 2)))
+    return RangeNoise(white, slow, best[2])
+
+
+def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None = None) -> Floats:
+    """Return the standard deviation (m,) to give each of one anchor's ranges so that all together weigh what they know.
+
+    Parameters
+    ----------
+    positions : (m, 2) tag at the ranges, m.
+    noise : the anchor's noise.
+    weights : (m,) how far each range counts as a neighbour of others, 0..1; None = all 1.
+    """
+    if noise.slow == 0.0 or len(positions) == 0:
+        return np.full(len(positions), max(noise.sigma, 1e-6))
+    return np.sqrt(noise.white**2 + noise.slow**2 * _alike(positions, noise.length, weights))
+
+
+def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | None = None) -> Floats:
+    """Return the standard deviation (m,) to give each of one anchor's ranges for what they err alike by direction and distance.
+
+    Parameters
+    ----------
+    offsets : (m, 2) from the anchor to the tag, m.
+    """
+    if config.steady == 0.0 or len(offsets) == 0:
+        return np.zeros(len(offsets))
+    distance = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 0.1)
+    bearing = np.arctan2(offsets[:, 1], offsets[:, 0])
+    # Half a radian of direction is alike, and half an e-fold of distance.
+    polar = np.stack([np.cos(bearing), np.sin(bearing), np.log(distance)], axis=1)
+    return config.steady * np.sqrt(_alike(polar, 0.5, weights))
+
+
+def _alike(positions: Floats, length: float, weights: Floats | None) -> Floats:
+    """Return the sum (m,) of exp(-distance / length) over all ranges, itself included; places binned to length / 4."""
+    cells, inverse = np.unique(np.round(positions * (4.0 / length)).astype(np.int64), axis=0, return_inverse=True)
+    counts = np.bincount(inverse.reshape(-1), weights, len(cells)).astype(np.float64)
+    tree = cKDTree(cells / 4.0)
+    near = tree.sparse_distance_matrix(tree, 4.0, output_type="coo_matrix")
+    total = np.bincount(near.row, np.exp(-near.data) * counts[near.col], len(cells))
+    return np.maximum(total[inverse.reshape(-1)], 1.0)

@@ -1,0 +1,1 @@
+"""A result for people: HTML page, picture, canvas and font."""

@@ -1,0 +1,220 @@
+"""A map's result as one HTML page: no network, no plotting library, the same bytes for the same result.
+
+Everything that comes from a log (names of files and anchors, reasons) is escaped, the page's policy forbids anything
+from elsewhere, and its script reads only the page itself.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
+from .page import PAGE, SCRIPT, STYLE
+from .svg_map import draw, number, shown_closures, sigma, thin
+
+Floats = NDArray[np.float64]
+
+MOST_RESIDUALS = 1500
+"""Residuals of one anchor drawn at most."""
+
+
+def render(
+    result: MapResult,
+    *,
+    title: str,
+    command: str,
+    facts: tuple[tuple[str, str], ...] = (),
+    grid_png: bytes | None = None,
+    timings: bool = False,
+) -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    result : the map.
+    title : name of the recording.
+    command : command line that makes the same map again.
+    facts : (name, value) pairs for the head of the page: input hash, version, settings.
+    grid_png : picture of the bare grid, one pixel a cell, highest y first.
+    timings : whether to show the seconds of each stage; the page then differs from run to run.
+    """
+    sections = (
+        _banner(result),
+        _section("Map", draw(result, grid_png)),
+        _section("Anchors", _anchor_table(result.anchors)),
+        _section("Range residuals", _residuals(result)) if len(result.range_table.get("stamp", ())) else "",
+        _section("Calibration", _calibration_table(result)),
+        _section("Loop closures", _closure_table(result)),
+        _section("Stages", _stage_table(result, timings)),
+        _section("Again", f"<p>The exact command that makes this map again:</p><pre>{escape(command)}</pre>"),
+    )
+    table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts)
+    body = f"<h1>{escape(title)}</h1><div class=scroll><table class=facts>{table}</table></div>" + "".join(sections)
+    return PAGE.format(title=escape(title), style=STYLE, script=SCRIPT, body=body)
+
+
+def _section(title: str, content: str) -> str:
+    return f'<section id="{title.lower().replace(" ", "-")}"><h2>{title}</h2>{content}</section>'
+
+
+def _banner(result: MapResult) -> str:
+    parts = []
+    if result.doubts:
+        items = "".join(f"<li>{escape(text)}</li>" for text in result.doubts)
+        parts.append(
+            f'<div class="box bad" role=alert><b>Do not trust this map before these are settled:</b><ul>{items}</ul></div>'
+        )
+    if result.warnings:
+        items = "".join(f"<li>{escape(text)}</li>" for text in result.warnings)
+        parts.append(f'<div class="box warn"><b>Worth knowing:</b><ul>{items}</ul></div>')
+    if not parts:
+        parts.append('<div class="box good">No warnings.</div>')
+    return f'<section id="warnings">{"".join(parts)}</section>'
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], empty: str) -> str:
+    if not rows:
+        return f"<p>{escape(empty)}</p>"
+    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    body = "".join("<tr>" + "".join(_cell(cell) for cell in row) + "</tr>" for row in rows)
+    return f"<div class=scroll><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _cell(text: str) -> str:
+    """Return a cell of a table; one that holds a sentence may be wrapped, but not to a word a line."""
+    return f"<td class=words>{escape(text)}</td>" if len(text) > 20 and " " in text else f"<td>{escape(text)}</td>"
+
+
+def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
+    head = (
+        "anchor",
+        "x, m",
+        "\u00b1",
+        "y, m",
+        "\u00b1",
+        "bias, m",
+        "\u00b1",
+        "ranges",
+        "down-weighted",
+        "residual rms, m",
+        "status",
+    )
+    rows = [
+        (
+            a.id,
+            number(a.position[0]),
+            number(sigma(a, 0)),
+            number(a.position[1]),
+            number(sigma(a, 1)),
+            number(a.bias, sign=True),
+            number(a.bias_sigma),
+            str(a.ranges),
+            f"{100 * (1 - a.used_share):.0f} %" if np.isfinite(a.used_share) else "\u2013",
+            number(a.residual_rms),
+            f"{a.status}: {a.reason}" if a.reason else a.status,
+        )
+        for a in anchors
+    ]
+    return _table(head, rows, "The recording has no anchors.")
+
+
+def _calibration_table(result: MapResult) -> str:
+    """Return what was calibrated, and, folded away, what the recording does not show."""
+    head = ("name", "value", "\u00b1", "unit", "meaning")
+    found = [_calibration_row(c) for c in result.calibration if c.state == "estimated"]
+    text = _table(head, found, "Nothing was calibrated.")
+    if silent := [(*_calibration_row(c), c.reason) for c in result.calibration if c.state != "estimated"]:
+        rest = _table((*head, "why it stays at what was assumed"), silent, "")
+        text += f"<details><summary>{len(silent)} more that the recording does not show</summary>{rest}</details>"
+    return text
+
+
+def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
+    """Return name, value, sigma, unit and meaning; ratios in per cent."""
+    scale, digits, unit = (100.0, 2, "%") if value.unit == "1" else (1.0, 4, value.unit)
+    return (value.name, number(scale * value.value, digits, True), number(scale * value.sigma, digits), unit, value.meaning)
+
+
+def _closure_table(result: MapResult) -> str:
+    kept, rejected = shown_closures(result)
+    count = sum(c.accepted for c in result.closures)
+    # Reasons that differ in their figures only are one kind.
+    reasons = Counter(re.sub(r"\d+(\.\d+)?", "\u2026", c.reason) for c in result.closures if not c.accepted)
+    text = f"<p>{count} of {len(result.closures)} candidates kept.</p>" if result.closures else ""
+    if reasons:
+        text += _table(("rejected because", "candidates"), [(why, str(n)) for why, n in reasons.most_common(30)], "")
+    rows = [
+        (f"{c.i}\u2013{c.j}", "kept" if c.accepted else "rejected", f"{c.fitness:.3f}", f"{100 * c.overlap:.0f} %", c.reason)
+        for c in [*kept, *rejected]
+    ]
+    listing = _table(("keyframes", "", "fitness, m", "overlap", "why"), rows, "No loop closure was looked for or found.")
+    return text + (f"<details><summary>All of them</summary>{listing}</details>" if rows else listing)
+
+
+def _stage_table(result: MapResult, timings: bool) -> str:
+    head = ("stage", "\u03c7\u00b2", "degrees of freedom", "\u03c7\u00b2 / dof", *(("seconds",) if timings else ()), "figures")
+    rows = []
+    for stage in result.stages:
+        chi2, dof = stage.figures.get("chi2"), stage.figures.get("dof")
+        ratio = number(chi2 / dof) if chi2 is not None and dof else ""
+        others = ", ".join(f"{k} {_figure(v)}" for k, v in stage.figures.items() if k not in ("chi2", "dof"))
+        time = (f"{stage.seconds:.2f}",) if timings else ()
+        rows.append((stage.name, "" if chi2 is None else f"{chi2:.1f}", "" if dof is None else str(dof), ratio, *time, others))
+    hint = "" if timings else "<p class=hint>The timings of each stage stand in report.json, beside this page.</p>"
+    return _table(head, rows, "") + hint
+
+
+def _figure(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return "(" + ", ".join(f"{k} {_figure(v)}" for k, v in value.items()) + ")"
+    if isinstance(value, list | tuple):
+        return f"{len(value)} values" if len(value) > 6 else ", ".join(map(_figure, value))
+    return str(value)
+
+
+def _residuals(result: MapResult) -> str:
+    table = {name: np.asarray(values) for name, values in result.range_table.items()}
+    several = len(np.unique(result.session)) > 1
+    # The clocks of several recordings have nothing in common: their ranges are drawn one after another.
+    time = np.arange(len(table["stamp"]), dtype=np.float64) if several else table["stamp"] - table["stamp"].min()
+    span = max(float(time.max()), 1e-9)
+    along = "one recording after another" if several else f"{span:.0f} s"
+    parts = [
+        "<p class=hint>Expected minus measured range over time; <span class=nlos-text>marked</span>: does not agree with the"
+        " map, as where something blocks the radio's sight (NLOS).</p>"
+    ]
+    for index, anchor in enumerate(result.anchors):
+        mine = np.flatnonzero(table["anchor"] == index)
+        mine = mine[np.isfinite(table["residual"][mine])]
+        if len(mine):
+            parts.append(_residual_plot(anchor.id, table, mine[thin(len(mine), MOST_RESIDUALS)], time / span, along))
+    return "".join(parts)
+
+
+def _dots(x: Floats, y: Floats) -> str:
+    return "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+
+
+def _residual_plot(anchor_id: str, table: dict[str, Floats], which: NDArray[np.int64], time: Floats, along: str) -> str:
+    residual, good = table["residual"][which], table["agrees"][which] > 0
+    inner = float(np.quantile(np.abs(residual[good]), 0.99)) if good.any() else 0.0
+    limit = max(2.0 * inner, 0.1)
+    x = 1000.0 * time[which]
+    y = 60.0 - 55.0 * np.clip(residual / limit, -1.0, 1.0)
+    dots = "".join(
+        f'<path class="{name}" d="{_dots(x[sel], y[sel])}"/>' for name, sel in (("los", good), ("nlos", ~good)) if sel.any()
+    )
+    return (
+        f"<figure><figcaption>{escape(anchor_id)} <span class=hint>axis \u00b1{limit:.2f} m, {escape(along)};"
+        f" {100 * float(np.mean(~good)):.0f} % marked</span></figcaption>"
+        f'<svg class="residuals" viewBox="0 0 1000 120" preserveAspectRatio="none" role="img"'
+        f' aria-label="residuals of {escape(anchor_id)}">'
+        f'<path class="axis" d="M0 60H1000"/>{dots}</svg></figure>'
+    )

@@ -1,0 +1,209 @@
+"""The map as a picture: grid, trajectory, anchors and loop closures on one RGB array."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..grid.geometry import GridGeometry
+from ..grid.occupancy_grid import OccupancyGrid
+from .canvas import Canvas, Colour
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+PAPER: Colour = (226, 229, 233)
+FLOOR: Colour = (255, 255, 255)
+WALL: Colour = (24, 28, 36)
+PATH: Colour = (37, 99, 235)
+PATHS: tuple[Colour, ...] = (PATH, (124, 58, 180), (0, 128, 140), (92, 64, 51))
+"""Of the recordings, in turn."""
+CLOSURE: Colour = (234, 120, 20)
+ANCHOR: Colour = (208, 28, 60)
+START: Colour = (22, 150, 80)
+INK: Colour = (52, 58, 68)
+
+_MARGIN = 0.8
+"""m; free border around what is drawn."""
+_SMALLEST = 240
+"""Pixels; the picture is at least this wide and high, so that the strip below has room."""
+_FOOT = 44
+"""Pixels of the strip below the map with scale and caption."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PictureAnchor:
+    """An anchor to draw."""
+
+    id: str
+    position: Floats
+    """(2,) m, map frame."""
+    covariance: Floats | None = None
+    """(2, 2) m^2; drawn as an ellipse of two standard deviations."""
+
+
+def draw_map(
+    grid: OccupancyGrid | None,
+    trajectory: Floats,
+    *,
+    anchors: Sequence[PictureAnchor] = (),
+    closures: Floats | None = None,
+    caption: str = "",
+    size: int = 1400,
+) -> Image:
+    """Draw a map.
+
+    Parameters
+    ----------
+    grid : cells; None = none were mapped.
+    trajectory : (n, 2 or more) x, y of the base, m, map frame; a row of nan parts recordings,
+        which have colours of their own.
+    anchors : those to draw; positions that are not finite are left out.
+    closures : (c, 4) x, y, x, y of the two poses of each accepted loop closure, m.
+    caption : words below the map.
+    size : pixels of the longer side, about; the scale is chosen so that cells are whole pixels where they can be.
+
+    Returns
+    -------
+    (height, width, 3) red, green, blue; row 0 on top, largest y on top.
+    """
+    path, size = trajectory[:, :2], max(size, _SMALLEST)
+    placed = [a for a in anchors if np.isfinite(a.position).all()]
+    low, high = _extent(grid, path, placed)
+    resolution = grid.geometry.resolution if grid is not None else max(float((high - low).max()) / size, 1e-3)
+    scale = _pixels_per_metre(float((high - low).max()), resolution, size)
+    low = np.floor(low / resolution) * resolution
+    width, height = (np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int)).tolist()
+    image = np.empty((height + _FOOT, width, 3), dtype=np.uint8)
+    image[:] = PAPER
+    if grid is not None:
+        _paste(image[:height], _shaded(grid), grid.geometry, low, scale)
+
+    def pixel(points: Floats) -> Floats:
+        return np.stack([(points[..., 0] - low[0]) * scale, height - (points[..., 1] - low[1]) * scale], axis=-1)
+
+    canvas = Canvas(image[:height])
+    if closures is not None and len(closures):
+        ends = np.concatenate([pixel(closures[:, :2]), pixel(closures[:, 2:])], axis=1)
+        canvas.lines(ends, 1.3, CLOSURE, 0.75)
+    for number, track in enumerate(_recordings(pixel(path))):
+        colour = PATHS[number % len(PATHS)]
+        canvas.polyline(track, 2.2, colour, 0.85)
+        for end, fill in ((track[:1], START), (track[-1:], colour)):
+            canvas.discs(end, 7.0, FLOOR)
+            canvas.discs(end, 5.0, fill)
+    for anchor in placed:
+        _draw_anchor(canvas, anchor, pixel)
+    _draw_foot(image, height, scale, caption)
+    return image
+
+
+def _recordings(track: Floats) -> list[Floats]:
+    """Return the pieces of a path between its rows of nan."""
+    gaps = np.flatnonzero(~np.isfinite(track).all(axis=1))
+    pieces = np.split(track, np.unique(np.concatenate([gaps, gaps + 1])))
+    return [piece for piece in pieces if len(piece) and np.isfinite(piece).all()]
+
+
+def _extent(grid: OccupancyGrid | None, path: Floats, anchors: list[PictureAnchor]) -> tuple[Floats, Floats]:
+    """Return the corners of the box around everything known, m."""
+    boxes = [path[np.isfinite(path).all(axis=1)], np.array([a.position for a in anchors]).reshape(-1, 2)]
+    if grid is not None:
+        known = grid.log_odds != 0.0
+        rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        if len(rows):
+            corners = grid.geometry.centre_of(rows[[0, -1]], cols[[0, -1]])
+            boxes.append(corners)
+    points = np.concatenate(boxes)
+    if len(points) == 0:
+        points = np.zeros((1, 2))
+    return points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
+
+
+def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
+    """Return a scale at which a cell is a whole number of pixels, or a pixel a whole number of cells."""
+    cell = size / (extent / resolution)
+    return max(math.floor(cell), 1) / resolution if cell >= 1.0 else 1.0 / (math.ceil(1.0 / cell) * resolution)
+
+
+def _shaded(grid: OccupancyGrid) -> Image:
+    """Return the colours (rows, cols, 3) of the cells: the surer a cell, the clearer its white or black."""
+    p = grid.probability()
+    known = (grid.log_odds != 0.0)[:, :, None]
+    free = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, :, None]
+    wall = np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, :, None]
+    paper, floor, ink = (np.array(c, dtype=np.float32) for c in (PAPER, FLOOR, WALL))
+    colours = paper + free * (floor - paper) + wall * (ink - paper)
+    return np.rint(np.where(known, colours, paper)).astype(np.uint8)
+
+
+def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, scale: float) -> None:
+    """Copy the cells into the picture; where several cells share a pixel the darkest shows."""
+    height, width = image.shape[:2]
+    pixels = scale * geometry.resolution
+    first_col, first_row = np.rint((geometry.origin - low) / geometry.resolution).astype(int).tolist()
+    if pixels >= 1.0:
+        each = round(pixels)
+        row = (height - 1 - np.arange(height)) // each - first_row
+        col = np.arange(width) // each - first_col
+        rows, cols = (row >= 0) & (row < geometry.rows), (col >= 0) & (col < geometry.cols)
+        image[np.ix_(rows, cols)] = colours[np.ix_(row[rows], col[cols])]
+        return
+    together = round(1.0 / pixels)
+    padded_rows, padded_cols = height * together, width * together
+    canvas = np.empty((padded_rows, padded_cols, 3), dtype=np.uint8)
+    canvas[:] = PAPER
+    top, left = max(-first_row, 0), max(-first_col, 0)
+    part = colours[top : padded_rows - first_row, left : padded_cols - first_col]
+    canvas[first_row + top :, first_col + left :][: part.shape[0], : part.shape[1]] = part
+    blocks = canvas.reshape(height, together, width, together, 3)
+    darkest, brightest = blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3))
+    dark = darkest[:, :, :1] < PAPER[0] - 20
+    image[:] = np.where(dark, darkest, brightest)[::-1]
+
+
+def _draw_anchor(canvas: Canvas, anchor: PictureAnchor, pixel: Callable[[Floats], Floats]) -> None:
+    """Draw an anchor's ellipse of two standard deviations, its place and its name."""
+    turn = np.linspace(0.0, 2.0 * math.pi, 73)
+    if anchor.covariance is not None and np.isfinite(anchor.covariance).all():
+        variance, axes = np.linalg.eigh(anchor.covariance)
+        ellipse = (axes * (2.0 * np.sqrt(np.maximum(variance, 0.0)))) @ np.stack([np.cos(turn), np.sin(turn)])
+        outline = pixel(anchor.position + ellipse.T)
+        canvas.polygon(outline[:-1], ANCHOR, 0.15)
+        canvas.polyline(outline, 1.5, ANCHOR, 0.9)
+    x, y = pixel(anchor.position).tolist()
+    corners = np.array([[0.0, -1.1], [0.95, 0.6], [-0.95, 0.6]])
+    canvas.polygon(np.array([x, y]) + 12.5 * corners, FLOOR)
+    canvas.polygon(np.array([x, y]) + 9.0 * corners, ANCHOR)
+    height, width = canvas.image.shape[:2]
+    name = anchor.id if len(anchor.id) <= 16 else anchor.id[:14] + ".."
+    wide = 12 * len(name)
+    canvas.text(
+        min(max(x + 14.0, 4.0), max(width - wide - 4.0, 4.0)), min(max(y - 9.0, 4.0), height - 22.0), name, ANCHOR, 2, FLOOR
+    )
+
+
+def _draw_foot(image: Image, top: int, scale: float, caption: str) -> None:
+    """Draw the strip below the map: a scale bar of a round length and the caption."""
+    image[top:] = FLOOR
+    image[top : top + 1] = PAPER
+    canvas = Canvas(image)
+    width = image.shape[1]
+    length = _round_length(min(220.0, width / 4.0) / scale)
+    bar, y = length * scale, top + 24.0
+    canvas.polygon(np.array([[16, y - 2.5], [16 + bar, y - 2.5], [16 + bar, y + 2.5], [16, y + 2.5]]), INK)
+    for x in (16.0, 16.0 + bar):
+        canvas.polygon(np.array([[x - 1, y - 7], [x + 1, y - 7], [x + 1, y + 7], [x - 1, y + 7]]), INK)
+    canvas.text(16 + bar + 12, y - 7, f"{length:g} m", INK)
+    left = 16 + bar + 12 + 12 * len(f"{length:g} m") + 36
+    room = int((width - left - 12) / 12)
+    if room >= len(caption) > 0:
+        canvas.text(width - 16 - 12 * len(caption), y - 7, caption, INK)
+
+
+def _round_length(longest: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not longer, m."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return float(max(f * power for f in (1.0, 2.0, 5.0) if f * power <= longest))

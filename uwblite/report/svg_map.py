@@ -1,0 +1,158 @@
+"""The zoomable map of the HTML report: an SVG with path, anchors and closures over the picture of the grid."""
+
+import base64
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..map_result import AnchorEstimate, LoopClosure, MapResult
+
+Floats = NDArray[np.float64]
+
+MOST_POINTS = 4000
+"""Points of one line drawn at most."""
+MOST_CLOSURES = 1500
+"""Rejected closures drawn and listed at most; accepted ones all are."""
+
+
+def number(value: float, digits: int = 3, sign: bool = False) -> str:
+    """Return a number with a true minus sign; a dash where it is not finite."""
+    if not np.isfinite(value):
+        return "\u2013"
+    # What rounds to zero has no sign to be told.
+    return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "\u2212")
+
+
+def thin(n: int, most: int) -> NDArray[np.int64]:
+    """Return at most about `most` of n indices, evenly spread, the last included."""
+    return np.unique(np.append(np.arange(0, n, max(1, -(-n // most))), n - 1)) if n else np.zeros(0, dtype=np.int64)
+
+
+def _coordinates(points: Floats, digits: int = 3) -> str:
+    """Return points (n, 2) as SVG coordinates, y upwards turned into y downwards."""
+    return " ".join(f"{x:.{digits}f},{-y:.{digits}f}" for x, y in points.tolist())
+
+
+def _extent(result: MapResult) -> tuple[float, float, float, float]:
+    """Return the box of everything drawn: x, y (downwards) of the corner, width, height, m."""
+    parts = [result.trajectory[:, :2], result.graph.poses[:, :2]]
+    parts += [np.asarray(a.position)[None] for a in result.anchors]
+    if result.grid is not None:
+        geometry = result.grid.geometry
+        parts.append(np.stack([geometry.origin, geometry.corner]))
+    points = np.concatenate(parts)
+    points = points[np.isfinite(points).all(axis=1)]
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.03 * float(np.max(high - low)) + 0.5
+    return (
+        float(low[0]) - margin,
+        -float(high[1]) - margin,
+        float(high[0] - low[0]) + 2 * margin,
+        float(high[1] - low[1]) + 2 * margin,
+    )
+
+
+def draw(result: MapResult, grid_png: bytes | None) -> str:
+    """Return the map with its switches and buttons as HTML."""
+    x, y, width, height = _extent(result)
+    size = max(width, height)
+    parts = []
+    if grid_png is not None and result.grid is not None:
+        geometry = result.grid.geometry
+        corner, data = geometry.corner, base64.b64encode(grid_png).decode()
+        parts.append(
+            f'<image class="grid" x="{geometry.origin[0]:.4f}" y="{-corner[1]:.4f}" preserveAspectRatio="none"'
+            f' width="{corner[0] - geometry.origin[0]:.4f}" height="{corner[1] - geometry.origin[1]:.4f}"'
+            f' href="data:image/png;base64,{data}"/>'
+        )
+    parts.append(_closure_lines(result))
+    parts.append('<g class="trajectory">')
+    for session in np.unique(result.session):
+        path = result.trajectory[result.session == session, :2]
+        parts.append(f'<polyline class="s{int(session) % 6}" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
+    start = result.trajectory[0]
+    parts.append(
+        f'<circle class="start" cx="{start[0]:.3f}" cy="{-start[1]:.3f}" r="{size / 150:.3f}"><title>start</title></circle></g>'
+    )
+    parts.append('<g class="anchors">' + "".join(_anchor_mark(a, size) for a in result.anchors) + "</g>")
+    bar = _scale_length(size)
+    svg = (
+        f'<svg id="map-view" viewBox="{x:.3f} {y:.3f} {width:.3f} {height:.3f}" role="img" aria-label="map"'
+        f' style="--s:{size / 900:.6f};aspect-ratio:{width:.3f}/{height:.3f}">{"".join(parts)}'
+        f'<g class="bar"><path d="M{x + size / 40:.3f} {y + height - size / 40:.3f}h{bar:g}"/>'
+        f'<text x="{x + size / 40:.3f}" y="{y + height - size / 25:.3f}">{bar:g} m</text></g></svg>'
+    )
+    layers = (("grid", "map"), ("trajectory", "trajectory"), ("anchors", "anchors, 2\u03c3"), ("kept", "closures kept"))
+    boxes = "".join(_switch(name, text, True) for name, text in layers) + _switch("rejected", "closures rejected", False)
+    names = (("zoom-in", "+", "zoom in"), ("zoom-out", "\u2212", "zoom out"), ("zoom-all", "all", "all of the map"))
+    buttons = " ".join(f'<button id="{name}" aria-label="{label}">{text}</button>' for name, text, label in names)
+    hint = '<p class=hint><output id="place"></output>Wheel or pinch zooms, dragging moves, point at things for details.</p>'
+    return f"<div class=controls>{boxes}<span class=buttons>{buttons}</span></div><div class=mapbox>{svg}</div>{hint}"
+
+
+def _switch(name: str, text: str, on: bool) -> str:
+    """Return the switch of a layer of the map, with the colour it has there."""
+    state = " checked" if on else ""
+    return f'<label><input type=checkbox{state} data-layer="{name}"> <i class="key key-{name}"></i> {escape(text)}</label>'
+
+
+def _scale_length(size: float) -> float:
+    """Return a round length of about a fifth of the size, m."""
+    power = 10.0 ** np.floor(np.log10(size / 5.0))
+    return float(max(k * power for k in (1.0, 2.0, 5.0) if k * power <= size / 5.0))
+
+
+def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:
+    if not np.isfinite(anchor.position).all():
+        return ""
+    cx, cy = float(anchor.position[0]), -float(anchor.position[1])
+    label = (
+        f"anchor {anchor.id}: x {number(anchor.position[0], 2)} \u00b1{sigma(anchor, 0):.2f} m, "
+        f"y {number(anchor.position[1], 2)} \u00b1{sigma(anchor, 1):.2f} m, {anchor.status} {anchor.reason}"
+    )
+    r = size / 110
+    state = "ok" if anchor.status == "ok" else "doubt"
+    mark = (
+        f'<g class="anchor {state}"><title>{escape(label.strip())}</title>{_ellipse(anchor, cx, cy)}'
+        f'<g transform="translate({cx:.3f} {cy:.3f})"><path d="M0-9L8 5H-8z"/><text>{escape(anchor.id)}</text></g>'
+    )
+    if anchor.alternative is not None and np.isfinite(anchor.alternative).all():
+        mark += f'<circle class="mirror" cx="{anchor.alternative[0]:.3f}" cy="{-anchor.alternative[1]:.3f}" r="{r:.3f}"/>'
+    return mark + "</g>"
+
+
+def sigma(anchor: AnchorEstimate, axis: int) -> float:
+    """Return the standard deviation of an anchor along an axis, m."""
+    return float(np.sqrt(max(anchor.covariance[axis, axis], 0.0)))
+
+
+def _ellipse(anchor: AnchorEstimate, cx: float, cy: float) -> str:
+    """Return the 2-sigma ellipse: half axes 2 sqrt(eigenvalue) along the eigenvectors, y turned downwards."""
+    if not np.isfinite(anchor.covariance).all():
+        return ""
+    values, vectors = np.linalg.eigh(anchor.covariance)
+    minor, major = 2.0 * np.sqrt(np.maximum(values, 0.0))
+    angle = -float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
+    turn = f'transform="rotate({angle:.2f} {cx:.3f} {cy:.3f})"'
+    return f'<ellipse cx="{cx:.3f}" cy="{cy:.3f}" rx="{major:.4f}" ry="{minor:.4f}" {turn}/>'
+
+
+def shown_closures(result: MapResult) -> tuple[list[LoopClosure], list[LoopClosure]]:
+    """Return all accepted closures and a sample of the rejected ones."""
+    kept = [c for c in result.closures if c.accepted]
+    rejected = [c for c in result.closures if not c.accepted]
+    return kept, [rejected[k] for k in thin(len(rejected), MOST_CLOSURES)]
+
+
+def _closure_lines(result: MapResult) -> str:
+    groups = []
+    for name, closures in zip(("kept", "rejected"), shown_closures(result), strict=True):
+        lines = []
+        for c in closures:
+            (x1, y1), (x2, y2) = result.graph.poses[c.i, :2].tolist(), result.graph.poses[c.j, :2].tolist()
+            label = f"{c.i}\u2013{c.j}: {c.reason} (fitness {c.fitness:.3f} m, overlap {100 * c.overlap:.0f} %)"
+            lines.append(f'<path d="M{x1:.3f} {-y1:.3f}L{x2:.3f} {-y2:.3f}"><title>{escape(label)}</title></path>')
+        hidden = " hidden" if name == "rejected" else ""
+        groups.append(f'<g class="closure {name}{hidden}">{"".join(lines)}</g>')
+    return "".join(groups)
