@@ -15,7 +15,7 @@ PACKAGE = Path(uwblite.__file__).parent
 MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    ("errors", "se2", "parallel"),
+    ("errors", "se2", "arrays", "parallel"),
     ("config", "sensor_log", "graph", "evaluation", "drivers"),
     ("constraints", "keyframes", "grid"),
     ("map_result", "radio"),

@@ -6,14 +6,10 @@ Surveyed anchors and pinned poses are given in the user's own frame. ``constrain
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Bools, Floats, Ints
 from .config import setting
 from .errors import ConfigError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,13 +7,10 @@ becomes their lever arm, so they need no poses of their own and none is thrown a
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import se2
+from .arrays import Bools, Floats, Ints
 from .sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +70,7 @@ class AttachedRanges:
     """(m,) rad."""
     velocity: Floats
     """(m, 2) velocity of the tag in the keyframe's frame, m/s."""
-    inside: NDArray[np.bool_]
+    inside: Bools
     """(m,) whether the range was made while there was odometry; elsewhere nobody knows where the robot was."""
 
 

@@ -11,9 +11,9 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import se2
+from .arrays import Floats
 from .constraints import Constraints
 from .errors import DataError
 from .grid.occupancy_grid import OccupancyGrid
@@ -24,8 +24,6 @@ from .map_result import MapResult, StageSummary
 from .mapping import MappingConfig, Progress, build_map
 from .pipeline import map_frame
 from .sensor_log import SensorLog
-
-Floats = NDArray[np.float64]
 
 LEAST_OVERLAP = 0.4
 """Share of the new walls that must lie on earlier ones; the rest may be new, or not seen before."""

@@ -3,14 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from .arrays import Floats, Ints
 from .graph.graph import Graph
 from .grid.occupancy_grid import OccupancyGrid
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,9 +10,9 @@ from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import se2
+from .arrays import Floats
 from .constraints import Constraints
 from .errors import ConfigError
 from .graph.calibration import LASER, freed, with_real_heights
@@ -38,7 +38,6 @@ from .sensor_log import SensorLog
 
 __all__ = ["MappingConfig", "Progress", "build_map"]
 
-Floats = NDArray[np.float64]
 
 _LARGE_GRID = 5_000_000
 """Cells from which on a grid's memory is announced."""

@@ -13,9 +13,9 @@ Angles are kept in (-pi, pi].
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from .arrays import Floats
 
 _SERIES_BELOW = 1e-2
 """Angle below which the series replace sin(t)/t and its kin; both branches agree to rounding there."""

@@ -140,7 +140,7 @@ def test_a_full_disk_leaves_the_previous_result(tmp_path, monkeypatch, fresh):
 KILLED = """
 import os, signal, sys
 sys.path.insert(0, {tests!r})
-from results import small_log, small_result
+from helpers.results import small_log, small_result
 from uwblite.io import results
 plain = results.{what}
 def stop(*args, **options):
@@ -281,7 +281,7 @@ def test_every_file_is_on_the_disk_before_it_counts(tmp_path, monkeypatch):
 FILE_LIMIT = """
 import resource, signal, sys
 sys.path.insert(0, {tests!r})
-from results import small_log, small_result
+from helpers.results import small_log, small_result
 from uwblite.io import results
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)

@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import Floats
 from ..lidar.laser_mounting import Turning, compare
 from ..sensor_log import LaserScans, SensorLog
-from .findings import Findings, Floats, timing
+from .findings import Findings, timing
 
 
 def check_scans(log: SensorLog, found: Findings) -> dict[str, Any]:

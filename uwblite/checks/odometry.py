@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from .. import se2
+from ..arrays import Floats
 from ..sensor_log import Odometry
-from .findings import Findings, Floats, timing
+from .findings import Findings, timing
 
 FASTEST = 3.0
 """A ground robot of this kind is not faster, m/s."""

@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 
 from .. import se2
+from ..arrays import Floats
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..sensor_log import SensorLog
-from .findings import Findings, Floats, timing
+from .findings import Findings, timing
 from .odometry import STRAIGHT
 
 LONGEST = 200.0

@@ -7,13 +7,10 @@ frames to speak of: distances are the same in all of them. The alignment only sa
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from ..arrays import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

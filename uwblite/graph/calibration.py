@@ -3,12 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bools, Ints
 from .graph import Calibration, Graph, PriorEdges
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 WHEELS = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
 """Unknowns of the wheels."""
@@ -65,7 +62,7 @@ class Unknown:
 
 
 def unknowns(
-    config: CalibrationConfig, anchor_ids: tuple[str, ...], told_height: NDArray[np.bool_], recording: int = 0
+    config: CalibrationConfig, anchor_ids: tuple[str, ...], told_height: Bools, recording: int = 0
 ) -> tuple[Unknown, ...]:
     """List the scalar unknowns that a recording with these anchors brings into a graph.
 

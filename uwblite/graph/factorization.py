@@ -12,16 +12,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.csgraph import depth_first_order, reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
 
+from ..arrays import Floats, Ints
 from ..errors import SolverError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""

@@ -16,15 +16,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import ConfigError
 from .graph import Edges, Graph, Linearization
 from .normal_equations import NormalEquations
 from .robust import SQUARED
 from .solver import Progress, SolverConfig, SolverSummary, check, linearize, minimise
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

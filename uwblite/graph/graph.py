@@ -14,14 +14,12 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
 from .robust import SQUARED, Kernel
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Block = tuple[str, Ints, Floats]
 """(block name, index (e,) of the unknown in that block, Jacobian (e, d, k) of the whitened residual by it)."""
 
@@ -93,11 +91,11 @@ class Graph:
     """(a, 2) m, map frame."""
     edges: tuple[Edges, ...] = ()
     calibration: Calibration = field(default_factory=Calibration)
-    fixed_poses: NDArray[np.bool_] | None = None
+    fixed_poses: Bools | None = None
     """(n,) True = held; None = the first pose is held (gauge)."""
-    fixed_anchors: NDArray[np.bool_] | None = None
+    fixed_anchors: Bools | None = None
     """(a,) True = held; None = all free."""
-    fixed_calibration: NDArray[np.bool_] | None = None
+    fixed_calibration: Bools | None = None
     """(c,) True = held; None = all free."""
 
     def with_edges(self, *edges: Edges) -> "Graph":

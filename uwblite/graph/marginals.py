@@ -3,19 +3,17 @@
 from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
 from .graph import Graph
 from .normal_equations import NormalEquations
 from .selected_inverse import selected_inverse
 from .solver import edge_weights, linearize
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _AT_ONCE = 300
 """Right-hand sides solved together: bounds the memory."""
@@ -42,7 +40,7 @@ class Marginals:
         self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
         """(c,) standard deviations, unit by name."""
 
-    def _block_diagonal(self, unseen: NDArray[np.bool_]) -> dict[str, Floats]:
+    def _block_diagonal(self, unseen: Bools) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
         numbers = self._unknowns.number
         rows = {name: np.broadcast_to(n[:, :, None], (*n.shape, n.shape[1])) for name, n in numbers.items()}

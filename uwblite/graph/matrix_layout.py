@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
+from ..arrays import Floats, Ints
 from .factorization import BandedFactor, BorderedFactor, Factor, Ordering, superlu
 from .schwarz_cg import LocalPlaces, Pieces, TwoLevelFactor
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class Layout(Protocol):

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from .factorization import Factor, choose_ordering
 from .graph import Graph, Linearization
 from .matrix_layout import Blocks, IterativeLayout, Layout, make_layout
 from .schwarz_cg import cut
 from .unknowns import WIDTHS, Unknowns, free_unknowns
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _AT_ONCE = 1 << 15
 """Edges whose products are held at once; a bound on the memory."""

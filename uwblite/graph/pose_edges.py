@@ -9,7 +9,8 @@ from typing import ClassVar, cast
 import numpy as np
 
 from .. import se2
-from .graph import Block, Floats, Graph, Ints, Linearization, pick_rows, whiten
+from ..arrays import Floats, Ints
+from .graph import Block, Graph, Linearization, pick_rows, whiten
 from .robust import SQUARED, Kernel
 
 # An edge between poses has the error e = Z^-1 (Xi^-1 Xj); with m = tj - ti - R(theta_i) z its plane part is

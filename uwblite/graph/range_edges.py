@@ -6,7 +6,8 @@ from typing import ClassVar, cast
 import numpy as np
 
 from .. import se2
-from .graph import Block, Floats, Graph, Ints, Linearization, pick_rows
+from ..arrays import Floats, Ints
+from .graph import Block, Graph, Linearization, pick_rows
 from .robust import SQUARED, Kernel
 
 

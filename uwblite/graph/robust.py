@@ -6,11 +6,9 @@ Laws: rho(s) ~ s for small s, weight(0) = 1, weight is the derivative of rho, bo
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import ConfigError
-
-Floats = NDArray[np.float64]
 
 KERNELS = ("none", "huber", "cauchy", "geman-mcclure", "tukey")
 

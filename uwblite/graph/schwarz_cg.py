@@ -10,14 +10,11 @@ The number of iterations hardly depends on the length of the chain. Anchors and 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import lapack
 
+from ..arrays import Floats, Ints
 from ..errors import SolverError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _PIECE = 24
 """Poses of a piece."""

@@ -13,15 +13,12 @@ short circuit study, 1973). Ranges of a few dozen columns make the work one of d
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
+from ..arrays import Floats, Ints
 from ..errors import SolverError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _WIDEST = 64
 """Columns of a range at most."""

@@ -35,16 +35,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError, SolverError
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost
 from .normal_equations import NormalEquations
 from .unknowns import Unknowns, free_unknowns, moved, moved_along
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Progress = Callable[[int, int], None]
 """Called as progress(iterations done, most iterations)."""
 
@@ -261,7 +259,7 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
     return factor, step, float(step @ (damping * step - normal.gradient))
 
 
-def _trial(graph: Graph, unknowns: Unknowns, step: Floats, linked: NDArray[np.bool_]) -> Graph:
+def _trial(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Graph:
     """Return the graph moved by a step; where that turns poses by much, by whichever way of moving them costs less."""
     straight = moved(graph, unknowns, step)
     if np.abs(unknowns.spread("poses", step)[:, 2]).max(initial=0.0) < _LARGE_TURN or not linked.any():
@@ -271,7 +269,7 @@ def _trial(graph: Graph, unknowns: Unknowns, step: Floats, linked: NDArray[np.bo
     return straight if not costs[1] < costs[0] else along
 
 
-def _linked(poses: int, linearized: list[Linearization]) -> NDArray[np.bool_]:
+def _linked(poses: int, linearized: list[Linearization]) -> Bools:
     """Tell which poses (n - 1,) are measured from the one before them."""
     linked = np.zeros(max(poses - 1, 0), dtype=bool)
     for lin in linearized:

@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from .graph import Graph
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
 """Blocks of unknowns, and the scalars of one unknown."""
@@ -43,7 +40,7 @@ def moved(graph: Graph, unknowns: Unknowns, step: Floats) -> Graph:
     return _moved_to(graph, unknowns, step, poses)
 
 
-def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: NDArray[np.bool_]) -> Graph:
+def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Graph:
     """Return the graph moved by a step, poses link by link: each relative pose changes as the step says to first order,
     and the chain is put together again from these.
 
@@ -81,7 +78,7 @@ def _moved_to(graph: Graph, unknowns: Unknowns, step: Floats, poses: Floats) -> 
     return graph.updated(poses, graph.anchors + unknowns.spread("anchors", step), calibration)
 
 
-def free_unknowns(graph: Graph) -> dict[str, NDArray[np.bool_]]:
+def free_unknowns(graph: Graph) -> dict[str, Bools]:
     """Return by block which unknowns are not held fixed."""
     held = {"poses": graph.fixed_poses, "anchors": graph.fixed_anchors, "calibration": graph.fixed_calibration}
     counts = {"poses": len(graph.poses), "anchors": len(graph.anchors), "calibration": len(graph.calibration.values)}

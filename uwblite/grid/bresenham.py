@@ -12,7 +12,7 @@ sorted by length are still under way as a prefix of the array.
 import numpy as np
 from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
+from ..arrays import Bools, Ints
 
 _SINGLE_UP_TO = 256
 """Steps up to which single precision decides every rounding rightly: values k d / n keep 1 / (2 n) off a tie that is not
@@ -26,7 +26,7 @@ def mark_rays(
     d_col: Ints,
     stride: int,
     value: int,
-    walls: NDArray[np.bool_] | None = None,
+    walls: Bools | None = None,
 ) -> None:
     """Write a value into every cell of the rays, first cell included, last cell excluded.
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError, DataError
 from ..sensor_log import LaserScans
 from .geometry import GridGeometry
@@ -30,9 +31,6 @@ from .scan_rays import ScanRays, empty_reach, extent, moved_scans, scan_rays, se
 
 __all__ = ["GridConfig", "GridGeometry", "OccupancyGrid", "RayCounter", "Sweeps", "from_counts", "from_scans", "from_sweeps"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Progress = Callable[[int, int], None]
 """Called as progress(scans done, scans in all)."""
 

@@ -6,13 +6,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
 from .bresenham import mark_rays
 from .geometry import GridGeometry
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Counts = NDArray[np.int32]
 
 WEIGHT_UNIT = 16

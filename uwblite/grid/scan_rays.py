@@ -7,11 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from ..sensor_log import LaserScans
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats
 from ..sensor_log import LaserScans
 from .carmen_messages import BrokenLine, numbers, stamp_of, time_order
 from .carmen_params import Params
 from .carmen_readings import Block, Pending
-
-Floats = NDArray[np.float64]
 
 DEFAULT_RANGE_MIN = 0.02
 """m; what a scanner reports below is an error code (URG-04LX: 0..19 mm). PARAM laser_range_min wins."""

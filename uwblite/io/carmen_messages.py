@@ -5,9 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..sensor_log import MOST_METRES, MOST_SECONDS
-
-Floats = NDArray[np.float64]
 
 
 class BrokenLine(ValueError):

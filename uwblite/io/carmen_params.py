@@ -3,12 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..sensor_log import SensorMounting
 from .carmen_messages import BrokenLine, numbers
-
-Floats = NDArray[np.float64]
 
 _ANCHOR_HEIGHT = "uwb_anchor_height_"
 _NUMBERS = frozenset(

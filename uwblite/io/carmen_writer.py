@@ -11,8 +11,6 @@ from ..sensor_log import LaserScans, SensorLog
 from .decimal_text import encode_fixed_point
 from .files import replacing
 
-Floats = NDArray[np.float64]
-
 HOST = "uwblite"
 _SCANS_AT_A_TIME = 256
 _LASER_TYPE = 2

@@ -21,13 +21,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..config import from_dict, parse_toml, setting, to_toml
 from ..errors import ConfigError, FormatError
 from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges
 from .files import replacing
 from .source import open_source
-
-Floats = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -8,8 +8,9 @@ eight characters long; everything else is reported as not done and left to the s
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Ints
+
 Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int64]
 
 _U = np.uint64
 _ZEROS = _U(0x3030303030303030)

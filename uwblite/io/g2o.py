@@ -20,16 +20,13 @@ import os
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
 from .graph_file import GraphFile, PlainEdges, assembled, plain_edges, read_matrices, told_places, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _LAYOUTS = {
     "VERTEX_SE2": Layout(1, 3),

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from .. import se2
+from ..arrays import Floats, Ints
 from ..errors import FormatError
 from ..graph.graph import Graph, PriorEdges
 from ..graph.point_edges import LandmarkEdges
@@ -18,8 +18,6 @@ from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from .records import RecordFile, Records
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 _NONE = np.zeros(0, dtype=np.int64)
 
 

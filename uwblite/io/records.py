@@ -4,13 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from ..errors import FormatError
 from .source import OVERLONG_LINE, TextSource
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _TAGS_COUNTED = 100
 

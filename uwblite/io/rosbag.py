@@ -22,8 +22,6 @@ from .bag_frames import Frames, planar
 from .optional_packages import missing_package
 from .uwb_mapping import KNOWN, UwbMapping
 
-Floats = NDArray[np.float64]
-
 _ODOMETRY, _SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan"
 _TF = "tf2_msgs/msg/TFMessage"
 

@@ -3,13 +3,11 @@
 import os
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import FormatError
 from .files import write_bytes
 from .source import open_source
-
-Floats = NDArray[np.float64]
 
 
 def write_tum(path: str | os.PathLike[str], stamps: Floats, poses: Floats) -> None:

@@ -12,13 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from ..keyframes import ScanPoints
 from .point_cloud import Lines, estimate_normals, make_tree
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-
 
 _BLOCK = 32
 """Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
@@ -81,7 +77,7 @@ class Clouds:
         offsets = np.append(first, counts.sum()).astype(np.int64)
         return Clouds(offsets, self.points[rows], self.normals[rows], owner, self.normal_variance[rows])
 
-    def only(self, kept: NDArray[np.bool_]) -> "Clouds":
+    def only(self, kept: Bools) -> "Clouds":
         """Return the clouds with some of their points (p,) alone."""
         counts = np.bincount(self.owner[kept], minlength=len(self))
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from .. import se2
+from ..arrays import Floats, Ints
 from ..config import setting
 from .point_cloud import PointCloud
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Singles = NDArray[np.float32]
 
 _CELLS_PER_REACH = 4

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph
 from ..graph.normal_equations import NormalEquations
@@ -21,10 +21,6 @@ from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, SolverSummary, check, linearize, minimise
 from .clouds import Clouds
 from .scan_matching import CloudRasters, PairFactors, match, measured, pair_points
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _NEIGHBOURS = 4
 """Clouds no farther apart in the chain than this are neighbours."""
@@ -88,7 +84,7 @@ class Refined:
     i: Ints
     j: Ints
     factors: PairFactors
-    used: NDArray[np.bool_]
+    used: Bools
     """(e,) pairs that counted in the last round."""
     sigma: float
     """Learnt standard deviation of a point-to-line distance, m."""

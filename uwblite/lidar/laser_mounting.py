@@ -8,13 +8,10 @@ sign), the clock offset (the lag at which both agree best) and the wheels' headi
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans, SensorLog
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 PAIRS = 1000
 """Scan pairs matched at most."""

@@ -20,17 +20,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from ..arrays import Bools, Floats
 from ..config import setting
 from ..graph.robust import Kernel
 from .nearest import NearestRaster
 from .point_cloud import PointCloud
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 CAUCHY = Kernel("cauchy", 2.0)
 

@@ -9,10 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from ..errors import DataError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _MAX_CELLS = 1 << 26
 

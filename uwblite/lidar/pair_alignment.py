@@ -3,14 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats, Ints
 from .clouds import Clouds
 from .scan_matching import CloudRasters, PairFactors, PairPoints, match, trusted_step
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

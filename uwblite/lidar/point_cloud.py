@@ -7,14 +7,10 @@ radius. Every function is pure and keeps a fixed order of points.
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..arrays import Bools, Floats, Ints
 from .nearest import NearestRaster, make_raster
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _DENSE_CELLS_PER_POINT = 16
 """A voxel grid of at most so many cells per point (plus a few thousand) is counted densely instead of sorted."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats
 from ..config import setting
 from ..graph.robust import Kernel
 from .line_factor import (
@@ -26,8 +26,6 @@ from .line_factor import (
     trusted_step,
 )
 from .point_cloud import PointCloud
-
-Floats = NDArray[np.float64]
 
 _COARSE_TOLERANCE = 10.0
 """The coarse stage hands over at steps so many times the tolerance."""

@@ -12,12 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats, Ints
 from .clouds import Clouds
 from .line_factor import relative_eigen
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 _CLOUDS_AT_ONCE = 256
 """Clouds whose rasters are painted at once."""

@@ -7,9 +7,9 @@ sharp turn between sparse scans): a correlative search around it finds the place
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..radio.range_measurements import learn_wheels
@@ -18,9 +18,6 @@ from .correlative_matching import SearchConfig, search
 from .pair_alignment import align_pairs
 from .point_cloud import make_cloud
 from .scan_matching import CloudRasters, match, measured, pair_points
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

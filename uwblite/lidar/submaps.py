@@ -10,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats, Ints
 from .clouds import Clouds, joined, mean_by_key
 from .point_cloud import radius_outlier_filter, statistical_outlier_filter
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 _AT_ONCE = 32
 """Sub-maps merged at once; a bound on the memory."""

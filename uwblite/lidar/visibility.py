@@ -8,16 +8,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .. import se2
+from ..arrays import Floats, Ints
 from .clouds import Clouds
 from .free_space import FreeSpace, contradiction, free_space, looked_through
 from .submaps import Submaps
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _BEARINGS = 120
 """Bins of the free space around a keyframe: so wide that the points of a wall 5 m away leave none empty."""

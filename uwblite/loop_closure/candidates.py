@@ -7,17 +7,14 @@ it is large, when they might.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
 from ..lidar.joint_refinement import surface_cells
 from ..lidar.submaps import Submaps
 from .closures import Closures, LoopClosureConfig
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

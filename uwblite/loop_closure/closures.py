@@ -5,12 +5,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bools
 from ..graph.pose_edges import RelativePoseEdges
 from ..map_result import LoopClosure
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,9 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from ..lidar.clouds import Clouds
 from ..lidar.correlative_matching import SearchConfig, search
 from ..lidar.free_space import FreeSpace
@@ -22,10 +22,6 @@ from ..lidar.visibility import sees_through
 from ..parallel import in_order
 from .candidates import Candidates
 from .closures import LoopClosureConfig
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _AT_ONCE = 32
 """Candidates of a batch."""

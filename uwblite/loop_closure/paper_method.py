@@ -10,9 +10,9 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges
 from ..lidar.clouds import Clouds
@@ -22,9 +22,6 @@ from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
 from ..parallel import in_order
 from .closures import Closures, LoopClosureConfig, no_closures
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _CELL = 0.5
 """m; two sub-maps overlap by the share of such squares of the smaller one that both have points in."""

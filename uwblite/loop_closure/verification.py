@@ -12,9 +12,9 @@ from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
@@ -28,10 +28,6 @@ from ..map_result import LoopClosure
 from .candidates import Candidates
 from .closures import Closures, LoopClosureConfig, no_closures
 from .matching import Fits, fit
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 def find(

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats
 from ..constraints import Clock, Constraints, KnownAnchor
 from ..errors import ConfigError
 from ..evaluation.trajectory import align
@@ -19,10 +19,6 @@ from ..graph.distance_edges import AnchorDistanceEdges
 from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

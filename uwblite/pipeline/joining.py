@@ -11,9 +11,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
 from ..graph import calibration
 from ..graph.graph import Calibration, Graph, PriorEdges
@@ -24,10 +24,6 @@ from ..radio.bootstrap import FirstEstimate
 from ..radio.trilateration import AnchorHypothesis
 from .constraint_edges import consensus
 from .recordings import Drives, Joined, Part, Session, moved_hypotheses, moved_text, numbered
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _FIRST_TOLERANCE = 0.5
 """How far first estimates of one anchor may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""

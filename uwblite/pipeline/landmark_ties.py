@@ -13,15 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats, Ints
 from ..constraints import Constraints, KnownLandmark
 from ..errors import ConfigError
 from ..evaluation.map import Landmarks, find_columns, fit_circle
 from ..graph.distance_edges import PointDistanceEdges
 from ..graph.graph import Graph
 from ..lidar.clouds import Clouds
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""

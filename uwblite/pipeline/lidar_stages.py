@@ -7,9 +7,9 @@ is; once loops are closed all overlapping clouds pull on all poses, and visits t
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import keyframes
+from ..arrays import Bools, Floats, Ints
 from ..constraints import Clock, Constraints
 from ..graph.calibration import RADIO, freed, with_real_heights
 from ..graph.graph import Edges, Graph
@@ -23,10 +23,6 @@ from ..mapping_config import MappingConfig
 from ..radio.range_measurements import learn_noise
 from .progress import Stages, solver_figures
 from .recordings import Drives, Part, Session
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _BLOCK = 32
 """Keyframes whose rays are held at once."""

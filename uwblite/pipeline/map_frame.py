@@ -3,15 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats
 from ..errors import ConfigError, DataError
 from ..graph.graph import Graph, PriorEdges
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid
-
-Floats = NDArray[np.float64]
 
 ALIGNMENTS = ("odometry", "first-pose", "walls", "anchors")
 """odometry: the first pose is where the odometry began. first-pose: it is the origin, looking along x. walls: as
@@ -56,7 +54,7 @@ def _quarter(angle: Floats) -> Floats:
     return np.asarray(-(np.remainder(-angle + np.pi / 4, np.pi / 2) - np.pi / 4), dtype=np.float64)
 
 
-def alignment(how: str, graph: Graph, placed: NDArray[np.bool_], normals: Floats) -> Floats:
+def alignment(how: str, graph: Graph, placed: Bools, normals: Floats) -> Floats:
     """Return T_new_map (3,), the motion that turns the present map frame into the wished one.
 
     Parameters

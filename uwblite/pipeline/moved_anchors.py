@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from ..graph import calibration
 from ..graph.graph import Graph, PriorEdges
 from ..graph.marginals import marginals
@@ -13,9 +13,6 @@ from ..graph.solver import SolverConfig, optimize
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
 from .recordings import Drives, Joined, Part, moved_text, numbered
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _LEAST_MOVE = 0.25
 """An anchor that two recordings see nearer together than this was not moved, m."""

@@ -3,15 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bools, Floats
 from ..graph.calibration import CalibrationConfig, Unknown, stem
 from ..graph.graph import Graph, PriorEdges
 from ..map_result import CalibrationEstimate
 from .recordings import Drives
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate is told."""

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import keyframes, se2
+from ..arrays import Floats, Ints
 from ..constraints import Clock
 from ..errors import DataError
 from ..graph.graph import Edges, Graph
@@ -15,10 +15,6 @@ from ..graph.range_edges import RangeEdges
 from ..keyframes import KeyframeConfig, Keyframes
 from ..radio.bootstrap import FirstEstimate
 from ..sensor_log import SensorLog
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _APART = 1000.0
 """Travelled distance between the end of a recording and the begin of the next, m: never the same epoch."""

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..graph.calibration import CalibrationConfig, Unknown, unknowns
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals
@@ -15,8 +15,6 @@ from ..loop_closure.closures import Closures
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, StageSummary
 from . import plausibility
 from .recordings import Drives, Part, Session
-
-Floats = NDArray[np.float64]
 
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""

@@ -3,14 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Floats
 from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
 from .trilateration import AnchorConfig, locate
-
-Floats = NDArray[np.float64]
 
 
 def place_anchors(graph: Graph, config: AnchorConfig | None = None) -> tuple[Graph, tuple[int, ...]]:

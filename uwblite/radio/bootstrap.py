@@ -10,18 +10,15 @@ again and anchors not yet placed are searched from the poses so far.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats
 from ..graph.graph import Calibration, Graph
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, optimize
 from .trilateration import AnchorConfig, AnchorHypothesis, ambiguous, locate
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

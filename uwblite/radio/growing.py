@@ -18,9 +18,9 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError
 from ..graph.graph import Edges, Graph, PriorEdges, pick_rows
 from ..graph.range_edges import RangeEdges
@@ -28,10 +28,6 @@ from ..graph.robust import Kernel
 from ..graph.solver import Progress, SolverConfig, SolverSummary, check, optimize
 from ..graph.unknowns import free_unknowns
 from .trilateration import AnchorConfig, ambiguous, locate
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

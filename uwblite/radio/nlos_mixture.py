@@ -14,10 +14,9 @@ with psi = -f' / f: late errors pull less than early ones of the same size.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfcx, ndtr
 
-Floats = NDArray[np.float64]
+from ..arrays import Floats
 
 _ROUNDS = 60
 _SHORTEST = 2.0

@@ -17,15 +17,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from ..errors import SolverError
 from ..graph.calibration import CalibrationConfig, stem
 from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.marginals import calibration_covariance
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _STEPS = 4
 """Widths tried from sound to unsound, evenly spaced in their logarithm."""

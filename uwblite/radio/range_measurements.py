@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
+from ..arrays import Bools, Floats
 from ..graph.calibration import odometry_indices, range_indices
 from ..graph.graph import Calibration, Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
@@ -16,10 +16,6 @@ from ..sensor_log import SensorMounting
 from . import nlos_mixture
 from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, steady_sigma
 from .trilateration import AnchorConfig, agreement, locate, usable
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 _STEPS = Kernel("cauchy", 5.0)
 _RANGES = Kernel("cauchy", 2.5)

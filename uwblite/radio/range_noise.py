@@ -10,13 +10,10 @@ they weigh what one draw of the slow part is worth.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..arrays import Floats, Ints
 from ..graph.robust import Kernel
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _ROBUST = Kernel("cauchy", 2.5)
 

@@ -8,9 +8,8 @@ cells are refined one by one. A straight path leaves two mirrored positions of e
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from ..arrays import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ class AnchorHypothesis:
     """Larger standard deviation of the position were the errors independent, m."""
 
 
-def usable(ranges: Floats, config: AnchorConfig) -> NDArray[np.bool_]:
+def usable(ranges: Floats, config: AnchorConfig) -> Bools:
     """Tell which readings (m,) can be distances at all: positive, finite, below max_range."""
     return np.isfinite(ranges) & (ranges > 0.02) & (ranges < config.max_range)
 

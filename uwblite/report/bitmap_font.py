@@ -1,7 +1,8 @@
 """A small fixed-width font, 5 x 7 pixels a character and two rows of descent: labels without a font library."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..arrays import Bools
 
 WIDTH, HEIGHT = 5, 9
 """Pixels of one character; characters are set one pixel apart."""
@@ -87,7 +88,7 @@ _ROWS = {
 _UNKNOWN = "11111 10001 10001 10001 10001 10001 11111"
 
 
-def text_mask(text: str, scale: int = 1) -> NDArray[np.bool_]:
+def text_mask(text: str, scale: int = 1) -> Bools:
     """Return the ink of a line of text (height, width); characters the font lacks become boxes.
 
     Parameters

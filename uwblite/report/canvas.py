@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Bools, Floats
 from .bitmap_font import text_mask
 
-Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 _FINE = 3
@@ -103,7 +103,7 @@ class Canvas:
             ink[rows + oy, columns + ox] = True
         self._lay(ink, int(low_x) // _FINE, int(low_y) // _FINE, colour, opacity)
 
-    def _lay(self, ink: NDArray[np.bool_], x: int, y: int, colour: Colour, opacity: float) -> None:
+    def _lay(self, ink: Bools, x: int, y: int, colour: Colour, opacity: float) -> None:
         """Average fine ink to pixels and blend it in with its first pixel at (x, y)."""
         rows, columns = ink.shape[0] // _FINE, ink.shape[1] // _FINE
         fine = ink.view(np.uint8).reshape(rows, _FINE, columns, _FINE)

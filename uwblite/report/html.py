@@ -11,13 +11,11 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from .page import PAGE, SCRIPT, STYLE
 from .svg_map import draw, number, shown_closures, sigma, thin
-
-Floats = NDArray[np.float64]
 
 MOST_RESIDUALS = 1500
 """Residuals of one anchor drawn at most."""
@@ -202,7 +200,7 @@ def _dots(x: Floats, y: Floats) -> str:
     return "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _residual_plot(anchor_id: str, table: dict[str, Floats], which: NDArray[np.int64], time: Floats, along: str) -> str:
+def _residual_plot(anchor_id: str, table: dict[str, Floats], which: Ints, time: Floats, along: str) -> str:
     residual, good = table["residual"][which], table["agrees"][which] > 0
     inner = float(np.quantile(np.abs(residual[good]), 0.99)) if good.any() else 0.0
     limit = max(2.0 * inner, 0.1)

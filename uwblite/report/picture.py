@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid
 from .canvas import Canvas, Colour
 
-Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 PAPER: Colour = (226, 229, 233)

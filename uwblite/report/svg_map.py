@@ -4,11 +4,9 @@ import base64
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
-
-Floats = NDArray[np.float64]
 
 MOST_POINTS = 4000
 """Points of one line drawn at most."""
@@ -24,7 +22,7 @@ def number(value: float, digits: int = 3, sign: bool = False) -> str:
     return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "\u2212")
 
 
-def thin(n: int, most: int) -> NDArray[np.int64]:
+def thin(n: int, most: int) -> Ints:
     """Return at most about `most` of n indices, evenly spread, the last included."""
     return np.unique(np.append(np.arange(0, n, max(1, -(-n // most))), n - 1)) if n else np.zeros(0, dtype=np.int64)
 

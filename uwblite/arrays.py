@@ -1,0 +1,8 @@
+"""Names for arrays of one element type; shapes are said where an array is used."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
