@@ -1,7 +1,9 @@
 import contextlib
 import os
+import struct
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -123,8 +125,8 @@ GOOD = {"image": "map.pgm", "resolution": "0.05", "origin": "[0, 0, 0]", "occupi
     ("change", "says"),
     [
         ({"image": ""}, "image is missing"),
-        ({"image": "none.pgm"}, "cannot be read"),
-        ({"image": "."}, "cannot be read"),
+        ({"image": "none.pgm"}, "cannot be opened"),
+        ({"image": "."}, "cannot be opened"),
         ({"resolution": "x"}, "resolution: 'x' is not a number"),
         ({"resolution": "0"}, "positive"),
         ({"origin": "[0, 0]"}, "origin"),
@@ -153,6 +155,58 @@ def test_anything_else_is_a_format_error(tmp_path_factory, image, extra):
     (folder / "map.pgm").write_bytes(b"P5 2 2 255\n" + image)
     with contextlib.suppress(FormatError):
         read_map(folder / "map.yaml")
+
+
+def mapped(folder, image):
+    folder.mkdir(exist_ok=True)
+    (folder / "map.yaml").write_text("".join(f"{key}: {value}\n" for key, value in (GOOD | {"image": "map.pgm"}).items()))
+    if image is not None:
+        (folder / "map.pgm").write_bytes(image)
+    return folder / "map.yaml"
+
+
+def test_the_header_of_a_picture_bounds_what_is_read(tmp_path):
+    """A quarter of a gigabyte of nothing, by its header and by its length, in pixels and as text: none is looked at."""
+    png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 16000, 16000, 8, 0, 0, 0, 0)
+    tracemalloc.start()
+    for header in (b"P5\n16384 16384\n255\n", b"P2\n16384 16384\n255\n", png):
+        yaml = mapped(tmp_path / "map", header)
+        os.truncate(tmp_path / "map" / "map.pgm", 1 << 28)
+        with pytest.raises(FormatError, match=r"is not read \(at most"):
+            read_map(yaml)
+    yaml = mapped(tmp_path / "map", b"P5\n100 100\n255\n" + bytes([254]) * 10_000)
+    os.truncate(tmp_path / "map" / "map.pgm", 1 << 28)
+    assert read_map(yaml).geometry.cells == 10_000
+    assert tracemalloc.get_traced_memory()[1] < 10e6
+    tracemalloc.stop()
+
+
+def test_a_text_picture_is_read_in_pieces(tmp_path, monkeypatch):
+    monkeypatch.setattr("uwblite.io.map_server._TEXT_BYTES", 7)
+    pixels = np.random.default_rng(0).integers(0, 256, (30, 20))
+    text = b"P2\n# a comment\n20 30\n255\n" + "\n".join(" ".join(map(str, row)) for row in pixels.tolist()).encode()
+    grid = read_map(mapped(tmp_path / "map", text))
+    binary = read_map(mapped(tmp_path / "map", b"P5 20 30 255\n" + pixels.astype(np.uint8).tobytes()))
+    np.testing.assert_array_equal(grid.log_odds, binary.log_odds)
+    for damaged in (text[:-40], text[:100] + b" x " + text[100:], text[:-3] + b" 999"):
+        with pytest.raises(FormatError, match=r"cut off|damaged"):
+            read_map(mapped(tmp_path / "map", damaged))
+
+
+def test_a_map_of_nothing_but_walls_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("uwblite.io.map_server._MOST_OCCUPIED", 50)
+    with pytest.raises(FormatError, match="64 of 64 cells are occupied; is negate right"):
+        read_map(mapped(tmp_path / "map", b"P5 8 8 255\n" + bytes(64)))
+
+
+@pytest.mark.parametrize("name", ["map.yaml", "map.pgm"])
+def test_a_pipe_that_nobody_fills_is_an_error(tmp_path, monkeypatch, name):
+    monkeypatch.setattr("uwblite.io.source._PIPE_PATIENCE", 0.1)
+    yaml = mapped(tmp_path / "map", None)
+    (tmp_path / "map" / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / "map" / name)
+    with pytest.raises(FormatError, match="is a pipe, and nobody wrote into it"):
+        read_map(yaml)
 
 
 @pytest.mark.slow

@@ -36,13 +36,10 @@ def effective_config(args: argparse.Namespace) -> "MappingConfig":
 def read_text(path: str) -> str:
     """Return the text of a small file of settings; anything else is one clear error."""
     from ..errors import FormatError
+    from ..io.source import read_bounded
 
-    with open(path, "rb") as file:
-        data = file.read(_LARGEST_SETTINGS + 1)
-    if len(data) > _LARGEST_SETTINGS:
-        raise FormatError("far too long for a file of settings", path)
     try:
-        return data.decode("utf-8-sig")
+        return read_bounded(path, _LARGEST_SETTINGS).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FormatError("not a text file (UTF-8)", path) from None
 

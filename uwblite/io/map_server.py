@@ -10,6 +10,7 @@ import math
 import os
 import re
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +19,15 @@ from ..errors import FormatError
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_ABOVE, OccupancyGrid
 from .files import replacing, write_text
-from .png import SIGNATURE, decode_png, encode_png
+from .png import MOST_PIXELS, SIGNATURE, decode_png, encode_png, png_shape
+from .source import open_input, read_bounded
 
 Image = NDArray[np.uint8]
 
 PIXEL_OCCUPIED, PIXEL_UNKNOWN, PIXEL_FREE = 0, 205, 254
-_MOST_BYTES = 1 << 28
-"""Largest image read."""
+_MOST_YAML_BYTES = 1 << 16
+_MOST_OCCUPIED = 4_000_000
+"""Occupied cells of a map that is read: walls of ten kilometres, drawn ten cells thick, have half as many."""
 _READ_ODDS = 4.0
 """Log-odds given to occupied and free cells of a map that was read; three states carry no more."""
 
@@ -98,11 +101,10 @@ def read_map(path: str | os.PathLike[str]) -> OccupancyGrid:
     FormatError : a file is missing or is not what it should be.
     """
     name = os.fspath(path)
-    settings = _parse_yaml(_read(name).decode(errors="replace"), name)
+    settings = _parse_yaml(read_bounded(name, _MOST_YAML_BYTES).decode(errors="replace"), name)
     image = _text(settings, "image", name)
     image_path = os.path.join(os.path.dirname(name), image)
-    data = _read(image_path)
-    pixels = decode_png(data, image_path) if data.startswith(SIGNATURE) else _decode_pgm(data, image_path)[:, :, None]
+    pixels = _read_picture(image_path)[::-1]
     resolution = _number(settings, "resolution", name)
     origin = _numbers(settings, "origin", name)
     occupied, free = _number(settings, "occupied_thresh", name), _number(settings, "free_thresh", name)
@@ -113,28 +115,25 @@ def read_map(path: str | os.PathLike[str]) -> OccupancyGrid:
     mode = str(settings.get("mode", "trinary"))
     if mode not in ("trinary", "scale"):
         raise FormatError(f"mode {mode} is not read; use trinary or scale", name)
-    colours = 3 if pixels.shape[2] >= 3 else 1
-    grey = pixels[:, :, :colours].mean(axis=2)
     negate = str(settings.get("negate", "0")).lower() in ("1", "true")
-    p = (grey if negate else 255.0 - grey) / 255.0
-    odds = np.where(p > occupied, _READ_ODDS, np.where(p < free, -_READ_ODDS, 0.0))
+    log_odds = _log_odds(pixels, negate, occupied, free)
+    if (walls := int(np.count_nonzero(log_odds > 0))) > _MOST_OCCUPIED:
+        raise FormatError(f"{walls} of {log_odds.size} cells are occupied; is negate right in the YAML file?", name)
+    return OccupancyGrid(GridGeometry(resolution, np.array(origin[:2]), *log_odds.shape), log_odds)
+
+
+def _log_odds(pixels: Image, negate: bool, occupied: float, free: float) -> NDArray[np.float32]:
+    """Return what pixels (rows, cols, channels) say of their cells; transparent ones say nothing."""
+    colours = 3 if pixels.shape[2] >= 3 else 1
+    total = pixels[:, :, 0].astype(np.uint16)
+    for channel in range(1, colours):
+        total += pixels[:, :, channel]
+    p = np.arange(255 * colours + 1) / (255.0 * colours)
+    p = p if negate else 1.0 - p
+    log_odds = np.select([p > occupied, p < free], [_READ_ODDS, -_READ_ODDS], 0.0).astype(np.float32)[total]
     if pixels.shape[2] in (2, 4):
-        odds[pixels[:, :, -1] == 0] = 0.0
-    rows, cols = grey.shape
-    geometry = GridGeometry(resolution, np.array(origin[:2]), rows, cols)
-    return OccupancyGrid(geometry, np.ascontiguousarray(odds[::-1], dtype=np.float32))
-
-
-def _read(path: str) -> bytes:
-    try:
-        with open(path, "rb") as stream:
-            data = stream.read(_MOST_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise FormatError(f"cannot be read: {reason}", path) from None
-    if len(data) > _MOST_BYTES:
-        raise FormatError("the file is too large for a map", path)
-    return data
+        log_odds[pixels[:, :, -1] == 0] = 0.0
+    return log_odds
 
 
 def _parse_yaml(text: str, path: str) -> dict[str, str | list[str]]:
@@ -190,24 +189,70 @@ def _finite(text: str, key: str, path: str) -> float:
     return value
 
 
-def _decode_pgm(data: bytes, path: str) -> Image:
-    """Return the pixels of a PGM with values up to 255, binary (P5) or text (P2)."""
-    header = re.match(rb"(P[25])" + 3 * rb"(?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})" + rb"\s", data)
+def _read_picture(path: str) -> Image:
+    """Return the pixels (height, width, channels) of a PGM or PNG; its header tells how much of the file is read at all."""
+    with open_input(path) as stream:
+        try:
+            start = stream.read(_HEADER_BYTES)
+            if start.startswith(SIGNATURE):
+                height, width, channels = png_shape(start, path)
+                return decode_png(start + stream.read(height * (1 + width * channels) + _PNG_EXTRAS), path)
+            return _decode_pgm(start, stream, path)[:, :, None]
+        except OSError as error:
+            raise FormatError(f"cannot be read: {error.strerror or error}", path) from None
+
+
+_HEADER_BYTES = 4096
+"""A picture's header, comments included, is shorter."""
+_PNG_EXTRAS = 1 << 20
+"""Bytes that a PNG may take beside its pixels: texts, times, colour profiles."""
+
+
+def _decode_pgm(start: bytes, rest: BinaryIO, path: str) -> Image:
+    """Return the pixels of a PGM with values up to 255, binary (P5) or text (P2), from its beginning and the rest."""
+    header = re.match(rb"(P[25])" + 3 * rb"(?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})" + rb"\s", start)
     if not header:
         raise FormatError("this is neither a PGM nor a PNG picture", path)
     width, height, highest = (int(header[i]) for i in (2, 3, 4))
-    if not 0 < highest <= 255 or not 0 < width * height <= _MOST_BYTES:
-        raise FormatError(f"a PGM of {width} x {height} pixels with values up to {highest} is not read", path)
-    body = data[header.end() :]
+    if not 0 < highest <= 255 or not 0 < width * height <= MOST_PIXELS:
+        most = f"{MOST_PIXELS / 1e6:.0f} million pixels"
+        raise FormatError(f"a PGM of {width} x {height} pixels with values up to {highest} is not read (at most {most})", path)
+    start = start[header.end() :]
     if header[1] == b"P2":
-        try:
-            pixels = np.array(body.split()[: width * height], dtype=np.uint8)
-        except (ValueError, OverflowError):
-            raise FormatError("the PGM's pixels are damaged", path) from None
+        pixels = _text_pixels(start, rest, width * height, path)
     else:
-        pixels = np.frombuffer(body[: width * height], dtype=np.uint8)
+        pixels = np.frombuffer(start + rest.read(max(width * height - len(start), 0)), dtype=np.uint8)
     if len(pixels) < width * height:
         raise FormatError("the PGM is cut off", path)
+    pixels = pixels[: width * height].reshape(height, width)
     if highest != 255:
-        pixels = (np.minimum(pixels, highest) * (255.0 / highest)).astype(np.uint8)
-    return pixels.reshape(height, width)
+        pixels = (np.minimum(np.arange(256), highest) * (255.0 / highest)).astype(np.uint8)[pixels]
+    return pixels
+
+
+def _text_pixels(start: bytes, rest: BinaryIO, count: int, path: str) -> Image:
+    """Return `count` whole numbers, or as many as there are."""
+    pixels, done, carry = np.empty(count, dtype=np.uint8), 0, b""
+    block = start
+    while done < count and (block or (block := rest.read(_TEXT_BYTES))):
+        text = carry + block
+        cut = max(text.rfind(b" "), text.rfind(b"\n"), text.rfind(b"\t")) + 1
+        words, carry, block = text[:cut].split(), text[cut:], b""
+        done = _take_words(words, pixels, done, path)
+        if len(carry) > 3 + _TEXT_BYTES // 2:
+            raise FormatError("the PGM's pixels are damaged", path)
+    return pixels[: _take_words(carry.split(), pixels, done, path)]
+
+
+_TEXT_BYTES = 1 << 18
+"""Bytes of a text picture taken apart at a time."""
+
+
+def _take_words(words: list[bytes], pixels: Image, done: int, path: str) -> int:
+    """Write numbers behind those that are there already; return how many there are then."""
+    words = words[: len(pixels) - done]
+    try:
+        pixels[done : done + len(words)] = np.array(words, dtype=np.uint8)
+    except (ValueError, OverflowError):
+        raise FormatError("the PGM's pixels are damaged", path) from None
+    return done + len(words)

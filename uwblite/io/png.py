@@ -17,7 +17,8 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _COLOUR_TYPE = {1: 0, 2: 4, 3: 2, 4: 6}
 """PNG's colour type by number of channels."""
 _CHANNELS = {colour: channels for channels, colour in _COLOUR_TYPE.items()}
-_MOST_PIXELS = 1 << 28
+MOST_PIXELS = 40_000_000
+"""Largest picture read: the largest grid that the mapper makes by itself. Decoding takes about three bytes a pixel."""
 
 
 def encode_png(image: Image) -> bytes:
@@ -51,28 +52,38 @@ def decode_png(data: bytes, path: str = "") -> Image:
     """
     if not data.startswith(SIGNATURE):
         raise FormatError("this is not a PNG picture", path)
-    header, packed = b"", []
-    for kind, content in _chunks(data, path):
-        if kind == b"IHDR":
-            header = content
-        elif kind == b"IDAT":
-            packed.append(content)
-    if len(header) != 13:
-        raise FormatError("the PNG has no header", path)
-    width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", header)
-    if depth != 8 or colour not in _CHANNELS or interlaced:
-        raise FormatError("only PNG with 8 bits per channel, without palette and interlacing, is read", path)
-    channels = _CHANNELS[colour]
-    if not 0 < width * height <= _MOST_PIXELS:
-        raise FormatError(f"a PNG of {width} x {height} pixels is not read", path)
+    height, width, channels = png_shape(data, path)
     size = height * (1 + width * channels)
     try:
-        raw = zlib.decompressobj().decompress(b"".join(packed), size)
+        packed = b"".join(content for kind, content in _chunks(data, path) if kind == b"IDAT")
+        raw = zlib.decompressobj().decompress(packed, size)
     except zlib.error:
         raise FormatError("the PNG's pixels are damaged", path) from None
     if len(raw) != size:
         raise FormatError("the PNG is cut off", path)
     return _unfiltered(np.frombuffer(raw, dtype=np.uint8).reshape(height, -1), channels, path)
+
+
+def png_shape(data: bytes, path: str = "") -> tuple[int, int, int]:
+    """Return height, width and channels that the beginning of a PNG tells.
+
+    Raises
+    ------
+    FormatError : it is no PNG, of a kind not read here, or too large.
+    """
+    if not data.startswith(SIGNATURE) or len(data) < _HEADER.size or data[12:16] != b"IHDR":
+        raise FormatError("the PNG has no header", path)
+    *_, width, height, depth, colour, _, _, interlaced = _HEADER.unpack_from(data)
+    if depth != 8 or colour not in _CHANNELS or interlaced:
+        raise FormatError("only PNG with 8 bits per channel, without palette and interlacing, is read", path)
+    if not 0 < width * height <= MOST_PIXELS:
+        most = f"at most {MOST_PIXELS / 1e6:.0f} million pixels"
+        raise FormatError(f"a PNG of {width} x {height} pixels is not read ({most})", path)
+    return height, width, _CHANNELS[colour]
+
+
+_HEADER = struct.Struct(">8sI4sIIBBBBB")
+"""Signature, length and name of the first chunk, width, height, depth, colour, compression, filter, interlacing."""
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
@@ -94,36 +105,62 @@ def _chunks(data: bytes, path: str) -> Iterator[tuple[bytes, bytes]]:
 def _unfiltered(rows: Image, channels: int, path: str) -> Image:
     """Undo the filters that each row names: sums with the left, upper and upper left neighbours (PNG specification 9.2)."""
     height, width = rows.shape[0], (rows.shape[1] - 1) // channels
-    image = np.zeros((height, width, channels), dtype=np.uint8)
+    kinds, lines = rows[:, 0], rows[:, 1:].reshape(height, width, channels)
+    unknown = np.flatnonzero(kinds > 4)
+    if len(unknown):
+        raise FormatError(f"the PNG's row {unknown[0]} names an unknown filter", path)
+    image = np.empty((height, width, channels), dtype=np.uint8)
     above = np.zeros((width, channels), dtype=np.uint8)
-    for row in range(height):
-        kind, line = int(rows[row, 0]), rows[row, 1:].reshape(width, channels)
-        if kind == 1:
-            line = np.cumsum(line, axis=0, dtype=np.uint8)
-        elif kind == 2:
-            line = line + above
-        elif kind in (3, 4):
-            line = _mixed(line, above, average=kind == 3)
-        elif kind:
-            raise FormatError(f"the PNG's row {row} names an unknown filter", path)
-        image[row] = above = line
+    for start in range(0, height, _BAND):
+        band = slice(start, start + _BAND)
+        if (kinds[band] > 2).any():
+            image[band] = _by_diagonals(kinds[band], lines[band], above)
+        else:
+            _by_rows(kinds[band], lines[band], above, image[band])
+        above = image[band][-1]
     return image
 
 
-def _mixed(line: Image, above: Image, average: bool) -> Image:
-    """Undo the average or the Paeth filter, where each pixel needs the one before."""
-    done = line.astype(int).tolist()
-    upper = above.astype(int).tolist()
-    channels = range(line.shape[1])
-    left, corner = [0] * line.shape[1], [0] * line.shape[1]
-    for pixel, up in zip(done, upper, strict=True):
-        for c in channels:
-            a, b, d = left[c], up[c], corner[c]
-            if average:
-                guess = (a + b) // 2
-            else:
-                estimate = a + b - d
-                guess = min((abs(estimate - a), 0, a), (abs(estimate - b), 1, b), (abs(estimate - d), 2, d))[2]
-            pixel[c] = (pixel[c] + guess) & 255
-        left, corner = pixel, up
-    return np.array(done, dtype=np.uint8).reshape(line.shape)
+_BAND = 1024
+"""Rows decoded together, so that what is worked on stays in the processor's cache."""
+
+
+def _by_rows(kinds: Image, lines: Image, above: Image, out: Image) -> None:
+    """Undo filters that need no pixel of the same row but as a sum: none, left and up."""
+    for row, kind in enumerate(kinds.tolist()):
+        line = lines[row]
+        out[row] = above = np.cumsum(line, axis=0, dtype=np.uint8) if kind == 1 else line + above if kind == 2 else line
+
+
+def _by_diagonals(kinds: Image, lines: Image, above: Image) -> Image:
+    """Undo all filters of a band of rows.
+
+    A pixel needs its left, upper and upper left neighbours, so that all pixels of an anti-diagonal, row + column = d, can
+    be decoded at once. In a flat array of rows of P pixels these lie P - 1 apart.
+    """
+    height, width, channels = lines.shape
+    pitch = width + 1
+    padded = np.zeros((height + 1, pitch, channels), dtype=np.uint8)
+    padded[0, 1:], padded[1:, 1:] = above, lines
+    flat = padded.reshape(-1, channels)
+    for d in range(2, height + width + 1):
+        first, last = max(1, d - width), min(height, d - 1)
+        here = first * pitch + (d - first)
+        count = last - first + 1
+
+        def neighbours(back: int, here: int = here, count: int = count) -> NDArray[np.int16]:
+            start = here - back
+            return flat[start : start + (count - 1) * (pitch - 1) + 1 : pitch - 1].astype(np.int16)
+
+        kind = kinds[first - 1 : last, None]
+        guess = _guess(kind, neighbours(1), neighbours(pitch), neighbours(pitch + 1))
+        flat[here : here + (count - 1) * (pitch - 1) + 1 : pitch - 1] += guess.astype(np.uint8)
+    return padded[1:, 1:]
+
+
+def _guess(kind: Image, left: NDArray[np.int16], up: NDArray[np.int16], corner: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Return what the filter of each pixel's row (n, 1) adds to it (n, channels)."""
+    by_left, by_up = np.abs(up - corner), np.abs(left - corner)
+    by_corner = np.abs(left + up - 2 * corner)
+    paeth = np.where((by_left <= by_up) & (by_left <= by_corner), left, np.where(by_up <= by_corner, up, corner))
+    return np.choose(kind, [np.zeros_like(left), left, up, (left + up) >> 1, paeth])

@@ -4,6 +4,8 @@ import gzip
 import hashlib
 import io
 import os
+import select
+import stat
 import sys
 import zlib
 from collections.abc import Iterator
@@ -22,6 +24,9 @@ OVERLONG_LINE = b"\xfe"
 _BOMB_BYTES, _BOMB_RATIO = 1 << 24, 100
 """A recording packs to a tenth. What unpacks to a hundred times its size, and to more than so many bytes, is made to fill
 the memory."""
+
+_PIPE_PATIENCE = 10.0
+"""s that a named pipe may take before somebody writes into it."""
 
 _GZIP = b"\x1f\x8b"
 _OTHER_FORMATS = (
@@ -118,11 +123,7 @@ def open_source(path: str | os.PathLike[str]) -> Iterator[TextSource]:
     FormatError : the file cannot be read: missing, a directory, damaged or cut-off gzip, or binary.
     """
     name = os.fspath(path)
-    try:
-        stream = sys.stdin.buffer if name == "-" else open(name, "rb")  # noqa: SIM115
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise FormatError(f"cannot be opened: {reason}", name) from None
+    stream = open_input(name)
     try:
         yield TextSource(stream, "stdin" if name == "-" else name)
     except EOFError:
@@ -134,6 +135,52 @@ def open_source(path: str | os.PathLike[str]) -> Iterator[TextSource]:
     finally:
         if name != "-":
             stream.close()
+
+
+def open_input(name: str) -> BinaryIO:
+    """Open a file, a pipe or standard input (``-``) for reading.
+
+    Raises
+    ------
+    FormatError : it is missing, a directory, closed, or a named pipe into which nobody writes.
+    """
+    if name == "-":
+        if sys.stdin is None or sys.stdin.closed:
+            raise FormatError("standard input is closed; name a file, or send one through a pipe", "stdin")
+        return sys.stdin.buffer
+    try:
+        # A pipe without a writer would hold the opening for ever.
+        handle = os.open(name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise FormatError(f"cannot be opened: {reason}", name) from None
+    if stat.S_ISFIFO(os.fstat(handle).st_mode) and not select.select([handle], [], [], _PIPE_PATIENCE)[0]:
+        os.close(handle)
+        raise FormatError(f"is a pipe, and nobody wrote into it for {_PIPE_PATIENCE:.0f} s", name)
+    if hasattr(os, "set_blocking"):
+        os.set_blocking(handle, True)
+    try:
+        return os.fdopen(handle, "rb")
+    except OSError as error:
+        os.close(handle)
+        raise FormatError(f"cannot be opened: {error.strerror}", name) from None
+
+
+def read_bounded(name: str, most: int) -> bytes:
+    """Return the bytes of a small file.
+
+    Raises
+    ------
+    FormatError : it cannot be read, or holds more than `most` bytes.
+    """
+    with open_input(name) as stream:
+        try:
+            data = stream.read(most + 1)
+        except OSError as error:
+            raise FormatError(f"cannot be read: {error.strerror or error}", name) from None
+    if len(data) > most:
+        raise FormatError(f"is larger than {most / 1e6:.0f} MB, far too large for what it should be", name)
+    return data
 
 
 def _checked_start(data: bytes, path: str) -> bytes:

@@ -1,0 +1,47 @@
+import io
+import os
+import sys
+import threading
+
+import pytest
+
+from uwblite.errors import FormatError
+from uwblite.io.source import open_input, open_source, read_bounded
+
+
+def test_a_pipe_with_a_writer_is_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    writer = threading.Thread(target=lambda: (tmp_path / "pipe").write_bytes(b"one\n" * 100_000))
+    writer.start()
+    with open_source(tmp_path / "pipe") as source:
+        assert sum(map(len, source.blocks())) == 400_000
+    writer.join()
+
+
+def test_a_pipe_without_a_writer_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr("uwblite.io.source._PIPE_PATIENCE", 0.05)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FormatError, match="is a pipe, and nobody wrote into it for"), open_source(tmp_path / "pipe"):
+        pass
+
+
+@pytest.mark.parametrize("stdin", [None, "closed"])
+def test_closed_standard_input_is_an_error(monkeypatch, stdin):
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(sys, "stdin", closed if stdin else None)
+    with pytest.raises(FormatError, match="standard input is closed"):
+        open_input("-")
+
+
+@pytest.mark.parametrize(("name", "says"), [("none", "No such file"), (".", "Is a directory"), ("a\0b", "null byte")])
+def test_what_cannot_be_opened_is_named(tmp_path, name, says):
+    with pytest.raises(FormatError, match=f"cannot be opened: .*{says}"):
+        open_input(str(tmp_path / name))
+
+
+def test_small_files_are_small(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_bounded(str(tmp_path / "a"), 5) == b"12345"
+    with pytest.raises(FormatError, match="larger than"):
+        read_bounded(str(tmp_path / "a"), 4)
