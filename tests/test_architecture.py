@@ -15,16 +15,17 @@ PACKAGE = Path(uwblite.__file__).parent
 MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    ("errors", "se2", "arrays", "parallel"),
-    ("config", "sensor_log", "graph", "evaluation", "drivers"),
+    ("errors", "arrays", "parallel"),
+    ("se2",),
+    ("config", "sensor_log", "graph", "drivers"),
     ("constraints", "keyframes", "grid"),
-    ("map_result", "radio"),
+    ("wheels", "map_result", "radio"),
     ("lidar", "report"),
-    ("loop_closure", "checks", "io"),
+    ("loop_closure", "checks", "evaluation", "io"),
     ("mapping_config",),
     ("pipeline",),
     ("mapping",),
-    ("localize", "presets"),
+    ("localize",),
     ("cli",),
     ("__main__",),
 )

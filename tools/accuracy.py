@@ -26,7 +26,7 @@ from trials import ROOT, SHARED, Figures, Trial, judged, made, spread_out, table
 
 from uwblite import se2
 from uwblite.config import override
-from uwblite.evaluation.trajectory import align, evaluate_trajectory
+from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.gnc import optimize_gnc
 from uwblite.graph.graph import Edges, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
@@ -35,6 +35,7 @@ from uwblite.graph.robust import SQUARED
 from uwblite.io.carmen import read_log
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.se2 import align
 from uwblite.sensor_log import SensorLog
 
 PARTS = ("simulated", "real", "ablation", "injection")

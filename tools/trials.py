@@ -22,11 +22,12 @@ from simulation.recording import Settings, simulate
 
 from uwblite import se2
 from uwblite.cli.evaluate import read_landmarks
-from uwblite.evaluation.map import LandmarkErrors, Landmarks, find_columns, landmark_errors, landmark_errors_along
+from uwblite.evaluation.map import LandmarkErrors, landmark_errors, landmark_errors_along
 from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory
 from uwblite.io.carmen import read_log
 from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_tum
+from uwblite.lidar.columns import Landmarks, find_columns
 from uwblite.map_result import MapResult
 from uwblite.sensor_log import SensorLog
 

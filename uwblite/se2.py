@@ -12,6 +12,7 @@ Laws, up to rounding, for all poses a, b, c and points p (angles compared modulo
 Angles are kept in (-pi, pi].
 """
 
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -142,3 +143,20 @@ def between_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
     da[..., 0, 2] = d[..., 1]
     da[..., 1, 2] = -d[..., 0]
     return da, db
+
+
+def align(source: Floats, target: Floats) -> Floats:
+    """Return T_target_source (3,), the rigid motion that minimises the squared distances of paired points.
+
+    Parameters
+    ----------
+    source, target : (n, 2) m, point k of one belongs to point k of the other.
+
+    Notes
+    -----
+    Closed form of Umeyama (1991) in the plane: with centred points p, q the angle is atan2(sum p x q, sum p . q).
+    """
+    p, q = source - source.mean(axis=0), target - target.mean(axis=0)
+    theta = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
+    shift = target.mean(axis=0) - rotate(theta, source.mean(axis=0))
+    return np.array([shift[0], shift[1], float(theta)])

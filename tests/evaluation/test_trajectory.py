@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.evaluation.trajectory import align, evaluate_anchors, evaluate_trajectory, statistics, stretches
+from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory, statistics, stretches
+from uwblite.se2 import align
 
 
 def a_drive(n=400, seed=0):

@@ -11,9 +11,10 @@ from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unk
 from uwblite.graph.graph import Graph
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
 from uwblite.radio.bootstrap import FirstEstimate, GrowthConfig, grow
-from uwblite.radio.range_measurements import OdometryNoiseConfig, range_edges, wheel_edges
+from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import AnchorConfig
 from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
+from uwblite.wheels import OdometryNoiseConfig, wheel_edges
 
 SIGMA = 0.05
 WELL = 0.3

@@ -15,18 +15,11 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.graph.solver import optimize
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
-from uwblite.radio.range_measurements import (
-    OdometryNoiseConfig,
-    learn_noise,
-    learn_wheels,
-    range_edges,
-    relocate,
-    tag_positions,
-    wheel_edges,
-)
+from uwblite.radio.range_measurements import learn_noise, range_edges, relocate, tag_positions
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import AnchorConfig
 from uwblite.sensor_log import Odometry, SensorMounting
+from uwblite.wheels import OdometryNoiseConfig, learn_wheels, wheel_edges
 
 NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
 MOUNTING = SensorMounting(tag_position=np.array([0.2, -0.1, 0.4]), anchor_height=2.4)

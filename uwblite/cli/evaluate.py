@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ..evaluation.map import LandmarkErrors, Landmarks, WallErrors
+    from ..evaluation.map import LandmarkErrors, WallErrors
     from ..evaluation.trajectory import AnchorErrors, ErrorStatistics, TrajectoryErrors
+    from ..lidar.columns import Landmarks
 
     Drive = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
     """Stamps (n,) s and poses (n, 3) of a result, and the true ones."""
@@ -79,9 +80,10 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     import numpy as np
 
     from .. import se2
-    from ..evaluation.map import find_columns, landmark_errors, landmark_errors_along
+    from ..evaluation.map import landmark_errors, landmark_errors_along
     from ..evaluation.trajectory import evaluate_trajectory
     from ..io.results import mend_result
+    from ..lidar.columns import find_columns
 
     folder = Path(args.dir)
     mend_result(folder)
@@ -180,8 +182,8 @@ def read_landmarks(path: str) -> "tuple[Landmarks, tuple[tuple[str, str], ...] |
     import numpy as np
 
     from ..errors import FormatError
-    from ..evaluation.map import Landmarks
     from ..io.csv_table import read_csv
+    from ..lidar.columns import Landmarks
 
     table = read_csv(path)
     names = table.texts("name")

@@ -23,7 +23,7 @@ def effective_config(args: argparse.Namespace) -> "MappingConfig":
     """Return the settings that --preset, --config and --set amount to."""
     from ..config import merge, override, parse_toml
     from ..mapping import MappingConfig
-    from ..presets import preset
+    from ..mapping_config import preset
 
     config = preset(args.preset) if args.preset else MappingConfig()
     if args.config:

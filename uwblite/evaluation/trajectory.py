@@ -12,6 +12,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints
 from ..errors import DataError
+from ..se2 import align
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,23 +73,6 @@ def statistics(errors: Floats) -> ErrorStatistics:
         max=float(np.max(errors)),
         count=len(errors),
     )
-
-
-def align(source: Floats, target: Floats) -> Floats:
-    """Return T_target_source (3,), the rigid motion that minimises the squared distances of paired points.
-
-    Parameters
-    ----------
-    source, target : (n, 2) m, point k of one belongs to point k of the other.
-
-    Notes
-    -----
-    Closed form of Umeyama (1991) in the plane: with centred points p, q the angle is atan2(sum p x q, sum p . q).
-    """
-    p, q = source - source.mean(axis=0), target - target.mean(axis=0)
-    theta = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
-    shift = target.mean(axis=0) - se2.rotate(theta, source.mean(axis=0))
-    return np.array([shift[0], shift[1], float(theta)])
 
 
 def evaluate_trajectory(

@@ -12,7 +12,7 @@ from .. import se2
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..radio.range_measurements import learn_wheels
+from ..wheels import learn_wheels
 from .clouds import Clouds
 from .correlative_matching import SearchConfig, search
 from .pair_alignment import align_pairs

@@ -14,11 +14,11 @@ from .. import se2
 from ..arrays import Bools, Floats
 from ..constraints import Clock, Constraints, KnownAnchor
 from ..errors import ConfigError
-from ..evaluation.trajectory import align
 from ..graph.distance_edges import AnchorDistanceEdges
 from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
+from ..se2 import align
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,10 +16,10 @@ from .. import se2
 from ..arrays import Floats, Ints
 from ..constraints import Constraints, KnownLandmark
 from ..errors import ConfigError
-from ..evaluation.map import Landmarks, find_columns, fit_circle
 from ..graph.distance_edges import PointDistanceEdges
 from ..graph.graph import Graph
 from ..lidar.clouds import Clouds
+from ..lidar.columns import Landmarks, find_columns, fit_circle
 
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""

@@ -19,8 +19,9 @@ from ..graph.solver import optimize
 from ..lidar.joint_refinement import Refined
 from ..mapping_config import MappingConfig
 from ..radio import bootstrap, prior_selection
-from ..radio.range_measurements import learn_noise, range_edges, relocate, wheel_edges
+from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
+from ..wheels import wheel_edges
 from . import joining, map_frame, recordings
 from .constraint_edges import apply as apply_constraints
 from .progress import Stages, solver_figures

@@ -12,10 +12,10 @@ from uwblite.graph.pose_edges import OdometryEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.presets import NAMES, preset
+from uwblite.mapping_config import PRESETS, preset
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_settings_that_survive_a_file(name):
     config = preset(name)
     assert from_dict(MappingConfig, to_dict(config)) == config

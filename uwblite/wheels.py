@@ -1,0 +1,79 @@
+"""Odometry edges and their noise, from the settings and from the recording."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from . import se2
+from .graph.calibration import odometry_indices
+from .graph.graph import Calibration, Graph
+from .graph.pose_edges import OdometryEdges, RelativePoseEdges
+from .graph.robust import Kernel
+from .keyframes import Keyframes
+
+_STEPS = Kernel("cauchy", 5.0)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryNoiseConfig:
+    """Random errors of the wheels; systematic ones are calibrated."""
+
+    distance: float = 0.018
+    """Standard deviation of position along and across after one metre, m; grows with the square root of the distance."""
+    heading_per_metre: float = 0.008
+    """Standard deviation of heading after one metre, rad; grows with the square root of the distance."""
+    heading_per_turn: float = 0.03
+    """Standard deviation of heading after one radian of turning, rad; grows with the square root of the angle."""
+    standing: float = 0.0005
+    """Standard deviation of position (m) and heading (rad) of a robot that stands."""
+    kernel: Kernel = _STEPS
+    """Robust kernel: a step that slipped must not bend the rest; none = squared errors (the paper)."""
+
+
+def wheel_edges(keyframes: Keyframes, first: int, config: OdometryNoiseConfig, calibration: Calibration) -> OdometryEdges:
+    """Return the edges between consecutive keyframes of one recording; `first` is the graph's number of its first pose."""
+    n = len(keyframes) - 1
+    position = np.sqrt(config.standing**2 + config.distance**2 * keyframes.path)
+    turning = config.heading_per_turn**2 * keyframes.turned
+    heading = np.sqrt(config.standing**2 + config.heading_per_metre**2 * keyframes.path + turning)
+    sqrt_information = np.zeros((n, 3, 3))
+    sqrt_information[:, 0, 0] = sqrt_information[:, 1, 1] = 1.0 / position
+    sqrt_information[:, 2, 2] = 1.0 / heading
+    return OdometryEdges(
+        first + np.arange(n),
+        first + np.arange(1, n + 1),
+        keyframes.motion,
+        keyframes.length,
+        keyframes.duration,
+        sqrt_information,
+        odometry_indices(calibration, n),
+        config.kernel,
+    )
+
+
+def learn_wheels(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
+    """Scale the wheels' noise along, across and in heading so that it explains how far they lie from measured steps.
+
+    Parameters
+    ----------
+    wheels : edges between neighbouring poses, in the order of the poses.
+    steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see do not count;
+        where fewer than 20 steps see one, its noise stays.
+    graph : holds the wheels' calibration.
+    """
+    if len(steps) < _ENOUGH_STEPS:
+        return wheels
+    own = np.searchsorted(wheels.i, steps.i)
+    off = se2.between(steps.T_i_j, wheels.corrected(graph)[own]) / wheels.own_scale(graph)[own]
+    off = np.abs(np.einsum("eij,ej->ei", wheels.sqrt_information[own], off))
+    information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
+    onto = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ information
+    seen = np.einsum("eii->ei", onto) > 0.9
+    factor = np.ones(3)
+    for k in np.flatnonzero(seen.sum(axis=0) >= _ENOUGH_STEPS):
+        factor[k] = np.clip(1.4826 * np.median(off[seen[:, k], k]), 0.3, 10.0)
+    return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
+
+
+_ENOUGH_STEPS = 20
+"""Measured steps from which the noise of the wheels may be learnt."""
