@@ -163,6 +163,16 @@ def test_jacobians_equal_differences(a, b):
             np.testing.assert_allclose(analytic[:, k], slope / (2 * step), atol=1e-6)
 
 
+@pytest.mark.parametrize("query", [0.0, np.array([-1.0, 5.0, 9.0]), np.zeros((2, 3)), np.zeros(0)])
+def test_a_trajectory_of_one_pose_holds_everywhere(query):
+    pose = np.array([[1.0, -2.0, 0.5]])
+    found = se2.interpolate_trajectory(np.array([5.0]), pose, query)
+    assert found.shape == (*np.shape(query), 3)
+    np.testing.assert_array_equal(found, np.broadcast_to(pose[0], found.shape))
+    found += 1.0
+    np.testing.assert_array_equal(pose[0], [1.0, -2.0, 0.5])
+
+
 def test_bits_do_not_depend_on_where_angles_lie_in_memory():
     rng = np.random.default_rng(1)
     table = rng.uniform(-3.0, 3.0, size=(199, 3))

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.planted import drive, odometry, ranges, recording, wander
 from helpers.results import FILES, contents
 
 from uwblite.cli import main
-from uwblite.io.carmen import read_log
+from uwblite.io.carmen import read_log, write_log
 from uwblite.io.tum import read_tum
+from uwblite.sensor_log import SensorMounting
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +153,68 @@ def anchors_of(folder):
 
     with open(folder / "anchors.csv") as file:
         return {row["id"]: (float(row["x"]), float(row["y"])) for row in csv.DictReader(file)}
+
+
+@pytest.fixture(scope="module")
+def radio_only(tmp_path_factory):
+    """Two recordings without a lidar: one that wanders among four anchors, one that drives straight past three."""
+    folder = tmp_path_factory.mktemp("radio")
+    rng = np.random.default_rng(7)
+    level = SensorMounting(anchor_height=0.0)
+    stamps, truth = wander(rng, 60.0)
+    around = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
+    wheels = odometry(stamps, truth, rng, noise=0.01, turn_noise=0.01)
+    write_log(folder / "around.log", recording(wheels, ranges(rng, stamps, truth, around), mounting=level))
+    stamps, truth = drive([(0.5, 0.0, 0.0)], [40.0])
+    aside = np.array([[4.0, 3.0], [10.0, -4.0], [16.0, 2.5]])
+    wheels = odometry(stamps, truth, rng, noise=0.005, turn_noise=0.001)
+    write_log(folder / "straight.log", recording(wheels, ranges(rng, stamps, truth, aside), mounting=level))
+    return folder
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_result_to_trust_exits_with_0_and_one_in_doubt_with_3(radio_only, tmp_path, capsys, as_json):
+    words = ["--json"] if as_json else []
+    for name, code in (("around", 0), ("straight", 3)):
+        out = tmp_path / name
+        assert main(["map", str(radio_only / f"{name}.log"), "--out", str(out), *words]) == code
+        said = capsys.readouterr().out
+        report = json.loads((out / "report.json").read_text())
+        assert bool(report["doubts"]) == (code == 3)
+        assert (out / "trajectory.tum").exists()
+        if as_json:
+            summary = json.loads(said)
+            assert (summary["trusted"], summary["exit_code"]) == (code == 0, code)
+            assert summary["doubts"] == report["doubts"]
+        else:
+            doubts = [line.removeprefix("DOUBT: ") for line in said.splitlines() if line.startswith("DOUBT: ")]
+            assert doubts == report["doubts"]
+            assert all("mirror-ambiguous" in doubt for doubt in doubts)
+
+
+def test_broken_lines_are_told_counted_and_skipped(radio_only, tmp_path, capsys):
+    lines = (radio_only / "around.log").read_text().splitlines(keepends=True)
+    lines[40:40] = ["ODOM 1 2\n"]
+    lines[90:90] = ["UWB A00 far 100 1 r 1\n"]
+    (tmp_path / "broken.log").write_text("".join(lines))
+    assert main(["map", str(tmp_path / "broken.log"), "--out", str(tmp_path / "map")]) == 0
+    said = capsys.readouterr().err
+    assert "uwblite: 2 broken lines skipped; the first is line 41: ODOM has too few fields" in said
+    report = json.loads((tmp_path / "map" / "report.json").read_text())
+    assert report["inputs"][0]["broken_lines"] == 2
+    assert main(["map", str(radio_only / "around.log"), "--out", str(tmp_path / "whole")]) == 0
+    assert "broken" not in capsys.readouterr().err
+    assert contents(tmp_path / "map")["trajectory.tum"] == contents(tmp_path / "whole")["trajectory.tum"]
+
+
+def test_too_many_broken_lines_are_refused_and_nothing_is_written(radio_only, tmp_path, capsys):
+    lines = (radio_only / "around.log").read_text().splitlines(keepends=True)
+    (tmp_path / "broken.log").write_text("".join(line + "ODOM 1 2\n" * (k % 10 == 0) for k, line in enumerate(lines)))
+    assert main(["map", str(tmp_path / "broken.log"), "--out", str(tmp_path / "map")]) == 1
+    said = capsys.readouterr().err
+    assert "messages are broken (allowed: 5%)" in said
+    assert f"{tmp_path / 'broken.log'}:2:" in said
+    assert not (tmp_path / "map").exists()
 
 
 def test_a_second_map_lies_in_the_frame_of_the_first_and_names_what_was_moved(mapped, room_log, tmp_path, capsys):

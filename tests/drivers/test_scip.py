@@ -116,6 +116,51 @@ def test_text_sums_are_never_fatal_and_an_extra_line_end_in_vv_is_taken():
     assert fields == {"VEND": "x", "SERI": "H07"}
 
 
+@pytest.mark.parametrize(("command", "width", "values"), [
+    ("GD0300030001", 3, (1234,)), ("GS0300030001", 2, (1234,)), ("GD0300032001", 3, tuple(range(100, 121))),
+])  # fmt: skip
+def test_a_scan_of_one_data_line_is_a_scan(command, width, values):
+    data = scan_frame(values, 77, command, "00", width)
+    assert len(data.split(b"\n")) == 4 + 2
+    assert feed_whole(ScipProtocol, data) == [Distances(1.0, command[:2], 77, values, 300, 299 + len(values), 1, 0)]
+    for clustered in (command, command[:-2] + "99"):
+        without = frame(clustered, "00", data.split(b"\n")[2])
+        assert all(isinstance(e, Corrupt) for e in feed_whole(ScipProtocol, without))
+
+
+@pytest.mark.parametrize(("cluster", "counts"), [(10, (68, 69)), (11, (62,)), (68, (10, 11)), (99, (6, 7))])
+def test_clusters_of_two_digits(cluster, counts):
+    """682 steps; units send one value for the rest of the steps, or none."""
+    for count in counts:
+        values = scan_values(3, count)
+        (event,) = feed_whole(ScipProtocol, scan_frame(values, 5, f"MD00440725{cluster}000"))
+        assert event == Distances(1.0, "MD", 5, values, 44, 725, cluster, 0)
+    for count in (min(counts) - 1, max(counts) + 1):
+        events = feed_whole(ScipProtocol, scan_frame(scan_values(3, count), 5, f"MD00440725{cluster}000"))
+        assert all(isinstance(e, Corrupt) for e in events)
+
+
+def test_a_good_scan_may_hold_what_looks_like_another_reply():
+    """A line of data that ends like the request QT, before a last line that is spelled like its status."""
+    for filler in range(0x30, 0x70):
+        line = bytes([filler]) + b"0" * 60 + b"QT;"
+        if chr(scip.checksum(line)).isalnum():
+            break
+    data = line + b"00"
+    assert scip._TEXT_ECHO.search(data_lines(data)[0])
+    assert data_lines(data)[1] == b"00P"
+    stamp = encode(9, 4)
+    reply = frame("GD0300032101", "00", stamp + bytes([scip.checksum(stamp)]), *data_lines(data))
+    (event,) = feed_whole(ScipProtocol, reply)
+    assert event == Distances(1.0, "GD", 9, scip.decode_values(data, 3), 300, 321, 1, 0)
+
+
+def test_text_that_ends_like_a_request_belongs_to_its_reply():
+    lines = (b"VEND:Hokuyo;x", b"SERI:H07VV;B", b"00P", b"PROT:SCIP 2.0;N")
+    (reply,) = feed_whole(ScipProtocol, frame("VV", "00", *lines))
+    assert reply == Reply(1.0, "VV", "00", ("VEND:Hokuyo", "SERI:H07VV", "00P", "PROT:SCIP 2.0"))
+
+
 @pytest.mark.parametrize("line", range(2, 35))
 def test_one_damaged_line_costs_one_scan_and_no_more(line):
     first, second = scan_values(1), scan_values(2)

@@ -102,6 +102,15 @@ def test_other_clock_is_an_error_that_says_so():
         evaluate_trajectory(stamps, poses, stamps + 1e6, poses)
 
 
+@pytest.mark.parametrize("length", [0, 1])
+def test_an_estimate_of_one_pose_or_none_cannot_be_compared(length):
+    stamps, poses = a_drive(5)
+    with pytest.raises(DataError, match=r"only 0 of 5 true stamps \(0.000 .. 0.200 s\) lie within the trajectory"):
+        evaluate_trajectory(stamps[:length], poses[:length], stamps, poses)
+    with pytest.raises(DataError, match=rf"only {length} of {length} true stamps"):
+        evaluate_trajectory(stamps, poses, stamps[:length], poses[:length])
+
+
 def test_stretches_are_the_shortest_that_are_long_enough():
     way = np.cumsum(np.concatenate([[0.0], np.full(100, 0.25)]))
     points = np.stack([way, np.zeros_like(way)], axis=1)

@@ -1,3 +1,6 @@
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.planted_graphs import every_kind
@@ -44,6 +47,27 @@ def assert_jacobians_equal_differences(graph, edges):
 def test_jacobians_equal_differences(kind, seed, calibrated):
     graph, kinds = every_kind(seed, calibrated)
     assert_jacobians_equal_differences(graph, kinds[kind])
+
+
+@pytest.mark.parametrize("free", list(itertools.product([False, True], repeat=4)))
+def test_scan_jacobians_equal_differences_whatever_of_mounting_and_delay_is_free(free):
+    graph, kinds = every_kind(9)
+    edges = replace(kinds["scan"], calibration=np.where(free, np.arange(4, 8), -1))
+    assert_jacobians_equal_differences(graph, edges)
+    named = [index[0] for block, index, _ in edges.linearize(graph).blocks if block == "calibration"]
+    assert named == [4 + k for k in range(4) if free[k]]
+
+
+@pytest.mark.parametrize(("scale", "turn"), [(-0.95, 0.2), (-1.5, 0.2), (0.3, -0.97), (-0.99, -2.0), (-0.85, -0.85)])
+def test_wheels_that_count_more_than_ten_times_what_they_do_divide_by_a_tenth(scale, turn):
+    graph, kinds = every_kind(10)
+    edges = replace(kinds["odometry"], calibration=np.tile([0, 1, 2, 3], (8, 1)))
+    values = np.concatenate([[scale, turn], graph.calibration.values[2:]])
+    graph = graph.updated(graph.poses, graph.anchors, values)
+    assert_jacobians_equal_differences(graph, edges)
+    off = se2.between(edges.corrected(graph), se2.between(graph.poses[edges.i], graph.poses[edges.j]))
+    own = off / np.maximum([1.0 + scale, 1.0 + scale, 1.0 + turn], 0.1)
+    np.testing.assert_allclose(edges.residuals(graph), np.einsum("eij,ej->ei", edges.sqrt_information, own), atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

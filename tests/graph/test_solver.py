@@ -428,6 +428,30 @@ def test_steps_that_fail_are_dropped():
     assert failed > 0
 
 
+def test_a_first_step_that_fails_is_no_sign_of_a_minimum():
+    """Almost in line with all robots, the anchor's first Gauss-Newton step goes far aside; its place is found all the same."""
+    poses, place = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), np.array([1.0, 3.0])
+    ranges = plain_ranges(np.arange(3), np.zeros(3, int), np.hypot(*(poses[:, :2] - place).T), 0.1)
+    graph = Graph(poses, np.array([[3.0, 0.01]]), (ranges,), fixed_poses=np.ones(3, dtype=bool))
+    found, summary = optimize(graph)
+    assert summary.chi2_history[0] > summary.chi2_initial
+    assert summary.damping_history[0] == SolverConfig().initial_damping
+    assert summary.converged
+    assert summary.chi2 < 1e-9
+    np.testing.assert_allclose(found.anchors[0], place, atol=1e-5)
+
+
+@pytest.mark.parametrize(("away", "steps"), [(0.0, 0), (1.9, 0), (-1.9, 0), (2.1, 1), (-2.1, 1)])
+def test_the_gradient_is_judged_in_standard_deviations(away, steps):
+    """A prior alone: the gradient over the root of its curvature is the distance from it over its standard deviation."""
+    sigma = 0.01
+    prior = PriorEdges("calibration", np.array([0]), np.array([[5.0]]), np.array([[[1.0 / sigma]]]))
+    graph = Graph(np.zeros((1, 3)), edges=(prior,), calibration=Calibration(("bias",), np.array([5.0 + away * sigma])))
+    found, summary = optimize(graph, SolverConfig(gradient_tolerance=2.0))
+    assert (summary.converged, summary.reason, summary.iterations) == (True, "gradient negligible", steps)
+    assert found.calibration.values[0] == pytest.approx(5.0 + (0.0 if steps else away * sigma), abs=1e-9)
+
+
 def test_ill_posed_problems_are_named():
     graph, _, _ = loop(17)
     everything = replace(graph, fixed_poses=np.ones(60, dtype=bool), fixed_anchors=np.ones(3, dtype=bool))

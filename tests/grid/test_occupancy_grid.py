@@ -354,6 +354,22 @@ def test_log_odds_are_bayes():
     assert np.abs(from_counts(counter, GridConfig(clamp=0.1)).log_odds).max() == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("backwards", [False, True])
+def test_the_grid_holds_the_farthest_scans_in_whatever_block_they_stand(backwards):
+    """150 scans are traced in blocks; a hall is driven up and most of the way back, so its end lies in the middle block."""
+    along = np.concatenate([np.linspace(0.0, 20.0, 75), np.linspace(20.0, 8.0, 75)])
+    poses = np.stack([(-along if backwards else along) + 0.0123, np.full(150, 0.0123), np.zeros(150)], axis=1)
+    scans = LaserScans(0.1 * np.arange(150), np.full((150, 8), 1.01, np.float32), -math.pi, math.pi / 4, 0.0, 0.02, 5.0)
+    grid = from_scans(poses, scans, GridConfig(move_distance=0.0))
+    rays = scan_rays(scans, scans.ranges, poses)
+    wide = GridGeometry.around(np.full(2, -25.0), np.full(2, 25.0), 0.05, 10**7)
+    whole = from_scans(poses, scans, GridConfig(move_distance=0.0), geometry=wide)
+    row, col = grid.geometry.cell_of(rays.endpoints)
+    assert grid.geometry.inside(row, col).all()
+    np.testing.assert_array_equal(grid.log_odds[row, col], whole.log_odds[wide.cell_of(rays.endpoints)])
+    assert np.count_nonzero(grid.log_odds) == np.count_nonzero(whole.log_odds)
+
+
 def test_misuse_is_named():
     scans = room_scans(drive(3))
     with pytest.raises(DataError, match="poses"):

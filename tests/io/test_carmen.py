@@ -359,6 +359,22 @@ def test_the_first_twenty_broken_lines_are_kept(tmp_path):
         read(tmp_path, text)
 
 
+def test_many_broken_lines_within_the_allowed_share_are_counted_not_refused(tmp_path):
+    """Reading stops early only where nearly all lines are broken; 20,500 of 41,000 are many, and half."""
+    log = read(tmp_path, (ODOM.format(x=1, t=1) + "ODOM x\n") * 20_500, max_broken_share=0.5)
+    assert (log.notes.broken, log.notes.lines, len(log.odometry.stamps)) == (20_500, 41_000, 20_500)
+    with pytest.raises(FormatError, match=r"a\.log:2: 20500 of 41000 messages are broken \(allowed: 49%\)"):
+        read(tmp_path, (ODOM.format(x=1, t=1) + "ODOM x\n") * 20_500, max_broken_share=0.49)
+
+
+def test_reading_stops_early_where_nearly_all_lines_are_broken(tmp_path):
+    text = odometry(10) + "ODOM x\n" * 200_000
+    with pytest.raises(FormatError, match=r"a\.log:11: \d+ of \d+ messages are broken") as refused:
+        read(tmp_path, text)
+    counted = int(str(refused.value).split()[1])
+    assert 20_000 < counted < 100_000
+
+
 def test_a_last_line_cut_off_in_the_middle_is_no_reason_to_refuse(tmp_path):
     log = read(tmp_path, odometry(3) + "ODOM 3 0 0")
     assert log.notes.broken == 1

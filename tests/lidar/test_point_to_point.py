@@ -1,5 +1,7 @@
 """Known motions recovered within noise, honest information, named failures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.registration_worlds import CORRIDOR, NOISE, ROOM, pair, wall_points
@@ -91,6 +93,39 @@ def test_information_is_the_inverse_covariance():
     ratio = np.diagonal(np.cov(np.array(errors).T)) / np.diagonal(np.mean(claimed, axis=0))
     assert (ratio > 0.4).all()
     assert (ratio < 2.5).all()
+
+
+def test_point_to_point_claims_half_the_curvature_of_its_squared_distances():
+    """With pairs fixed, cost(e) = sum |X o e s - t|^2 / variance has the second derivative 2 information at the minimum."""
+    rng = np.random.default_rng(9)
+    target_points = rng.uniform(-3.0, 3.0, (40, 2)) * [1.0, 0.4] + [2.0, 0.0]
+    truth = np.array([0.4, -0.3, 0.5])
+    source_points = se2.transform(se2.inverse(truth), target_points + rng.normal(scale=0.02, size=(40, 2)))
+    target, source = make_cloud(target_points), make_cloud(source_points)
+    config = replace(POINTS, max_correspondence_distance=0.2, min_sigma=1e-6)
+    found = align(target, source, truth, config)
+    assert found.converged, found.reason
+    assert found.num_inliers == 40
+    partner = target.points[target.tree.query(se2.transform(found.T_target_source, source.points))[1]]
+
+    def squares(e):
+        return np.sum((se2.transform(se2.compose(found.T_target_source, e), source.points) - partner) ** 2)
+
+    variance, step = squares(np.zeros(3)) / (2 * 40 - 3), 1e-3
+    basis = step * np.eye(3)
+    curvature = np.array([
+        [(squares(a + b) - squares(a - b) - squares(b - a) + squares(-a - b)) / (4.0 * step**2) for a in basis] for b in basis
+    ])
+    # Off the minimum by the tolerance of the last step, and third derivatives times the step: a thousandth.
+    scale = np.sqrt(np.outer(np.diag(found.information), np.diag(found.information)))
+    np.testing.assert_allclose(0.5 * curvature / variance / scale, found.information / scale, atol=3e-3)
+
+
+def test_point_to_point_claims_no_more_than_its_least_sigma():
+    points = np.random.default_rng(10).uniform(-3.0, 3.0, (30, 2))
+    found = align(make_cloud(points), make_cloud(points), np.zeros(3), replace(POINTS, min_sigma=0.05))
+    assert found.converged, found.reason
+    np.testing.assert_allclose(np.diag(found.information)[:2], 30 / 0.05**2)
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7])

@@ -10,7 +10,7 @@ from helpers.planted import aligned_error, box, odometry, ranges, recording, sca
 from uwblite import se2
 from uwblite.constraints import Constraints, KnownAnchor
 from uwblite.graph.calibration import CalibrationConfig
-from uwblite.graph.graph import Calibration, Graph
+from uwblite.graph.graph import Calibration, Graph, PriorEdges
 from uwblite.keyframes import OUTSIDE
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.plausibility import lying_stretches, mirrored
@@ -66,6 +66,18 @@ def test_known_anchors_vouch_for_the_sign():
     )
     result = build_map(log, constraints=known)
     assert not said(result.doubts, "mirrored")
+
+
+@pytest.mark.parametrize(("known", "doubted"), [(0, True), (2, True), (3, False), (4, False)])
+@pytest.mark.parametrize("lidar", [False, True])
+def test_three_known_anchors_settle_the_sign_and_two_do_not(known, doubted, lidar):
+    """Two points and their mirror image lie on one another by a rigid motion; three do not."""
+    prior = PriorEdges("anchors", np.arange(known), PLACES[:known], np.tile(np.eye(2), (known, 1, 1)))
+    other = PriorEdges("calibration", np.zeros(3, int), np.zeros((3, 1)), np.ones((3, 1, 1)))
+    calibration = Calibration(("heading_scale",), np.array([-1.9]))
+    graph = Graph(np.zeros((1, 3)), PLACES, calibration=calibration).with_edges(prior, other)
+    drives = SimpleNamespace(sessions=[SimpleNamespace(has_scans=lidar)])
+    assert len(mirrored(graph, drives, CalibrationConfig())) == doubted
 
 
 def test_a_value_far_from_usual_is_told():

@@ -8,7 +8,7 @@ from helpers.planted import ranges, wander
 from scipy.stats import multivariate_normal
 
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
-from uwblite.graph.graph import Graph
+from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.solver import optimize
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
 from uwblite.radio.prior_selection import choose_widths, log_evidence
@@ -85,6 +85,20 @@ def test_a_radio_with_large_biases_gets_wide_ones(seed):
 def test_a_radio_with_another_idea_of_the_metre_gets_a_wide_scale(scale):
     graph, edges = solved(0, scale=scale)
     assert widths(choose_widths(graph, (edges,), CONFIG))["range_scale"] > 0.9 * CONFIG.range_scale
+
+
+def test_only_priors_of_range_scale_and_biases_change():
+    """Priors on poses and anchors stay as they are, and so does what is known of every other calibration value."""
+    graph, edges = solved(0)
+    surveyed = PriorEdges("anchors", np.arange(2), PLACES[:2], np.tile(20.0 * np.eye(2), (2, 1, 1)))
+    pinned = PriorEdges("poses", np.arange(2), graph.poses[:2], np.tile(30.0 * np.eye(3), (2, 1, 1)))
+    chosen = choose_widths(graph.with_edges(surveyed, pinned), (edges,), CONFIG)
+    assert chosen.edges[1:] == (surveyed, pinned)
+    before, after = widths(graph), widths(chosen)
+    changed = {name for name in before if after[name] != pytest.approx(before[name], rel=1e-12)}
+    assert changed == {"range_scale", "bias:A00", "bias:A01", "bias:A02", "bias:A03"}
+    np.testing.assert_array_equal(chosen.edges[0].value, graph.edges[0].value)
+    np.testing.assert_array_equal(chosen.edges[0].index, graph.edges[0].index)
 
 
 def test_nothing_free_leaves_the_graph_alone():

@@ -225,3 +225,26 @@ def test_an_anchor_in_the_wrong_place_goes_where_its_ranges_agree_and_others_sta
     np.testing.assert_array_equal(found.anchors[1:], wrong[1:])
     held = relocate(edges, graph, np.zeros(len(places), dtype=bool), AnchorConfig())
     np.testing.assert_array_equal(held.anchors, wrong)
+
+
+def test_ranges_of_weight_zero_move_no_anchor_and_teach_no_noise():
+    _, truth, frames, places, _, edges = world(10, metres=80.0, anchors=2, sigma=0.05)
+    graph = Graph(truth[frames.index], places)
+    wrong = places + np.array([[2.0, -1.0], [0.0, 0.0]])
+    agreeing = replace(edges, ranges=edges.distances(graph.updated(graph.poses, wrong, np.zeros(0))))
+    off = np.arange(len(edges)) % 4 != 0
+    mixed = replace(edges, ranges=np.where(off, agreeing.ranges, edges.ranges), weights=np.where(off, 0.0, 1.0))
+    astray, both = replace(graph, anchors=wrong), np.ones(2, dtype=bool)
+    moved = relocate(mixed, astray, both, AnchorConfig())
+    assert np.hypot(*(moved.anchors[0] - places[0])) < 0.3
+    learnt, noises = learn_noise(mixed, graph, 2, RangeNoiseConfig())
+    rest, alone = learn_noise(edges.rows(np.flatnonzero(~off)), graph, 2, RangeNoiseConfig())
+    assert [(n.white, n.slow, n.length) for n in noises] == [(n.white, n.slow, n.length) for n in alone]
+    np.testing.assert_array_equal(learnt.weights[off], 0.0)
+    np.testing.assert_array_equal(learnt.sigma[off], edges.sigma[off])
+    np.testing.assert_array_equal(learnt.weights[~off], rest.weights)
+    nothing = replace(edges, weights=np.zeros(len(edges)))
+    np.testing.assert_array_equal(relocate(nothing, astray, both, AnchorConfig()).anchors, wrong)
+    silent, unknown = learn_noise(nothing, graph, 2, RangeNoiseConfig(sigma=0.4))
+    assert [n.sigma for n in unknown] == pytest.approx([0.4, 0.4])
+    assert not silent.weights.any()

@@ -73,6 +73,36 @@ def test_outliers_of_weight_zero_do_not_count_and_a_constant_neither():
     assert (one.white, one.slow, one.length) == pytest.approx((other.white, other.slow, other.length), rel=1e-9)
 
 
+@pytest.mark.filterwarnings("error")
+def test_distances_at_which_there_is_no_pair_teach_nothing():
+    """Places 4 m apart, each visited by a cluster of half a metre: pairs at 0 to 0.5 m and beyond 3 m, none between."""
+    rng = np.random.default_rng(3)
+    corner = 4.0 * np.stack(np.meshgrid(np.arange(12), np.arange(12)), axis=-1).reshape(-1, 2)
+    place = np.repeat(np.arange(len(corner)), 8)
+    positions = corner[place] + rng.uniform(-0.18, 0.18, (len(place), 2))
+    errors = 0.15 * rng.standard_normal(len(corner))[place] + 0.05 * rng.standard_normal(len(place))
+    noise = learn(positions, errors, np.ones(len(place)), CONFIG)
+    # 144 patches know the slow variance to sqrt(2 / 144) = 12 %; what a cluster has in common is exp(-0.2 m / length).
+    assert noise.slow == pytest.approx(0.15, rel=0.2)
+    assert noise.white == pytest.approx(0.05, rel=0.5)
+
+
+GRID = 0.7 * np.stack(np.meshgrid(np.arange(8), np.arange(8)), axis=-1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("places", [np.zeros((100, 2)), np.repeat([[0.0, 0.0], [0.4, 0.0]], 50, axis=0), GRID])
+def test_too_few_distances_leave_the_assumption(places):
+    """One place, two of them, and many of which none has another within half a metre."""
+    noise = learn(places, 0.1 * np.random.default_rng(4).standard_normal(len(places)), np.ones(len(places)), CONFIG)
+    assert (noise.white, noise.slow, noise.length) == (assumed(CONFIG).white, assumed(CONFIG).slow, assumed(CONFIG).length)
+
+
+def test_thirty_ranges_are_enough():
+    rng = np.random.default_rng(0)
+    noise = learn(rng.uniform(0, 1, (30, 2)), rng.standard_normal(30), np.ones(30), CONFIG)
+    assert noise.sigma > 2.0 * assumed(CONFIG).sigma
+
+
 @pytest.mark.parametrize("count", [0, 5, 29])
 def test_too_few_ranges_leave_the_assumption(count):
     rng = np.random.default_rng(0)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.radio.trilateration import AnchorConfig, agreement, ambiguous, locate, usable
+from uwblite.radio.trilateration import AnchorConfig, _raster_search, agreement, ambiguous, locate, usable
 
 CONFIG = AnchorConfig()
 
@@ -125,6 +125,28 @@ def test_hypotheses_are_distinct_and_in_order():
     places = np.array([h.position for h in found])
     apart = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)) + 99.0 * np.eye(len(places))
     assert apart.min() > 0.06
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_search_starts_at_ten_places_at_least_two_cells_apart(seed):
+    rng = np.random.default_rng(seed)
+    path = np.column_stack([np.linspace(-8, 8, 160), 0.005 * rng.standard_normal(160)])
+    said = measured(rng, path, np.array([1.0, 5.0]), 0.1)
+    starts, step = _raster_search(path, said, CONFIG)
+    apart = np.abs(starts[:, None] - starts[None]).max(axis=2) + 99.0 * np.eye(len(starts))
+    assert len(starts) == 10
+    # Cells are whole steps apart: nearer than two of them lie only neighbours.
+    assert apart.min() > 1.5 * step
+    for place in ([1.0, 5.0], [1.0, -5.0]):
+        assert np.abs(starts - place).max(axis=1).min() < 1.5 * step
+
+
+def test_equal_neighbours_do_not_crowd_out_the_mirrored_place():
+    """On a path that is straight to a millimetre both sides come back, whatever the raster; each once."""
+    rng = np.random.default_rng(8)
+    path = np.column_stack([np.linspace(-8, 8, 160), 0.001 * rng.standard_normal(160)])
+    found = locate(path, measured(rng, path, np.array([2.0, 4.0]), 0.02), AnchorConfig(raster=120))
+    assert sorted(round(float(h.position[1])) for h in found[:2]) == [-4, 4]
 
 
 def test_usable_readings_are_positive_finite_and_not_absurd():
