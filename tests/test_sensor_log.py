@@ -1,11 +1,13 @@
 """One recording as arrays: what is checked when it enters, and parts of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.planted import box, odometry, ranges, recording, scans, wander
 
 from uwblite.errors import DataError
-from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +94,26 @@ def test_a_thousand_anchors_are_enough():
     radio = UwbRanges(np.arange(3.0), np.zeros(3, dtype=np.int64), np.ones(3), np.full(3, 100.0), names)
     with pytest.raises(DataError, match="name 1001 anchors"):
         SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), radio)
+
+
+@pytest.mark.parametrize("name", ["5C0B", "A@2", "-17", "anchor#2", "\u00c4nker,\"1\"", "x" * 64])
+def test_ids_of_anchors_are_words(name):
+    assert fault_of_id(name) == ""
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["", "x" * 65, "A B", "A\nODOM 1 2 3", "\x1b[31mred", "\u202eleft", "\ud800", "=1+1", "+1", "@x", "-1+c", "\x9b1m"],
+)
+def test_other_ids_are_refused_wherever_they_come_from(log, name):
+    assert fault_of_id(name).isprintable()
+    assert fault_of_id(name) != ""
+    ranges = replace(log.ranges, anchor_ids=(name, *log.ranges.anchor_ids[1:]))
+    with pytest.raises(DataError, match="anchor's id"):
+        replace(log, ranges=ranges)
+    with pytest.raises(DataError, match="anchor's id"):
+        replace(log, mounting=SensorMounting(anchor_heights={name: 1.0}))
+
+
+def test_blanks_in_an_id_become_underscores():
+    assert one_word(" hall  west\t2 ") == "hall_west_2"

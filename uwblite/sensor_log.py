@@ -3,6 +3,7 @@
 Every array is time-ordered. Times are seconds of one clock (the log's ipc_timestamp); lengths metres; angles radians.
 """
 
+import re
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -108,6 +109,26 @@ MOST_ANCHORS = 1000
 """A building may have hundreds."""
 
 
+def one_word(name: str) -> str:
+    """Return an anchor's id as the one word that it is in a line of text: blanks become underscores."""
+    return re.sub("[ \t]+", "_", name.strip(" \t"))
+
+
+def fault_of_id(name: str) -> str:
+    """Return what is wrong with an anchor's id, '' where nothing is.
+
+    Ids stand in lines of text, on terminals and in tables that spreadsheets open, which take a word that begins with = + -
+    or @ for a formula.
+    """
+    if not 0 < len(name) <= 64:
+        return "must be 1 to 64 characters long"
+    if not name.isprintable() or " " in name:
+        return f"{name!a} holds a blank or what cannot be printed"
+    if re.match(r"[=+@]|-(?!\d+$)", name):
+        return f"{name!r} begins like the formula of a spreadsheet"
+    return ""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorLog:
     """One recording. `ranges` and `scans` are None when the sensor was not there."""
@@ -137,6 +158,9 @@ class SensorLog:
                 raise DataError(f"ranges.anchor has shape {self.ranges.anchor.shape}, expected ({m},)")
             if m and not 0 <= self.ranges.anchor.min() <= self.ranges.anchor.max() < len(self.ranges.anchor_ids):
                 raise DataError("ranges.anchor holds an index outside anchor_ids")
+        for name in (*(() if self.ranges is None else self.ranges.anchor_ids), *self.mounting.anchor_heights):
+            if fault := fault_of_id(name):
+                raise DataError(f"the anchor's id {fault}")
         if self.scans is not None:
             _check(self.scans.stamps, "scans.stamps", (None,), ordered=True)
             if self.scans.ranges.ndim != 2 or len(self.scans.ranges) != len(self.scans.stamps):

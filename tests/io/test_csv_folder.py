@@ -1,6 +1,7 @@
 """CSV folders: round trips and clear errors."""
 
 import contextlib
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -86,3 +87,31 @@ def test_any_bytes_do_no_worse_than_an_error(tmp_path_factory, data, name):
     (folder / name).write_bytes(data)
     with contextlib.suppress(UwbliteError):
         read_csv_folder(folder)
+
+
+@pytest.mark.parametrize("name", ['"B 1 1 h 1\nODOM 9 9 9"', "=1+2", "\x1b[2J", "x" * 65, '""'])
+def test_an_id_that_would_tear_a_log_apart_is_refused(tmp_path, name):
+    (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n1,0,0,0\n")
+    (tmp_path / "ranges.csv").write_text(f"stamp,anchor,range,quality\n1,A,2,90\n2,{name},2,90\n")
+    with pytest.raises(FormatError, match=r"ranges\.csv:[34]: the anchor's id ") as caught:
+        read_csv_folder(tmp_path)
+    assert str(caught.value).isprintable()
+
+
+def test_blanks_in_ids_become_underscores(tmp_path):
+    (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n1,0,0,0\n")
+    (tmp_path / "ranges.csv").write_text("stamp,anchor,range,quality\n1,hall west,2,90\n2,B,3,90\n3, hall  west,4,90\n")
+    ranges = read_csv_folder(tmp_path).ranges
+    assert ranges.anchor_ids == ("B", "hall_west")
+    assert ranges.anchor.tolist() == [1, 0, 1]
+
+
+def test_tables_of_millions_of_rows_take_little_more_memory_than_their_numbers(tmp_path):
+    rows = 200_000
+    (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n" + "1,0,0,0\n" * rows)
+    (tmp_path / "scans.csv").write_text("stamp,r0\n" + "1,2\n" * rows)
+    (tmp_path / "sensors.toml").write_text("[scans]\nangle_increment = 0.1\n")
+    tracemalloc.start()
+    read_csv_folder(tmp_path)
+    assert tracemalloc.get_traced_memory()[1] < 5 * 8 * 4 * rows + 4e6
+    tracemalloc.stop()

@@ -23,7 +23,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..errors import FormatError
-from ..sensor_log import LogNotes, Odometry, SensorLog, UwbRanges
+from ..sensor_log import LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id
 from .carmen_laser import LaserMessages
 from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
 from .carmen_params import Params
@@ -155,8 +155,8 @@ class _Reader:
         anchor = self.uwb_ids.get(tokens[1])
         if anchor is None:
             name = tokens[1].decode()
-            if len(name) > 64 or not name.isprintable():
-                raise BrokenLine("UWB anchor_id is longer than 64 characters or not printable")
+            if fault := fault_of_id(name):
+                raise BrokenLine(f"UWB anchor_id {fault}")
             anchor = self.uwb_ids.setdefault(tokens[1], len(self.uwb_ids))
         self.uwb.extend((stamp, anchor, distance, quality))
 

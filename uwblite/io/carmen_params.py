@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ..arrays import Floats
-from ..sensor_log import SensorMounting
+from ..sensor_log import SensorMounting, fault_of_id
 from .carmen_messages import BrokenLine, numbers
 
 _ANCHOR_HEIGHT = "uwb_anchor_height_"
@@ -46,6 +46,8 @@ class Params:
                 raise BrokenLine(f"PARAM {name} must be on or off")
             self._flipped = _TRUE[tokens[2].lower()]
         elif name in _NUMBERS or name.startswith(_ANCHOR_HEIGHT):
+            if name not in _NUMBERS and (fault := fault_of_id(name.removeprefix(_ANCHOR_HEIGHT))):
+                raise BrokenLine(f"PARAM {_ANCHOR_HEIGHT}*: the anchor's id {fault}")
             (self._numbers[name],) = numbers(tokens[2:3], f"PARAM {name[:40]}", 1)
 
     def get(self, *names: str) -> float | None:

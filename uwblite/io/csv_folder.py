@@ -15,16 +15,16 @@ import dataclasses
 import hashlib
 import io
 import os
+from array import array
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Floats
 from ..config import from_dict, parse_toml, setting, to_toml
 from ..errors import ConfigError, FormatError
-from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges
+from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .files import replacing
 from .source import open_source
 
@@ -138,7 +138,7 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
     digest = hashlib.sha256()
     sensors = Sensors()
     if (path / "sensors.toml").exists():
-        sensors = from_dict(Sensors, parse_toml(_text(path / "sensors.toml", digest), str(path / "sensors.toml")))
+        sensors = from_dict(Sensors, parse_toml("".join(_lines(path / "sensors.toml", digest)), str(path / "sensors.toml")))
     table = _in_order(_table(path / "odometry.csv", 4, digest))
     ranges = _read_ranges(path / "ranges.csv", digest) if (path / "ranges.csv").exists() else None
     scans = _read_scans(path / "scans.csv", sensors.scans, digest) if (path / "scans.csv").exists() else None
@@ -148,19 +148,20 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
     return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), ranges, scans, mounting, notes)
 
 
-def _text(path: Path, digest: "hashlib._Hash") -> str:
+def _lines(path: Path, digest: "hashlib._Hash") -> Iterator[str]:
+    """Yield the lines of a file, a block in memory at a time."""
     with open_source(path) as source:
-        data = b"".join(source.blocks())
-    digest.update(data)
-    try:
-        return data.decode()
-    except UnicodeDecodeError:
-        raise FormatError("not UTF-8 text", str(path)) from None
+        for block in source.blocks():
+            digest.update(block)
+            try:
+                yield from io.StringIO(block.decode())
+            except UnicodeDecodeError:
+                raise FormatError("not UTF-8 text", str(path)) from None
 
 
 def _rows(path: Path, columns: int, digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
     """Yield (line number, fields) behind the header; columns < 0 asks for at least that many."""
-    reader = csv.reader(io.StringIO(_text(path, digest)))
+    reader = csv.reader(_lines(path, digest))
     try:
         next(reader, None)
         for row in reader:
@@ -183,10 +184,12 @@ def _number(text: str, path: Path, line: int) -> float:
 
 
 def _table(path: Path, columns: int, digest: "hashlib._Hash") -> Floats:
-    rows = [[_number(cell, path, line) for cell in row] for line, row in _rows(path, columns, digest)]
-    if not rows:
+    cells = array("d")
+    for line, row in _rows(path, columns, digest):
+        cells.extend([_number(cell, path, line) for cell in row])
+    if not cells:
         raise FormatError("there are no rows", str(path))
-    return np.array(rows)
+    return np.array(cells).reshape(-1, columns)
 
 
 def _in_order(table: Floats) -> Floats:
@@ -194,36 +197,43 @@ def _in_order(table: Floats) -> Floats:
 
 
 def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:
-    rows = list(_rows(path, 4, digest))
-    if not rows:
+    cells, anchors, names = array("d"), array("q"), dict[str, int]()
+    for line, row in _rows(path, 4, digest):
+        cells.extend([_number(row[k], path, line) for k in (0, 2, 3)])
+        place = names.get(row[1])
+        if place is None:
+            place = names[row[1]] = len(names)
+            if fault := fault_of_id(one_word(row[1])):
+                raise FormatError(f"the anchor's id {fault}", str(path), line)
+        anchors.append(place)
+    if not cells:
         return None
-    ids = tuple(sorted({row[1].strip() for _, row in rows}))
-    place = {name: k for k, name in enumerate(ids)}
-    table = np.array([[_number(row[k], path, line) for k in (0, 2, 3)] for line, row in rows])
-    anchor = np.array([place[row[1].strip()] for _, row in rows], dtype=np.int64)
+    ids = tuple(sorted({one_word(name) for name in names}))
+    index = np.array([ids.index(one_word(name)) for name in names], dtype=np.int64)
+    table = np.array(cells).reshape(-1, 3)
     order = np.argsort(table[:, 0], kind="stable")
-    return UwbRanges(table[order, 0], anchor[order], table[order, 1], table[order, 2], ids)
+    return UwbRanges(table[order, 0], index[np.array(anchors)][order], table[order, 1], table[order, 2], ids)
 
 
 def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash") -> LaserScans | None:
-    stamps: list[float] = []
-    readings: list[NDArray[np.float32]] = []
+    stamps, readings, beams = array("d"), array("f"), 0
     for line, row in _rows(path, -2, digest):
-        if readings and len(row) != len(readings[0]) + 1:
-            raise FormatError(f"{len(row) - 1} beams, the first scan has {len(readings[0])}", str(path), line)
+        beams = beams or len(row) - 1
+        if len(row) != beams + 1:
+            raise FormatError(f"{len(row) - 1} beams, the first scan has {beams}", str(path), line)
         try:
-            readings.append(np.array([cell or "inf" for cell in row[1:]], dtype=np.float32))
+            readings.extend([float(cell or "inf") for cell in row[1:]])
         except ValueError:
             raise FormatError("a reading is not a number", str(path), line) from None
         stamps.append(_number(row[0], path, line))
-    if not readings:
+    if not stamps:
         return None
     if geometry.angle_increment == -1.0:
         raise FormatError(
             "scans need their geometry in sensors.toml ([scans] angle_min, angle_increment, range_max)", str(path)
         )
     order = np.argsort(stamps, kind="stable")
-    ranges = np.stack([readings[k] for k in order])
+    ranges = np.array(readings).reshape(-1, beams)[order]
     with np.errstate(invalid="ignore"):
         ranges[~(ranges >= geometry.range_min)] = np.nan
     g = geometry

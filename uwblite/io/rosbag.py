@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigError, FormatError, UwbliteError
-from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges
+from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id
 from .bag_frames import Frames, planar
 from .optional_packages import missing_package
 from .uwb_mapping import KNOWN, UwbMapping
@@ -226,7 +226,8 @@ class _Collector:
         return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), self._ranges(), self._scans(), mounting, notes)
 
     def _ranges(self) -> UwbRanges | None:
-        rows = [r for r in self.ranges if np.isfinite(r[0]) and np.isfinite(r[2]) and np.isfinite(r[3])]
+        faults = self._faults_of_ids()
+        rows = [r for r in self.ranges if np.isfinite(r[0]) and np.isfinite(r[2]) and np.isfinite(r[3]) and r[1] not in faults]
         if not rows:
             return None
         ids = tuple(sorted({row[1] for row in rows}))
@@ -236,6 +237,10 @@ class _Collector:
         anchor = np.array([place[row[1]] for row in rows], dtype=np.int64)
         ranges, quality = (np.array([row[k] for row in rows]) for k in (2, 3))
         return UwbRanges(stamps[order], anchor[order], ranges[order], quality[order], ids)
+
+    def _faults_of_ids(self) -> dict[str, str]:
+        """Return what is wrong with anchors' ids, of those with which something is."""
+        return {name: fault for name in {row[1] for row in self.ranges} if (fault := fault_of_id(name))}
 
     def _scans(self) -> LaserScans | None:
         if not self.scans:
@@ -275,6 +280,9 @@ class _Collector:
             yield f"not used: {', '.join(self.plan.passed_over)}"
         if broken:
             yield f"{broken} odometry messages are not finite and were skipped"
+        if faults := self._faults_of_ids():
+            count = sum(row[1] in faults for row in self.ranges)
+            yield f"{count} ranges were left out: the anchor's id {faults[min(faults)]}"
         if self.odd_scans:
             yield f"{self.odd_scans} scans of another geometry were skipped"
         if self.unstamped:

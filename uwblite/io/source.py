@@ -145,7 +145,7 @@ def open_input(name: str) -> BinaryIO:
     FormatError : it is missing, a directory, closed, or a named pipe into which nobody writes.
     """
     if name == "-":
-        if sys.stdin is None or sys.stdin.closed:
+        if sys.stdin is None or getattr(sys.stdin, "closed", False):
             raise FormatError("standard input is closed; name a file, or send one through a pipe", "stdin")
         return sys.stdin.buffer
     try:
