@@ -99,6 +99,9 @@ class LogNotes:
     skipped: dict[str, int] = field(default_factory=dict)
     """Messages that are known and not used, by name."""
     warnings: tuple[str, ...] = ()
+    """Oddities in words, each with its remedy or what was done."""
+    unread: tuple[str, ...] = ()
+    """Topics of a bag that may hold ranges and were not read."""
     scans_left_out: int = 0
     """Scans that were recorded and are not among `scans`, because no map looks at them."""
 

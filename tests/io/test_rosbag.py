@@ -62,10 +62,14 @@ def test_topics_are_listed_and_wrong_ones_refused(tmp_path):
     topics = {t.name: t for t in list_topics(tmp_path / "bag")}
     assert topics["/odom"].count == 40
     assert topics["/uwb/anchor_9_1_A/range"].type == "sensor_msgs/msg/Range"
-    with pytest.raises(ConfigError, match=r"no topic /odo; it has .*/odom"):
+    with pytest.raises(ConfigError, match=r"no topic /odo; did you mean /odom\? it has .*/odom"):
         read_bag(tmp_path / "bag", BagTopics(odometry="/odo"))
-    with pytest.raises(ConfigError, match="no uwb mapping fits /odom"):
+    with pytest.raises(ConfigError, match="no uwb mapping reads /odom"):
         read_bag(tmp_path / "bag", BagTopics(uwb=("/odom",)))
+    with pytest.raises(ConfigError, match=r"/scan is of type sensor_msgs/LaserScan; odometry .* nav_msgs/Odometry.*: /odom"):
+        read_bag(tmp_path / "bag", BagTopics(odometry="/scan"))
+    with pytest.raises(ConfigError, match=r"no frame base_lnk; did you mean base_link\? they know base_link, laser, uwb_tag"):
+        read_bag(tmp_path / "bag", BagTopics(base_frame="base_lnk"))
     one = read_bag(tmp_path / "bag", BagTopics(uwb=("/uwb/anchor_5C0B/range",)))
     assert one.ranges.anchor_ids == ("5C0B",)
 

@@ -51,7 +51,7 @@ def diagnose(
     odometry = check_odometry(log.odometry, found)
     figures: dict[str, Any] = {"odometry": odometry}
     if log.ranges is None or len(log.ranges.stamps) == 0:
-        found.note("radio", "there are no UWB ranges", "the map rests on wheels and lidar; check the tag if that is not meant")
+        found.note("radio", "there are no UWB ranges", _advice_without_ranges(log))
     else:
         figures["uwb"] = check_ranges(log, found)
         figures["radio calibration"] = check_calibration(anchors, calibration, found)
@@ -63,6 +63,12 @@ def diagnose(
     if log.ranges is not None and len(log.ranges.stamps):
         _check_overlap(log, "radio", log.ranges.stamps, found)
     return Diagnosis(found.ranked(), figures)
+
+
+def _advice_without_ranges(log: SensorLog) -> str:
+    if log.notes.unread:
+        return f"there may be some in what was not read: {', '.join(log.notes.unread)}; --uwb-mapping says where (see above)"
+    return "the map rests on wheels and lidar; check the tag if that is not meant"
 
 
 def _check_notes(log: SensorLog, found: Findings) -> None:
@@ -77,7 +83,7 @@ def _check_notes(log: SensorLog, found: Findings) -> None:
             "a recorder that was cut off leaves one; more point to a bad disk, cable or writer",
         )
     for warning in notes.warnings:
-        found.warning("log", warning, "the readings are used in the order of their stamps")
+        found.warning("log", warning, "")
 
 
 def _check_overlap(log: SensorLog, topic: str, stamps: np.ndarray[Any, Any], found: Findings) -> None:

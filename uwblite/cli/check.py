@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from .options import add_mounting_arguments
+from .options import add_bag_arguments, add_mounting_arguments
 from .wording import signed
 
 if TYPE_CHECKING:
@@ -21,10 +21,11 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
-    parser.add_argument("log", help="CARMEN log, plain or .gz; - reads standard input")
+    parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     parser.add_argument("--quick", action="store_true", help="leave out what needs a trial map from wheels and radio")
     add_mounting_arguments(parser)
+    add_bag_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -32,9 +33,9 @@ def run(args: argparse.Namespace) -> int:
     from ..checks.recording import diagnose
     from . import console
     from .formats import read_recording
-    from .options import apply_mounting
+    from .options import apply_mounting, bag_choices
 
-    log = apply_mounting(read_recording(args.log), args)
+    log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
     anchors, calibration, problem = ((), (), "") if args.quick else _trial_map(log)
     diagnosis = diagnose(log, anchors=anchors, calibration=calibration)
     cost = expected_cost(log)
@@ -102,7 +103,8 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], prob
     """Return the findings and figures as lines of text."""
     lines = [f"{name}: {_counts(diagnosis.figures)}", ""]
     for finding in diagnosis.findings:
-        lines += [f"{finding.rank.upper():<8} {finding.topic}: {finding.what}", f"         -> {finding.advice}"]
+        lines.append(f"{finding.rank.upper():<8} {finding.topic}: {finding.what}")
+        lines += [f"         -> {finding.advice}"] if finding.advice else []
     if problem:
         lines += ["NOTE     radio: no trial map from wheels and radio alone", f"         -> {problem}"]
     if not diagnosis.findings:

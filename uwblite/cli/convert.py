@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ..errors import ConfigError
-from .options import add_mounting_arguments, number
+from .options import add_bag_arguments, add_mounting_arguments, number
 
 if TYPE_CHECKING:
     from ..sensor_log import SensorLog
@@ -32,13 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", nargs="?", help="what to make; its name tells the format, or --to does")
     parser.add_argument("--to", choices=_TARGETS, help="format of the target where its name does not tell")
     parser.add_argument("--force", action="store_true", help="replace a file that is already there")
-    bag = parser.add_argument_group("bags")
-    bag.add_argument("--list", action="store_true", help="list the topics and stop")
-    bag.add_argument("--odometry-topic", metavar="TOPIC", default="", help="nav_msgs/Odometry of the wheels")
-    bag.add_argument("--scan-topic", metavar="TOPIC", default="", help="sensor_msgs/LaserScan")
-    bag.add_argument("--uwb-topic", metavar="TOPIC", action="append", default=[], help="ranges; repeatable")
-    bag.add_argument("--uwb-mapping", metavar="FILE.toml", help="where ranges stand in messages, see docs/formats.md")
-    bag.add_argument("--base-frame", metavar="FRAME", default="", help="frame of the robot (the odometry's child frame)")
+    parser.add_argument("--list", action="store_true", help="list the topics of a bag and stop")
+    add_bag_arguments(parser)
     part = parser.add_argument_group("part and units")
     unit = number(above=0)
     part.add_argument("--start", metavar="S", type=number(), help="leave out what is earlier, s after the first odometry")
@@ -61,22 +56,24 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("name a target: uwblite convert SOURCE TARGET")
     if kind in ("g2o", "pyfg"):
         return _convert_graph(args)
-    return _convert_recording(args, kind)
+    return _convert_recording(args)
 
 
 def _list(args: argparse.Namespace, kind: str) -> int:
-    from ..io.rosbag import list_topics
-    from ..io.uwb_mapping import KNOWN
+    from ..io.bag_topics import unread_warning
+    from ..io.rosbag import plan_bag
     from . import console
+    from .options import bag_choices
 
     if kind != "bag":
         raise ConfigError(f"{args.source} is not a bag; --list shows the topics of bags")
-    roles = {"nav_msgs/msg/Odometry": "odometry", "sensor_msgs/msg/LaserScan": "scans"}
-    topics = list_topics(args.source)
+    topics, plan = plan_bag(args.source, *bag_choices(args))
     width = max((len(t.name) for t in topics), default=0)
     for t in topics:
-        role = roles.get(t.type) or ("ranges" if any(m.fits(t.name, t.type) for m in KNOWN) else "")
+        role = plan.role(t.name) or ("ranges?" if t.name in plan.unread else "")
         console.say(f"{t.count:>8}  {t.name:<{width}}  {t.type}{f'  <- {role}' if role else ''}")
+    if plan.unread:
+        console.say(unread_warning(plan))
     return 0
 
 
@@ -95,17 +92,17 @@ def _convert_graph(args: argparse.Namespace) -> int:
     return 0
 
 
-def _convert_recording(args: argparse.Namespace, kind: str) -> int:
+def _convert_recording(args: argparse.Namespace) -> int:
     from . import console
-    from .formats import format_of, refuse_existing
-    from .options import apply_mounting
+    from .formats import format_of, read_recording, refuse_existing
+    from .options import apply_mounting, bag_choices
 
     to = args.to or format_of(args.target)
     if to in ("", "bag", "g2o", "pyfg"):
         hint = "a ROS 1 bag cannot be written; use --to mcap" if to == "bag" else "use --to log, csv, mcap or sqlite3"
         raise ConfigError(f"{args.target}: not a format for a recording; {hint}")
     refuse_existing(args.force, args.target)
-    log = apply_mounting(_scaled(_read(args, kind), args), args)
+    log = apply_mounting(_scaled(read_recording(args.source, bag=bag_choices(args)), args), args)
     log = _cropped(log, args.start, args.end)
     for warning in log.notes.warnings:
         console.note(f"uwblite: {args.source}: {warning}")
@@ -116,20 +113,6 @@ def _convert_recording(args: argparse.Namespace, kind: str) -> int:
     if to == "log":
         console.say(f"next: uwblite check {args.target}")
     return 0
-
-
-def _read(args: argparse.Namespace, kind: str) -> "SensorLog":
-    from .formats import read_recording
-    from .options import read_text
-
-    if kind != "bag":
-        return read_recording(args.source)
-    from ..io.rosbag import BagTopics, read_bag
-    from ..io.uwb_mapping import parse_mappings
-
-    mappings = parse_mappings(read_text(args.uwb_mapping), args.uwb_mapping) if args.uwb_mapping else ()
-    topics = BagTopics(args.odometry_topic, args.scan_topic, tuple(args.uwb_topic), args.base_frame)
-    return read_bag(args.source, topics, mappings)
 
 
 def _write(args: argparse.Namespace, to: str, log: "SensorLog") -> None:

@@ -6,8 +6,12 @@ from typing import TYPE_CHECKING
 from ..errors import ConfigError
 
 if TYPE_CHECKING:
+    from ..io.bag_topics import BagTopics
     from ..io.graph_file import GraphFile
+    from ..io.uwb_mapping import UwbMapping
     from ..sensor_log import SensorLog
+
+    BagChoices = tuple[BagTopics, tuple[UwbMapping, ...]]
 
 GRAPHS = {".g2o": "g2o", ".graph": "g2o", ".toro": "g2o", ".pyfg": "pyfg"}
 """TORO files are told from g2o by their tags."""
@@ -25,9 +29,22 @@ def format_of(path: str) -> str:
     return "log" if path == "-" else "csv" if path.endswith(os.sep) else (GRAPHS | LOGS).get(ending, "")
 
 
-def read_recording(path: str, every_nth_scan: int = 1) -> "SensorLog":
-    """Read a recording of any kind: a CARMEN log, a ROS bag or a folder of CSV files; of its scans every n-th."""
+def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" = None) -> "SensorLog":
+    """Read a recording of any kind: a CARMEN log, a ROS bag or a folder of CSV files; of its scans every n-th.
+
+    Parameters
+    ----------
+    path : the file or folder; - is standard input.
+    every_nth_scan : how many scans are left out.
+    bag : topics and mappings of a bag, as `options.bag_choices` returns them.
+
+    Raises
+    ------
+    ConfigError : topics or mappings are named for what is no bag.
+    """
     kind = format_of(path)
+    if bag is not None and kind != "bag" and (bag[1] or bag[0] != type(bag[0])()):
+        raise ConfigError(f"{path} is no ROS bag: --uwb-mapping and the topics are for bags")
     if kind == "csv":
         from ..io.csv_folder import read_csv_folder
 
@@ -35,7 +52,7 @@ def read_recording(path: str, every_nth_scan: int = 1) -> "SensorLog":
     if kind == "bag":
         from ..io.rosbag import read_bag
 
-        return _with_every_nth(read_bag(path), every_nth_scan)
+        return _with_every_nth(read_bag(path, *(bag or ())), every_nth_scan)
     from ..io.carmen import read_log
 
     return read_log(path, every_nth_scan=every_nth_scan)

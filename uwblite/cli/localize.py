@@ -5,7 +5,7 @@ import os
 import time
 from typing import TYPE_CHECKING, Any
 
-from .options import add_mounting_arguments, add_settings_arguments
+from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments
 
 if TYPE_CHECKING:
     from ..grid.occupancy_grid import OccupancyGrid
@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
+    add_bag_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from ..localize import localize
     from . import console
     from .formats import read_recording, refuse_existing
-    from .options import apply_mounting, effective_config
+    from .options import apply_mounting, bag_choices, effective_config
 
     files = _files(args)
     refuse_existing(args.force, *files.values())
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     yaml = os.path.join(args.map, "map.yaml")
     grid = read_map(yaml) if os.path.exists(yaml) else None
     anchors = read_anchors(os.path.join(args.map, "anchors.csv"), least=1 if grid is None else 0)
-    log = apply_mounting(read_recording(args.log), args)
+    log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
     progress = console.Progress()
     try:
         found = localize(log, anchors, grid, config, progress=progress, clock=time.perf_counter)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from .options import add_mounting_arguments, add_settings_arguments, number, numbers
+from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments, number, numbers
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -30,6 +30,7 @@ examples:
   uwblite map run.log --out d/ --align walls --crop 0,0,12,8
   uwblite map monday.log tuesday.log --out both/       one map of several drives: anchors tie them together
   uwblite map monday.log --out monday/ --anchors-from sunday/anchors.csv    in the frame of Sunday's map
+  uwblite map drive.bag --out map/ --uwb-mapping uwb.toml    a ROS bag with ranges of one's own kind
   uwblite map run.log --out map/ --dry-run             read, check and estimate only
 
 files in --out: map.png (picture), report.html, map.yaml + map.pgm (map_server, nav2), trajectory.tum (evo),
@@ -69,6 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     beforehand.add_argument("--anchors-from", metavar="FILE.csv", help=text)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
+    add_bag_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -80,14 +82,14 @@ def run(args: argparse.Namespace) -> int:
     from ..pipeline.scan_selection import thinned
     from . import console
     from .formats import read_recording
-    from .options import apply_mounting
+    from .options import apply_mounting, bag_choices
 
     if not args.dry_run:
         check_target(args.out, force=args.force)
     config, constraints = _settings(args), _known(args)
     began = time.perf_counter()
     with _workers(args.jobs if len(args.logs) > 1 else 1) as executor:
-        read = partial(read_recording, every_nth_scan=args.every_nth_scan)
+        read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
         logs = [apply_mounting(log, args) for log in in_order(read, args.logs, executor)]
     reading = time.perf_counter() - began
     _tell_reader_warnings(logs)
@@ -207,6 +209,10 @@ def repeat_command(args: argparse.Namespace) -> str:
         words.append("--laser-pose=" + ",".join(map(repr, args.laser_pose)))
     if args.laser_flipped:
         words.append("--laser-flipped")
+    for option in ("odometry_topic", "scan_topic", "uwb_mapping", "base_frame"):
+        if value := getattr(args, option):
+            words.append(f"--{option.replace('_', '-')}={value}")
+    words += [f"--uwb-topic={topic}" for topic in args.uwb_topic]
     if args.tag is not None:
         words.append("--tag=" + ",".join(map(repr, args.tag)))
     if args.anchor_height is not None:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ..io.bag_topics import BagTopics
+    from ..io.uwb_mapping import UwbMapping
     from ..mapping import MappingConfig
     from ..sensor_log import SensorLog
 
@@ -54,6 +56,25 @@ def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
     group.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), help="UWB tag on the base, z above the floor: m")
     group.add_argument("--anchor-height", metavar="H", type=number(), help="height of all anchors above the floor, m")
+
+
+def add_bag_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare which topics of a ROS bag are read; recordings of other kinds have none."""
+    bag = parser.add_argument_group("ROS bags (topics are guessed by their types where these are not given)")
+    bag.add_argument("--odometry-topic", metavar="TOPIC", default="", help="nav_msgs/Odometry of the wheels")
+    bag.add_argument("--scan-topic", metavar="TOPIC", default="", help="sensor_msgs/LaserScan")
+    bag.add_argument("--uwb-topic", metavar="TOPIC", action="append", default=[], help="ranges; repeatable")
+    bag.add_argument("--uwb-mapping", metavar="FILE.toml", help="where ranges stand in messages, see docs/formats.md")
+    bag.add_argument("--base-frame", metavar="FRAME", default="", help="frame of the robot (the odometry's child frame)")
+
+
+def bag_choices(args: argparse.Namespace) -> "tuple[BagTopics, tuple[UwbMapping, ...]]":
+    """Return the topics and mappings that the command line names."""
+    from ..io.bag_topics import BagTopics
+    from ..io.uwb_mapping import parse_mappings
+
+    mappings = parse_mappings(read_text(args.uwb_mapping), args.uwb_mapping) if args.uwb_mapping else ()
+    return BagTopics(args.odometry_topic, args.scan_topic, tuple(args.uwb_topic), args.base_frame), mappings
 
 
 def number(

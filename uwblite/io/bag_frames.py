@@ -1,11 +1,13 @@
 """Where a sensor sits on the robot, from the transforms (tf) in a bag."""
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats
+from ..errors import ConfigError
 
 
 class Frames:
@@ -22,6 +24,14 @@ class Frames:
             pose[:3, :3] = _rotation(turn.x, turn.y, turn.z, turn.w)
             pose[:3, 3] = shift.x, shift.y, shift.z
             self._parents.setdefault(_name(t.child_frame_id), (_name(t.header.frame_id), pose))
+
+    def check(self, frame: str) -> None:
+        """Raise ConfigError where the transforms do not know a frame; without any transform every frame will do."""
+        names = sorted(set(self._parents) | {parent for parent, _ in self._parents.values()})
+        if names and _name(frame) not in names:
+            near = get_close_matches(_name(frame), names, n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            raise ConfigError(f"the transforms of the bag know no frame {frame}; {hint}they know {', '.join(names)}")
 
     def pose(self, base: str, frame: str) -> Floats | None:
         """Return T_base_frame (4, 4), None where the frames are not connected."""

@@ -10,40 +10,23 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigError, FormatError, UwbliteError
+from ..errors import FormatError, UwbliteError
 from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id
 from .bag_frames import Frames, planar
+from .bag_topics import GUESSED, ODOMETRY, BagTopic, BagTopics, TopicPlan, plan_topics, unread_warning
 from .optional_packages import missing_package
-from .uwb_mapping import KNOWN, UwbMapping
+from .uwb_mapping import UwbMapping, readings_of, short_type
 
-_ODOMETRY, _SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan"
-_TF = "tf2_msgs/msg/TFMessage"
-
-
-@dataclass(frozen=True, slots=True)
-class BagTopics:
-    """Which topics to read; empty = guess from the types."""
-
-    odometry: str = ""
-    scan: str = ""
-    uwb: tuple[str, ...] = ()
-    base_frame: str = ""
-    """Empty = the odometry's child frame."""
-
-
-@dataclass(frozen=True, slots=True)
-class BagTopic:
-    """One topic of a bag."""
-
-    name: str
-    type: str
-    count: int
+_SAMPLES = 20
+"""Messages of a topic that are looked at to tell how they are made."""
 
 
 def list_topics(path: str | os.PathLike[str]) -> tuple[BagTopic, ...]:
@@ -52,11 +35,26 @@ def list_topics(path: str | os.PathLike[str]) -> tuple[BagTopic, ...]:
         return _topics(reader)
 
 
+def plan_bag(
+    path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings: tuple[UwbMapping, ...] = ()
+) -> tuple[tuple[BagTopic, ...], TopicPlan]:
+    """Return the topics of a bag and what `read_bag` would read of them."""
+    with _opened(path) as reader:
+        return _topics(reader), plan_topics(_topics(reader), partial(_samples, reader), topics, mappings)
+
+
+def _samples(reader: Any, name: str) -> list[Any]:
+    """Return the first messages of a topic; none where their definition is missing."""
+    chosen = [c for c in reader.connections if c.topic == name and c.msgtype in reader.typestore.fielddefs]
+    first = islice(reader.messages(connections=chosen), _SAMPLES) if chosen else ()
+    return [reader.deserialize(raw, connection.msgtype) for connection, _, raw in first]
+
+
 def _topics(reader: Any) -> tuple[BagTopic, ...]:
     return tuple(BagTopic(name, info.msgtype or "?", info.msgcount) for name, info in sorted(reader.topics.items()))
 
 
-def read_bag(path: str | os.PathLike[str], topics: BagTopics = BagTopics(), mappings: tuple[UwbMapping, ...] = ()) -> SensorLog:
+def read_bag(path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings: tuple[UwbMapping, ...] = ()) -> SensorLog:
     """Read a bag.
 
     Parameters
@@ -75,10 +73,13 @@ def read_bag(path: str | os.PathLike[str], topics: BagTopics = BagTopics(), mapp
     ConfigError : a topic or field that was asked for is not there.
     """
     with _opened(path) as reader:
-        found = _Collector(_chosen(reader, topics, (*mappings, *KNOWN)), topics.base_frame)
+        plan = plan_topics(_topics(reader), partial(_samples, reader), topics, mappings)
+        found = _Collector(plan, topics.base_frame)
         wanted = {found.plan.odometry, found.plan.scan, *found.plan.uwb, *found.plan.tf}
         for connection, recorded, raw in reader.messages(connections=[c for c in reader.connections if c.topic in wanted]):
-            found.take(connection.topic, recorded * 1e-9, reader.deserialize(raw, connection.msgtype))
+            found.take(connection.topic, recorded / 1e9, reader.deserialize(raw, connection.msgtype))
+        if topics.base_frame:
+            found.frames.check(topics.base_frame)
         return found.log(os.fspath(path), _hash(Path(path)))
 
 
@@ -105,60 +106,11 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Any]:
         raise FormatError(f"cannot be read as a ROS bag: {type(error).__name__}: {detail}", name) from None
 
 
-@dataclass(frozen=True, slots=True)
-class _Plan:
-    odometry: str
-    scan: str
-    uwb: dict[str, UwbMapping]
-    tf: tuple[str, ...]
-    passed_over: tuple[str, ...]
-    """Topics that would have done too, in words."""
-
-
-def _chosen(reader: Any, asked: BagTopics, mappings: tuple[UwbMapping, ...]) -> _Plan:
-    topics = _topics(reader)
-    names = {t.name for t in topics}
-    for name in (asked.odometry, asked.scan, *asked.uwb):
-        if name and name not in names:
-            raise ConfigError(f"the bag has no topic {name}; it has {', '.join(sorted(names))}")
-    odometry = asked.odometry or _best(topics, _ODOMETRY, ("odom", "wheel"), ("filtered", "gps", "visual"))
-    scan = asked.scan or _best(topics, _SCAN, ("/scan",), ("sonar", "ultra", "back", "rear"))
-    by_topic = {}
-    for t in topics:
-        if asked.uwb and t.name not in asked.uwb:
-            continue
-        mapping = next((m for m in mappings if m.fits(t.name, t.type)), None)
-        if mapping is None and t.name in asked.uwb:
-            raise ConfigError(f"no uwb mapping fits {t.name} of type {t.type}; describe it in a file for --uwb-mapping")
-        if mapping is not None:
-            by_topic[t.name] = mapping
-    kept = by_topic if asked.uwb else _uncorrected(by_topic)
-    spare = [t.name for t in topics if t.type in (_ODOMETRY, _SCAN) and t.name not in (odometry, scan)]
-    spare += [name for name in by_topic if name not in kept]
-    return _Plan(odometry, scan, kept, tuple(t.name for t in topics if t.type == _TF), tuple(spare))
-
-
-def _best(topics: tuple[BagTopic, ...], kind: str, liked: tuple[str, ...], disliked: tuple[str, ...]) -> str:
-    """Return the likeliest topic of a type; '' where there is none."""
-
-    def rank(topic: BagTopic) -> tuple[bool, bool, int, str]:
-        name = topic.name.lower()
-        return (any(d in name for d in disliked), not any(w in name for w in liked), -topic.count, topic.name)
-
-    fitting = [t for t in topics if t.type == kind]
-    return min(fitting, key=rank).name if fitting else ""
-
-
-def _uncorrected(by_topic: dict[str, UwbMapping]) -> dict[str, UwbMapping]:
-    """Leave out X where X_raw exists: the map has its own correction."""
-    return {name: m for name, m in by_topic.items() if f"{name}_raw" not in by_topic}
-
-
 @dataclass(slots=True)
 class _Collector:
     """Gathers the messages of the chosen topics."""
 
-    plan: _Plan
+    plan: TopicPlan
     base_frame: str = ""
     frames: Frames = field(default_factory=Frames)
     odometry: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -184,16 +136,16 @@ class _Collector:
         elif topic == self.plan.scan:
             self._take_scan(recorded, message)
         else:
-            mapping = self.plan.uwb[topic]
+            mappings = self.plan.uwb[topic]
             stamp = recorded
-            if mapping.stamp:
+            if mappings[0].stamp:
                 holder: Any = message
-                for name in mapping.stamp.split("."):
+                for name in mappings[0].stamp.split("."):
                     holder = getattr(holder, name, None)
                 stamp = recorded if holder is None else self._time(holder, recorded)
             if hasattr(message, "header"):
                 self.tag_frames[message.header.frame_id] += 1
-            self.ranges += [(stamp, *reading) for reading in mapping.extract(message, topic)]
+            self.ranges += [(stamp, *reading) for reading in readings_of(message, topic, mappings)]
 
     def _time(self, stamp: Any, recorded: float) -> float:
         seconds = float(stamp.sec) + 1e-9 * float(stamp.nanosec)
@@ -216,13 +168,13 @@ class _Collector:
     def log(self, path: str, sha256: str) -> SensorLog:
         """Return what was gathered as a recording."""
         if not self.odometry:
-            raise FormatError(f"the bag has no odometry ({_ODOMETRY}); name its topic with --odometry-topic", path)
+            raise FormatError(f"the bag has no odometry ({short_type(ODOMETRY)}); name its topic with --odometry-topic", path)
         table = np.array(self.odometry)
         table = table[np.isfinite(table).all(axis=1)]
         table = table[np.argsort(table[:, 0], kind="stable")]
         warnings = list(self._warnings(len(self.odometry) - len(table)))
         mounting = self._mounting(warnings)
-        notes = LogNotes(source=path, sha256=sha256, warnings=tuple(warnings))
+        notes = LogNotes(source=path, sha256=sha256, warnings=tuple(warnings), unread=tuple(self.plan.unread))
         return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), self._ranges(), self._scans(), mounting, notes)
 
     def _ranges(self) -> UwbRanges | None:
@@ -261,7 +213,10 @@ class _Collector:
         if self.scans:
             pose = self.frames.pose(self.base_frame, self.laser_frame)
             if pose is None:
-                warnings.append(f"no transform from {self.base_frame} to {self.laser_frame}: give --laser-pose")
+                warnings.append(
+                    f"no transform from {self.base_frame} to {self.laser_frame}: the laser is taken to sit in the middle of"
+                    " the robot, looking ahead; give --laser-pose X,Y,THETA where it does not"
+                )
             else:
                 T_base_laser, flipped = planar(pose)
         if self.ranges:
@@ -270,7 +225,9 @@ class _Collector:
             known = (self.frames.pose(self.base_frame, name) for name in names if name)
             pose = next((p for p in known if p is not None), None)
             if pose is None:
-                warnings.append("no transform to the UWB tag: give --tag")
+                warnings.append(
+                    "no transform to the UWB tag: it is taken to sit in the middle of the robot, on the floor; give --tag X,Y,Z"
+                )
             else:
                 tag = pose[:3, 3].copy()
         return SensorMounting(T_base_laser, flipped, tag)
@@ -278,6 +235,8 @@ class _Collector:
     def _warnings(self, broken: int) -> Iterator[str]:
         if self.plan.passed_over:
             yield f"not used: {', '.join(self.plan.passed_over)}"
+        if self.plan.unread:
+            yield unread_warning(self.plan)
         if broken:
             yield f"{broken} odometry messages are not finite and were skipped"
         if faults := self._faults_of_ids():

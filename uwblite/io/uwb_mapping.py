@@ -11,8 +11,11 @@ As TOML, one ``[[uwb]]`` table per kind of message; the first that fits a topic 
     stamp = "header.stamp"       # field of the message with the time; "" = when it was recorded
 """
 
+import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -27,7 +30,7 @@ class UwbMapping:
     topic: str = "*"
     """Pattern of the topic's name, * and ? as in file names."""
     type: str = "*"
-    """Pattern of the message's type, such as gtec_msgs/msg/Ranging."""
+    """Pattern of the message's type, such as gtec_msgs/Ranging."""
     readings: str = ""
     """Field of the message that holds a list of readings; empty: the message itself is one reading."""
     anchor: str = "id"
@@ -44,31 +47,38 @@ class UwbMapping:
     anchor_format: str = "{}"
     """How a numeric id is written: '{}' as it is, '{:04X}' as four hexadecimal digits."""
     only: dict[str, int] = field(default_factory=dict)
-    """Fields of the reading that must have these values, e.g. the tag's id where there are several tags."""
+    """Fields of the reading that must have these values, e.g. the tag's id where there are several tags; with 'index' a
+    field that is an array is asked at the place of the range."""
 
     def fits(self, topic: str, message_type: str) -> bool:
-        """Tell whether the mapping is meant for a topic."""
-        return fnmatchcase(topic, self.topic) and fnmatchcase(message_type, self.type)
+        """Tell whether the mapping is meant for a topic; ``pkg/Name`` and ``pkg/msg/Name`` are one type."""
+        return fnmatchcase(topic, self.topic) and fnmatchcase(short_type(message_type), short_type(self.type))
 
     def extract(self, message: Any, topic: str) -> list[tuple[str, float, float]]:
         """Return (anchor id, range in m, quality) of every reading in a message.
 
+        An array with a place for each anchor holds zeros or nan where an anchor was not heard: these are no readings.
+
         Raises
         ------
-        ConfigError : the message has no such field.
+        MissingField : the message has no such field.
         """
         readings = _field(message, self.readings, self) if self.readings else [message]
         found = []
         for reading in readings:
-            if any(int(_field(reading, name, self)) != value for name, value in self.only.items()):
-                continue
             value = _field(reading, self.range, self)
             quality = float(_field(reading, self.quality, self)) if self.quality else 100.0
             if self.anchor == "index":
-                found += [(self._name(k), float(v) * self.unit, quality) for k, v in enumerate(value)]
-            else:
+                heard = [(k, float(v)) for k, v in enumerate(value) if self._wanted(reading, k)]
+                found += [(self._name(k), v * self.unit, quality) for k, v in heard if math.isfinite(v) and v != 0.0]
+            elif self._wanted(reading):
                 found.append((self._anchor(reading, topic), float(value) * self.unit, quality))
         return found
+
+    def _wanted(self, reading: Any, place: int | None = None) -> bool:
+        """Tell whether the fields of `only` have their values, in an array the value at a place."""
+        values = ((_field(reading, name, self), wanted) for name, wanted in self.only.items())
+        return all(int(v if place is None or not hasattr(v, "__len__") else v[place]) == wanted for v, wanted in values)
 
     def _anchor(self, reading: Any, topic: str) -> str:
         if self.anchor.startswith("topic:"):
@@ -84,26 +94,56 @@ class UwbMapping:
         return re.sub(r"\s+", "_", name.strip()) or "?"
 
 
+class MissingField(ConfigError):
+    """A message has not the field that a mapping names."""
+
+
 def _field(message: Any, path: str, mapping: UwbMapping) -> Any:
     for name in path.split("."):
         if not hasattr(message, name):
-            known = ", ".join(k for k in getattr(message, "__dataclass_fields__", {}) if not k.startswith("_"))
-            raise ConfigError(f"uwb mapping for {mapping.topic}: a message has no field {path!r}; it has {known}")
+            fields = [k for k in getattr(message, "__dataclass_fields__", {}) if not k.startswith("_")]
+            near = "".join(f"; did you mean {n}?" for n in get_close_matches(name, fields, n=1))
+            raise MissingField(
+                f"uwb mapping for {mapping.topic}, type {mapping.type}: a message has no field {path!r};"
+                f" it has {', '.join(fields)}{near}"
+            )
         message = getattr(message, name)
     return message
 
 
-KNOWN = (
-    # What `uwblite convert` itself writes.
-    UwbMapping(topic="/uwb/anchor_*/range", type="sensor_msgs/msg/Range", anchor="header.frame_id"),
-    UwbMapping(type="mrpt_msgs/msg/ObservationRangeBeacon", readings="sensed_data"),
-    UwbMapping(type="gtec_msgs/msg/Ranging", anchor="anchorId", unit=0.001, stamp=""),
-    UwbMapping(type="mrs_msgs/msg/RangeWithCovarianceArrayStamped", readings="ranges", range="range.range"),
-    UwbMapping(type="dwm1001*_ros/msg/UWBMeas", readings="measurements", range="dist", stamp=""),
-    UwbMapping(type="px4_msgs/msg/SensorUwb", anchor="mac_dest", range="distance", stamp="", anchor_format="{:04X}"),
-    UwbMapping(topic="/uwb/*/distance", type="sensor_msgs/msg/Range", anchor="topic:([^/]+)/distance$"),
-)
-"""Mappings tried where the user gives none."""
+def short_type(name: str) -> str:
+    """Return ``pkg/Name`` of a message's type, as ROS 1 writes it, for ``pkg/msg/Name`` of ROS 2."""
+    return name.replace("/msg/", "/")
+
+
+def readings_of(message: Any, topic: str, mappings: Sequence[UwbMapping]) -> list[tuple[str, float, float]]:
+    """Return the readings of a message by the first mapping that finds some.
+
+    Mappings with the same patterns describe forms of one kind of message: fields that were renamed between releases, or
+    directions that are told apart by `only`.
+
+    Raises
+    ------
+    MissingField : no mapping finds its fields.
+    """
+    missing: MissingField | None = None
+    understood = False
+    for mapping in mappings:
+        try:
+            if found := mapping.extract(message, topic):
+                return found
+            understood = True
+        except MissingField as error:
+            missing = missing or error
+    if missing is not None and not understood:
+        raise missing
+    return []
+
+
+def fitting(topic: str, message_type: str, table: Sequence[UwbMapping]) -> tuple[UwbMapping, ...]:
+    """Return the first mapping of a table that fits a topic, and with it the others of the same patterns."""
+    first = next((m for m in table if m.fits(topic, message_type)), None)
+    return () if first is None else tuple(m for m in table if (m.topic, m.type) == (first.topic, first.type))
 
 
 def parse_mappings(text: str, path: str = "") -> tuple[UwbMapping, ...]:

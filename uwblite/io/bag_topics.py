@@ -1,0 +1,182 @@
+"""Which topics of a bag hold wheels, scans, ranges and transforms; and which may hold ranges that no mapping reads."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any
+
+from ..errors import ConfigError
+from .uwb_mapping import MissingField, UwbMapping, fitting, readings_of, short_type
+from .uwb_messages import KNOWN
+from .uwb_suggestions import as_toml, suggested
+
+ODOMETRY, SCAN, TRANSFORMS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage"
+
+Samples = Callable[[str], Sequence[Any]]
+"""First messages of a topic, by its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagTopics:
+    """Which topics to read; empty = guess from the types."""
+
+    odometry: str = ""
+    scan: str = ""
+    uwb: tuple[str, ...] = ()
+    base_frame: str = ""
+    """Empty = the odometry's child frame."""
+
+
+GUESSED = BagTopics()
+"""No topic is named: all are guessed."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagTopic:
+    """One topic of a bag."""
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class TopicPlan:
+    """What is read from which topic."""
+
+    odometry: str
+    scan: str
+    uwb: dict[str, tuple[UwbMapping, ...]]
+    tf: tuple[str, ...]
+    passed_over: tuple[str, ...]
+    """Topics that would have done too."""
+    unread: dict[str, UwbMapping]
+    """Topics that may hold ranges, with a mapping to begin with."""
+
+    def role(self, name: str) -> str:
+        """Return what a topic is read for; '' where it is not read."""
+        roles = {self.odometry: "odometry", self.scan: "scans"} | dict.fromkeys(self.uwb, "ranges")
+        return roles.get(name, "")
+
+
+def plan_topics(
+    topics: tuple[BagTopic, ...], samples: Samples, asked: BagTopics = GUESSED, mappings: tuple[UwbMapping, ...] = ()
+) -> TopicPlan:
+    """Choose the topics of a bag.
+
+    Parameters
+    ----------
+    topics : all of the bag.
+    samples : gives the first messages of a topic.
+    asked : topics that the user names.
+    mappings : the user's mappings of ranges; the known ones are tried after these.
+
+    Raises
+    ------
+    ConfigError : a topic that was asked for is not there or of another type, or a mapping of the user's matches nothing.
+    """
+    odometry = _named(topics, asked.odometry, ODOMETRY, "odometry") or _best(
+        topics, ODOMETRY, ("odom", "wheel"), ("filtered", "gps", "visual")
+    )
+    scan = _named(topics, asked.scan, SCAN, "scans") or _best(topics, SCAN, ("/scan",), ("sonar", "ultra", "back", "rear"))
+    for name in asked.uwb:
+        _topic(topics, name)
+    others = (t for t in topics if t.name not in (odometry, scan) and t.type != TRANSFORMS)
+    rest = [*others, *(t for t in topics if t.name in asked.uwb and t.name in (odometry, scan))]
+    _check_mappings(rest, mappings)
+    uwb, unread = {}, {}
+    for t in rest:
+        chosen = t.name in asked.uwb or not asked.uwb
+        if chosen and (found := _usable(t, samples, mappings)):
+            uwb[t.name] = found
+        elif (guess := suggested(t.name, t.type, samples)) is not None:
+            unread[t.name] = guess
+        if t.name in asked.uwb and t.name not in uwb:
+            raise ConfigError(_no_mapping(t, unread.get(t.name)))
+    kept = uwb if asked.uwb else _uncorrected(uwb)
+    spare = [t.name for t in topics if t.type in (ODOMETRY, SCAN) and t.name not in (odometry, scan)]
+    spare += [name for name in uwb if name not in kept]
+    tf = tuple(t.name for t in topics if t.type == TRANSFORMS)
+    return TopicPlan(odometry, scan, kept, tf, tuple(spare), {} if asked.uwb else unread)
+
+
+def unread_warning(plan: TopicPlan) -> str:
+    """Return one line that names the topics which may hold ranges, with a mapping to paste."""
+    names = ", ".join(plan.unread)
+    return (
+        f"not read, though there may be ranges in it: {names}. If there are, put this line into a file uwb.toml, correct it"
+        f" (docs/formats.md explains it) and give --uwb-mapping uwb.toml: {as_toml(plan.unread.values())}"
+    )
+
+
+def _usable(topic: BagTopic, samples: Samples, mappings: Sequence[UwbMapping]) -> tuple[UwbMapping, ...]:
+    """Return the mappings by which a topic is read: the user's, or known ones whose fields its messages have."""
+    if own := fitting(topic.name, topic.type, mappings):
+        return own
+    known = fitting(topic.name, topic.type, KNOWN)
+    try:
+        for message in samples(topic.name) if known else ():
+            readings_of(message, topic.name, known)
+    except MissingField:
+        return ()
+    return known
+
+
+def _topic(topics: Sequence[BagTopic], name: str) -> BagTopic:
+    """Return the topic of a name.
+
+    Raises
+    ------
+    ConfigError : there is none.
+    """
+    found = next((t for t in topics if t.name == name), None)
+    if found is None:
+        names = [t.name for t in topics]
+        near = get_close_matches(name, names, n=1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise ConfigError(f"the bag has no topic {name}; {hint}it has {', '.join(names)}")
+    return found
+
+
+def _named(topics: Sequence[BagTopic], name: str, kind: str, what: str) -> str:
+    if name and (given := _topic(topics, name)).type != kind:
+        fitting = [t.name for t in topics if t.type == kind]
+        there = f"; of that type: {', '.join(fitting)}" if fitting else ", of which the bag has none"
+        raise ConfigError(f"{name} is of type {short_type(given.type)}; {what} are read from {short_type(kind)}{there}")
+    return name
+
+
+def _check_mappings(topics: Sequence[BagTopic], mappings: Sequence[UwbMapping]) -> None:
+    """Raise ConfigError where a mapping of the user's matches no topic."""
+    for number, m in enumerate(mappings, 1):
+        if any(m.fits(t.name, t.type) for t in topics):
+            continue
+        named = [t for t in topics if UwbMapping(topic=m.topic).fits(t.name, t.type)]
+        typed = [t for t in topics if UwbMapping(type=m.type).fits(t.name, t.type)]
+        near = [t for t in topics if t.name in get_close_matches(m.topic, [t.name for t in topics], n=2)]
+        shown = [f"{t.name} of type {short_type(t.type)}" for t in (named or typed or near or topics)[:5]]
+        raise ConfigError(
+            f"uwb mapping number {number} matches nothing: topic {m.topic!r} and type {m.type!r};"
+            f" the bag has {', '.join(shown) or 'nothing besides odometry, scans and transforms'}"
+        )
+
+
+def _no_mapping(topic: BagTopic, guess: UwbMapping | None) -> str:
+    text = f"no uwb mapping reads {topic.name} of type {short_type(topic.type)}; describe it in a file for --uwb-mapping"
+    return text if guess is None else f"{text}, for a start: {as_toml([guess])}"
+
+
+def _best(topics: Sequence[BagTopic], kind: str, liked: tuple[str, ...], disliked: tuple[str, ...]) -> str:
+    """Return the likeliest topic of a type; '' where there is none."""
+
+    def rank(topic: BagTopic) -> tuple[bool, bool, int, str]:
+        name = topic.name.lower()
+        return (any(d in name for d in disliked), not any(w in name for w in liked), -topic.count, topic.name)
+
+    fitting = [t for t in topics if t.type == kind]
+    return min(fitting, key=rank).name if fitting else ""
+
+
+def _uncorrected(by_topic: dict[str, tuple[UwbMapping, ...]]) -> dict[str, tuple[UwbMapping, ...]]:
+    """Leave out X where X_raw exists: the map has its own correction."""
+    return {name: m for name, m in by_topic.items() if f"{name}_raw" not in by_topic}

@@ -1,0 +1,119 @@
+"""A mapping to begin with for messages of an unknown kind that may hold ranges, guessed from the names of their fields."""
+
+import json
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields as dataclass_fields
+from numbers import Number
+from typing import Any
+
+import numpy as np
+
+from .uwb_mapping import UwbMapping, short_type
+
+_HINT = re.compile(r"uwb|dwm?\d|rang(e|es|ing)\b|anchor|beacon|pozyx|decawave|linktrack|toa\b|twr|ultra.?wide", re.I)
+"""In the name of a topic or type: it may be about radio ranges."""
+_OTHERS = re.compile(
+    r"(action|actionlib|diagnostic|geometry|lifecycle|map|move_base|nav|rosgraph|shape|stereo|tf2|trajectory|visualization)_msgs/"
+    r"|rcl_interfaces/|dynamic_reconfigure/|tf/|sensor_msgs/(?!Range\b)"
+)
+"""Types that hold no ranges to anchors, whatever a field of theirs is called."""
+_OTHER_RANGE = re.compile(r"sonar|ultra.?sonic|infra.?red|\bir\b|cliff|bumper|proximity|altitude|height|lidar|tof", re.I)
+"""In the name of a topic of sensor_msgs/Range: not a radio."""
+_RANGE = re.compile(
+    r"((measured|raw|uwb)_)?(ranges?|distances?|dist|dis)(_?arr(ay)?)?(_?(mm|cm|m|raw|meas|met(er|re)s?))?"
+)
+"""Name of a field with a distance."""
+_ID = re.compile(
+    r"((anchor|dest(ination)?|responder|remote|target|beacon|node|peer|mac|uwb)_?)?(device_?)?(id2?|addr(ess)?|mac|dest|name)"
+)
+"""Name of a field with whom the distance leads to."""
+_NOT_ID = re.compile(r"tag|origin|source|src|requester|seq|frame|msg|message|session|own|self")
+"""In the name of a field: the other end, or something else."""
+_MOST_SAMPLES = 20
+"""Messages looked at: a list may be empty at first."""
+
+
+def suggested(topic: str, message_type: str, samples: Callable[[str], Sequence[Any]]) -> UwbMapping | None:
+    """Return a mapping for a topic that may hold ranges to anchors, None where it does not look like it.
+
+    Parameters
+    ----------
+    topic, message_type : names of both.
+    samples : gives the first messages of a topic.
+    """
+    kind = short_type(message_type)
+    hinted = _HINT.search(topic) is not None or _HINT.search(kind) is not None
+    if kind == "sensor_msgs/Range":
+        return None if _OTHER_RANGE.search(topic) else UwbMapping(topic=topic, type=kind, anchor=_word_of_topic(topic))
+    if _OTHERS.match(kind) or (kind.startswith("std_msgs/") and not hinted):
+        return None
+    for message in list(samples(topic))[:_MOST_SAMPLES]:
+        for path, reading in _readings(message):
+            if (found := _mapping(reading, kind, hinted)) is not None:
+                stamp = "header.stamp" if hasattr(message, "header") else ""
+                return UwbMapping(topic, kind, path, **found, stamp=stamp)
+    return UwbMapping(topic, kind, anchor="?", range="?") if hinted and not kind.startswith("std_msgs/") else None
+
+
+def as_toml(mappings: Iterable[UwbMapping]) -> str:
+    """Return mappings as one line of TOML, with the fields that are not as they are by themselves."""
+    plain = UwbMapping()
+    tables = []
+    for m in mappings:
+        names = [f.name for f in dataclass_fields(m)]
+        changed = [n for n in names if n in ("anchor", "range") or getattr(m, n) != getattr(plain, n)]
+        tables.append("{ " + ", ".join(f"{name} = {json.dumps(getattr(m, name))}" for name in changed) + " }")
+    return f"uwb = [{', '.join(tables)}]"
+
+
+def _readings(message: Any) -> list[tuple[str, Any]]:
+    """Return the message itself and the first entry of each list of messages in it, with its path."""
+    found = [("", message)]
+    for name, value in _fields(message):
+        if isinstance(value, list | tuple) and value and hasattr(value[0], "__dataclass_fields__"):
+            found.append((name, value[0]))
+    return found
+
+
+def _mapping(reading: Any, kind: str, hinted: bool) -> dict[str, Any] | None:
+    """Return anchor, range and unit of a reading, None where no field looks like a range of something."""
+    values = dict(_fields(reading))
+    ranges = [name for name in values if _RANGE.fullmatch(name.lower()) or kind.startswith("std_msgs/")]
+    lists = [name for name in ranges if _is_list(values[name])]
+    single = [name for name in ranges if isinstance(values[name], Number)]
+    ids = [name for name, v in values.items() if isinstance(v, str | Number) and _is_id(name)]
+    ids.sort(key=lambda name: (name.lower() == "id", _NOT_ID.search(name.lower()) is not None))
+    if single and ids:
+        return {"anchor": ids[0], "range": single[0], "unit": _unit(single[0], values[single[0]])}
+    if lists:
+        return {"anchor": "index", "range": lists[0], "unit": _unit(lists[0], values[lists[0]][0])}
+    if hinted and kind in ("std_msgs/Float32", "std_msgs/Float64"):
+        return {"anchor": "topic:([^/]+)$", "range": "data"}
+    return None
+
+
+def _fields(message: Any) -> list[tuple[str, Any]]:
+    names = [n for n in getattr(message, "__dataclass_fields__", {}) if not n.startswith("_")]
+    return [(name, getattr(message, name)) for name in names]
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.ndim == 1 and len(value) > 0 and value.dtype.kind in "fiu"
+
+
+def _is_id(name: str) -> bool:
+    return _ID.fullmatch(name.lower()) is not None and _NOT_ID.match(name.lower()) is None
+
+
+def _unit(name: str, value: Any) -> float:
+    """Return metres per unit: as the name says, and millimetres for whole numbers."""
+    if name.lower().endswith("cm"):
+        return 0.01
+    return 0.001 if name.lower().endswith("mm") or isinstance(value, int | np.integer) else 1.0
+
+
+def _word_of_topic(topic: str) -> str:
+    """Return where the anchor's name stands in a topic: the last word, or the one before a general one."""
+    general = topic.rsplit("/", 1)[-1] in ("range", "distance", "dist", "data", "raw")
+    return "topic:([^/]+)/[^/]+$" if general and topic.count("/") > 1 else "topic:([^/]+)$"
