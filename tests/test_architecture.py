@@ -15,7 +15,7 @@ PACKAGE = Path(uwblite.__file__).parent
 MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    ("errors", "arrays", "parallel"),
+    ("errors", "printable", "arrays", "parallel"),
     ("se2",),
     ("config", "sensor_log", "graph", "drivers"),
     ("constraints", "keyframes", "grid"),

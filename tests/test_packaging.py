@@ -52,7 +52,7 @@ def test_the_wheel_is_pure_and_complete(built):
     needed = {re.split(r"[<>=;\s]", r)[0] for r in metadata.get_all("Requires-Dist") if "extra" not in r}
     assert needed == {"numpy", "scipy", "pyserial"}
     assert not [r for r in metadata.get_all("Requires-Dist") if "<" in r.split(";")[0]]
-    assert "uwblite = uwblite.cli:main" in entry
+    assert "uwblite = uwblite.__main__:start" in entry
 
 
 def test_the_sdist_builds_the_same_wheel(built, tmp_path):

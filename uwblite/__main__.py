@@ -1,8 +1,26 @@
-"""``python -m uwblite``: the same as the ``uwblite`` command."""
+"""``python -m uwblite`` and the command ``uwblite``."""
 
+import os
+import signal
 import sys
+from typing import Any, NoReturn
 
-from .cli import main
+
+def start() -> int:
+    """Run the command line; Ctrl-C while nothing has begun, or once all is done, ends it without a traceback."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _leave)
+    from .cli import main
+
+    return main()
+
+
+def _leave(_number: int, _frame: Any) -> NoReturn:
+    try:
+        os.write(2, b"uwblite: interrupted\n")
+    finally:
+        os._exit(130)
+
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(start())

@@ -6,16 +6,20 @@ errors answer at once on a small computer. This package alone prints, and this f
 """
 
 import argparse
+import os
 import re
+import signal
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, NoReturn
 
 from .. import __version__
 from ..errors import UwbliteError
+from ..printable import printable
 
 VERBS = ("map", "localize", "check", "record", "devices", "convert", "evaluate", "optimize", "config")
 """In the order in which a user meets them; `uwblite VERB` is the module of the same name."""
@@ -50,6 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     ----------
     argv : arguments without the program's name; None = those of this process.
     """
+    _open_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     verb = next((word for word in words if not word.startswith("-")), None)
     if verb is None:
@@ -61,18 +66,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = _verb_parser(verb, module).parse_args(words)
     except SystemExit as leave:
-        return int(leave.code or 0)
+        return _flushed(int(leave.code or 0))
     return _run(module, args)
 
 
+def _open_streams() -> None:
+    """Send what would go to a closed stdout or stderr to nowhere: the work is done all the same.
+
+    Their numbers are taken, so that no file gets one of them and, with it, what is meant for a stream.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+
+
 def _without_verb(words: list[str]) -> int:
+    from . import console
+
     if "--version" in words:
-        sys.stdout.write(f"uwblite {__version__}\n")
-        return 0
+        console.say(f"uwblite {__version__}")
+        return _flushed(0)
     parser = _overview()
     if not words or "-h" in words or "--help" in words:
-        (sys.stdout if words else sys.stderr).write(parser.format_help())
-        return 0 if words else 2
+        console.write(sys.stdout if words else sys.stderr, parser.format_help())
+        return _flushed(0 if words else 2)
     return _usage_error(f"{words[0]} needs a command before or after it")
 
 
@@ -92,6 +114,11 @@ def _overview() -> argparse.ArgumentParser:
 class _VerbParser(argparse.ArgumentParser):
     """A parser whose errors are short: what is wrong, what may have been meant, where the options stand."""
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        from . import console
+
+        console.write(file or sys.stderr, message)
+
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and leave with code 2."""
         name, _, wrong = message.partition(": ")
@@ -100,7 +127,7 @@ class _VerbParser(argparse.ArgumentParser):
             near = get_close_matches(word, self._option_string_actions, n=1)
             message = f"unknown option {word}" if word.startswith("-") else f"one argument too many: {word}"
             message += f"; did you mean {near[0]}?" if near else ""
-        self.exit(2, f"{self.prog}: error: {message}\n`{self.prog} --help` shows the options, examples first\n")
+        self.exit(2, f"{self.prog}: error: {printable(message)}\n`{self.prog} --help` shows the options, examples first\n")
 
 
 def _verb_parser(verb: str, module: Any) -> argparse.ArgumentParser:
@@ -125,12 +152,58 @@ def _run(module: Any, args: argparse.Namespace) -> int:
     from . import console
 
     console.set_up(quiet=args.quiet, verbose=args.verbose)
+    with _interruptible() as interrupted:
+        code = _carry_out(module, args, interrupted)
+    return _flushed(code)
+
+
+def _flushed(code: int) -> int:
+    """Return an exit code once all that was said is out; 1 where stdout could not take it."""
+    from . import console
+
+    return code if console.flush() else 1
+
+
+@contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """Let the first Ctrl-C raise KeyboardInterrupt, so that nothing is left half done, and a second one end the program.
+
+    The list holds the signal once it came: what it interrupts in a library may come out as another error.
+    """
+    came: list[int] = []
+
+    def interrupt(number: int, _frame: Any) -> None:
+        if came:
+            os._exit(130)
+        came.append(number)
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.getsignal(signal.SIGINT)
+        if before is signal.SIG_IGN:
+            yield came
+            return
+        signal.signal(signal.SIGINT, interrupt)
+    except ValueError:
+        # Not the main thread: signals are somebody else's.
+        yield came
+        return
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) -> int:
+    """Run a verb and turn its errors into exit codes."""
+    from . import console
+
     try:
         with warnings.catch_warnings():
             if not args.debug:
                 # numpy's remarks on overflows say nothing to a user; what comes of them is told in our own words.
                 warnings.simplefilter("ignore", RuntimeWarning)
-            code = int(module.run(args))
+            return int(module.run(args))
     except KeyboardInterrupt:
         return console.fail("interrupted", 130)
     except UwbliteError as error:
@@ -140,14 +213,17 @@ def _run(module: Any, args: argparse.Namespace) -> int:
     except OSError as error:
         return console.fail(console.os_error_text(error), 1, trace=args.debug)
     except Exception as error:
+        if interrupted:
+            return console.fail("interrupted", 130)
         text = f"internal error: {type(error).__name__}: {error} (please report it; --debug shows where)"
         return console.fail(text, 1, trace=args.debug)
-    return code if console.flush() else 1
 
 
 def _usage_error(text: str) -> int:
-    sys.stderr.write(f"uwblite: error: {text}\nuwblite --help lists the commands\n")
-    return 2
+    from . import console
+
+    console.write(sys.stderr, f"uwblite: error: {printable(text)}\nuwblite --help lists the commands\n")
+    return _flushed(2)
 
 
 def _did_you_mean(verb: str) -> str:

@@ -28,5 +28,5 @@ def run(args: argparse.Namespace) -> int:
 
     config = effective_config(args)
     header = f"uwblite settings{f', preset {args.preset}' if args.preset else ''}; use with: uwblite map LOG --config FILE"
-    console.say(to_toml(config, comments=not args.no_comments, header=header).rstrip("\n"))
+    console.say_lines(to_toml(config, comments=not args.no_comments, header=header).rstrip("\n"))
     return 0

@@ -1,6 +1,7 @@
 """What the command line says: results on stdout, everything else on stderr, a progress bar on a terminal.
 
-A reader that leaves early (``uwblite map ... | head -1``) does not stop the work: what it no longer reads is dropped.
+A reader that leaves early (``uwblite map ... | head -1``) does not stop the work: what it no longer reads is dropped. Nor
+does a full disk behind stdout, which is told at the end. No line holds what a terminal would obey, whatever a file is named.
 """
 
 import logging
@@ -9,6 +10,8 @@ import sys
 import time
 import traceback
 from typing import Any, TextIO
+
+from ..printable import encodable, printable
 
 _LOGGER = logging.getLogger("uwblite")
 
@@ -19,6 +22,8 @@ class _Console:
     def __init__(self) -> None:
         self.quiet = False
         self.bar: Progress | None = None
+        self.lost = ""
+        """Why stdout did not take what was said; empty = it did."""
 
 
 _CONSOLE = _Console()
@@ -36,24 +41,29 @@ def set_up(*, quiet: bool = False, verbose: int = 0) -> None:
 
 def say(text: str = "") -> None:
     """Write one line of the result to stdout."""
+    say_lines(printable(text))
+
+
+def say_lines(text: str) -> None:
+    """Write lines of our own making to stdout."""
     _clear_bar()
-    _write(sys.stdout, text + "\n")
+    write(sys.stdout, text + "\n")
 
 
 def note(text: str) -> None:
     """Write one line beside the result to stderr; --quiet drops it."""
     if not _CONSOLE.quiet:
         _clear_bar()
-        _write(sys.stderr, text + "\n")
+        write(sys.stderr, printable(text) + "\n")
 
 
 def fail(text: str, code: int, *, trace: bool = False) -> int:
     """Write one line about what went wrong to stderr and return the exit code."""
     _clear_bar()
     if trace:
-        _write(sys.stderr, traceback.format_exc())
-    _write(sys.stderr, "uwblite: error: " + " ".join(text.split()) + "\n" if code != 130 else f"uwblite: {text}\n")
-    flush()
+        write(sys.stderr, traceback.format_exc())
+    head = "uwblite: " if code == 130 else "uwblite: error: "
+    write(sys.stderr, head + printable(" ".join(text.split())) + "\n")
     return code
 
 
@@ -78,28 +88,35 @@ def _name_of(number: int | None) -> str:
 
 def flush() -> bool:
     """Push out what was said; False where stdout could not take it (disk full, not a closed pipe)."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        _drop(sys.stdout)
-    except OSError as error:
-        _drop(sys.stdout)
-        _write(sys.stderr, f"uwblite: error: stdout: {os_error_text(error)}\n")
-        return False
-    return True
+    _flush(sys.stdout)
+    _flush(sys.stderr)
+    lost, _CONSOLE.lost = _CONSOLE.lost, ""
+    if lost:
+        write(sys.stderr, f"uwblite: error: stdout: {lost}\n")
+    return not lost
 
 
-def _write(stream: TextIO, text: str) -> None:
+def write(stream: TextIO, text: str) -> None:
+    """Write text as it is; a stream that cannot take it gets nothing from then on (see `flush`)."""
     try:
         stream.write(text)
     except UnicodeEncodeError:
         stream.write(text.encode(stream.encoding or "ascii", "replace").decode(stream.encoding or "ascii"))
-    except BrokenPipeError:
-        _drop(stream)
+    except OSError as error:
+        _drop(stream, error)
 
 
-def _drop(stream: TextIO) -> None:
+def _flush(stream: TextIO) -> None:
+    try:
+        stream.flush()
+    except OSError as error:
+        _drop(stream, error)
+
+
+def _drop(stream: TextIO, error: OSError) -> None:
     """Send the rest of a stream that nobody reads to nowhere."""
+    if stream is sys.stdout and not isinstance(error, BrokenPipeError):
+        _CONSOLE.lost = os_error_text(error)
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
     except (OSError, ValueError):
@@ -140,9 +157,9 @@ class Progress:
         self._draw(progress_line(stage, done, total, now - self.began))
 
     def _draw(self, line: str) -> None:
-        line = line[: self._columns() - 1]
-        _write(self.stream, "\r" + line + " " * (self.width - len(line)))
-        self.stream.flush()
+        line = printable(line)[: self._columns() - 1]
+        write(self.stream, "\r" + line + " " * (self.width - len(line)))
+        _flush(self.stream)
         self.width = len(line)
 
     def _columns(self) -> int:
@@ -154,8 +171,8 @@ class Progress:
     def clear(self) -> None:
         """Wipe the bar, so that a line can be written in its place."""
         if self.active and self.width:
-            _write(self.stream, "\r" + " " * self.width + "\r")
-            self.stream.flush()
+            write(self.stream, "\r" + " " * self.width + "\r")
+            _flush(self.stream)
             self.width = 0
 
     def close(self) -> None:
@@ -189,17 +206,19 @@ def say_json(value: Any) -> None:
     """Write one JSON object to stdout; numbers that are not finite become null."""
     import json
 
-    say(json.dumps(plain(value), indent=2, allow_nan=False))
+    say_lines(json.dumps(plain(value), indent=2, allow_nan=False))
 
 
 def plain(value: Any) -> Any:
     """Return a value as JSON has it: arrays as lists, numbers that are not finite as None."""
     if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {encodable(str(k)): plain(v) for k, v in value.items()}
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
+    if isinstance(value, str):
+        return encodable(value)
     if isinstance(value, float):
         return value if abs(value) < float("inf") else None
     return value

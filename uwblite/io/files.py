@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import BinaryIO
 
+from ..printable import encodable
+
 WAITING = ".uwblite-partial-"
 """In the name of a folder whose files are forced to the disk all at once, before it takes its place; see folders.py."""
 
@@ -57,7 +59,7 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a whole UTF-8 file with Unix line ends, or leave the previous one untouched (see `replacing`)."""
-    write_bytes(path, text.encode())
+    write_bytes(path, encodable(text).encode())
 
 
 def sync_folder(folder: str | os.PathLike[str]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..map_result import MapResult
+from ..printable import encodable
 from ..sensor_log import LogNotes, SensorLog
 
 SCHEMA = 1
@@ -181,11 +182,13 @@ def _closure_entry(closure: Any, stamps: NDArray[np.float64]) -> dict[str, Any]:
 def _ready(value: Any) -> Any:
     """Return a value as JSON has it: nine significant digits, null where it is not finite."""
     if isinstance(value, dict):
-        return {str(k): _ready(v) for k, v in value.items()}
+        return {encodable(str(k)): _ready(v) for k, v in value.items()}
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if isinstance(value, list | tuple):
         return [_ready(v) for v in value]
+    if isinstance(value, str):
+        return encodable(value)
     if isinstance(value, float):
         return float(f"{value:.9g}") if np.isfinite(value) else None
     return value

@@ -7,18 +7,24 @@ from elsewhere, and its script reads only the page itself.
 import re
 from collections import Counter
 from collections.abc import Sequence
-from html import escape
+from html import escape as escape_markup
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats, Ints
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
+from ..printable import printable
 from .page import PAGE, SCRIPT, STYLE
 from .svg_map import draw, number, shown_closures, sigma, thin
 
 MOST_RESIDUALS = 1500
 """Residuals of one anchor drawn at most."""
+
+
+def escape(text: str) -> str:
+    """Return text without markup and without what cannot be printed."""
+    return escape_markup(printable(text))
 
 
 def render(
