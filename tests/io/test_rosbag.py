@@ -68,7 +68,7 @@ def test_topics_are_listed_and_wrong_ones_refused(tmp_path):
         read_bag(tmp_path / "bag", BagTopics(uwb=("/odom",)))
     with pytest.raises(ConfigError, match=r"/scan is of type sensor_msgs/LaserScan; odometry .* nav_msgs/Odometry.*: /odom"):
         read_bag(tmp_path / "bag", BagTopics(odometry="/scan"))
-    with pytest.raises(ConfigError, match=r"no frame base_lnk; did you mean base_link\? they know base_link, laser, uwb_tag"):
+    with pytest.raises(ConfigError, match=r"no frame base_lnk; did you mean base_link\? they know .*, odom, uwb_tag"):
         read_bag(tmp_path / "bag", BagTopics(base_frame="base_lnk"))
     one = read_bag(tmp_path / "bag", BagTopics(uwb=("/uwb/anchor_5C0B/range",)))
     assert one.ranges.anchor_ids == ("5C0B",)

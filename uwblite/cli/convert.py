@@ -7,9 +7,10 @@ from ..errors import ConfigError
 from .options import add_bag_arguments, add_mounting_arguments, number
 
 if TYPE_CHECKING:
+    from ..arrays import Floats
     from ..sensor_log import SensorLog
 
-HELP = "convert recordings (CARMEN log, ROS 1/2 bag, CSV folder) and pose graphs (g2o, TORO, PyFG)"
+HELP = "convert recordings (CARMEN log, ROS 1/2 bag, CSV folder), maps, trajectories and pose graphs (g2o, TORO, PyFG)"
 EPILOG = """\
 examples:
   uwblite convert record.bag run.log.gz                ROS 1 bag, ROS 2 folder, .mcap or .db3 -> log
@@ -17,13 +18,17 @@ examples:
   uwblite convert record.bag run.log --uwb-mapping uwb.toml --scan-topic /scan
   uwblite convert run.log tables/                      -> odometry.csv, ranges.csv, scans.csv, sensors.toml
   uwblite convert tables/ run.log --odometry-unit 0.001
-  uwblite convert run.log bag/ --to mcap               -> ROS 2 bag (MCAP or sqlite3)
+  uwblite convert run.log run.mcap                     -> ROS 2 bag, one file; bag/ --to sqlite3 or mcap: a folder
   uwblite convert run.log part.log --start 60 --end 120
   uwblite convert graph.g2o graph.pyfg
+  uwblite convert map/ map.mcap --recording run.log    a map for Foxglove and RViz: /map, tf, path, anchors, closures
+  uwblite convert map/ scans.g2o --recording run.log   its pose graph with the scans (ROBOTLASER1)
+  uwblite convert map/ path.kitti                      trajectories: .tum and .kitti, as evo reads them; run.log too
 
 bags need the package rosbags, in the environment of uwblite (without it the error gives the command)
 """
-_TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg")
+_RECORDINGS = ("log", "csv", "mcap", "sqlite3", "tum", "kitti")
+_TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg", "tum", "kitti")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", nargs="?", help="what to make; its name tells the format, or --to does")
     parser.add_argument("--to", choices=_TARGETS, help="format of the target where its name does not tell")
     parser.add_argument("--force", action="store_true", help="replace a file that is already there")
+    text = "recording that a map was made of, for its scans and odometry; repeatable, in their order"
+    parser.add_argument("--recording", metavar="LOG", action="append", default=[], help=text)
     parser.add_argument("--list", action="store_true", help="list the topics of a bag and stop")
     add_bag_arguments(parser)
     part = parser.add_argument_group("part and units")
@@ -54,9 +61,25 @@ def run(args: argparse.Namespace) -> int:
         return _list(args, kind)
     if not args.target:
         raise ConfigError("name a target: uwblite convert SOURCE TARGET")
+    to = _target_format(args)
+    if args.recording and kind != "map":
+        raise ConfigError(f"--recording goes with a map, and {args.source} is none")
     if kind in ("g2o", "pyfg"):
         return _convert_graph(args)
-    return _convert_recording(args)
+    if kind == "map":
+        return _convert_map(args, to)
+    if kind in ("tum", "kitti"):
+        return _convert_trajectory(args, to)
+    return _convert_recording(args, to)
+
+
+def _target_format(args: argparse.Namespace) -> str:
+    """Return the format that --to or the target's name tells; '' where neither does."""
+    from .formats import format_of
+
+    if args.to:
+        return str(args.to)
+    return "mcap" if args.target.endswith(".mcap") else format_of(args.target)
 
 
 def _list(args: argparse.Namespace, kind: str) -> int:
@@ -92,14 +115,62 @@ def _convert_graph(args: argparse.Namespace) -> int:
     return 0
 
 
-def _convert_recording(args: argparse.Namespace) -> int:
+def _convert_map(args: argparse.Namespace, to: str) -> int:
+    from ..io.graph_scans import write_graph_with_scans
+    from ..io.result_bag import write_result_bag
+    from ..io.stored_result import read_result
     from . import console
-    from .formats import format_of, read_recording, refuse_existing
+    from .formats import read_recording, refuse_existing
     from .options import apply_mounting, bag_choices
 
-    to = args.to or format_of(args.target)
-    if to in ("", "bag", "g2o", "pyfg"):
-        hint = "a ROS 1 bag cannot be written; use --to mcap" if to == "bag" else "use --to log, csv, mcap or sqlite3"
+    if to not in ("mcap", "sqlite3", "g2o", "tum", "kitti"):
+        raise ConfigError(f"{args.target}: not a format for a map; use --to mcap, sqlite3, g2o, tum or kitti")
+    refuse_existing(args.force, args.target)
+    result = read_result(args.source)
+    if to in ("tum", "kitti"):
+        if len(result.trajectories) > 1:
+            console.note(f"uwblite: {args.source} holds {len(result.trajectories)} trajectories; this is the first of them")
+        return _say_trajectory(args.target, to, *result.trajectories[0])
+    logs = [apply_mounting(read_recording(name, bag=bag_choices(args)), args) for name in args.recording]
+    if to == "g2o":
+        scans = write_graph_with_scans(args.target, result, logs)
+        console.say(f"{args.target}: {len(result.keyframe_stamps)} poses, {scans} with a scan")
+        return 0
+    write_result_bag(args.target, result, logs, storage=to)
+    without = "" if logs else " (without scans and odometry: --recording adds them)"
+    counts = f"{len(result.anchors)} anchors, {len(result.closures)} closures"
+    console.say(f"{args.target}: map, transforms, path, {counts}{without}")
+    return 0
+
+
+def _convert_trajectory(args: argparse.Namespace, to: str) -> int:
+    from ..io.tum import read_tum
+    from .formats import format_of, refuse_existing
+
+    if format_of(args.source) == "kitti":
+        raise ConfigError(f"{args.source}: KITTI poses have no times; only TUM files are read")
+    if to not in ("tum", "kitti"):
+        raise ConfigError(f"{args.target}: not a format for a trajectory; use --to tum or kitti")
+    refuse_existing(args.force, args.target)
+    return _say_trajectory(args.target, to, *read_tum(args.source))
+
+
+def _say_trajectory(path: str, to: str, stamps: "Floats", poses: "Floats") -> int:
+    from ..io.tum import write_trajectory
+    from . import console
+
+    write_trajectory(path, to, stamps, poses)
+    console.say(f"{path}: {len(poses)} poses")
+    return 0
+
+
+def _convert_recording(args: argparse.Namespace, to: str) -> int:
+    from . import console
+    from .formats import read_recording, refuse_existing
+    from .options import apply_mounting, bag_choices
+
+    if to in ("", "bag", "g2o", "pyfg", "map"):
+        hint = "a ROS 1 bag cannot be written; use --to mcap" if to == "bag" else f"use --to {', '.join(_RECORDINGS)}"
         raise ConfigError(f"{args.target}: not a format for a recording; {hint}")
     refuse_existing(args.force, args.target)
     log = apply_mounting(_scaled(read_recording(args.source, bag=bag_choices(args)), args), args)
@@ -120,6 +191,10 @@ def _write(args: argparse.Namespace, to: str, log: "SensorLog") -> None:
         from ..io.carmen import write_log
 
         write_log(args.target, log)
+    elif to in ("tum", "kitti"):
+        from ..io.tum import write_trajectory
+
+        write_trajectory(args.target, to, log.odometry.stamps, log.odometry.poses)
     elif to == "csv":
         from ..io.csv_folder import write_csv_folder
 

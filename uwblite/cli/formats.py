@@ -16,17 +16,20 @@ if TYPE_CHECKING:
 GRAPHS = {".g2o": "g2o", ".graph": "g2o", ".toro": "g2o", ".pyfg": "pyfg"}
 """TORO files are told from g2o by their tags."""
 LOGS = {".log": "log", ".clf": "log", ".bag": "bag", ".mcap": "bag", ".db3": "bag"}
+TRAJECTORIES = {".tum": "tum", ".kitti": "kitti"}
 
 
 def format_of(path: str) -> str:
-    """Return 'log', 'bag', 'csv', 'g2o' or 'pyfg'; '' where the name does not tell."""
+    """Return 'log', 'bag', 'csv', 'g2o', 'pyfg', 'tum', 'kitti' or 'map' (a result); '' where the name does not tell."""
     if os.path.isdir(path):
+        if os.path.exists(os.path.join(path, "trajectory.tum")):
+            return "map"
         if os.path.exists(os.path.join(path, "odometry.csv")):
             return "csv"
         return "bag" if os.path.exists(os.path.join(path, "metadata.yaml")) else ""
     stem = path.removesuffix(".gz")
     ending = os.path.splitext(stem)[1].lower()
-    return "log" if path == "-" else "csv" if path.endswith(os.sep) else (GRAPHS | LOGS).get(ending, "")
+    return "log" if path == "-" else "csv" if path.endswith(os.sep) else (GRAPHS | LOGS | TRAJECTORIES).get(ending, "")
 
 
 def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" = None) -> "SensorLog":

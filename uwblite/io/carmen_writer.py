@@ -37,7 +37,7 @@ def write_log(path: str | os.PathLike[str], log: SensorLog) -> None:
         stream.write(b"# CARMEN Logfile\n")
         for name, value in _params(log):
             stream.write(f"PARAM {name} {value} 0 {HOST} 0\n".encode())
-        sources = [_odometry_lines(log), _range_lines(log), _scan_lines(log)]
+        sources = [_odometry_lines(log), _range_lines(log), scan_lines(log)]
         none = np.zeros(0)
         stamps = [log.odometry.stamps, log.ranges.stamps if log.ranges else none, log.scans.stamps if log.scans else none]
         kind = np.repeat(np.arange(3), [len(s) for s in stamps])
@@ -76,7 +76,8 @@ def _range_lines(log: SensorLog) -> Iterator[bytes]:
         yield f"UWB {name} {distance:.4f} {quality:g} {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
 
 
-def _scan_lines(log: SensorLog) -> Iterator[bytes]:
+def scan_lines(log: SensorLog) -> Iterator[bytes]:
+    """Yield the ROBOTLASER1 line of each scan; g2o attaches such lines to the vertex above them."""
     scans = log.scans
     if scans is None:
         return

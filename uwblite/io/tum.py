@@ -1,4 +1,4 @@
-"""Trajectories as TUM text, as evo reads it: ``timestamp tx ty tz qx qy qz qw``, seconds and metres, one pose a line."""
+"""Trajectories as evo reads them: TUM text, ``timestamp tx ty tz qx qy qz qw``, and KITTI text, a pose matrix a line."""
 
 import os
 
@@ -25,6 +25,21 @@ def write_tum(path: str | os.PathLike[str], stamps: Floats, poses: Floats) -> No
     # + 0.0 turns a negative zero into zero, so that equal poses look equal.
     text = "".join(f"{t:.6f} {x + 0.0:.6f} {y + 0.0:.6f} 0 0 0 {s + 0.0:.9f} {c:.9f}\n" for t, x, y, s, c in rows)
     write_bytes(path, text.encode())
+
+
+def write_kitti(path: str | os.PathLike[str], poses: Floats) -> None:
+    """Write planar poses (n, 3) as KITTI text: the upper three rows of the 4 x 4 pose matrix, row by row; no times."""
+    rows = zip(poses[:, :2].tolist(), np.cos(poses[:, 2]).tolist(), np.sin(poses[:, 2]).tolist(), strict=True)
+    text = "".join(f"{c:.9f} {-s + 0.0:.9f} 0 {x:.6f} {s:.9f} {c:.9f} 0 {y:.6f} 0 0 1 0\n" for (x, y), c, s in rows)
+    write_bytes(path, text.encode())
+
+
+def write_trajectory(path: str | os.PathLike[str], kind: str, stamps: Floats, poses: Floats) -> None:
+    """Write stamps (n,) and poses (n, 3) as 'tum' or 'kitti'."""
+    if kind == "tum":
+        write_tum(path, stamps, poses)
+    else:
+        write_kitti(path, poses)
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:

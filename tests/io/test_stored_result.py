@@ -1,0 +1,73 @@
+"""A result that was written is read back as it was."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers.results import small_log, small_result
+
+from uwblite.errors import FormatError
+from uwblite.io.result_text import RunRecord
+from uwblite.io.results import write_result
+from uwblite.io.stored_result import read_result
+
+
+@pytest.fixture(params=[1, 2])
+def written(request, tmp_path):
+    result = small_result(sessions=request.param)
+    write_result(tmp_path / "map", [small_log()] * request.param, result, RunRecord("uwblite map x", ""))
+    return result, tmp_path / "map"
+
+
+def test_everything_comes_back(written):
+    result, folder = written
+    back = read_result(folder)
+    assert len(back.trajectories) == len(np.unique(result.session))
+    np.testing.assert_allclose(np.concatenate([p for _, p in back.trajectories])[:, :2], result.trajectory[:, :2], atol=1e-6)
+    np.testing.assert_allclose(back.keyframe_covariances, result.keyframe_covariances, rtol=1e-5)
+    np.testing.assert_allclose(back.keyframe_stamps, result.keyframe_stamps, atol=1e-6)
+    np.testing.assert_array_equal(back.keyframe_recordings, result.keyframe_session + 1)
+    assert [a.id for a in back.anchors] == [a.id for a in result.anchors]
+    for one, two in zip(back.anchors, result.anchors, strict=True):
+        np.testing.assert_allclose(one.position, two.position, atol=1e-6)
+        np.testing.assert_allclose(one.covariance, two.covariance, atol=1e-6)
+    assert [c.accepted for c in back.closures] == [c.accepted for c in result.closures]
+    for one, two in zip(back.closures, result.closures, strict=True):
+        np.testing.assert_allclose(one.places, result.trajectory[[two.i, two.j], :2], atol=1e-6)
+    np.testing.assert_array_equal(back.grid.states(), result.grid.states())
+
+
+def test_what_is_no_result_is_one_clear_error(tmp_path):
+    with pytest.raises(FormatError, match="holds no result of uwblite map"):
+        read_result(tmp_path)
+
+
+def test_a_damaged_report_is_named_and_a_missing_one_is_none(written):
+    folder = written[1]
+    (folder / "report.json").write_text("{")
+    with pytest.raises(FormatError, match=r"report.json.*no JSON"):
+        read_result(folder)
+    (folder / "report.json").write_text("[]")
+    with pytest.raises(FormatError, match="not a report"):
+        read_result(folder)
+    (folder / "report.json").unlink()
+    assert read_result(folder).closures == ()
+
+
+def test_closures_of_unknown_keyframes_are_left_out(written):
+    folder = written[1]
+    report = json.loads((folder / "report.json").read_text())
+    report["closures"][0]["i"] = 10_000
+    (folder / "report.json").write_text(json.dumps(report))
+    assert len(read_result(folder).closures) == 2
+
+
+def test_tables_that_do_not_fit_are_named(written):
+    folder = written[1]
+    table = (folder / "trajectory_covariance.csv").read_text()
+    (folder / "trajectory_covariance.csv").write_text(table.replace(",1\n", ",7\n"))
+    with pytest.raises(FormatError, match="recording 7"):
+        read_result(folder)
+    (folder / "trajectory_covariance.csv").write_text(table.replace("1000.000000", "soon"))
+    with pytest.raises(FormatError, match="'soon', not a time"):
+        read_result(folder)

@@ -1,0 +1,166 @@
+"""A result that `uwblite map` has written, read back: for other formats, for the local page, for planning anchors."""
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats, Ints
+from ..errors import FormatError
+from ..grid.occupancy_grid import OccupancyGrid
+from .csv_table import read_csv
+from .map_server import read_map
+from .results import mend_result
+from .tum import read_tum
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredAnchor:
+    """An anchor of a result."""
+
+    id: str
+    position: Floats
+    """(2,) m, map frame; nan where it has none."""
+    covariance: Floats
+    """(2, 2) m^2."""
+    status: str
+    """'ok', 'mirror-ambiguous', 'unplaced' or 'distrusted'."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredClosure:
+    """A candidate of a loop closure."""
+
+    stamps: tuple[float, float]
+    """s, each on the clock of its recording."""
+    recordings: tuple[int, int]
+    """Counted from 1."""
+    places: Floats
+    """(2, 2) m, map frame: where the robot was at both times."""
+    accepted: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredResult:
+    """The folder that `uwblite map` wrote."""
+
+    folder: Path
+    trajectories: tuple[tuple[Floats, Floats], ...]
+    """Of each recording: stamps (n,) s, poses (n, 3) m, m, rad, map frame."""
+    keyframe_stamps: Floats
+    """(k,) s."""
+    keyframe_recordings: Ints
+    """(k,) counted from 1."""
+    keyframe_covariances: Floats
+    """(k, 3, 3) m, m, rad, map frame."""
+    anchors: tuple[StoredAnchor, ...]
+    closures: tuple[StoredClosure, ...]
+    grid: OccupancyGrid | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+    """report.json, as it stands there; empty where there is none."""
+
+    def pose_at(self, recording: int, stamps: Floats) -> Floats:
+        """Return the poses (..., 3) of a recording, counted from 1, at times of its clock, s."""
+        return se2.interpolate_trajectory(*self.trajectories[recording - 1], stamps)
+
+
+def read_result(folder: str | os.PathLike[str]) -> StoredResult:
+    """Read a result.
+
+    Raises
+    ------
+    FormatError : the folder holds none, or a file in it is not what it should be.
+    """
+    path = Path(folder)
+    mend_result(path)
+    if not (path / "trajectory.tum").is_file():
+        raise FormatError("holds no result of uwblite map (no trajectory.tum)", os.fspath(path))
+    later = (path / f"trajectory_{k}.tum" for k in range(2, 1 + len(list(path.glob("trajectory*.tum")))))
+    trajectories = tuple(read_tum(p) for p in (path / "trajectory.tum", *(p for p in later if p.is_file())))
+    report = _report(path / "report.json")
+    stamps, recordings, covariances = _keyframes(path / "trajectory_covariance.csv", len(trajectories))
+    result = StoredResult(
+        path,
+        trajectories,
+        stamps,
+        recordings,
+        covariances,
+        _anchors(path / "anchors.csv"),
+        (),
+        read_map(path / "map.yaml") if (path / "map.yaml").is_file() else None,
+        report,
+    )
+    return _with_closures(result)
+
+
+def _report(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise FormatError(f"is no JSON ({error})", os.fspath(path)) from None
+    if not isinstance(content, dict):
+        raise FormatError("is not a report of uwblite map", os.fspath(path))
+    return content
+
+
+def _keyframes(path: Path, recordings: int) -> tuple[Floats, Ints, Floats]:
+    """Return stamps (k,), recordings (k,) and covariances (k, 3, 3) of the keyframes; none where the file is missing."""
+    if not path.is_file():
+        return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3, 3))
+    table = read_csv(path)
+    # Stamps are times since 1970 in many recordings: too large for the lengths that a table is checked for.
+    stamps = np.array([_stamp(text, table.path, line) for text, line in zip(table.texts("stamp"), table.lines, strict=True)])
+    upper = table.numbers("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
+    covariances = np.empty((len(upper), 3, 3))
+    row, col = np.triu_indices(3)
+    covariances[:, row, col] = covariances[:, col, row] = upper
+    number = table.numbers("recording", default=1.0)[:, 0].astype(np.int64)
+    if len(number) and not 1 <= number.min() <= number.max() <= recordings:
+        raise FormatError(f"names recording {number.max()}; the folder holds {recordings} trajectories", table.path)
+    return stamps, number, covariances
+
+
+def _stamp(text: str, path: str, line: int) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise FormatError(f"stamp is {text[:40]!r}, not a time", path, line)
+    return value
+
+
+def _anchors(path: Path) -> tuple[StoredAnchor, ...]:
+    if not path.is_file():
+        return ()
+    table = read_csv(path)
+    values = table.numbers("x", "y", "sigma_x", "sigma_y", "covariance_xy", default=np.nan)
+    found = []
+    for name, status, (x, y, sx, sy, xy) in zip(table.texts("id"), table.texts("status", default="ok"), values, strict=True):
+        off = 0.0 if np.isnan(xy) else xy
+        found.append(StoredAnchor(name, np.array([x, y]), np.array([[sx**2, off], [off, sy**2]]), status))
+    return tuple(found)
+
+
+def _with_closures(result: StoredResult) -> StoredResult:
+    """Return the result with the closures of its report; those of keyframes that the tables do not know are left out."""
+    from dataclasses import replace
+
+    count, found = len(result.keyframe_stamps), []
+    for entry in result.report.get("closures") or ():
+        ends = (entry.get("i"), entry.get("j"))
+        if not all(isinstance(k, int) and 0 <= k < count for k in ends):
+            continue
+        numbers = tuple(int(result.keyframe_recordings[k]) for k in ends)
+        stamps = tuple(float(result.keyframe_stamps[k]) for k in ends)
+        places = np.array([result.pose_at(n, np.array(t))[:2] for n, t in zip(numbers, stamps, strict=True)])
+        kept, why = entry.get("accepted", entry.get("outcome") == "accepted"), str(entry.get("reason", ""))
+        found.append(StoredClosure(stamps, numbers, places, bool(kept), why))  # type: ignore[arg-type]
+    return replace(result, closures=tuple(found))
