@@ -147,12 +147,12 @@ class Clock:
 
     stamps: Floats
     """(n,) s, each on the clock of its recording."""
-    session: Ints
+    recording: Ints
     """(n,) recording of each: 0, 1, ..."""
 
     def off(self, stamp: float, recording: int) -> Floats:
         """Return how far (n,), s, each pose is from a stamp of a recording (1, 2, ...); inf for those of others."""
-        return np.where(self.session == recording - 1, np.abs(self.stamps - stamp), np.inf)
+        return np.where(self.recording == recording - 1, np.abs(self.stamps - stamp), np.inf)
 
     def nearest(self, stamp: float, recording: int) -> int:
         """Return the pose nearest to a stamp.
@@ -161,10 +161,10 @@ class Clock:
         ------
         ConfigError : there is no such recording, or the stamp lies outside it.
         """
-        own = self.stamps[self.session == recording - 1]
+        own = self.stamps[self.recording == recording - 1]
         if not len(own):
-            raise ConfigError(f"constraints: there is no recording {recording}; there are {int(self.session.max()) + 1}")
+            raise ConfigError(f"constraints: there is no recording {recording}; there are {int(self.recording.max()) + 1}")
         if not own.min() - 1.0 <= stamp <= own.max() + 1.0:
-            where = f"recording {recording}" if self.session.max() > 0 else "the recording"
+            where = f"recording {recording}" if self.recording.max() > 0 else "the recording"
             raise ConfigError(f"constraints: stamp {stamp:g} lies outside {where} ({own.min():g} to {own.max():g} s)")
         return int(np.argmin(self.off(stamp, recording)))

@@ -17,7 +17,7 @@ from .arrays import Floats
 from .constraints import Constraints
 from .errors import DataError
 from .grid.occupancy_grid import OccupancyGrid
-from .lidar.correlative_matching import SearchConfig, search
+from .lidar.correlative_matching import CorrelativeConfig, search
 from .lidar.point_cloud import PointCloud, make_cloud
 from .lidar.point_to_point import IcpConfig, Registration, align
 from .map_result import MapResult, StageSummary
@@ -117,7 +117,7 @@ def _laid_over(result: MapResult, grid: OccupancyGrid, *, anywhere: bool) -> Loc
 _FIT = IcpConfig(max_correspondence_distance=0.15, coarse_distance=REACH, sigma=0.05, max_iterations=100)
 _UNIQUE = 0.85
 """A second place whose overlap is this share of the first's makes the first doubtful."""
-_EVERYWHERE = SearchConfig(resolution=0.25, angle_step=0.05, spread=0.25, candidates=8, separation=1.0)
+_EVERYWHERE = CorrelativeConfig(resolution=0.25, angle_step=0.05, spread=0.25, candidates=8, separation=1.0)
 """Coarse: the alignment that follows reaches farther than a step."""
 
 

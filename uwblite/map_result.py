@@ -91,11 +91,11 @@ class MapResult:
     """(n,) s, one per odometry stamp."""
     trajectory: Floats
     """(n, 3) T_map_base at the stamps."""
-    session: Ints
+    recording: Ints
     """(n,) which recording each stamp belongs to (all 0 for one recording)."""
     keyframe_stamps: Floats
     """(k,) s."""
-    keyframe_session: Ints
+    keyframe_recording: Ints
     """(k,) which recording each keyframe belongs to."""
     keyframe_covariances: Floats
     """(k, 3, 3) marginal covariance of each keyframe, map frame (relative to the first pose)."""

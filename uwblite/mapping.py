@@ -15,7 +15,7 @@ from . import se2
 from .arrays import Floats
 from .constraints import Constraints
 from .errors import ConfigError
-from .graph.calibration import LASER, freed, with_real_heights
+from .graph.calibration import LASER, with_free, with_nonnegative_heights
 from .graph.graph import Edges, Graph
 from .graph.marginals import marginals
 from .graph.solver import optimize
@@ -24,15 +24,15 @@ from .grid.geometry import GridGeometry
 from .grid.occupancy_grid import OccupancyGrid, Sweeps
 from .lidar import joint_refinement, laser_mounting
 from .lidar.clouds import Clouds
-from .lidar.joint_refinement import Refined
+from .lidar.joint_refinement import RefinementResult
 from .loop_closure import closures
 from .loop_closure.closures import Closures
 from .map_result import MapResult
 from .mapping_config import MappingConfig
-from .pipeline import closure_rounds, landmark_ties, lidar_stages, map_frame, moved_anchors, radio_stages, recordings, summary
+from .pipeline import closure_rounds, landmark_ties, lidar_stages, map_frame, moved_anchors, radio_stages, summary
 from .pipeline.lidar_stages import Scans
 from .pipeline.progress import Progress, Stages
-from .pipeline.recordings import Drives, Part, Session
+from .pipeline.recordings import Estimate, Recording, Recordings, gather, moved_hypotheses
 from .pipeline.scan_selection import thinned
 from .sensor_log import SensorLog
 
@@ -75,53 +75,53 @@ def build_map(
     logs = [_upright(log, config, stages) for log in logs]
     logs = [thinned(log, config.keyframes, config.grid) for log in logs]
 
-    drives = recordings.gather(logs, config.keyframes)
-    travelled = sum(float(s.frames.path.sum()) for s in drives.sessions)
-    stages.end("keyframes", keyframes=len(drives.stamps), travelled=round(travelled, 3))
+    recordings = gather(logs, config.keyframes)
+    travelled = sum(float(s.frames.path.sum()) for s in recordings.each)
+    stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(travelled, 3))
 
-    parts = [radio_stages.measurements(session, config) for session in drives.sessions]
-    ranges = sum(len(part.radio) for part in parts if part.radio is not None)
-    stages.end("edges", odometry=sum(len(part.wheels) for part in parts), ranges=ranges)
+    estimates = [radio_stages.measurements(recording, config) for recording in recordings.each]
+    ranges = sum(len(estimate.radio) for estimate in estimates if estimate.radio is not None)
+    stages.end("edges", odometry=sum(len(estimate.wheels) for estimate in estimates), ranges=ranges)
 
-    part = radio_stages.first_optimisation(parts, drives, config, stages)
-    part = radio_stages.constrained(part, known, drives, config, stages)
+    estimate = radio_stages.first_optimisation(estimates, recordings, config, stages)
+    estimate = radio_stages.constrained(estimate, known, recordings, config, stages)
 
-    scans = Scans.of(drives, known, config)
+    scans = Scans.of(recordings, known, config)
     found = closures.no_closures()
-    tracked: Refined | None = None
-    refined: Refined | None = None
+    tracked: RefinementResult | None = None
+    refined: RefinementResult | None = None
     if scans is not None:
         stages.end("clouds", points=len(scans.clouds.points))
-        part = replace(part, graph=freed(part.graph, *LASER))
+        estimate = replace(estimate, graph=with_free(estimate.graph, *LASER))
         if config.tracking.on:
-            part, tracked, scans = lidar_stages.track(part, scans, drives, config, stages)
-            part = radio_stages.heard_anew(part, tracked, config, stages)
+            estimate, tracked, scans = lidar_stages.track(estimate, scans, recordings, config, stages)
+            estimate = radio_stages.reestimate_ranges(estimate, tracked, config, stages)
         if config.use_loops:
             held = () if tracked is None else (tracked.edges,)
             close = closure_rounds.close if config.loops.method == "search" else closure_rounds.close_plainly
-            part, found = close(part, (*part.edges, *held), scans, drives, config, stages, executor)
-            part = radio_stages.weighed_anew(part, (*held, found.edges), config)
-            part, refined = lidar_stages.refine_jointly(part, scans, drives, config, stages)
-            apart = moved_anchors.apart(part, drives, config.solver, config.ranges)
+            estimate, found = close(estimate, (*estimate.edges, *held), scans, recordings, config, stages, executor)
+            estimate = radio_stages.reestimate_range_noise(estimate, (*held, found.edges), config)
+            estimate, refined = lidar_stages.refine_jointly(estimate, scans, recordings, config, stages)
+            apart = moved_anchors.apart(estimate, recordings, config.solver, config.ranges)
             if apart.warnings:
                 stages.warnings += apart.warnings
-                part, refined = lidar_stages.refine_jointly(apart.part, scans, drives, config, stages)
-        lidar_stages.look_again(part, scans, drives, stages)
+                estimate, refined = lidar_stages.refine_jointly(apart.estimate, scans, recordings, config, stages)
+        lidar_stages.check_map_consistency(estimate, scans, recordings, stages)
     if known.landmark_distances:
-        part, refined = _measured_distances(part, found, tracked, refined, known, scans, drives, config, stages)
-    part = _final(part, found, tracked, refined)
+        estimate, refined = _measured_distances(estimate, found, tracked, refined, known, scans, recordings, config, stages)
+    estimate = _final(estimate, found, tracked, refined)
     walls = _walls(scans, config)
-    weighed_anew = refined is not None and part.radio is not None
+    reestimate_range_noise = refined is not None and estimate.radio is not None
     # What only matching needed is most of the memory.
     scans = tracked = refined = None
-    if weighed_anew:
-        part = replace(part, graph=with_real_heights(optimize(part.graph, config.solver)[0]))
-    part = _aligned(part, walls, config)
+    if reestimate_range_noise:
+        estimate = replace(estimate, graph=with_nonnegative_heights(optimize(estimate.graph, config.solver)[0]))
+    estimate = _aligned(estimate, walls, config)
 
-    grid = _grid(drives, part.graph, config, executor, stages)
-    uncertainty = marginals(joint_refinement.with_fewer_pairs(part.graph))
+    grid = _grid(recordings, estimate.graph, config, executor, stages)
+    uncertainty = marginals(joint_refinement.with_fewer_pairs(estimate.graph))
     result = summary.summarise(
-        drives, part, uncertainty, found, grid, config.calibration, stages.done, stages.warnings, stages.doubts
+        recordings, estimate, uncertainty, found, grid, config.calibration, stages.done, stages.warnings, stages.doubts
     )
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
@@ -144,32 +144,41 @@ _TURNS = 300
 """Scan pairs looked at for the way up of the laser."""
 
 
-def _final(part: Part, closures: Closures, tracked: Refined | None, refined: Refined | None) -> Part:
+def _final(
+    estimate: Estimate, closures: Closures, tracked: RefinementResult | None, refined: RefinementResult | None
+) -> Estimate:
     """Return the graph with every measurement that holds it; the joint refinement's take the place of all other scans'."""
     if refined is not None:
-        return replace(part, graph=part.graph.with_edges(*part.edges, refined.edges))
+        return replace(estimate, graph=estimate.graph.with_edges(*estimate.edges, refined.edges))
     lidar: tuple[Edges, ...] = (closures.edges,) if tracked is None else (tracked.edges, closures.edges)
-    return replace(part, graph=part.graph.with_edges(*part.edges, *lidar))
+    return replace(estimate, graph=estimate.graph.with_edges(*estimate.edges, *lidar))
 
 
 def _measured_distances(
-    part: Part, closures: Closures, tracked: Refined | None, refined: Refined | None, known: Constraints,
-    scans: Scans | None, drives: Drives, config: MappingConfig, stages: Stages
-) -> tuple[Part, Refined | None]:
+    estimate: Estimate,
+    closures: Closures,
+    tracked: RefinementResult | None,
+    refined: RefinementResult | None,
+    known: Constraints,
+    scans: Scans | None,
+    recordings: Recordings,
+    config: MappingConfig,
+    stages: Stages,
+) -> tuple[Estimate, RefinementResult | None]:
     """Let true distances between landmarks pull on the map as it is without them."""
     if scans is None:
         raise ConfigError("constraints: distances between landmarks need the lidar, which sees them")
-    held = _final(part, closures, tracked, refined)
+    held = _final(estimate, closures, tracked, refined)
     poses = se2.compose(_alignment(held, _walls(scans, config), config), held.graph.poses)
-    tied = landmark_ties.ties(known, scans.clouds, poses, drives.path)
+    tied = landmark_ties.ties(known, scans.clouds, poses, recordings.path)
     solved = optimize(held.graph.with_edges(tied.edges), config.solver)[0]
-    part = replace(part, graph=part.graph.with_edges(tied.edges).with_estimates_of(solved))
+    estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges).with_estimates_of(solved))
     if refined is not None:
-        part, refined = lidar_stages.refine_jointly(part, scans, drives, config, stages)
-    figures, warnings = landmark_ties.outcome(known, tied, part.graph)
+        estimate, refined = lidar_stages.refine_jointly(estimate, scans, recordings, config, stages)
+    figures, warnings = landmark_ties.outcome(known, tied, estimate.graph)
     stages.warnings += warnings
     stages.end("measured distances", distances=figures)
-    return part, refined
+    return estimate, refined
 
 
 def _walls(scans: Scans | None, config: MappingConfig) -> Clouds | None:
@@ -177,49 +186,51 @@ def _walls(scans: Scans | None, config: MappingConfig) -> Clouds | None:
     return scans.clouds if scans is not None and config.align == "walls" else None
 
 
-def _aligned(part: Part, walls: Clouds | None, config: MappingConfig) -> Part:
+def _aligned(estimate: Estimate, walls: Clouds | None, config: MappingConfig) -> Estimate:
     """Put the map's axes where the settings want them."""
-    motion = _alignment(part, walls, config)
-    return replace(part, graph=map_frame.moved(part.graph, motion), first=recordings.moved_hypotheses(part.first, motion))
+    motion = _alignment(estimate, walls, config)
+    return replace(estimate, graph=map_frame.moved(estimate.graph, motion), first=moved_hypotheses(estimate.first, motion))
 
 
-def _alignment(part: Part, walls: Clouds | None, config: MappingConfig) -> Floats:
+def _alignment(estimate: Estimate, walls: Clouds | None, config: MappingConfig) -> Floats:
     """Return T_new_map (3,), by which the map is turned to where the settings want its axes."""
-    graph, normals = part.graph, np.zeros((0, 2))
-    placed = np.zeros(len(graph.anchors), dtype=bool) if part.first is None else part.first.placed
+    graph, normals = estimate.graph, np.zeros((0, 2))
+    placed = np.zeros(len(graph.anchors), dtype=bool) if estimate.first is None else estimate.first.placed
     if walls is not None:
         normals = se2.rotate(graph.poses[walls.owner, 2], walls.normals)
     return map_frame.alignment(config.align, graph, placed, normals)
 
 
 def _grid(
-    drives: Drives, graph: Graph, config: MappingConfig, executor: Executor | None, stages: Stages
+    recordings: Recordings, graph: Graph, config: MappingConfig, executor: Executor | None, stages: Stages
 ) -> OccupancyGrid | None:
     """Trace every scan from where the laser was at its first and last ray (paper: Bresenham, binary Bayes filter)."""
-    sweeps = [_sweeps(session, graph) for session in drives.sessions if session.has_scans]
+    sweeps = [_sweeps(recording, graph) for recording in recordings.each if recording.has_scans]
     if not sweeps:
         return None
 
     def announce(geometry: GridGeometry) -> None:
         """Say what a large grid will take; the caller may still stop."""
         if geometry.cells >= _LARGE_GRID:
-            stages.tell(f"occupancy grid of {geometry.cells / 1e6:.0f} million cells, about {geometry.megabytes:.0f} MB", 0, 1)
+            stages.report(
+                f"occupancy grid of {geometry.cells / 1e6:.0f} million cells, about {geometry.megabytes:.0f} MB", 0, 1
+            )
 
-    teller = stages.teller("occupancy grid")
-    grid = occupancy_grid.from_sweeps(sweeps, config.grid, executor=executor, progress=teller, announce=announce)
+    reporter = stages.reporter("occupancy grid")
+    grid = occupancy_grid.from_sweeps(sweeps, config.grid, executor=executor, progress=reporter, announce=announce)
     if config.crop is not None:
         grid = map_frame.cropped(grid, config.crop)
     stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)
     return grid
 
 
-def _sweeps(session: Session, graph: Graph) -> Sweeps:
+def _sweeps(recording: Recording, graph: Graph) -> Sweeps:
     """Return the scans of a recording with where its laser was."""
-    scans, mounting, cal = session.log.scans, session.log.mounting, graph.calibration
+    scans, mounting, cal = recording.log.scans, recording.log.mounting, graph.calibration
     assert scans is not None
     correction = np.array([cal.get("laser_x"), cal.get("laser_y"), cal.get("laser_theta")])
     mount = se2.compose(correction, mounting.T_base_laser)
     first = scans.stamps + cal.get("laser_delay")
     last = first + scans.time_increment * (scans.ranges.shape[1] - 1)
-    ends = [se2.compose(session.dense_trajectory(graph.poses, stamps), mount) for stamps in (first, last)]
+    ends = [se2.compose(recording.dense_trajectory(graph.poses, stamps), mount) for stamps in (first, last)]
     return Sweeps(scans, ends[0], ends[1], mounting.laser_flipped)

@@ -10,15 +10,15 @@ from .graph.solver import SolverConfig
 from .grid.occupancy_grid import GridConfig
 from .keyframes import KeyframeConfig
 from .lidar.clouds import CloudConfig
-from .lidar.correlative_matching import SearchConfig
+from .lidar.correlative_matching import CorrelativeConfig
 from .lidar.joint_refinement import RefinementConfig
 from .lidar.point_to_point import IcpConfig
 from .lidar.scan_to_scan import TrackingConfig
 from .lidar.submaps import SubmapConfig
 from .loop_closure.closures import LoopClosureConfig
-from .radio.bootstrap import GrowthConfig
+from .radio.bootstrap import BootstrapConfig
 from .radio.range_noise import RangeNoiseConfig
-from .radio.trilateration import AnchorConfig
+from .radio.trilateration import TrilaterationConfig
 from .wheels import OdometryNoiseConfig
 
 
@@ -42,15 +42,15 @@ class MappingConfig:
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
     ranges: RangeNoiseConfig = field(default_factory=RangeNoiseConfig)
-    anchors: AnchorConfig = field(default_factory=AnchorConfig)
-    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    anchors: TrilaterationConfig = field(default_factory=TrilaterationConfig)
+    growth: BootstrapConfig = field(default_factory=BootstrapConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     clouds: CloudConfig = field(default_factory=CloudConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
     loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)
     icp: IcpConfig = field(default_factory=IcpConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    search: SearchConfig = field(default_factory=SearchConfig)
+    search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
     grid: GridConfig = field(default_factory=GridConfig)

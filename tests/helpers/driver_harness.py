@@ -51,7 +51,7 @@ def check_transcript(make, frames, expected, noises, splits=200, seed=0):
         assert good(feed_split(make, noisy, rng)) == expected, noisy
 
 
-def simulate(session, device, seconds, *, line=None, step=0.0005, start=1000.0, latency=0.0008, jitter=lambda: 0.0):
+def simulate(recording, device, seconds, *, line=None, step=0.0005, start=1000.0, latency=0.0008, jitter=lambda: 0.0):
     """Run a session against an emulated device in simulated time, with a fault line between them.
 
     Returns
@@ -75,11 +75,11 @@ def simulate(session, device, seconds, *, line=None, step=0.0005, start=1000.0, 
                 to_come(device.receive(action.data, now), latency)
             elif isinstance(action, Reopen):
                 reopens += 1
-                do(session.start(now))
+                do(recording.start(now))
             else:
                 actions.append((now, action))
 
-    do(session.start(now))
+    do(recording.start(now))
     while now < end:
         to_come(device.advance(now), 0.0)
         while to_host and to_host[0][0] <= now:
@@ -87,11 +87,11 @@ def simulate(session, device, seconds, *, line=None, step=0.0005, start=1000.0, 
             if line is not None:
                 data = line.pass_on(data, now - start)
             if data:
-                do(session.feed(data, now))
-        deadline = session.deadline()
+                do(recording.feed(data, now))
+        deadline = recording.deadline()
         if deadline is not None and deadline <= now:
-            do(session.tick(now))
-        times = [device.next_time(now), session.deadline() or end, to_host[0][0] if to_host else end, end]
+            do(recording.tick(now))
+        times = [device.next_time(now), recording.deadline() or end, to_host[0][0] if to_host else end, end]
         now = max(now + step / 10, min(max(min(times), now), now + 0.05))
     return actions, reopens
 

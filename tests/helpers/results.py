@@ -26,9 +26,9 @@ def contents(folder):
     return {p.name: p.read_bytes() for p in Path(folder).iterdir()}
 
 
-def small_result(*, evil: str = "", lidar: bool = True, sessions: int = 1, seconds: float = 0.0) -> MapResult:
+def small_result(*, evil: str = "", lidar: bool = True, each: int = 1, seconds: float = 0.0) -> MapResult:
     """Return a result of a square drive with two anchors and three closures; `evil` is put into every text of it."""
-    k = 24 * sessions
+    k = 24 * each
     turn = np.linspace(0, 4 * np.pi, k, endpoint=False)
     poses = np.stack([3 * np.cos(turn), 2 * np.sin(turn), se2.wrap_angle(turn + np.pi / 2)], axis=1)
     stamps = 1000.0 + np.arange(k) * 0.5
@@ -54,8 +54,8 @@ def small_result(*, evil: str = "", lidar: bool = True, sessions: int = 1, secon
     log_odds[:10] = 0.0
     agrees = (rng.uniform(size=2 * k) > 0.1).astype(np.float64)
     return MapResult(
-        stamps, poses, np.repeat(np.arange(sessions), 24),
-        stamps, np.repeat(np.arange(sessions), 24), covariances, Graph(poses, anchors, (chain, edges)),
+        stamps, poses, np.repeat(np.arange(each), 24),
+        stamps, np.repeat(np.arange(each), 24), covariances, Graph(poses, anchors, (chain, edges)),
         (
             AnchorEstimate("5C0B" + evil, anchors[0], np.diag([0.0016, 0.0004]), k, 0.94, 0.46, 0.02, 0.05, "ok"),
             AnchorEstimate(

@@ -87,7 +87,7 @@ def test_covariances_are_the_upper_triangle():
 
 
 def test_each_recording_has_its_trajectory(tmp_path):
-    write_result(tmp_path / "map", [small_log()], small_result(sessions=2), RECORD)
+    write_result(tmp_path / "map", [small_log()], small_result(each=2), RECORD)
     stamps, _ = read_tum(tmp_path / "map" / "trajectory_2.tum")
     assert len(stamps) == 24
     assert stamps[0] == 1012.0

@@ -5,7 +5,7 @@ import pytest
 from helpers.registration_worlds import CORRIDOR, ROOM, pair, wall_points
 
 from uwblite import se2
-from uwblite.lidar.correlative_matching import SearchConfig, _target_field, score_grid, search
+from uwblite.lidar.correlative_matching import CorrelativeConfig, _target_field, score_grid, search
 from uwblite.lidar.point_cloud import make_cloud
 from uwblite.lidar.point_to_point import align
 
@@ -30,7 +30,7 @@ def test_scores_equal_brute_force(oriented):
     target, source = pair(ROOM, truth, rng, CENTRE, spacing=0.2)
     if not oriented:
         target, source = make_cloud(target.points), make_cloud(source.points)
-    config = SearchConfig(resolution=0.1, angle_step=0.05, spread=0.1)
+    config = CorrelativeConfig(resolution=0.1, angle_step=0.05, spread=0.1)
     guess = truth + np.array([0.13, -0.07, 0.01])
     scores, headings, shift_x, shift_y = score_grid(target, source, guess, (0.6, 0.5, 0.1), config)
     assert scores.shape == (5, 11, 13)
@@ -51,7 +51,7 @@ def test_scores_equal_brute_force(oriented):
 
 def test_the_field_is_the_likelihood_of_the_nearest_point():
     rng = np.random.default_rng(1)
-    config = SearchConfig(resolution=0.05, spread=0.1)
+    config = CorrelativeConfig(resolution=0.05, spread=0.1)
     target = make_cloud(wall_points(ROOM, rng))
     field, origin = _target_field(target, config, oriented=False)
     rows, columns = np.indices(field.shape)
@@ -69,7 +69,7 @@ def test_planted_poses_are_found_from_metres_and_tens_of_degrees(seed):
     truth = np.array([*rng.uniform(-3.0, 3.0, 2), rng.uniform(-np.pi, np.pi)])
     target, source = pair(_world(rng), truth, rng, (4.0, 1.0))
     guess = truth + rng.uniform(-1.0, 1.0, 3) * [3.0, 3.0, 0.5]
-    config = SearchConfig()
+    config = CorrelativeConfig()
     found = search(target, source, guess, (3.2, 3.2, 0.55), config)
     e = se2.between(found.poses[0], truth)
     assert np.hypot(e[0], e[1]) < 1.5 * config.resolution

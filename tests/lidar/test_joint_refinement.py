@@ -14,7 +14,7 @@ from uwblite.graph.marginals import marginals
 from uwblite.graph.solver import SolverConfig
 from uwblite.lidar.clouds import in_map
 from uwblite.lidar.joint_refinement import RefinementConfig, choose_pairs, refine, surface_cells, with_fewer_pairs
-from uwblite.lidar.scan_matching import paint
+from uwblite.lidar.scan_matching import rasterize
 
 CONFIG = RefinementConfig()
 NOISE = np.array([0.01, 0.005, 0.006])
@@ -22,10 +22,10 @@ NOISE = np.array([0.01, 0.005, 0.006])
 
 def refined(graph, clouds, path, config=CONFIG, selections=2):
     """Return the result of choosing pairs and refining, twice as the walk does."""
-    session = np.zeros(len(clouds), dtype=np.int64)
-    raster, twist, result = paint(clouds, 0.2 * config.first_gate, config.first_gate), np.zeros((len(clouds), 3)), None
+    recording = np.zeros(len(clouds), dtype=np.int64)
+    raster, twist, result = rasterize(clouds, 0.2 * config.first_gate, config.first_gate), np.zeros((len(clouds), 3)), None
     for _ in range(selections):
-        i, j = choose_pairs(clouds, graph.poses, path, session, config)
+        i, j = choose_pairs(clouds, graph.poses, path, recording, config)
         result = refine(graph, clouds, raster, twist, i, j, config, SolverConfig())
         graph = graph.updated(result.graph.poses, graph.anchors, graph.calibration.values)
     return result
@@ -86,8 +86,8 @@ def test_a_corridor_leaves_the_way_along_it_to_the_wheels():
 
 def test_pairs_are_ordered_unique_and_overlap():
     truth, path, clouds = room(4)
-    session = np.zeros(len(truth), dtype=np.int64)
-    i, j = choose_pairs(clouds, truth, path, session, CONFIG)
+    recording = np.zeros(len(truth), dtype=np.int64)
+    i, j = choose_pairs(clouds, truth, path, recording, CONFIG)
     assert np.all(i < j)
     assert len(np.unique(i * len(truth) + j)) == len(i)
     seen = surface_cells(clouds, truth)
@@ -113,16 +113,16 @@ def test_clouds_take_turns_at_giving_the_lines():
 
 def test_no_partners_are_only_neighbours():
     truth, path, clouds = room(5)
-    session = np.zeros(len(truth), dtype=np.int64)
-    i, j = choose_pairs(clouds, truth, path, session, replace(CONFIG, partners=0))
+    recording = np.zeros(len(truth), dtype=np.int64)
+    i, j = choose_pairs(clouds, truth, path, recording, replace(CONFIG, partners=0))
     assert set((j - i).tolist()) == set(CONFIG.neighbours)
 
 
 def test_neighbours_are_of_one_recording():
     truth, path, clouds = room(6)
-    session = (np.arange(len(truth)) >= 20).astype(np.int64)
-    i, j = choose_pairs(clouds, truth, path, session, replace(CONFIG, partners=0))
-    assert np.all(session[i] == session[j])
+    recording = (np.arange(len(truth)) >= 20).astype(np.int64)
+    i, j = choose_pairs(clouds, truth, path, recording, replace(CONFIG, partners=0))
+    assert np.all(recording[i] == recording[j])
 
 
 def test_surface_cells_tell_the_sides_of_a_wall_apart():
@@ -151,10 +151,10 @@ def test_keyframes_without_any_return_are_held_by_the_wheels():
 def test_rounds_are_told_and_bounded():
     truth, path, clouds = room(7, 0.01, 8.0)
     graph = drifted(np.random.default_rng(1), truth, NOISE)
-    session, told = np.zeros(len(truth), dtype=np.int64), []
-    i, j = choose_pairs(clouds, graph.poses, path, session, CONFIG)
+    recording, told = np.zeros(len(truth), dtype=np.int64), []
+    i, j = choose_pairs(clouds, graph.poses, path, recording, CONFIG)
     config = replace(CONFIG, rounds=3)
-    raster = paint(clouds, 0.1, 0.5)
+    raster = rasterize(clouds, 0.1, 0.5)
     result = refine(graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig(), lambda *a: told.append(a))
     assert result.rounds == 3
     assert told == [(1, 3), (2, 3), (3, 3)]

@@ -12,7 +12,7 @@ from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.keyframes import ScanPoints
 from uwblite.lidar.clouds import CloudConfig, Clouds, build
-from uwblite.lidar.scan_matching import PairFactors, match, measured, paint, pair_points, trusted_step
+from uwblite.lidar.scan_matching import PairFactors, match, measured, pair_points, rasterize, trusted_step
 
 ROOM = np.concatenate([box(8, 6), [[1.0, -1.0, 1.0, 1.0], [1.0, 1.0, 2.0, 1.5]]])
 CORRIDOR = np.array([[-40.0, -1.0, 40.0, -1.0], [40.0, 1.0, -40.0, 1.0]])
@@ -46,7 +46,7 @@ def scattered(rng, counts) -> Clouds:
 def test_the_raster_names_the_nearest_point_to_a_cell(seed):
     rng = np.random.default_rng(seed)
     clouds, cell, reach = scattered(rng, [40, 0, 1, 80]), 0.05, 0.3
-    raster = paint(clouds, cell, reach)
+    raster = rasterize(clouds, cell, reach)
     usable = np.any(clouds.normals != 0.0, axis=1)
     for k in range(4):
         own = np.flatnonzero(usable & (clouds.owner == k))
@@ -108,7 +108,7 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
     rng = np.random.default_rng(seed)
     truth = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
     clouds = scanned(truth, ROOM, 0.01, seed)
-    raster, gate, scale = paint(clouds, 0.05, 0.4), 0.3, 0.08
+    raster, gate, scale = rasterize(clouds, 0.05, 0.4), 0.3, 0.08
     i, j = np.array([0, 0, 2]), np.array([1, 2, 1])
     pose = se2.between(truth[i], truth[j]) + rng.normal(0, 0.03, (3, 3))
     points = pair_points(clouds, j, 120)
@@ -156,7 +156,7 @@ def test_known_motions_are_recovered(noise):
     i, j = np.triu_indices(8, 1)
     exact = se2.between(truth[i], truth[j])
     guess = exact + np.column_stack([rng.uniform(-0.15, 0.15, (len(i), 2)), rng.uniform(-0.08, 0.08, len(i))])
-    _, factors, pose, root = settled(clouds, paint(clouds, 0.04, 0.4), i, j, guess)
+    _, factors, pose, root = settled(clouds, rasterize(clouds, 0.04, 0.4), i, j, guess)
     error = se2.between(exact, pose)
     # Noise-free: what is left comes from averaging in cells of 0.02 m on slanting walls and at corners.
     variance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
@@ -173,7 +173,7 @@ def test_a_corridor_constrains_across_and_not_along():
     exact = se2.between(truth[0], truth[1])
     along = se2.rotate(-truth[0, 2], np.array([1.0, 0.0]))
     guess = exact + np.array([*(0.1 * along), 0.0])
-    _, _, pose, root = settled(clouds, paint(clouds, 0.04, 0.4), i, j, guess[None])
+    _, _, pose, root = settled(clouds, rasterize(clouds, 0.04, 0.4), i, j, guess[None])
     information = root[0].T @ root[0]
     shift = se2.rotate(-pose[0, 2], along)
     assert np.array([*shift, 0.0]) @ information @ np.array([*shift, 0.0]) < 1e-9 * np.trace(information)
@@ -239,7 +239,7 @@ def test_headings_are_wrapped():
 
 def test_nothing_to_match_is_no_information():
     clouds = scattered(np.random.default_rng(0), [5, 0, 5])
-    raster = paint(clouds, 0.1, 0.3)
+    raster = rasterize(clouds, 0.1, 0.3)
     none = np.zeros(0, dtype=np.int64)
     empty = match(clouds, raster, none, np.zeros((0, 3)), pair_points(clouds, none, 10), 0.3, 0.1)
     assert measured(empty, np.zeros((0, 3)), np.zeros(0))[1].shape == (0, 3, 3)
@@ -259,6 +259,6 @@ def test_opposite_sides_of_a_thin_wall_do_not_match():
     clouds = scanned(truth, walls)
     i, j = np.array([0, 0]), np.array([1, 2])
     points = pair_points(clouds, j, 100)
-    factors = match(clouds, paint(clouds, 0.04, 0.3), i, se2.between(truth[i], truth[j]), points, 0.2, 0.1)
+    factors = match(clouds, rasterize(clouds, 0.04, 0.3), i, se2.between(truth[i], truth[j]), points, 0.2, 0.1)
     assert factors.matched[0] == 0
     assert factors.matched[1] > 50

@@ -10,8 +10,8 @@ from loop_closure.test_verification import HALL, chained, walked
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
-from uwblite.lidar.correlative_matching import SearchConfig
-from uwblite.lidar.scan_matching import paint
+from uwblite.lidar.correlative_matching import CorrelativeConfig
+from uwblite.lidar.scan_matching import rasterize
 from uwblite.lidar.scan_to_scan import TrackingConfig, follow
 
 NOISE = np.array([0.01, 0.005, 0.006])
@@ -24,8 +24,8 @@ def followed(truth, clouds, said):
     poses = [truth[0]]
     for step in said:
         poses.append(se2.compose(poses[-1], step))
-    raster = paint(clouds, 0.1, GATE)
-    result = follow(clouds, raster, wheels, Graph(np.array(poses)), GATE, TrackingConfig(), SearchConfig())
+    raster = rasterize(clouds, 0.1, GATE)
+    result = follow(clouds, raster, wheels, Graph(np.array(poses)), GATE, TrackingConfig(), CorrelativeConfig())
     return result.steps, result.wheels, result.searched
 
 

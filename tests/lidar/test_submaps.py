@@ -20,17 +20,17 @@ KEEP = SubmapConfig(epsilon=2.0, voxel=0.08, std_ratio=1e6, min_neighbours=0)
 def test_pieces_are_no_longer_than_epsilon_and_of_one_recording(seed, epsilon, n):
     rng = np.random.default_rng(seed)
     path = 7.0 + np.cumsum(rng.uniform(0, 0.6, n))
-    session = np.sort(rng.integers(0, 3, n))
-    first, last = cut(path, session, epsilon)
+    recording = np.sort(rng.integers(0, 3, n))
+    first, last = cut(path, recording, epsilon)
     assert first[0] == 0
     assert last[-1] == n
     np.testing.assert_array_equal(first[1:], last[:-1])
     assert np.all(first < last)
     for a, b in zip(first, last, strict=True):
         assert path[b - 1] - path[a] <= epsilon + 1e-9
-        assert len(np.unique(session[a:b])) == 1
+        assert len(np.unique(recording[a:b])) == 1
     # No more pieces than the way and the recordings ask for.
-    assert len(first) <= (path[-1] - path[0]) / epsilon + 1 + len(np.unique(session)) - 1
+    assert len(first) <= (path[-1] - path[0]) / epsilon + 1 + len(np.unique(recording)) - 1
 
 
 def test_epsilon_of_zero_makes_every_keyframe_a_sub_map():

@@ -7,7 +7,14 @@ from loop_closure.test_verification import walked
 from uwblite import se2
 from uwblite.lidar.clouds import Clouds
 from uwblite.lidar.submaps import SubmapConfig, build
-from uwblite.lidar.visibility import disagreement, nearest_by_bearing, seen_free, sees_through, still, unrest
+from uwblite.lidar.visibility import (
+    dynamic_share,
+    free_space_violation,
+    nearest_by_bearing,
+    observed_free_space,
+    static_points,
+    violates_free_space,
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +36,7 @@ def test_nearest_by_bearing_is_the_nearest_point_of_every_direction(drive):
 
 def test_visits_agree_where_every_pose_is_true(drive):
     truth, path, clouds = drive
-    share, visits = disagreement(clouds, truth, path, np.zeros(len(truth), dtype=np.int64))
+    share, visits = free_space_violation(clouds, truth, path, np.zeros(len(truth), dtype=np.int64))
     assert visits > 20
     assert share < 0.01
 
@@ -39,31 +46,31 @@ def test_visits_disagree_where_half_of_the_drive_lies_elsewhere(drive, error):
     truth, path, clouds = drive
     poses, half = truth.copy(), len(truth) // 2
     poses[half:] = se2.compose(np.array(error), truth[half:])
-    assert disagreement(clouds, poses, path, np.zeros(len(truth), dtype=np.int64))[0] > 0.05
+    assert free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.int64))[0] > 0.05
 
 
 def test_one_visit_has_nothing_to_compare_with(drive):
     truth, path, clouds = drive
-    assert disagreement(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.int64)) == (0.0, 0)
+    assert free_space_violation(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.int64)) == (0.0, 0)
 
 
 def test_recordings_are_visits_of_their_own(drive):
     truth, path, clouds = drive
-    session = (np.arange(len(truth)) >= len(truth) // 2).astype(np.int64)
-    assert disagreement(clouds, truth, 0.01 * path, session)[1] > 0
+    recording = (np.arange(len(truth)) >= len(truth) // 2).astype(np.int64)
+    assert free_space_violation(clouds, truth, 0.01 * path, recording)[1] > 0
 
 
 def test_sub_maps_in_their_place_see_through_nothing_and_elsewhere_through_walls(drive):
     truth, path, clouds = drive
     pieces = build(clouds, truth, path, np.zeros(len(truth), dtype=np.int64), SubmapConfig(epsilon=4.0))
-    free = seen_free(clouds, pieces, truth)
+    free = observed_free_space(clouds, pieces, truth)
     where = truth[pieces.reference]
     pairs = ((a, b) for a in range(len(where)) for b in range(a + 2, len(where)))
     a, b = next((a, b) for a, b in pairs if np.hypot(*(where[a] - where[b])[:2]) < 2.0)
     points = [pieces.clouds.cloud(k)[0] for k in (a, b)]
     T_a_b = se2.between(where[a], where[b])
-    assert sees_through(free[a], points[0], free[b], points[1], T_a_b) < 0.05
-    assert sees_through(free[a], points[0], free[b], points[1], se2.compose(T_a_b, [1.5, 1.0, 0.0])) > 0.12
+    assert violates_free_space(free[a], points[0], free[b], points[1], T_a_b) < 0.05
+    assert violates_free_space(free[a], points[0], free[b], points[1], se2.compose(T_a_b, [1.5, 1.0, 0.0])) > 0.12
 
 
 
@@ -85,12 +92,14 @@ def with_a_walker(truth, clouds):
 
 def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(drive):
     truth, path, clouds = drive
-    session = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.int64)
     settings = SubmapConfig(epsilon=4.0)
-    quiet = build(clouds, truth, path, session, settings)
+    quiet = build(clouds, truth, path, recording, settings)
     busy_clouds = with_a_walker(truth, clouds)
-    busy = build(busy_clouds, truth, path, session, settings)
-    kept = [still(pieces, seen_free(own, pieces, truth)) for own, pieces in ((clouds, quiet), (busy_clouds, busy))]
+    busy = build(busy_clouds, truth, path, recording, settings)
+    kept = [
+        static_points(pieces, observed_free_space(own, pieces, truth)) for own, pieces in ((clouds, quiet), (busy_clouds, busy))
+    ]
     assert len(kept[0].clouds.points) > 0.98 * len(quiet.clouds.points)
     walkers = [len(pieces.clouds.points) - len(quiet.clouds.points) for pieces in (busy, kept[1])]
     assert walkers[0] > 100
@@ -100,11 +109,11 @@ def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(drive):
 
 def test_unrest_is_nothing_in_an_empty_hall_and_something_among_people(drive):
     truth, path, clouds = drive
-    session = np.zeros(len(truth), dtype=np.int64)
+    recording = np.zeros(len(truth), dtype=np.int64)
 
     def of(own):
-        pieces = build(own, truth, path, session, SubmapConfig(epsilon=4.0))
-        return unrest(pieces, seen_free(own, pieces, truth), truth, session)
+        pieces = build(own, truth, path, recording, SubmapConfig(epsilon=4.0))
+        return dynamic_share(pieces, observed_free_space(own, pieces, truth), truth, recording)
 
     assert of(clouds) < 0.05
     assert of(with_a_walker(truth, clouds)) > of(clouds) + 0.05
@@ -112,6 +121,6 @@ def test_unrest_is_nothing_in_an_empty_hall_and_something_among_people(drive):
 
 def test_sub_maps_of_different_recordings_do_not_follow_each_other(drive):
     truth, path, clouds = drive
-    session = np.arange(len(truth))
-    pieces = build(clouds, truth, path, session, SubmapConfig(epsilon=4.0))
-    assert unrest(pieces, seen_free(clouds, pieces, truth), truth, session) == 0.0
+    recording = np.arange(len(truth))
+    pieces = build(clouds, truth, path, recording, SubmapConfig(epsilon=4.0))
+    assert dynamic_share(pieces, observed_free_space(clouds, pieces, truth), truth, recording) == 0.0

@@ -30,21 +30,21 @@ def laps():
 
 def pieces_of(laps, epsilon=2.0, poses=None):
     truth, path, clouds = laps
-    session = np.zeros(len(path), dtype=np.int64)
-    return build(clouds, truth if poses is None else poses, path, session, SubmapConfig(epsilon=epsilon)), session
+    recording = np.zeros(len(path), dtype=np.int64)
+    return build(clouds, truth if poses is None else poses, path, recording, SubmapConfig(epsilon=epsilon)), recording
 
 
 def test_candidates_are_pairs_that_overlap_and_are_not_neighbours(laps):
-    pieces, session = pieces_of(laps)
-    target, source = candidates(laps[0], pieces, session, 1000)
+    pieces, recording = pieces_of(laps)
+    target, source = candidates(laps[0], pieces, recording, 1000)
     # In one room every sub-map shows the same walls.
     every = [(a, b) for a in range(len(pieces)) for b in range(a + 2, len(pieces))]
     assert list(zip(target.tolist(), source.tolist(), strict=True)) == every
 
 
 def test_neighbours_of_different_recordings_are_candidates(laps):
-    pieces, session = pieces_of(laps)
-    later = session.copy()
+    pieces, recording = pieces_of(laps)
+    later = recording.copy()
     later[pieces.first[3] :] = 1
     pairs = set(zip(*(c.tolist() for c in candidates(laps[0], pieces, later, 1000)), strict=True))
     assert (2, 3) in pairs
@@ -52,20 +52,20 @@ def test_neighbours_of_different_recordings_are_candidates(laps):
 
 
 def test_sub_maps_far_apart_are_no_candidates(laps):
-    pieces, session = pieces_of(laps)
+    pieces, recording = pieces_of(laps)
     far = laps[0].copy()
     far[pieces.first[4] :, 0] += 50.0
-    target, source = candidates(far, pieces, session, 1000)
+    target, source = candidates(far, pieces, recording, 1000)
     assert len(target)
     assert np.all((target < 4) == (source < 4))
 
 
 def test_partners_bound_the_candidates_best_first(laps):
-    pieces, session = pieces_of(laps)
-    few, all_of_them = (len(candidates(laps[0], pieces, session, limit)[0]) for limit in (2, 1000))
+    pieces, recording = pieces_of(laps)
+    few, all_of_them = (len(candidates(laps[0], pieces, recording, limit)[0]) for limit in (2, 1000))
     assert len(pieces) / 2 <= few <= 2 * len(pieces)
     assert few < all_of_them
-    assert len(candidates(laps[0], pieces, session, 0)[0]) == 0
+    assert len(candidates(laps[0], pieces, recording, 0)[0]) == 0
 
 
 def test_a_drifted_second_lap_is_put_back(laps):
@@ -74,8 +74,8 @@ def test_a_drifted_second_lap_is_put_back(laps):
     half = len(path) // 2
     bent = truth.copy()
     bent[half:] = se2.compose(np.array([0.06, -0.05, 0.01]), truth[half:])
-    pieces, session = pieces_of(laps, poses=bent)
-    found = find(Graph(bent), pieces, session, PLAIN, ICP)
+    pieces, recording = pieces_of(laps, poses=bent)
+    found = find(Graph(bent), pieces, recording, PLAIN, ICP)
     assert sum(c.accepted for c in found.candidates) == len(found.edges) > 5
     across = (found.edges.i < half - 4) & (found.edges.j > half + 4)
     assert across.any()
@@ -89,21 +89,21 @@ def test_a_drifted_second_lap_is_put_back(laps):
 
 
 def test_every_candidate_is_kept_with_its_reason(laps):
-    pieces, session = pieces_of(laps)
-    strict = find(Graph(laps[0]), pieces, session, PLAIN, replace(ICP, fitness_sigma=1e-9))
+    pieces, recording = pieces_of(laps)
+    strict = find(Graph(laps[0]), pieces, recording, PLAIN, replace(ICP, fitness_sigma=1e-9))
     assert len(strict.edges) == 0
     assert len(strict.candidates) > 10
     assert all(not c.accepted and "fitness score" in c.reason for c in strict.candidates)
-    short = find(Graph(laps[0]), pieces, session, PLAIN, replace(ICP, max_iterations=1, tolerance_translation=1e-9))
+    short = find(Graph(laps[0]), pieces, recording, PLAIN, replace(ICP, max_iterations=1, tolerance_translation=1e-9))
     assert all("still moving" in c.reason for c in short.candidates)
 
 
 def test_more_correlated_points_say_less(laps):
-    pieces, session = pieces_of(laps)
-    one, other = (find(Graph(laps[0]), pieces, session, replace(PLAIN, correlation=c), ICP) for c in (1.0, 4.0))
+    pieces, recording = pieces_of(laps)
+    one, other = (find(Graph(laps[0]), pieces, recording, replace(PLAIN, correlation=c), ICP) for c in (1.0, 4.0))
     np.testing.assert_allclose(one.edges.sqrt_information, 2.0 * other.edges.sqrt_information, rtol=1e-9)
 
 
 def test_a_single_sub_map_closes_nothing(laps):
-    pieces, session = pieces_of(laps, epsilon=1000.0)
-    assert find(Graph(laps[0]), pieces, session, PLAIN, ICP).candidates == ()
+    pieces, recording = pieces_of(laps, epsilon=1000.0)
+    assert find(Graph(laps[0]), pieces, recording, PLAIN, ICP).candidates == ()

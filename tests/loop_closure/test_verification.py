@@ -14,7 +14,7 @@ from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.solver import SolverConfig, optimize
-from uwblite.lidar.correlative_matching import SearchConfig
+from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig, build
 from uwblite.loop_closure.candidates import Candidates, missed, propose
 from uwblite.loop_closure.closures import Closures, LoopClosureConfig, merged, no_closures
@@ -32,7 +32,7 @@ TWINS = np.concatenate([
     *([[PERIOD * k, 2.0, PERIOD * k, 1.2], [PERIOD * k, -2.0, PERIOD * k, -1.2]] for k in range(-20, 21)),
 ])
 """A corridor with equal pillars all along."""
-SOLVER, SEARCH = SolverConfig(), SearchConfig()
+SOLVER, SEARCH = SolverConfig(), CorrelativeConfig()
 CONFIG = LoopClosureConfig()
 
 
@@ -69,10 +69,10 @@ def hall():
     """A walk of 60 m in the hall, its drifting chain, its sub-maps and what was proposed."""
     truth, path, clouds = walked(3)
     graph = drifted(np.random.default_rng(4), truth, NOISE)
-    session = np.zeros(len(truth), dtype=np.int64)
-    pieces = build(clouds, graph.poses, path, session, SubmapConfig(epsilon=4.0))
+    recording = np.zeros(len(truth), dtype=np.int64)
+    pieces = build(clouds, graph.poses, path, recording, SubmapConfig(epsilon=4.0))
     known = marginals(graph)
-    return truth, graph, known, pieces, session, propose(graph, known, pieces, session, set(), set(), True, CONFIG)
+    return truth, graph, known, pieces, recording, propose(graph, known, pieces, recording, set(), set(), True, CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -93,15 +93,15 @@ def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess
 
 
 def test_what_was_tried_is_not_proposed_again(hall):
-    _, graph, known, pieces, session, candidates = hall
+    _, graph, known, pieces, recording, candidates = hall
     tried = candidates.names(CONFIG)
-    again = propose(graph, known, pieces, session, tried, set(), True, CONFIG)
+    again = propose(graph, known, pieces, recording, tried, set(), True, CONFIG)
     assert not tried & again.names(CONFIG)
 
 
 def test_pairs_that_missed_are_searched_with_slack(hall, closures):
     """After wheels have slipped the graph is sure and wrong: what did not match is proposed once more, with a wide search."""
-    truth, graph, known, pieces, session, candidates = hall
+    truth, graph, known, pieces, recording, candidates = hall
     sure = replace(candidates, spread=np.zeros(len(candidates.target)))
     gone = missed(sure, closures, CONFIG)
     few = {(int(a), int(b)) for a, b, c in zip(sure.target, sure.source, closures.candidates, strict=True)
@@ -109,7 +109,7 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
     assert gone == few
     assert gone
     assert not missed(replace(candidates, spread=np.full(len(candidates.target), 9.0)), closures, CONFIG)
-    again = propose(graph, known, pieces, session, sure.names(CONFIG), gone, True, replace(CONFIG, partners=99))
+    again = propose(graph, known, pieces, recording, sure.names(CONFIG), gone, True, replace(CONFIG, partners=99))
     for a, b, spread in zip(again.target.tolist(), again.source.tolist(), again.spread, strict=True):
         assert (a, b) not in gone or spread > 3 * CONFIG.slip * 0.99
     assert gone & set(zip(again.target.tolist(), again.source.tolist(), strict=True))
@@ -117,8 +117,8 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
 
 
 def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
-    _, graph, known, pieces, session, _ = hall
-    half = (np.arange(len(session)) >= pieces.first[len(pieces) // 2]).astype(np.int64)
+    _, graph, known, pieces, recording, _ = hall
+    half = (np.arange(len(recording)) >= pieces.first[len(pieces) // 2]).astype(np.int64)
     candidates = propose(graph, known, pieces, half, set(), set(), True, replace(CONFIG, partners=99))
     close = candidates.source - candidates.target == 1
     assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
@@ -335,9 +335,9 @@ def test_a_robot_that_never_returns_has_no_candidates():
     walls = np.array([[-5.0, -2.0, 30.0, -2.0], [30.0, 3.0, -5.0, 3.0]])
     clouds = scanned(truth, walls, 0.01, 1, reach=5.6)
     graph = drifted(np.random.default_rng(1), truth, NOISE / 10)
-    session = np.zeros(60, dtype=np.int64)
-    pieces = build(clouds, graph.poses, truth[:, 0], session, SubmapConfig(epsilon=8.0))
-    far = propose(graph, marginals(graph), pieces, session, set(), set(), True, replace(CONFIG, reach=6.0, search_limit=1.0))
+    recording = np.zeros(60, dtype=np.int64)
+    pieces = build(clouds, graph.poses, truth[:, 0], recording, SubmapConfig(epsilon=8.0))
+    far = propose(graph, marginals(graph), pieces, recording, set(), set(), True, replace(CONFIG, reach=6.0, search_limit=1.0))
     apart = np.hypot(*(truth[pieces.reference[far.target], :2] - truth[pieces.reference[far.source], :2]).T)
     assert np.all(apart < 7.0)
     assert optimize(graph, SOLVER)[1].converged

@@ -13,7 +13,7 @@ from uwblite.graph.calibration import CalibrationConfig
 from uwblite.graph.graph import Calibration, Graph, PriorEdges
 from uwblite.keyframes import OUTSIDE
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.pipeline.plausibility import lying_stretches, mirrored
+from uwblite.pipeline.plausibility import mirror_ambiguity, outlier_stretches
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -55,8 +55,8 @@ def test_wheels_that_turn_rightly_and_lasers_vouch_for_the_sign():
 @pytest.mark.parametrize(("error", "doubted"), [(-1.9, True), (-1.1, True), (-0.4, False), (0.0, False), (1.0, False)])
 def test_wheels_that_turn_against_the_laser_are_doubted(error, doubted):
     graph = Graph(np.zeros((1, 3)), calibration=Calibration(("heading_scale",), np.array([error])))
-    seeing = SimpleNamespace(sessions=[SimpleNamespace(has_scans=True)])
-    assert len(said(mirrored(graph, seeing, CalibrationConfig()), "upside down")) == doubted
+    seeing = SimpleNamespace(each=[SimpleNamespace(has_scans=True)])
+    assert len(said(mirror_ambiguity(graph, seeing, CalibrationConfig()), "upside down")) == doubted
 
 
 def test_known_anchors_vouch_for_the_sign():
@@ -76,8 +76,8 @@ def test_three_known_anchors_settle_the_sign_and_two_do_not(known, doubted, lida
     other = PriorEdges("calibration", np.zeros(3, int), np.zeros((3, 1)), np.ones((3, 1, 1)))
     calibration = Calibration(("heading_scale",), np.array([-1.9]))
     graph = Graph(np.zeros((1, 3)), PLACES, calibration=calibration).with_edges(prior, other)
-    drives = SimpleNamespace(sessions=[SimpleNamespace(has_scans=lidar)])
-    assert len(mirrored(graph, drives, CalibrationConfig())) == doubted
+    recordings = SimpleNamespace(each=[SimpleNamespace(has_scans=lidar)])
+    assert len(mirror_ambiguity(graph, recordings, CalibrationConfig())) == doubted
 
 
 def test_a_value_far_from_usual_is_told():
@@ -117,13 +117,13 @@ def test_the_map_begins_where_the_odometry_did(seed):
 def test_stretches_in_which_most_readings_disagree_are_found():
     stamps = np.arange(400.0)
     agrees = np.random.default_rng(0).random(400) < 0.95
-    assert lying_stretches(stamps, agrees) == []
+    assert outlier_stretches(stamps, agrees) == []
     agrees[100:200] = False
     agrees[360:] = False
-    found = lying_stretches(stamps, agrees)
+    found = outlier_stretches(stamps, agrees)
     assert len(found) == 2
     np.testing.assert_allclose(found, [(100, 199), (360, 399)], atol=20)
-    assert lying_stretches(stamps[:99], np.zeros(99, dtype=bool)) == []
+    assert outlier_stretches(stamps[:99], np.zeros(99, dtype=bool)) == []
 
 
 @pytest.mark.parametrize("seed", [11, 12])

@@ -47,7 +47,7 @@ def joint_ate(result, truths):
     order = np.arange(len(truth), dtype=float)
     both = evaluate_trajectory(order, result.trajectory, order, truth).ate.rmse
     each = [
-        evaluate_trajectory(order[: len(t)], result.trajectory[result.session == n], order[: len(t)], t).ate.rmse
+        evaluate_trajectory(order[: len(t)], result.trajectory[result.recording == n], order[: len(t)], t).ate.rmse
         for n, t in enumerate(truths)
     ]
     return both, each
@@ -75,7 +75,7 @@ def test_two_drives_share_a_frame(two, merged):
 
 def test_every_stamp_says_its_recording(two, merged):
     for n, (log, _) in enumerate(two):
-        np.testing.assert_array_equal(merged.stamps[merged.session == n], log.odometry.stamps)
+        np.testing.assert_array_equal(merged.stamps[merged.recording == n], log.odometry.stamps)
     assert len(merged.keyframe_stamps) == len(merged.graph.poses)
 
 
@@ -84,7 +84,7 @@ def test_the_map_lies_in_the_frame_of_the_first(two, merged):
 
 
 def test_clouds_of_different_recordings_are_matched(merged):
-    count = int(np.sum(merged.session == 0))
+    count = int(np.sum(merged.recording == 0))
     stamps = merged.keyframe_stamps
     first = np.flatnonzero(np.diff(stamps) > 100.0)[0]
     assert any(c.accepted and c.i <= first < c.j for c in merged.closures)
@@ -124,7 +124,7 @@ def test_a_moved_anchor_is_named_and_stands_at_both_places(two, shift):
     assert len(told) == 1
     assert f"anchor {name} was moved: in recording 2" in told[0]
     places = {a.id: a.position for a in result.anchors}
-    stamps, first = logs[0].odometry.stamps, result.trajectory[result.session == 0]
+    stamps, first = logs[0].odometry.stamps, result.trajectory[result.recording == 0]
     laid = evaluate_trajectory(stamps, first, stamps, two[0][1]).T_truth_map
     off = se2.rotate(laid[2], places[f"{name}#2"] - places[name])
     np.testing.assert_allclose(off, shift, atol=0.25)
@@ -200,13 +200,13 @@ def test_no_recording_and_no_ranges_are_said(two):
 
 
 def test_paths_of_recordings_lie_apart(two):
-    drives = gather([log for log, _ in two], MappingConfig().keyframes)
-    assert len(drives) == 2
-    change = np.flatnonzero(np.diff(drives.session))
+    recordings = gather([log for log, _ in two], MappingConfig().keyframes)
+    assert len(recordings) == 2
+    change = np.flatnonzero(np.diff(recordings.of_keyframe))
     assert len(change) == 1
-    assert np.all(np.diff(drives.path) >= 0)
-    assert np.diff(drives.path)[change[0]] > 100.0
-    assert [s.rows.stop - s.rows.start for s in drives.sessions] == [len(s.frames) for s in drives.sessions]
+    assert np.all(np.diff(recordings.path) >= 0)
+    assert np.diff(recordings.path)[change[0]] > 100.0
+    assert [s.rows.stop - s.rows.start for s in recordings.each] == [len(s.frames) for s in recordings.each]
 
 
 @pytest.mark.slow

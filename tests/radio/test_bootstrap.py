@@ -10,9 +10,9 @@ from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
 from uwblite.graph.graph import Graph
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
-from uwblite.radio.bootstrap import FirstEstimate, GrowthConfig, grow
+from uwblite.radio.bootstrap import BootstrapConfig, BootstrapResult, bootstrap_graph
 from uwblite.radio.range_measurements import range_edges
-from uwblite.radio.trilateration import AnchorConfig
+from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
 from uwblite.wheels import OdometryNoiseConfig, wheel_edges
 
@@ -22,7 +22,7 @@ WELL = 0.3
 grown trajectory is good enough as a start when it lies well within the width of the kernels that follow."""
 
 
-def start(wheels: Odometry, radio: UwbRanges) -> tuple[FirstEstimate, np.ndarray]:
+def start(wheels: Odometry, radio: UwbRanges) -> tuple[BootstrapResult, np.ndarray]:
     """Grow from one recording; return the estimate and the keyframes' stamps."""
     frames = select(wheels, KeyframeConfig())
     ids = radio.anchor_ids
@@ -33,10 +33,12 @@ def start(wheels: Odometry, radio: UwbRanges) -> tuple[FirstEstimate, np.ndarray
     graph = Graph(frames.odometry, np.zeros((len(ids), 2)), (prior_edges(listed),), calibration, fixed_calibration=held)
     mounting = SensorMounting()
     attached = attach_ranges(radio, wheels, frames, mounting)
-    edges = range_edges(attached, 0, ids, mounting, calibration, 0.1, AnchorConfig())
+    edges = range_edges(attached, 0, ids, mounting, calibration, 0.1, TrilaterationConfig())
     path = np.concatenate([[0.0], np.cumsum(frames.path)])
-    config = GrowthConfig(range_sigma=1.5 * SIGMA)
-    grown = grow(graph, wheel_edges(frames, 0, OdometryNoiseConfig(), calibration), edges, path, config, AnchorConfig())
+    config = BootstrapConfig(range_sigma=1.5 * SIGMA)
+    grown = bootstrap_graph(
+        graph, wheel_edges(frames, 0, OdometryNoiseConfig(), calibration), edges, path, config, TrilaterationConfig()
+    )
     return grown, frames.stamps
 
 

@@ -11,9 +11,9 @@ from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unk
 from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.solver import optimize
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
-from uwblite.radio.prior_selection import choose_widths, log_evidence
+from uwblite.radio.prior_selection import log_evidence, select_priors
 from uwblite.radio.range_measurements import range_edges
-from uwblite.radio.trilateration import AnchorConfig
+from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
 
 LEVEL = SensorMounting(anchor_height=0.0)
@@ -52,7 +52,7 @@ def solved(seed, bias=(0.0,) * 4, scale=1.0):
     frames, ids = select(wheels, KeyframeConfig()), radio.anchor_ids
     listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
     attached = attach_ranges(radio, wheels, frames, LEVEL)
-    edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, AnchorConfig())
+    edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
     held = np.array([u.name.split(":")[0] not in ("range_scale", "bias") for u in listed])
     fixed = np.ones(len(frames), dtype=bool)
     graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, None, held)
@@ -68,7 +68,7 @@ def widths(graph):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sound_radio_gets_narrow_priors(seed):
     graph, edges = solved(seed)
-    found = widths(choose_widths(graph, (edges,), CONFIG))
+    found = widths(select_priors(graph, (edges,), CONFIG))
     assert found["range_scale"] < 2.0 * CONFIG.range_scale_sound
     assert CONFIG.range_bias_sound < found["bias:A00"] == found["bias:A03"] < 2.0 * CONFIG.range_bias_sound
 
@@ -76,7 +76,7 @@ def test_a_sound_radio_gets_narrow_priors(seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_radio_with_large_biases_gets_wide_ones(seed):
     graph, edges = solved(seed, bias=(0.9, 0.4, 1.3, 0.7))
-    found = widths(choose_widths(graph, (edges,), CONFIG))
+    found = widths(select_priors(graph, (edges,), CONFIG))
     assert found["bias:A02"] > 3 * CONFIG.range_bias_sound
     assert found["odometry_scale"] == CONFIG.odometry_scale
 
@@ -84,7 +84,7 @@ def test_a_radio_with_large_biases_gets_wide_ones(seed):
 @pytest.mark.parametrize("scale", [1.07, 0.93])
 def test_a_radio_with_another_idea_of_the_metre_gets_a_wide_scale(scale):
     graph, edges = solved(0, scale=scale)
-    assert widths(choose_widths(graph, (edges,), CONFIG))["range_scale"] > 0.9 * CONFIG.range_scale
+    assert widths(select_priors(graph, (edges,), CONFIG))["range_scale"] > 0.9 * CONFIG.range_scale
 
 
 def test_only_priors_of_range_scale_and_biases_change():
@@ -92,7 +92,7 @@ def test_only_priors_of_range_scale_and_biases_change():
     graph, edges = solved(0)
     surveyed = PriorEdges("anchors", np.arange(2), PLACES[:2], np.tile(20.0 * np.eye(2), (2, 1, 1)))
     pinned = PriorEdges("poses", np.arange(2), graph.poses[:2], np.tile(30.0 * np.eye(3), (2, 1, 1)))
-    chosen = choose_widths(graph.with_edges(surveyed, pinned), (edges,), CONFIG)
+    chosen = select_priors(graph.with_edges(surveyed, pinned), (edges,), CONFIG)
     assert chosen.edges[1:] == (surveyed, pinned)
     before, after = widths(graph), widths(chosen)
     changed = {name for name in before if after[name] != pytest.approx(before[name], rel=1e-12)}
@@ -104,7 +104,7 @@ def test_only_priors_of_range_scale_and_biases_change():
 def test_nothing_free_leaves_the_graph_alone():
     graph, edges = solved(0)
     held = replace(graph, fixed_calibration=np.ones(len(graph.calibration.values), dtype=bool))
-    assert choose_widths(held, (edges,), CONFIG) is held
+    assert select_priors(held, (edges,), CONFIG) is held
 
 
 @pytest.mark.filterwarnings("error")
@@ -113,6 +113,6 @@ def test_one_of_the_two_may_be_held():
     scale = graph.calibration.index("range_scale")
     held = np.asarray(graph.fixed_calibration).copy()
     held[scale] = True
-    found = widths(choose_widths(replace(graph, fixed_calibration=held), (edges,), CONFIG))
+    found = widths(select_priors(replace(graph, fixed_calibration=held), (edges,), CONFIG))
     assert found["range_scale"] == CONFIG.range_scale
     assert found["bias:A02"] > 3 * CONFIG.range_bias_sound

@@ -17,7 +17,7 @@ from uwblite.graph.solver import optimize
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
 from uwblite.radio.range_measurements import learn_noise, range_edges, relocate, tag_positions
 from uwblite.radio.range_noise import RangeNoiseConfig
-from uwblite.radio.trilateration import AnchorConfig
+from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
 from uwblite.wheels import OdometryNoiseConfig, learn_wheels, wheel_edges
 
@@ -34,7 +34,7 @@ def world(seed, metres=40.0, anchors=3, **settings):
     wheels = Odometry(stamps, truth)
     frames = select(wheels, KeyframeConfig())
     attached = attach_ranges(radio, wheels, frames, MOUNTING)
-    edges = range_edges(attached, 0, radio.anchor_ids, MOUNTING, Calibration(), 0.3, AnchorConfig())
+    edges = range_edges(attached, 0, radio.anchor_ids, MOUNTING, Calibration(), 0.3, TrilaterationConfig())
     return stamps, truth, frames, places, radio, edges
 
 
@@ -84,7 +84,7 @@ def test_range_edges_of_a_later_recording_are_shifted():
     radio, wheels = ranges(rng, stamps, truth, np.zeros((1, 2))), Odometry(stamps, truth)
     frames = select(wheels, KeyframeConfig())
     attached = attach_ranges(radio, wheels, frames, MOUNTING)
-    edges = range_edges(attached, 100, radio.anchor_ids, MOUNTING, Calibration(), 0.1, AnchorConfig())
+    edges = range_edges(attached, 100, radio.anchor_ids, MOUNTING, Calibration(), 0.1, TrilaterationConfig())
     np.testing.assert_array_equal(edges.pose, attached.keyframe + 100)
 
 
@@ -94,7 +94,7 @@ def test_readings_that_cannot_be_distances_weigh_nothing():
     radio, wheels = ranges(rng, stamps, truth, np.zeros((1, 2))), Odometry(stamps, truth)
     radio.ranges[:4] = [0.0, -1.0, 1e6, 0.001]
     attached = attach_ranges(radio, wheels, select(wheels, KeyframeConfig()), MOUNTING)
-    edges = range_edges(attached, 0, radio.anchor_ids, MOUNTING, Calibration(), 0.1, AnchorConfig())
+    edges = range_edges(attached, 0, radio.anchor_ids, MOUNTING, Calibration(), 0.1, TrilaterationConfig())
     assert edges.weights.tolist() == [0.0] * 4 + [1.0] * (len(radio.ranges) - 4)
 
 
@@ -171,7 +171,7 @@ def test_a_range_is_an_outlier_by_what_one_range_scatters():
     radio = ranges(rng, stamps, truth, places, sigma=0.05, rate=8.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig())
     attached = attach_ranges(radio, Odometry(stamps, truth), frames, SensorMounting())
-    edges = range_edges(attached, 0, radio.anchor_ids, SensorMounting(), Calibration(), 0.3, AnchorConfig())
+    edges = range_edges(attached, 0, radio.anchor_ids, SensorMounting(), Calibration(), 0.3, TrilaterationConfig())
     slow = 0.15 * np.sin(tag_positions(edges, truth[frames.index]).sum(axis=1))
     edges = replace(edges, ranges=edges.ranges + slow + np.where(np.arange(len(edges)) == 40, 2.0, 0.0))
     graph = Graph(truth[frames.index], places)
@@ -220,10 +220,10 @@ def test_an_anchor_in_the_wrong_place_goes_where_its_ranges_agree_and_others_sta
     wrong = places.copy()
     wrong[0] += [2.0, -1.0]
     graph = Graph(truth[frames.index], wrong)
-    found = relocate(edges, graph, np.ones(len(places), dtype=bool), AnchorConfig())
+    found = relocate(edges, graph, np.ones(len(places), dtype=bool), TrilaterationConfig())
     assert np.hypot(*(found.anchors[0] - places[0])) < 0.3
     np.testing.assert_array_equal(found.anchors[1:], wrong[1:])
-    held = relocate(edges, graph, np.zeros(len(places), dtype=bool), AnchorConfig())
+    held = relocate(edges, graph, np.zeros(len(places), dtype=bool), TrilaterationConfig())
     np.testing.assert_array_equal(held.anchors, wrong)
 
 
@@ -235,7 +235,7 @@ def test_ranges_of_weight_zero_move_no_anchor_and_teach_no_noise():
     off = np.arange(len(edges)) % 4 != 0
     mixed = replace(edges, ranges=np.where(off, agreeing.ranges, edges.ranges), weights=np.where(off, 0.0, 1.0))
     astray, both = replace(graph, anchors=wrong), np.ones(2, dtype=bool)
-    moved = relocate(mixed, astray, both, AnchorConfig())
+    moved = relocate(mixed, astray, both, TrilaterationConfig())
     assert np.hypot(*(moved.anchors[0] - places[0])) < 0.3
     learnt, noises = learn_noise(mixed, graph, 2, RangeNoiseConfig())
     rest, alone = learn_noise(edges.rows(np.flatnonzero(~off)), graph, 2, RangeNoiseConfig())
@@ -244,7 +244,7 @@ def test_ranges_of_weight_zero_move_no_anchor_and_teach_no_noise():
     np.testing.assert_array_equal(learnt.sigma[off], edges.sigma[off])
     np.testing.assert_array_equal(learnt.weights[~off], rest.weights)
     nothing = replace(edges, weights=np.zeros(len(edges)))
-    np.testing.assert_array_equal(relocate(nothing, astray, both, AnchorConfig()).anchors, wrong)
+    np.testing.assert_array_equal(relocate(nothing, astray, both, TrilaterationConfig()).anchors, wrong)
     silent, unknown = learn_noise(nothing, graph, 2, RangeNoiseConfig(sigma=0.4))
     assert [n.sigma for n in unknown] == pytest.approx([0.4, 0.4])
     assert not silent.weights.any()

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.radio.trilateration import AnchorConfig, _raster_search, agreement, ambiguous, locate, usable
+from uwblite.radio.trilateration import TrilaterationConfig, _raster_search, agreement, ambiguous, trilaterate, usable
 
-CONFIG = AnchorConfig()
+CONFIG = TrilaterationConfig()
 
 
 def measured(rng, path, anchor, sigma=0.05, bias=0.0, outliers=0.0):
@@ -38,7 +38,7 @@ def test_planted_anchors_are_found_among_lies(seed, outliers, bias):
     rng = np.random.default_rng(seed)
     path = loop_path(rng)
     anchor = rng.uniform(-9, 9, 2)
-    found = locate(path, measured(rng, path, anchor, 0.05, bias, outliers), CONFIG)
+    found = trilaterate(path, measured(rng, path, anchor, 0.05, bias, outliers), CONFIG)
     # A weak prior pulls the bias towards 0 by less than its own uncertainty; a kernel that drops lies costs a half.
     tolerance = 5 * 1.5 * expected_sigma(path, anchor, 0.05, outliers, CONFIG.samples)
     assert np.hypot(*(found[0].position - anchor)) < max(tolerance, 0.05)
@@ -49,7 +49,7 @@ def test_planted_anchors_are_found_among_lies(seed, outliers, bias):
 def test_position_sigma_tells_the_scatter():
     rng = np.random.default_rng(1)
     path, anchor = loop_path(rng), np.array([7.0, -3.0])
-    found = [locate(path, measured(rng, path, anchor, 0.1), CONFIG)[0] for _ in range(60)]
+    found = [trilaterate(path, measured(rng, path, anchor, 0.1), CONFIG)[0] for _ in range(60)]
     scatter = np.sqrt(np.linalg.eigvalsh(np.cov(np.array([h.position for h in found]).T))[-1])
     # Sixty draws know a standard deviation to 9 %; the robust kernel and its 1.4826 MAD add their own.
     assert np.median([h.position_sigma for h in found]) == pytest.approx(scatter, rel=0.5)
@@ -63,7 +63,7 @@ def test_a_straight_path_leaves_two_mirrored_places(seed, aside, heading):
     path = np.column_stack([np.linspace(-8, 8, 160), 0.005 * rng.standard_normal(160)])
     anchor = np.array([rng.uniform(-5, 5), aside])
     turn = np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), heading])
-    found = locate(se2.transform(turn, path), measured(rng, path, anchor, 0.05, 0.3), CONFIG)
+    found = trilaterate(se2.transform(turn, path), measured(rng, path, anchor, 0.05, 0.3), CONFIG)
     assert ambiguous(found, CONFIG)
     both = se2.transform(turn, np.array([anchor, anchor * [1, -1]]))
     gap = np.hypot(*(both[:, None] - np.array([h.position for h in found[:2]])[None]).transpose(2, 0, 1))
@@ -79,7 +79,7 @@ def test_a_corner_in_the_path_settles_the_mirror(seed, left):
     leg = np.linspace(0, 8, 80)
     path = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([8 + 0 * leg, leg if left else -leg])])
     anchor = np.array([rng.uniform(0, 6), rng.choice([-1, 1]) * rng.uniform(2, 6)])
-    found = locate(path, measured(rng, path, anchor, 0.05, 0.2), CONFIG)
+    found = trilaterate(path, measured(rng, path, anchor, 0.05, 0.2), CONFIG)
     assert not ambiguous(found, CONFIG)
     assert np.hypot(*(found[0].position - anchor)) < 5 * expected_sigma(path, anchor, 0.05, 0.0, CONFIG.samples)
 
@@ -88,7 +88,7 @@ def test_the_outcome_turns_with_the_path():
     rng = np.random.default_rng(3)
     path, anchor = loop_path(rng), np.array([3.0, 6.0])
     said, move = measured(rng, path, anchor), np.array([100.0, -50.0, 2.0])
-    here, there = locate(path, said, CONFIG)[0], locate(se2.transform(move, path), said, CONFIG)[0]
+    here, there = trilaterate(path, said, CONFIG)[0], trilaterate(se2.transform(move, path), said, CONFIG)[0]
     np.testing.assert_allclose(there.position, se2.transform(move, here.position), atol=0.01)
 
 
@@ -98,20 +98,20 @@ def test_a_path_that_drifts_is_trusted_as_far_as_it_drifts():
     path, anchor = loop_path(rng), np.array([4.0, -7.0])
     said = measured(rng, path, anchor)
     bent = path + 0.4 * np.linspace(0, 1, len(path))[:, None] * [0.7, 0.7]
-    found = locate(bent, said, CONFIG, drift=0.4)
+    found = trilaterate(bent, said, CONFIG, drift=0.4)
     assert np.hypot(*(found[0].position - anchor)) < 0.4
     assert not ambiguous(found, CONFIG)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_too_few_ranges_place_nothing(count):
-    assert locate(np.zeros((count, 2)), np.ones(count), CONFIG) == []
+    assert trilaterate(np.zeros((count, 2)), np.ones(count), CONFIG) == []
     assert not ambiguous([], CONFIG)
 
 
 def test_a_robot_that_stands_places_nothing_for_sure():
     rng = np.random.default_rng(5)
-    found = locate(np.zeros((50, 2)), 4.0 + 0.05 * rng.standard_normal(50), CONFIG)
+    found = trilaterate(np.zeros((50, 2)), 4.0 + 0.05 * rng.standard_normal(50), CONFIG)
     assert len(found) > 1
     assert ambiguous(found, CONFIG)
 
@@ -119,7 +119,7 @@ def test_a_robot_that_stands_places_nothing_for_sure():
 def test_hypotheses_are_distinct_and_in_order():
     rng = np.random.default_rng(6)
     path = loop_path(rng, metres=12.0)
-    found = locate(path, measured(rng, path, np.array([5.0, 5.0]), 0.2, outliers=0.3), CONFIG)
+    found = trilaterate(path, measured(rng, path, np.array([5.0, 5.0]), 0.2, outliers=0.3), CONFIG)
     costs = [h.cost for h in found]
     assert costs == sorted(costs)
     places = np.array([h.position for h in found])
@@ -145,12 +145,12 @@ def test_equal_neighbours_do_not_crowd_out_the_mirrored_place():
     """On a path that is straight to a millimetre both sides come back, whatever the raster; each once."""
     rng = np.random.default_rng(8)
     path = np.column_stack([np.linspace(-8, 8, 160), 0.001 * rng.standard_normal(160)])
-    found = locate(path, measured(rng, path, np.array([2.0, 4.0]), 0.02), AnchorConfig(raster=120))
+    found = trilaterate(path, measured(rng, path, np.array([2.0, 4.0]), 0.02), TrilaterationConfig(raster=120))
     assert sorted(round(float(h.position[1])) for h in found[:2]) == [-4, 4]
 
 
 def test_usable_readings_are_positive_finite_and_not_absurd():
-    config = AnchorConfig(max_range=100.0)
+    config = TrilaterationConfig(max_range=100.0)
     readings = np.array([0.0, -3.0, 0.01, 0.5, 99.0, 101.0, np.inf, np.nan])
     assert usable(readings, config).tolist() == [False, False, False, True, True, False, False, False]
 

@@ -151,14 +151,14 @@ def scan_indices(calibration: Calibration) -> Ints:
     return indices(calibration, *LASER)
 
 
-def freed(graph: Graph, *names: str) -> Graph:
+def with_free(graph: Graph, *names: str) -> Graph:
     """Return the graph with calibration unknowns of these names (an anchor's or a recording's own by their stem) set free."""
     assert graph.fixed_calibration is not None
     named = np.array([stem(name) in names for name in graph.calibration.names], dtype=bool)
     return replace(graph, fixed_calibration=graph.fixed_calibration & ~named)
 
 
-def with_real_heights(graph: Graph) -> Graph:
+def with_nonnegative_heights(graph: Graph) -> Graph:
     """Return the graph with squared heights that came out negative put back to 0 and held."""
     names, values = graph.calibration.names, graph.calibration.values.copy()
     below = np.array([n.startswith("height2:") for n in names], dtype=bool) & (values < 0.0)

@@ -198,10 +198,10 @@ def from_sweeps(
 
     def trace(walls: Bools | None, before: int) -> None:
         for task in tasks:
-            _trace(task, counter, walls, executor, teller(before))
+            _trace(task, counter, walls, executor, reporter(before))
             before += len(task.chosen)
 
-    def teller(before: int) -> Callable[[int], None]:
+    def reporter(before: int) -> Callable[[int], None]:
         return lambda done: None if progress is None else progress(before + done, count * (2 if clears else 1))
 
     trace(None, 0)

@@ -50,16 +50,16 @@ def covariance_csv(result: MapResult) -> str:
     """Return stamp and covariance (upper triangle; m^2, m rad, rad^2; map frame) and recording of every keyframe as CSV."""
     lines = ["stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording"]
     upper = np.triu_indices(3)
-    rows = (result.keyframe_stamps.tolist(), result.keyframe_covariances, result.keyframe_session.tolist())
-    for stamp, matrix, session in zip(*rows, strict=True):
-        lines.append(f"{stamp:.6f}," + ",".join(f"{v:.6e}" for v in matrix[upper].tolist()) + f",{session + 1}")
+    rows = (result.keyframe_stamps.tolist(), result.keyframe_covariances, result.keyframe_recording.tolist())
+    for stamp, matrix, recording in zip(*rows, strict=True):
+        lines.append(f"{stamp:.6f}," + ",".join(f"{v:.6e}" for v in matrix[upper].tolist()) + f",{recording + 1}")
     return "\n".join(lines) + "\n"
 
 
 def stamps_csv(result: MapResult) -> str:
     """Return number, stamp (s, on the clock of its recording) and recording of every pose of the graph as CSV."""
-    rows = zip(result.keyframe_stamps.tolist(), result.keyframe_session.tolist(), strict=True)
-    return "id,stamp,recording\n" + "".join(f"{k},{stamp:.6f},{session + 1}\n" for k, (stamp, session) in enumerate(rows))
+    rows = zip(result.keyframe_stamps.tolist(), result.keyframe_recording.tolist(), strict=True)
+    return "id,stamp,recording\n" + "".join(f"{k},{stamp:.6f},{recording + 1}\n" for k, (stamp, recording) in enumerate(rows))
 
 
 def anchors_csv(result: MapResult) -> str:
@@ -91,7 +91,7 @@ def _quoted(text: str) -> str:
 
 def _travelled(result: MapResult) -> float:
     steps = np.hypot(*np.diff(result.trajectory[:, :2], axis=0).T)
-    return float(steps[np.diff(result.session) == 0].sum())
+    return float(steps[np.diff(result.recording) == 0].sum())
 
 
 def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, hashes: dict[str, str]) -> dict[str, Any]:

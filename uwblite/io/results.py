@@ -132,9 +132,9 @@ def _title(logs: Sequence[SensorLog]) -> str:
 
 
 def _write_trajectories(folder: Path, result: MapResult) -> None:
-    for session in np.unique(result.session).tolist():
-        mine = result.session == session
-        name = "trajectory.tum" if session == 0 else f"trajectory_{session + 1}.tum"
+    for recording in np.unique(result.recording).tolist():
+        mine = result.recording == recording
+        name = "trajectory.tum" if recording == 0 else f"trajectory_{recording + 1}.tum"
         write_tum(folder / name, result.stamps[mine], result.trajectory[mine])
 
 
@@ -147,7 +147,7 @@ def _write_graphs(folder: Path, result: MapResult) -> None:
 
 def picture(result: MapResult, caption: str) -> NDArray[np.uint8]:
     """Return the picture of the map with path, anchors and accepted closures."""
-    parts = [np.vstack([result.trajectory[result.session == s, :2], [[np.nan, np.nan]]]) for s in np.unique(result.session)]
+    parts = [np.vstack([result.trajectory[result.recording == s, :2], [[np.nan, np.nan]]]) for s in np.unique(result.recording)]
     poses = result.graph.poses
     kept = [(*poses[c.i, :2], *poses[c.j, :2]) for c in result.closures if c.accepted]
     anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in result.anchors]

@@ -26,7 +26,7 @@ _CELLS_PER_REACH = 4
 
 
 @dataclass(frozen=True, slots=True)
-class SearchConfig:
+class CorrelativeConfig:
     """Grid of poses and what is made of its scores."""
 
     resolution: float = setting(0.15, above=0.0)
@@ -63,7 +63,7 @@ def search(
     source: PointCloud,
     T_target_source: Floats,
     window: tuple[float, float, float],
-    config: SearchConfig | None = None,
+    config: CorrelativeConfig | None = None,
 ) -> SearchResult:
     """Score every pose of a grid around a guess and return the best few.
 
@@ -78,7 +78,7 @@ def search(
     -------
     SearchResult; without candidates where nothing fits at all.
     """
-    config = config or SearchConfig()
+    config = config or CorrelativeConfig()
     scores, headings, shift_x, shift_y = score_grid(target, source, T_target_source, window, config)
     found = _peaks(scores, config)
     poses = np.stack(
@@ -98,7 +98,7 @@ def score_grid(
     source: PointCloud,
     T_target_source: Floats,
     window: tuple[float, float, float],
-    config: SearchConfig,
+    config: CorrelativeConfig,
 ) -> tuple[Singles, Floats, Ints, Ints]:
     """Score every pose of the grid.
 
@@ -132,7 +132,7 @@ def score_grid(
     return scores, headings, shift_x, shift_y
 
 
-def _target_field(target: PointCloud, config: SearchConfig, oriented: bool) -> tuple[NDArray[np.complex64], Floats]:
+def _target_field(target: PointCloud, config: CorrelativeConfig, oriented: bool) -> tuple[NDArray[np.complex64], Floats]:
     """Return the field (rows, columns) and the place of its lower left corner, m."""
     raster = target.raster(_CELLS_PER_REACH * config.resolution)
     index = raster.table.reshape(raster.height, raster.width)
@@ -146,7 +146,7 @@ def _target_field(target: PointCloud, config: SearchConfig, oriented: bool) -> t
 
 def _source_image(
     source: PointCloud, weight: NDArray[np.complex128], heading: float, guess: Floats, origin: Floats,
-    field: tuple[int, ...], half: list[int], shape: tuple[int, ...], config: SearchConfig,
+    field: tuple[int, ...], half: list[int], shape: tuple[int, ...], config: CorrelativeConfig,
 ) -> NDArray[np.complex64]:
     """Return the source turned to the heading and put at the guess, as weights in the cells of the target's field."""
     c, s = np.cos(heading), np.sin(heading)
@@ -161,7 +161,7 @@ def _source_image(
     return image.reshape(shape)
 
 
-def _peaks(scores: Singles, config: SearchConfig) -> Ints:
+def _peaks(scores: Singles, config: CorrelativeConfig) -> Ints:
     """Return indices (c, 3) of local maxima, the best first, none within the separation of a better one."""
     around = scores
     for axis in range(3):

@@ -74,7 +74,7 @@ class RefinementConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Refined:
+class RefinementResult:
     """Result of the joint refinement."""
 
     graph: Graph
@@ -113,7 +113,7 @@ def surface_cells(clouds: Clouds, poses: Floats, size: float = 0.5) -> sparse.cs
 
 
 def choose_pairs(
-    clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: RefinementConfig
+    clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: RefinementConfig
 ) -> tuple[Ints, Ints]:
     """Choose the pairs (i < j) of clouds to be matched: following keyframes, and the best views from other times.
 
@@ -124,15 +124,15 @@ def choose_pairs(
     k = len(clouds)
     near_i = np.concatenate([np.arange(k - n) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
     near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
-    joined = (session[near_i] == session[near_j]) & (path[near_j] - path[near_i] < 3.0)
+    joined = (recording[near_i] == recording[near_j]) & (path[near_j] - path[near_i] < 3.0)
     near_i, near_j = near_i[joined], near_j[joined]
-    i, j = _best_views(surface_cells(clouds, poses), path, session, config) if config.partners else (near_i[:0], near_j[:0])
+    i, j = _best_views(surface_cells(clouds, poses), path, recording, config) if config.partners else (near_i[:0], near_j[:0])
     low, high = np.minimum(i, j), np.maximum(i, j)
     pairs = np.unique(np.concatenate([low, near_i]) * k + np.concatenate([high, near_j]))
     return pairs // k, pairs % k
 
 
-def _best_views(seen: sparse.csr_matrix, path: Floats, session: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
+def _best_views(seen: sparse.csr_matrix, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
     """Return for every cloud i the clouds j from other times that share most with it, one of each epoch."""
     size = np.maximum(np.diff(seen.indptr), 1)
     epoch = (path / config.epoch).astype(np.int64)
@@ -144,9 +144,9 @@ def _best_views(seen: sparse.csr_matrix, path: Floats, session: Ints, config: Re
         share = common.data / np.minimum(size[i], size[j])
         kept = np.flatnonzero((np.abs(path[i] - path[j]) > config.epoch) & (share > config.min_share) & (common.data >= 4))
         i, j, share = i[kept], j[kept], share[kept]
-        order = np.lexsort((j, -share, epoch[j], session[j], i))
+        order = np.lexsort((j, -share, epoch[j], recording[j], i))
         i, j, share = i[order], j[order], share[order]
-        fresh = np.flatnonzero(np.diff(np.stack([i, epoch[j], session[j]]), axis=1, prepend=-1).any(axis=0))
+        fresh = np.flatnonzero(np.diff(np.stack([i, epoch[j], recording[j]]), axis=1, prepend=-1).any(axis=0))
         i, j, share = i[fresh], j[fresh], share[fresh]
         order = np.lexsort((j, -share, i))
         i, j = i[order], j[order]
@@ -167,7 +167,7 @@ def refine(
     solver: SolverConfig,
     on_round: Callable[[int, int], None] | None = None,
     delay: float = 0.0,
-) -> Refined:
+) -> RefinementResult:
     """Match all pairs and solve the graph, round by round.
 
     Parameters
@@ -216,7 +216,7 @@ def refine(
             on_round(rounds, config.rounds)
         last = gate <= config.last_gate * 1.001
         if rounds >= config.rounds or (last and moved < config.settled):
-            return Refined(graph, _only(edges, used), i, j, factors, used, sigma, rounds, summary)
+            return RefinementResult(graph, _only(edges, used), i, j, factors, used, sigma, rounds, summary)
         gate = max(gate * config.shrink, config.last_gate)
 
 

@@ -61,7 +61,7 @@ class PairFactors:
     """(e,) sum of w."""
 
 
-def paint(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
+def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     """Build the rasters: each point with a normal claims the cells within reach, nearer cells last.
 
     Parameters

@@ -14,7 +14,7 @@ from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..wheels import learn_wheels
 from .clouds import Clouds
-from .correlative_matching import SearchConfig, search
+from .correlative_matching import CorrelativeConfig, search
 from .pair_alignment import align_pairs
 from .point_cloud import make_cloud
 from .scan_matching import CloudRasters, match, measured, pair_points
@@ -49,7 +49,7 @@ class TrackingConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Followed:
+class ScanOdometry:
     """Steps between neighbouring keyframes."""
 
     steps: RelativePoseEdges
@@ -64,8 +64,8 @@ class Followed:
 
 def follow(
     clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig,
-    search_config: SearchConfig,
-) -> Followed:
+    search_config: CorrelativeConfig,
+) -> ScanOdometry:
     """Measure every step between neighbouring keyframes by their clouds, searching where the guess may have been bad.
 
     Parameters
@@ -91,7 +91,7 @@ def follow(
     kept = enough & (share >= config.least_share)
     steps = _edges(clouds, raster, i[kept], step[kept], tight, config)
     learnt = learn_wheels(wheels, steps, graph)
-    return Followed(steps, learnt, float(np.median(miss)) if len(miss) else 0.0, len(rows))
+    return ScanOdometry(steps, learnt, float(np.median(miss)) if len(miss) else 0.0, len(rows))
 
 
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
@@ -113,7 +113,7 @@ def _edges(
 
 def _search_step(
     clouds: Clouds, raster: CloudRasters, i: int, guess: Floats, gate: float, config: TrackingConfig,
-    search_config: SearchConfig,
+    search_config: CorrelativeConfig,
 ) -> tuple[Floats, float] | None:
     """Return the best pose of cloud i + 1 in cloud i and the share of points that match there."""
     target, source = (make_cloud(p, p + n) for p, n in (clouds.cloud(i), clouds.cloud(i + 1)))

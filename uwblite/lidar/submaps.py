@@ -53,7 +53,7 @@ class Submaps:
         return len(self.first)
 
 
-def cut(path: Floats, session: Ints, epsilon: float) -> tuple[Ints, Ints]:
+def cut(path: Floats, recording: Ints, epsilon: float) -> tuple[Ints, Ints]:
     """Cut keyframes with travelled distances path (k,), m, into pieces no longer than epsilon, m, each of one recording.
 
     Returns
@@ -61,19 +61,19 @@ def cut(path: Floats, session: Ints, epsilon: float) -> tuple[Ints, Ints]:
     first (s,) and one past the last keyframe (s,) of each piece.
     """
     piece = np.floor((path - path[0]) / max(epsilon, 1e-9)).astype(np.int64) if epsilon > 0 else np.arange(len(path))
-    change = np.concatenate([[True], (np.diff(piece) != 0) | (np.diff(session) != 0)])
+    change = np.concatenate([[True], (np.diff(piece) != 0) | (np.diff(recording) != 0)])
     first = np.flatnonzero(change)
     return first, np.append(first[1:], len(path))
 
 
-def build(clouds: Clouds, poses: Floats, path: Floats, session: Ints, config: SubmapConfig) -> Submaps:
+def build(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: SubmapConfig) -> Submaps:
     """Merge the clouds of each piece of the trajectory and filter them: voxel, statistical, radius.
 
     Parameters
     ----------
     clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. session : (k,).
     """
-    first, last = cut(path, session, config.epsilon)
+    first, last = cut(path, recording, config.epsilon)
     reference = (first + last - 1) // 2
     parts = []
     for block in range(0, len(first), _AT_ONCE):

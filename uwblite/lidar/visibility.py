@@ -48,7 +48,7 @@ def _free(poses: Floats, nearest: Floats) -> FreeSpace:
     return free_space(poses, nearest, -np.pi + 0.5 * step, step, blur=1)
 
 
-def seen_free(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:
+def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:
     """Return what each sub-map saw to be free, from some of its keyframes.
 
     Parameters
@@ -63,7 +63,7 @@ def seen_free(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace
     return free
 
 
-def still(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
+def static_points(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
     """Return sub-maps without what moved: points through which most of their own keyframes looked to which they were in view.
 
     People who walk beside the robot leave trails in a sub-map that no other sub-map shows.
@@ -76,7 +76,7 @@ def still(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
     return replace(submaps, clouds=submaps.clouds.only(kept))
 
 
-def sees_through(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, points_b: Floats, T_a_b: Floats) -> float:
+def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, points_b: Floats, T_a_b: Floats) -> float:
     """Return the larger share of either sub-map's points that would stand in what the other saw to be free, 0..1.
 
     Parameters
@@ -89,7 +89,7 @@ def sees_through(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, points_
     return max(one, other)
 
 
-def unrest(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, session: Ints) -> float:
+def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, recording: Ints) -> float:
     """Return how much of a sub-map the next one sees through where nothing but people, glass and drift can be the cause.
 
     Parameters
@@ -101,17 +101,17 @@ def unrest(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, session: 
     The share that one pair in ten of sub-maps driven one after the other exceeds, 0..1; 0 where there is no such pair.
     """
     reference = submaps.reference
-    pairs = np.flatnonzero(np.diff(session[reference]) == 0)
+    pairs = np.flatnonzero(np.diff(recording[reference]) == 0)
     steps = se2.between(poses[reference[pairs]], poses[reference[pairs + 1]])
     points = [submaps.clouds.cloud(k)[0] for k in range(len(submaps))]
     shares = [
-        sees_through(free[k], points[k], free[k + 1], points[k + 1], step)
+        violates_free_space(free[k], points[k], free[k + 1], points[k + 1], step)
         for k, step in zip(pairs.tolist(), steps, strict=True)
     ]
     return float(np.quantile(shares, 0.9)) if shares else 0.0
 
 
-def disagreement(clouds: Clouds, poses: Floats, path: Floats, session: Ints) -> tuple[float, int]:
+def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, int]:
     """Tell how much of what was seen on one visit stands in what another visit to the same place saw to be free.
 
     Parameters
@@ -122,7 +122,7 @@ def disagreement(clouds: Clouds, poses: Floats, path: Floats, session: Ints) -> 
     -------
     share : of the points that the other visit could see, 0..1. visits : views of one keyframe on what another saw.
     """
-    i, j = _revisits(poses, path, session)
+    i, j = _revisits(poses, path, recording)
     nearest = nearest_by_bearing(clouds)
     through, seen, visits = 0.0, 0.0, 0
     for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
@@ -135,12 +135,12 @@ def disagreement(clouds: Clouds, poses: Floats, path: Floats, session: Ints) -> 
     return through / max(seen, 1.0), visits
 
 
-def _revisits(poses: Floats, path: Floats, session: Ints) -> tuple[Ints, Ints]:
+def _revisits(poses: Floats, path: Floats, recording: Ints) -> tuple[Ints, Ints]:
     """Return pairs (p,), (p,) of keyframes that lie together but were not driven one after the other."""
     distance, other = cKDTree(poses[:, :2]).query(poses[:, :2], k=min(_NEIGHBOURS, len(poses)), distance_upper_bound=_REVISIT)
     distance, other = distance.reshape(len(poses), -1), other.reshape(len(poses), -1)
     other = np.minimum(other, len(poses) - 1)
-    again = (np.abs(path[other] - path[:, None]) > _APART) | (session[other] != session[:, None])
+    again = (np.abs(path[other] - path[:, None]) > _APART) | (recording[other] != recording[:, None])
     again &= np.isfinite(distance)
     i = np.flatnonzero(again.any(axis=1))
     i = i[np.unique(np.linspace(0, len(i) - 1, min(_REVISITS, len(i))).round().astype(np.int64))]

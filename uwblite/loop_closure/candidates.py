@@ -52,7 +52,7 @@ class Candidates:
 
 
 def propose(
-    graph: Graph, marginals: JointCovariance, submaps: Submaps, session: Ints, tried: set[tuple[int, int, bool]],
+    graph: Graph, marginals: JointCovariance, submaps: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
     missed: set[tuple[int, int]], held: bool, config: LoopClosureConfig,
 ) -> Candidates:
     """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
@@ -68,7 +68,7 @@ def propose(
     s = len(submaps)
     reference = submaps.reference
     a, b = np.triu_indices(s, 1)
-    apart = (b - a > 1) | (session[reference[a]] != session[reference[b]])
+    apart = (b - a > 1) | (recording[reference[a]] != recording[reference[b]])
     a, b = a[apart], b[apart]
     poses = graph.poses[reference]
     distance = np.hypot(*(poses[a, :2] - poses[b, :2]).T)

@@ -13,12 +13,12 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..lidar.clouds import Clouds
-from ..lidar.correlative_matching import SearchConfig, search
+from ..lidar.correlative_matching import CorrelativeConfig, search
 from ..lidar.free_space import FreeSpace
 from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.point_cloud import PointCloud, make_cloud
-from ..lidar.scan_matching import PairFactors, match, paint, pair_points
-from ..lidar.visibility import sees_through
+from ..lidar.scan_matching import PairFactors, match, pair_points, rasterize
+from ..lidar.visibility import violates_free_space
 from ..parallel import in_order
 from .candidates import Candidates
 from .closures import LoopClosureConfig
@@ -30,7 +30,7 @@ _SAME_PLACE = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fits:
+class ClosureMatches:
     """How candidates (c,) fit."""
 
     best: Aligned
@@ -52,14 +52,14 @@ class _Batch:
     clouds: Clouds
     free: Sequence[FreeSpace] | None
     config: LoopClosureConfig
-    search: SearchConfig
+    search: CorrelativeConfig
 
 
 def fit(
-    candidates: Candidates, clouds: Clouds, config: LoopClosureConfig, search_config: SearchConfig,
+    candidates: Candidates, clouds: Clouds, config: LoopClosureConfig, search_config: CorrelativeConfig,
     free: Sequence[FreeSpace] | None = None, progress: Callable[[int, int], None] | None = None,
     executor: Executor | None = None,
-) -> Fits:
+) -> ClosureMatches:
     """Find where each candidate fits.
 
     Parameters
@@ -76,11 +76,11 @@ def fit(
             progress(done, total)
     factors = (np.concatenate([getattr(p.best.factors, f.name) for p in parts]) for f in fields(PairFactors))
     best = Aligned(np.concatenate([p.best.pose for p in parts]), PairFactors(*factors))
-    return Fits(best, *(np.concatenate([getattr(p, name) for p in parts]) for name in ("found", "second", "through")))
+    return ClosureMatches(best, *(np.concatenate([getattr(p, name) for p in parts]) for name in ("found", "second", "through")))
 
 
 def _batches(
-    candidates: Candidates, clouds: Clouds, config: LoopClosureConfig, search_config: SearchConfig,
+    candidates: Candidates, clouds: Clouds, config: LoopClosureConfig, search_config: CorrelativeConfig,
     free: Sequence[FreeSpace] | None,
 ) -> Iterator[_Batch]:
     for first in range(0, len(candidates.target), _AT_ONCE):
@@ -91,10 +91,10 @@ def _batches(
         yield _Batch(part.renumbered(target, source), clouds.chosen(used), spaces, config, search_config)
 
 
-def _fit(batch: _Batch) -> Fits:
+def _fit(batch: _Batch) -> ClosureMatches:
     """Fit one batch; runs in a worker."""
     candidates, clouds, config = batch.candidates, batch.clouds, batch.config
-    raster = paint(clouds, 0.1, 0.5)
+    raster = rasterize(clouds, 0.1, 0.5)
     row, guess = _guesses(batch)
     points = pair_points(clouds, candidates.source[row], config.points)
     tries = align_pairs(clouds, raster, candidates.target[row], candidates.source[row], guess, points, 0.5, config.gate)
@@ -104,7 +104,7 @@ def _fit(batch: _Batch) -> Fits:
     points = pair_points(clouds, candidates.source, config.points)
     factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
     best = Aligned(pose, factors)
-    return Fits(best, found, second, _see_through(batch, best))
+    return ClosureMatches(best, found, second, _see_through(batch, best))
 
 
 def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
@@ -155,5 +155,5 @@ def _see_through(batch: _Batch, best: Aligned) -> Floats:
     promising = (best.share >= min(config.overlap, config.overlap_after_search)) & (best.rms <= config.sigma)
     for k in np.flatnonzero(promising):
         a, b = int(candidates.target[k]), int(candidates.source[k])
-        through[k] = sees_through(free[a], batch.clouds.cloud(a)[0], free[b], batch.clouds.cloud(b)[0], best.pose[k])
+        through[k] = violates_free_space(free[a], batch.clouds.cloud(a)[0], free[b], batch.clouds.cloud(b)[0], best.pose[k])
     return through

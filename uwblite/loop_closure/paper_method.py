@@ -32,7 +32,7 @@ _AT_ONCE = 32
 
 
 def find(
-    graph: Graph, submaps: Submaps, session: Ints, config: LoopClosureConfig, icp: IcpConfig,
+    graph: Graph, submaps: Submaps, recording: Ints, config: LoopClosureConfig, icp: IcpConfig,
     progress: Callable[[int, int], None] | None = None, executor: Executor | None = None,
 ) -> Closures:
     """Align every pair of sub-maps that overlap by the graph; keep all, with what became of them.
@@ -45,7 +45,7 @@ def find(
     progress : called with (done, total).
     executor : any concurrent.futures executor; the result does not depend on it.
     """
-    target, source = candidates(graph.poses, submaps, session, config.partners)
+    target, source = candidates(graph.poses, submaps, recording, config.partners)
     if not len(target):
         return no_closures()
     i, j = submaps.reference[target], submaps.reference[source]
@@ -70,7 +70,7 @@ def find(
     )
 
 
-def candidates(poses: Floats, submaps: Submaps, session: Ints, limit: int) -> tuple[Ints, Ints]:
+def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> tuple[Ints, Ints]:
     """Return target (c,) and source (c,) of the pairs of sub-maps that share enough of their surface, a < b.
 
     Parameters
@@ -80,7 +80,7 @@ def candidates(poses: Floats, submaps: Submaps, session: Ints, limit: int) -> tu
     """
     shared = _shared(poses[submaps.reference], submaps)
     a, b = np.triu_indices(len(submaps), 1)
-    first = session[submaps.reference]
+    first = recording[submaps.reference]
     worth = np.where((b - a > 1) | (first[a] != first[b]), shared[a, b], 0.0)
     order = np.lexsort((b, a, -worth))
     order = order[worth[order] >= _LEAST_SHARED]

@@ -19,7 +19,7 @@ from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, optimize
-from ..lidar.correlative_matching import SearchConfig
+from ..lidar.correlative_matching import CorrelativeConfig
 from ..lidar.free_space import FreeSpace
 from ..lidar.pair_alignment import Aligned
 from ..lidar.scan_matching import measured
@@ -27,11 +27,11 @@ from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
 from .candidates import Candidates
 from .closures import Closures, LoopClosureConfig, no_closures
-from .matching import Fits, fit
+from .matching import ClosureMatches, fit
 
 
 def find(
-    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: SearchConfig,
+    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: CorrelativeConfig,
     progress: Callable[[int, int], None] | None = None, free: Sequence[FreeSpace] | None = None,
     executor: Executor | None = None,
 ) -> Closures:
@@ -55,7 +55,7 @@ def find(
 
 
 def _judge(
-    candidates: Candidates, fits: Fits, z: Floats, sqrt_information: Floats, config: LoopClosureConfig
+    candidates: Candidates, fits: ClosureMatches, z: Floats, sqrt_information: Floats, config: LoopClosureConfig
 ) -> list[str]:
     """Return why each candidate is rejected; '' = accepted so far."""
     result, searched = fits.best, candidates.spread > config.direct

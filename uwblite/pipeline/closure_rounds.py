@@ -13,30 +13,32 @@ from ..loop_closure.closures import Closures
 from ..mapping_config import MappingConfig
 from .lidar_stages import Scans
 from .progress import Stages, solver_figures
-from .recordings import Drives, Part
+from .recordings import Estimate, Recordings
 
 
 def close(
-    part: Part, edges: tuple[Edges, ...], scans: Scans, drives: Drives, config: MappingConfig, stages: Stages,
+    estimate: Estimate, edges: tuple[Edges, ...], scans: Scans, recordings: Recordings, config: MappingConfig, stages: Stages,
     executor: Executor | None,
-) -> tuple[Part, Closures]:
+) -> tuple[Estimate, Closures]:
     """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
-    session = drives.session
-    base = part.graph.with_edges(*edges)
+    recording = recordings.of_keyframe
+    base = estimate.graph.with_edges(*edges)
     found = closures.no_closures()
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
-    held = part.radio is not None
+    held = estimate.radio is not None
     for lap in range(config.loops.rounds):
-        pieces = submaps.build(scans.clouds, base.poses, drives.path, session, config.submaps)
-        free = visibility.seen_free(scans.clouds, pieces, base.poses)
-        pieces = visibility.still(pieces, free)
+        pieces = submaps.build(scans.clouds, base.poses, recordings.path, recording, config.submaps)
+        free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
+        pieces = visibility.static_points(pieces, free)
         known = JointCovariance(base.with_edges(found.edges), pieces.reference)
-        candidates = closure_candidates.propose(base, known, pieces, session, tried, missed, held, config.loops)
+        candidates = closure_candidates.propose(base, known, pieces, recording, tried, missed, held, config.loops)
         tried |= candidates.names(config.loops)
-        teller = stages.teller("loop closure")
-        rules = replace(config.loops, through=max(config.loops.through, visibility.unrest(pieces, free, base.poses, session)))
-        new = verification.find(candidates, pieces, rules, config.search, teller, free, executor)
+        reporter = stages.reporter("loop closure")
+        rules = replace(
+            config.loops, through=max(config.loops.through, visibility.dynamic_share(pieces, free, base.poses, recording))
+        )
+        new = verification.find(candidates, pieces, rules, config.search, reporter, free, executor)
         new = _without_forbidden(new, scans)
         missed |= set() if held else closure_candidates.missed(candidates, new, config.loops)
         found = closures.merged(found, new)
@@ -49,26 +51,26 @@ def close(
         unsearched = missed - {(a, b) for a, b, searched in tried if searched}
         if (tied or len(new.edges) <= 0.05 * len(found.edges)) and not unsearched:
             break
-    return replace(part, graph=part.graph.with_estimates_of(base)), found
+    return replace(estimate, graph=estimate.graph.with_estimates_of(base)), found
 
 
 def close_plainly(
-    part: Part, edges: tuple[Edges, ...], scans: Scans, drives: Drives, config: MappingConfig, stages: Stages,
+    estimate: Estimate, edges: tuple[Edges, ...], scans: Scans, recordings: Recordings, config: MappingConfig, stages: Stages,
     executor: Executor | None,
-) -> tuple[Part, Closures]:
+) -> tuple[Estimate, Closures]:
     """Align sub-maps pair by pair and solve once more with those that fit (paper: second optimisation)."""
-    graph, session = part.graph, drives.session
+    graph, recording = estimate.graph, recordings.of_keyframe
     found = closures.no_closures()
     for lap in range(config.loops.rounds):
-        pieces = submaps.build(scans.clouds, graph.poses, drives.path, session, config.submaps)
-        teller = stages.teller("loop closure")
-        found = paper_method.find(graph, pieces, session, config.loops, config.icp, teller, executor)
+        pieces = submaps.build(scans.clouds, graph.poses, recordings.path, recording, config.submaps)
+        reporter = stages.reporter("loop closure")
+        found = paper_method.find(graph, pieces, recording, config.loops, config.icp, reporter, executor)
         found = _without_forbidden(found, scans)
         stages.end(f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(found.candidates), accepted=len(found.edges))
         solved, result = optimize(graph.with_edges(*edges, found.edges), config.solver)
         graph = graph.with_estimates_of(solved)
         stages.end(f"second optimisation {lap + 1}", **solver_figures(result))
-    return replace(part, graph=graph), found
+    return replace(estimate, graph=graph), found
 
 
 def _without_forbidden(found: Closures, scans: Scans) -> Closures:

@@ -1,4 +1,4 @@
-"""Many recordings in one graph: anchors have ids, so drives of other days and robots share a frame.
+"""Many recordings in one graph: anchors have ids, so recordings of other days and robots share a frame.
 
 Each recording grows its own first estimate. The anchors that two have in common then say how one lies in the frame of
 the other; one that was moved in between does not join in, gets a place of its own for each recording (``5C0B`` and
@@ -20,16 +20,16 @@ from ..graph.graph import Calibration, Graph, PriorEdges
 from ..graph.marginals import marginals
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
-from ..radio.bootstrap import FirstEstimate
+from ..radio.bootstrap import BootstrapResult
 from ..radio.trilateration import AnchorHypothesis
 from .constraint_edges import consensus
-from .recordings import Drives, Joined, Part, Session, moved_hypotheses, moved_text, numbered
+from .recordings import Estimate, JoinResult, Recording, Recordings, moved_anchor_text, moved_hypotheses, numbered
 
 _FIRST_TOLERANCE = 0.5
 """How far first estimates of one anchor may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""
 
 
-def join(parts: Sequence[Part], drives: Drives) -> Joined:
+def join(estimates: Sequence[Estimate], recordings: Recordings) -> JoinResult:
     """Bring all recordings into the frame of the first, by the anchors they have in common, and make them one graph.
 
     Recordings join in the order of how many anchors they share with those already in, so that a third may link two.
@@ -37,23 +37,23 @@ def join(parts: Sequence[Part], drives: Drives) -> Joined:
     Parameters
     ----------
     parts : each recording's own estimates, in its own frame and numbering.
-    drives : the recordings.
+    recordings : all of them, their keyframes in one numbering.
 
     Raises
     ------
     DataError : a recording shares fewer than two placed anchors with the others.
     """
-    if len(parts) == 1:
-        return Joined(parts[0], ())
-    known = _places(parts[0])
-    motions = [np.zeros(3) for _ in parts]
-    names = [list(part.anchor_ids) for part in parts]
+    if len(estimates) == 1:
+        return JoinResult(estimates[0], ())
+    known = _places(estimates[0])
+    motions = [np.zeros(3) for _ in estimates]
+    names = [list(estimate.anchor_ids) for estimate in estimates]
     warnings: list[str] = []
-    waiting = list(range(1, len(parts)))
+    waiting = list(range(1, len(estimates)))
     while waiting:
-        found = {n: _places(parts[n]) for n in waiting}
+        found = {n: _places(estimates[n]) for n in waiting}
         number = max(waiting, key=lambda n: (len(found[n].keys() & known.keys()), -n))
-        motions[number], moved = _laid_on(found[number], known, drives.sessions[number])
+        motions[number], moved = _laid_on(found[number], known, recordings.each[number])
         waiting.remove(number)
         for k, name in enumerate(names[number]):
             here, spread = found[number].get(name, (None, 0.0))
@@ -62,9 +62,9 @@ def join(parts: Sequence[Part], drives: Drives) -> Joined:
             here = se2.transform(motions[number], here)
             if name in moved:
                 names[number][k] = _other_name(name, here, spread, number, known)
-                warnings.append(moved_text(name, moved[name], number, names[number][k]))
+                warnings.append(moved_anchor_text(name, moved[name], number, names[number][k]))
             known.setdefault(names[number][k], (here, spread))
-    return Joined(_one_graph(parts, motions, names, drives), tuple(warnings))
+    return JoinResult(_one_graph(estimates, motions, names, recordings), tuple(warnings))
 
 
 def _other_name(name: str, here: Floats, spread: float, number: int, known: dict[str, tuple[Floats, float]]) -> str:
@@ -76,28 +76,29 @@ def _other_name(name: str, here: Floats, spread: float, number: int, known: dict
     return numbered(name, number)
 
 
-def _places(part: Part) -> dict[str, tuple[Floats, float]]:
+def _places(estimate: Estimate) -> dict[str, tuple[Floats, float]]:
     """Return place (2,) and standard deviation (m) of the anchors of a part that are clear; of all placed if these are few."""
-    if part.first is None:
+    if estimate.first is None:
         return {}
-    placed = np.flatnonzero(part.first.placed & ~part.first.ambiguous)
+    placed = np.flatnonzero(estimate.first.placed & ~estimate.first.ambiguous)
     if len(placed) < 2:
-        placed = np.flatnonzero(part.first.placed)
-    spread = marginals(part.graph.with_edges(*part.edges)).anchors
+        placed = np.flatnonzero(estimate.first.placed)
+    spread = marginals(estimate.graph.with_edges(*estimate.edges)).anchors
     return {
-        part.anchor_ids[k]: (part.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, 25.0)))) for k in placed
+        estimate.anchor_ids[k]: (estimate.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, 25.0))))
+        for k in placed
     }
 
 
 def _laid_on(
-    found: dict[str, tuple[Floats, float]], known: dict[str, tuple[Floats, float]], session: Session
+    found: dict[str, tuple[Floats, float]], known: dict[str, tuple[Floats, float]], recording: Recording
 ) -> tuple[Floats, dict[str, float]]:
     """Return the motion (3,) of a recording into the common frame, and the anchors that do not join in, with how far off."""
     common = sorted(found.keys() & known.keys())
     if len(common) < 2:
         raise DataError(
-            f"{session.name} shares {len(common)} placed anchors with the others ({', '.join(common) or 'none'}); two or more "
-            "are needed to bring it into their frame: map it alone, or record where common anchors are heard"
+            f"{recording.name} shares {len(common)} placed anchors with the others ({', '.join(common) or 'none'}); two "
+            "or more are needed to bring it into their frame: map it alone, or record where common anchors are heard"
         )
     here, there = (np.array([side[name][0] for name in common]) for side in (found, known))
     spread = np.array([np.hypot(found[name][1], known[name][1]) for name in common])
@@ -107,23 +108,25 @@ def _laid_on(
     return motion, {name: float(d) for name, d, most in zip(common, off, tolerance, strict=True) if d > most}
 
 
-def _one_graph(parts: Sequence[Part], motions: Sequence[Floats], names: Sequence[Sequence[str]], drives: Drives) -> Part:
+def _one_graph(
+    estimates: Sequence[Estimate], motions: Sequence[Floats], names: Sequence[Sequence[str]], recordings: Recordings
+) -> Estimate:
     """Make the parts one, each moved by its motion, its anchors under the given names."""
     ids = tuple(dict.fromkeys(name for own in names for name in own))
     place = [np.array([ids.index(name) for name in own], dtype=np.int64) for own in names]
-    block, priors, fixed, at = _one_calibration([part.graph for part in parts])
-    poses = np.concatenate([se2.compose(m, part.graph.poses) for m, part in zip(motions, parts, strict=True)])
-    first = _one_first_estimate(parts, motions, place, len(ids))
+    block, priors, fixed, at = _one_calibration([estimate.graph for estimate in estimates])
+    poses = np.concatenate([se2.compose(m, estimate.graph.poses) for m, estimate in zip(motions, estimates, strict=True)])
+    first = _one_first_estimate(estimates, motions, place, len(ids))
     anchors = np.zeros((len(ids), 2))
-    for part, motion, own in zip(reversed(parts), reversed(motions), reversed(place), strict=True):
-        known = np.zeros(len(own), dtype=bool) if part.first is None else part.first.placed
-        anchors[own[known]] = se2.transform(motion, part.graph.anchors[known])
+    for estimate, motion, own in zip(reversed(estimates), reversed(motions), reversed(place), strict=True):
+        known = np.zeros(len(own), dtype=bool) if estimate.first is None else estimate.first.placed
+        anchors[own[known]] = se2.transform(motion, estimate.graph.anchors[known])
     graph = Graph(
         poses, anchors, (priors,), block, fixed_anchors=None if first is None else ~first.placed, fixed_calibration=fixed
     )
     return replace(
-        parts[0], graph=graph, wheels=_one_wheels([p.wheels for p in parts], at, drives),
-        radio=_one_radio([p.radio for p in parts], at, place, drives), first=first, anchor_ids=ids,
+        estimates[0], graph=graph, wheels=_one_wheels([p.wheels for p in estimates], at, recordings),
+        radio=_one_radio([p.radio for p in estimates], at, place, recordings), first=first, anchor_ids=ids,
     )  # fmt: skip
 
 
@@ -145,14 +148,14 @@ def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, 
 
 
 def _one_first_estimate(
-    parts: Sequence[Part], motions: Sequence[Floats], place: Sequence[Ints], anchors: int
-) -> FirstEstimate | None:
+    estimates: Sequence[Estimate], motions: Sequence[Floats], place: Sequence[Ints], anchors: int
+) -> BootstrapResult | None:
     """Return the first estimates as one: an anchor that one recording shows clearly is clear."""
     placed, clear = np.zeros(anchors, dtype=bool), np.zeros(anchors, dtype=bool)
     hypotheses: list[tuple[AnchorHypothesis, ...]] = [()] * anchors
-    some = [part.first for part in parts if part.first is not None]
-    for part, motion, own in zip(parts, motions, place, strict=True):
-        moved = moved_hypotheses(part.first, motion)
+    some = [estimate.first for estimate in estimates if estimate.first is not None]
+    for estimate, motion, own in zip(estimates, motions, place, strict=True):
+        moved = moved_hypotheses(estimate.first, motion)
         if moved is None:
             continue
         for k, here in enumerate(own.tolist()):
@@ -169,8 +172,8 @@ def _renamed(indices: Ints, at: Ints) -> Ints:
     return np.append(at, -1)[indices]
 
 
-def _one_wheels(wheels: Sequence[OdometryEdges], at: Sequence[Ints], drives: Drives) -> OdometryEdges:
-    first = [s.first for s in drives.sessions]
+def _one_wheels(wheels: Sequence[OdometryEdges], at: Sequence[Ints], recordings: Recordings) -> OdometryEdges:
+    first = [s.first for s in recordings.each]
     return replace(
         wheels[0],
         i=np.concatenate([w.i + f for w, f in zip(wheels, first, strict=True)]),
@@ -184,17 +187,17 @@ def _one_wheels(wheels: Sequence[OdometryEdges], at: Sequence[Ints], drives: Dri
 
 
 def _one_radio(
-    radios: Sequence[RangeEdges | None], at: Sequence[Ints], place: Sequence[Ints], drives: Drives
+    radios: Sequence[RangeEdges | None], at: Sequence[Ints], place: Sequence[Ints], recordings: Recordings
 ) -> RangeEdges | None:
     """Return the ranges of all; what tags sit elsewhere than the first goes into the lever arms."""
     moved = []
     tag = next((r.tag for r in radios if r is not None), None)
-    for radio, session, own, rename in zip(radios, drives.sessions, place, at, strict=True):
+    for radio, recording, own, rename in zip(radios, recordings.each, place, at, strict=True):
         if radio is not None and tag is not None:
             arm = radio.lever_arm + se2.rotate(radio.turn, radio.tag - tag)
             moved.append(
                 replace(
-                    radio, pose=radio.pose + session.first, anchor=own[radio.anchor], lever_arm=arm, tag=tag,
+                    radio, pose=radio.pose + recording.first, anchor=own[radio.anchor], lever_arm=arm, tag=tag,
                     calibration=_renamed(radio.calibration, rename),
                 )
             )  # fmt: skip

@@ -127,5 +127,5 @@ def cropped(grid: OccupancyGrid, box: tuple[float, float, float, float]) -> Occu
         )
     cols, rows = slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
     origin = geometry.origin + geometry.resolution * low
-    part = GridGeometry(geometry.resolution, origin, rows.stop - rows.start, cols.stop - cols.start)
-    return replace(grid, geometry=part, log_odds=grid.log_odds[rows, cols].copy())
+    estimate = GridGeometry(geometry.resolution, origin, rows.stop - rows.start, cols.stop - cols.start)
+    return replace(grid, geometry=estimate, log_odds=grid.log_odds[rows, cols].copy())

@@ -12,7 +12,7 @@ from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, optimize
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
-from .recordings import Drives, Joined, Part, moved_text, numbered
+from .recordings import Estimate, JoinResult, Recordings, moved_anchor_text, numbered
 
 _LEAST_MOVE = 0.25
 """An anchor that two recordings see nearer together than this was not moved, m."""
@@ -21,44 +21,44 @@ _MOVED = 20.0
 freedom; 5e-5 by chance, the rest for what the sigmas do not know)."""
 
 
-def apart(part: Part, drives: Drives, solver: SolverConfig, noise: RangeNoiseConfig) -> Joined:
+def apart(estimate: Estimate, recordings: Recordings, solver: SolverConfig, noise: RangeNoiseConfig) -> JoinResult:
     """Give anchors that were moved between recordings a place of their own, once the poses are known well.
 
     With the poses held, every recording's ranges say where each anchor stood then; places whose distance their
     uncertainty does not explain are not the same.
     """
-    if len(drives) == 1 or part.radio is None or part.first is None:
-        return Joined(part, ())
-    heard = drives.session[part.radio.pose]
-    place, covariance, pairs = _places_by_recording(part, heard, solver, noise)
-    ids, anchors, anchor = list(part.anchor_ids), part.graph.anchors.copy(), part.radio.anchor.copy()
+    if len(recordings) == 1 or estimate.radio is None or estimate.first is None:
+        return JoinResult(estimate, ())
+    heard = recordings.of_keyframe[estimate.radio.pose]
+    place, covariance, pairs = _places_by_recording(estimate, heard, solver, noise)
+    ids, anchors, anchor = list(estimate.anchor_ids), estimate.graph.anchors.copy(), estimate.radio.anchor.copy()
     source = list(range(len(ids)))
     warnings: list[str] = []
-    for k in range(len(part.anchor_ids)):
+    for k in range(len(estimate.anchor_ids)):
         rows = np.flatnonzero(pairs[:, 0] == k).tolist()
         known = dict.fromkeys(rows[:1], k)
         for row in rows[1:]:
             recording = int(pairs[row, 1])
             same = [n for r, n in known.items() if not _differ(place[row] - place[r], covariance[row] + covariance[r])]
             if not same:
-                ids.append(numbered(part.anchor_ids[k], recording))
+                ids.append(numbered(estimate.anchor_ids[k], recording))
                 source.append(k)
                 anchors = np.vstack([anchors, place[row]])
             known[row] = same[0] if same else len(ids) - 1
             if known[row] != k:
-                anchor[(part.radio.anchor == k) & (heard == recording)] = known[row]
+                anchor[(estimate.radio.anchor == k) & (heard == recording)] = known[row]
                 off = float(np.hypot(*(place[row] - place[rows[0]])))
-                warnings.append(moved_text(part.anchor_ids[k], off, recording, ids[known[row]]))
+                warnings.append(moved_anchor_text(estimate.anchor_ids[k], off, recording, ids[known[row]]))
     if not warnings:
-        return Joined(part, ())
-    first = part.first
+        return JoinResult(estimate, ())
+    first = estimate.first
     first = replace(
         first, placed=first.placed[source], ambiguous=first.ambiguous[source],
-        hypotheses=tuple(first.hypotheses[k] if n < len(part.anchor_ids) else () for n, k in enumerate(source)),
+        hypotheses=tuple(first.hypotheses[k] if n < len(estimate.anchor_ids) else () for n, k in enumerate(source)),
     )  # fmt: skip
-    graph = replace(part.graph, anchors=anchors, fixed_anchors=~first.placed)
-    radio = replace(part.radio, anchor=anchor)
-    return Joined(replace(part, graph=graph, radio=radio, first=first, anchor_ids=tuple(ids)), tuple(warnings))
+    graph = replace(estimate.graph, anchors=anchors, fixed_anchors=~first.placed)
+    radio = replace(estimate.radio, anchor=anchor)
+    return JoinResult(replace(estimate, graph=graph, radio=radio, first=first, anchor_ids=tuple(ids)), tuple(warnings))
 
 
 def _differ(off: Floats, covariance: Floats) -> bool:
@@ -66,14 +66,14 @@ def _differ(off: Floats, covariance: Floats) -> bool:
 
 
 def _places_by_recording(
-    part: Part, heard: Ints, solver: SolverConfig, noise: RangeNoiseConfig
+    estimate: Estimate, heard: Ints, solver: SolverConfig, noise: RangeNoiseConfig
 ) -> tuple[Floats, Floats, Ints]:
     """Return place (p, 2), covariance (p, 2, 2) and (anchor, recording) of each anchor as each recording heard it."""
-    radio, graph = part.radio, part.graph
+    radio, graph = estimate.radio, estimate.graph
     assert radio is not None
-    assert part.first is not None
+    assert estimate.first is not None
     assert graph.fixed_calibration is not None
-    alive = np.flatnonzero((np.asarray(radio.weights) > 0) & part.first.placed[radio.anchor])
+    alive = np.flatnonzero((np.asarray(radio.weights) > 0) & estimate.first.placed[radio.anchor])
     pairs, which = np.unique(np.stack([radio.anchor[alive], heard[alive]], axis=1), axis=0, return_inverse=True)
     own = np.array([calibration.stem(name) == "bias" for name in graph.calibration.names], dtype=bool)
     priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration")

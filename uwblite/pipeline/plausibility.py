@@ -8,7 +8,7 @@ from ..arrays import Bools, Floats
 from ..graph.calibration import CalibrationConfig, Unknown, stem
 from ..graph.graph import Graph, PriorEdges
 from ..map_result import CalibrationEstimate
-from .recordings import Drives
+from .recordings import Recordings
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate is told."""
@@ -17,7 +17,9 @@ _WRONG_TURNS = 0.25
 """Relative error of the wheels' turns beyond which their sign is no longer sure."""
 
 
-def unusual(calibrated: Sequence[CalibrationEstimate], usual: dict[str, Unknown], config: CalibrationConfig) -> list[str]:
+def implausible_calibration(
+    calibrated: Sequence[CalibrationEstimate], usual: dict[str, Unknown], config: CalibrationConfig
+) -> list[str]:
     """Return a warning for each estimate clearly far outside what is usual.
 
     Parameters
@@ -39,7 +41,7 @@ def unusual(calibrated: Sequence[CalibrationEstimate], usual: dict[str, Unknown]
     return told
 
 
-def mirrored(graph: Graph, drives: Drives, config: CalibrationConfig) -> list[str]:
+def mirror_ambiguity(graph: Graph, recordings: Recordings, config: CalibrationConfig) -> list[str]:
     """Return a doubt for each recording whose ranges or scans fit only where the wheels' turns are scaled grossly.
 
     Ranges alone do not tell a map from its mirror image: a drive mirrored together with its anchors has the same ranges.
@@ -55,7 +57,7 @@ def mirrored(graph: Graph, drives: Drives, config: CalibrationConfig) -> list[st
         for name, value in zip(graph.calibration.names, graph.calibration.values, strict=True)
         if stem(name) == "heading_scale" and abs(value) > _WRONG_TURNS
     ]
-    if any(session.has_scans for session in drives.sessions):
+    if any(recording.has_scans for recording in recordings.each):
         return [
             f"the map may be mirrored: the wheels' turns agree with the laser's only when multiplied by {factor:.2f}; "
             "is the laser upside down (--laser-flipped), or does the odometry's heading count the other way?"
@@ -70,7 +72,7 @@ def mirrored(graph: Graph, drives: Drives, config: CalibrationConfig) -> list[st
     ]
 
 
-def lying_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
+def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
     """Return the stretches (first and last stamp, s) in which most of one anchor's readings (m,) disagree with the map.
 
     Bins of equal counts; fewer than 100 readings show no stretches.
@@ -85,7 +87,7 @@ def lying_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
     return [(float(stamps[bins[a][0]]), float(stamps[bins[b - 1][-1]])) for a, b in runs if b - a >= 2]
 
 
-def lies(table: dict[str, Floats], anchor_ids: Sequence[str], start: float) -> list[str]:
+def sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], start: float) -> list[str]:
     """Return a warning for each anchor that is wrong for long: something stood in its way, or it was moved.
 
     Parameters
@@ -95,7 +97,7 @@ def lies(table: dict[str, Floats], anchor_ids: Sequence[str], start: float) -> l
     told = []
     for k, name in enumerate(anchor_ids):
         own = (table["anchor"] == k) & (table["weight"] > 0)
-        stretches = lying_stretches(table["stamp"][own], table["agrees"][own] > 0.5) if own.any() else []
+        stretches = outlier_stretches(table["stamp"][own], table["agrees"][own] > 0.5) if own.any() else []
         if stretches:
             when = ", ".join(f"{a - start:.0f} to {b - start:.0f} s" for a, b in stretches[:4])
             told.append(
@@ -105,11 +107,11 @@ def lies(table: dict[str, Floats], anchor_ids: Sequence[str], start: float) -> l
     return told
 
 
-def out_of_time(drives: Drives, slack: float) -> list[str]:
+def ranges_outside_odometry(recordings: Recordings, slack: float) -> list[str]:
     """Return a warning where ranges were stamped outside the odometry's time by more than the slack, s."""
     told = []
-    for session in drives.sessions:
-        ranges, odometry = session.log.ranges, session.log.odometry.stamps
+    for recording in recordings.each:
+        ranges, odometry = recording.log.ranges, recording.log.odometry.stamps
         if ranges is None or not len(ranges.stamps):
             continue
         outside = int(np.sum((ranges.stamps < odometry[0] - slack) | (ranges.stamps > odometry[-1] + slack)))

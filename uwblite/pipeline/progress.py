@@ -20,7 +20,7 @@ class Stages:
         self.warnings: list[str] = []
         self.doubts: list[str] = []
 
-    def tell(self, stage: str, done: int, total: int) -> None:
+    def report(self, stage: str, done: int, total: int) -> None:
         """Report progress; raises Cancelled where the callback returns False."""
         if self._progress is not None and self._progress(stage, done, total) is False:
             raise Cancelled(f"stopped by the caller during {stage}")
@@ -30,11 +30,11 @@ class Stages:
         now = self._clock() if self._clock else 0.0
         self.done.append(StageSummary(stage, now - self._since, figures))
         self._since = now
-        self.tell(stage, 1, 1)
+        self.report(stage, 1, 1)
 
-    def teller(self, stage: str) -> Callable[[int, int], None]:
+    def reporter(self, stage: str) -> Callable[[int, int], None]:
         """Return a callback (done, total) for one stage."""
-        return lambda done, total: self.tell(stage, done, total)
+        return lambda done, total: self.report(stage, done, total)
 
 
 def solver_figures(result: SolverSummary) -> dict[str, object]:

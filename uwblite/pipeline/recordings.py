@@ -13,7 +13,7 @@ from ..graph.graph import Edges, Graph
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..keyframes import KeyframeConfig, Keyframes
-from ..radio.bootstrap import FirstEstimate
+from ..radio.bootstrap import BootstrapResult
 from ..sensor_log import SensorLog
 
 _APART = 1000.0
@@ -21,7 +21,7 @@ _APART = 1000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Session:
+class Recording:
     """One recording among others."""
 
     number: int
@@ -58,11 +58,11 @@ class Session:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drives:
+class Recordings:
     """All recordings of a map, their keyframes in one numbering."""
 
-    sessions: tuple[Session, ...]
-    session: Ints
+    each: tuple[Recording, ...]
+    of_keyframe: Ints
     """(k,) recording of each keyframe."""
     stamps: Floats
     """(k,) s, each on its recording's clock."""
@@ -72,15 +72,15 @@ class Drives:
     """(k, 3) velocity of the base at each keyframe, own frame, m/s, m/s, rad/s."""
 
     def __len__(self) -> int:
-        return len(self.sessions)
+        return len(self.each)
 
     @property
     def clock(self) -> Clock:
         """When the keyframes were."""
-        return Clock(self.stamps, self.session)
+        return Clock(self.stamps, self.of_keyframe)
 
 
-def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Drives:
+def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
     """Choose the keyframes of all recordings and number them through.
 
     Raises
@@ -89,32 +89,32 @@ def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Drives:
     """
     if not logs:
         raise DataError("no recording to map; give one or more")
-    sessions: list[Session] = []
+    each: list[Recording] = []
     paths: list[Floats] = []
     first, start = 0, 0.0
     for number, log in enumerate(logs):
         frames = keyframes.select(log.odometry, config)
-        sessions.append(Session(number, log, frames, first))
+        each.append(Recording(number, log, frames, first))
         paths.append(start + np.concatenate([[0.0], np.cumsum(frames.path)]))
         first, start = first + len(frames), float(paths[-1][-1]) + _APART
-    return Drives(
-        tuple(sessions),
-        np.repeat(np.arange(len(sessions)), [len(s.frames) for s in sessions]),
-        np.concatenate([s.frames.stamps for s in sessions]),
+    return Recordings(
+        tuple(each),
+        np.repeat(np.arange(len(each)), [len(s.frames) for s in each]),
+        np.concatenate([s.frames.stamps for s in each]),
         np.concatenate(paths),
-        np.concatenate([s.frames.twist for s in sessions]),
+        np.concatenate([s.frames.twist for s in each]),
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class Estimate:
     """What is known of one recording, or of several joined: estimates and measurements."""
 
     graph: Graph
     """Estimates and calibration priors."""
     wheels: OdometryEdges
     radio: RangeEdges | None
-    first: FirstEstimate | None
+    first: BootstrapResult | None
     """None without ranges."""
     anchor_ids: tuple[str, ...]
     """(a,) of the graph's anchors."""
@@ -126,15 +126,15 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joined:
+class JoinResult:
     """All recordings in the frame of the first."""
 
-    part: Part
+    estimate: Estimate
     warnings: tuple[str, ...]
     """Anchors that were moved, in words."""
 
 
-def moved_hypotheses(first: FirstEstimate | None, motion: Floats) -> FirstEstimate | None:
+def moved_hypotheses(first: BootstrapResult | None, motion: Floats) -> BootstrapResult | None:
     """Return the first estimate, where there is one, with its places of anchors in a frame moved by T_new_old."""
     if first is None:
         return None
@@ -147,6 +147,6 @@ def numbered(name: str, recording: int) -> str:
     return f"{name}#{recording + 1}"
 
 
-def moved_text(name: str, distance: float, recording: int, own: str) -> str:
+def moved_anchor_text(name: str, distance: float, recording: int, own: str) -> str:
     """Return what to tell of a moved anchor."""
     return f"anchor {name} was moved: in recording {recording + 1} it stands {distance:.2f} m away, and is called {own}"

@@ -14,7 +14,7 @@ from ..keyframes import OUTSIDE
 from ..loop_closure.closures import Closures
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, StageSummary
 from . import plausibility
-from .recordings import Drives, Part, Session
+from .recordings import Estimate, Recording, Recordings
 
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
@@ -23,40 +23,42 @@ _POOR = 4.0
 
 
 def summarise(
-    drives: Drives, part: Part, known: Marginals, closures: Closures, grid: OccupancyGrid | None,
+    recordings: Recordings, estimate: Estimate, known: Marginals, closures: Closures, grid: OccupancyGrid | None,
     config: CalibrationConfig, stages: Sequence[StageSummary], warnings: Sequence[str],
     doubts: Sequence[str],
 ) -> MapResult:
     """Gather the result of a run; see MapResult."""
-    graph, first, radio = part.graph, part.first, part.radio
+    graph, first, radio = estimate.graph, estimate.first, estimate.radio
     residuals, weights = _range_residuals(graph, radio)
     typical = 0.0
     if first is not None and radio is not None and first.placed.any():
         typical = float(np.median([_spread(residuals[radio.anchor == k]) for k in np.flatnonzero(first.placed)]))
     # By what ranges to a typical anchor scatter; by its own scatter, no anchor would ever lie.
     limit = 3.0 * max(typical, 0.05)
-    anchors = tuple(_anchor(k, part, drives, known, residuals, limit) for k in range(len(part.anchor_ids)))
-    listed = {u.name: u for session in drives.sessions for u in _unknowns(session, config)}
+    anchors = tuple(_anchor(k, estimate, recordings, known, residuals, limit) for k in range(len(estimate.anchor_ids)))
+    listed = {u.name: u for recording in recordings.each for u in _unknowns(recording, config)}
     calibrated = tuple(_calibration(k, listed[name], graph, known) for k, name in enumerate(graph.calibration.names))
     table = {} if radio is None else {
         "stamp": radio.stamps, "anchor": radio.anchor.astype(np.float64), "range": radio.ranges,
         "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
     }
-    more, own_doubts = _doubts(drives, anchors, closures, grid)
-    more += plausibility.unusual(calibrated, listed, config) + plausibility.out_of_time(drives, OUTSIDE)
-    more += plausibility.lies(table, part.anchor_ids, float(drives.stamps[0])) if table else []
-    own_doubts += plausibility.mirrored(graph, drives, config)
+    more, own_doubts = _doubts(recordings, anchors, closures, grid)
+    more += plausibility.implausible_calibration(calibrated, listed, config) + plausibility.ranges_outside_odometry(
+        recordings, OUTSIDE
+    )
+    more += plausibility.sustained_outliers(table, estimate.anchor_ids, float(recordings.stamps[0])) if table else []
+    own_doubts += plausibility.mirror_ambiguity(graph, recordings, config)
     fits = [float(stage.figures["chi2_per_dof"]) for stage in stages if "chi2_per_dof" in stage.figures]
     if fits and fits[-1] > _POOR:
         times = float(np.sqrt(fits[-1]))
         own_doubts.append(f"measurements lie {times:.1f} times as far off as their noise allows (chi2/dof {fits[-1]:.1f})")
-    stamps = [session.log.odometry.stamps for session in drives.sessions]
+    stamps = [recording.log.odometry.stamps for recording in recordings.each]
     return MapResult(
         stamps=np.concatenate(stamps),
-        trajectory=np.concatenate([session.dense_trajectory(graph.poses) for session in drives.sessions]),
-        session=np.repeat(np.arange(len(drives)), [len(own) for own in stamps]),
-        keyframe_stamps=drives.stamps,
-        keyframe_session=drives.session,
+        trajectory=np.concatenate([recording.dense_trajectory(graph.poses) for recording in recordings.each]),
+        recording=np.repeat(np.arange(len(recordings)), [len(own) for own in stamps]),
+        keyframe_stamps=recordings.stamps,
+        keyframe_recording=recordings.of_keyframe,
         keyframe_covariances=known.poses,
         graph=graph,
         anchors=anchors,
@@ -70,10 +72,10 @@ def summarise(
     )
 
 
-def _unknowns(session: Session, config: CalibrationConfig) -> tuple[Unknown, ...]:
-    ids, mounting = session.anchor_ids, session.log.mounting
+def _unknowns(recording: Recording, config: CalibrationConfig) -> tuple[Unknown, ...]:
+    ids, mounting = recording.anchor_ids, recording.log.mounting
     told = np.array([mounting.height_difference(a) is not None for a in ids], dtype=bool)
-    return unknowns(config, ids, told, session.number)
+    return unknowns(config, ids, told, recording.number)
 
 
 def _range_residuals(graph: Graph, radio: RangeEdges | None) -> tuple[Floats, Floats]:
@@ -90,9 +92,11 @@ def _spread(residuals: Floats) -> float:
     return 1.4826 * float(np.median(np.abs(residuals - np.median(residuals))))
 
 
-def _anchor(k: int, part: Part, drives: Drives, known: Marginals, residuals: Floats, limit: float) -> AnchorEstimate:
-    graph, first, radio, name = part.graph, part.first, part.radio, part.anchor_ids[k]
-    count = _count(name, drives) if radio is None else int(np.sum(radio.anchor == k))
+def _anchor(
+    k: int, estimate: Estimate, recordings: Recordings, known: Marginals, residuals: Floats, limit: float
+) -> AnchorEstimate:
+    graph, first, radio, name = estimate.graph, estimate.first, estimate.radio, estimate.anchor_ids[k]
+    count = _count(name, recordings) if radio is None else int(np.sum(radio.anchor == k))
     if first is None or radio is None or not first.placed[k]:
         reason = f"its {count} ranges were too few or did not agree on a place"
         nowhere = np.full(2, np.nan)
@@ -115,9 +119,9 @@ def _anchor(k: int, part: Part, drives: Drives, known: Marginals, residuals: Flo
     )
 
 
-def _count(name: str, drives: Drives) -> int:
+def _count(name: str, recordings: Recordings) -> int:
     """Return how many ranges to an anchor the recordings hold."""
-    heard = [(s.log.ranges, s.anchor_ids.index(name)) for s in drives.sessions if name in s.anchor_ids]
+    heard = [(s.log.ranges, s.anchor_ids.index(name)) for s in recordings.each if name in s.anchor_ids]
     return sum(int(np.sum(ranges.anchor == k)) for ranges, k in heard if ranges is not None)
 
 
@@ -134,7 +138,7 @@ def _calibration(k: int, unknown: Unknown, graph: Graph, known: Marginals) -> Ca
 
 
 def _doubts(
-    drives: Drives, anchors: tuple[AnchorEstimate, ...], closures: Closures, grid: OccupancyGrid | None
+    recordings: Recordings, anchors: tuple[AnchorEstimate, ...], closures: Closures, grid: OccupancyGrid | None
 ) -> tuple[list[str], list[str]]:
     """Return warnings and reasons not to trust the result."""
     warnings: list[str] = []
@@ -147,7 +151,7 @@ def _doubts(
     placed = [a for a in anchors if a.status != "unplaced"]
     if anchors and not placed:
         doubts.append("no anchor could be placed: the trajectory rests on odometry and lidar alone")
-    logs = [session.log for session in drives.sessions]
+    logs = [recording.log for recording in recordings.each]
     if not any(log.ranges is not None and len(log.ranges.ranges) for log in logs):
         warnings.append("no UWB ranges in use: the map rests on odometry and lidar")
     if grid is None:

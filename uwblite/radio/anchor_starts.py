@@ -8,10 +8,10 @@ from .. import se2
 from ..arrays import Floats
 from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
-from .trilateration import AnchorConfig, locate
+from .trilateration import TrilaterationConfig, trilaterate
 
 
-def place_anchors(graph: Graph, config: AnchorConfig | None = None) -> tuple[Graph, tuple[int, ...]]:
+def place_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> tuple[Graph, tuple[int, ...]]:
     """Return the graph with a position for each anchor that has none, and the anchors that could not be placed.
 
     The poses are taken as they are; anchors without a position are found from their ranges alone (anchors.locate).
@@ -23,7 +23,7 @@ def place_anchors(graph: Graph, config: AnchorConfig | None = None) -> tuple[Gra
     anchors, lost = graph.anchors.copy(), []
     for anchor in missing.tolist():
         positions, ranges = _heard(graph, anchor)
-        found = locate(positions, ranges, config or AnchorConfig())
+        found = trilaterate(positions, ranges, config or TrilaterationConfig())
         anchors[anchor] = found[0].position if found else 0.0
         if not found:
             lost.append(anchor)

@@ -18,11 +18,11 @@ from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, optimize
-from .trilateration import AnchorConfig, AnchorHypothesis, ambiguous, locate
+from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate
 
 
 @dataclass(frozen=True, slots=True)
-class GrowthConfig:
+class BootstrapConfig:
     """How the first estimate grows."""
 
     seed_distances: tuple[float, ...] = (25.0, 10.0, 4.0, 60.0, 150.0)
@@ -50,7 +50,7 @@ class GrowthConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FirstEstimate:
+class BootstrapResult:
     """Starting values for the first optimisation."""
 
     graph: Graph
@@ -63,9 +63,14 @@ class FirstEstimate:
     """(a,) two positions explain the ranges about equally well."""
 
 
-def grow(
-    graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: GrowthConfig, search: AnchorConfig
-) -> FirstEstimate:
+def bootstrap_graph(
+    graph: Graph,
+    odometry: OdometryEdges,
+    ranges: RangeEdges,
+    path: Floats,
+    config: BootstrapConfig,
+    search: TrilaterationConfig,
+) -> BootstrapResult:
     """Estimate poses and anchor positions without any guess of the anchors.
 
     Where the ranges do not agree in the end, the growth is tried again with other hypotheses of a gross heading error;
@@ -110,8 +115,8 @@ class _Growth:
     """One growth: the poses in [low, high) are known, the anchors in `placed` have a position."""
 
     def __init__(
-        self, graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: GrowthConfig,
-        search: AnchorConfig,
+        self, graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: BootstrapConfig,
+        search: TrilaterationConfig,
     ) -> None:
         self.graph, self.odometry, self.ranges, self.path = graph, odometry, ranges, path
         self.config, self.search = config, search
@@ -143,11 +148,11 @@ class _Growth:
             if hypotheses and not self.placed[anchor]:
                 self._put(anchor, hypotheses[0])
 
-    def estimate(self) -> FirstEstimate:
+    def estimate(self) -> BootstrapResult:
         """Return what was grown."""
         final = replace(self.graph, poses=self.poses, anchors=self.anchors, calibration=self.calibration)
         found = tuple(tuple(self.hypotheses.get(k, ())) for k in range(len(self.placed)))
-        return FirstEstimate(final, self.placed, found, self.doubtful)
+        return BootstrapResult(final, self.placed, found, self.doubtful)
 
     def misfit(self) -> float:
         """Return the median error of all ranges to placed anchors, in assumed standard deviations; 0 without any.
@@ -198,7 +203,7 @@ class _Growth:
                 level = np.sqrt(np.maximum(ranges.ranges[which] ** 2 - ranges.height[which] ** 2, 1e-4))
                 arm = ranges.lever_arm[which] + se2.rotate(ranges.turn[which], ranges.tag)
                 tag = se2.transform(self.poses[ranges.pose[which]], arm)
-                found[int(anchor)] = locate(tag, level, self.search, drift)
+                found[int(anchor)] = trilaterate(tag, level, self.search, drift)
         return found
 
     def _adopt(self, found: dict[int, list[AnchorHypothesis]]) -> bool:

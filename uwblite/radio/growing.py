@@ -27,7 +27,7 @@ from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import Progress, SolverConfig, SolverSummary, check, optimize
 from ..graph.unknowns import free_unknowns
-from .trilateration import AnchorConfig, ambiguous, locate
+from .trilateration import TrilaterationConfig, ambiguous, trilaterate
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class GrowingConfig:
     """Standard deviations beyond which a range is an outlier."""
     outlier_share: float = 0.3
     """An anchor with a larger share of outliers leaves."""
-    search: AnchorConfig = field(default_factory=lambda: AnchorConfig(ambiguity=0.7))
+    search: TrilaterationConfig = field(default_factory=lambda: TrilaterationConfig(ambiguity=0.7))
     """How anchors are searched; stricter than usual, since another try comes soon."""
     step: SolverConfig = field(default_factory=lambda: SolverConfig(max_iterations=30, relative_decrease=1e-4))
     """Of the optimisations on the way."""
@@ -259,7 +259,7 @@ class _Growth:
             if not last and (count < config.min_ranges or count < 1.2 * self.tried[anchor]):
                 continue
             self.tried[anchor] = count
-            found = locate(*self._distances(heard), config.search, config.drift)
+            found = trilaterate(*self._distances(heard), config.search, config.drift)
             clear = bool(found) and not ambiguous(found, config.search)
             if found and (last or (clear and found[0].position_sigma < config.max_position_sigma)):
                 anchors[anchor] = found[0].position

@@ -28,7 +28,7 @@ _STEPS = 4
 """Widths tried from sound to unsound, evenly spaced in their logarithm."""
 
 
-def choose_widths(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
+def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
     """Return the graph with the priors of range scale and biases as wide as the evidence wants them.
 
     Parameters

@@ -14,14 +14,14 @@ from ..keyframes import AttachedRanges
 from ..sensor_log import SensorMounting
 from . import nlos_mixture
 from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, steady_sigma
-from .trilateration import AnchorConfig, agreement, locate, usable
+from .trilateration import TrilaterationConfig, agreement, trilaterate, usable
 
 _RANGES = Kernel("cauchy", 2.5)
 
 
 def range_edges(
     attached: AttachedRanges, first: int, anchor_ids: tuple[str, ...], mounting: SensorMounting,
-    calibration: Calibration, sigma: float, search: AnchorConfig, kernel: Kernel = _RANGES,
+    calibration: Calibration, sigma: float, search: TrilaterationConfig, kernel: Kernel = _RANGES,
 ) -> RangeEdges:
     """Return one edge per range; readings that cannot be distances, or were made without odometry, get weight 0.
 
@@ -56,7 +56,7 @@ def tag_positions(edges: RangeEdges, poses: Floats) -> Floats:
     return se2.transform(poses[edges.pose], arm)
 
 
-def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: AnchorConfig) -> Graph:
+def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: TrilaterationConfig) -> Graph:
     """Return the graph with anchors moved to where clearly more of their ranges agree, its poses being trusted.
 
     Parameters
@@ -68,7 +68,7 @@ def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: AnchorConfi
     for anchor in np.flatnonzero(placed):
         own = np.flatnonzero(alive & (edges.anchor == anchor))
         level = np.sqrt(np.maximum(edges.ranges[own] ** 2 - edges.height[own] ** 2, 1e-4))
-        found = locate(positions[own], level, search, _TRUSTED)
+        found = trilaterate(positions[own], level, search, _TRUSTED)
         if not found:
             continue
         here, there = (

@@ -13,7 +13,7 @@ from ..arrays import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True)
-class AnchorConfig:
+class TrilaterationConfig:
     """Search for anchor positions."""
 
     raster: int = 40
@@ -48,12 +48,12 @@ class AnchorHypothesis:
     """Larger standard deviation of the position were the errors independent, m."""
 
 
-def usable(ranges: Floats, config: AnchorConfig) -> Bools:
+def usable(ranges: Floats, config: TrilaterationConfig) -> Bools:
     """Tell which readings (m,) can be distances at all: positive, finite, below max_range."""
     return np.isfinite(ranges) & (ranges > 0.02) & (ranges < config.max_range)
 
 
-def locate(path: Floats, ranges: Floats, config: AnchorConfig, drift: float = 0.0) -> list[AnchorHypothesis]:
+def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift: float = 0.0) -> list[AnchorHypothesis]:
     """Find where an anchor may stand.
 
     Parameters
@@ -84,7 +84,7 @@ def locate(path: Floats, ranges: Floats, config: AnchorConfig, drift: float = 0.
     return distinct
 
 
-def ambiguous(hypotheses: list[AnchorHypothesis], config: AnchorConfig) -> bool:
+def ambiguous(hypotheses: list[AnchorHypothesis], config: TrilaterationConfig) -> bool:
     """Tell whether the second hypothesis explains the ranges about as well as the first."""
     return len(hypotheses) > 1 and hypotheses[1].cost - hypotheses[0].cost < config.ambiguity
 
@@ -100,7 +100,7 @@ def agreement(path: Floats, ranges: Floats, place: Floats, height: Floats | floa
     return float(np.max(np.searchsorted(error, error + width, "right") - np.arange(len(error)))) / len(error)
 
 
-def _raster_search(path: Floats, ranges: Floats, config: AnchorConfig) -> tuple[Floats, float]:
+def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) -> tuple[Floats, float]:
     """Return the best raster cells (s, 2) and the cell size, m."""
     reach = float(np.quantile(ranges, 0.9)) + config.bias_sigma
     low, high = path.min(axis=0) - reach, path.max(axis=0) + reach
@@ -122,7 +122,7 @@ def _raster_search(path: Floats, ranges: Floats, config: AnchorConfig) -> tuple[
 
 
 def _refine(
-    path: Floats, ranges: Floats, starts: Floats, step: float, drift: float, config: AnchorConfig
+    path: Floats, ranges: Floats, starts: Floats, step: float, drift: float, config: TrilaterationConfig
 ) -> tuple[Floats, Floats, Floats]:
     """Refine starts (s, 2) by Gauss-Newton with a shrinking kernel.
 
@@ -159,7 +159,7 @@ def _refine(
 
 
 def _score(
-    path: Floats, ranges: Floats, state: Floats, covariance: Floats, own: float, sigma: float, config: AnchorConfig
+    path: Floats, ranges: Floats, state: Floats, covariance: Floats, own: float, sigma: float, config: TrilaterationConfig
 ) -> AnchorHypothesis:
     position, bias = state[:2], float(state[2])
     error = ranges - np.hypot(*(position - path).T) - bias

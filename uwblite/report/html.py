@@ -185,7 +185,7 @@ def _figure(value: Any) -> str:
 
 def _residuals(result: MapResult) -> str:
     table = {name: np.asarray(values) for name, values in result.range_table.items()}
-    several = len(np.unique(result.session)) > 1
+    several = len(np.unique(result.recording)) > 1
     # The clocks of several recordings have nothing in common: their ranges are drawn one after another.
     time = np.arange(len(table["stamp"]), dtype=np.float64) if several else table["stamp"] - table["stamp"].min()
     span = max(float(time.max()), 1e-9)

@@ -66,9 +66,9 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
         )
     parts.append(_closure_lines(result))
     parts.append('<g class="trajectory">')
-    for session in np.unique(result.session):
-        path = result.trajectory[result.session == session, :2]
-        parts.append(f'<polyline class="s{int(session) % 6}" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
+    for recording in np.unique(result.recording):
+        path = result.trajectory[result.recording == recording, :2]
+        parts.append(f'<polyline class="s{int(recording) % 6}" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
     start = result.trajectory[0]
     parts.append(
         f'<circle class="start" cx="{start[0]:.3f}" cy="{-start[1]:.3f}" r="{size / 150:.3f}"><title>start</title></circle></g>'
