@@ -11,7 +11,7 @@ import time
 import pytest
 from helpers.driver_harness import ROOT
 
-hokuyolx = pytest.importorskip("hokuyolx")
+hokuyolx = pytest.importorskip("hokuyolx", reason="hokuyolx is not installed (a development dependency)")
 from hokuyolx.exceptions import HokuyoException  # noqa: E402
 
 

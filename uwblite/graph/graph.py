@@ -6,8 +6,9 @@ one more dataclass and one more row in the numeric-Jacobian test; the solver doe
 ``range_edges`` hold what wheels, lidar and radio measure; knowledge of an unknown itself, a prior, stands here.
 
 Unknowns live in three blocks: ``poses`` (n, 3) T_map_base, ``anchors`` (a, 2) in the map frame and ``calibration``
-(c,), a vector of named scalars. They are updated by addition (angles wrapped). Pose residuals use the chart of g2o,
-e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's.
+(c,), a vector of named scalars. A step moves poses along arcs of constant twist and is added to the rest, see
+``unknowns``; Jacobians are by the coordinates x, y, theta, to which such an arc is the sum to first order. Pose
+residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's.
 """
 
 from dataclasses import dataclass, field, fields, replace
