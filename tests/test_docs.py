@@ -13,7 +13,7 @@ import sys
 import pytest
 from conftest import ROOT
 
-from uwblite.cli import VERBS, main
+from uwblite.cli import VERBS, main, module_of
 from uwblite.io.constraints_file import parse_constraints
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.io.uwb_messages import KNOWN
@@ -39,7 +39,7 @@ def parses(words):
     """Tell whether the command line understands these words, without running them."""
     if words in (["--version"], ["--help"]):
         return True
-    module = importlib.import_module(f"uwblite.cli.{words[0]}")
+    module = module_of(words[0])
     parser = argparse.ArgumentParser(allow_abbrev=False, exit_on_error=False)
     module.add_arguments(parser)
     for option in ("-q", "-v", "--debug"):
@@ -62,7 +62,7 @@ def test_every_command_is_understood(document):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_examples_of_every_verb_are_understood(verb):
-    epilog = importlib.import_module(f"uwblite.cli.{verb}").EPILOG
+    epilog = module_of(verb).EPILOG
     examples = [re.sub(r"\s\s+\S.*", "", line.strip()) for line in epilog.replace("\\\n", " ").splitlines()]
     examples = [re.sub(r"\s+", " ", line) for line in examples if line.startswith("uwblite ")]
     assert examples

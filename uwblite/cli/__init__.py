@@ -21,8 +21,8 @@ from .. import __version__
 from ..errors import UwbliteError
 from ..printable import printable
 
-VERBS = ("map", "localize", "check", "record", "devices", "convert", "evaluate", "optimize", "config")
-"""In the order in which a user meets them; `uwblite VERB` is the module of the same name."""
+VERBS = ("map", "localize", "check", "record", "devices", "plan-anchors", "convert", "evaluate", "optimize", "config")
+"""In the order in which a user meets them; `uwblite VERB` is the module of the same name, with _ for -."""
 
 _DESCRIPTION = """\
 Maps from wheel odometry, ultra-wideband ranges to unknown anchors and a short-range 2D lidar.
@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         return _usage_error(f"unknown command {verb!r}{_did_you_mean(verb)}")
     words.remove(verb)
-    module = import_module(f".{verb}", __name__)
+    module = module_of(verb)
     try:
         args = _verb_parser(verb, module).parse_args(words)
     except SystemExit as leave:
@@ -85,6 +85,11 @@ def _open_streams() -> None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
 
 
+def module_of(verb: str) -> Any:
+    """Return the module of a verb."""
+    return import_module(f".{verb.replace('-', '_')}", __name__)
+
+
 def _without_verb(words: list[str]) -> int:
     from . import console
 
@@ -100,7 +105,7 @@ def _without_verb(words: list[str]) -> int:
 
 def _overview() -> argparse.ArgumentParser:
     width = max(len(verb) for verb in VERBS)
-    lines = [f"  {verb:<{width}}  {import_module(f'.{verb}', __name__).HELP}" for verb in VERBS]
+    lines = [f"  {verb:<{width}}  {module_of(verb).HELP}" for verb in VERBS]
     return argparse.ArgumentParser(
         prog="uwblite",
         usage="uwblite VERB [options]   (uwblite --version, uwblite --help)",

@@ -52,6 +52,7 @@ def draw_map(
     closures: Floats | None = None,
     caption: str = "",
     size: int = 1400,
+    colours: Image | None = None,
 ) -> Image:
     """Draw a map.
 
@@ -64,6 +65,7 @@ def draw_map(
     closures : (c, 4) x, y, x, y of the two poses of each accepted loop closure, m.
     caption : words below the map.
     size : pixels of the longer side, about; the scale is chosen so that cells are whole pixels where they can be.
+    colours : (rows, cols, 3) of the cells; None = `shaded`.
 
     Returns
     -------
@@ -79,7 +81,7 @@ def draw_map(
     image = np.empty((height + _FOOT, width, 3), dtype=np.uint8)
     image[:] = PAPER
     if grid is not None:
-        _paste(image[:height], _shaded(grid), grid.geometry, low, scale)
+        _paste(image[:height], shaded(grid) if colours is None else colours, grid.geometry, low, scale)
 
     def pixel(points: Floats) -> Floats:
         return np.stack([(points[..., 0] - low[0]) * scale, height - (points[..., 1] - low[1]) * scale], axis=-1)
@@ -128,7 +130,7 @@ def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
     return max(math.floor(cell), 1) / resolution if cell >= 1.0 else 1.0 / (math.ceil(1.0 / cell) * resolution)
 
 
-def _shaded(grid: OccupancyGrid) -> Image:
+def shaded(grid: OccupancyGrid) -> Image:
     """Return the colours (rows, cols, 3) of the cells: the surer a cell, the clearer its white or black."""
     p = grid.probability()
     known = (grid.log_odds != 0.0)[:, :, None]

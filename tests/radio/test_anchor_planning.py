@@ -1,0 +1,101 @@
+"""Planning anchors: the error is that of least squares, the first choice the best of all, walls take the sight."""
+
+import numpy as np
+import pytest
+
+from uwblite.errors import ConfigError
+from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
+from uwblite.radio.anchor_planning import (
+    SIGMA_BEHIND_WALLS,
+    SIGMA_IN_SIGHT,
+    _coarse,
+    _in_sight,
+    _information,
+    plan_anchors,
+    position_errors,
+)
+
+
+def hall(rows=60, cols=100, wall_at=None, door=range(0)):
+    """A hall of cells of 0.2 m with walls around, and one across it with a door where it is asked for."""
+    odds = np.full((rows, cols), -4.0, dtype=np.float32)
+    odds[[0, -1]] = odds[:, [0, -1]] = 4.0
+    if wall_at is not None:
+        odds[:, wall_at] = 4.0
+        odds[list(door), wall_at] = -4.0
+    return OccupancyGrid(GridGeometry(0.2, np.array([-3.0, 2.0]), rows, cols), odds)
+
+
+def test_the_error_is_that_of_least_squares():
+    rng = np.random.default_rng(2)
+    point, anchors = rng.uniform(0, 10, 2), rng.uniform(0, 10, (4, 2))
+    told = _information(point[None], anchors, np.ones((4, 1), dtype=bool), 100.0).sum(axis=0)[0]
+    u = (point - anchors) / np.linalg.norm(point - anchors, axis=1)[:, None]
+    covariance = np.linalg.inv(u.T @ u / SIGMA_IN_SIGHT**2 + np.eye(2) / 9.0)
+    assert position_errors(told) == pytest.approx(np.sqrt(np.trace(covariance)), rel=1e-12)
+    # Drawn positions scatter as it says: ranges with that noise, linearised least squares.
+    step = np.linalg.lstsq(u, SIGMA_IN_SIGHT * rng.normal(size=(4, 20_000)), rcond=None)[0]
+    assert np.sqrt(np.mean(np.sum(step**2, axis=0))) == pytest.approx(position_errors(told), rel=0.03)
+
+
+def test_out_of_reach_tells_nothing_and_walls_tell_less():
+    point, anchor = np.zeros((1, 2)), np.array([[5.0, 0.0]])
+    cases = ((True, 9.0), (False, 9.0), (True, 4.0))
+    near, behind, far = (_information(point, anchor, np.array([[sight]]), reach)[0, 0] for sight, reach in cases)
+    assert near[0] / behind[0] == pytest.approx((SIGMA_BEHIND_WALLS / SIGMA_IN_SIGHT) ** 2)
+    assert not far.any()
+
+
+def test_the_first_place_is_the_best_of_all_and_more_never_harm():
+    grid = hall()
+    anchors = np.array([[-2.0, 3.0], [-2.0, 13.0]])
+    plan = plan_anchors(grid, anchors, 3)
+    assert (np.diff(plan.errors, axis=0) < 1e-12).all()
+    one = plan_anchors(grid, anchors, 1)
+    blocked, free, low, cell = _coarse(grid)
+    cells = np.argwhere(free)
+    rng = np.random.default_rng(0)
+    for other in cells[rng.choice(len(cells), 150, replace=False)]:
+        place = low + cell * (other[::-1] + 0.5)
+        beside = np.abs(place - grid.geometry.origin).min() < 0.5 or np.abs(place - grid.geometry.corner).min() < 0.5
+        if not beside or np.linalg.norm(anchors - place, axis=1).min() < 1.0:
+            continue
+        points = np.floor((one.points - low) / cell).astype(int)[:, ::-1]
+        both = np.vstack([anchors, place])
+        here = np.floor((both - low) / cell).astype(int)[:, ::-1]
+        told = _information(one.points, both, _in_sight(blocked, here, points), 25.0).sum(axis=0)
+        # The candidates are thinned to every other cell or so: a neighbour may be better by a little.
+        assert position_errors(told).mean() > one.errors[1].mean() * 0.99
+
+
+def test_anchors_go_where_none_are_in_sight():
+    """Two rooms joined by a door; all anchors stand in the left one."""
+    grid = hall(wall_at=50, door=range(28, 32))
+    plan = plan_anchors(grid, np.array([[-2.0, 3.0], [-2.0, 13.0], [5.0, 8.0]]), 2)
+    assert (plan.places[:, 0] > -3.0 + 0.2 * 50).all()
+    right = plan.points[:, 0] > -3.0 + 0.2 * 51
+    assert plan.errors[-1][right].mean() < 0.6 * plan.errors[0][right].mean()
+
+
+def test_sight_ends_at_walls_and_passes_doors():
+    blocked = np.zeros((9, 21), dtype=bool)
+    blocked[:, 10] = True
+    blocked[4, 10] = False
+    source = np.array([[4, 2]])
+    targets = np.array([[4, 18], [1, 18], [1, 6], [4, 2]])
+    assert _in_sight(blocked, source, targets)[0].tolist() == [True, False, True, True]
+
+
+def test_what_cannot_be_planned_is_said():
+    nothing = OccupancyGrid(GridGeometry(0.2, np.zeros(2), 5, 5), np.zeros((5, 5), dtype=np.float32))
+    with pytest.raises(ConfigError, match="no free space"):
+        plan_anchors(nothing, np.zeros((0, 2)), 1)
+    with pytest.raises(ConfigError, match="no room"):
+        plan_anchors(hall(10, 10), np.zeros((0, 2)), 50)
+
+
+def test_same_map_same_plan():
+    one, two = (plan_anchors(hall(wall_at=40), np.zeros((0, 2)), 4) for _ in range(2))
+    np.testing.assert_array_equal(one.places, two.places)
+    apart = np.linalg.norm(one.places[:, None] - one.places[None], axis=2) + 9 * np.eye(4)
+    assert apart.min() >= 1.0

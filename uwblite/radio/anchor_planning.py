@@ -1,0 +1,178 @@
+"""Where further anchors help most: dilution of precision over the free space of a map.
+
+A range of standard deviation s from a point p to an anchor at a tells the position of p along u = (p - a) / |p - a|: it adds
+u u^T / s^2 to the information about p. With I(p) the sum over the anchors and a weak prior,
+
+    error(p) = sqrt(trace((I(p) + 1 / s_0^2)^-1)),
+
+which for equal s is s times the horizontal dilution of precision (R. B. Langley, Dilution of Precision, GPS World 1999).
+Anchors are chosen one by one so that the mean error over the free space falls most, then exchanged one by one while that
+lowers it further (V. V. Fedorov, Theory of Optimal Experiments, 1972).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+from ..errors import ConfigError
+from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+
+SIGMA_IN_SIGHT, SIGMA_BEHIND_WALLS = 0.1, 0.5
+"""m; of a range in line of sight, and of one through walls, whose delay is not known."""
+_PRIOR = 3.0
+"""m; how well the position is known without ranges: it bounds the error where no anchor is heard."""
+_CELL = 0.2
+"""m; the map is looked at in cells at least this large."""
+_MOST_POINTS, _MOST_CANDIDATES = 1500, 400
+_APART = 1.0
+"""m; least distance between anchors."""
+_SWEEPS = 10
+"""Rounds of exchanges at most; two or three do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnchorPlan:
+    """Places for further anchors and what they give."""
+
+    places: Floats
+    """(n, 2) m, map frame, the most useful first."""
+    points: Floats
+    """(m, 2) m, places of the free space at which the error is told."""
+    errors: Floats
+    """(n + 1, m) m, expected error of a position: with today's anchors, with the first new one, ..."""
+
+
+def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: float = 25.0) -> AnchorPlan:
+    """Choose places for further anchors.
+
+    Parameters
+    ----------
+    grid : the map; anchors are put on walls next to free space, or into the free space where there are no walls.
+    anchors : (a, 2) today's anchors, m.
+    count : how many more.
+    reach : m up to which a radio is heard.
+
+    Raises
+    ------
+    ConfigError : the map has no free space, or too few places for so many anchors.
+    """
+    blocked, free, low, cell = _coarse(grid)
+    points, candidates = _places(free, _MOST_POINTS), _wall_cells(blocked, free)
+    if len(points) == 0:
+        raise ConfigError("the map has no free space to plan anchors for")
+    candidates = candidates if len(candidates) >= count else _places(free, _MOST_CANDIDATES)
+
+    def metres(cells: Ints) -> Floats:
+        return low + cell * (cells[:, ::-1] + 0.5)
+
+    at, offered = metres(points), metres(candidates)
+    here = np.floor((anchors - low) / cell).astype(np.int64)[:, ::-1] if len(anchors) else np.zeros((0, 2), dtype=np.int64)
+    today = _information(at, anchors, _in_sight(blocked, here, points), reach).sum(axis=0)
+    gains = _information(at, offered, _in_sight(blocked, candidates, points), reach)
+    offered_too_near = _near(offered, anchors)
+    chosen = _choose(today, gains, offered, offered_too_near, count)
+    errors = [position_errors(today)]
+    for k in range(count):
+        errors.append(position_errors(today + gains[chosen[: k + 1]].sum(axis=0)))
+    return AnchorPlan(offered[chosen], at, np.array(errors))
+
+
+def position_errors(information: Floats) -> Floats:
+    """Return sqrt(trace(P)) (...), m, of information (..., 3) as xx, xy, yy, with the prior."""
+    xx, xy, yy = np.moveaxis(information + np.array([1.0, 0.0, 1.0]) / _PRIOR**2, -1, 0)
+    return np.asarray(np.sqrt((xx + yy) / (xx * yy - xy**2)))
+
+
+def _information(points: Floats, anchors: Floats, in_sight: Bools, reach: float) -> Floats:
+    """Return what a range to each anchor tells at each point (a, m, 3): xx, xy, yy, 1/m^2."""
+    away = points[None] - anchors[:, None]
+    distance = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-3)
+    weight = np.where(in_sight, SIGMA_IN_SIGHT, SIGMA_BEHIND_WALLS) ** -2.0 * (distance <= reach)
+    x, y = np.moveaxis(away / distance[..., None], -1, 0)
+    return np.stack([x * x, x * y, y * y], axis=-1) * weight[..., None]
+
+
+def _choose(today: Floats, gains: Floats, places: Floats, taken: Bools, count: int) -> Ints:
+    """Return the indices of the chosen candidates, the most useful first."""
+    chosen: list[int] = []
+    for _ in range(count):
+        chosen.append(_best(today + gains[chosen].sum(axis=0), gains, taken | _near(places, places[chosen])))
+    for _ in range(_SWEEPS):
+        before = list(chosen)
+        for k in range(count):
+            others = chosen[:k] + chosen[k + 1 :]
+            chosen[k] = _best(today + gains[others].sum(axis=0), gains, taken | _near(places, places[others]))
+        if chosen == before:
+            break
+    ordered: list[int] = []
+    while left := [k for k in chosen if k not in ordered]:
+        base = today + gains[ordered].sum(axis=0)
+        ordered.append(min(left, key=lambda k: float(position_errors(base + gains[k]).mean())))
+    return np.array(ordered, dtype=np.int64)
+
+
+def _best(base: Floats, gains: Floats, taken: Bools) -> int:
+    """Return the candidate with which the mean error is least.
+
+    Raises
+    ------
+    ConfigError : all are taken.
+    """
+    if taken.all():
+        raise ConfigError(f"the map has no room for so many anchors {_APART:g} m apart; ask for fewer")
+    means = np.array([np.inf if skip else position_errors(base + gain).mean() for gain, skip in zip(gains, taken, strict=True)])
+    return int(np.argmin(means))
+
+
+def _near(places: Floats, others: Floats) -> Bools:
+    """Tell which places (n, 2) are nearer to one of the others than anchors should be."""
+    if len(others) == 0:
+        return np.zeros(len(places), dtype=np.bool_)
+    return np.asarray((np.linalg.norm(places[:, None] - others[None], axis=2) < _APART).any(axis=1))
+
+
+def _coarse(grid: OccupancyGrid) -> tuple[Bools, Bools, Floats, float]:
+    """Return which coarse cells are blocked and which are free (rows, cols), the lower left corner and the edge, m."""
+    together = max(round(_CELL / grid.geometry.resolution), 1)
+    states = grid.states()
+    rows, cols = (-(-n // together) * together for n in states.shape)
+    padded = np.full((rows, cols), -1, dtype=states.dtype)
+    padded[: states.shape[0], : states.shape[1]] = states
+    blocks = padded.reshape(rows // together, together, cols // together, together)
+    blocked = (blocks == OCCUPIED).any(axis=(1, 3))
+    free = (blocks == FREE).mean(axis=(1, 3)) > 0.5
+    return blocked, free & ~blocked, grid.geometry.origin, together * grid.geometry.resolution
+
+
+def _places(cells: Bools, most: int) -> Ints:
+    """Return row and column (n, 2) of cells, thinned evenly to at most so many."""
+    found = np.argwhere(cells)
+    return found[:: max(-(-len(found) // most), 1)]
+
+
+def _wall_cells(blocked: Bools, free: Bools) -> Ints:
+    """Return the free cells beside blocked ones (n, 2), thinned evenly: an anchor on a wall stands on one side of it."""
+    beside = np.zeros_like(free)
+    beside[1:] |= blocked[:-1]
+    beside[:-1] |= blocked[1:]
+    beside[:, 1:] |= blocked[:, :-1]
+    beside[:, :-1] |= blocked[:, 1:]
+    return _places(free & beside, _MOST_CANDIDATES)
+
+
+def _in_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
+    """Tell from which sources (a, 2) which targets (m, 2) are in sight (a, m).
+
+    The first cell on the way is no obstacle: an anchor whose place is known to a decimetre may lie in its own wall.
+    """
+    sight = np.zeros((len(sources), len(targets)), dtype=np.bool_)
+    for k, source in enumerate(sources):
+        step = targets - source
+        length = np.abs(step).max(axis=1)
+        along = np.arange(2, max(int(length.max(initial=0)), 2))
+        share = along[None] / np.maximum(length, 1)[:, None]
+        cells = np.rint(source + step[:, None] * share[..., None]).astype(np.int64)
+        cells = np.clip(cells, 0, np.array(blocked.shape) - 1)
+        sight[k] = ~(blocked[cells[..., 0], cells[..., 1]] & (share < 1.0)).any(axis=1)
+    return sight

@@ -1,0 +1,58 @@
+"""A map coloured by an expected error: where a position is well known, and where not."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..arrays import Floats
+from ..grid.occupancy_grid import FREE, OccupancyGrid
+from .canvas import Canvas
+from .picture import FLOOR, INK, PictureAnchor, draw_map, shaded
+
+_STEPS = (0.1, 0.2, 0.5, 1.0, 2.0)
+"""m; bounds of the colours."""
+_COLOURS = np.array(
+    [[33, 120, 180], [86, 180, 190], [190, 225, 170], [250, 220, 120], [240, 150, 70], [200, 60, 60]], dtype=np.uint8
+)
+"""From better than the first bound to worse than the last; told apart in grey as well (dark, light, dark with a legend)."""
+
+
+def draw_errors(
+    grid: OccupancyGrid, points: Floats, errors: Floats, anchors: Sequence[PictureAnchor], title: str, *, size: int = 900
+) -> NDArray[np.uint8]:
+    """Draw a map whose free space is coloured by the expected error of a position.
+
+    Parameters
+    ----------
+    grid : the map.
+    points, errors : (m, 2) m, (m,) m: the error at places of the free space; a cell has that of the nearest.
+    anchors : those to draw.
+    title : words below the map.
+    size : pixels of the longer side, about.
+
+    Returns
+    -------
+    (height, width, 3) red, green, blue.
+    """
+    colours = shaded(grid)
+    rows, cols = np.nonzero(grid.states() == FREE)
+    nearest = cKDTree(points).query(grid.geometry.centre_of(rows, cols))[1]
+    colours[rows, cols] = _COLOURS[np.searchsorted(_STEPS, errors[nearest])]
+    image = draw_map(grid, np.zeros((0, 2)), anchors=anchors, caption=title, size=size, colours=colours)
+    return np.concatenate([image, _legend(image.shape[1])], axis=0)
+
+
+def _legend(width: int) -> NDArray[np.uint8]:
+    """Return a strip with the colours and their bounds."""
+    image = np.empty((40, width, 3), dtype=np.uint8)
+    image[:] = FLOOR
+    canvas = Canvas(image)
+    labels = [f"to {_STEPS[0]:g} m", *(f"to {bound:g}" for bound in _STEPS[1:]), "more"]
+    each = max((width - 24) // len(labels), 1)
+    for k, (label, colour) in enumerate(zip(labels, _COLOURS.tolist(), strict=True)):
+        left = 12 + k * each
+        canvas.polygon(np.array([[left, 8], [left + 18, 8], [left + 18, 26], [left, 26]], dtype=float), tuple(colour))
+        canvas.text(left + 24, 10, label, INK)
+    return image
