@@ -2,6 +2,8 @@
 
 import math
 import random
+from functools import reduce
+from operator import xor
 
 import pytest
 from emulators.kobuki_device import KobukiDevice, encode_packet
@@ -54,6 +56,35 @@ def test_the_sum_covers_the_length():
     broken = bytearray(packet)
     broken[-1] ^= broken[2]  # what a driver that leaves the length out would expect
     assert all(isinstance(e, Corrupt) for e in feed_whole(KobukiProtocol, bytes(broken)))
+
+
+BASIC = "010f" "3412" "05" "02" "00" "0201" "feff" "1020" "00" "00" "a5" "00"
+"""4660 ms; bumpers right and left; left wheel dropped; encoders 258 and 65534; ... 16.5 V; currents."""
+INERTIA = "0407" "d8dc" "d204" "000000"
+"""-90.00 degrees, 12.34 degrees per second, three bytes that mean nothing."""
+OTHERS = ["0303" "112233", "0506" "010203040506", "0602" "0102", "0d0e" "0006" + "00" * 12, "1010" + "00" * 16]
+"""Docking infra-red, cliff voltages, motor currents, raw gyro, inputs and outputs: the rest of what the base streams."""
+
+
+@pytest.mark.parametrize("others", [[], OTHERS, OTHERS[::-1], *([other] for other in OTHERS)])
+def test_a_packet_byte_by_byte_of_the_protocol_description(others):
+    payload = bytes.fromhex("".join([BASIC, INERTIA, *others]))
+    packet = b"\xaa\x55" + bytes([len(payload)]) + payload
+    (event,) = feed_whole(KobukiProtocol, packet + bytes([reduce(xor, packet[2:])]), 7.0)
+    assert (event.stamp, event.time, event.left, event.right) == (7.0, 4660, 258, 65534)
+    assert (event.bumper, event.wheel_drop, event.battery) == (5, 2, 16.5)
+    assert event.heading == pytest.approx(-math.pi / 2)
+    assert event.turn_rate == pytest.approx(math.radians(12.34))
+
+
+@pytest.mark.parametrize("damage", ["shorter", "longer", "cut"])
+def test_parts_that_do_not_fill_the_packet_exactly_are_no_packet(damage):
+    """The sum is right, the length of the last part is not."""
+    last = {"shorter": "0301" "112233", "longer": "0305" "112233", "cut": "03"}[damage]
+    payload = bytes.fromhex(BASIC + INERTIA + last)
+    packet = b"\xaa\x55" + bytes([len(payload)]) + payload
+    events = feed_whole(KobukiProtocol, packet + bytes([reduce(xor, packet[2:])]))
+    assert not good(events)
 
 
 def test_gyro_of_any_length_and_packets_without_inertia_are_taken():
