@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from uwblite.drivers.clock import MAX_SKEW, ClockMap, Unwrapper
+from uwblite.drivers.clock import MAX_SKEW, ClockMap, DeviceClock, Unwrapper
 
 
 @pytest.mark.parametrize(("modulus", "tick"), [(1 << 24, 1e-3), (1 << 16, 1e-3)])
@@ -82,3 +82,57 @@ def test_map_keeps_a_bounded_number_of_points():
     for k in range(10000):
         clock.add(0.1 * k, 0.1 * k + 1.0)
     assert len(clock._minima) == 10
+
+
+def test_a_reset_keeps_the_latency_that_was_measured():
+    """The counter begins anew at 60 s; frames arrive 101 ms and a random millisecond after their stamp."""
+    rng, clock = random.Random(1), DeviceClock(1e-3, 1 << 24, period=0.1, latency=0.066)
+    for k in range(8):
+        sent = 5.0 + 0.01 * k
+        clock.tie(1000 * sent + 1.5, sent, sent + 0.003)
+    errors, resets = [], 0
+    for k in range(1200):
+        true = 10.0 + 0.1 * k
+        count = 1000 * true if true < 60 else 1000 * (true - 60) + 7
+        reading = clock.read(count, true + 0.101 + rng.expovariate(1000))
+        resets += reading.reset
+        errors.append(reading.stamp - true)
+    assert resets == 1
+    assert clock.latency == pytest.approx(0.101, abs=0.0005)
+    assert max(map(abs, errors[100:])) < 0.003
+
+
+def test_frames_that_are_missing_are_counted_across_a_reset_and_with_a_learned_period():
+    for period in (0.05, None):
+        clock = DeviceClock(1e-3, 1 << 16, period=period)
+        missing = []
+        for k in (*range(40), *range(43, 60), *range(100, 120)):
+            count = 50 * k if k < 100 else 50 * (k - 100)
+            missing.append(clock.read(count % 65536, 0.05 * k).missing)
+        assert [m for m in missing if m] == [3, 40]
+
+
+@pytest.mark.parametrize(
+    ("unit", "rate"), [(1e-3, 1e-3), (1e-6, 1e-6), (1.0, 1.0), (60.0, 60.0), (1000.0, 1000.0), (1e6, None)]
+)
+def test_a_clock_with_a_wrong_unit_is_noticed_and_arrivals_are_used(unit, rate):
+    """A base counts seconds; what is believed to be its unit is wrong by a factor."""
+    clock = DeviceClock(unit, proven=False)
+    readings = [(0.02 * k, clock.read(0.02 * k, 50 + 0.02 * k + 0.003 * (k % 2))) for k in range(600)]
+    assert max(abs(reading.stamp - 50 - time) for time, reading in readings) < 0.004
+    if rate == 1.0:
+        assert clock.rate is None
+        assert clock.proven
+        assert max(abs(reading.stamp - 50 - time) for time, reading in readings[300:]) < 1e-6
+    elif rate:
+        assert clock.rate == pytest.approx(rate, rel=0.01, abs=1e-4)
+    else:
+        assert clock.rate is not None
+
+
+def test_a_clock_is_believed_through_a_stall_of_the_host():
+    clock = DeviceClock(1.0, proven=False)
+    for k in range(1000):
+        time = 0.02 * k
+        clock.read(time, 50 + (time if not 7 < time < 12 else 12))
+    assert clock.rate is None

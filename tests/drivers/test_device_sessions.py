@@ -11,9 +11,10 @@ from emulators.scip_device import ScipDevice, ScipOptions
 from emulators.world import Epoch, Scan, WorldClock
 from helpers.driver_harness import of_kind, simulate
 
-from uwblite.drivers.dwm1001_session import Dwm1001Session
+from uwblite.drivers.dwm1001_driver import Dwm1001Driver
 from uwblite.drivers.events import Corrupt, LaserScan, Lost, Note, Param, RangeEpoch, SetBaud
-from uwblite.drivers.scip_session import ScipSession
+from uwblite.drivers.scip_driver import ScipDriver
+from uwblite.drivers.session import Session
 
 START = 1000.0
 
@@ -48,7 +49,7 @@ def test_lidar_starts_from_every_state(state):
         device.receive(words.get(state, b""), now - 1.0)
 
     device.power_up = prepared
-    session = ScipSession()
+    session = ScipDriver()
     actions, reopens = simulate(session, device, 5.0)
     scans = of_kind(actions, LaserScan)
     assert reopens == 0
@@ -62,7 +63,7 @@ def test_lidar_starts_from_every_state(state):
 
 def test_lidar_reports_who_it_is_and_its_geometry():
     device, _ = lidar()
-    session = ScipSession()
+    session = ScipDriver()
     actions, _ = simulate(session, device, 2.0)
     assert {p.name for p in of_kind(actions, Param)} == {"laser_product", "laser_firmware", "laser_serial"}
     (scan, *_) = of_kind(actions, LaserScan)
@@ -75,7 +76,7 @@ def test_lidar_reports_who_it_is_and_its_geometry():
 @pytest.mark.parametrize("options", [{"cluster": 3}, {"skip": 1}, {"wide": False}, {"start": 128, "end": 640}])
 def test_lidar_sub_sampled(options):
     device, sent = lidar()
-    actions, _ = simulate(ScipSession(**options), device, 4.0)
+    actions, _ = simulate(ScipDriver(**options), device, 4.0)
     scans = of_kind(actions, LaserScan)
     assert len(scans) > (12 if "skip" in options else 20)
     assert not of_kind(actions, Lost)
@@ -93,7 +94,7 @@ def test_lidar_stamps_stay_within_2_ms_through_a_clock_wrap(skew):
     device, sent = lidar(ScipOptions(clock_start=(1 << 24) - 60_000, clock_skew=skew))
     rng = random.Random(0)
     delay = lambda: 0.04 if rng.random() < 0.02 else rng.expovariate(1000)  # noqa: E731
-    actions, _ = simulate(ScipSession(), device, 120.0, jitter=delay)
+    actions, _ = simulate(ScipDriver(), device, 120.0, jitter=delay)
     scans = of_kind(actions, LaserScan)
     assert len(scans) > 1180
     assert not names(actions) & {"lidar-clock-reset", "lidar-restart"}
@@ -105,7 +106,7 @@ def test_lidar_stamps_stay_within_2_ms_through_a_clock_wrap(skew):
 
 def test_lidar_pause_and_hardware_fault_are_named_and_survived():
     device, _ = lidar()
-    session, advance = ScipSession(), device.advance
+    session, advance = ScipDriver(), device.advance
 
     def scripted(now):
         device.fault = 22 if 3 < now - START < 4 else 55 if 6 < now - START < 7 else None
@@ -120,7 +121,7 @@ def test_lidar_pause_and_hardware_fault_are_named_and_survived():
 def test_lidar_that_is_silent_asks_for_the_port_to_be_opened_anew():
     device, _ = lidar()
     device.receive = lambda data, now: b""
-    actions, reopens = simulate(ScipSession(), device, 20.0)
+    actions, reopens = simulate(ScipDriver(), device, 20.0)
     assert reopens >= 1
     assert "lidar-silent" in names(actions)
     assert {a.rate for a in of_kind(actions, SetBaud)} == {19200, 57600, 250000, 500000, 750000}
@@ -130,7 +131,7 @@ def test_lidar_with_scip_1_only_is_named():
     device, _ = lidar(ScipOptions(scip1=True))
     receive = device.receive
     device.receive = lambda data, now: b"SCIP2.0\nE\n\n" if data.startswith(b"SCIP2.0") else receive(data, now)
-    actions, reopens = simulate(ScipSession(), device, 3.0)
+    actions, reopens = simulate(ScipDriver(), device, 3.0)
     assert "lidar-scip1-only" in names(actions)
     assert reopens
 
@@ -140,7 +141,7 @@ def test_lidar_damage_costs_the_scans_that_were_damaged(seed):
     """Noise at one byte in 20,000 hits about every tenth scan; all others arrive with the right ranges."""
     device, sent = lidar()
     line = FaultyLine([parse_fault("noise=0.00005@3")], seed)
-    actions, _ = simulate(ScipSession(), device, 60.0, line=line)
+    actions, _ = simulate(ScipDriver(), device, 60.0, line=line)
     scans = of_kind(actions, LaserScan)
     lost = sum(item.count for item in of_kind(actions, Lost))
     assert len(scans) + lost >= len(sent) - 3
@@ -152,7 +153,7 @@ def test_lidar_damage_costs_the_scans_that_were_damaged(seed):
 
 def test_lidar_scans_sent_twice_are_dropped():
     device, _ = lidar(ScipOptions(duplicates=0.2, random=random.Random(1)))
-    actions, _ = simulate(ScipSession(), device, 20.0)
+    actions, _ = simulate(ScipDriver(), device, 20.0)
     stamps = [scan.stamp for scan in of_kind(actions, LaserScan)]
     assert min(b - a for a, b in itertools.pairwise(stamps)) > 0.09
     assert "scan sent twice" in {c.why for c in of_kind(actions, Corrupt)}
@@ -199,7 +200,7 @@ def check_ranges(actions, sent, resolution, tolerance):
 )
 def test_tag_by_tlv_from_every_state(options):
     device, sent = tag(DwmOptions(**options))
-    session = Dwm1001Session()
+    session = Dwm1001Driver()
     actions, reopens = simulate(session, device, 20.0)
     assert reopens == 0
     assert len(of_kind(actions, RangeEpoch)) > 150
@@ -212,7 +213,7 @@ def test_tag_by_tlv_from_every_state(options):
 @pytest.mark.parametrize("options", [{}, {"shell": True}, {"stream": "lec"}, {"stream": "les"}], ids=str)
 def test_tag_by_shell_from_every_state(options):
     device, sent = tag(DwmOptions(**options))
-    actions, reopens = simulate(Dwm1001Session(shell=True), device, 20.0)
+    actions, reopens = simulate(Dwm1001Driver(shell=True), device, 20.0)
     assert reopens == 0
     assert len(of_kind(actions, RangeEpoch)) > 120
     check_ranges(actions, sent, 10, 0.01)
@@ -221,7 +222,7 @@ def test_tag_by_shell_from_every_state(options):
 @pytest.mark.parametrize("dropouts", [0.2, 0.9])
 def test_tag_with_rounds_missing(dropouts):
     device, sent = tag(dropouts=dropouts)
-    actions, _ = simulate(Dwm1001Session(), device, 60.0)
+    actions, _ = simulate(Dwm1001Driver(), device, 60.0)
     check_ranges(actions, sent, 1, 0.006)
     assert not of_kind(actions, Lost)
 
@@ -235,19 +236,19 @@ def test_tag_half_a_request_of_a_dead_host_is_closed_by_the_gap():
         device.receive(b"\x0c", now - 0.5)
 
     device.power_up = prepared
-    actions, _ = simulate(Dwm1001Session(), device, 5.0)
+    actions, _ = simulate(Dwm1001Driver(), device, 5.0)
     check_ranges(actions, sent, 1, 0.005)
 
 
 def test_tag_settings_that_hurt_are_named():
     device, _ = tag(DwmOptions(stationary_detection=True, update=[10, 100], joined=False))
-    actions, _ = simulate(Dwm1001Session(), device, 8.0)
+    actions, _ = simulate(Dwm1001Driver(), device, 8.0)
     assert {"stationary-detection", "slow-update-rate", "not-joined"} <= names(actions)
     device, _ = tag(DwmOptions(anchor=True))
-    actions, _ = simulate(Dwm1001Session(), device, 3.0)
+    actions, _ = simulate(Dwm1001Driver(), device, 3.0)
     assert "not-a-tag" in names(actions)
     device, _ = tag(DwmOptions(stationary_detection=True, joined=False))
-    actions, _ = simulate(Dwm1001Session(shell=True), device, 6.0)
+    actions, _ = simulate(Dwm1001Driver(shell=True), device, 6.0)
     assert {"stationary-detection", "not-joined"} <= names(actions)
 
 
@@ -256,7 +257,7 @@ def test_tag_on_a_bad_cable_logs_nothing_wrong(seed):
     """One byte in a hundred is changed and TLV has no sum: reading twice keeps wrong ranges out of the log."""
     device, sent = tag(seed=seed)
     line = FaultyLine([parse_fault("noise=0.01@3")], seed)
-    actions, _ = simulate(Dwm1001Session(), device, 60.0, line=line)
+    actions, _ = simulate(Dwm1001Driver(), device, 60.0, line=line)
     epochs = of_kind(actions, RangeEpoch)
     true = {tuple((a, d) for a, d, _ in readings) for _, readings in sent}
     wrong = [e for e in epochs if tuple((int(r.anchor_id, 16), round(1000 * r.range)) for r in e.readings) not in true]
@@ -269,14 +270,14 @@ def test_tag_on_a_bad_cable_logs_nothing_wrong(seed):
 def test_tag_that_falls_silent_asks_for_the_port_to_be_opened_anew():
     device, _ = tag()
     device.silent = True
-    actions, reopens = simulate(Dwm1001Session(), device, 15.0)
+    actions, reopens = simulate(Dwm1001Driver(), device, 15.0)
     assert reopens >= 1
     assert "uwb-silent" in names(actions)
 
 
 def test_tag_that_restarts_in_mid_run_comes_back():
     device, _ = tag()
-    session = Dwm1001Session()
+    session = Session(Dwm1001Driver())
     feed, done = session.feed, []
 
     def scripted(data, now):

@@ -140,5 +140,4 @@ def test_memory_is_bounded():
     protocol = ShellProtocol()
     for _ in range(3000):
         protocol.feed(b"DIST,4,AN0," * 100, 0.0)
-        assert len(protocol._line) <= dwm1001_shell.MAX_LINE
-        assert len(protocol._marks) <= dwm1001_shell.MAX_LINE
+        assert protocol._lines.held <= dwm1001_shell.MAX_LINE

@@ -8,8 +8,9 @@ from emulators.wires import PtyWire
 from emulators.world import LogWorld, RoomWorld, WorldClock
 from helpers.driver_harness import ROOT
 
-from uwblite.drivers.scip_session import ScipSession
-from uwblite.drivers.transport import Port
+from uwblite.drivers.scip_driver import ScipDriver
+from uwblite.drivers.session import Session
+from uwblite.drivers.transport import open_port
 from uwblite.errors import DeviceError, ProtocolError
 
 ROOM = ROOT / "tests" / "data" / "room.log.gz"
@@ -83,7 +84,7 @@ def test_faults_have_a_grammar():
 def test_a_wire_that_is_pulled_fails_at_the_other_end(tmp_path):
     wire = PtyWire(tmp_path / "port")
     wire.plug_in()
-    port = Port(str(tmp_path / "port"), 115200)
+    port = open_port(str(tmp_path / "port"), 115200)
     assert wire.connected()
     wire.write(b"hello")
     assert port.read() == b"hello"
@@ -95,11 +96,11 @@ def test_a_wire_that_is_pulled_fails_at_the_other_end(tmp_path):
         port.read()
     port.close()
     with pytest.raises(DeviceError, match="no such port"):
-        Port(str(tmp_path / "port"), 115200)
+        open_port(str(tmp_path / "port"), 115200)
 
 
 def test_a_port_without_a_descriptor_is_read_too():
-    port = Port("loop://", 115200)
+    port = open_port("loop://", 115200)
     assert port.fileno() is None
     assert port.read() == b""
     port.write(b"echo")
@@ -111,15 +112,15 @@ def test_a_port_without_a_descriptor_is_read_too():
 @pytest.mark.parametrize("url", ["socket://127.0.0.1:1", "nonsense://x", "spy:///dev/none"])
 def test_urls_that_do_not_open_are_one_clear_error(url):
     with pytest.raises(DeviceError, match="cannot open"):
-        Port(url, 115200)
+        open_port(url, 115200)
 
 
 def test_steps_that_the_unit_does_not_have_are_refused_at_once():
-    session = ScipSession(0, 900)
+    session = Session(ScipDriver(0, 900))
     session.start(0.0)
     session.tick(1.0)
     session.feed(b"QT\n00P\n\n", 1.1)
     session.feed(b"VV\n00P\n\n", 1.2)
-    session.feed(b"PP\n00P\nAMIN:44;7\n\n", 1.3)  # incomplete: asked once more
+    asked_again = b"PP\n00P\nAMIN:44;7\n\n" * 6  # the answer is not complete
     with pytest.raises(ProtocolError, match=r"44\.\.725"):
-        session.feed(b"PP\n00P\nAMIN:44;7\n\n", 1.4)
+        session.feed(asked_again, 1.4)

@@ -8,14 +8,12 @@ from helpers.driver_harness import ROOT  # noqa: F401
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from uwblite.drivers.devices import DEVICES, open_device
 from uwblite.drivers.dwm1001 import TlvProtocol
-from uwblite.drivers.dwm1001_session import Dwm1001Session
 from uwblite.drivers.dwm1001_shell import ShellProtocol
 from uwblite.drivers.kobuki import KobukiProtocol
 from uwblite.drivers.odometry_line import LineFormat, OdometryLineProtocol
-from uwblite.drivers.odometry_session import KobukiSession, LineSession
 from uwblite.drivers.scip import ScipProtocol
-from uwblite.drivers.scip_session import ScipSession
 
 WORDS = {
     "scip": [b"MD0044072501000\n", b"99b\n", b"00P\n", b"\n\n", b"GD", b"VV\n", b"QT", b"0" * 64, b"TM1\n", b";"],
@@ -31,24 +29,21 @@ PROTOCOLS = {
     "kobuki": (KobukiProtocol, WORDS["kobuki"]),
     "line": (lambda: OdometryLineProtocol(LineFormat()), WORDS["line"]),
 }
-SESSIONS = {
-    "scip": ScipSession,
-    "tlv": Dwm1001Session,
-    "shell": lambda: Dwm1001Session(shell=True),
-    "kobuki": KobukiSession,
-    "line": lambda: LineSession(LineFormat()),
-}
+SESSIONS = tuple(DEVICES)
+LINE_OPTIONS = "?columns=t,x,y,theta"
 
 
-def held(protocol):
-    """Return the bytes that a protocol holds."""
-    total = 0
-    for value in vars(protocol).values():
-        if isinstance(value, bytearray | bytes):
-            total += len(value)
-        elif isinstance(value, list):
-            total += sum(len(item[1]) if isinstance(item[1], bytes) else 16 for item in value if isinstance(item, tuple))
-    return total
+def session_of(name):
+    return open_device(DEVICES[name].sensor, f"{name}:/dev/null" + LINE_OPTIONS * (name == "line"))[0]
+
+
+def held(value):
+    """Return the bytes that a protocol holds, in whatever it is made of."""
+    if isinstance(value, bytearray | bytes):
+        return len(value)
+    if isinstance(value, list | tuple):
+        return 16 + sum(map(held, value))
+    return sum(map(held, vars(value).values())) if hasattr(value, "__dict__") and not callable(value) else 0
 
 
 def pieces(words):
@@ -85,7 +80,7 @@ def test_splits_do_not_matter_for_any_input(name, data):
 @given(data=st.data())
 def test_sessions_take_anything_at_any_time(name, data):
     words = PROTOCOLS[name][1]
-    session, now = SESSIONS[name](), 0.0
+    session, now = session_of(name), 0.0
     session.start(now)
     for piece in data.draw(pieces(words)):
         now += data.draw(st.sampled_from([0.0, 0.001, 0.1, 0.3, 1.2, 5.0]))
@@ -101,7 +96,7 @@ def test_a_million_bytes(name, kind):
     """Work per byte is bounded: counted in Python calls, so that the machine's load does not matter."""
     make, words = PROTOCOLS[name]
     rng = random.Random(f"{name} {kind}")
-    protocol, session, fed, largest, now = make(), SESSIONS[name](), 0, 0, 0.0
+    protocol, session, fed, largest, now = make(), session_of(name), 0, 0, 0.0
     session.start(now)
     calls = [0]
 

@@ -183,10 +183,10 @@ def test_a_base_that_prints_lines(tmp_path):
     stop = threading.Event()
 
     def talk():
-        k = 0
+        began = time.monotonic()
         while not stop.wait(0.02):
-            os.write(master, f"{20 * k},{10 * k},{10 * k}\n".encode())
-            k += 1
+            ms = int(1000 * (time.monotonic() - began))
+            os.write(master, f"{ms},{ms // 2},{ms // 2}\n".encode())
 
     thread = threading.Thread(target=talk)
     thread.start()

@@ -8,6 +8,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 
 from uwblite.drivers.events import Corrupt, Reopen, Send  # noqa: E402
+from uwblite.drivers.session import Session  # noqa: E402
 
 
 def feed_whole(make, data, stamp=1.0):
@@ -51,14 +52,15 @@ def check_transcript(make, frames, expected, noises, splits=200, seed=0):
         assert good(feed_split(make, noisy, rng)) == expected, noisy
 
 
-def simulate(recording, device, seconds, *, line=None, step=0.0005, start=1000.0, latency=0.0008, jitter=lambda: 0.0):
-    """Run a session against an emulated device in simulated time, with a fault line between them.
+def simulate(session, device, seconds, *, line=None, step=0.0005, start=1000.0, latency=0.0008, jitter=lambda: 0.0):
+    """Run a session, or a driver's, against an emulated device in simulated time, with a fault line between them.
 
     Returns
     -------
     actions : all but Send, each with the time it was made.
     reopens : how often the session asked for the port to be opened anew.
     """
+    session = session if isinstance(session, Session) else Session(session)
     now, end = start, start + seconds
     actions, to_host, reopens = [], [], 0
     device.power_up(now)
@@ -75,11 +77,11 @@ def simulate(recording, device, seconds, *, line=None, step=0.0005, start=1000.0
                 to_come(device.receive(action.data, now), latency)
             elif isinstance(action, Reopen):
                 reopens += 1
-                do(recording.start(now))
+                do(session.start(now))
             else:
                 actions.append((now, action))
 
-    do(recording.start(now))
+    do(session.start(now))
     while now < end:
         to_come(device.advance(now), 0.0)
         while to_host and to_host[0][0] <= now:
@@ -87,11 +89,11 @@ def simulate(recording, device, seconds, *, line=None, step=0.0005, start=1000.0
             if line is not None:
                 data = line.pass_on(data, now - start)
             if data:
-                do(recording.feed(data, now))
-        deadline = recording.deadline()
+                do(session.feed(data, now))
+        deadline = session.deadline()
         if deadline is not None and deadline <= now:
-            do(recording.tick(now))
-        times = [device.next_time(now), recording.deadline() or end, to_host[0][0] if to_host else end, end]
+            do(session.tick(now))
+        times = [device.next_time(now), session.deadline() or end, to_host[0][0] if to_host else end, end]
         now = max(now + step / 10, min(max(min(times), now), now + 0.05))
     return actions, reopens
 

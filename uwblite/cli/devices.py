@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 from .console import note, say, say_json
 
 if TYPE_CHECKING:
-    from ..drivers.dwm1001_session import Dwm1001Session
-    from ..drivers.events import Action, Session
-    from ..drivers.scip_session import ScipSession
+    from ..drivers.devices import DeviceKind
+    from ..drivers.events import Action
     from ..drivers.transport import Port
 
 HELP = "list tag, lidar and base that are plugged in, and say how to mend what is not right"
@@ -20,13 +19,15 @@ examples:
   uwblite devices /dev/ttyUSB0 /dev/serial0    look at these ports, whatever they are
   uwblite devices --pan-id 0xC0DE              and is the tag in this network?
   uwblite devices --list                       only list ports; nothing is opened
+  uwblite devices --kinds                      what can be recorded, with names and options
 
 Looking at a port opens it, listens for a moment and asks who is there. Ports of an unknown kind are only opened when they
-are named. Nothing is changed: every finding says what to type. Exit code 0: all is well; 1: nothing is there; 3: something
+are named. Nothing is changed: every finding says what to type. Exit code 0: all is well; 1: no device was found; 3: something
 needs mending.
 """
 
-LISTEN, ASK = 0.4, 4.0
+LISTEN, ASK = 0.6, 5.0
+"""s to wait for a device that talks unasked, and for one that answers."""
 
 
 @dataclass
@@ -35,6 +36,8 @@ class Sight:
 
     path: str
     kind: str = "unknown"
+    found: bool = False
+    """Somebody answered."""
     details: dict[str, str] = field(default_factory=dict)
     findings: list[tuple[str, str]] = field(default_factory=list)
     """(level, what and how to mend it)."""
@@ -44,34 +47,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("ports", metavar="PORT", nargs="*", help="ports to look at (default: those of a known kind)")
     parser.add_argument("--list", action="store_true", help="list the ports and open none")
+    parser.add_argument("--kinds", action="store_true", help="list the devices that can be recorded, with their options")
     parser.add_argument("--pan-id", metavar="ID", type=_pan_id, help="network id that the tag should have, e.g. 0xC0DE")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
 
 
 def run(args: argparse.Namespace) -> int:
     """Look at the ports and report."""
+    from ..drivers.devices import kinds_on_usb
     from ..drivers.transport import check_url, plugged_in
     from ..errors import DeviceError
 
+    if args.kinds:
+        return _list_kinds()
     sights = []
     if args.ports:
         for path in args.ports:
             check_url(path)
-        sights = [Sight(path) if args.list else look(path, "", args.pan_id) for path in args.ports]
+        sights = [Sight(path) if args.list else look(path, [], args.pan_id) for path in args.ports]
     else:
         for port in plugged_in():
-            sight = Sight(port.path)
-            if port.guess and not args.list:
-                sight = look(port.path, port.guess, args.pan_id)
+            kinds = kinds_on_usb(port.usb_id, port.description)
+            sight = look(port.path, kinds, args.pan_id) if kinds and not args.list else Sight(port.path)
             sight.details = {"usb": f"{port.usb_id} {port.description}".strip(), **sight.details}
             sights.append(sight)
-            if not port.guess:
+            if not kinds:
                 sight.findings.append(("info", f"kind not known; `uwblite devices {port.path}` looks at it"))
     if not sights:
         raise DeviceError("no serial device is plugged in; check cables and power, then `dmesg | tail` (see firmware_notes)")
     _compare_networks(sights)
     _report(sights, args.json)
-    return 3 if any(level != "info" for sight in sights for level, _ in sight.findings) else 0
+    if any(level != "info" for sight in sights for level, _ in sight.findings):
+        return 3
+    return 0 if args.list or any(sight.found for sight in sights) else 1
+
+
+def _list_kinds() -> int:
+    from ..drivers.devices import DEVICES, SENSORS
+
+    for sensor in SENSORS:
+        for kind in DEVICES.values():
+            if kind.sensor == sensor:
+                say(f"--{sensor} {kind.name}:PORT".ljust(28) + kind.title)
+                if kind.options:
+                    say(f"    options: {kind.options}")
+    return 0
 
 
 def _report(sights: list[Sight], as_json: bool) -> None:
@@ -93,48 +113,45 @@ def _report(sights: list[Sight], as_json: bool) -> None:
             say(f"    {name}: {value}")
         for level, text in sight.findings:
             say(f"    {level}: {text}")
-    if not any(level != "info" for sight in sights for level, _ in sight.findings):
+    if sights and all(sight.found for sight in sights) and not any(
+        level != "info" for sight in sights for level, _ in sight.findings
+    ):  # fmt: skip
         note("all is well")
 
 
-def look(path: str, kind: str, pan_id: int | None) -> Sight:
+def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> Sight:
     """Open a port, find out who is there, and judge its settings.
 
     Parameters
     ----------
     path : of the port.
-    kind : "scip", "dwm1001" or "kobuki" where it is known; "" to find out.
+    kinds : of device that it may be; empty = any.
     pan_id : network id that a tag should have, None = any.
 
     Returns
     -------
     Sight
     """
-    from ..drivers.dwm1001_session import Dwm1001Session
-    from ..drivers.scip_session import ScipSession
-    from ..drivers.transport import Port
+    from ..drivers.devices import DEVICES
+    from ..drivers.transport import open_port
     from ..errors import DeviceError
 
     sight = Sight(path)
+    tried = kinds or [kind for kind in DEVICES.values() if kind.probe]
     try:
-        port = Port(path, 115200)
+        port = open_port(path, tried[0].baud)
     except DeviceError as error:
         sight.findings.append(("error", str(error)))
         return sight
     try:
-        if kind in ("", "kobuki") and _listen_for_base(port, sight):
-            return sight
-        if kind in ("", "dwm1001"):
-            tag = Dwm1001Session(stream=False)
-            if _ask(port, tag, sight):
-                _judge_tag(tag, sight, pan_id)
+        for kind in sorted(tried, key=lambda kind: not kind.talks):
+            port.set_baud(kind.baud)
+            if _ask(port, kind, sight):
+                _judge_network(sight, pan_id)
                 return sight
-        if kind in ("", "scip"):
-            lidar = ScipSession(stream=False)
-            if _ask(port, lidar, sight):
-                _judge_lidar(lidar, sight)
-                return sight
-        sight.findings.append(("error", _SILENT.get(kind, _SILENT[""])))
+        known = ", ".join(kind.title for kind in tried)
+        silent = f"nobody known answers: is the device powered, and is it one of these: {known}?"
+        sight.findings.append(("error", kinds[0].silent if kinds else silent))
     except DeviceError as error:
         sight.findings.append(("error", str(error)))
     finally:
@@ -142,41 +159,14 @@ def look(path: str, kind: str, pan_id: int | None) -> Sight:
     return sight
 
 
-_SILENT = {
-    "": "nobody known answers: is the device powered, and is it a DWM1001 (PANS), a URG-04LX or a Kobuki?",
-    "kobuki": "the base is silent: switch it on (its USB chip is powered by this computer, the base is not)",
-    "dwm1001": "the tag is silent: unplug and replug it (the USB bridge of the DEV board can hang)",
-    "scip": "the lidar is silent: unplug and replug it, check its 5 V supply (it draws up to 0.8 A at start)",
-}
+def _ask(port: "Port", kind: "DeviceKind", sight: Sight) -> bool:
+    """Let a device's session find it; True when it did."""
+    from ..drivers.devices import Options, Setup
+    from ..drivers.events import Note, Reopen, Send, SetBaud, SetDtr
+    from ..drivers.session import Session
 
-
-def _listen_for_base(port: "Port", sight: Sight) -> bool:
-    from ..drivers.kobuki import Feedback, KobukiProtocol
-
-    protocol, packets = KobukiProtocol(), 0
-    battery = 0.0
-    end = time.monotonic() + LISTEN
-    while time.monotonic() < end:
-        for event in protocol.feed(port.read(), time.monotonic()):
-            if isinstance(event, Feedback):
-                packets, battery = packets + 1, event.battery
-                if event.wheel_drop:
-                    sight.findings = [("warning", "a wheel hangs in the air: travel will be wrong")]
-        time.sleep(0.01)
-    if packets < 3:
-        return False
-    sight.kind = "Kobuki base"
-    sight.details = {"rate": f"{packets / LISTEN:.0f} packets/s", "battery": f"{battery:.1f} V"}
-    if 0 < battery < 13.5:
-        sight.findings.append(("warning", f"the battery is low ({battery:.1f} V): charge it before a run"))
-    return True
-
-
-def _ask(port: "Port", session: "Session", sight: Sight) -> bool:
-    """Let a session find its device; True when it did."""
-    from ..drivers.events import Note, Reopen, Send, SetBaud
-
-    notes: list[Note] = []
+    driver = kind.make(Options(kind.name, {}), Setup(stream=False))
+    session, notes = Session(driver), []
 
     def do(actions: "list[Action]") -> bool:
         for action in actions:
@@ -184,69 +174,37 @@ def _ask(port: "Port", session: "Session", sight: Sight) -> bool:
                 port.write(action.data)
             elif isinstance(action, SetBaud):
                 port.set_baud(action.rate)
+            elif isinstance(action, SetDtr):
+                port.set_dtr(action.on)
             elif isinstance(action, Note):
                 notes.append(action)
-            elif isinstance(action, Reopen):
-                return False
-        return True
+        return not any(isinstance(action, Reopen) for action in actions)
 
-    end = time.monotonic() + ASK
+    end = time.monotonic() + (LISTEN if kind.talks else ASK)
     going = do(session.start(time.monotonic()))
-    while going and time.monotonic() < end and not getattr(session, "ready", False):
+    while going and time.monotonic() < end and not driver.ready:
         data = port.read()
         now = time.monotonic()
         going = do(session.feed(data, now)) if data else True
-        due = session.deadline()
-        if going and due is not None and due <= now:
-            going = do(session.tick(now))
+        going = going and do(session.tick(now))
         time.sleep(0.003)
-    found = bool(getattr(session, "ready", False))
-    if found:
-        do(session.stop())
-    wanted = {"lidar-scip1-only"} if not found else None
-    sight.findings += [(n.level, n.text) for n in notes if wanted is None or n.name in wanted]
-    return found
+    if not driver.ready:
+        sight.findings += [(note.level, note.text) for note in notes if note.name == "lidar-scip1-only"]
+        return False
+    do(session.stop())
+    identity = driver.identity()
+    sight.found, sight.kind, sight.details = True, identity.title, dict(identity.details)
+    said = {note.name for note in identity.findings}
+    shown = [*identity.findings, *(note for note in notes if note.name not in said)]
+    sight.findings += [(note.level, note.text) for note in shown]
+    return True
 
 
-def _judge_tag(tag: "Dwm1001Session", sight: Sight, pan_id: int | None) -> None:
-    from ..drivers.dwm1001_blocks import short_id
-
-    node = tag.values.get("node_id")
-    network = tag.values.get("pan_id", tag.info.pan_id)
-    sight.kind = "DWM1001 anchor" if tag.config and tag.config.anchor else "DWM1001 tag"
-    if node is not None:
-        sight.details["id"] = short_id(node)
-    if network is not None:
-        sight.details["network"] = f"0x{network:04X}"
-    if "firmware" in tag.values:
-        sight.details["firmware"] = ".".join(str(b) for b in tag.values["firmware"].to_bytes(4, "big"))
-    if tag.rate:
-        sight.details["period"] = f"{tag.rate.normal:.1f} s moving, {tag.rate.stationary:.1f} s at rest"
-    if tag.joined is not None:
-        sight.details["network state"] = "joined" if tag.joined else "not joined"
-        if not tag.joined:
-            text = "not joined: switch the initiator anchor on; all nodes need the same network id and no update pending"
-            sight.findings.append(("warning", text))
-    if network == 0:
-        sight.findings.append(("error", "the network id is 0: in the shell type `nis 0xC0DE` (with 0x), then `reset`"))
-    elif pan_id is not None and network is not None and network != pan_id:
-        text = f"the network id is 0x{network:04X}: in the shell type `nis 0x{pan_id:04X}`, then `reset`"
+def _judge_network(sight: Sight, pan_id: int | None) -> None:
+    network = sight.details.get("network")
+    if pan_id is not None and network not in (None, "0x0000", f"0x{pan_id:04X}"):
+        text = f"the network id is {network}: in the shell type `nis 0x{pan_id:04X}`, then `reset`"
         sight.findings.append(("error", text))
-
-
-def _judge_lidar(lidar: "ScipSession", sight: Sight) -> None:
-    identity, unit = lidar.identity, lidar.geometry
-    sight.kind = f"laser scanner {unit.model}"
-    for name, key in (("firmware", "FIRM"), ("serial", "SERI"), ("laser", "LASR"), ("state", "STAT")):
-        if key in identity:
-            sight.details[name] = identity[key]
-    sight.details["range"] = f"{unit.distance_min / 1000:.2f} to {unit.distance_max / 1000:.2f} m"
-    sight.details["steps"] = f"{unit.first} to {unit.last}, {unit.speed} rev/min"
-    if identity.get("LASR") == "OFF":
-        sight.findings.append(("info", "the laser is off, as it should be now; `uwblite record` switches it on"))
-    state = identity.get("STAT", "")
-    if state and "works well" not in state and "Stable" not in state:
-        sight.findings.append(("error", f"it reports {state!r}: power it down and up; if that stays, it needs service"))
 
 
 def _compare_networks(sights: list[Sight]) -> None:

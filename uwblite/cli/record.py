@@ -9,7 +9,7 @@ from .console import note, say, say_json
 from .options import number, numbers
 
 if TYPE_CHECKING:
-    from ..drivers.events import Note, Session
+    from ..drivers.events import Note, Pose
     from ..drivers.link import Link
     from ..drivers.recorder import Recorder
 
@@ -25,11 +25,7 @@ examples:
   uwblite record ... --out run.log --append           go on after a crash
 
 devices (a path, a by-id path, socket://host:port or any other pyserial URL):
-  --uwb       [tlv:|shell:]PORT     DWM1001 tag with PANS R2; tlv (default) gives 1 mm, shell 1 cm
-  --lidar     PORT                  URG-04LX, SCIP 1.1 or 2.0
-  --odometry  kobuki:PORT | line:PORT?columns=...&baud=115200
-              line options: columns (t,x,y,theta | t,left,right | speed, turn_rate, - to skip), tick (m), wheel_base (m),
-              tick_modulus, time_unit (s), length_unit (m), angle_unit (rad), prefix, baud
+  each is written [NAME:]PORT[?option=value&...]; `uwblite devices --kinds` lists the names with their options
 
 The log is CARMEN text. Each line is with the kernel as soon as it is written, so a crash loses at most the last one, and
 with the disk after --sync seconds. Losses, reconnects and warnings stand in it as COMMENT lines. A recording ends with
@@ -41,16 +37,12 @@ computer's monotonic clock, s).
 """
 
 
-SPEEDS = (1200, 4_000_000)
-"""bit/s, least and most, that a serial port is opened with."""
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     devices = parser.add_argument_group("devices")
-    devices.add_argument("--uwb", metavar="[tlv:|shell:]PORT", help="DWM1001 tag")
-    devices.add_argument("--lidar", metavar="PORT", help="URG-04LX")
-    devices.add_argument("--odometry", metavar="KIND:PORT", help="kobuki:PORT or line:PORT?columns=t,x,y,theta")
+    devices.add_argument("--uwb", metavar="[NAME:]PORT", action="append", help="UWB tag (a DWM1001 without a name)")
+    devices.add_argument("--lidar", metavar="[NAME:]PORT", action="append", help="lidar (a Hokuyo without a name)")
+    devices.add_argument("--odometry", metavar="NAME:PORT", action="append", help="base: kobuki:PORT, line:PORT?columns=...")
     output = parser.add_argument_group("output")
     output.add_argument("--out", metavar="FILE", required=True, help="the log; must not exist unless --append")
     output.add_argument("--append", action="store_true", help="go on with a log that broke off")
@@ -60,13 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument("--sync", metavar="S", type=number(least=0), default=1.0, help=pause)
     output.add_argument("--json", action="store_true", help="summary as one JSON object on stdout")
     laser = parser.add_argument_group("lidar")
-    laser.add_argument("--lidar-steps", metavar="A:B", type=_steps, help="first and last step, e.g. 128:640 (all: 44:725)")
+    laser.add_argument("--lidar-steps", metavar="A:B", help="first and last step, e.g. 128:640 (all: 44:725)")
     merged, skipped = number(1, 99, whole=True), number(0, 9, whole=True)
-    laser.add_argument("--lidar-cluster", metavar="N", type=merged, default=1, help="steps merged into one reading (1)")
-    laser.add_argument("--lidar-skip", metavar="N", type=skipped, default=0, help="scans left out between two (0)")
-    laser.add_argument("--lidar-narrow", action="store_true", help="2-character readings up to 4.095 m, for slow RS-232")
-    speed = number(*SPEEDS, whole=True)
-    laser.add_argument("--lidar-baud", metavar="N", type=speed, default=115200, help="bit/s to try first on RS-232 (115200)")
+    laser.add_argument("--lidar-cluster", metavar="N", type=merged, help="steps merged into one reading (1)")
+    laser.add_argument("--lidar-skip", metavar="N", type=skipped, help="scans left out between two (0)")
+    narrow = "2-character readings up to 4.095 m, for slow RS-232"
+    laser.add_argument("--lidar-narrow", action="store_const", const=1, help=narrow)
+    laser.add_argument("--lidar-baud", metavar="N", type=number(whole=True), help="bit/s to try first on RS-232 (115200)")
     mounting = parser.add_argument_group("mounting, for the log")
     mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
     mounting.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
@@ -83,12 +75,15 @@ def run(args: argparse.Namespace) -> int:
     from ..drivers.link import Mounting
     from ..drivers.log_file import LogFile, last_state
     from ..drivers.recorder import Recorder
-    from ..drivers.transport import check_url
+    from ..drivers.transport import check_pyserial, check_url
 
     if not (args.uwb or args.lidar or args.odometry):
         note("uwblite: error: name at least one of --uwb, --lidar, --odometry; `uwblite devices` lists what is there")
         return 2
     path = Path(args.out)
+    if path.suffix in (".gz", ".bz2", ".xz", ".zip"):
+        note(f"uwblite: error: --out {path}: a log is plain text, so that a crash loses one line; compress it afterwards")
+        return 2
     offset = time.time() - time.monotonic()
     pose, remark = (0.0, 0.0, 0.0), ""
     if args.append and path.exists():
@@ -101,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
     links = _links(args, pose)
     for link in links:
         check_url(link.url)
+        check_pyserial(link.url)
     log = LogFile(path, append=args.append, rotate=args.rotate, sync=args.sync)
     mounting = Mounting(args.laser_pose or (0.0, 0.0, 0.0), tuple(_mounting_params(args, offset)))
     stopped: list[int] = []
@@ -163,49 +159,22 @@ def _last_part(path: Path) -> Path:
     return path
 
 
-def _links(args: argparse.Namespace, pose: tuple[float, float, float]) -> list["Link"]:
+def _links(args: argparse.Namespace, pose: "Pose") -> list["Link"]:
+    from ..drivers.devices import SENSORS, Setup, open_device
     from ..drivers.link import Link
-
-    links = []
-    if args.odometry:
-        session, url = odometry_session(args.odometry, pose)
-        links.append(Link("odometry", url, session))
-    if args.lidar:
-        from ..drivers.scip_session import ScipSession
-
-        start, end = args.lidar_steps or (None, None)
-        lidar = ScipSession(
-            start, end, cluster=args.lidar_cluster, skip=args.lidar_skip, wide=not args.lidar_narrow, baud=args.lidar_baud
-        )
-        links.append(Link("lidar", args.lidar.removeprefix("scip:"), lidar))
-    if args.uwb:
-        from ..drivers.dwm1001_session import Dwm1001Session
-
-        kind, _, url = args.uwb.partition(":") if re.match(r"(tlv|shell|dwm1001):", args.uwb) else ("tlv", "", args.uwb)
-        links.append(Link("uwb", url, Dwm1001Session(shell=kind == "shell")))
-    return links
-
-
-def odometry_session(spec: str, pose: tuple[float, float, float]) -> tuple["Session", str]:
-    """Return the session and the port that ``kobuki:PORT`` or ``line:PORT?options`` names."""
-    from urllib.parse import parse_qsl
-
-    from ..drivers.odometry_line import parse_format
-    from ..drivers.odometry_session import KobukiSession, LineSession
     from ..errors import ConfigError
 
-    kind, _, rest = spec.partition(":")
-    if kind == "kobuki" and rest:
-        return KobukiSession(pose), rest
-    if kind == "line" and rest:
-        url, _, query = rest.partition("?")
-        options = dict(parse_qsl(query, keep_blank_values=True))
-        try:
-            baud = number(*SPEEDS, whole=True)(options.pop("baud", "115200"))
-        except argparse.ArgumentTypeError as problem:
-            raise ConfigError(f"--odometry: baud={problem}") from None
-        return LineSession(parse_format(options), baud, pose), url
-    raise ConfigError(f"--odometry {spec}: say kobuki:PORT, or line:PORT?columns=t,x,y,theta")
+    names = ("steps", "cluster", "skip", "narrow", "baud")
+    lidar = {name: str(value) for name in names if (value := getattr(args, f"lidar_{name}")) is not None}
+    links = []
+    for sensor in reversed(SENSORS):
+        specs = getattr(args, sensor) or []
+        if len(specs) > 1:
+            raise ConfigError(f"--{sensor} is given {len(specs)} times: one {sensor} can be recorded at a time")
+        for spec in specs:
+            session, url = open_device(sensor, spec, Setup(pose), lidar if sensor == "lidar" else None)
+            links.append(Link(sensor, url, session))
+    return links
 
 
 def _mounting_params(args: argparse.Namespace, offset: float) -> list[tuple[str, str]]:
@@ -223,7 +192,7 @@ def _mounting_params(args: argparse.Namespace, offset: float) -> list[tuple[str,
 def _head(args: argparse.Namespace, remark: str) -> list[str]:
     from .. import __version__
 
-    devices = ", ".join(f"{name} {value}" for name in ("uwb", "lidar", "odometry") if (value := getattr(args, name)))
+    devices = ", ".join(f"{name} {spec}" for name in ("uwb", "lidar", "odometry") for spec in getattr(args, name) or [])
     return [f"recorded by uwblite {__version__}: {devices}", *([remark] if remark else [])]
 
 
@@ -275,10 +244,3 @@ def _size(text: str) -> int:
     if not match:
         raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 500M")
     return int(match[1]) * {"": 1, "k": 1000, "M": 10**6, "G": 10**9}[match[2]]
-
-
-def _steps(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{1,4}):(\d{1,4})", text)
-    if not match or int(match[1]) > int(match[2]):
-        raise argparse.ArgumentTypeError(f"{text!r} is not two steps such as 128:640")
-    return int(match[1]), int(match[2])

@@ -1,4 +1,7 @@
-"""Device clocks: counters that wrap, and their time in seconds of the host.
+"""Device clocks: counters that wrap or start anew, and their time in seconds of the host.
+
+`DeviceClock` is what drivers use: it unwraps the counter, notices resets, counts frames that are missing and maps to
+host time.
 
 A frame arrives at the host some time after the device stamped it. The delay is never negative and often near its
 minimum, so the host time of a device stamp is the *lower envelope* of (device time, arrival) up to a constant: the
@@ -7,8 +10,11 @@ the window (Moon, Skelly, Towsley 1999, "Estimation and removal of clock skew fr
 Its slope is the skew of the device's crystal; scheduling jitter of the host drops out.
 """
 
+import math
 from collections import deque
+from dataclasses import dataclass
 from itertools import pairwise
+from statistics import median
 
 MAX_SKEW = 1e-3
 """Largest believable relative error of a crystal; anything above is a broken estimate."""
@@ -16,6 +22,16 @@ BACKWARD = 1.0
 """s; a scan may have begun before the last reading of the clock, more than that is another power-up."""
 FIT_BUCKETS = 8
 """Fewer buckets than this: offset only, no skew."""
+LEARNING = 3.0
+"""s of frames in which their delay is measured against `DeviceClock.tie`; clocks drift less than 1 ms in it."""
+RATE_WINDOW = 1.0
+"""s of arrivals whose smallest delay is compared with that of the window before."""
+WRONG_RATE = 0.05
+"""Relative error of a device clock that no crystal has: its unit of time is not what was believed."""
+WITNESSES = 3
+"""Windows in a row that must say so."""
+GAP = 1.6
+"""Periods between two frames from which on one is missing."""
 
 
 class Unwrapper:
@@ -23,17 +39,17 @@ class Unwrapper:
 
     Parameters
     ----------
-    modulus : the counter counts 0 .. modulus - 1.
+    modulus : the counter counts 0 .. modulus - 1; 0 = it does not wrap.
     tick : seconds per count.
     """
 
     def __init__(self, modulus: int, tick: float) -> None:
         self._modulus, self._tick = modulus, tick
-        self._tolerance = min(60.0, modulus * tick / 4)
-        self._total: int | None = None
-        self._count, self._now = 0, 0.0
+        self._tolerance = min(60.0, modulus * tick / 4) if modulus else 60.0
+        self._total: float | None = None
+        self._count, self._now = 0.0, 0.0
 
-    def unwrap(self, count: int, now: float) -> tuple[float, bool]:
+    def unwrap(self, count: float, now: float) -> tuple[float, bool]:
         """Return the unwrapped time of a count, and whether the counter was reset since the last one.
 
         Parameters
@@ -50,8 +66,10 @@ class Unwrapper:
             self._total, reset = count, False
         else:
             elapsed = (now - self._now) / self._tick
-            step = (count - self._count) % self._modulus
-            step += self._modulus * round((elapsed - step) / self._modulus)
+            step = count - self._count
+            if self._modulus:
+                step %= self._modulus
+                step += self._modulus * round((elapsed - step) / self._modulus)
             reset = step * self._tick < -BACKWARD or abs(step - elapsed) * self._tick > self._tolerance
             self._total = count if reset else self._total + step
         self._count, self._now = count, now
@@ -120,3 +138,135 @@ def _lower_hull(points: deque[tuple[float, float]]) -> list[tuple[float, float]]
             hull.pop()
         hull.append((x, y))
     return hull
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What the clock says of one frame."""
+
+    stamp: float
+    """s, host clock."""
+    elapsed: float | None
+    """s since the frame before, by the device; None = the first frame, or the first after a reset."""
+    missing: int
+    """Frames that did not arrive in between."""
+    reset: bool
+    """The device counted anew: it was powered up again."""
+
+
+class DeviceClock:
+    """The clock that a device stamps its frames with.
+
+    A reset costs the map between the clocks, which begins anew, but not what was measured of the link: the delay of a
+    frame is a property of the device and its cable.
+
+    Parameters
+    ----------
+    tick : s per count.
+    modulus : the counter wraps at this number of counts; 0 = it does not wrap.
+    period : s between frames; None = learned from them.
+    latency : s from a frame's stamp to its first byte at the host, at least, as long as it was not measured (`tie`).
+    proven : the unit of time is a fact of the protocol. Otherwise frames are stamped with their arrival until the clock
+        has kept pace with the host's.
+    """
+
+    def __init__(
+        self, tick: float, modulus: int = 0, *, period: float | None = None, latency: float = 0.0, proven: bool = True
+    ) -> None:  # fmt: skip
+        self.latency, self.period = latency, period
+        self.proven, self._believed = proven, proven
+        self.rate: float | None = None
+        """Device seconds per host second where these disagree: frames are then stamped with their arrival."""
+        self._unwrapper, self._map = Unwrapper(modulus, tick), ClockMap()
+        self._last: float | None = None
+        self._arrival = 0.0
+        self._steps: deque[float] = deque(maxlen=25)
+        self._tie: tuple[float, float] | None = None
+        self._learn_until: float | None = None
+        self._windows: list[tuple[float, float]] = []
+        self._witnesses = 0
+
+    def tie(self, count: float, sent: float, answered: float) -> None:
+        """Take a reading of the clock that the host asked for at `sent` and got at `answered`, s.
+
+        The reading was made in between; of several the one with the shortest round trip counts. The delay of the frames
+        that follow is measured with it.
+        """
+        device, reset = self._unwrapper.unwrap(count, answered)
+        if reset:
+            self._begin_anew()
+        trip, offset = answered - sent, (sent + answered) / 2 - device
+        if self._tie is None or trip < self._tie[0]:
+            self._tie = trip, offset
+        self._learn_until = None
+
+    def read(self, count: float, arrival: float) -> Reading:
+        """Take a frame.
+
+        Parameters
+        ----------
+        count : the frame's stamp, counts.
+        arrival : s, of its first byte at the host.
+
+        Returns
+        -------
+        Reading : `elapsed` is 0 for a frame sent twice.
+        """
+        device, reset = self._unwrapper.unwrap(count, arrival)
+        if reset:
+            self._begin_anew()
+        elapsed = None if self._last is None else device - self._last
+        missing = self._missing(elapsed, arrival)
+        self._arrival, self._last = arrival, device
+        self._map.add(device, arrival)
+        if not self._believed:
+            self._check_rate(device, arrival, reset=reset)
+        self._learn_latency(device, arrival)
+        known = self.proven and self.rate is None
+        return Reading(self._map.host(device) - self.latency if known else arrival, elapsed, missing, reset)
+
+    def _begin_anew(self) -> None:
+        self._map, self._last, self._tie = ClockMap(), None, None
+        self._windows.clear()
+
+    def _missing(self, elapsed: float | None, arrival: float) -> int:
+        if elapsed is not None and self.rate is None and self.period is None and elapsed > 0:
+            self._steps.append(elapsed)
+        period = self.period or (median(self._steps) if len(self._steps) > 4 else math.inf)
+        gap = arrival - self._arrival if self._arrival and elapsed is None else elapsed or 0.0
+        return round(gap / period) - 1 if gap > GAP * period else 0
+
+    def _learn_latency(self, device: float, arrival: float) -> None:
+        if self._tie is None:
+            return
+        delay = arrival - device - self._tie[1]
+        if self._learn_until is None:
+            self._learn_until, self.latency = device + LEARNING, math.inf
+        if device <= self._learn_until:
+            self.latency = max(0.0, min(self.latency, delay))
+        else:
+            self._tie = None
+
+    def _check_rate(self, device: float, arrival: float, *, reset: bool) -> None:
+        """Compare the pace of both clocks: the smallest delay of a window must be that of the one before."""
+        delay = arrival - device
+        if reset:
+            # The unit may be so far off that every frame looks like another power-up.
+            self._judge(math.inf)
+        if self._windows and arrival < self._windows[-1][0] + RATE_WINDOW:
+            if delay < self._windows[-1][1]:
+                self._windows[-1] = self._windows[-1][0], delay
+            return
+        if len(self._windows) > 1:
+            (since, before), (begin, last) = self._windows[-2:]
+            self._judge(1 - (last - before) / (begin - since))
+            del self._windows[0]
+        self._windows.append((arrival, delay))
+
+    def _judge(self, rate: float) -> None:
+        wrong = abs(rate - 1) > WRONG_RATE
+        self._witnesses = self._witnesses + 1 if wrong else 0
+        if self._witnesses >= WITNESSES:
+            self.rate = rate
+        elif not wrong:
+            self.rate, self.proven = None, True

@@ -13,8 +13,8 @@ Sources: DWM1001 firmware API guide 2.3; the vendor's host code.
 
 from ..errors import ProtocolError
 from .dwm1001_blocks import Answer, Event, block_length, decode
-from .events import Corrupt, corrupt
-from .stamped_buffer import StampedBuffer
+from .events import Corrupt
+from .framing import FrameReader
 
 BAUD = 115200
 
@@ -48,99 +48,53 @@ def request(name: str, value: bytes = b"") -> bytes:
     return bytes((REQUESTS[name], len(value))) + value
 
 
-class TlvProtocol:
+class TlvProtocol(FrameReader):
     """Bytes of the module in, blocks and Corrupt out. Holds at most one block (257 bytes)."""
 
+    lead, head_size, unique_head, noise = 0x40, 5, True, "no TLV answer"
+
     def __init__(self) -> None:
-        self._buffer = StampedBuffer()
+        super().__init__()
         self._inside = False
-        self._taken = 0
-
-    def feed(self, data: bytes, stamp: float) -> list[Event]:
-        """Take bytes that arrived at `stamp` s and return the events they complete.
-
-        Parameters
-        ----------
-        data : bytes from the port.
-        stamp : arrival, s, clock of the host.
-
-        Returns
-        -------
-        list of events, in the order of the bytes.
-        """
-        events: list[Event] = []
-        for start in range(0, len(data), 512):
-            self._buffer.append(data[start : start + 512], stamp)
-            self._scan(events)
-        return events
 
     def reset(self) -> None:
         """Forget what is half received: a request was given up, its answer must not run into the next one."""
-        self._buffer.clear()
-        self._inside, self._taken = False, 0
+        super().reset()
+        self._inside = False
 
-    def _scan(self, events: list[Event]) -> None:
-        buffer, at, noise = self._buffer.data, 0, 0
-        while at < len(buffer):
-            size = self._size(at)
-            if size == 0:
-                break
-            if size < 0:
-                self._inside = False
-                at -= size
-                continue
-            self._report(noise, at, events)
-            piece = bytes(buffer[at : at + size])
-            event = decode(piece, self._buffer.stamp_at(at))
-            if isinstance(event, Corrupt):
-                events.append(event)
-                self._inside = False
-                at += 1
-                self._taken = at
-            else:
-                events.append(event)
-                self._inside = not (isinstance(event, Answer) and event.error)
-                at += size
-                self._taken = at
-                if size > 3:
-                    # The last bytes may be the head of the next answer, if this block had lost as many.
-                    at -= next((k for k in (4, 3, 2, 1) if _may_begin(piece[-k:])), 0)
-            noise = at
-        self._report(noise, at, events)
-        self._forget(at)
+    def frame_size(self, head: bytes) -> int:
+        """Tell the head of an answer by the type and length of the block behind it."""
+        return 3 if _may_begin(head) else -1
 
-    def _size(self, at: int) -> int:
+    def measure(self, at: int) -> int:
         """Return the size of the head or block at `at`; 0 = wait for more bytes; -n = the first n bytes are noise."""
-        buffer = self._buffer.data
-        if buffer[at] == 0x40:
+        buffer = self.held.data
+        if buffer[at] == self.lead:
             # Bytes that were taken already are believed to be a head only together with the block that follows.
-            want = 5 if at < self._taken else 3
+            want = 5 if at < self.taken else 3
             head = bytes(buffer[at : at + want])
-            if not _may_begin(head):
-                return -1
-            return 3 if len(head) == want else 0
-        if not self._inside or at < self._taken:
-            following = buffer.find(0x40, at + 1)
-            return at - (following if following >= 0 else len(buffer))
+            return (3 if len(head) == want else 0) if _may_begin(head) else self._noise(-1)
+        if not self._inside or at < self.taken:
+            following = buffer.find(self.lead, at + 1)
+            return self._noise(at - (following if following >= 0 else len(buffer)))
         length = block_length(bytes(buffer[at : at + 3]))
         if length < 0:
-            return -1
+            return self._noise(-1)
         end = at + 2 + length if length else len(buffer) + 1
-        inner = at + 1
-        while (inner := buffer.find(b"\x40\x01", inner, min(end, len(buffer)))) >= 0:
-            if inner + 5 <= min(end, len(buffer)) and _may_begin(bytes(buffer[inner : inner + 5])):
-                return at - inner
-            inner += 1
+        broken = self.head_inside(at + 1, min(end, len(buffer)))
+        if broken:
+            return self._noise(at - broken)
         return 0 if end > len(buffer) else end - at
 
-    def _report(self, start: int, end: int, events: list[Event]) -> None:
-        start = max(start, self._taken)
-        if end > start:
-            events.append(corrupt(bytes(self._buffer.data[start:end]), "no TLV answer"))
+    def decode(self, frame: bytes, stamp: float) -> Event:
+        """Decode a head or a block."""
+        event = decode(frame, stamp)
+        self._inside = not isinstance(event, Corrupt) and not (isinstance(event, Answer) and event.error)
+        return event
 
-    def _forget(self, count: int) -> None:
-        self._buffer.drop(count)
-        self._taken = max(0, self._taken - count)
+    def _noise(self, size: int) -> int:
+        self._inside = False
+        return size
 
 
 def _may_begin(data: bytes) -> bool:

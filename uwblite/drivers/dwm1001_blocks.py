@@ -129,7 +129,6 @@ _VALUES = {
     0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware"), 0x5F: (6, "ble_address"),
 }  # fmt: skip
 _LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
-_STATUS_MASK = 0x01EF
 _HEAD_AS_STATUS = 0x0140
 """``40 01``, the head of the next answer, read as a status: user data and an update pending in a node with no network."""
 _POSITION = struct.Struct("<iiiB")
@@ -178,8 +177,9 @@ def decode(piece: bytes, stamp: float) -> Event:
         return _decode_config(value, stamp)
     if kind == 0x5A:
         bits = int.from_bytes(value, "little")
-        damaged = bits & ~_STATUS_MASK or bits == _HEAD_AS_STATUS
-        return corrupt(piece, "status that no module has") if damaged else Status(stamp, bits)
+        if bits == _HEAD_AS_STATUS:
+            return corrupt(piece, "the head of an answer instead of a status")
+        return Status(stamp, bits)  # a firmware may set bits that the guide does not name
     if kind in _VALUES:
         return Value(stamp, _VALUES[kind][1], int.from_bytes(value, "little"))
     if kind == 0x56:

@@ -1,147 +1,166 @@
-"""Reading a DWM1001 that answers TLV: status until a fix is ready, then the fix; what to send next, given answers and time.
+"""Reading a DWM1001 that answers TLV: status until a fix is ready, then the fix.
 
-The module carries no clock, so a fix is stamped between the last "not ready" and the first "ready" (`fix_timer`); to keep
-that short without polling all the time, polls are dense only around the moment the next fix is due.
-TLV has no checksum: on a link that has shown damage, and when an anchor is new, a fix is read twice and must agree.
+The module carries no clock. Reading the status clears it, so a fix that one poll finds was made after the poll before was
+sent and before this answer came: its stamp is the middle of that bracket, wrong by at most half its width. A fix may be
+replaced by the next one before it is read; so the status is asked once more afterwards, and a fix counts only when it is
+known which one was read. TLV has no checksum: a fix is read twice and must agree, unless the link is too slow for that.
 """
 
-from .dwm1001 import LOC_GET, STATUS_GET
-from .dwm1001_blocks import Distances, Status
-from .events import Action, Corrupt, Lost, RangeEpoch, RangeReading, Send
-from .fix_timer import FixTimer
+from typing import Any
 
-ANSWER = 0.060
-"""s to wait for an answer; the longest takes 9 ms, and USB and a busy computer add some."""
+from .clock import GAP
+from .dwm1001 import LOC_GET, STATUS_GET
+from .dwm1001_advice import not_joined
+from .dwm1001_blocks import ERRORS, Answer, Distances, Status
+from .events import Corrupt, Lost, Note, RangeEpoch, RangeReading, Send
+from .session import Driver, Script, Wait
+
+PATIENCE = 0.030, 3.0
+"""s, and round trips, to wait for an answer: the longest takes 9 ms, USB and a busy computer add some."""
+MAX_TRIP = 0.5
+"""s; a longer round trip is not believed."""
 BROKEN_ANSWER = 0.015
 """s to wait for the rest of an answer once part of it was damaged."""
 DENSE, SPARSE, IDLE = 0.004, 0.008, 0.020
-"""s between polls: when a fix is due; when it is late; when none has come for a while."""
-LEAD, LONGER_LEAD = 0.010, 0.025
-"""s before a fix is due at which polling begins; added when the first poll found the fix already there."""
+"""s between polls: when a fix is due; when it is late by LATE; when none has come for LONG_AGO."""
+LATE, LONG_AGO = 0.05, 10.0
+LEAD, MORE_LEAD, LESS_LEAD = 0.010, 0.010, 0.98
+"""s before a fix is due at which polling begins; added when that was too late; factor per fix when it was not."""
 DISTRUST = 5.0
 """s for which a link counts as damaged after a corrupt byte."""
+QUICK = 0.12
+"""Share of a period: with a shorter round trip every fix is read twice."""
 READS = 5
 """Times a fix is read before it is given up."""
+WIDEST = 0.2
+"""s; a fix with a wider bracket is not logged but counted as lost."""
+MAX_FAILURES = 40
+"""Requests without an answer after which the module is started again."""
+UNJOINED = 3.0
+"""s without a fix after which a tag is told to have no network."""
+
+Readings = tuple[RangeReading, ...]
+Bracket = tuple[float, float]
 
 
 class FixPoller:
-    """Polls one module.
+    """Polls one module for a driver.
 
     Parameters
     ----------
-    now : s.
+    driver : whose script this is part of.
     period : s between fixes.
-    known : anchors heard before; grows.
-    distrust_until : s; until then the link counts as damaged.
     """
 
-    def __init__(self, now: float, period: float, known: set[str], distrust_until: float) -> None:
-        self.due = now
-        """s, when `tick` wants to be called."""
-        self.failures = 0
-        """Answers that did not come, since the last that did."""
-        self.last_fix = now
-        self._period, self._known, self._distrust = period, known, distrust_until
-        self._timer = FixTimer()
-        self._waiting = ""
-        self._sent = now
-        self._not_ready: float | None = None
-        self._stamp: float | None = None
-        self._candidate: tuple[RangeReading, ...] | None = None
-        self._candidate_at = now
-        self._latest: tuple[RangeReading, ...] | None = None
-        self._reads = 0
+    def __init__(self, driver: Driver, period: float) -> None:
+        self._driver, self._period = driver, period
+        self._trip = MAX_TRIP / 3
+        self._failures = 0
+        self._distrust_until = 0.0
+        self._known: set[str] = set()
         self._lead = LEAD
-        self._damaged = self._guess = False
+        self._last_fix = driver.now
+        self._latest: tuple[Bracket, Readings] | None = None
+        self._pending: tuple[Bracket, Readings] | None = None
+        self._missed = False
 
-    def tick(self, now: float) -> list[Action]:
-        """Poll, or give up waiting for an answer: it was damaged on the way, or the module is gone."""
-        if not self._waiting:
-            return self._ask("status", now)
-        self.failures += 1
-        self._distrust, self._damaged = now + DISTRUST, True
-        lost = Corrupt(b"", "no answer in time")
-        if self._waiting == "fix":
-            return [lost, *self._ask("fix", now)]
-        # Reading the status clears it, so the answer that was lost may have announced a fix: look for one.
-        stamp = self._timer.time(self._not_ready, self._sent + 0.002, self._period)
-        self._stamp, self._guess = self._sent if stamp is None else stamp, True
-        return [lost, *self._read_fix(now)]
+    def script(self) -> Script[None]:
+        """Poll until the module answers no more."""
+        low: float | None = None
+        hidden = False  # an answer was lost that may have announced a fix
+        while self._failures < MAX_FAILURES:
+            sent = self._driver.now
+            status = yield from self._ask(STATUS_GET, Status)
+            if status is None:
+                hidden = self._missed = True
+                continue
+            since, low = low, sent
+            if status.location_ready or hidden:
+                bracket = None if since is None else (since, self._driver.now)
+                yield from self._take(bracket, sure=status.location_ready)
+                hidden = False
+                continue
+            if self._pending:
+                yield from self._accept(*self._pending)
+            yield from self._rest(status)
 
-    def damaged(self, now: float) -> None:
-        """Take note of bytes that are no answer."""
-        self._distrust = now + DISTRUST
-        if self._waiting:
-            self.due = min(self.due, now + BROKEN_ANSWER)
+    def _take(self, bracket: Bracket | None, *, sure: bool) -> Script[None]:
+        """Read a fix that was announced; it counts when the next status announces none."""
+        readings = yield from self._read_fix()
+        before = self._pending or self._latest
+        soon = bracket and before and bracket[1] - before[0][0] < self._period / 2
+        if readings is not None and before and readings == before[1] and (soon or not sure):
+            return  # a damaged status, or a lost one that announced nothing: no fix is that close to another
+        if self._pending and readings is not None and readings != self._pending[1]:
+            yield from self._accept(*self._pending)
+        # A fix that is still pending was overwritten, or nobody knows which one was read.
+        self._missed |= readings is None or self._pending is not None
+        self._pending = None if readings is None or bracket is None else (bracket, readings)
 
-    def refused(self, now: float) -> None:
-        """Take note of an error that the module answered."""
-        self._waiting, self.due = "", now + SPARSE
-
-    def status(self, status: Status, now: float) -> list[Action]:
-        """Take a status."""
-        if self._waiting != "status":
-            return []
-        self.failures = 0
-        stamp = self._timer.time(self._not_ready, now, self._period) if status.location_ready else None
-        if stamp is None:
-            self._not_ready = self._sent
-            return self._rest(now)
-        # Polling that begins after the fix cannot tell when it came: begin earlier until a poll finds none.
-        self._lead = self._lead + LONGER_LEAD if self._not_ready is None else max(LEAD, self._lead / 2)
-        self._stamp, self._guess = stamp, False
-        return self._read_fix(now)
-
-    def fix(self, event: Distances, now: float) -> list[Action]:
-        """Take the answer to loc_get."""
-        if self._waiting != "fix" or self._stamp is None:
-            return []
-        self._reads += 1
-        self.failures = 0
-        readings, suspect = event.readings, now < self._distrust
-        doubtful = suspect or not self._known.issuperset(reading.anchor_id for reading in readings)
-        if not doubtful or readings != self._candidate:
-            self._candidate_at = self._sent
-        if doubtful and readings != self._candidate:
-            self._candidate = readings
-            if self._reads < READS:
-                return self._ask("fix", now)
-            self._damaged, self._stamp = True, None
-            return [Corrupt(b"", f"a fix read {READS} times never came twice alike"), *self._rest(now)]
-        # While it was read again and again, newer fixes may have taken its place.
-        turns = max(0, int((self._candidate_at - self._stamp) / self._period))
-        stamp, self._stamp, self._candidate = self._stamp + turns * self._period, None, None
-        if (self._guess or suspect) and readings == self._latest:
-            return self._rest(now)
-        if self._latest is not None and stamp < self.last_fix + self._period / 2:
-            # A new fix cannot be that close to the last one.
-            stamp, turns = min(now, stamp + self._period), turns + 1
-        return [*self._accept(stamp, readings, as_found=not (turns or self._guess)), *self._rest(now)]
-
-    def _accept(self, stamp: float, readings: tuple[RangeReading, ...], *, as_found: bool) -> list[Action]:
-        gap, damaged, self._damaged = stamp - self.last_fix, self._damaged, False
-        self.last_fix, self._latest = stamp, readings
-        self._timer.accept(stamp, as_found=as_found)
+    def _accept(self, bracket: Bracket, readings: Readings) -> Script[None]:
+        """Log a fix; where its bracket holds several, the last of them was read."""
+        low, high = max(bracket[0], bracket[1] - self._period), bracket[1]
+        stamp, unsure = (low + high) / 2, high - low > WIDEST
+        gap = round((stamp - self._last_fix) / self._period) - 1 if self._latest else 0
+        if (gap > 0 and (self._missed or bracket[1] - bracket[0] > GAP * self._period)) or unsure:
+            yield Lost(stamp, max(0, gap) + unsure)
+        narrow = high - low < 2 * (DENSE + self._trip) + LEAD
+        self._lead = max(LEAD, self._lead * LESS_LEAD) if narrow else min(self._lead + MORE_LEAD, self._period / 2)
+        self._last_fix, self._latest = stamp, ((low, high), readings)
+        self._pending, self._missed = None, False
         self._known.update(reading.anchor_id for reading in readings)
-        lost: list[Action] = []
-        if damaged and gap > 1.6 * self._period:
-            lost.append(Lost(stamp, round(gap / self._period) - 1))
-        return [*lost, RangeEpoch(stamp, readings)] if readings else lost
+        if readings and not unsure:
+            yield RangeEpoch(stamp, readings, (high - low) / 2)
 
-    def _read_fix(self, now: float) -> list[Action]:
-        self._not_ready, self._candidate, self._reads = None, None, 0
-        return self._ask("fix", now)
+    def _rest(self, status: Status) -> Script[None]:
+        """Wait until the next fix may come."""
+        now = self._driver.now
+        if not status.joined and now - self._last_fix > UNJOINED:
+            yield from self._driver.say_once(not_joined())
+        due = self._last_fix + self._period - self._lead - self._trip
+        late = now - self._last_fix - self._period
+        pause = DENSE if late < LATE else SPARSE if late < LONG_AGO else IDLE
+        yield from self._driver.sleep(max(due - now, pause))
 
-    def _ask(self, what: str, now: float) -> list[Action]:
-        self._waiting, self.due, self._sent = what, now + ANSWER, now
-        return [Send(STATUS_GET if what == "status" else LOC_GET)]
+    def _read_fix(self) -> Script[Readings | None]:
+        """Read the fix until it came twice alike where that is asked for; None = it never did."""
+        before: Readings | None = None
+        for _ in range(READS):
+            answer = yield from self._ask(LOC_GET, Distances)
+            if answer is None:
+                continue
+            readings: Readings = answer.readings
+            fresh = not self._known.issuperset(reading.anchor_id for reading in readings)
+            quick = self._trip < QUICK * self._period
+            if readings == before or not (quick or fresh or self._driver.now < self._distrust_until):
+                return readings
+            before = readings
+        yield Corrupt(b"", f"a fix read {READS} times never came twice alike")
+        return None
 
-    def _rest(self, now: float) -> list[Action]:
-        """Choose when to poll next."""
-        due = self.last_fix + self._period - min(self._lead, self._period)
-        late = now - due
-        wait = DENSE if late < self._lead + LEAD else SPARSE if late < 10.0 else IDLE
-        if not self._timer.settled:
-            due, wait = now, DENSE  # nothing is known yet of when the next one comes
-        self._waiting, self.due = "", max(now + wait, due)
-        return []
+    def _ask(self, request: bytes, kind: type) -> Script[Any]:
+        """Return the answer to a request, None where none came."""
+        sent, damaged = self._driver.now, False
+        until = sent + PATIENCE[0] + PATIENCE[1] * self._trip
+        yield Send(request)
+        while (event := (yield Wait(until))) is not None:
+            if isinstance(event, kind):
+                self._failures = 0
+                self._trip = min(MAX_TRIP, max(self._driver.now - sent, 0.9 * self._trip))
+                return event
+            if isinstance(event, Corrupt):
+                damaged, self._distrust_until = True, self._driver.now + DISTRUST
+                until = min(until, self._driver.now + BROKEN_ANSWER)
+            elif isinstance(event, Answer) and event.error:
+                text = f"uwb: the module answers error {event.error}, {ERRORS[event.error]}"
+                yield from self._driver.say_once(Note("warning", f"uwb-error-{event.error}", text))
+                yield from self._driver.sleep(SPARSE)
+                return None
+        self._failures += 1
+        yield Corrupt(b"", "no answer in time")
+        self._distrust_until = self._driver.now + DISTRUST
+        if not damaged:
+            # It may only be late: let it pass, so that it is not taken for the answer to the next request.
+            self._trip = min(MAX_TRIP, 2 * self._trip)
+            yield from self._driver.sleep(self._trip)
+        return None

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from ..errors import ProtocolError
 from .events import Corrupt, RangeReading, corrupt
+from .framing import Line, LineReader
 
 ENTER = b"\r\r"
 PROMPT = b"dwm> "
@@ -116,8 +117,7 @@ class ShellProtocol:
     """Bytes of the module in, lines, prompts and Corrupt out. Holds at most one line of MAX_LINE bytes."""
 
     def __init__(self) -> None:
-        self._line = bytearray()
-        self._marks: list[tuple[int, float]] = []
+        self._lines = LineReader(MAX_LINE, ends=(b"\r", b"\n", PROMPT))
 
     def feed(self, data: bytes, stamp: float) -> list[Event]:
         """Take bytes that arrived at `stamp` s and return the events they complete.
@@ -132,48 +132,29 @@ class ShellProtocol:
         list of events, in the order of the bytes.
         """
         events: list[Event] = []
-        if not data:
-            return events
-        # A prompt or a line end may be cut by the chunk, so at most its first bytes are looked at again.
-        start = max(0, len(self._line) - len(PROMPT) + 1)
-        fresh = bytes(self._line[start:]) + data
-        self._marks.append((len(self._line), stamp))
-        del self._line[start:]
-        for piece in re.split(rb"([\r\n]|dwm> )", fresh):
-            if piece in (b"\r", b"\n", PROMPT):
-                self._take_line(events)
-                if piece == PROMPT:
-                    events.append(Prompt(stamp))
-                self._marks = [(0, stamp)]
+        for line in self._lines.feed(data, stamp):
+            if isinstance(line, Corrupt):
+                events.append(line)
                 continue
-            self._line += piece
-            while len(self._line) > MAX_LINE:
-                events.append(corrupt(bytes(self._line[:MAX_LINE]), "line too long"))
-                del self._line[:MAX_LINE]
-                self._marks = [(0, stamp)]
+            if line.data.strip():
+                events += _parse(line)
+            if line.end == PROMPT:
+                events.append(Prompt(stamp))
         return events
 
-    def _take_line(self, events: list[Event]) -> None:
-        line = bytes(self._line)
-        self._line.clear()
-        if line.strip():
-            events += self._parse(line)
 
-    def _stamp_at(self, offset: int) -> float:
-        return next((when for at, when in reversed(self._marks) if at <= offset), self._marks[0][1])
-
-    def _parse(self, line: bytes) -> list[Event]:
-        """Find what a line holds; the rest of it before that is Corrupt."""
-        text = line.decode("latin-1").rstrip()
-        broken: Corrupt | None = None
-        for find in (_find_lec, _find_les, _find_position, _find_text):
-            at, event = find(text, self._stamp_at)
-            if isinstance(event, Corrupt):
-                broken = broken or event
-            elif event is not None:
-                noise: list[Event] = [corrupt(line[:at], "noise before a line")] if line[:at].strip() else []
-                return [*noise, event]
-        return [broken or corrupt(line, "not a line of the shell")]
+def _parse(line: Line) -> list[Event]:
+    """Find what a line holds; the rest of it before that is Corrupt."""
+    text = line.data.decode("latin-1").rstrip()
+    broken: Corrupt | None = None
+    for find in (_find_lec, _find_les, _find_position, _find_text):
+        at, event = find(text, line.stamp_at)
+        if isinstance(event, Corrupt):
+            broken = broken or event
+        elif event is not None:
+            before = line.data[:at]
+            return [*([corrupt(before, "noise before a line")] if before.strip() else []), event]
+    return [broken or corrupt(line.data, "not a line of the shell")]
 
 
 Found = tuple[int, Event | None]

@@ -1,12 +1,10 @@
 """What drivers say. Events are frozen and compared by ``==``; noise is an event, misuse is an exception.
 
-A *protocol* turns bytes into events (``feed(data, stamp)``). A *session* owns a protocol and the start-up and recovery
-of one device: it turns bytes and time into *actions*, that is measurements to log and bytes to send. Neither opens a
-port nor reads a clock: the caller brings ``now``, seconds of a monotonic clock.
+A *protocol* turns bytes into events (``feed(data, stamp)``). A *session* drives a protocol through the start-up and
+recovery of one device: it turns bytes and time into *actions*, that is measurements to log and bytes to send.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +44,13 @@ class SetBaud:
     """Change the speed of the port, bit/s; ports without a speed ignore it."""
 
     rate: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetDtr:
+    """Set the DTR line of the port, which switches the motor of some lidars; ports without one ignore it."""
+
+    on: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +99,8 @@ class RangeEpoch:
     stamp: float
     """s, host clock."""
     readings: tuple[RangeReading, ...]
+    spread: float = 0.0
+    """s; the stamp may be wrong by this much to either side; 0 = not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,26 +149,7 @@ class Lost:
     """Frames missing."""
 
 
-Action = Corrupt | Send | SetBaud | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | Lost
+Pose = tuple[float, float, float]
+"""x, y, theta of the base in the odom frame; m, m, rad."""
 
-
-class Session(Protocol):
-    """Start-up, running and recovery of one device, without a port."""
-
-    baud: int
-    """bit/s to open the port with."""
-
-    def start(self, now: float) -> list[Action]:
-        """Begin, or begin again after a reconnect, at time `now`, s."""
-
-    def feed(self, data: bytes, now: float) -> list[Action]:
-        """Take bytes that arrived at time `now`, s."""
-
-    def tick(self, now: float) -> list[Action]:
-        """Do what is due at time `now`, s."""
-
-    def deadline(self) -> float | None:
-        """Return the time at which `tick` wants to be called, s; None = when bytes come."""
-
-    def stop(self) -> list[Action]:
-        """Return what to send so that the device falls quiet."""
+Action = Corrupt | Send | SetBaud | SetDtr | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | Lost

@@ -4,10 +4,10 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from .events import Session
+from .session import Session
 
 if TYPE_CHECKING:
-    from .transport import Port
+    from .transport import Opening, Port
 
 
 @dataclass(slots=True)
@@ -26,6 +26,10 @@ class Counts:
     """s, sum of the pauses longer than SILENCE."""
     anchors: Counter[str] = field(default_factory=Counter)
     """Ranges by anchor."""
+    spread: float = 0.0
+    """s, sum of what the stamps may be wrong by, where the device does not stamp itself."""
+    widest: float = 0.0
+    """s, the largest of these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +56,16 @@ class Link:
         self.name, self.url, self.session = name, url, session
         self.counts = Counts()
         self.port: Port | None = None
+        self.opening: Opening | None = None
         self.retry_at = 0.0
         self.attempt = 0
+        self.said: set[str] = set()
+        """Names of the notes since it last gave data."""
         self.last_data = self.last_message = self.opened = 0.0
         self.quiet = False
         self.new_lost = self.new_corrupt = 0
         self.rate = 0.0
         self._rate_base = (0.0, 0)
-        self.why_down = ""
 
     def update_rate(self, now: float) -> None:
         """Refresh `rate`, messages per second over the last two seconds."""
@@ -97,6 +103,9 @@ def summary_lines(links: list[Link], start: float, end: float) -> list[str]:
         )
         if counts.anchors:
             text += "; anchors " + ", ".join(f"{name} {count}" for name, count in sorted(counts.anchors.items()))
+        if counts.widest:
+            mean = counts.spread / counts.messages
+            text += f"; stamps within {1000 * mean:.1f} ms on average, {1000 * counts.widest:.0f} ms at worst"
         lines.append(text)
         lines += [f"{link.name}: corrupt {count} times: {why}" for why, count in counts.corrupt.most_common(8)]
     return lines

@@ -7,11 +7,14 @@ There is no standard for what hobby controllers print, so the columns are told: 
 import math
 import re
 import sys
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from ..errors import ConfigError
-from .events import Corrupt, OdometryPose, corrupt
+from .clock import DeviceClock
+from .events import Action, Corrupt, Lost, Note, OdometryPose, Pose, corrupt
+from .framing import LineReader
+from .session import Driver, Identity, Script, Wait
 
 _Number = TypeVar("_Number", int, float)
 
@@ -121,8 +124,7 @@ class OdometryLineProtocol:
 
     def __init__(self, line_format: LineFormat) -> None:
         self._format = line_format
-        self._line = bytearray()
-        self._stamp = 0.0
+        self._lines = LineReader(MAX_LINE)
 
     def feed(self, data: bytes, stamp: float) -> list[Sample | Corrupt]:
         """Take bytes that arrived at `stamp` s and return the events they complete.
@@ -137,21 +139,14 @@ class OdometryLineProtocol:
         list of Sample or Corrupt.
         """
         events: list[Sample | Corrupt] = []
-        for piece in data.splitlines(keepends=True):
-            if not self._line:
-                self._stamp = stamp
-            self._line += piece
-            if piece[-1:] in (b"\n", b"\r"):
-                line = bytes(self._line).strip()
-                self._line.clear()
-                if line:
-                    events += self._take_line(line)
-            while len(self._line) > MAX_LINE:
-                events.append(corrupt(bytes(self._line[:MAX_LINE]), "line too long"))
-                del self._line[:MAX_LINE]
+        for line in self._lines.feed(data, stamp):
+            if isinstance(line, Corrupt):
+                events.append(line)
+            elif line.data.strip() and not line.cut:
+                events += self._take_line(line.data.strip(), line.marks[0][1])
         return events
 
-    def _take_line(self, line: bytes) -> list[Sample | Corrupt]:
+    def _take_line(self, line: bytes, stamp: float) -> list[Sample | Corrupt]:
         text = line.decode("ascii", "replace")
         prefix = self._format.prefix
         if prefix:
@@ -169,7 +164,7 @@ class OdometryLineProtocol:
             if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", field) or not math.isfinite(float(field)):
                 return [corrupt(line, f"column {name} is not a number")]
             values.append((name, float(field)))
-        return [Sample(self._stamp, tuple(values))]
+        return [Sample(stamp, tuple(values))]
 
 
 class LineOdometer:
@@ -181,13 +176,13 @@ class LineOdometer:
     start : pose at the first sample when it is made from ticks; m, m, rad.
     """
 
-    def __init__(self, line_format: LineFormat, start: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+    def __init__(self, line_format: LineFormat, start: Pose = (0.0, 0.0, 0.0)) -> None:
         self._format = line_format
         self._x, self._y, self._theta = start
         self._last: dict[str, float] | None = None
 
     def update(self, sample: Sample) -> OdometryPose:
-        """Take one sample; its stamp is the arrival (map ``device_time`` to the host's clock first if there is one).
+        """Take one sample; its stamp is the arrival.
 
         Parameters
         ----------
@@ -209,11 +204,6 @@ class LineOdometer:
         speed = values.get("speed", 0.0) * spec.length_unit
         return OdometryPose(sample.stamp, self._x, self._y, self._theta, speed, values.get("turn_rate", 0.0) * spec.angle_unit)
 
-    def device_time(self, sample: Sample) -> float | None:
-        """Return the base's own time of a sample, s, or None where the line has none."""
-        time = dict(sample.values).get("t")
-        return None if time is None else time * self._format.time_unit
-
     def _from_ticks(self, values: dict[str, float], theta: float | None) -> None:
         spec, last = self._format, self._last
         if last is None:
@@ -229,3 +219,61 @@ class LineOdometer:
     def _difference(self, ticks: float) -> float:
         wrap = self._format.tick_modulus
         return (ticks + wrap / 2) % wrap - wrap / 2 if wrap else ticks
+
+
+class LineDriver(Driver):
+    """A base that prints text lines.
+
+    Parameters
+    ----------
+    line_format : columns and units.
+    baud : bit/s.
+    start : pose at the first line, where the lines hold ticks; m, m, rad.
+    """
+
+    def __init__(self, line_format: LineFormat, baud: int = 115200, start: Pose = (0.0, 0.0, 0.0)) -> None:
+        super().__init__()
+        self.baud = baud
+        self._format = line_format
+        self._protocol = OdometryLineProtocol(line_format)
+        self._odometer = LineOdometer(line_format, start)
+        self._clock = DeviceClock(line_format.time_unit, proven=False)
+
+    def begin(self) -> None:
+        """Forget half a line."""
+        self._protocol = OdometryLineProtocol(self._format)
+
+    def parse(self, data: bytes, now: float) -> list[Any]:
+        """Return Sample and Corrupt."""
+        return self._protocol.feed(data, now)
+
+    def script(self) -> Script[None]:
+        """Pass over the first line, of which the port may have shown only the end; then listen."""
+        yield Wait(None)
+        yield from super().script()
+
+    def take(self, event: Sample) -> list[Action]:
+        """Turn a line into a pose."""
+        self.ready = True
+        time = dict(event.values).get("t")
+        if time is None:
+            return [self._odometer.update(event)]
+        reading = self._clock.read(time, event.stamp)
+        if reading.elapsed == 0:
+            return [Corrupt(b"", "line sent twice")]
+        actions: list[Action] = [Lost(reading.stamp, reading.missing)] if reading.missing else []
+        if self._clock.rate is not None:
+            actions += self.say_once(self._wrong_unit(self._clock.rate))
+        elif reading.reset:
+            actions.append(Note("warning", "odometry-clock", "odometry: its clock leapt; time mapping starts anew"))
+        return [*actions, replace(self._odometer.update(event), stamp=reading.stamp)]
+
+    def _wrong_unit(self, rate: float) -> Note:
+        text = "odometry: column t does not count seconds as time_unit says"
+        if math.isfinite(rate) and rate > 0:
+            text += f", it runs {rate:.4g} times too fast: say time_unit={self._format.time_unit / rate:.1g}"
+        return Note("error", "odometry-time-unit", text + "; until then lines are stamped with their arrival")
+
+    def identity(self) -> Identity:
+        """Say who answered."""
+        return Identity("base that prints lines")

@@ -10,10 +10,10 @@ import selectors
 from collections.abc import Callable
 
 from ..errors import DeviceError
-from .events import Action, Corrupt, LaserScan, Lost, Note, OdometryPose, Param, RangeEpoch, Reopen, Send, SetBaud
+from .events import Action, Corrupt, LaserScan, Lost, Note, OdometryPose, Param, RangeEpoch, Reopen, Send, SetBaud, SetDtr
 from .link import Counts, Link, Mounting, doubts, summary_lines
 from .log_file import LogFile, number_text, pose_line, range_lines, scan_line
-from .transport import Port
+from .transport import Opening, Port, open_port
 
 SILENCE = 3.0
 """s without a measurement before it is said."""
@@ -23,6 +23,8 @@ BACK_OFF = (0.1, 0.2, 0.4, 0.7, 1.0)
 """s between attempts to open a port that is gone; the last one repeats."""
 HOUSEKEEPING = 0.25
 """s between looks at silent devices and the status line."""
+OPENING = 0.02
+"""s between looks while a port is being opened."""
 DAMAGE_REPORT = 5.0
 """s between COMMENT lines about loss and damage."""
 POLL = 0.005
@@ -47,7 +49,7 @@ class Recorder:
     def __init__(
         self, links: list[Link], log: LogFile, *, monotonic: Callable[[], float], wall_offset: float, host: str,
         mounting: Mounting | None = None, on_note: Callable[[float, Note], None] | None = None,
-        open_port: Callable[[str, int], Port] = Port,
+        open_port: Callable[[str, int], Port] = open_port,
     ) -> None:  # fmt: skip
         self.links, self.log = links, log
         self._now, self._offset, self._host = monotonic, wall_offset, host
@@ -84,7 +86,8 @@ class Recorder:
                 if until is not None and now >= until:
                     break
                 if now >= next_look:
-                    next_look = now + HOUSEKEEPING
+                    opening = any(link.opening for link in self.links)
+                    next_look = now + (OPENING if opening else HOUSEKEEPING)
                     self._housekeeping(now)
                     if on_status:
                         on_status()
@@ -133,7 +136,7 @@ class Recorder:
             if isinstance(action, LaserScan | RangeEpoch | OdometryPose):
                 self._message(link, now)
                 self._write(action, counts)
-            elif isinstance(action, Send | SetBaud):
+            elif isinstance(action, Send | SetBaud | SetDtr):
                 if not self._send(link, action):
                     return
             elif isinstance(action, Corrupt):
@@ -143,21 +146,23 @@ class Recorder:
                 counts.lost += action.count
                 link.new_lost += action.count
             elif isinstance(action, Note):
-                self.note(action)
+                self._note(link, action)
             elif isinstance(action, Param):
                 self.param(action.name, action.value)
             elif isinstance(action, Reopen):
                 self._down(link, action.why)
                 return
 
-    def _send(self, link: Link, action: Send | SetBaud) -> bool:
+    def _send(self, link: Link, action: Send | SetBaud | SetDtr) -> bool:
         if link.port is None:
             return False
         try:
             if isinstance(action, Send):
                 link.port.write(action.data)
-            else:
+            elif isinstance(action, SetBaud):
                 link.port.set_baud(action.rate)
+            else:
+                link.port.set_dtr(action.on)
         except DeviceError as error:
             self._down(link, str(error))
             return False
@@ -169,7 +174,8 @@ class Recorder:
             link.quiet = False
             pause = now - link.last_message
             link.counts.silent_time += pause
-            self.note(Note("info", "data-again", f"{link.name}: data again after {pause:.1f} s"))
+            self._note(link, Note("info", f"{link.name}-data-again", f"{link.name}: data again after {pause:.1f} s"))
+            link.said.clear()
         link.last_message = now
 
     def _write(self, measured: LaserScan | RangeEpoch | OdometryPose, counts: Counts) -> None:
@@ -179,6 +185,7 @@ class Recorder:
             self._lines.append(pose_line(measured, tail))
         elif isinstance(measured, RangeEpoch):
             self._lines += range_lines(measured, tail)
+            counts.spread, counts.widest = counts.spread + measured.spread, max(counts.widest, measured.spread)
             counts.anchors.update(reading.anchor_id for reading in measured.readings)
         else:
             self.param("laser_time_increment", f"{measured.time_increment:.9f}")
@@ -222,6 +229,12 @@ class Recorder:
         self.comment(f"{note.level} {note.name}: {note.text}")
         self._on_note(self._now() - self.start, note)
 
+    def _note(self, link: Link, note: Note) -> None:
+        """Say something of a device, once until it gives data again: one that comes and goes would fill the log."""
+        if note.name not in link.said:
+            link.said.add(note.name)
+            self.note(note)
+
     # ---- devices that come and go
 
     def _housekeeping(self, now: float) -> None:
@@ -252,28 +265,30 @@ class Recorder:
                 why = "bytes come, but no good frame: wrong bit rate, wrong device or a bad cable"
             else:
                 why = "check power and cable; unplug it and plug it in again"
-            self.note(Note("warning", f"{link.name}-no-data", f"{link.name}: no data for {silent:.0f} s; {why}"))
+            self._note(link, Note("warning", f"{link.name}-no-data", f"{link.name}: no data for {silent:.0f} s; {why}"))
         if silent > HANG and now - link.last_data > HANG:
             self._down(link, "silent")
 
     def _up(self, link: Link, now: float) -> None:
-        try:
-            link.port = self._open_port(link.url, link.session.baud)
-        except DeviceError as error:
-            wait = BACK_OFF[min(link.attempt, len(BACK_OFF) - 1)]
-            if str(error) != link.why_down:
-                link.why_down = str(error)
-                self.note(Note("error", f"{link.name}-cannot-open", f"{link.name}: {error}; trying again"))
-            link.attempt += 1
-            link.retry_at = now + wait
+        """Open the port in the background, or take it when it is open."""
+        if link.opening is None:
+            link.opening = Opening(self._open_port, link.url, link.session.baud)
+        port = link.opening.result()
+        if port is None:
             return
-        link.attempt, link.why_down = 0, ""
+        link.opening = None
+        if isinstance(port, DeviceError):
+            self._note(link, Note("error", f"{link.name}-cannot-open", f"{link.name}: {port}; trying again"))
+            link.retry_at = now + BACK_OFF[min(link.attempt, len(BACK_OFF) - 1)]
+            link.attempt += 1
+            return
+        link.port, link.attempt = port, 0
         link.counts.connects += 1
         link.opened = link.last_data = now
-        fileno = link.port.fileno()
+        fileno = port.fileno()
         if fileno is not None:
             self._selector.register(fileno, selectors.EVENT_READ, link)
-        self.note(Note("info", f"{link.name}-connected", f"{link.name}: {link.url} open"))
+        self._note(link, Note("info", f"{link.name}-connected", f"{link.name}: {link.url} open"))
         self._do(link, link.session.start(now), now)
 
     def _down(self, link: Link, why: str) -> None:
@@ -289,7 +304,7 @@ class Recorder:
         if not link.quiet:
             link.quiet = True
             link.last_message = max(link.last_message, link.opened)
-        self.note(Note("warning", f"{link.name}-gone", f"{link.name}: {why}; opening it again"))
+        self._note(link, Note("warning", f"{link.name}-gone", f"{link.name}: {why}; opening it again"))
 
     # ---- the end
 
@@ -311,6 +326,8 @@ class Recorder:
             if link.port is not None:
                 link.port.close()
                 link.port = None
+            if link.opening is not None:
+                link.opening.give_up()
         self._selector.close()
         self._report_damage()
         for line in self.summary():

@@ -16,7 +16,7 @@ import re
 from dataclasses import dataclass
 
 from .events import Corrupt, corrupt
-from .stamped_buffer import StampedBuffer
+from .framing import Line, LineReader
 
 TIME_MODULUS = 1 << 24
 """The time stamp is a counter of 24 bit, 1 ms each: it wraps every 4 h 39 min 37 s."""
@@ -105,7 +105,8 @@ def decode_values(data: bytes, width: int) -> tuple[int, ...]:
 
 _SCAN_ECHO = re.compile(rb"(M[DS]\d{13}|G[DS]\d{10})(;[A-Za-z0-9 ._+@]{0,16})?$")
 _TEXT_ECHO = re.compile(rb"(VV|PP|II|BM|QT|RS|RT|TM[012]|SS\d{6}|CR\d\d|HS[01]|SCIP2\.0|%ST)(;[A-Za-z0-9 ._+@]{0,16})?$")
-_WITH_LINES = ("VV", "PP", "II")
+WITH_LINES = ("VV", "PP", "II")
+"""Requests that are answered by lines of text."""
 _NOT_DATA = bytes(set(range(256)) - set(range(0x30, 0x70)))
 
 
@@ -118,7 +119,7 @@ class ScipProtocol:
     """
 
     def __init__(self) -> None:
-        self._line = StampedBuffer()
+        self._lines = LineReader(MAX_LINE, keep=LONGEST_ECHO, ends=(b"\n",))
         self._frame: list[tuple[float, bytes]] = []
         self._text_owner = ""
 
@@ -135,49 +136,37 @@ class ScipProtocol:
         list of Reply, Distances or Corrupt.
         """
         events: list[Event] = []
-        start = 0
-        while start < len(data):
-            end = data.find(b"\n", start)
-            self._line.append(data[start : end if end >= 0 else len(data)], stamp)
-            if len(self._line.data) > MAX_LINE:
-                self._shorten_line(events)
-            if end < 0:
-                break
-            line = bytes(self._line.data).rstrip(b"\r")
-            self._take_line(line, events)
-            self._line.clear()
-            start = end + 1
+        for line in self._lines.feed(data, stamp):
+            if not isinstance(line, Corrupt):
+                self._take_line(line, events)
+                continue
+            if self._frame:
+                events.append(corrupt(self._frame[0][1], "frame with a line too long"))
+                self._frame = []
+            events.append(line)
         return events
 
-    def _shorten_line(self, events: list[Event]) -> None:
-        """Give up a line that cannot be one, except its end, which may be the beginning of an echo."""
-        if self._frame:
-            events.append(corrupt(self._frame[0][1], "frame with a line too long"))
-            self._frame = []
-        cut = len(self._line.data) - LONGEST_ECHO
-        events.append(corrupt(bytes(self._line.data[:cut]), "line too long"))
-        self._line.drop(cut)
-
-    def _take_line(self, line: bytes, events: list[Event]) -> None:
-        if not line:
+    def _take_line(self, line: Line, events: list[Event]) -> None:
+        data = line.data.rstrip(b"\r")
+        if not data:
             self._close(events)
             return
-        echo = _SCAN_ECHO.search(line) or (None if self._frame else _TEXT_ECHO.search(line))
+        echo = _SCAN_ECHO.search(data) or (None if self._frame else _TEXT_ECHO.search(data))
         if echo:
             self._close(events, cut=True)
             if echo.start():
-                events.append(corrupt(line[: echo.start()], "noise before an echo"))
-            self._frame = [(self._line.stamp_at(echo.start()), line[echo.start() :])]
+                events.append(corrupt(data[: echo.start()], "noise before an echo"))
+            self._frame = [(line.stamp_at(echo.start()), data[echo.start() :])]
         elif self._frame:
-            self._frame.append((self._line.stamp_at(0), line))
+            self._frame.append((line.stamp_at(0), data))
             if len(self._frame) > MAX_LINES:
                 self._close(events)
-        elif self._text_owner and re.match(rb"[A-Z]{4}:", line):
+        elif self._text_owner and re.match(rb"[A-Z]{4}:", data):
             # Some units print an empty line in the middle of VV; the rest still belongs to it.
-            text = line.decode("ascii", "replace")
-            events.append(Reply(self._line.stamp_at(0), self._text_owner, "00", (_strip_sum(text),)))
+            text = data.decode("ascii", "replace")
+            events.append(Reply(line.stamp_at(0), self._text_owner, "00", (_strip_sum(text),)))
         else:
-            events.append(corrupt(line, "line outside a frame"))
+            events.append(corrupt(data, "line outside a frame"))
 
     def _close(self, events: list[Event], cut: bool = False) -> None:
         """Decode the frame held; `cut` says that its closing empty line never came."""
@@ -194,7 +183,7 @@ class ScipProtocol:
                         events.append(event)
                         event = later
                         break
-        self._text_owner = event.command if isinstance(event, Reply) and event.command in _WITH_LINES else ""
+        self._text_owner = event.command if isinstance(event, Reply) and event.command in WITH_LINES else ""
         events.append(event)
 
 

@@ -64,6 +64,26 @@ def text_command(name: str) -> bytes:
     return name.encode() + b"\n"
 
 
+def rate_command(rate: int) -> bytes:
+    """Build SS, which sets the speed of the RS-232 port.
+
+    Parameters
+    ----------
+    rate : bit/s, of BAUD_RATES.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    ProtocolError : not one of these.
+    """
+    if rate not in BAUD_RATES:
+        raise ProtocolError(f"{rate} bit/s is no speed of a URG-04LX; use {', '.join(map(str, sorted(BAUD_RATES)))}")
+    return f"SS{rate:06d}\n".encode()
+
+
 def scan_command(
     start: int = 44, end: int = 725, *, cluster: int = 1, skip: int = 0, count: int | None = 0, wide: bool = True,
     geometry: Geometry | None = None,

@@ -1,4 +1,4 @@
-"""Serial ports by URL: the only file that knows pyserial, which is imported when a port is first opened.
+"""Ports by URL: the only file that knows pyserial, which is imported when a serial port is first opened.
 
 ``/dev/ttyACM0`` or a path in ``/dev/serial/by-id`` opens a port, ``socket://host:port`` a bridge (ser2net, an emulator),
 ``loop://`` a port that hears itself. Reads never block.
@@ -6,14 +6,22 @@
 
 import contextlib
 import os
+import select
+import socket
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from ..errors import ConfigError, DeviceError
 
 CHUNK = 65536
+CONNECT_TIMEOUT = 5.0
+"""s for a TCP connection to come about."""
+WRITE_TIMEOUT = 1.0
+"""s for which ports that are no files may hold up a write."""
 BY_ID = Path("/dev/serial/by-id")
 
 
@@ -41,45 +49,195 @@ def check_url(url: str) -> None:
 
 
 _KINDS = ("alt", "cp2110", "hwgrep", "loop", "rfc2217", "socket", "spy")
-"""URLs that pyserial opens."""
+"""URLs that pyserial opens; sockets are opened here."""
 
 
-class Port:
-    """An open port; raises DeviceError when it is gone.
+def check_pyserial(url: str) -> None:
+    """Raise DeviceError if the port needs pyserial and it is not installed."""
+    if not is_socket(url):
+        _pyserial()
+
+
+def is_socket(url: str) -> bool:
+    """Tell whether a URL names a TCP port."""
+    return url.lower().startswith("socket://")
+
+
+def _pyserial() -> Any:
+    try:
+        import serial
+    except ImportError:
+        raise DeviceError("pyserial is missing: install python3-serial (apt) or pyserial (pip)") from None
+    return serial
+
+
+class Port(Protocol):
+    """An open port; its methods never wait, and raise DeviceError when the device is gone."""
+
+    def fileno(self) -> int | None:
+        """Return the descriptor to select on, or None where the port has none."""
+
+    def read(self) -> bytes:
+        """Return what has arrived, b"" when nothing has."""
+
+    def write(self, data: bytes) -> None:
+        """Write all bytes in one write."""
+
+    def set_baud(self, rate: int) -> None:
+        """Set the speed, bit/s; ports without one, and speeds the port cannot do, are passed over."""
+
+    def set_dtr(self, on: bool) -> None:
+        """Set the DTR line; ports without one pass it over."""
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+
+
+def open_port(url: str, baud: int) -> Port:
+    """Open a port, which may take seconds where it is behind a network.
 
     Parameters
     ----------
-    url : what `serial.serial_for_url` takes.
+    url : a path, ``socket://host:port``, or what `serial.serial_for_url` takes.
     baud : bit/s.
+
+    Returns
+    -------
+    Port
 
     Raises
     ------
     DeviceError : cannot be opened; the message says how to mend it.
     """
+    return SocketPort(url) if is_socket(url) else SerialPort(url, baud)
+
+
+class Opening:
+    """A port that is being opened by a thread of its own, so that nobody has to wait for it.
+
+    Parameters
+    ----------
+    open_port : (url, baud) -> Port; raises DeviceError.
+    url, baud : as for `open_port`.
+    """
+
+    def __init__(self, open_port: Callable[[str, int], Port], url: str, baud: int) -> None:
+        self._open, self._place = open_port, (url, baud)
+        self._lock = threading.Lock()
+        self._result: Port | DeviceError | None = None
+        self._given_up = False
+        threading.Thread(target=self._run, name=f"uwblite-open {url}", daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            result: Port | DeviceError = self._open(*self._place)
+        except DeviceError as error:
+            result = error
+        with self._lock:
+            if not self._given_up:
+                self._result = result
+                return
+        if not isinstance(result, DeviceError):
+            result.close()
+
+    def result(self) -> "Port | DeviceError | None":
+        """Return the port, why it cannot be opened, or None as long as that is not known."""
+        return self._result
+
+    def give_up(self) -> None:
+        """Close the port when it opens after all."""
+        with self._lock:
+            self._given_up = True
+        if self._result is not None and not isinstance(self._result, DeviceError):
+            self._result.close()
+
+
+class SocketPort:
+    """A TCP bridge such as ser2net or an emulator. See `Port` for the methods.
+
+    Parameters
+    ----------
+    url : ``socket://host:port``.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        place = urlsplit(url)
+        try:
+            self._socket = socket.create_connection((place.hostname or "", place.port or 0), CONNECT_TIMEOUT)
+        except OSError as error:
+            raise DeviceError(f"{url}: cannot open ({error})") from None
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def fileno(self) -> int | None:
+        """Return the descriptor to select on."""
+        return self._socket.fileno()
+
+    def read(self) -> bytes:
+        """Return what has arrived."""
+        try:
+            data = self._socket.recv(CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise DeviceError(f"{self.url}: unplugged or gone ({error})") from None
+        if not data:
+            raise DeviceError(f"{self.url}: the other side closed the connection")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Write all bytes."""
+        try:
+            sent = self._socket.send(data)
+        except OSError as error:
+            raise DeviceError(f"{self.url}: cannot write ({error})") from None
+        if sent < len(data):
+            raise DeviceError(f"{self.url}: it takes no bytes")
+
+    def set_baud(self, rate: int) -> None:
+        """Do nothing: the bridge has the speed."""
+
+    def set_dtr(self, on: bool) -> None:
+        """Do nothing: a bridge has no DTR line."""
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+
+class SerialPort:
+    """A port that pyserial opens. See `Port` for the methods.
+
+    Parameters
+    ----------
+    url : what `serial.serial_for_url` takes.
+    baud : bit/s.
+    """
 
     def __init__(self, url: str, baud: int) -> None:
-        try:
-            import serial
-        except ImportError:
-            raise DeviceError("pyserial is missing: install python3-serial (apt) or pyserial (pip)") from None
+        serial = _pyserial()
         self.url = url
         self._errors = (OSError, serial.SerialException)
-        local = "://" not in url
+        self._local = "://" not in url
         try:
-            options: dict[str, Any] = {"exclusive": True} if local else {}
-            self._serial = serial.serial_for_url(url, baudrate=baud, timeout=0, write_timeout=1.0, **options)
+            options: dict[str, Any] = {"exclusive": True} if self._local else {}
+            wait = 0.0 if self._local else WRITE_TIMEOUT
+            self._serial = serial.serial_for_url(url, baudrate=baud, timeout=0, write_timeout=wait, **options)
         except (*self._errors, ValueError) as error:
             raise DeviceError(_explain(url, error)) from None
-        if local:
+        if self._local:
             self._claim()
 
     def _claim(self) -> None:
-        """Besides pyserial's flock, ask the kernel to refuse the port to programs that take no lock."""
+        """Keep other programs out, also those that take no lock; have an FTDI adapter deliver at once, not in 16 ms steps."""
         import fcntl
         import termios
 
         with contextlib.suppress(OSError):
             fcntl.ioctl(self._serial.fileno(), termios.TIOCEXCL)
+        with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+            self._serial.set_low_latency_mode(True)
 
     def fileno(self) -> int | None:
         """Return the descriptor to select on, or None where the port has none."""
@@ -89,16 +247,9 @@ class Port:
             return None
 
     def read(self) -> bytes:
-        """Return what has arrived, b"" when nothing has.
-
-        Raises
-        ------
-        DeviceError : the device is gone.
-        """
+        """Return what has arrived."""
         try:
-            if self.url.lower().startswith("socket://"):
-                return self._read_socket()
-            if "://" in self.url:
+            if not self._local:
                 return bytes(self._serial.read(self._serial.in_waiting))
             data = os.read(self._serial.fileno(), CHUNK)
         except BlockingIOError:
@@ -111,45 +262,38 @@ class Port:
 
     def _hung_up(self) -> bool:
         """Tell a terminal that has nothing to say from one that is gone: both read as nothing."""
-        import select
-
         poller = select.poll()
         poller.register(self._serial.fileno(), select.POLLIN)
         return any(flags & ~select.POLLIN for _, flags in poller.poll(0))
 
-    def _read_socket(self) -> bytes:
-        data: bytes = self._serial._socket.recv(CHUNK)
-        if not data:
-            raise DeviceError(f"{self.url}: the other side closed the connection")
-        return data
-
     def write(self, data: bytes) -> None:
-        """Write all bytes in one write.
-
-        Raises
-        ------
-        DeviceError : the device is gone or takes no bytes.
-        """
+        """Write all bytes in one write."""
         try:
-            self._serial.write(data)
+            sent = self._serial.write(data)
         except self._errors as error:
             raise DeviceError(f"{self.url}: cannot write ({error})") from None
+        if sent is not None and sent < len(data):
+            raise DeviceError(f"{self.url}: it takes no bytes")
 
     def set_baud(self, rate: int) -> None:
-        """Set the speed, bit/s; ports without one, and speeds the port cannot do, are passed over."""
+        """Set the speed, bit/s."""
         with contextlib.suppress(ValueError, *self._errors):
             self._serial.baudrate = rate
 
+    def set_dtr(self, on: bool) -> None:
+        """Set the DTR line."""
+        with contextlib.suppress(ValueError, *self._errors):
+            self._serial.dtr = on
+
     def close(self) -> None:
-        """Close the port; never raises."""
+        """Close the port."""
         with contextlib.suppress(*self._errors):
             self._serial.close()
 
 
 def _explain(url: str, error: Exception) -> str:
     """Say how to mend a port that does not open."""
-    path = Path(url)
-    text = str(error)
+    path, text = Path(url), str(error)
     if "://" in url:
         return f"{url}: cannot open ({text})"
     if not path.exists():
@@ -190,16 +334,11 @@ class PluggedIn:
     description: str
     usb_id: str
     """"vvvv:pppp" in lower-case hexadecimal, or ""."""
-    guess: str
-    """"scip", "dwm1001", "kobuki" or ""."""
-
-
-KNOWN_USB = {"15d1:0000": "scip", "1366:0105": "dwm1001", "1366:1015": "dwm1001"}
-"""Hokuyo; SEGGER J-Link of the DWM1001-DEV board. A Kobuki has a stock FTDI chip and is known by its product name."""
 
 
 def plugged_in() -> list[PluggedIn]:
     """List the USB serial ports of this computer, and the UART of a Raspberry Pi's header."""
+    _pyserial()
     from serial.tools.list_ports import comports
 
     found = []
@@ -208,6 +347,5 @@ def plugged_in() -> list[PluggedIn]:
         if not usb and port.device not in ("/dev/ttyAMA0", "/dev/ttyS0", "/dev/serial0"):
             continue
         text = " ".join(str(part) for part in (port.manufacturer, port.product) if part) or str(port.description)
-        guess = KNOWN_USB.get(usb, "kobuki" if "kobuki" in text.lower() else "")
-        found.append(PluggedIn(stable_name(port.device) or port.device, text, usb, guess))
+        found.append(PluggedIn(stable_name(port.device) or port.device, text, usb))
     return found

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.drivers.stamped_buffer import StampedBuffer
+from uwblite.drivers.framing import StampedBuffer
 
 
 @given(st.lists(st.one_of(st.binary(max_size=5), st.integers(1, 6)), max_size=30))

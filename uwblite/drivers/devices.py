@@ -1,0 +1,215 @@
+"""The table of devices: a name that users type, what talks to it, and how it shows on USB.
+
+A new device is one file with its protocol and its `Driver`, one row here, an emulator and a page in firmware_notes.
+Rows of one sensor stand in the order in which an unknown port is looked at: first what talks unasked.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from urllib.parse import parse_qsl, urlencode
+
+from ..errors import ConfigError
+from .dwm1001_driver import Dwm1001Driver
+from .events import Pose
+from .kobuki import KobukiDriver
+from .odometry_line import LineDriver, parse_format
+from .scip_driver import ScipDriver
+from .session import Driver, Session
+
+BAUD = 1200, 4_000_000
+"""bit/s, least and most, that a serial port is opened with."""
+SENSORS = ("uwb", "lidar", "odometry")
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What a driver is told besides its options."""
+
+    start: Pose = (0.0, 0.0, 0.0)
+    """Pose of the base with which odometry goes on."""
+    stream: bool = True
+    """Measure; False: only find out who answers."""
+
+
+@dataclass(slots=True)
+class Options:
+    """What a user wrote behind the port, ``?name=value&...``; every name must be asked for."""
+
+    device: str
+    values: dict[str, str]
+    known: list[str] = field(default_factory=list)
+
+    def text(self, name: str, default: str = "") -> str:
+        """Return an option as it was written."""
+        self.known.append(name)
+        return self.values.get(name, default)
+
+    def number(self, name: str, default: float, least: float, most: float) -> float:
+        """Return a number within bounds."""
+        text = self.text(name, str(default))
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not least <= value <= most:
+            raise ConfigError(f"{self.device}: {name}={text} is not a number from {least:g} to {most:g}")
+        return value
+
+    def whole(self, name: str, default: int, least: int, most: int) -> int:
+        """Return a whole number within bounds."""
+        value = self.number(name, default, least, most)
+        if value != int(value):
+            raise ConfigError(f"{self.device}: {name}={self.values[name]} is not a whole number")
+        return int(value)
+
+    def finish(self) -> None:
+        """Refuse what nobody asked for."""
+        unknown = [name for name in self.values if name not in self.known]
+        if unknown:
+            known = f"known are {', '.join(self.known)}" if self.known else "it has none"
+            raise ConfigError(f"{self.device}: unknown option {unknown[0]!r}; {known}")
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceKind:
+    """One row."""
+
+    name: str
+    """What users type before the port."""
+    sensor: str
+    """One of SENSORS."""
+    title: str
+    make: Callable[[Options, Setup], Driver]
+    baud: int = 115200
+    """bit/s that it is looked for with first."""
+    usb: tuple[str, ...] = ()
+    """"vvvv:pppp" in lower-case hexadecimal."""
+    product: str = ""
+    """A word of its USB product name, lower case, where its USB chip is a stock one."""
+    talks: bool = False
+    """It talks unasked, so that listening finds it."""
+    probe: bool = True
+    """`uwblite devices` can tell it from others."""
+    silent: str = "it does not answer: check its power and its cable, unplug it and plug it in again"
+    """What to do when it does not answer."""
+    options: str = ""
+    """Its options, for the help."""
+
+
+def _scip(options: Options, setup: Setup) -> Driver:
+    steps = options.text("steps")
+    first, _, last = steps.partition(":")
+    if steps and not (first.isdecimal() and last.isdecimal() and int(first) <= int(last) <= 9999):
+        raise ConfigError(f"{options.device}: steps={steps} is not two steps such as 128:640")
+    return ScipDriver(
+        int(first) if steps else None, int(last) if steps else None, cluster=options.whole("cluster", 1, 1, 99),
+        skip=options.whole("skip", 0, 0, 9), wide=not options.whole("narrow", 0, 0, 1),
+        baud=options.whole("baud", ScipDriver.baud, *BAUD), stream=setup.stream,
+    )  # fmt: skip
+
+
+def _kobuki(_options: Options, setup: Setup) -> Driver:
+    return KobukiDriver(setup.start)
+
+
+def _line(options: Options, setup: Setup) -> Driver:
+    baud = options.whole("baud", LineDriver.baud, *BAUD)
+    options.known += options.values
+    return LineDriver(parse_format({k: v for k, v in options.values.items() if k != "baud"}), baud, setup.start)
+
+
+DEVICES = {
+    kind.name: kind
+    for kind in (
+        DeviceKind(
+            "kobuki", "odometry", "Kobuki base", _kobuki, product="kobuki", talks=True,
+            silent="the base is silent: switch it on (its USB chip is powered by this computer, the base is not)",
+        ),
+        DeviceKind(
+            "line", "odometry", "base that prints text lines", _line, talks=True, probe=False,
+            options="columns (t,x,y,theta | t,left,right | speed, turn_rate, - to skip), tick (m), wheel_base (m),"
+            " tick_modulus, time_unit (s), length_unit (m), angle_unit (rad), prefix, baud",
+        ),
+        DeviceKind(
+            "tlv", "uwb", "DWM1001 tag with PANS R2, 1 mm", lambda _o, setup: Dwm1001Driver(stream=setup.stream),
+            usb=("1366:0105", "1366:1015"),
+            silent="the tag is silent: unplug and replug it (the USB bridge of the DEV board can hang)",
+        ),
+        DeviceKind(
+            "shell", "uwb", "DWM1001 tag with PANS R2 by its text shell, 1 cm",
+            lambda _o, setup: Dwm1001Driver(shell=True, stream=setup.stream), probe=False,
+        ),
+        DeviceKind(
+            "scip", "lidar", "Hokuyo URG-04LX and others that speak SCIP", _scip, usb=("15d1:0000",),
+            silent="the lidar is silent: unplug and replug it, check its 5 V supply (it draws up to 0.8 A at start)",
+            options="steps (first:last), cluster, skip, narrow (1: 2-character readings), baud",
+        ),
+    )
+}  # fmt: skip
+"""By name. The first kind of a sensor that has no name of its own in what the user wrote is DEFAULT's."""
+DEFAULT = {"uwb": "tlv", "lidar": "scip"}
+ALIASES = {"dwm1001": "tlv"}
+
+
+def open_device(sensor: str, spec: str, setup: Setup | None = None, more: dict[str, str] | None = None) -> tuple[Session, str]:
+    """Return the session for what a user wrote, and the URL of its port.
+
+    Parameters
+    ----------
+    sensor : one of SENSORS.
+    spec : ``[NAME:]PORT[?option=value&...]``.
+    setup : what the driver is told.
+    more : options from elsewhere; those of `spec` win.
+
+    Returns
+    -------
+    session, url
+
+    Raises
+    ------
+    ConfigError : no such device, no port, or an option that it does not have.
+    """
+    name, separator, rest = spec.partition(":")
+    name = ALIASES.get(name, name)
+    kind = DEVICES.get(name)
+    if not separator or kind is None:
+        if sensor not in DEFAULT:
+            raise ConfigError(f"--{sensor} {spec}: say {' or '.join(f'{name}:PORT' for name in _names(sensor))}")
+        kind, rest = DEVICES[DEFAULT[sensor]], spec
+    if kind.sensor != sensor:
+        raise ConfigError(f"--{sensor} {spec}: {kind.name} is no {sensor}; known are {', '.join(_names(sensor))}")
+    port, _, query = rest.partition("?")
+    pairs = dict(parse_qsl(query, keep_blank_values=True))
+    options = Options(f"--{sensor} {kind.name}", {**(more or {}), **pairs})
+    driver = kind.make(options, setup or Setup())
+    if "://" in port:
+        # What the device does not know may be meant for the port: rfc2217://host:port?ign_set_control
+        port_options = {key: value for key, value in pairs.items() if key not in options.known}
+        options.known += port_options
+        port += "?" + urlencode(port_options) if port_options else ""
+    options.finish()
+    if not port:
+        raise ConfigError(f"--{sensor} {spec}: it names no port, as {kind.name}:/dev/ttyUSB0 does")
+    return Session(driver), port
+
+
+def _names(sensor: str) -> list[str]:
+    return [kind.name for kind in DEVICES.values() if kind.sensor == sensor]
+
+
+def kinds_on_usb(usb_id: str, text: str) -> list[DeviceKind]:
+    """Return the devices that a USB port may belong to.
+
+    Parameters
+    ----------
+    usb_id : "vvvv:pppp" in lower-case hexadecimal.
+    text : manufacturer and product.
+
+    Returns
+    -------
+    list of DeviceKind
+    """
+    return [
+        kind for kind in DEVICES.values()
+        if kind.probe and (usb_id in kind.usb or (kind.product and kind.product in text.lower()))
+    ]  # fmt: skip

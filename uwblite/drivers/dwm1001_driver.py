@@ -1,0 +1,255 @@
+"""The conversation with a DWM1001 tag: start-up, reading and recovery.
+
+Two ways to read it. *TLV* (default): status until a fix is ready, then the fix (`dwm1001_poll`); distances to 1 mm.
+*Shell*: the stream of ``lec``; distances to 1 cm. Either way a module left in the other mode, or streaming for a host
+that died, is brought round.
+"""
+
+from typing import Any
+
+from .dwm1001 import BAUD, STATUS_GET, TlvProtocol, request
+from .dwm1001_advice import advise, not_joined
+from .dwm1001_blocks import NodeConfig, Status, UpdateRate, Value, short_id
+from .dwm1001_poll import FixPoller
+from .dwm1001_shell import (
+    ENTER,
+    NodeInfo,
+    PositionLine,
+    Prompt,
+    RangeLine,
+    ShellProtocol,
+    TextLine,
+    parse_node_info,
+    shell_command,
+)
+from .events import Action, Corrupt, Note, Param, RangeEpoch, Reopen, Send
+from .session import Driver, Identity, Script, Wait
+
+DRAIN = 0.25
+PATIENCE = 0.25
+"""s to wait for an answer during start-up."""
+PROBES = ((STATUS_GET, PATIENCE), (ENTER, 0.6), (STATUS_GET, PATIENCE), (STATUS_GET, PATIENCE), (b"\r", 1.0))
+"""What finds out the mode: the status in generic mode; Enter in the shell, which also wakes a sleeping tag."""
+QUIET = 0.15, 0.35
+"""s: lines may still come at first; after that, a stream that was stopped must be silent."""
+QUERIES = ("ver_get", "nodeid_get", "panid_get", "cfg_get", "upd_rate_get")
+ANSWERS = {"ver_get": "hardware", "nodeid_get": "node_id", "panid_get": "pan_id"}
+"""The value that completes the answer to a query."""
+SHORTEST_PERIOD = 0.1
+"""s between fixes at the highest rate."""
+
+
+class Dwm1001Driver(Driver):
+    """One DWM1001 tag.
+
+    Parameters
+    ----------
+    shell : read the text stream instead of polling TLV.
+    stream : False: stop after the queries (for a look at what is plugged in).
+    """
+
+    baud = BAUD
+
+    def __init__(self, *, shell: bool = False, stream: bool = True) -> None:
+        super().__init__()
+        self.config: NodeConfig | None = None
+        self.rate: UpdateRate | None = None
+        self.values: dict[str, int] = {}
+        self.info = NodeInfo()
+        self.joined: bool | None = None
+        self._shell, self._stream = shell, stream
+        self._poller: FixPoller | None = None
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what was half received; the mode is not known."""
+        self._tlv, self._lines = TlvProtocol(), ShellProtocol()
+        self._text = self._binary = True
+        self._streaming = False
+
+    @property
+    def period(self) -> float:
+        """Expected time between fixes, s."""
+        return max(SHORTEST_PERIOD, self.rate.normal) if self.rate else SHORTEST_PERIOD
+
+    def parse(self, data: bytes, now: float) -> list[Any]:
+        """Return the events of the mode that the module is in, of both while that is not known."""
+        events: list[Any] = self._lines.feed(data, now) if self._text else []
+        events += self._tlv.feed(data, now) if self._binary else []
+        for event in events:
+            if isinstance(event, NodeConfig):
+                self.config = event
+            elif isinstance(event, UpdateRate):
+                self.rate = event
+            elif isinstance(event, Value):
+                self.values[event.name] = event.value
+            elif isinstance(event, Status):
+                self.joined = event.joined
+        unknown = self._text and self._binary
+        return [event for event in events if not (unknown and isinstance(event, Corrupt))]
+
+    def stop(self) -> list[Action]:
+        """Return what ends a stream; polling ends by itself."""
+        return [Send(shell_command("lec"))] if self._streaming else []
+
+    def script(self) -> Script[None]:
+        """Find the module, learn who it is, and read fixes; begin again when it falls silent."""
+        while (yield from self._find()):
+            yield from (self._ask_shell() if self._shell else self._query())
+            self.ready = True
+            if not self._stream:
+                return
+            if self._shell:
+                yield from self._read_lines()
+            else:
+                yield from FixPoller(self, self.period).script()
+            yield Note("warning", "uwb-restart", "uwb: no fix and no answer; starting the module again")
+        text = (
+            "uwb: no answer. The USB bridge of the DEV board can hang: unplug it and plug it in again;"
+            " check that the port is the DWM1001's and that no other program has it"
+        )
+        yield from self.say_once(Note("error", "uwb-silent", text))
+        yield Reopen("no answer")
+
+    # ---- finding out the mode, and changing it
+
+    def _find(self) -> Script[bool]:
+        """Bring the module into the mode wanted; False = no answer."""
+        self.begin()
+        shell = yield from self._in_shell()
+        if shell is None:
+            return False
+        if self._shell:
+            self._text, self._binary = True, False
+            prompt = shell or (yield from self.ask(ENTER, lambda e: isinstance(e, Prompt), 1.2, 3))
+            return prompt is not None
+        if shell:
+            self._text, self._binary = True, False
+            yield Send(shell_command("quit"))
+            yield from self.sleep(PATIENCE)
+        self._text, self._binary = False, True
+        self._tlv.reset()
+        return not shell or (yield from self.ask(STATUS_GET, lambda e: isinstance(e, Status), PATIENCE, 4)) is not None
+
+    def _in_shell(self) -> Script[bool | None]:
+        """Tell whether the module is in its shell, and quiet; None = no answer."""
+        left = _source((yield from self.sleep(DRAIN)))
+        for probe, patience in () if left else PROBES:
+            yield Send(probe)
+            until = self.now + patience
+            while (event := (yield Wait(until))) is not None and not left:
+                if isinstance(event, Status):
+                    return False
+                if isinstance(event, Prompt):
+                    return True
+                left = _source([event])
+            if left:
+                break
+        if not left:
+            return None
+        self._binary = False
+        text = f"uwb: a {left} stream was left running; stopped it"
+        yield from self.say_once(Note("info", "uwb-stream-left", text))
+        for _ in range(4):
+            if left:
+                yield Send(shell_command(left))
+                yield from self.sleep(QUIET[0])
+                left = _source((yield from self.sleep(QUIET[1])))
+        return True
+
+    # ---- shell
+
+    def _ask_shell(self) -> Script[None]:
+        texts: list[str] = []
+        yield Send(shell_command("si"))
+        until = self.now + 1.0
+        while (event := (yield Wait(until))) is not None and not (texts and isinstance(event, Prompt)):
+            if isinstance(event, TextLine):
+                texts.append(event.text)
+        self.info = parse_node_info(texts)
+        self.joined = self.info.connected
+        settings = dict(self.info.settings)
+        normal = settings.get("upd_rate_norm", "1")
+        if normal.isdecimal():
+            self.rate = UpdateRate(self.now, int(normal) / 10, int(normal) / 10)
+        if self.info.short_id:
+            yield Param("uwb_tag_id", self.info.short_id)
+        if self.info.firmware:
+            yield Param("uwb_tag_firmware", self.info.firmware)
+        yield from self.say_once(*advise(
+            tag=self.info.mode in ("tn", ""), active=self.info.activity in ("act", ""),
+            stationary=settings.get("stat_det") == "1", joined=self.joined,
+            low_power=settings.get("lp") == "1", period=self.period,
+        ))  # fmt: skip
+
+    def _read_lines(self) -> Script[None]:
+        """Read the stream until no more lines come; the command toggles it, so it is sent until they do."""
+        self._streaming, tries = True, 4
+        while tries:
+            tries -= 1
+            yield Send(shell_command("lec"))
+            until = self.now + max(1.0, 3 * self.period)
+            while (event := (yield Wait(until))) is not None:
+                if isinstance(event, RangeLine):
+                    until, tries = self.now + max(3.0, 3 * self.period), 4
+                    if event.readings:
+                        yield RangeEpoch(event.stamp, event.readings)
+        self._streaming = False
+
+    # ---- TLV
+
+    def _query(self) -> Script[None]:
+        for name in QUERIES:
+
+            def answers(event: Any, name: str = name) -> bool:
+                if isinstance(event, Value):
+                    return event.name == ANSWERS.get(name)
+                return isinstance(event, NodeConfig if name == "cfg_get" else UpdateRate)
+
+            yield from self.ask(request(name), answers, PATIENCE)
+        for name, key in (("uwb_tag_id", "node_id"), ("uwb_pan_id", "pan_id")):
+            if key in self.values:
+                yield Param(name, short_id(self.values[key]))
+        if "firmware" in self.values:
+            yield Param("uwb_tag_firmware", self._firmware())
+        config = self.config
+        if config is not None:
+            yield from self.say_once(*advise(
+                tag=not config.anchor, active=config.uwb_mode == 2, stationary=config.stationary_detection,
+                joined=None, low_power=config.low_power, period=self.period,
+            ))  # fmt: skip
+
+    def _firmware(self) -> str:
+        return ".".join(str(byte) for byte in self.values["firmware"].to_bytes(4, "big"))
+
+    # ---- for people
+
+    def identity(self) -> Identity:
+        """Say who answered."""
+        details = {}
+        node, network = self.values.get("node_id"), self.values.get("pan_id", self.info.pan_id)
+        if node is not None:
+            details["id"] = short_id(node)
+        if network is not None:
+            details["network"] = f"0x{network:04X}"
+        if "firmware" in self.values:
+            details["firmware"] = self._firmware()
+        if self.rate:
+            details["period"] = f"{self.rate.normal:.1f} s moving, {self.rate.stationary:.1f} s at rest"
+        findings = []
+        if self.joined is not None:
+            details["network state"] = "joined" if self.joined else "not joined"
+            findings += [] if self.joined else [not_joined()]
+        if network == 0:
+            text = "the network id is 0: in the shell type `nis 0xC0DE` (with 0x), then `reset`"
+            findings.append(Note("error", "no-network-id", text))
+        title = "DWM1001 anchor" if self.config and self.config.anchor else "DWM1001 tag"
+        return Identity(title, tuple(details.items()), tuple(findings))
+
+
+def _source(events: list[Any]) -> str:
+    """Return the command of the stream that lines among the events belong to, "" where there are none."""
+    for event in events:
+        if isinstance(event, RangeLine | PositionLine):
+            return event.source if isinstance(event, RangeLine) else "lep"
+    return ""

@@ -1,0 +1,230 @@
+"""From bytes to frames: the one place that waits for the rest of a frame, and that finds the next one after damage.
+
+Bytes come in pieces of any size; each keeps the time at which its own piece arrived, so that noise before a frame does
+not lend it its time. A binary protocol is a `FrameReader` that says how long a frame is and what it holds; a protocol of
+text lines uses a `LineReader`. What is no frame becomes `Corrupt`.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from .events import Corrupt, corrupt
+
+CHUNK = 512
+"""Bytes looked at together, so that noise of any length is held at most in pieces of this size."""
+
+
+class StampedBuffer:
+    """Bytes in the order of their arrival, each with the stamp of its own piece."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self._marks: list[tuple[int, float]] = []
+
+    def append(self, piece: bytes, stamp: float) -> None:
+        """Hold a piece that arrived at `stamp`, s."""
+        self._marks.append((len(self.data), stamp))
+        self.data += piece
+
+    def stamp_at(self, offset: int) -> float:
+        """Return the arrival of the byte at `offset`, s."""
+        return next(when for at, when in reversed(self._marks) if at <= offset)
+
+    def marks(self, start: int, end: int) -> tuple[tuple[int, float], ...]:
+        """Return (offset from `start`, arrival, s) of the pieces between two offsets."""
+        if len(self._marks) == 1:
+            return ((0, self._marks[0][1]),)
+        inner = [(at - start, when) for at, when in self._marks if start < at < end]
+        return ((0, self.stamp_at(start)), *inner)
+
+    def drop(self, count: int) -> None:
+        """Forget the first bytes."""
+        if count >= len(self.data):
+            self.clear()
+        elif count:
+            self._marks = [(0, self.stamp_at(count))] + [(at - count, when) for at, when in self._marks if at > count]
+            del self.data[:count]
+
+    def clear(self) -> None:
+        """Forget all bytes."""
+        self.data.clear()
+        self._marks.clear()
+
+
+class FrameReader:
+    """Binary frames; a protocol derives from this and says `frame_size` and `decode`.
+
+    A frame is decoded when it is complete. If it is damaged, the search for the next one goes on at its second byte, so a
+    frame that broke off does not take the next one with it. At most one frame and CHUNK bytes are held.
+    """
+
+    lead = 0
+    """First byte of every frame."""
+    head_size = 2
+    """Bytes by which a frame is known: as many as `frame_size` is shown."""
+    unique_head = False
+    """A head cannot occur inside a frame by chance: then one found there means that the frame broke off."""
+    noise = "no frame"
+    """What bytes between frames are called in the counters."""
+
+    def __init__(self) -> None:
+        self.held = StampedBuffer()
+        self.taken = 0
+        """Bytes of `held` that belong to a frame that was decoded."""
+        self._told = 0
+
+    def frame_size(self, head: bytes) -> int:
+        """Return the size of the frame that begins so; 0 = more bytes are needed to say, -1 = none begins so.
+
+        Parameters
+        ----------
+        head : the first `head_size` bytes, or as many as have come.
+        """
+        raise NotImplementedError
+
+    def decode(self, frame: bytes, stamp: float) -> Any:
+        """Return the event that a frame of the right size holds, or Corrupt; `stamp` s, arrival of its first byte."""
+        raise NotImplementedError
+
+    def feed(self, data: bytes, stamp: float) -> list[Any]:
+        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes.
+
+        Parameters
+        ----------
+        data : bytes from the port.
+        stamp : arrival, s, clock of the host.
+
+        Returns
+        -------
+        list of events of the protocol, and Corrupt.
+        """
+        events: list[Any] = []
+        for start in range(0, len(data), CHUNK):
+            self.held.append(data[start : start + CHUNK], stamp)
+            self._scan(events)
+        return events
+
+    def reset(self) -> None:
+        """Forget what is half received."""
+        self.held.clear()
+        self.taken = self._told = 0
+
+    def measure(self, at: int) -> int:
+        """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
+        buffer = self.held.data
+        size = self.frame_size(bytes(buffer[at : at + self.head_size]))
+        if size < 0:
+            following = buffer.find(self.lead, at + 1)
+            return at - (following if following >= 0 else len(buffer))
+        end = at + size if size else len(buffer) + 1
+        broken = self.head_inside(at + 1, min(end, len(buffer))) if self.unique_head else 0
+        if broken:
+            return at - broken
+        return size if end <= len(buffer) else 0
+
+    def head_inside(self, start: int, end: int) -> int:
+        """Return where a whole head stands between two offsets, 0 = nowhere."""
+        buffer, at = self.held.data, start
+        while 0 <= (at := buffer.find(self.lead, at, end)) <= end - self.head_size:
+            if self.frame_size(bytes(buffer[at : at + self.head_size])) >= 0:
+                return at
+            at += 1
+        return 0
+
+    def _scan(self, events: list[Any]) -> None:
+        buffer, at, noise = self.held.data, 0, 0
+        while at < len(buffer) and (size := self.measure(at)):
+            if size < 0:
+                at -= size
+                continue
+            self._report(noise, at, events)
+            frame = bytes(buffer[at : at + size])
+            event = self.decode(frame, self.held.stamp_at(at))
+            events.append(event)
+            self._told = at + size
+            if isinstance(event, Corrupt):
+                at = self.taken = at + 1
+            else:
+                at = self.taken = at + size
+                at -= self._overlap(frame)
+            noise = at
+        self._report(noise, at, events)
+        self.held.drop(at)
+        self.taken, self._told = max(0, self.taken - at), max(0, self._told - at)
+
+    def _overlap(self, frame: bytes) -> int:
+        """Return how many of the last bytes may be the head of the next frame, if this one had lost as many."""
+        sizes = range(min(self.head_size, len(frame)) - 1, 0, -1) if self.unique_head else ()
+        return next((k for k in sizes if self.frame_size(frame[-k:]) >= 0), 0)
+
+    def _report(self, start: int, end: int, events: list[Any]) -> None:
+        start = max(start, self._told)
+        if end > start:
+            events.append(corrupt(bytes(self.held.data[start:end]), self.noise))
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line without its end."""
+
+    data: bytes
+    end: bytes
+    """What ended it."""
+    marks: tuple[tuple[int, float], ...]
+    """(offset, s): the arrival of the bytes from there on."""
+    cut: bool = False
+    """Its beginning was dropped because it was too long."""
+
+    def stamp_at(self, offset: int) -> float:
+        """Return the arrival of the byte at `offset`, s."""
+        return next(when for at, when in reversed(self.marks) if at <= offset)
+
+
+class LineReader:
+    """Text lines.
+
+    Parameters
+    ----------
+    most : bytes; of a longer line only the end is kept.
+    keep : bytes of it that are kept at least.
+    ends : what ends a line.
+    """
+
+    def __init__(self, most: int, *, keep: int = 0, ends: tuple[bytes, ...] = (b"\r", b"\n")) -> None:
+        self._held = StampedBuffer()
+        self._most, self._step = most, most - keep
+        self._ends = re.compile(b"|".join(re.escape(end) for end in ends))
+        self._look_back = max(map(len, ends)) - 1
+        self._cut = False
+
+    @property
+    def held(self) -> int:
+        """Number of bytes held."""
+        return len(self._held.data)
+
+    def feed(self, data: bytes, stamp: float) -> list[Line | Corrupt]:
+        """Take bytes that arrived at `stamp` s; return the lines they complete, and Corrupt for what was too long."""
+        lines: list[Line | Corrupt] = []
+        if not data:
+            return lines
+        begin = max(0, self.held - self._look_back)
+        self._held.append(data, stamp)
+        at = 0
+        for match in self._ends.finditer(bytes(self._held.data), begin):
+            cut = at
+            while match.start() - cut > self._most:
+                lines.append(self._too_long(cut))
+                cut += self._step
+            text = bytes(self._held.data[cut : match.start()])
+            lines.append(Line(text, match[0], self._held.marks(cut, match.end()), self._cut))
+            at, self._cut = match.end(), False
+        while self.held - at > self._most:
+            lines.append(self._too_long(at))
+            at += self._step
+        self._held.drop(at)
+        return lines
+
+    def _too_long(self, at: int) -> Corrupt:
+        self._cut = True
+        return corrupt(bytes(self._held.data[at : at + self._step]), "line too long")

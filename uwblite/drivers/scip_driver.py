@@ -1,0 +1,352 @@
+"""The conversation with a URG-04LX: start-up, streaming and recovery.
+
+The order is that of drivers that survived the field: drain, QT, out of SCIP 1.1 or the time-adjust mode where the answer
+says so, VV, PP, II, a few TM1 to tie the device clock to the host's, MD without end. Only commands that every URG-04LX
+knows are sent; others can hang it until its power is cycled.
+
+Time of a scan. The device stamps the first step of its field of view (the specification leaves open whether it means
+step 0, which would be 4.3 ms earlier). A scan arrives after its turn: the lower envelope of arrivals follows the device
+clock up to that constant delay, and TM1 measures the constant, since the clock read in the time-adjust mode lies between
+request and reply.
+"""
+
+import math
+from typing import Any
+
+from ..errors import ProtocolError
+from .clock import DeviceClock
+from .events import Action, Corrupt, LaserScan, Lost, Note, Param, Reopen, Send, SetBaud
+from .scip import TIME_MODULUS, WITH_LINES, Distances, Reply, ScipProtocol
+from .scip_codes import status_meaning
+from .scip_commands import BAUD_RATES, Geometry, parse_geometry, rate_command, scan_command, text_command, to_ranges
+from .session import Driver, Identity, Script, Wait
+
+DRAIN = 0.25
+"""s to wait for silence before the first word."""
+PATIENCE = 0.4
+"""s to wait for an answer."""
+SETTLE = 0.1
+"""s for a flush or another bit rate to take effect."""
+PARAMETER_READS = 4
+TIME_READS = 8
+TRUNCATION = 0.5
+"""ms; stamps are truncated to 1 ms, half of that makes them unbiased."""
+SCAN_PATIENCE = 1.0
+"""s without a scan, or ten periods, after which the laser is started again."""
+NOISE_PATIENCE = 10.0
+"""s of nothing but damaged scans after which the laser is started again all the same."""
+PAUSE_PATIENCE = 10.0
+"""s for which a unit may verify itself."""
+FAULT_PAUSE = 2.0
+"""s before a unit with a hardware fault is tried again."""
+MAX_ROUNDS = 3
+"""Starts without a scan before the port is opened anew."""
+FULL_LINE = 0.92
+"""Share of a period that a scan may take on the line; above, the unit leaves scans out."""
+FAST_RATES = (500000, 250000, 750000, 115200, 57600)
+"""bit/s to raise an RS-232 line to, in the order tried."""
+MAX_SKIP = 9
+NARROW = 4095
+"""mm, the largest reading of two characters."""
+
+
+class ScipDriver(Driver):
+    """One lidar that speaks SCIP 2.0.
+
+    Parameters
+    ----------
+    start, end : first and last step; None = the unit's own limits.
+    cluster, skip : as in `scip_commands.scan_command`.
+    wide : three characters a value; False: two, for slow RS-232.
+    baud : bit/s to begin with; other rates are tried when nothing answers.
+    stream : False: stop after VV, PP and II (for a look at what is plugged in).
+    """
+
+    def __init__(
+        self, start: int | None = None, end: int | None = None, *, cluster: int = 1, skip: int = 0, wide: bool = True,
+        baud: int = BAUD_RATES[0], stream: bool = True,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.baud = baud
+        self.geometry = Geometry()
+        self.facts: dict[str, str] = {}
+        """KEY: value of VV, PP and II."""
+        self._start, self._end, self._cluster, self._skip, self._wide = start, end, max(1, cluster), skip, wide
+        self._stream = stream
+        self._protocol = ScipProtocol()
+        self._clock = DeviceClock(1e-3, TIME_MODULUS, latency=self.geometry.period)
+        self._rates_tried: set[int] = set()
+        self._rounds = 0
+
+    def begin(self) -> None:
+        """Forget half a reply."""
+        self._protocol = ScipProtocol()
+
+    def parse(self, data: bytes, now: float) -> list[Any]:
+        """Return Reply, Distances and Corrupt; remember what the unit says of itself."""
+        events = self._protocol.feed(data, now)
+        for event in events:
+            if isinstance(event, Reply) and event.command in WITH_LINES and event.status == "00":
+                self.facts.update(event.fields())
+        return events
+
+    def stop(self) -> list[Action]:
+        """Return what switches the laser off and ends the stream."""
+        return [Send(text_command("QT"))]
+
+    def script(self) -> Script[None]:
+        """Find the unit, learn who it is, and read scans; begin again when none come."""
+        self._rounds = 0
+        while self._rounds <= MAX_ROUNDS:
+            if not (yield from self._find()):
+                return
+            yield from self._greet()
+            self.ready = True
+            if not self._stream:
+                return
+            yield from self._tie_clock()
+            why = yield from self._read_scans()
+            self.ready = False
+            self._rounds += 1
+            if why:
+                yield Note("warning", "lidar-restart", f"lidar: {why}; starting it again")
+        yield Reopen("the laser does not start")
+
+    # ---- finding it
+
+    def _request(self, command: str, tries: int = 2) -> Script[Reply | None]:
+        def answers(event: Any) -> bool:
+            return isinstance(event, Reply) and event.command == command
+
+        reply: Reply | None = yield from self.ask(text_command(command), answers, PATIENCE, tries)
+        return reply
+
+    def _find(self) -> Script[bool]:
+        """Make the unit quiet, whatever state and bit rate a dead host left it in; False: Reopen was said."""
+        yield from self.sleep(DRAIN)
+        for rate in (self.baud, *(rate for rate in BAUD_RATES if rate != self.baud)):
+            if rate != self.baud:
+                yield SetBaud(rate)
+            reply = yield from self._request("QT", 1)
+            if reply is None:
+                # A single QT may be ignored, or half a command of another program stood before it.
+                yield from self._flush()
+                reply = yield from self._request("QT", 1)
+            if reply is not None:
+                self.baud = rate
+                return (yield from self._make_quiet(reply))
+        text = (
+            "lidar: no answer at any bit rate. Unplug it and plug it in again (about one power-up in ten needs that),"
+            " check its 5 V supply, and that no other program has the port"
+        )
+        yield from self.say_once(Note("error", "lidar-silent", text))
+        yield Reopen("no answer at any bit rate")
+        return False
+
+    def _make_quiet(self, reply: Reply) -> Script[bool]:
+        kind, _ = status_meaning(reply.command, reply.status)
+        if kind == "scip1":
+            switched = yield from self._request("SCIP2.0")
+            if switched is not None and status_meaning("SCIP2.0", switched.status)[0] == "scip1":
+                text = "lidar: it speaks SCIP 1.1 only; its firmware (before 3.0) needs the maker's update to SCIP 2.0"
+                yield from self.say_once(Note("error", "lidar-scip1-only", text))
+                yield Reopen("SCIP 1.1 only")
+                return False
+            yield from self.say_once(Note("info", "lidar-scip1", "lidar: it woke in SCIP 1.1; switched to SCIP 2.0"))
+        elif kind != "ok":
+            # Foreign bytes stood before QT, or the unit was left in the time-adjust mode.
+            yield from self._flush()
+            yield from self._request("TM2")
+        if kind != "ok":
+            yield from self._request("QT")
+        return True
+
+    def _flush(self) -> Script[None]:
+        """End the line that the unit may be in, and let its answer pass."""
+        yield Send(b"\n")
+        yield from self.sleep(SETTLE)
+
+    # ---- who it is, and its clock
+
+    def _greet(self) -> Script[None]:
+        for command in WITH_LINES:
+            reply = yield from self._request(command)
+            if reply is not None and status_meaning(command, reply.status)[0] != "ok":
+                yield from self._flush()
+                reply = yield from self._request(command)
+            if command == "PP":
+                yield from self._take_geometry(reply)
+        for name, key in (("product", "PROD"), ("firmware", "FIRM"), ("serial", "SERI")):
+            if key in self.facts:
+                yield Param(f"laser_{name}", self.facts[key].replace(" ", "_"))
+
+    def _take_geometry(self, reply: Reply | None) -> Script[None]:
+        """Believe PP when it came twice alike: the sums of its lines are wrong in some units and cannot be asked for."""
+        before, problem = None, "no answer to PP"
+        for _ in range(PARAMETER_READS):
+            try:
+                geometry = parse_geometry(reply) if reply else None
+                if geometry and geometry == before:
+                    self.geometry = geometry
+                    break
+                before, problem = geometry or before, "two answers to PP differ" if geometry else problem
+            except ProtocolError as error:
+                problem = str(error)
+            reply = yield from self._request("PP", 1)
+        else:
+            self.geometry = before or Geometry()
+            text = f"lidar: {problem}; going on with {'the last answer' if before else 'the limits of a URG-04LX'}"
+            yield from self.say_once(Note("warning", "lidar-parameters", text))
+        self._scan_request()  # steps that the unit does not have are the user's mistake: say so now
+
+    def _tie_clock(self) -> Script[None]:
+        """Read the clock a few times in the time-adjust mode; without it, what was measured before stays in force."""
+        entered = yield from self._request("TM0")
+        for _ in range(TIME_READS if entered and status_meaning("TM0", entered.status)[0] == "ok" else 0):
+            sent = self.now
+            reply = yield from self._request("TM1", 1)
+            if reply is None or not reply.lines:
+                break
+            self._clock.tie(int(reply.lines[0]) + TRUNCATION, sent, reply.stamp)
+        yield from self._request("TM2")
+
+    # ---- scans
+
+    @property
+    def period(self) -> float:
+        """Time between scans that are sent, s."""
+        return self.geometry.period * (self._skip + 1)
+
+    def _scan_request(self) -> bytes:
+        unit = self.geometry
+        first = unit.first if self._start is None else self._start
+        last = unit.last if self._end is None else self._end
+        return scan_command(first, last, cluster=self._cluster, skip=self._skip, wide=self._wide, geometry=unit)
+
+    def _read_scans(self) -> Script[str]:
+        """Stream until something is wrong; return what, "" where it was said already."""
+        refusal = yield from self._begin_stream()
+        if refusal:
+            return refusal
+        good = self.now
+        until = self.now + max(2 * SCAN_PATIENCE, 20 * self.period)
+        durations: list[float] = []
+        while (event := (yield Wait(until))) is not None:
+            if isinstance(event, Corrupt):
+                # Scans come, but damaged: starting the laser again would only lose more of them.
+                until = max(until, min(self.now + SCAN_PATIENCE, good + NOISE_PATIENCE))
+            elif isinstance(event, Distances) and event.command[0] == "M":
+                good, self._rounds = self.now, 0
+                until = self.now + max(SCAN_PATIENCE, 10 * self.period)
+                yield from self._scan(event)
+                durations.append(self.now - event.stamp)
+                if len(durations) == 2 and (yield from self._fit_line(min(durations))):
+                    return ""
+            elif isinstance(event, Reply) and event.command[0] == "M":
+                kind, text = status_meaning(event.command, event.status)
+                until = self.now + (PAUSE_PATIENCE if kind == "paused" else 2 * SCAN_PATIENCE)
+                if kind == "hardware-fault":
+                    yield Note("error", "lidar-hardware-fault", f"lidar: {text}; trying again")
+                    yield from self.sleep(FAULT_PAUSE)
+                    self._rounds = -1
+                    return ""
+                if kind in ("paused", "resumed"):
+                    yield Note("warning" if kind == "paused" else "info", f"lidar-{kind}", f"lidar: {text}")
+        return "no scan for too long"
+
+    def _begin_stream(self) -> Script[str]:
+        self._clock.period = self.period
+
+        def answers(event: Any) -> bool:
+            return isinstance(event, Reply) and event.command[:1] == "M"
+
+        reply = yield from self.ask(self._scan_request(), answers, 2 * PATIENCE, 2)
+        if reply is None:
+            return "no answer to MD"
+        kind, text = status_meaning(reply.command, reply.status)
+        return f"{reply.command[:2]} refused, {text}" if kind == "refused" else ""
+
+    def _fit_line(self, seconds: float) -> Script[bool]:
+        """Make scans fit the line, one of which took so long on it; True: the stream must begin anew."""
+        if seconds <= FULL_LINE * self.period:
+            return False
+        yield from self._request("QT")
+        carried = 1 / seconds
+        if (yield from self._raise_rate()):
+            return True
+        periods = seconds / FULL_LINE / self.geometry.period
+        if periods > MAX_SKIP + 1 and self._wide:
+            self._wide, periods = False, periods * 2 / 3
+        self._skip = min(MAX_SKIP, math.ceil(periods) - 1)
+        text = (
+            f"lidar: this line carries {carried:.1f} of {1 / self.geometry.period:.0f} scans a second; asking for one in"
+            f" {self._skip + 1}{'' if self._wide else ', up to 4.1 m'}. On RS-232 use USB or a faster port, or --lidar-steps"
+        )
+        yield from self.say_once(Note("warning", "lidar-slow-line", text))
+        return True
+
+    def _raise_rate(self) -> Script[bool]:
+        """Let the unit and the port talk faster, where both can."""
+        for rate in FAST_RATES:
+            if rate <= self.baud or rate in self._rates_tried:
+                continue
+            self._rates_tried.add(rate)
+            command = rate_command(rate)
+            reply = yield from self.ask(command, lambda e: isinstance(e, Reply) and e.command[:2] == "SS", PATIENCE)
+            if reply is None or status_meaning("SS", reply.status)[0] != "ok":
+                continue
+            yield SetBaud(rate)
+            yield from self.sleep(SETTLE)
+            if (yield from self._request("QT")) is None:
+                yield SetBaud(self.baud)
+                continue
+            text = f"lidar: scans did not fit a line of {self.baud} bit/s; it now runs at {rate}"
+            self.baud = rate
+            yield Note("info", "lidar-faster-line", text)
+            return True
+        return False
+
+    def _scan(self, scan: Distances) -> Script[None]:
+        reading = self._clock.read(scan.time + TRUNCATION, scan.stamp)
+        if reading.reset:
+            yield Note("warning", "lidar-clock-reset", "lidar: its clock was reset; time mapping starts anew")
+        if reading.elapsed is not None and reading.elapsed < 0.5 * self.period:
+            yield Corrupt(b"", "scan sent twice")
+            return
+        if reading.missing:
+            yield Lost(reading.stamp, reading.missing)
+        yield self._laser_scan(scan, reading.stamp)
+
+    def _laser_scan(self, scan: Distances, stamp: float) -> LaserScan:
+        unit = self.geometry
+        limit = None if scan.command[1] == "D" else NARROW
+        merge = (scan.cluster - 1) / 2
+        return LaserScan(
+            stamp + (scan.start - unit.first) * unit.step_time,
+            to_ranges(scan.values, unit, limit),
+            (scan.start + merge - unit.front) * unit.step_angle,
+            unit.step_angle * scan.cluster,
+            unit.step_time * scan.cluster,
+            min(unit.distance_max, limit or unit.distance_max) / 1000,
+            unit.distance_min / 1000,
+        )
+
+    # ---- for people
+
+    def identity(self) -> Identity:
+        """Say who answered."""
+        unit, facts, findings = self.geometry, self.facts, []
+        details = [(name, facts[key]) for name, key in (
+            ("firmware", "FIRM"), ("serial", "SERI"), ("laser", "LASR"), ("state", "STAT")) if key in facts]  # fmt: skip
+        details.append(("range", f"{unit.distance_min / 1000:.2f} to {unit.distance_max / 1000:.2f} m"))
+        details.append(("steps", f"{unit.first} to {unit.last}, {unit.speed} rev/min"))
+        if facts.get("LASR") == "OFF":
+            text = "the laser is off, as it should be now; `uwblite record` switches it on"
+            findings.append(Note("info", "laser-off", text))
+        state = facts.get("STAT")
+        if state is None:
+            findings.append(Note("warning", "lidar-state", "it does not say how it is (no answer to II): try again"))
+        elif "works well" not in state and "stable" not in state.lower():
+            text = f"it reports {state!r}: power it down and up; if that stays, it needs service"
+            findings.append(Note("error", "lidar-state", text))
+        return Identity(f"laser scanner {facts.get('MODL', unit.model).partition('(')[0]}", tuple(details), tuple(findings))

@@ -1,0 +1,183 @@
+"""One session drives any device: bytes go through the device's protocol, and what comes out resumes its script.
+
+A *driver* is what one kind of device needs: a protocol (bytes to events, sans-I/O) and a *script*, a generator that reads
+like the conversation it holds. It yields actions (bytes to send, measurements, notes); to wait, it yields a `Wait`, and
+gets back an event of the protocol, or None when the time is over::
+
+    def script(self):
+        yield Send(b"QT\\n")
+        reply = yield Wait(self.now + 0.4)
+
+A device that only talks needs no script of its own, only `take`. Nothing here opens a port or reads a clock: the caller
+brings `now`, seconds of a monotonic clock.
+"""
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from .events import Action, Corrupt, Note, Param, Reopen, Send
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Wait for the next event, at most until this time."""
+
+    until: float | None
+    """s; None = for ever."""
+
+
+Result = TypeVar("Result")
+Script = Generator[Action | Wait, Any, Result]
+"""Yields actions and waits, gets events, returns a result to the script that called it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who answered on a port, for people."""
+
+    title: str
+    details: tuple[tuple[str, str], ...] = ()
+    """(name, value)."""
+    findings: tuple[Note, ...] = ()
+    """What about it needs mending."""
+
+
+class Driver:
+    """What one kind of device needs; kinds derive from this.
+
+    A driver lives as long as the recording: what it learned (a clock, a pose, known anchors) stays after a reconnect.
+    """
+
+    baud = 115200
+    """bit/s to open the port with."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        """s, host clock: the time of what is being handled."""
+        self.ready = False
+        """The device was found and has said who it is."""
+        self._told: set[str] = set()
+
+    def begin(self) -> None:
+        """Forget what was half received: the port was just opened."""
+
+    def parse(self, data: bytes, now: float) -> list[Any]:
+        """Return the events that bytes complete; Corrupt is counted, and shown to the script as well."""
+        raise NotImplementedError
+
+    def script(self) -> Script[None]:
+        """Hold the conversation; by default, listen."""
+        while True:
+            event = yield Wait(None)
+            if not isinstance(event, Corrupt):
+                yield from self.take(event)
+
+    def take(self, event: Any) -> list[Action]:
+        """Return what an event of a device that talks unasked means."""
+        raise NotImplementedError
+
+    def stop(self) -> list[Action]:
+        """Return what to send so that the device falls quiet."""
+        return []
+
+    def identity(self) -> Identity:
+        """Say who answered, once `ready`."""
+        raise NotImplementedError
+
+    # ---- words of a script
+
+    def say_once(self, *notes: Note) -> list[Action]:
+        """Return the notes that were not said yet."""
+        fresh = [note for note in notes if note.name not in self._told]
+        self._told.update(note.name for note in fresh)
+        return list(fresh)
+
+    def sleep(self, seconds: float) -> Script[list[Any]]:
+        """Wait and return the events that came meanwhile."""
+        until, events = self.now + seconds, []
+        while (event := (yield Wait(until))) is not None:
+            events.append(event)
+        return events
+
+    def ask(
+        self, request: bytes, answers: Callable[[Any], bool], patience: float, tries: int = 1
+    ) -> Script[Any]:  # fmt: skip
+        """Send a request, again if need be, and return the first event that answers it; None = none came."""
+        for _ in range(tries):
+            yield Send(request)
+            until = self.now + patience
+            while (event := (yield Wait(until))) is not None:
+                if answers(event):
+                    return event
+        return None
+
+
+class Session:
+    """Start-up, running and recovery of one device, without a port.
+
+    Parameters
+    ----------
+    driver : of the device.
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self.driver = driver
+        self._script: Script[None] | None = None
+        self._due: float | None = None
+
+    @property
+    def baud(self) -> int:
+        """bit/s to open the port with."""
+        return self.driver.baud
+
+    def start(self, now: float) -> list[Action]:
+        """Begin, or begin again after a reconnect, at time `now`, s."""
+        self.driver.now = now
+        self.driver.begin()
+        self._script = self.driver.script()
+        return self._resume(None)
+
+    def feed(self, data: bytes, now: float) -> list[Action]:
+        """Take bytes that arrived at time `now`, s."""
+        self.driver.now = now
+        actions: list[Action] = []
+        for event in self.driver.parse(data, now):
+            if isinstance(event, Corrupt):
+                actions.append(event)
+            actions += self._resume(event)
+        return actions
+
+    def tick(self, now: float) -> list[Action]:
+        """Do what is due at time `now`, s."""
+        if self._due is None or now < self._due:
+            return []
+        self.driver.now = now
+        return self._resume(None)
+
+    def deadline(self) -> float | None:
+        """Return the time at which `tick` wants to be called, s; None = when bytes come."""
+        return self._due
+
+    def stop(self) -> list[Action]:
+        """Return what to send so that the device falls quiet."""
+        return self.driver.stop()
+
+    def _resume(self, event: Any) -> list[Action]:
+        """Let the script go on to its next wait."""
+        actions: list[Action] = []
+        while self._script is not None:
+            try:
+                step = self._script.send(event)
+            except StopIteration:
+                self._script, self._due = None, None
+                break
+            if isinstance(step, Wait):
+                self._due = step.until
+                break
+            actions.append(step)
+            event = None
+        return actions
+
+
+__all__ = ["Driver", "Identity", "Param", "Reopen", "Script", "Session", "Wait"]
