@@ -14,7 +14,7 @@ from uwblite.io.stored_result import read_result
 
 @pytest.fixture(params=[1, 2])
 def written(request, tmp_path):
-    result = small_result(sessions=request.param)
+    result = small_result(each=request.param)
     write_result(tmp_path / "map", [small_log()] * request.param, result, RunRecord("uwblite map x", ""))
     return result, tmp_path / "map"
 
@@ -22,11 +22,11 @@ def written(request, tmp_path):
 def test_everything_comes_back(written):
     result, folder = written
     back = read_result(folder)
-    assert len(back.trajectories) == len(np.unique(result.session))
+    assert len(back.trajectories) == len(np.unique(result.recording))
     np.testing.assert_allclose(np.concatenate([p for _, p in back.trajectories])[:, :2], result.trajectory[:, :2], atol=1e-6)
     np.testing.assert_allclose(back.keyframe_covariances, result.keyframe_covariances, rtol=1e-5)
     np.testing.assert_allclose(back.keyframe_stamps, result.keyframe_stamps, atol=1e-6)
-    np.testing.assert_array_equal(back.keyframe_recordings, result.keyframe_session + 1)
+    np.testing.assert_array_equal(back.keyframe_recordings, result.keyframe_recording + 1)
     assert [a.id for a in back.anchors] == [a.id for a in result.anchors]
     for one, two in zip(back.anchors, result.anchors, strict=True):
         np.testing.assert_allclose(one.position, two.position, atol=1e-6)
