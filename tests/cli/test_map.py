@@ -11,6 +11,7 @@ from helpers.results import FILES, contents
 
 from uwblite.cli import main
 from uwblite.io.carmen import read_log, write_log
+from uwblite.io.locks import sole_writer
 from uwblite.io.tum import read_tum
 from uwblite.sensor_log import SensorMounting
 
@@ -299,6 +300,26 @@ def test_two_recordings_become_one_map_through_their_anchors(mapped, room_log, t
     assert np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=1))) < 0.06
 
 
+def test_a_folder_of_localize_is_exchanged_as_a_whole(mapped, room_log, tmp_path, monkeypatch):
+    part = tmp_path / "part.log"
+    main(["convert", str(room_log), str(part), "--start", "100", "--end", "140"])
+    words = ["localize", str(part), "--map", str(mapped[0]), "--out", str(tmp_path / "where")]
+    assert main([*words, "--picture", str(tmp_path / "where" / "mine.png")]) == 0
+    before = {p.name: p.read_bytes() for p in (tmp_path / "where").iterdir()}
+    assert set(before) == {"trajectory.tum", "trajectory_covariance.csv", "mine.png", "report.json"}
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("uwblite.io.png.write_png", full)
+        assert main([*words, "--force"]) == 1
+    assert {p.name: p.read_bytes() for p in (tmp_path / "where").iterdir()} == before
+    assert main([*words, "--force"]) == 0
+    assert {p.name for p in (tmp_path / "where").iterdir()} == {*before, "path.png"}
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["part.log", "where"]
+
+
 def test_localize_fills_a_folder_but_never_the_map_s(mapped, room_log, tmp_path, capsys):
     part, out = tmp_path / "part.log", tmp_path / "there"
     assert main(["convert", str(room_log), str(part), "--start", "150"]) == 0
@@ -343,3 +364,19 @@ def test_every_third_scan_makes_a_map_too(room_log, tmp_path, capsys):
     whole = read_log(room_log).scans
     assert report["recording"]["scans"] == -(-len(whole.stamps) // 3)
     assert "--every-nth-scan=3" in report["command"]
+
+
+def test_a_second_run_into_the_same_folder_is_refused_before_it_computes(tmp_path, room_log, capsys):
+    with sole_writer(tmp_path / "map"):
+        assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--force"]) == 1
+    assert "another run is writing" in capsys.readouterr().err
+    assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.parametrize("verb", ["map", "localize", "record", "convert", "optimize"])
+def test_an_empty_name_is_wrong_usage(verb, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = {"convert": ["x.log", ""], "localize": ["x.log", "--map", "m", "--out", ""], "record": ["--out", ""]}
+    assert main([verb, *words.get(verb, ["x", "--out", " "])]) == 2
+    assert "an empty name is no place for a result" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ..errors import ConfigError
-from .options import add_bag_arguments, add_mounting_arguments, number
+from .options import add_bag_arguments, add_mounting_arguments, number, place
 
 if TYPE_CHECKING:
     from ..arrays import Floats
@@ -34,7 +34,7 @@ _TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg", "tum", "kitti")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("source", help="what to convert; - reads a log from standard input")
-    parser.add_argument("target", nargs="?", help="what to make; its name tells the format, or --to does")
+    parser.add_argument("target", type=place, nargs="?", help="what to make; its name tells the format, or --to does")
     parser.add_argument("--to", choices=_TARGETS, help="format of the target where its name does not tell")
     parser.add_argument("--force", action="store_true", help="replace a file that is already there")
     text = "recording that a map was made of, for its scans and odometry; repeatable, in their order"

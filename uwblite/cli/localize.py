@@ -3,11 +3,14 @@
 import argparse
 import os
 import time
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments
+from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments, place
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from ..grid.occupancy_grid import OccupancyGrid
     from ..localize import Localization
 
@@ -29,9 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
     parser.add_argument("--map", metavar="DIR", required=True, help="folder that uwblite map wrote: anchors.csv, map.yaml")
     out = "trajectory in the map's frame, FILE.tum; any other name is a folder for it, its covariances and a report"
-    parser.add_argument("--out", metavar="FILE.tum|DIR", required=True, help=out)
-    parser.add_argument("--covariance", metavar="FILE.csv", help="covariance of every keyframe")
-    parser.add_argument("--picture", metavar="FILE.png", help="the path drawn on the map")
+    parser.add_argument("--out", type=place, metavar="FILE.tum|DIR", required=True, help=out)
+    parser.add_argument("--covariance", type=place, metavar="FILE.csv", help="covariance of every keyframe")
+    parser.add_argument("--picture", type=place, metavar="FILE.png", help="the path drawn on the map")
     parser.add_argument("--force", action="store_true", help="replace files that are already there")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
     add_settings_arguments(parser)
@@ -42,12 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from ..io.constraints_file import read_anchors
-    from ..io.files import write_text
     from ..io.map_server import read_map
-    from ..io.png import write_png
-    from ..io.result_text import covariance_csv, json_lines
+    from ..io.result_text import json_lines
     from ..io.results import mend_result
-    from ..io.tum import write_tum
     from ..localize import localize
     from . import console
     from .formats import read_recording, refuse_existing
@@ -66,22 +66,49 @@ def run(args: argparse.Namespace) -> int:
         found = localize(log, anchors, grid, config, progress=progress, clock=time.perf_counter)
     finally:
         progress.close()
-    if "report" in files:
-        os.makedirs(args.out, exist_ok=True)
-    write_tum(files["trajectory"], found.result.stamps, found.result.trajectory)
-    if "covariance" in files:
-        write_text(files["covariance"], covariance_csv(found.result))
-    if "picture" in files:
-        write_png(files["picture"], _picture(found, grid, os.path.basename(args.log)))
     summary = _summary(found, list(files.values()))
-    if "report" in files:
-        about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
-        write_text(files["report"], json_lines(about | summary))
+    about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
+    picture = _picture(found, grid, os.path.basename(args.log)) if "picture" in files else None
+    with _together(files, args.out) as places:
+        _write(places, found, picture, json_lines(about | summary))
     if args.json:
         console.say_json(summary)
     else:
         _say(found, list(files.values()))
     return 3 if found.result.doubts else 0
+
+
+@contextmanager
+def _together(files: dict[str, str], folder: str) -> "Iterator[dict[str, str]]":
+    """Give places to write files to; those of a folder of ours appear in it all together."""
+    from ..io.folders import replacing_folder
+
+    if "report" not in files:
+        yield files
+        return
+    home = os.path.realpath(folder)
+    inside = {what: os.path.basename(name) for what, name in files.items() if os.path.dirname(os.path.realpath(name)) == home}
+    with replacing_folder(folder, (_OWN | set(inside.values())).__contains__) as waiting:
+        yield files | {what: str(waiting / name) for what, name in inside.items()}
+
+
+def _write(places: dict[str, str], found: "Localization", picture: Any, report: str) -> None:
+    from ..io.files import write_text
+    from ..io.png import write_png
+    from ..io.result_text import covariance_csv
+    from ..io.tum import write_tum
+
+    write_tum(places["trajectory"], found.result.stamps, found.result.trajectory)
+    if "covariance" in places:
+        write_text(places["covariance"], covariance_csv(found.result))
+    if "picture" in places:
+        write_png(places["picture"], picture)
+    if "report" in places:
+        write_text(places["report"], report)
+
+
+_OWN = {"trajectory.tum", "trajectory_covariance.csv", "path.png", "report.json"}
+"""What a folder of a localisation holds."""
 
 
 def _files(args: argparse.Namespace) -> dict[str, str]:
@@ -95,6 +122,8 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
         raise ConfigError(f"--out {args.out} is the map itself, which is not changed; choose another folder")
     if os.path.isfile(args.out):
         raise ConfigError(f"{args.out} is a file; name a folder, or a trajectory that ends in .tum")
+    if os.path.exists(os.path.join(args.out, "map.yaml")):
+        raise ConfigError(f"{args.out} holds a map, which a localisation does not replace; choose another folder")
     names = {"trajectory": "trajectory.tum", "covariance": "trajectory_covariance.csv", "picture": "path.png"}
     own = {what: os.path.join(args.out, name) for what, name in (names | {"report": "report.json"}).items()}
     return own | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments, number, numbers
+from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments, number, numbers, place
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     several = "CARMEN log, plain or .gz, ROS bag or CSV folder; several are mapped together; - reads a log from standard input"
     parser.add_argument("logs", metavar="LOG", nargs="+", help=several)
-    parser.add_argument("--out", metavar="DIR", required=True, help="folder for the result")
+    parser.add_argument("--out", type=place, metavar="DIR", required=True, help="folder for the result")
     parser.add_argument("--force", action="store_true", help="replace a result that is already there")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
     parser.add_argument("--dry-run", action="store_true", help="read, check and estimate time and memory; write nothing")
@@ -75,17 +75,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
+    from ..io.locks import sole_writer
+    from ..io.results import check_target
+
+    if args.dry_run:
+        return _map(args)
+    with sole_writer(args.out):
+        check_target(args.out, force=args.force)
+        return _map(args)
+
+
+def _map(args: argparse.Namespace) -> int:
     from ..config import to_toml
     from ..io.result_text import RunRecord
-    from ..io.results import check_target, write_result
+    from ..io.results import write_result
     from ..parallel import in_order
     from ..pipeline.scan_selection import thinned
     from . import console
     from .formats import read_recording
     from .options import apply_mounting, bag_choices
 
-    if not args.dry_run:
-        check_target(args.out, force=args.force)
     config, constraints = _settings(args), _known(args)
     began = time.perf_counter()
     with _workers(args.jobs if len(args.logs) > 1 else 1) as executor:

@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from .options import number
+from .options import number, place
 
 if TYPE_CHECKING:
     from ..graph.graph import Graph
@@ -25,8 +25,8 @@ exit code 3: the search did not converge
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("graph", help=".g2o, TORO (.graph, .toro) or .pyfg file, plain or .gz; - reads standard input")
-    parser.add_argument("--out", metavar="FILE", help="optimised graph; .g2o or .pyfg by its name, .gz compresses")
-    parser.add_argument("--trajectory", metavar="FILE", help="poses as a TUM trajectory, as evo reads it")
+    parser.add_argument("--out", type=place, metavar="FILE", help="optimised graph; .g2o or .pyfg by its name, .gz compresses")
+    parser.add_argument("--trajectory", type=place, metavar="FILE", help="poses as a TUM trajectory, as evo reads it")
     parser.add_argument("--from-odometry", action="store_true", help="forget the file's estimates, start from the odometry")
     parser.add_argument("--kernel", metavar="NAME", default="none", help="robust kernel on edges that close loops, and ranges")
     bend = "standard deviations where it bends (2)"

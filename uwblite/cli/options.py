@@ -100,6 +100,13 @@ def number(
     return parse
 
 
+def place(text: str) -> str:
+    """Read the name of a file or folder to write."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("an empty name is no place for a result; . is the current folder")
+    return text
+
+
 def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
     """Return a reader of so many numbers separated by commas."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .console import note, say, say_json
-from .options import number, numbers
+from .options import number, numbers, place
 
 if TYPE_CHECKING:
     from ..drivers.events import Note, Pose
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     devices.add_argument("--lidar", metavar="[NAME:]PORT", action="append", help="lidar (a Hokuyo without a name)")
     devices.add_argument("--odometry", metavar="NAME:PORT", action="append", help="base: kobuki:PORT, line:PORT?columns=...")
     output = parser.add_argument_group("output")
-    output.add_argument("--out", metavar="FILE", required=True, help="the log; must not exist unless --append")
+    output.add_argument("--out", type=place, metavar="FILE", required=True, help="the log; must not exist unless --append")
     output.add_argument("--append", action="store_true", help="go on with a log that broke off")
     output.add_argument("--rotate", metavar="SIZE", type=_size, default=0, help="begin a new part at this size, e.g. 500M")
     output.add_argument("--duration", metavar="S", type=number(above=0), help="stop after so many seconds")

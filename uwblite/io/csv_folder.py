@@ -26,6 +26,7 @@ from ..config import from_dict, parse_toml, setting, to_toml
 from ..errors import ConfigError, FormatError
 from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .files import replacing
+from .folders import replacing_folder
 from .source import open_source
 
 
@@ -72,7 +73,7 @@ class Sensors:
 
 
 def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: bool = False) -> None:
-    """Write a recording as CSV files into a folder, made where it is missing; each file is replaced when complete.
+    """Write a recording as CSV files into a folder, made where it is missing; all files are replaced together.
 
     Raises
     ------
@@ -81,7 +82,14 @@ def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: b
     path = Path(folder)
     if (path / "odometry.csv").exists() and not force:
         raise ConfigError(f"{path} already holds a recording; use --force to replace it, or another folder")
-    path.mkdir(parents=True, exist_ok=True)
+    with replacing_folder(path, _FILES.__contains__) as waiting:
+        _write_tables(waiting, log)
+
+
+_FILES = {"odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"}
+
+
+def _write_tables(path: Path, log: SensorLog) -> None:
     odometry = np.column_stack([log.odometry.stamps, log.odometry.poses])
     _write(path / "odometry.csv", "stamp,x,y,theta", (",".join(f"{v:.6f}" for v in row) for row in odometry.tolist()))
     if log.ranges is not None:

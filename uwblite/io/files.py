@@ -31,7 +31,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             yield stream
         return
     folder, name = os.path.split(target)
-    temporary = os.path.join(folder, f".{name[:100]}.{secrets.token_hex(4)}.part")
+    temporary = os.path.join(folder, f".{shortened(name)}.{secrets.token_hex(4)}.part")
     try:
         with open(temporary, "xb") as stream:
             if name.endswith(".gz"):
@@ -49,6 +49,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise
     if not waiting:
         sync_folder(folder)
+
+
+def shortened(name: str) -> str:
+    """Return the beginning of a file's name, so that a longer one made of it is no longer than file systems allow."""
+    return os.fsdecode(os.fsencode(name)[:100])
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:

@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .files import WAITING, sync_files, sync_folder, write_text
+from .files import WAITING, shortened, sync_files, sync_folder, write_text
+from .locks import one_at_a_time
 
 _READY = ".uwblite-ready"
 _LIST = "files"
@@ -38,9 +39,14 @@ def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Pat
     """
     folder = Path(os.path.realpath(path))
     folder.parent.mkdir(parents=True, exist_ok=True)
-    mend(folder, owned)
+    with one_at_a_time(folder):
+        yield from _replacing(folder, owned)
+
+
+def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:
+    _mend(folder, owned)
     beside = not folder.exists() or _may_change_places(folder, owned)
-    home, prefix = (folder.parent, f".{folder.name}{WAITING}") if beside else (folder, WAITING)
+    home, prefix = (folder.parent, f".{shortened(folder.name)}{WAITING}") if beside else (folder, WAITING)
     _clear(home, prefix)
     waiting = home / f"{prefix}{secrets.token_hex(4)}"
     waiting.mkdir()
@@ -51,9 +57,11 @@ def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Pat
             write_text(waiting / _LIST, "\n".join(sorted(p.name for p in waiting.iterdir())))
             sync_files(waiting)
             folder.mkdir(exist_ok=True)
+            # What a crash left of an earlier one, after its files had been moved.
+            shutil.rmtree(folder / _READY, ignore_errors=True)
             os.replace(waiting, folder / _READY)
             sync_folder(folder)
-            mend(folder, owned)
+            _mend(folder, owned)
     finally:
         shutil.rmtree(waiting, ignore_errors=True)
 
@@ -61,6 +69,13 @@ def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Pat
 def mend(path: str | os.PathLike[str], owned: Owned) -> bool:
     """Finish a replacement that was interrupted after all of its files were complete; return whether there was one."""
     folder = Path(os.path.realpath(path))
+    if not (folder / _READY / _LIST).is_file():
+        return False
+    with one_at_a_time(folder):
+        return _mend(folder, owned)
+
+
+def _mend(folder: Path, owned: Owned) -> bool:
     ready = folder / _READY
     if ready.is_symlink() or not (ready / _LIST).is_file():
         return False

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import ConfigError
 from ..sensor_log import SensorLog
+from .files import shortened
 from .optional_packages import missing_package
 from .ros_messages import BASE, ODOM, Messages, nanoseconds
 
@@ -68,7 +69,7 @@ def write_messages(
         raise ConfigError(f"{target} exists; choose another name or remove it")
     store = get_typestore(Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    waiting = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=target.absolute().parent))
+    waiting = Path(tempfile.mkdtemp(prefix=f".{shortened(target.name)}.partial-", dir=target.absolute().parent))
     try:
         with Writer(waiting / "bag", version=_FORMAT, storage_plugin=plugin) as writer:
             connections: dict[str, Any] = {}
