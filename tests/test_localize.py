@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import sys
 
 import numpy as np
 import pytest
@@ -111,7 +110,6 @@ def test_covariances_and_anchors_move_along(log, earlier):
 @pytest.mark.slow
 def test_another_drive_through_the_same_room(tmp_path):
     spec = importlib.util.spec_from_file_location("simulate", ROOT / "tools" / "simulate.py")
-    sys.path.insert(0, str(ROOT / "tools"))
     simulate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(simulate)
     for seed in (5, 6):

@@ -9,10 +9,8 @@ import threading
 import time
 
 import pytest
-from helpers.driver_harness import ROOT
-
-sys.path.insert(0, str(ROOT / "tools"))
 from compare_recording import compare
+from helpers.driver_harness import ROOT
 
 from uwblite.cli import main
 

@@ -1,14 +1,12 @@
 """What the driver tests share: feeding transcripts in every way, and sessions against emulators in simulated time."""
 
 import random
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "tools"))
+from uwblite.drivers.events import Corrupt, Reopen, Send
+from uwblite.drivers.session import Session
 
-from uwblite.drivers.events import Corrupt, Reopen, Send  # noqa: E402
-from uwblite.drivers.session import Session  # noqa: E402
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def feed_whole(make, data, stamp=1.0):

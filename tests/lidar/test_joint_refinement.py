@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import CORRIDOR, ROOM, chained, drifted, scanned, walked
 from helpers.planted import aligned_error, box
-from lidar.test_scan_matching import CORRIDOR, ROOM, scanned
-from loop_closure.test_verification import chained, drifted, walked
 
 from uwblite import se2
 from uwblite.graph.graph import Graph

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.planted import box, cast
+from helpers.laser_walks import CORRIDOR, ROOM, scanned
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
@@ -10,25 +10,8 @@ from scipy.spatial import cKDTree
 from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
-from uwblite.keyframes import ScanPoints
-from uwblite.lidar.clouds import CloudConfig, Clouds, build
+from uwblite.lidar.clouds import Clouds
 from uwblite.lidar.scan_matching import PairFactors, match, measured, pair_points, rasterize, trusted_step
-
-ROOM = np.concatenate([box(8, 6), [[1.0, -1.0, 1.0, 1.0], [1.0, 1.0, 2.0, 1.5]]])
-CORRIDOR = np.array([[-40.0, -1.0, 40.0, -1.0], [40.0, 1.0, -40.0, 1.0]])
-
-
-def scanned(poses, walls, noise=0.0, seed=0, beams=360, reach=8.0) -> Clouds:
-    """Return the clouds that a laser sees from poses (k, 3)."""
-    rng = np.random.default_rng(seed)
-    bearings = np.tile(np.linspace(-np.pi, np.pi, beams, endpoint=False), len(poses))
-    owner = np.repeat(np.arange(len(poses)), beams)
-    distance = cast(poses[owner], bearings, walls) + noise * rng.standard_normal(len(owner))
-    hit = np.isfinite(distance) & (distance < reach)
-    points = distance[hit, None] * np.column_stack([np.cos(bearings[hit]), np.sin(bearings[hit])])
-    nothing = np.zeros(hit.sum(), dtype=np.int64)
-    rays = ScanPoints(owner[hit], points, np.zeros_like(points), nothing, nothing)
-    return build(rays, len(poses), CloudConfig(voxel=0.02, normal_radius=0.3))
 
 
 def scattered(rng, counts) -> Clouds:

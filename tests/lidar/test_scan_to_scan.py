@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import HALL, chained, scanned, walked
 from helpers.planted import box
-from lidar.test_scan_matching import scanned
-from loop_closure.test_verification import HALL, chained, walked
 
 from uwblite import se2
 from uwblite.graph.graph import Graph

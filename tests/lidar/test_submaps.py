@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.laser_walks import ROOM, scanned
 from helpers.planted import box, wander
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidar.test_scan_matching import ROOM, scanned
 
 from uwblite import se2
 from uwblite.lidar.clouds import Clouds, in_map

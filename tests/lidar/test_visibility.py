@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from loop_closure.test_verification import walked
+from helpers.laser_walks import walked
 
 from uwblite import se2
 from uwblite.lidar.clouds import Clouds

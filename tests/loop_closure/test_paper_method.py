@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import scanned
 from helpers.planted import box, drive
-from lidar.test_scan_matching import scanned
 
 from uwblite import se2
 from uwblite.graph.graph import Graph

@@ -4,15 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted import box, chain, wander
-from lidar.test_scan_matching import scanned
+from helpers.laser_walks import drifted, scanned, walked
 from scipy.spatial import cKDTree
 
 from uwblite import se2
-from uwblite.graph.calibration import odometry_indices
-from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
-from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
+from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig, build
@@ -21,11 +18,6 @@ from uwblite.loop_closure.closures import Closures, LoopClosureConfig, merged, n
 from uwblite.loop_closure.verification import find, reconcile
 from uwblite.map_result import LoopClosure
 
-HALL = np.concatenate([
-    box(16, 12),
-    [[-3.0, -6.0, -3.0, -1.0], [2.0, 6.0, 2.0, 1.5], [4.0, -1.0, 6.5, -2.5], [-6.0, 2.0, -4.5, 4.0], [-5.5, -3.0, -5.0, -3.4]],
-])
-"""A hall whose corners and inner walls all look different."""
 PERIOD = 1.2
 TWINS = np.concatenate([
     [[-26.0, -2.0, 26.0, -2.0], [26.0, 2.0, -26.0, 2.0]],
@@ -34,31 +26,6 @@ TWINS = np.concatenate([
 """A corridor with equal pillars all along."""
 SOLVER, SEARCH = SolverConfig(), CorrelativeConfig()
 CONFIG = LoopClosureConfig()
-
-
-def chained(poses, noise) -> OdometryEdges:
-    """Return exact edges between consecutive poses, with standard deviations noise (3,) each."""
-    n = len(poses) - 1
-    motion = se2.between(poses[:-1], poses[1:])
-    root = np.tile(np.diag(1.0 / np.asarray(noise)), (n, 1, 1))
-    i = np.arange(n)
-    return OdometryEdges(i, i + 1, motion, motion[:, 0], np.ones(n), root, odometry_indices(Calibration(), n))
-
-
-def drifted(rng, truth, noise) -> Graph:
-    """Return the graph of a chain whose steps err by the noise that its edges state."""
-    steps = se2.between(truth[:-1], truth[1:])
-    poses = chain(truth[0], steps + rng.standard_normal(steps.shape) * noise)
-    return Graph(poses).with_edges(chained(poses, noise))
-
-
-def walked(seed, walls=HALL, metres=60.0, half_width=4.0, spacing=6, **settings):
-    """Return true key poses (k, 3), travelled distance and clouds of a walk through walls with lidar noise of 1 cm."""
-    rng = np.random.default_rng(seed)
-    _, truth = wander(rng, metres, half_width=half_width, **settings)
-    truth = truth[::spacing]
-    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
-    return truth, path, scanned(truth, walls, 0.01, seed, beams=300, reach=5.6)
 
 
 NOISE = np.array([0.01, 0.005, 0.006])
