@@ -52,6 +52,18 @@ def test_keyframes_are_spaced_by_distance_and_angle(seed):
     np.testing.assert_allclose(frames.duration, np.diff(frames.stamps))
 
 
+@pytest.mark.parametrize("steps", [1.0, 1.2, 1.45, 1.55, 1.95, 2.2, 2.7, 7.3, 7.6])
+@pytest.mark.parametrize("turning", [False, True])
+def test_a_rest_of_less_than_half_a_step_joins_the_last_one(steps, turning):
+    config = KeyframeConfig(distance=0.5, angle=0.5)
+    stamps, truth = drive([(0.0, 0.0, 0.1) if turning else (0.1, 0.0, 0.0)], [5.0 * steps], rate=50.0)
+    frames = select(Odometry(stamps, truth), config)
+    gaps = (frames.turned if turning else frames.path) / 0.5
+    assert len(gaps) == round(steps)
+    np.testing.assert_allclose(gaps[:-1], 1.0, atol=0.01)
+    assert 0.5 - 0.01 <= gaps[-1] <= 1.5 + 0.01
+
+
 def test_length_is_signed_and_path_is_not():
     stamps, truth = drive([(0.5, 0, 0), (-0.5, 0, 0)], [2.0, 2.0])
     frames = select(Odometry(stamps, truth), KeyframeConfig(distance=0.25))
@@ -237,6 +249,20 @@ def test_dense_trajectory_holds_its_ends_and_serves_a_single_keyframe():
     np.testing.assert_allclose(ends, truth[[0, -1]], atol=1e-9)
     alone = Odometry(stamps[:1], truth[:1])
     np.testing.assert_allclose(dense_trajectory(alone, select(alone, CONFIG), np.array([[1.0, 2.0, 3.0]])), [[1.0, 2.0, 3.0]])
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3])
+def test_dense_trajectory_of_a_few_samples_is_what_they_are(samples):
+    wheels = Odometry(np.arange(samples) * 1.0, np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.2], [2.0, 0.5, 0.3]])[:samples])
+    frames = select(wheels, KeyframeConfig(distance=10.0, angle=10.0))
+    assert len(frames) == min(samples, 2)
+    shift = np.array([3.0, -1.0, 2.0])
+    expected = se2.compose(shift, wheels.poses)
+    poses = se2.compose(shift, frames.odometry)
+    np.testing.assert_allclose(dense_trajectory(wheels, frames, poses), expected, atol=1e-12)
+    at = np.array([-9.0, 0.0, 0.5, 99.0])
+    held = se2.interpolate_trajectory(wheels.stamps, expected, at)
+    np.testing.assert_allclose(dense_trajectory(wheels, frames, poses, at), held, atol=1e-12)
 
 
 def test_equal_stamps_do_no_harm():

@@ -195,3 +195,32 @@ def test_functions_broadcast_over_leading_axes():
     assert se2.exp(a).shape == se2.log(a).shape == se2.inverse(a).shape == (4, 1, 3)
     assert se2.transform(a, b[:, :2]).shape == (4, 5, 2)
     assert se2.between_jacobians(a, b)[1].shape == (4, 5, 3, 3)
+
+
+@given(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3.1, 3.1))
+def test_alignment_undoes_any_rigid_motion(x, y, theta):
+    points = np.random.default_rng(0).normal(scale=5.0, size=(50, 2))
+    moved = se2.transform(np.array([x, y, theta]), points)
+    np.testing.assert_allclose(se2.transform(se2.align(points, moved), points), moved, atol=1e-9)
+
+
+def test_alignment_is_the_least_squares_one():
+    rng = np.random.default_rng(1)
+    source, target = rng.normal(size=(2, 30, 2))
+    best = se2.align(source, target)
+
+    def cost(motion):
+        return np.sum((se2.transform(motion, source) - target) ** 2)
+
+    for k in range(3):
+        for step in (-1e-3, 1e-3):
+            nudge = np.zeros(3)
+            nudge[k] = step
+            assert cost(best + nudge) > cost(best)
+
+
+def test_a_bearing_is_the_angle_of_each_vector():
+    angle = np.linspace(-3.1, 3.1, 24).reshape(2, 3, 4)
+    vectors = np.stack([2.0 * np.cos(angle), 2.0 * np.sin(angle)], axis=-1)
+    np.testing.assert_allclose(se2.bearing(vectors), angle, atol=1e-12)
+    assert se2.bearing([-1.0, 0.0]) == np.pi

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory, statistics, stretches
-from uwblite.se2 import align
 
 
 def a_drive(n=400, seed=0):
@@ -21,29 +19,6 @@ def a_drive(n=400, seed=0):
 
 
 finite = st.floats(-50, 50)
-
-
-@given(finite, finite, st.floats(-3.1, 3.1))
-def test_alignment_undoes_any_rigid_motion(x, y, theta):
-    _, poses = a_drive(50)
-    moved = se2.transform(np.array([x, y, theta]), poses[:, :2])
-    found = align(poses[:, :2], moved)
-    np.testing.assert_allclose(se2.transform(found, poses[:, :2]), moved, atol=1e-9)
-
-
-def test_alignment_is_the_least_squares_one():
-    rng = np.random.default_rng(1)
-    source, target = rng.normal(size=(2, 30, 2))
-    best = align(source, target)
-
-    def cost(motion):
-        return np.sum((se2.transform(motion, source) - target) ** 2)
-
-    for k in range(3):
-        for step in (-1e-3, 1e-3):
-            nudge = np.zeros(3)
-            nudge[k] = step
-            assert cost(best + nudge) > cost(best)
 
 
 def test_statistics_of_known_errors():

@@ -49,13 +49,27 @@ def test_jacobians_equal_differences(kind, seed, calibrated):
     assert_jacobians_equal_differences(graph, kinds[kind])
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_are_some_of_the_edges_of_the_same_kind(kind):
+    graph, kinds = every_kind(11)
+    whole = replace(kinds[kind], kernel=Kernel("cauchy", 2.0), weights=np.linspace(0.1, 1.0, 8))
+    if not hasattr(whole, "rows"):
+        pytest.skip("nobody picks edges of this kind")
+    for which in (np.array([5, 2, 2]), np.array([], dtype=int), np.arange(8)):
+        some = whole.rows(which)
+        assert (type(some), some.kernel, len(some)) == (type(whole), whole.kernel, len(which))
+        np.testing.assert_array_equal(some.residuals(graph), whole.residuals(graph)[which])
+        np.testing.assert_array_equal(some.weights, whole.weights[which])
+
+
 @pytest.mark.parametrize("free", list(itertools.product([False, True], repeat=4)))
 def test_scan_jacobians_equal_differences_whatever_of_mounting_and_delay_is_free(free):
     graph, kinds = every_kind(9)
-    edges = replace(kinds["scan"], calibration=np.where(free, np.arange(4, 8), -1))
-    assert_jacobians_equal_differences(graph, edges)
-    named = [index[0] for block, index, _ in edges.linearize(graph).blocks if block == "calibration"]
-    assert named == [4 + k for k in range(4) if free[k]]
+    for first in (0, 4):
+        edges = replace(kinds["scan"], calibration=np.where(free, first + np.arange(4), -1))
+        assert_jacobians_equal_differences(graph, edges)
+        named = [index[0] for block, index, _ in edges.linearize(graph).blocks if block == "calibration"]
+        assert named == [first + k for k in range(4) if free[k]]
 
 
 @pytest.mark.parametrize(("scale", "turn"), [(-0.95, 0.2), (-1.5, 0.2), (0.3, -0.97), (-0.99, -2.0), (-0.85, -0.85)])

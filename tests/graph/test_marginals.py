@@ -6,7 +6,7 @@ from helpers.planted_graphs import dense_system, loop, relative_edges
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, PriorEdges
-from uwblite.graph.marginals import JointCovariance, marginals
+from uwblite.graph.marginals import JointCovariance, calibration_covariance, marginals
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import optimize
 
@@ -40,6 +40,14 @@ def test_marginals_are_blocks_of_the_dense_inverse(n):
         np.testing.assert_allclose(found.anchors[a], covariance("anchors", a, "anchors", a), rtol=1e-6)
     sigmas = [np.sqrt(covariance("calibration", c, "calibration", c)[0, 0]) for c in range(2)]
     np.testing.assert_allclose(found.calibration, sigmas, rtol=1e-6)
+
+
+@pytest.mark.parametrize("fixed", [None, [False, True], [True, False], [True, True]])
+def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(fixed):
+    graph = replace(calibrated()[0], fixed_calibration=None if fixed is None else np.array(fixed))
+    covariance = dense_covariance(graph)
+    expected = np.block([[covariance("calibration", a, "calibration", b) for b in (0, 1)] for a in (0, 1)])
+    np.testing.assert_allclose(calibration_covariance(graph), expected, rtol=1e-6, atol=1e-15)
 
 
 def test_held_unknowns_have_no_covariance():

@@ -3,6 +3,7 @@
 import numpy as np
 
 from uwblite import se2
+from uwblite.graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from uwblite.graph.graph import Calibration, Graph, PriorEdges
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
@@ -55,6 +56,10 @@ def every_kind(seed, calibrated=True, edges=8):
         "prior on poses": PriorEdges("poses", i, poses, L),
         "prior on anchors": PriorEdges("anchors", rng.integers(0, a, e), rng.normal(size=(e, 2)), rng.normal(size=(e, 2, 2))),
         "prior on calibration": PriorEdges("calibration", i, rng.normal(size=(e, 1)), rng.uniform(size=(e, 1, 1))),
+        "distance of anchors": AnchorDistanceEdges(i % a, (i + 1) % a, rng.uniform(1.0, 4.0, e), rng.uniform(0.1, 1.0, e)),
+        "distance of points": PointDistanceEdges(
+            i, j, *rng.normal(size=(2, e, 2)), rng.uniform(1.0, 4.0, e), rng.uniform(0.1, 1.0, e)
+        ),
     }
     return graph, kinds
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import exponnorm, norm
 
-from uwblite.radio.nlos_mixture import RangeMixture, fit, shortest_half
+from uwblite.radio.nlos_mixture import RangeMixture, _mean_detour, fit, shortest_half
 
 shapes = st.builds(
     RangeMixture,
@@ -40,6 +40,18 @@ def test_the_probability_of_the_core_is_bayes(mixture):
     total = density(mixture, errors)
     seen = total > 1e-200
     np.testing.assert_allclose(mixture.core(errors)[seen], (core / np.where(seen, total, 1.0))[seen], rtol=1e-6, atol=1e-9)
+
+
+@given(st.floats(0.02, 0.5), st.floats(0.1, 5.0), st.floats(-6.0, 30.0))
+def test_the_expected_detour_of_a_late_range_is_the_mean_over_all_detours(sigma, detour, error):
+    """By the trapezoid over detours d: exp(-d / detour) times the core's density at what is left of the error."""
+    off = error * sigma
+    grid = np.linspace(0.0, max(off, 0.0) + 12.0 * sigma, 40001)
+    log_weight = -grid / detour - 0.5 * ((off - grid) / sigma) ** 2
+    weight = np.exp(log_weight - log_weight.max())
+    expected = np.sum(weight * grid) / np.sum(weight)
+    # The sum's step is sigma / 950 at most; half a step is how far its first cell errs.
+    assert _mean_detour(np.array([off]), sigma, detour)[0] == pytest.approx(expected, rel=5e-3, abs=2e-3 * sigma)
 
 
 @given(shapes)

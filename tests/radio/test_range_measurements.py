@@ -1,27 +1,19 @@
-"""From keyframes to edges: noise that grows as stated, ranges tied to the right unknowns, noise learnt per anchor."""
+"""From keyframes to edges of ranges: tied to the right unknowns, noise estimated per anchor."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted import odometry, ranges, wander
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from helpers.planted import ranges, wander
 
 from uwblite import se2
-from uwblite.graph.calibration import CalibrationConfig, block, unknowns
 from uwblite.graph.graph import Calibration, Graph
-from uwblite.graph.pose_edges import RelativePoseEdges
-from uwblite.graph.robust import SQUARED
-from uwblite.graph.solver import optimize
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
 from uwblite.radio.range_measurements import learn_noise, range_edges, relocate, tag_positions
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
-from uwblite.wheels import OdometryNoiseConfig, learn_wheels, wheel_edges
 
-NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
 MOUNTING = SensorMounting(tag_position=np.array([0.2, -0.1, 0.4]), anchor_height=2.4)
 
 
@@ -36,35 +28,6 @@ def world(seed, metres=40.0, anchors=3, **settings):
     attached = attach_ranges(radio, wheels, frames, MOUNTING)
     edges = range_edges(attached, 0, radio.anchor_ids, MOUNTING, Calibration(), 0.3, TrilaterationConfig())
     return stamps, truth, frames, places, radio, edges
-
-
-def test_wheel_edges_hold_the_chain_and_name_the_calibration():
-    rng = np.random.default_rng(0)
-    stamps, truth = wander(rng, 20.0)
-    frames = select(odometry(stamps, truth, rng, noise=0.02), KeyframeConfig())
-    calibration = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
-    edges = wheel_edges(frames, 7, NOISE, calibration)
-    assert edges.i.tolist() == list(range(7, 7 + len(frames) - 1))
-    np.testing.assert_array_equal(edges.j, edges.i + 1)
-    graph = Graph(np.concatenate([np.zeros((7, 3)), frames.odometry]), calibration=calibration)
-    np.testing.assert_allclose(edges.residuals(graph), 0.0, atol=1e-8)
-    assert edges.calibration.shape == (len(edges), 4)
-
-
-@settings(max_examples=30)
-@given(st.integers(0, 1000))
-def test_the_wheels_variance_adds_up_along_the_way(seed):
-    """Variances of stretches add to that of the whole but for the standing part: cutting the way otherwise changes nothing."""
-    rng = np.random.default_rng(seed)
-    stamps, truth = wander(rng, 12.0)
-    wheels = Odometry(stamps, truth)
-    totals = []
-    for distance in (0.2, 0.5):
-        edges = wheel_edges(select(wheels, KeyframeConfig(distance=distance)), 0, NOISE, Calibration())
-        variance = 1.0 / np.einsum("eii->ei", edges.sqrt_information) ** 2
-        totals.append((variance - NOISE.standing**2).sum(axis=0))
-    np.testing.assert_allclose(totals[0], totals[1], rtol=1e-6)
-    assert totals[0][0] == pytest.approx(NOISE.distance**2 * 12.0, rel=1e-3)
 
 
 def test_range_edges_say_the_slant_distance_of_tag_and_anchor():
@@ -125,44 +88,6 @@ def test_an_anchor_with_hardly_any_range_keeps_the_assumption():
     assert noises[1].sigma == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize(("position", "heading"), [(3.0, 0.8), (1.0, 5.0), (100.0, 1.0)])
-def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
-    """Wheels that err so many times as much as stated; most steps are measured, exactly, and some of those are lies."""
-    rng = np.random.default_rng(1)
-    stamps, truth = wander(rng, 300.0)
-    frames = select(Odometry(stamps, truth), KeyframeConfig())
-    exact = wheel_edges(frames, 0, NOISE, Calibration())
-    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
-    wrong = se2.compose(exact.motion, rng.standard_normal((len(exact), 3)) * sigma * [position, position, heading])
-    wheels, graph = replace(exact, motion=wrong), Graph(frames.odometry)
-    some = np.sort(rng.permutation(len(exact))[: len(exact) // 2])
-    said = exact.motion[some] + (rng.random(len(some)) < 0.1)[:, None] * np.array([0.5, 0.5, 0.3])
-    steps = RelativePoseEdges(some, some + 1, said, np.tile(np.eye(3), (len(some), 1, 1)))
-    learnt = learn_wheels(wheels, steps, graph)
-    factor = np.einsum("eii->ei", exact.sqrt_information / learnt.sqrt_information.clip(1e-12))
-    # Medians of 500 steps are known to 5 %; a tenth of lies moves them by 12 %.
-    assert np.median(factor[:, 0]) == pytest.approx(np.clip(position, 0.5, 10.0), rel=0.3)
-    assert np.median(factor[:, 2]) == pytest.approx(np.clip(heading, 0.5, 10.0), rel=0.3)
-    few = RelativePoseEdges(some[:5], some[:5] + 1, said[:5], steps.sqrt_information[:5])
-    assert learn_wheels(wheels, few, graph) is wheels
-
-
-def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
-    """Steps in a corridor repeat the wheels' own word along it; across and in heading the wheels err four times as much."""
-    rng = np.random.default_rng(2)
-    stamps, truth = wander(rng, 300.0)
-    frames = select(Odometry(stamps, truth), KeyframeConfig())
-    exact = wheel_edges(frames, 0, NOISE, Calibration())
-    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
-    off = rng.standard_normal((len(exact), 3)) * sigma * 4.0
-    wheels = replace(exact, motion=se2.compose(exact.motion, off))
-    said = se2.compose(wheels.motion, np.column_stack([np.zeros(len(off)), se2.inverse(off)[:, 1:]]))
-    blind = np.tile(np.diag([0.0, 100.0, 100.0]), (len(exact), 1, 1))
-    learnt = learn_wheels(wheels, RelativePoseEdges(exact.i, exact.j, said, blind), Graph(frames.odometry))
-    factor = np.einsum("eii->ei", exact.sqrt_information)[0] / np.einsum("eii->ei", learnt.sqrt_information)[0]
-    assert factor == pytest.approx([1.0, 4.0, 4.0], rel=0.2)
-
-
 def test_a_range_is_an_outlier_by_what_one_range_scatters():
     """A hundred alike ranges weigh little each, yet one that is 10 sigma off hardly pulls."""
     rng = np.random.default_rng(6)
@@ -192,27 +117,6 @@ def test_late_ranges_pull_less_than_early_ones():
     assert abs(mean) < 0.03 < np.median(off) + 0.01 < np.mean(off)
     plain, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig(learn=False))
     assert plain.weights @ off / plain.weights.sum() > 0.1
-
-
-@pytest.mark.parametrize("calibration", [(0.04, 0.06), (-0.05, -0.3)])
-def test_noise_does_not_draw_the_wheels_scale(calibration):
-    """Errors in variables: the noise of a step is as large as the step. Fitted to the true poses, scale and turn come out
-    within four standard deviations of what was planted, sigma / sqrt(sum of squared steps)."""
-    scale, turn = calibration
-    rng = np.random.default_rng(8)
-    stamps, truth = wander(rng, 600.0)
-    frames = select(Odometry(stamps, truth), KeyframeConfig())
-    names = unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool))
-    exact = wheel_edges(frames, 0, OdometryNoiseConfig(distance=0.3, heading_per_metre=0.5), block(names))
-    sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
-    noise = rng.standard_normal((len(exact), 3)) * sigma
-    wheels = replace(exact, motion=exact.motion / [1 + scale, 1 + scale, 1 + turn] + noise)
-    graph = Graph(truth[frames.index], calibration=block(names), fixed_poses=np.ones(len(frames), dtype=bool))
-    held = np.array([n not in ("odometry_scale", "heading_scale") for n in graph.calibration.names])
-    solved, _ = optimize(replace(graph, fixed_calibration=held).with_edges(replace(wheels, kernel=SQUARED)))
-    reach = sigma[0] / np.sqrt((wheels.motion**2).sum(axis=0))
-    assert solved.calibration.get("odometry_scale") == pytest.approx(scale, abs=4 * reach[0])
-    assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])
 
 
 def test_an_anchor_in_the_wrong_place_goes_where_its_ranges_agree_and_others_stay():

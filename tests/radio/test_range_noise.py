@@ -34,7 +34,10 @@ def test_the_assumption_has_the_stated_variance_and_share():
     assert noise.length == CONFIG.correlation_length
 
 
-@pytest.mark.parametrize(("white", "slow", "length"), [(0.03, 0.08, 1.5), (0.10, 0.10, 1.0), (0.08, 0.03, 2.0)])
+SPLITS = [(0.03, 0.08, 1.5), (0.10, 0.10, 1.0), (0.08, 0.03, 2.0), (0.02, 0.10, 0.5)]
+
+
+@pytest.mark.parametrize(("white", "slow", "length"), SPLITS)
 def test_white_and_slow_part_are_recovered(white, slow, length):
     """Mean of six draws in 30 x 30 m.
 
