@@ -289,3 +289,136 @@ def test_tag_that_restarts_in_mid_run_comes_back():
     session.feed = scripted
     actions, _ = simulate(session, device, 30.0)
     assert of_kind(actions, RangeEpoch)[-1].stamp > START + 29
+
+
+# ---- what field reports and other people's fakes have shown
+
+
+@pytest.mark.parametrize("before", [b"AT", b"TM0\n", b"AT+GCAP\r2", b"2\x00", b"MD00440", b"\x00\xff~x"], ids=repr)
+def test_lidar_is_asked_everything_whatever_stood_in_its_input_line(before):
+    """ModemManager's AT, a tag's probe, a time-adjust mode: geometry, name and latency are still asked for."""
+    device, sent = lidar(ScipOptions(product=("UST-30LC", "Smart-URG UST-30LC")))
+    power_up = device.power_up
+    device.power_up = lambda now: (power_up(now), device.receive(before, now))
+    driver = ScipDriver()
+    actions, reopens = simulate(driver, device, 4.5)
+    assert not reopens
+    assert driver.geometry.model == "UST-30LC"
+    assert "UST-30LC" in driver.identity().title
+    assert {p.name for p in of_kind(actions, Param)} == {"laser_product", "laser_firmware", "laser_serial"}
+    scans = of_kind(actions, LaserScan)
+    assert len(scans) > 25
+    truth = {tuple(v): t for t, v in sent}
+    for scan in scans:
+        assert scan.stamp == pytest.approx(truth[tuple(round(1000 * r) for r in scan.ranges)], abs=0.002)
+
+
+def test_lidar_with_a_fault_is_not_called_well():
+    device, _ = lidar()
+    device.fault = 70
+    driver = ScipDriver(stream=False)
+    simulate(driver, device, 3.0)
+    assert driver.ready
+    assert [(note.level, "70" in note.text) for note in driver.identity().findings if note.name == "lidar-state"] == [
+        ("error", True)
+    ]
+
+
+def test_lidar_clock_that_is_reset_in_mid_stream_keeps_its_latency():
+    """The counter starts at 0 again after 20 s; the delay of the frames, 101.5 ms, was measured before."""
+    device, sent = lidar()
+    device_ms = device.device_ms
+    device.device_ms = lambda now: device_ms(now) if now < START + 20 else int(1000 * (now - START - 20))
+    actions, _ = simulate(ScipDriver(), device, 60.0)
+    assert "lidar-clock-reset" in names(actions)
+    scans, truth = of_kind(actions, LaserScan), {}
+    for true, values in sent:
+        truth.setdefault(tuple(values), []).append(true)
+    errors = [min(abs(scan.stamp - t) for t in truth[tuple(round(1000 * r) for r in scan.ranges)]) for scan in scans]
+    assert len(scans) > 560
+    assert max(errors) < 0.002
+
+
+def test_lidar_that_gives_no_time_is_late_by_no_more_than_a_turn_is_long():
+    """Without TM the delay cannot be measured: the nominal one is that of the timed capture of a real unit."""
+    device, sent = lidar()
+    device._do_TM = lambda line, rest, now: device._block(line, "0E")
+    actions, _ = simulate(ScipDriver(), device, 5.0)
+    truth = {tuple(v): t for t, v in sent}
+    for scan in of_kind(actions, LaserScan):
+        assert scan.stamp == pytest.approx(truth[tuple(round(1000 * r) for r in scan.ranges)], abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("rates", "expected"),
+    [
+        ((19200, 57600, 115200, 250000, 500000, 750000), (9.9, 1.0)),
+        ((19200, 57600, 115200), (5.0, 0.5)),
+        ((19200,), (1.2, 0.125)),
+    ],
+)
+def test_lidar_on_a_slow_line_is_made_faster_or_asked_for_fewer_scans(rates, expected):
+    """RS-232 at 19200 bit/s carries 0.8 scans a second. What is left out is said; nothing that was sent is lost."""
+    device, sent = lidar(ScipOptions(serial=True, rates=rates))
+    driver = ScipDriver()
+    actions, reopens = simulate(driver, device, 60.0)
+    scans = of_kind(actions, LaserScan)
+    assert not reopens
+    assert len(scans) / 60 > 0.85 * expected[0]
+    assert ("lidar-slow-line" in names(actions)) == (expected[1] < 1)
+    settled = [scan for when, scan in actions if isinstance(scan, LaserScan) and when > START + 20]
+    lost = sum(a.count for when, a in actions if isinstance(a, Lost) and when > START + 20)
+    assert lost == 0
+    assert len(settled) == pytest.approx(400 * expected[1], rel=0.12)
+    truth = {}
+    for true, values in sent:
+        truth.setdefault(tuple(v if v < 4095 or rates[1:] else 5600 for v in values), []).append(true)
+    for scan in settled:
+        key = tuple(5600 if math.isinf(r) else round(1000 * r) for r in scan.ranges)
+        # An answer to TM1 takes 8 ms at 19200 bit/s: the clock is known to half of that.
+        assert min(abs(scan.stamp - t) for t in truth[key]) < (0.003 if rates[1:] else 0.0045)
+
+
+def test_lidar_scans_that_a_restart_cost_are_counted():
+    device, _ = lidar()
+    advance = device.advance
+
+    def scripted(now):
+        device.hung = 10 < now - START < 12
+        return advance(now)
+
+    device.advance = scripted
+    actions, _ = simulate(ScipDriver(), device, 30.0)
+    assert "lidar-restart" in names(actions)
+    stamps = [scan.stamp for scan in of_kind(actions, LaserScan)]
+    assert sum(a.count for a in of_kind(actions, Lost)) == round((stamps[-1] - stamps[0]) / 0.1) + 1 - len(stamps)
+    assert len(stamps) < 280
+
+
+def test_tag_with_status_bits_that_the_guide_does_not_name():
+    device, sent = tag(DwmOptions(status_bits=16 | 0x0200))
+    actions, reopens = simulate(Dwm1001Driver(), device, 20.0)
+    assert not reopens
+    check_ranges(actions, sent, 1, 0.005)
+
+
+@pytest.mark.parametrize(
+    ("latency", "tick", "spread"), [(0.0008, 0.0, 0.005), (0.002, 0.016, 0.018), (0.018, 0.0, 0.024), (0.050, 0.0, 0.055)]
+)
+def test_tag_on_a_slow_link_is_stamped_within_what_is_stated(latency, tick, spread):
+    """FTDI adapters deliver every 16 ms; a bridge in a network takes 18 or 50 ms. No fix vanishes without being counted."""
+    device, sent = tag()
+    actions, reopens = simulate(Dwm1001Driver(), device, 60.0, latency=latency, tick=tick)
+    assert not reopens
+    fixes = {tuple((f"{a:04X}", d) for a, d, _ in readings): t for t, readings in sent}
+    epochs = of_kind(actions, RangeEpoch)
+    errors = []
+    for epoch in epochs:
+        true = fixes.pop(tuple((r.anchor_id, round(1000 * r.range)) for r in epoch.readings))
+        errors.append(abs(epoch.stamp - true))
+        assert errors[-1] <= epoch.spread + 1e-9
+    assert sorted(e.spread for e in epochs)[int(0.95 * len(epochs))] < spread
+    lost = sum(a.count for a in of_kind(actions, Lost))
+    begun = sum(t >= epochs[0].stamp - 0.05 for t, _ in sent)
+    assert len(epochs) + lost == pytest.approx(begun, abs=2)
+    assert len(epochs) > 0.97 * begun

@@ -68,6 +68,8 @@ class DwmOptions:
     """The module is an anchor, not a tag."""
     without_position: bool = False
     """Leave the position block out of loc_get."""
+    status_bits: int = 0
+    """Further bits of the status word, for example 16 for API_STATUS_FLAG_BH_INITIALIZED."""
     update: list[int] = field(default_factory=lambda: [1, 1])
     """Normal and stationary period in 0.1 s."""
 
@@ -98,7 +100,7 @@ class DwmDevice:
         self._power = now
         self._shell = self.options.shell or bool(self.options.stream)
         self._stream = self.options.stream
-        self._line, self._repeat = "", ""
+        self._line, self._repeat, self._after_return = "", "", False
         self._request, self._last_byte = bytearray(), now
         self._cr_at = -math.inf
         self._fix: Epoch | None = None
@@ -221,7 +223,7 @@ class DwmDevice:
 
     def _status(self) -> bytes:
         self.asked = True
-        bits = int(self._ready) | (2 if self.options.joined else 0)
+        bits = int(self._ready) | (2 if self.options.joined else 0) | self.options.status_bits
         self._ready = False
         return b"\x5a\x02" + struct.pack("<H", bits)
 
@@ -238,12 +240,13 @@ class DwmDevice:
     # ---- shell
 
     def _shell_byte(self, byte: int, now: float) -> bytes:
-        if byte == 0x0D:
+        after_return, self._after_return = self._after_return, byte == 0x0D
+        if byte == 0x0D or (byte == 0x0A and not after_return):
             line, self._line = self._line.strip() or self._repeat, ""
             self._repeat = line
             return b"\r\n" + self._run(line, now).encode()
         if byte == 0x0A:
-            return b""
+            return b""  # the second half of CR LF
         if byte in (0x08, 0x7F):
             self._line = self._line[:-1]
             return b"\b \b"

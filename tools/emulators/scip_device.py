@@ -8,6 +8,10 @@ from dataclasses import dataclass, field
 from .world import FIRST_STEP, LAST_STEP, STEPS, Feed, Scan, WorldClock
 
 STEP_TIME = 0.1 / 1024
+TURN = 0.1
+LATENCY = 0.0015
+"""s between the end of a turn and the first byte of its scan: a real URG-04LX (firmware 3.1.04) answers 101 ms and more
+after a scan's stamp."""
 LAST_ACCEPTED = 768
 
 
@@ -59,6 +63,12 @@ class ScipOptions:
     """Share of scans sent twice."""
     random: object = None
     """random.Random for the two shares."""
+    serial: bool = False
+    """It hangs on RS-232: bytes take their time, scans that do not fit are left out, and the host's bit rate must fit."""
+    rates: tuple[int, ...] = (19200, 57600, 115200, 250000, 500000, 750000)
+    """bit/s that SS grants."""
+    product: tuple[str, str] = ("URG-04LX", "SOKUIKI Sensor URG-04LX")
+    """Names in PP and VV."""
 
 
 @dataclass
@@ -105,6 +115,9 @@ class ScipDevice:
         self._stream: Stream | None = None
         self._fault_told, self._last_command = None, b""
         self._speed_set, self._sensitive, self._rate = "00", False, 19200
+        self.host_rate = 19200 if self.options.serial else None
+        """bit/s that the host has set; None = it does not matter (USB)."""
+        self._busy_until = now
         self.hung = False
         if self.options.streaming:
             self._laser, self._scip1 = True, False
@@ -126,11 +139,12 @@ class ScipDevice:
         """Return when `advance` has something to do, host s."""
         if self._feed.head is None:
             return math.inf
-        return self._clock.host(self._feed.head.time) + self._sweep()
+        return self._clock.host(self._feed.head.time) + TURN + LATENCY
 
-    def _sweep(self) -> float:
-        end = self._stream.end if self._stream else LAST_STEP
-        return (min(end, LAST_STEP) - FIRST_STEP + 1) * STEP_TIME
+    @property
+    def rate(self) -> int | None:
+        """Return the speed of its line, bit/s; None = that of USB."""
+        return self._rate if self.options.serial else None
 
     def advance(self, now: float) -> bytes:
         """Return what the unit sends by itself up to host time `now`."""
@@ -138,10 +152,13 @@ class ScipDevice:
         while self._feed.head is not None and self.next_time(now) <= now:
             self._latest = self._feed.pop()
             if self._stream is not None and not self.hung:
-                out += self._stream_scan(self._latest)
-        return out
+                out += self._stream_scan(self._latest, now)
+        return out if self._understood() else b""
 
-    def _stream_scan(self, scan: Scan) -> bytes:
+    def _understood(self) -> bool:
+        return not self.options.serial or self.host_rate == self._rate
+
+    def _stream_scan(self, scan: Scan, now: float) -> bytes:
         stream = self._stream
         assert stream is not None
         if self.fault is not None:
@@ -158,6 +175,8 @@ class ScipDevice:
             stream.skipped += 1
             return b""
         stream.skipped = 0
+        if now < self._busy_until:
+            return b""  # the line is still busy with the scan before
         remaining = 0
         if stream.remaining is not None:
             stream.remaining -= 1
@@ -166,6 +185,7 @@ class ScipDevice:
         frame = self._scan_block(echo, "99", scan, stream.start, stream.end, stream.cluster, stream.wide)
         if stream.remaining == 0:
             self._stream, self._laser = None, False
+        self._busy_until = now + 10 * len(frame) / self._rate if self.options.serial else now
         return frame
 
     def _scan_block(self, echo: bytes, status: str, scan: Scan, start: int, end: int, cluster: int, wide: bool) -> bytes:
@@ -196,7 +216,7 @@ class ScipDevice:
 
     def receive(self, data: bytes, now: float) -> bytes:
         """Take bytes from the host and return the answer."""
-        if self.hung:
+        if self.hung or not self._understood():
             return b""
         out = b""
         self._last_command = b""
@@ -260,15 +280,18 @@ class ScipDevice:
         return reply if not rest else self._block(line, "0E")
 
     def _do_VV(self, line: bytes, rest: str, now: float) -> bytes:
-        return self._plain(line, rest, self._block(line, "00", text_lines(VERSION)))
+        version = [(key, self.options.product[1] if key == "PROD" else value) for key, value in VERSION]
+        return self._plain(line, rest, self._block(line, "00", text_lines(version)))
 
     def _do_PP(self, line: bytes, rest: str, now: float) -> bytes:
-        return self._plain(line, rest, self._block(line, "00", text_lines(PARAMETERS)))
+        model = f"{self.options.product[0]}(Hokuyo Automatic Co.,Ltd.)"
+        parameters = [(key, model if key == "MODL" else value) for key, value in PARAMETERS]
+        return self._plain(line, rest, self._block(line, "00", text_lines(parameters)))
 
     def _do_II(self, line: bytes, rest: str, now: float) -> bytes:
         healthy = self.fault is None or self.fault < 50
         state = text_lines([
-            ("MODL", "URG-04LX(Hokuyo Automatic Co.,Ltd.)"), ("LASR", "ON" if self._laser else "OFF"),
+            ("MODL", f"{self.options.product[0]}(Hokuyo Automatic Co.,Ltd.)"), ("LASR", "ON" if self._laser else "OFF"),
             ("SCSP", "Initial(600[rpm])<-Default setting by user"), ("MESM", "MEASURE" if self._stream else "IDLE"),
             ("SBPS", f"{self._rate}[bps]<-Default setting by user"), ("TIME", f"{self.device_ms(now):06X}"),
             ("STAT", "Sensor works well." if healthy else f"Sensor fault {self.fault}."),
@@ -315,10 +338,10 @@ class ScipDevice:
         if not re.fullmatch(r"\d{6}", rest):
             return self._block(line, "01" if len(rest) == 6 else "0C")
         rate = int(rest)
-        if rate not in (19200, 57600, 115200, 250000, 500000, 750000):
+        if rate not in self.options.rates:
             return self._block(line, "02")
         status, self._rate = "03" if rate == self._rate else "00", rate
-        return self._block(line, status)
+        return self._block(line, status)  # at the old rate: the line has passed it on before the new one counts
 
     def _do_CR(self, line: bytes, rest: str, now: float) -> bytes:
         if not re.fullmatch(r"\d\d", rest):
@@ -353,6 +376,7 @@ class ScipDevice:
             return self._block(line, steps)
         if not self._laser:
             return self._block(line, "10")
+        self._latest = self._latest or self._feed.head
         if self._latest is None:
             return self._block(line, "0A")
         return self._scan_block(line, "00", self._latest, *steps, wide=line[1:2] == b"D")

@@ -181,7 +181,9 @@ class DeviceClock:
         self._last: float | None = None
         self._arrival = 0.0
         self._steps: deque[float] = deque(maxlen=25)
+        self._half = tick / 2
         self._tie: tuple[float, float] | None = None
+        """s, between which host time minus device time lies."""
         self._learn_until: float | None = None
         self._windows: list[tuple[float, float]] = []
         self._witnesses = 0
@@ -189,15 +191,15 @@ class DeviceClock:
     def tie(self, count: float, sent: float, answered: float) -> None:
         """Take a reading of the clock that the host asked for at `sent` and got at `answered`, s.
 
-        The reading was made in between; of several the one with the shortest round trip counts. The delay of the frames
-        that follow is measured with it.
+        The reading was made in between, and several narrow that down. The delay of the frames that follow is measured
+        with it.
         """
         device, reset = self._unwrapper.unwrap(count, answered)
         if reset:
             self._begin_anew()
-        trip, offset = answered - sent, (sent + answered) / 2 - device
-        if self._tie is None or trip < self._tie[0]:
-            self._tie = trip, offset
+        low, high = self._tie or (-math.inf, math.inf)
+        # Counts are whole: the reading was made up to half a count before or after what it says.
+        self._tie = max(low, sent - device - self._half), min(high, answered - device + self._half)
         self._learn_until = None
 
     def read(self, count: float, arrival: float) -> Reading:
@@ -239,7 +241,7 @@ class DeviceClock:
     def _learn_latency(self, device: float, arrival: float) -> None:
         if self._tie is None:
             return
-        delay = arrival - device - self._tie[1]
+        delay = arrival - device - sum(self._tie) / 2
         if self._learn_until is None:
             self._learn_until, self.latency = device + LEARNING, math.inf
         if device <= self._learn_until:

@@ -2,8 +2,9 @@
 
 The module carries no clock. Reading the status clears it, so a fix that one poll finds was made after the poll before was
 sent and before this answer came: its stamp is the middle of that bracket, wrong by at most half its width. A fix may be
-replaced by the next one before it is read; so the status is asked once more afterwards, and a fix counts only when it is
-known which one was read. TLV has no checksum: a fix is read twice and must agree, unless the link is too slow for that.
+replaced by the next one before it is read; so the status is asked once more afterwards, and where it announces another
+fix, the bracket covers both. Over a slow link the fix itself is read all the time, and other readings are a new one. TLV
+has no checksum: a fix is read twice and must agree, unless the link is too slow for that and has shown no damage.
 """
 
 from typing import Any
@@ -17,8 +18,10 @@ from .session import Driver, Script, Wait
 
 PATIENCE = 0.030, 3.0
 """s, and round trips, to wait for an answer: the longest takes 9 ms, USB and a busy computer add some."""
-MAX_TRIP = 0.5
-"""s; a longer round trip is not believed."""
+FIRST_TRIP, MAX_TRIP = 0.15, 0.5
+"""s; a round trip until one was measured, and the longest that is waited for."""
+SLOW = 0.2
+"""Share of a period: with a longer round trip the fix itself is read instead of the status."""
 BROKEN_ANSWER = 0.015
 """s to wait for the rest of an answer once part of it was damaged."""
 DENSE, SPARSE, IDLE = 0.004, 0.008, 0.020
@@ -54,59 +57,88 @@ class FixPoller:
 
     def __init__(self, driver: Driver, period: float) -> None:
         self._driver, self._period = driver, period
-        self._trip = MAX_TRIP / 3
+        self._trip: float | None = None
         self._failures = 0
         self._distrust_until = 0.0
         self._known: set[str] = set()
         self._lead = LEAD
+        self._low: float | None = None
+        """s, when the last look was sent that would have shown any fix made before it."""
         self._last_fix = driver.now
-        self._latest: tuple[Bracket, Readings] | None = None
-        self._pending: tuple[Bracket, Readings] | None = None
-        self._missed = False
+        self._latest: Readings | None = None
+        self._pending: tuple[Bracket, Readings, Bracket] | None = None
+        """Bracket and readings of a fix; and the bracket to take if another fix is found to be close behind."""
+        self._hidden = self._missed = False
+        """An answer was lost that may have announced a fix; a fix may have been missed."""
 
     def script(self) -> Script[None]:
         """Poll until the module answers no more."""
-        low: float | None = None
-        hidden = False  # an answer was lost that may have announced a fix
         while self._failures < MAX_FAILURES:
-            sent = self._driver.now
-            status = yield from self._ask(STATUS_GET, Status)
-            if status is None:
-                hidden = self._missed = True
-                continue
-            since, low = low, sent
-            if status.location_ready or hidden:
-                bracket = None if since is None else (since, self._driver.now)
-                yield from self._take(bracket, sure=status.location_ready)
-                hidden = False
-                continue
-            if self._pending:
-                yield from self._accept(*self._pending)
-            yield from self._rest(status)
+            if self._trip is not None and self._trip > SLOW * self._period:
+                yield from self._watch_fixes()
+            else:
+                yield from self._watch_status()
+
+    def _watch_fixes(self) -> Script[None]:
+        """Read the fix; other readings than before are a new one."""
+        sent = self._driver.now
+        readings = yield from self._read_fix()
+        if readings is not None:
+            if self._low is not None and readings != self._latest:
+                self._missed |= self._driver.now - self._low > GAP * self._period
+                yield from self._accept((max(self._low, sent - self._period), self._driver.now), readings)
+            self._low, self._latest = sent, readings
+        yield from self._driver.sleep(DENSE)
+
+    def _watch_status(self) -> Script[None]:
+        """Ask whether a fix is ready, and read it."""
+        sent = self._driver.now
+        status = yield from self._ask(STATUS_GET, Status)
+        if status is None:
+            self._hidden = self._missed = True
+            return
+        since, self._low = self._low, sent
+        if status.location_ready or self._hidden:
+            bracket = None if since is None else (since, self._driver.now)
+            self._missed |= bracket is not None and bracket[1] - bracket[0] > GAP * self._period
+            yield from self._take(bracket, sure=status.location_ready)
+            self._hidden = False
+            return
+        if self._pending:
+            yield from self._accept(*self._pending[:2])
+        yield from self._rest(status)
 
     def _take(self, bracket: Bracket | None, *, sure: bool) -> Script[None]:
-        """Read a fix that was announced; it counts when the next status announces none."""
+        """Read a fix that was announced; it counts when the next status is known."""
+        sent = self._driver.now
         readings = yield from self._read_fix()
-        before = self._pending or self._latest
-        soon = bracket and before and bracket[1] - before[0][0] < self._period / 2
-        if readings is not None and before and readings == before[1] and (soon or not sure):
+        before = self._pending[1] if self._pending else self._latest
+        since = self._pending[0][0] if self._pending else self._last_fix
+        soon = bracket is not None and bracket[1] - since < self._period / 2
+        if readings is not None and readings == before and (soon or not sure):
             return  # a damaged status, or a lost one that announced nothing: no fix is that close to another
-        if self._pending and readings is not None and readings != self._pending[1]:
-            yield from self._accept(*self._pending)
-        # A fix that is still pending was overwritten, or nobody knows which one was read.
-        self._missed |= readings is None or self._pending is not None
-        self._pending = None if readings is None or bracket is None else (bracket, readings)
+        pending, self._pending = self._pending, None
+        self._missed |= readings is None or (pending is not None and readings == pending[1])
+        if pending and readings == pending[1]:
+            self._pending = pending[2], pending[1], pending[2]  # what was read first was this fix already
+            return
+        if pending:
+            yield from self._accept(pending[2], pending[1])
+        if readings is not None and bracket is not None:
+            newest = sent - self._period  # what is read is the last fix: it is no older than that
+            either = max(bracket[0], newest), self._driver.now
+            self._pending = (max(bracket[0], newest), bracket[1]), readings, either
 
     def _accept(self, bracket: Bracket, readings: Readings) -> Script[None]:
         """Log a fix; where its bracket holds several, the last of them was read."""
-        low, high = max(bracket[0], bracket[1] - self._period), bracket[1]
+        low, high = bracket
         stamp, unsure = (low + high) / 2, high - low > WIDEST
-        gap = round((stamp - self._last_fix) / self._period) - 1 if self._latest else 0
-        if (gap > 0 and (self._missed or bracket[1] - bracket[0] > GAP * self._period)) or unsure:
+        gap = round((stamp - self._last_fix) / self._period) - 1 if self._latest is not None else 0
+        if (gap > 0 and self._missed) or unsure:
             yield Lost(stamp, max(0, gap) + unsure)
-        narrow = high - low < 2 * (DENSE + self._trip) + LEAD
+        narrow = high - low < 2 * (DENSE + (self._trip or 0.0)) + LEAD
         self._lead = max(LEAD, self._lead * LESS_LEAD) if narrow else min(self._lead + MORE_LEAD, self._period / 2)
-        self._last_fix, self._latest = stamp, ((low, high), readings)
+        self._last_fix, self._latest = stamp, readings
         self._pending, self._missed = None, False
         self._known.update(reading.anchor_id for reading in readings)
         if readings and not unsure:
@@ -117,7 +149,7 @@ class FixPoller:
         now = self._driver.now
         if not status.joined and now - self._last_fix > UNJOINED:
             yield from self._driver.say_once(not_joined())
-        due = self._last_fix + self._period - self._lead - self._trip
+        due = now if self._latest is None else self._last_fix + self._period - self._lead - (self._trip or 0.0)
         late = now - self._last_fix - self._period
         pause = DENSE if late < LATE else SPARSE if late < LONG_AGO else IDLE
         yield from self._driver.sleep(max(due - now, pause))
@@ -131,7 +163,7 @@ class FixPoller:
                 continue
             readings: Readings = answer.readings
             fresh = not self._known.issuperset(reading.anchor_id for reading in readings)
-            quick = self._trip < QUICK * self._period
+            quick = self._trip is None or self._trip < QUICK * self._period
             if readings == before or not (quick or fresh or self._driver.now < self._distrust_until):
                 return readings
             before = readings
@@ -141,12 +173,12 @@ class FixPoller:
     def _ask(self, request: bytes, kind: type) -> Script[Any]:
         """Return the answer to a request, None where none came."""
         sent, damaged = self._driver.now, False
-        until = sent + PATIENCE[0] + PATIENCE[1] * self._trip
+        until = sent + PATIENCE[0] + PATIENCE[1] * (FIRST_TRIP if self._trip is None else self._trip)
         yield Send(request)
         while (event := (yield Wait(until))) is not None:
             if isinstance(event, kind):
                 self._failures = 0
-                self._trip = min(MAX_TRIP, max(self._driver.now - sent, 0.9 * self._trip))
+                self._trip = min(MAX_TRIP, max(self._driver.now - sent, 0.9 * (self._trip or 0.0)))
                 return event
             if isinstance(event, Corrupt):
                 damaged, self._distrust_until = True, self._driver.now + DISTRUST
@@ -161,6 +193,6 @@ class FixPoller:
         self._distrust_until = self._driver.now + DISTRUST
         if not damaged:
             # It may only be late: let it pass, so that it is not taken for the answer to the next request.
-            self._trip = min(MAX_TRIP, 2 * self._trip)
+            self._trip = min(MAX_TRIP, 2 * (self._trip or FIRST_TRIP))
             yield from self._driver.sleep(self._trip)
         return None

@@ -16,7 +16,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from .events import Action, Corrupt, Note, Param, Reopen, Send
+from .events import Action, Corrupt, Note, Send
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +178,3 @@ class Session:
             actions.append(step)
             event = None
         return actions
-
-
-__all__ = ["Driver", "Identity", "Param", "Reopen", "Script", "Session", "Wait"]
