@@ -2,9 +2,11 @@
 
 import contextlib
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.results import small_log
 
 from uwblite.errors import ConfigError, FormatError, UwbliteError
 from uwblite.io.carmen import read_log
@@ -220,3 +222,29 @@ def test_the_real_bag_gives_the_map_of_its_log(shared_data):
     near = 1.01 * log.grid.geometry.resolution
     assert np.mean(cKDTree(one).query(two)[0] < near) > 0.9
     assert np.mean(cKDTree(two).query(one)[0] < near) > 0.9
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("first", [-5.0, 3e9, 1e15])
+def test_a_time_that_ros_cannot_count_is_named(tmp_path, storage, first):
+    whole = small_log()
+    moved = replace(whole.odometry, stamps=whole.odometry.stamps - whole.odometry.stamps[0] + first)
+    late = replace(whole, odometry=moved, ranges=None, scans=None)
+    with pytest.raises(FormatError, match="has no place in a ROS message"):
+        write_bag(tmp_path / "bag", late, storage=storage)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, storage):
+    """A limit on the size of files stands for the disk."""
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises((FormatError, OSError)) as caught:
+            write_bag(tmp_path / "bag", small_log(), storage=storage)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []

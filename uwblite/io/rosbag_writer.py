@@ -5,12 +5,13 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from ..errors import ConfigError
+from ..errors import ConfigError, FormatError, UwbliteError
 from ..sensor_log import SensorLog
 from .files import shortened
 from .optional_packages import missing_package
@@ -19,6 +20,9 @@ from .ros_messages import BASE, ODOM, Messages, nanoseconds
 _FORMAT: Final = 8
 """Version of rosbag2's metadata. From 9 on QoS policies are words, which ROS 2 Humble refuses ("bad conversion"); later
 releases read all earlier versions (ros2/rosbag2#1895)."""
+
+_LAST_STAMP: Final = 2.0**31
+"""s; ROS 2 counts them in 32 bits."""
 
 Stamped = tuple[float, str, Any]
 """Time of recording, s; topic; message."""
@@ -71,9 +75,12 @@ def write_messages(
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     waiting = Path(tempfile.mkdtemp(prefix=f".{shortened(target.name)}.partial-", dir=target.absolute().parent))
     try:
-        with Writer(waiting / "bag", version=_FORMAT, storage_plugin=plugin) as writer:
+        with _errors_of_ours(target), Writer(waiting / "bag", version=_FORMAT, storage_plugin=plugin) as writer:
             connections: dict[str, Any] = {}
             for stamp, topic, message in messages(Messages(store)):
+                if not 0.0 <= stamp < _LAST_STAMP:
+                    problem = f"a stamp of {stamp:.0f} s has no place in a ROS message, which counts seconds from 0 to 2^31"
+                    raise FormatError(f"{problem}; in which unit, and since when, does the recording count?", str(target))
                 kind = message.__msgtype__
                 if topic not in connections:
                     offered = [_profile(topic)]
@@ -82,6 +89,18 @@ def write_messages(
         os.replace(next((waiting / "bag").glob("*.mcap")) if single else waiting / "bag", target)
     finally:
         shutil.rmtree(waiting, ignore_errors=True)
+
+
+@contextmanager
+def _errors_of_ours(target: Path) -> Iterator[None]:
+    """Turn what rosbags and its databases say of a full disk or of numbers too large into one line."""
+    try:
+        yield
+    except (UwbliteError, OSError):
+        raise
+    except Exception as error:
+        detail = " ".join(str(error).split())[:200]
+        raise FormatError(f"could not be written as a ROS bag: {type(error).__name__}: {detail}", str(target)) from None
 
 
 def _profile(topic: str) -> Any:
