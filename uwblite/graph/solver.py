@@ -233,7 +233,7 @@ def _extrapolated(decrease: float, last: float, promised: float) -> float:
     """Return the sum of the geometric series that the last two decreases begin."""
     if not np.isfinite(last):
         return max(decrease, promised)
-    return decrease**2 / (last - decrease) if decrease < last else np.inf
+    return decrease * (decrease / (last - decrease)) if decrease < last else np.inf
 
 
 def _as_much_again(decrease: float, last: float, promised: float) -> float:

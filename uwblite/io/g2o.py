@@ -17,6 +17,7 @@ I is the upper triangle of the information matrix in the chart e = Z^-1 (Xi^-1 X
 """
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -29,16 +30,16 @@ from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
 _LAYOUTS = {
-    "VERTEX_SE2": Layout(1, 3),
-    "VERTEX_XY": Layout(1, 2),
-    "EDGE_SE2": Layout(2, 9),
-    "EDGE_SE2_XY": Layout(2, 5),
-    "EDGE_PRIOR_SE2": Layout(1, 9),
-    "EDGE_PRIOR_XY": Layout(1, 5),
+    "VERTEX_SE2": Layout(1, 3, places=3),
+    "VERTEX_XY": Layout(1, 2, places=2),
+    "EDGE_SE2": Layout(2, 9, places=3),
+    "EDGE_SE2_XY": Layout(2, 5, places=2),
+    "EDGE_PRIOR_SE2": Layout(1, 9, places=3),
+    "EDGE_PRIOR_XY": Layout(1, 5, places=2),
     "FIX": Layout(1, 0),
-    "EDGE_RANGE_SE2_XY": Layout(2, 2),
-    "VERTEX2": Layout(1, 3),
-    "EDGE2": Layout(2, 9),
+    "EDGE_RANGE_SE2_XY": Layout(2, 2, places=1),
+    "VERTEX2": Layout(1, 3, places=3),
+    "EDGE2": Layout(2, 9, places=3),
 }
 _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 """Where dx dy dtheta I11 I12 I13 I22 I23 I33 stand among the numbers of an EDGE2."""
@@ -174,11 +175,13 @@ def _together(a: Records, b: Records) -> Records:
 
 def _ids(content: RecordFile) -> Ints:
     """Return the vertex id that each name of the file stands for."""
-    try:
-        return np.array([int(name) for name in content.names], dtype=np.int64)
-    except (ValueError, OverflowError):
-        wrong = next(n for n in content.names if len(n) > 18 or not n.lstrip(b"-").isdigit())
-        raise content.error(f"{wrong[:30].decode(errors='replace')!r} is not a vertex id, a whole number") from None
+    wrong = next((name for name in content.names if not _ID.fullmatch(name)), None)
+    if wrong is not None:
+        raise content.error(f"{wrong[:30].decode(errors='replace')!r} is not a vertex id, a whole number")
+    return np.array([int(name) for name in content.names], dtype=np.int64)
+
+
+_ID = re.compile(rb"-?\d{1,18}")
 
 
 def _numbered(ids: Ints, names: Sequence[Ints]) -> tuple[Ints, Ints]:

@@ -28,13 +28,13 @@ from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
 _LAYOUTS = {
-    "VERTEX_SE2": Layout(1, 3, stamped=True),
-    "VERTEX_XY": Layout(1, 2),
-    "VERTEX_SE2:PRIOR": Layout(1, 9, stamped=True),
-    "VERTEX_XY:PRIOR": Layout(1, 5, stamped=True),
-    "EDGE_SE2": Layout(2, 9, stamped=True),
-    "EDGE_SE2_XY": Layout(2, 5, stamped=True),
-    "EDGE_RANGE": Layout(2, 2, stamped=True),
+    "VERTEX_SE2": Layout(1, 3, stamped=True, places=3),
+    "VERTEX_XY": Layout(1, 2, places=2),
+    "VERTEX_SE2:PRIOR": Layout(1, 9, stamped=True, places=3),
+    "VERTEX_XY:PRIOR": Layout(1, 5, stamped=True, places=2),
+    "EDGE_SE2": Layout(2, 9, stamped=True, places=3),
+    "EDGE_SE2_XY": Layout(2, 5, stamped=True, places=2),
+    "EDGE_RANGE": Layout(2, 2, stamped=True, places=1),
 }
 _SPATIAL = ("VERTEX_SE3", "VERTEX_XYZ", "EDGE_SE3")
 _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")

@@ -10,6 +10,10 @@ from ..errors import FormatError
 from .source import OVERLONG_LINE, TextSource
 
 _TAGS_COUNTED = 100
+_FARTHEST = 1e9
+"""m; no place on Earth is farther. Squares and products of what is measured must stay finite too."""
+_MOST = 1e30
+"""Of an information or covariance: a femtometre in one direction, a light year in the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +26,8 @@ class Layout:
     """How many numbers."""
     stamped: bool = False
     """Whether a time stands before the names."""
+    places: int = 0
+    """How many of the numbers, from the first on, are places, angles or distances; the others are uncertainties."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +124,11 @@ def _table(rows: list[tuple[int, list[bytes]]], layout: Layout, names: dict[byte
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         raise result.error("a number is not finite", rows[bad[0]][0])
+    most = np.full(values.shape[1], _MOST)
+    most[layout.stamped : layout.stamped + layout.places] = _FARTHEST
+    far = np.flatnonzero((np.abs(values) > most).any(axis=1))
+    if len(far):
+        raise result.error("a number is beyond anything that is measured; are the units right?", rows[far[0]][0])
     indices = [[names.setdefault(name, len(names)) for name in tokens[first : first + layout.names]] for _, tokens in rows]
     return Records(
         np.array([line for line, _ in rows], dtype=np.int64),
