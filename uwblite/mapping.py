@@ -218,6 +218,11 @@ def _grid(
 
     reporter = stages.reporter("occupancy grid")
     grid = occupancy_grid.from_sweeps(sweeps, config.grid, executor=executor, progress=reporter, announce=announce)
+    if grid.scans_astray:
+        stages.doubts.append(
+            f"{grid.scans_astray} of {grid.scans_astray + grid.scans_used} scans lie so far from the others that no map holds"
+            " both; they are not drawn"
+        )
     if config.crop is not None:
         grid = map_frame.cropped(grid, config.crop)
     stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)

@@ -388,13 +388,27 @@ def test_misuse_is_named():
             GridConfig(**wrong)
 
 
+@pytest.mark.parametrize("far", [3e3, 1e7])
+def test_a_scan_that_a_wrong_reading_threw_far_away_is_not_drawn_and_counted(far):
+    poses = drive()
+    plain = from_scans(poses, room_scans(poses), GridConfig(move_distance=0.0))
+    astray = np.insert(poses, 20, [far, -far, 1.0], axis=0)
+    tracemalloc.start()
+    grid = from_scans(astray, room_scans(np.insert(poses, 20, poses[20], axis=0)), GridConfig(move_distance=0.0))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+    assert (plain.scans_astray, grid.scans_astray, grid.scans_used) == (0, 1, len(poses))
+    np.testing.assert_array_equal(grid.log_odds, plain.log_odds)
+
+
 def test_a_grid_too_large_is_refused_before_it_is_allocated():
-    """One pose far off makes a map of 10^12 cells: the refusal says how large, what it would take and what to change."""
-    poses = drive(3)
-    poses[-1, :2] = 5e4
+    """Two places far apart make a map of 10^12 cells: the refusal says how large, what it would take and what to change."""
+    poses = drive(4)
+    poses[2:, :2] = 5e4
     tracemalloc.start()
     with pytest.raises(ConfigError, match=r"million cells, about \d+ MB.*grid\.resolution.*grid\.max_cells"):
-        from_scans(poses, room_scans(drive(3)), GridConfig())
+        from_scans(poses, room_scans(drive(4)), GridConfig())
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 50e6

@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
 from uwblite.report.bitmap_font import HEIGHT, WIDTH, text_mask
 from uwblite.report.canvas import Canvas
-from uwblite.report.picture import ANCHOR, CLOSURE, PAPER, PATH, PATHS, WALL, PictureAnchor, _round_length, draw_map
+from uwblite.report.picture import ANCHOR, CLOSURE, PAPER, PATH, PATHS, WALL, PictureAnchor, _paste, _round_length, draw_map
 
 
 def room(rows=80, cols=120, resolution=0.05):
@@ -132,3 +134,32 @@ def test_an_anchor_that_may_stand_anywhere_takes_no_longer_than_others():
     anchor = PictureAnchor("far", np.array([0.0, 3.0]), np.diag([1e6, 1e4]))
     image = draw_map(room(), PATH_IN_ROOM, anchors=[anchor])
     assert share(image, ANCHOR, 40) > 0
+
+
+@pytest.mark.parametrize("far", [3e3, 1e7])
+def test_what_strays_far_takes_neither_memory_nor_the_room_of_the_rest(far):
+    path = np.insert(PATH_IN_ROOM, [20], [[far, -far, 0.0]], axis=0)
+    anchors = [PictureAnchor("near", np.array([0.0, 3.0])), PictureAnchor("far", np.array([-far, far]), np.eye(2) * far)]
+    closures = np.array([[0.0, 2.0, far, far]])
+    tracemalloc.start()
+    image = draw_map(room(), path, anchors=anchors, closures=closures)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6
+    assert max(image.shape) < 2000
+    assert share(image, WALL) > 1e-4
+
+
+def test_many_cells_in_one_pixel_equal_a_loop_over_blocks():
+    """The darkest of a block where there is a wall, else the brightest; wherever the blocks begin."""
+    rng = np.random.default_rng(3)
+    colours = rng.choice([PAPER, (255, 255, 255), WALL], (50, 70), p=[0.2, 0.75, 0.05]).astype(np.uint8)
+    geometry = GridGeometry(0.1, np.array([0.3, 0.2]), 50, 70)
+    image = np.full((17, 21, 3), PAPER, np.uint8)
+    _paste(image, colours, geometry, np.zeros(2), 1 / 0.4)
+    for row in range(17):
+        for col in range(21):
+            block = colours[max(4 * row - 2, 0) : max(4 * row + 2, 0), max(4 * col - 3, 0) : max(4 * col + 1, 0)].reshape(-1, 3)
+            if len(block):
+                expected = block.min(axis=0) if block[:, 0].min() < PAPER[0] - 20 else block.max(axis=0)
+                np.testing.assert_array_equal(image[16 - row, col], expected)

@@ -81,3 +81,20 @@ class GridGeometry:
                 f"{coarser:.2g} or more, or a smaller grid.max_range, or raise grid.max_cells"
             )
         return GridGeometry(resolution, first * resolution, int(height), int(width))
+
+
+def central_box(points: Floats) -> tuple[Floats, Floats]:
+    """Return the corners (2,) of a box that holds what belongs together of points (n, 2), and no stray ones.
+
+    The box around the central 98 % of each coordinate, wider by its longer side in every direction; never larger than the
+    box around all points. A path fills it; a pose that one wrong reading threw kilometres away lies outside.
+    """
+    low, high = np.quantile(points, _OUTER, axis=0, method="higher"), np.quantile(points, 1.0 - _OUTER, axis=0, method="lower")
+    margin = max(float((high - low).max()), _LEAST_MARGIN)
+    return np.maximum(low - margin, points.min(axis=0)), np.minimum(high + margin, points.max(axis=0))
+
+
+_OUTER = 0.01
+"""Share of the points left out on each side."""
+_LEAST_MARGIN = 10.0
+"""m; a robot that stands has no extent."""

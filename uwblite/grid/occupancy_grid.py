@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError, DataError
 from ..sensor_log import LaserScans
-from .geometry import GridGeometry
+from .geometry import GridGeometry, central_box
 from .ray_counter import WEIGHT_UNIT, Counts, RayCounter
 from .scan_rays import ScanRays, empty_reach, extent, moved_scans, scan_rays, seen_reach
 
@@ -94,6 +94,8 @@ class OccupancyGrid:
     """(rows, cols) log(p / (1 - p)) of being occupied; 0 = unknown."""
     scans_used: int = 0
     """Scans traced into it."""
+    scans_astray: int = 0
+    """Scans not traced, because they lie so far from all others that the grid would have been too large."""
 
     def probability(self) -> NDArray[np.float32]:
         """Return the probability of being occupied (rows, cols); 0.5 = unknown."""
@@ -190,6 +192,11 @@ def from_sweeps(
     count = sum(len(task.chosen) for task in tasks)
     boxes = [task.extent() for task in tasks]
     low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+    if geometry is None and np.prod((high - low) / config.resolution) > config.max_cells:
+        tasks = _together(tasks)
+        boxes = [task.extent() for task in tasks]
+        low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+    astray, count = count - sum(len(task.chosen) for task in tasks), sum(len(task.chosen) for task in tasks)
     grid = geometry or GridGeometry.around(low, high, config.resolution, config.max_cells)
     if announce is not None:
         announce(grid)
@@ -207,7 +214,13 @@ def from_sweeps(
     trace(None, 0)
     if clears:
         trace(walls_of(from_counts(counter, config)), count)
-    return from_counts(counter if geometry else counter.cropped(), config, count)
+    return replace(from_counts(counter if geometry else counter.cropped(), config, count), scans_astray=astray)
+
+
+def _together(tasks: "list[_Task]") -> "list[_Task]":
+    """Return the tasks without the scans that lie far from all others; see geometry.central_box."""
+    low, high = central_box(np.concatenate([task.first[:, :2] for task in tasks]))
+    return [task for task in (task.within(low, high) for task in tasks) if len(task.chosen)]
 
 
 def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":
@@ -260,6 +273,12 @@ class _Task:
             reach = np.maximum(self._reach(part, False), self._reach(part, True))
             boxes.append(extent(self.scans, reach, *self._poses(part), flipped=self.flipped))
         return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+
+    def within(self, low: Floats, high: Floats) -> "_Task":
+        """Return the task with the scans whose laser stood in a box."""
+        inside = ((self.first[:, :2] >= low) & (self.first[:, :2] <= high)).all(axis=1)
+        last = None if self.last is None else self.last[inside]
+        return replace(self, chosen=self.chosen[inside], first=self.first[inside], last=last)
 
     def split(self, parts: int) -> "list[_Task]":
         """Return tasks that hold only their own share of the scans."""

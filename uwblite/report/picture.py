@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Floats
-from ..grid.geometry import GridGeometry
+from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
 from .canvas import Canvas, Colour
 
@@ -27,6 +27,8 @@ INK: Colour = (52, 58, 68)
 
 _MARGIN = 0.8
 """m; free border around what is drawn."""
+_ANCHOR_REACH = 100.0
+"""m; an anchor is heard no farther away than this and the extent of the path."""
 _SMALLEST = 240
 """Pixels; the picture is at least this wide and high, so that the strip below has room."""
 _FOOT = 44
@@ -110,8 +112,12 @@ def _recordings(track: Floats) -> list[Floats]:
 
 
 def _extent(grid: OccupancyGrid | None, path: Floats, anchors: list[PictureAnchor]) -> tuple[Floats, Floats]:
-    """Return the corners of the box around everything known, m."""
+    """Return the corners of the box around everything known but for what strays far from the rest, m."""
     boxes = [path[np.isfinite(path).all(axis=1)], np.array([a.position for a in anchors]).reshape(-1, 2)]
+    if len(boxes[0]):
+        low, high = central_box(boxes[0])
+        reach = max(float((high - low).max()), _ANCHOR_REACH)
+        boxes = [np.clip(boxes[0], low, high), np.clip(boxes[1], low - reach, high + reach)]
     if grid is not None:
         known = grid.log_odds != 0.0
         rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
@@ -154,16 +160,17 @@ def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, sc
         image[np.ix_(rows, cols)] = colours[np.ix_(row[rows], col[cols])]
         return
     together = round(1.0 / pixels)
-    padded_rows, padded_cols = height * together, width * together
-    canvas = np.empty((padded_rows, padded_cols, 3), dtype=np.uint8)
-    canvas[:] = PAPER
-    top, left = max(-first_row, 0), max(-first_col, 0)
-    part = colours[top : padded_rows - first_row, left : padded_cols - first_col]
-    canvas[first_row + top :, first_col + left :][: part.shape[0], : part.shape[1]] = part
-    blocks = canvas.reshape(height, together, width, together, 3)
-    darkest, brightest = blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3))
-    dark = darkest[:, :, :1] < PAPER[0] - 20
-    image[:] = np.where(dark, darkest, brightest)[::-1]
+    row, col = (first_row + np.arange(geometry.rows)) // together, (first_col + np.arange(geometry.cols)) // together
+    rows, row_starts = np.unique(row, return_index=True)
+    cols, col_starts = np.unique(col, return_index=True)
+
+    def reduced(extreme: np.ufunc) -> Image:
+        return np.asarray(extreme.reduceat(extreme.reduceat(colours, row_starts, axis=0), col_starts, axis=1), dtype=np.uint8)
+
+    darkest, brightest = reduced(np.minimum), reduced(np.maximum)
+    cells = np.where(darkest[:, :, :1] < PAPER[0] - 20, darkest, brightest)
+    seen_rows, seen_cols = (rows >= 0) & (rows < height), (cols >= 0) & (cols < width)
+    image[np.ix_(height - 1 - rows[seen_rows], cols[seen_cols])] = cells[np.ix_(seen_rows, seen_cols)]
 
 
 def _draw_anchor(canvas: Canvas, anchor: PictureAnchor, pixel: Callable[[Floats], Floats]) -> None:
