@@ -21,6 +21,7 @@ FLOORS = (
     ("constraints", "keyframes", "grid"),
     ("wheels", "map_result", "radio"),
     ("lidar", "report"),
+    ("screening",),
     ("loop_closure", "checks", "evaluation", "io"),
     ("mapping_config",),
     ("pipeline",),

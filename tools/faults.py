@@ -16,7 +16,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,11 +50,12 @@ class Case:
     """A recording in the order in which it was recorded, and what is true of every odometry reading in it."""
 
     log: SensorLog
-    """Stamps may run backwards here; see `sorted_log`."""
     truth: Floats
     """(n, 3) T_truth_base at each odometry reading."""
     anchors: dict[str, list[Floats]]
     """Places (2,) of each anchor, m, in the order of time."""
+    clocks: dict[str, Floats] = field(default_factory=dict)
+    """By odometry, radio and lidar: what its clock is wrong by at each reading, s."""
 
     @property
     def middle(self) -> float:
@@ -97,15 +98,9 @@ def kept(case: Case, keep: Callable[[Floats], NDArray[np.bool_]], *, odometry: b
 
 
 def shifted(case: Case, by: Callable[[Floats], Floats], kinds: str = "odometry radio lidar") -> Case:
-    """Return the case with stamps shifted by by(stamps), s."""
-    log = case.log
-    if "odometry" in kinds:
-        log = replace(log, odometry=Odometry(log.odometry.stamps + by(log.odometry.stamps), log.odometry.poses))
-    if "radio" in kinds and log.ranges is not None:
-        log = replace(log, ranges=replace(log.ranges, stamps=log.ranges.stamps + by(log.ranges.stamps)))
-    if "lidar" in kinds and log.scans is not None:
-        log = replace(log, scans=replace(log.scans, stamps=log.scans.stamps + by(log.scans.stamps)))
-    return replace(case, log=log)
+    """Return the case with the clocks of some sensors wrong by by(stamps), s."""
+    sensors = {"odometry": case.log.odometry, "radio": case.log.ranges, "lidar": case.log.scans}
+    return replace(case, clocks={k: by(v.stamps) for k, v in sensors.items() if k in kinds and v is not None})
 
 
 def rows(ranges: UwbRanges, which: NDArray[np.bool_]) -> UwbRanges:
@@ -348,24 +343,25 @@ def twice(case: Case, rng: Rng) -> Case:
 
 
 def merged(a: Case, b: Case) -> Case:
-    """Return both recordings in one log."""
+    """Return both recordings in one log, in the order of their stamps."""
     one, two = a.log, b.log
-    odometry = Odometry(
-        np.concatenate([one.odometry.stamps, two.odometry.stamps]), np.concatenate([one.odometry.poses, two.odometry.poses])
-    )
+    order = np.argsort(np.concatenate([one.odometry.stamps, two.odometry.stamps]), kind="stable")
+    both = {n: np.concatenate([getattr(one.odometry, n), getattr(two.odometry, n)])[order] for n in ("stamps", "poses")}
+    odometry = Odometry(**both)
+    truth = np.concatenate([a.truth, b.truth])[order]
     ranges, scans = one.ranges, one.scans
-    if one.ranges is not None and two.ranges is not None:
-        pairs = [np.concatenate(p) for p in zip(
-            (one.ranges.stamps, one.ranges.anchor, one.ranges.ranges, one.ranges.quality),
-            (two.ranges.stamps, two.ranges.anchor, two.ranges.ranges, two.ranges.quality), strict=True,
-        )]  # fmt: skip
-        ranges = UwbRanges(*pairs, one.ranges.anchor_ids)
-    if one.scans is not None and two.scans is not None:
-        scans = replace(
-            one.scans, stamps=np.concatenate([one.scans.stamps, two.scans.stamps]),
-            ranges=np.concatenate([one.scans.ranges, two.scans.ranges]),
-        )  # fmt: skip
-    return Case(replace(one, odometry=odometry, ranges=ranges, scans=scans), np.concatenate([a.truth, b.truth]), a.anchors)
+    if ranges is not None and two.ranges is not None:
+        order = np.argsort(np.concatenate([ranges.stamps, two.ranges.stamps]), kind="stable")
+        both = {n: np.concatenate([getattr(ranges, n), getattr(two.ranges, n)])[order] for n in RANGE_FIELDS}
+        ranges = UwbRanges(**both, anchor_ids=ranges.anchor_ids)
+    if scans is not None and two.scans is not None:
+        order = np.argsort(np.concatenate([scans.stamps, two.scans.stamps]), kind="stable")
+        readings = np.concatenate([scans.ranges, two.scans.ranges])[order]
+        scans = replace(scans, stamps=np.concatenate([scans.stamps, two.scans.stamps])[order], ranges=readings)
+    return Case(replace(one, odometry=odometry, ranges=ranges, scans=scans), truth, a.anchors)
+
+
+RANGE_FIELDS = ("stamps", "anchor", "ranges", "quality")
 
 
 def standing(case: Case, rng: Rng) -> Case:
@@ -441,19 +437,24 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
 
 def sorted_log(case: Case) -> tuple[SensorLog, Floats]:
     """Return the recording as a reader gives it, sorted by time, and the truth in that order."""
-    log, warnings = case.log, list[str]()
-    order = time_order(log.odometry.stamps, "odometry", warnings)
+    log, warnings, set_back = case.log, list[str](), dict[str, float]()
+
+    def ordered(sensor: str, stamps: Floats) -> tuple[Floats, Ints]:
+        said = stamps + case.clocks.get(sensor, 0.0)
+        order = time_order(said, sensor, warnings, set_back)
+        return said[order], order
+
+    stamps, order = ordered("odometry", log.odometry.stamps)
     truth = case.truth[order]
-    log = replace(log, odometry=Odometry(log.odometry.stamps[order], log.odometry.poses[order]))
+    log = replace(log, odometry=Odometry(stamps, log.odometry.poses[order]))
     if log.ranges is not None:
-        r, order = log.ranges, time_order(log.ranges.stamps, "UWB", warnings)
-        log = replace(
-            log, ranges=UwbRanges(r.stamps[order], r.anchor[order], r.ranges[order], r.quality[order], r.anchor_ids)
-        )
+        r = log.ranges
+        stamps, order = ordered("radio", r.stamps)
+        log = replace(log, ranges=UwbRanges(stamps, r.anchor[order], r.ranges[order], r.quality[order], r.anchor_ids))
     if log.scans is not None:
-        order = time_order(log.scans.stamps, "ROBOTLASER1", warnings)
-        log = replace(log, scans=replace(log.scans, stamps=log.scans.stamps[order], ranges=log.scans.ranges[order]))
-    return replace(log, notes=replace(log.notes, warnings=tuple(warnings))), truth
+        stamps, order = ordered("lidar", log.scans.stamps)
+        log = replace(log, scans=replace(log.scans, stamps=stamps, ranges=log.scans.ranges[order]))
+    return replace(log, notes=replace(log.notes, warnings=tuple(warnings), set_back=set_back)), truth
 
 
 def _stopped(signum: int, frame: object) -> None:

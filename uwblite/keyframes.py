@@ -10,7 +10,7 @@ import numpy as np
 
 from . import se2
 from .arrays import Bools, Floats, Ints
-from .sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
+from .sensor_log import LaserScans, Odometry, OdometryBreaks, SensorLog, SensorMounting, UwbRanges
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +47,8 @@ class Keyframes:
     """(k-1,) s."""
     twist: Floats
     """(k, 3) velocity of the base at each keyframe, own frame, m/s, m/s, rad/s."""
+    slack: Floats
+    """(k-1, 3) standard deviation of the steps among them that were not measured, m, m, rad."""
 
     def __len__(self) -> int:
         return len(self.index)
@@ -94,13 +96,14 @@ class ScanPoints:
     """(p,) which scan of the log."""
 
 
-def select(odometry: Odometry, config: KeyframeConfig) -> Keyframes:
+def select(odometry: Odometry, config: KeyframeConfig, breaks: OdometryBreaks | None = None) -> Keyframes:
     """Choose keyframes on the odometry by travelled distance and turned angle; the first and last sample are always in.
 
     Parameters
     ----------
     odometry : n >= 1 samples.
     config : thresholds.
+    breaks : steps that were not measured; a keyframe stands on either side of each.
 
     Returns
     -------
@@ -113,6 +116,8 @@ def select(odometry: Odometry, config: KeyframeConfig) -> Keyframes:
     turned = np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 2]))])
     signed = np.concatenate([[0.0], np.cumsum(forward)])
     index = _advance(path / config.distance, turned / config.angle)
+    broken = np.zeros(0, dtype=np.int64) if breaks is None else _broken_steps(stamps, breaks)
+    index = np.union1d(index, np.concatenate([broken, broken + 1]))
     first, last = index[:-1], index[1:]
     duration = stamps[last] - stamps[first]
     return Keyframes(
@@ -125,7 +130,26 @@ def select(odometry: Odometry, config: KeyframeConfig) -> Keyframes:
         turned[last] - turned[first],
         duration,
         velocity_at(odometry, stamps[index]),
+        _slack(index, broken, breaks),
     )
+
+
+def of(log: SensorLog, config: KeyframeConfig) -> Keyframes:
+    """Choose the keyframes of a recording, see select."""
+    return select(log.odometry, config, None if log.screening is None else log.screening.breaks)
+
+
+def _broken_steps(stamps: Floats, breaks: OdometryBreaks) -> Ints:
+    """Return the number (b,) of the odometry sample before each break; the last sample has no step behind it."""
+    return np.clip(np.searchsorted(stamps, breaks.stamps, "right") - 1, 0, max(len(stamps) - 2, 0)).astype(np.int64)
+
+
+def _slack(index: Ints, broken: Ints, breaks: OdometryBreaks | None) -> Floats:
+    """Return the standard deviation (k-1, 3) that the breaks add to the steps between keyframes."""
+    variance = np.zeros((max(len(index) - 1, 0), 3))
+    if breaks is not None and len(variance):
+        np.add.at(variance, np.searchsorted(index, broken, "right") - 1, breaks.sigma**2)
+    return np.sqrt(variance)
 
 
 def _advance(path: Floats, turned: Floats) -> Ints:

@@ -22,7 +22,7 @@ from .graph.solver import optimize
 from .grid import occupancy_grid
 from .grid.geometry import GridGeometry
 from .grid.occupancy_grid import OccupancyGrid, Sweeps
-from .lidar import joint_refinement, laser_mounting
+from .lidar import joint_refinement
 from .lidar.clouds import Clouds
 from .lidar.joint_refinement import RefinementResult
 from .loop_closure import closures
@@ -34,6 +34,7 @@ from .pipeline.lidar_stages import Scans
 from .pipeline.progress import Progress, Stages
 from .pipeline.recordings import Estimate, Recording, Recordings, gather, moved_hypotheses
 from .pipeline.scan_selection import thinned
+from .screening.screen import screen
 from .sensor_log import SensorLog
 
 __all__ = ["MappingConfig", "Progress", "build_map"]
@@ -72,7 +73,8 @@ def build_map(
     stages = Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
     logs = [log.without(uwb=not config.use_uwb, lidar=not config.use_lidar) for log in logs]
-    logs = [_upright(log, config, stages) for log in logs]
+    logs = [screen(log, config.turn_laser) for log in logs]
+    stages.note(logs)
     logs = [thinned(log, config.keyframes, config.grid) for log in logs]
 
     recordings = gather(logs, config.keyframes)
@@ -125,23 +127,6 @@ def build_map(
     )
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
-
-
-def _upright(log: SensorLog, config: MappingConfig, stages: Stages) -> SensorLog:
-    """Return the recording with the laser the way up that its turns show."""
-    seen = laser_mounting.compare(log, _TURNS) if config.turn_laser and log.scans is not None else None
-    if seen is None or not (seen.agree and seen.turned_over):
-        return log
-    flipped = not log.mounting.laser_flipped
-    stages.warnings.append(
-        f"the laser is mounted {'upside down' if flipped else 'upright'}, not as told: so its turns agree "
-        f"{seen.told / max(seen.other, 1e-6):.0f} times better with the wheels'; it was taken that way"
-    )
-    return replace(log, mounting=replace(log.mounting, laser_flipped=flipped))
-
-
-_TURNS = 300
-"""Scan pairs looked at for the way up of the laser."""
 
 
 def _final(

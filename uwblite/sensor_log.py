@@ -102,8 +102,45 @@ class LogNotes:
     """Oddities in words, each with its remedy or what was done."""
     unread: tuple[str, ...] = ()
     """Topics of a bag that may hold ranges and were not read."""
+    set_back: dict[str, float] = field(default_factory=dict)
+    """By how much a sensor's clock was set back at most, s, in the order in which its messages were written."""
     scans_left_out: int = 0
     """Scans that were recorded and are not among `scans`, because no map looks at them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """One thing that a recording says against itself."""
+
+    kind: str
+    """A name for programs."""
+    text: str
+    """What, where and how to mend it, for people."""
+    doubt: bool = False
+    """Whether a map of the recording should not be trusted; otherwise it was repaired, or costs accuracy only."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryBreaks:
+    """Steps of the odometry that were predicted, not measured."""
+
+    stamps: Floats
+    """(b,) of the reading before the step, s."""
+    sigma: Floats
+    """(b, 3) standard deviation of the step, m, m, rad; what wheels are uncertain by besides comes on top."""
+
+    @staticmethod
+    def none() -> "OdometryBreaks":
+        """Return no breaks."""
+        return OdometryBreaks(np.zeros(0), np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Screening:
+    """What was found and repaired in a recording before it is mapped."""
+
+    remarks: tuple[Remark, ...]
+    breaks: OdometryBreaks
 
 
 MOST_METRES, MOST_SECONDS = 1e7, 1e20
@@ -141,6 +178,8 @@ class SensorLog:
     scans: LaserScans | None = None
     mounting: SensorMounting = field(default_factory=SensorMounting)
     notes: LogNotes = field(default_factory=LogNotes)
+    screening: Screening | None = None
+    """What screening found; None before it."""
 
     def __post_init__(self) -> None:
         _check(self.odometry.stamps, "odometry.stamps", (None,), ordered=True)

@@ -33,18 +33,20 @@ class OdometryNoiseConfig:
 def wheel_edges(keyframes: Keyframes, first: int, config: OdometryNoiseConfig, calibration: Calibration) -> OdometryEdges:
     """Return the edges between consecutive keyframes of one recording; `first` is the graph's number of its first pose."""
     n = len(keyframes) - 1
-    position = np.sqrt(config.standing**2 + config.distance**2 * keyframes.path)
+    slack = keyframes.slack
+    along, across = (np.sqrt(config.standing**2 + config.distance**2 * keyframes.path + slack[:, k] ** 2) for k in (0, 1))
     turning = config.heading_per_turn**2 * keyframes.turned
-    heading = np.sqrt(config.standing**2 + config.heading_per_metre**2 * keyframes.path + turning)
+    heading = np.sqrt(config.standing**2 + config.heading_per_metre**2 * keyframes.path + turning + slack[:, 2] ** 2)
     sqrt_information = np.zeros((n, 3, 3))
-    sqrt_information[:, 0, 0] = sqrt_information[:, 1, 1] = 1.0 / position
-    sqrt_information[:, 2, 2] = 1.0 / heading
+    sqrt_information[:, 0, 0], sqrt_information[:, 1, 1], sqrt_information[:, 2, 2] = 1.0 / along, 1.0 / across, 1.0 / heading
+    # What drifts by the second drifts while wheels are read: a log that pauses for an hour drifts no more than one second.
+    duration = np.where(slack[:, 2] > 0.0, np.minimum(keyframes.duration, 1.0), keyframes.duration)
     return OdometryEdges(
         first + np.arange(n),
         first + np.arange(1, n + 1),
         keyframes.motion,
         keyframes.length,
-        keyframes.duration,
+        duration,
         sqrt_information,
         odometry_indices(calibration, n),
         config.kernel,

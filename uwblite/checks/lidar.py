@@ -6,7 +6,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..lidar.laser_mounting import Turning, compare
-from ..sensor_log import LaserScans, SensorLog
+from ..sensor_log import SensorLog
 from .findings import Findings, timing
 
 
@@ -28,25 +28,15 @@ def check_scans(log: SensorLog, found: Findings) -> dict[str, Any]:
     figures["share of beams that hit"] = round(float(hit.mean()), 3)
     figures["share that saw nothing"] = round(float(np.isposinf(sample).mean()), 3)
     figures["share that is invalid"] = round(float(np.isnan(sample).mean()), 3)
-    _check_units(sample[hit], scans, view, found)
+    _check_units(sample[hit], found)
     _check_valid(hit, figures, found)
     if beams >= 30 and len(scans.stamps) >= 20:
         figures["turning"] = _check_turning(log, found)
     return figures
 
 
-def _check_units(seen: Floats, scans: LaserScans, view: float, found: Findings) -> None:
-    if view > 2.0 * np.pi + 0.1:
-        found.serious(
-            "lidar",
-            f"the field of view is {np.degrees(view):.0f} degrees: the angles look like degrees taken for radians",
-            "angles must be radians",
-        )
-    if len(seen) and np.median(seen) > 150.0:
-        found.serious(
-            "lidar", f"the usual reading is {np.median(seen):.0f} m: they look like millimetres", "write metres into the log"
-        )
-    elif len(seen) and np.quantile(seen, 0.95) < 0.05:
+def _check_units(seen: Floats, found: Findings) -> None:
+    if len(seen) and np.quantile(seen, 0.95) < 0.05:
         found.serious("lidar", f"95 % of the readings are below {np.quantile(seen, 0.95):.3f} m", "check the unit: metres")
     if len(seen) and np.ptp(seen) == 0.0:
         found.serious("lidar", "all readings are equal", "the laser is off, covered, or not the laser")
@@ -93,13 +83,6 @@ def _check_turning(log: SensorLog, found: Findings) -> dict[str, float]:
             "check the stamps, the beam order and the wheels' heading",
         )
         return figures
-    if turning.turned_over:
-        found.serious(
-            "lidar",
-            f"the laser is mounted {'upright' if log.mounting.laser_flipped else 'upside down'}: that way its turns agree"
-            f" {turning.told / max(turning.other, 1e-6):.0f} times better with the wheels",
-            "leave out --laser-flipped" if log.mounting.laser_flipped else "use --laser-flipped",
-        )
     if abs(turning.clock_offset) > 0.06 and turning.clock_clear:
         found.warning(
             "lidar",

@@ -7,12 +7,11 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..screening.units import LONGEST
 from ..sensor_log import SensorLog
 from .findings import Findings, timing
 from .odometry import STRAIGHT
 
-LONGEST = 200.0
-"""No radio of this kind reaches farther, m."""
 FEW = 10
 """Ranges from which an anchor cannot be placed."""
 
@@ -23,13 +22,7 @@ def check_ranges(log: SensorLog, found: Findings) -> dict[str, Any]:
     assert ranges is not None
     figures: dict[str, Any] = timing(ranges.stamps, "radio", found, expected_gap=3.0)
     positive = ranges.ranges[ranges.ranges > 0]
-    if len(positive) and np.median(positive) > LONGEST:
-        found.serious(
-            "radio",
-            f"the usual range is {np.median(positive):.0f} m: they look like millimetres or centimetres",
-            "write metres into the log; uwblite convert has unit factors",
-        )
-    elif len(positive) > FEW and np.quantile(positive, 0.95) < 0.1:
+    if len(positive) > FEW and np.quantile(positive, 0.95) < 0.1:
         found.warning("radio", f"95 % of the ranges are below {np.quantile(positive, 0.95):.3f} m", "check the unit: metres")
     path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T))])
     travelled = np.interp(ranges.stamps, log.odometry.stamps, path)

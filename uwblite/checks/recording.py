@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import DataError
 from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..screening.screen import screen
 from ..sensor_log import SensorLog
 from .findings import Finding, Findings
 from .lidar import check_scans
@@ -48,6 +50,7 @@ def diagnose(
     """
     found = Findings()
     _check_notes(log, found)
+    _check_screening(log, found)
     odometry = check_odometry(log.odometry, found)
     figures: dict[str, Any] = {"odometry": odometry}
     if log.ranges is None or len(log.ranges.stamps) == 0:
@@ -69,6 +72,20 @@ def _advice_without_ranges(log: SensorLog) -> str:
     if log.notes.unread:
         return f"there may be some in what was not read: {', '.join(log.notes.unread)}; --uwb-mapping says where (see above)"
     return "the map rests on wheels and lidar; check the tag if that is not meant"
+
+
+def _check_screening(log: SensorLog, found: Findings) -> None:
+    """What a map would repair is a warning, what it would doubt or refuse is serious."""
+    try:
+        screening = screen(log).screening
+    except DataError as error:
+        found.serious("log", str(error), "no map is made before that is mended")
+        return
+    for remark in screening.remarks if screening is not None else ():
+        if remark.doubt:
+            found.serious("log", remark.text, "a map of this is doubted: mend the recording, or cut it there")
+        else:
+            found.warning("log", remark.text, "a map repairs it so; the files stay as they are")
 
 
 def _check_notes(log: SensorLog, found: Findings) -> None:

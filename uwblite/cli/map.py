@@ -91,6 +91,7 @@ def _map(args: argparse.Namespace) -> int:
     from ..io.results import write_result
     from ..parallel import in_order
     from ..pipeline.scan_selection import thinned
+    from ..screening.screen import screen
     from . import console
     from .formats import read_recording
     from .options import apply_mounting, bag_choices
@@ -105,7 +106,7 @@ def _map(args: argparse.Namespace) -> int:
     if args.dry_run:
         return max(_dry_run(args, log) for log in logs)
     # The scans that no map looks at are most of the memory.
-    logs = [thinned(log, config.keyframes, config.grid) for log in logs]
+    logs = [thinned(screen(log, config.turn_laser), config.keyframes, config.grid) for log in logs]
     result = _build(logs, config, constraints, args.jobs)
     record = RunRecord(
         command=repeat_command(args),

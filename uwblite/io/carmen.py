@@ -86,6 +86,7 @@ class _Reader:
         self.uwb = array("d")
         self.uwb_ids: dict[bytes, int] = {}
         self.skipped: dict[str, int] = {}
+        self.set_back: dict[str, float] = {}
         self.lines = self.messages = self.broken = 0
         self.broken_lines: list[tuple[int, str]] = []
         self.ends_broken = False
@@ -196,7 +197,7 @@ class _Reader:
         warnings: list[str] = []
         odometry = self._finish_odometry(warnings)
         ranges = self._finish_ranges(warnings)
-        scans, T_base_laser = self.laser.finish(self.params, self.skipped, warnings)
+        scans, T_base_laser = self.laser.finish(self.params, self.skipped, warnings, self.set_back)
         notes = LogNotes(
             source=self.path,
             sha256=source.sha256(),
@@ -205,6 +206,7 @@ class _Reader:
             broken=self.broken,
             skipped=dict(sorted(self.skipped.items())),
             warnings=tuple(warnings),
+            set_back=self.set_back,
         )
         return SensorLog(odometry, ranges, scans, self.params.mounting(T_base_laser), notes)
 
@@ -219,7 +221,7 @@ class _Reader:
                     self.path,
                 )
             warnings.append("no ODOM messages: the robot poses of the laser messages serve as odometry")
-        order = time_order(rows[:, 0], "odometry", warnings)
+        order = time_order(rows[:, 0], "odometry", warnings, self.set_back)
         return Odometry(rows[order, 0], rows[order, 1:])
 
     def _finish_ranges(self, warnings: list[str]) -> UwbRanges | None:
@@ -230,6 +232,6 @@ class _Reader:
         ids = sorted(names)
         place = {name: i for i, name in enumerate(ids)}
         rank = np.array([place[name] for name in names], dtype=np.int64)
-        order = time_order(rows[:, 0], "UWB", warnings)
+        order = time_order(rows[:, 0], "UWB", warnings, self.set_back)
         rows = rows[order]
         return UwbRanges(rows[:, 0], rank[rows[:, 1].astype(np.int64)], rows[:, 2], rows[:, 3], tuple(ids))

@@ -169,7 +169,7 @@ class LaserMessages:
         return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]]
 
     def finish(
-        self, params: Params, skipped: dict[str, int], warnings: list[str]
+        self, params: Params, skipped: dict[str, int], warnings: list[str], set_back: dict[str, float] | None = None
     ) -> tuple[LaserScans | None, Floats | None]:
         """Return the scans of the commonest layout, sorted by time, and T_base_laser where the messages tell it."""
         for name, count in self._counts.items():
@@ -188,7 +188,7 @@ class LaserMessages:
         if scans.seen > len(scans.stamps) and self._every_nth > 1:
             skipped[f"{what} thinned out"] = scans.seen - len(scans.stamps)
         stamps = np.array(scans.stamps)
-        order = time_order(stamps, what, warnings)
+        order = time_order(stamps, what, warnings, set_back)
         angle_min, increment = (kept.angle_min, kept.angle_increment) if what != "FLASER" else params.guess_scanner(kept.beams)
         told = params.get("robot_front_laser_max", "laser_front_laser_max_range")
         range_max = kept.range_max or told or DEFAULT_RANGE_MAX

@@ -48,9 +48,18 @@ def why_broken(error: ValueError) -> str:
     return text if len(text) <= 100 else text[:97] + "..."
 
 
-def time_order(stamps: Floats, what: str, warnings: list[str]) -> NDArray[np.int64]:
-    """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when it is not the order given."""
+def time_order(
+    stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None
+) -> NDArray[np.int64]:
+    """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when it is not the order given.
+
+    Parameters
+    ----------
+    set_back : takes by how much the clock was set back at most, s, by what.
+    """
     late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps)))
     if late:
         warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
+        if set_back is not None:
+            set_back[what] = float(np.max(np.maximum.accumulate(stamps) - stamps))
     return np.argsort(stamps, kind="stable")

@@ -1,10 +1,11 @@
 """Stage summaries in the making, and the wire to the caller: progress, clock, cancellation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from ..errors import Cancelled
 from ..graph.solver import SolverSummary
 from ..map_result import StageSummary
+from ..sensor_log import SensorLog
 
 Progress = Callable[[str, int, int], object]
 """progress(stage, done, total); returning False asks to stop, see errors.Cancelled."""
@@ -19,6 +20,13 @@ class Stages:
         self.done: list[StageSummary] = []
         self.warnings: list[str] = []
         self.doubts: list[str] = []
+
+    def note(self, logs: Sequence[SensorLog]) -> None:
+        """Take over what the screening of the recordings found."""
+        for number, log in enumerate(logs):
+            where = f"recording {number + 1}: " if len(logs) > 1 else ""
+            for remark in log.screening.remarks if log.screening is not None else ():
+                (self.doubts if remark.doubt else self.warnings).append(where + remark.text)
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Report progress; raises Cancelled where the callback returns False."""

@@ -93,7 +93,7 @@ def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
     paths: list[Floats] = []
     first, start = 0, 0.0
     for number, log in enumerate(logs):
-        frames = keyframes.select(log.odometry, config)
+        frames = keyframes.of(log, config)
         each.append(Recording(number, log, frames, first))
         paths.append(start + np.concatenate([[0.0], np.cumsum(frames.path)]))
         first, start = first + len(frames), float(paths[-1][-1]) + _APART

@@ -31,7 +31,7 @@ def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorL
     scans = log.scans
     if scans is None or not len(scans.stamps) or grid.move_distance <= 0.0:
         return log
-    _, near = keyframes.choose_scans(scans, keyframes.select(log.odometry, frames), frames)
+    _, near = keyframes.choose_scans(scans, keyframes.of(log, frames), frames)
     base = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps)
     laser = se2.compose(base, log.mounting.T_base_laser)
     traced = moved_scans(laser, grid.move_distance / _STEPS, grid.move_angle / _STEPS)

@@ -1,0 +1,209 @@
+"""What a recording says against itself is repaired where it can be, and said in any case."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.room_drive import recording, two_rounds
+
+from uwblite import se2
+from uwblite.errors import DataError
+from uwblite.screening.odometry_chain import chained
+from uwblite.screening.screen import screen
+from uwblite.sensor_log import LogNotes, Odometry, UwbRanges
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return recording(two_rounds())
+
+
+def with_poses(log, poses):
+    return replace(log, odometry=Odometry(log.odometry.stamps, poses))
+
+
+def kinds(log, doubts=False):
+    return {r.kind for r in log.screening.remarks if r.doubt or not doubts}
+
+
+def frozen(log, start, end):
+    steps = se2.between(log.odometry.poses[:-1], log.odometry.poses[1:])
+    still = (log.odometry.stamps[1:] >= start) & (log.odometry.stamps[1:] < end)
+    return with_poses(log, chained(log.odometry.poses[0], np.where(still[:, None], 0.0, steps)))
+
+
+def test_a_sound_recording_stays_as_it_is(sound):
+    done = screen(sound)
+    assert done.screening.remarks == ()
+    assert len(done.screening.breaks.stamps) == 0
+    assert done.odometry is sound.odometry
+    assert screen(done) is done
+
+
+def test_wheels_that_stand_still_are_replaced_by_the_motion_from_scan_to_scan(sound):
+    log = frozen(sound, 130.0, 160.0)
+    done = screen(log)
+    assert kinds(done) == {"wheels stand still"}
+    assert not kinds(done, doubts=True)
+    motion, true, lost = (
+        se2.between(*(se2.interpolate_trajectory(x.odometry.stamps, x.odometry.poses, t) for t in (130.0, 160.0)))
+        for x in (done, sound, log)
+    )
+    assert np.hypot(*(lost - true)[:2]) > 0.5 or abs(se2.wrap_angle(lost[2] - true[2])) > 1.0
+    spread = np.sqrt((done.screening.breaks.sigma**2).sum(axis=0))
+    assert np.hypot(*(motion - true)[:2]) < 2.0 * spread[0] < 0.5
+    assert abs(se2.wrap_angle(motion[2] - true[2])) < 2.0 * spread[2]
+
+
+def test_without_lidar_ranges_tell_that_wheels_stand_still_and_the_map_is_doubted(sound):
+    done = screen(frozen(sound, 120.0, 200.0).without(lidar=True))
+    assert kinds(done, doubts=True) == {"wheels stand still"}
+
+
+def test_a_robot_that_stands_has_no_lost_wheels(sound):
+    rests = 0.05 * np.arange(400)
+    stamps = np.concatenate([100.0 + rests, sound.odometry.stamps + 20.0])
+    poses = np.concatenate([np.repeat(sound.odometry.poses[:1], 400, axis=0), sound.odometry.poses])
+    again = np.random.default_rng(2).normal(0.0, 0.01, (100, sound.scans.ranges.shape[1]))
+    scans = replace(
+        sound.scans,
+        stamps=np.concatenate([100.0 + 0.2 * np.arange(100), sound.scans.stamps + 20.0]),
+        ranges=np.concatenate([sound.scans.ranges[:1] + again, sound.scans.ranges]).astype(np.float32),
+    )
+    ranges = replace(sound.ranges, stamps=sound.ranges.stamps + 20.0)
+    done = screen(replace(sound, odometry=Odometry(stamps, poses), scans=scans, ranges=ranges))
+    assert done.screening.remarks == ()
+
+
+def test_one_reading_far_off_is_left_out(sound):
+    poses = sound.odometry.poses.copy()
+    poses[1000, :2] += 3000.0
+    done = screen(with_poses(sound, poses))
+    assert kinds(done) == {"odometry glitches"}
+    assert len(done.odometry.stamps) == len(poses) - 1
+    assert np.abs(done.odometry.poses).max() < 20.0
+
+
+def test_a_reset_is_a_break_whose_sides_are_joined_by_predicted_motion(sound):
+    poses = sound.odometry.poses.copy()
+    poses[1500:] = se2.between(poses[1500], poses[1500:])
+    done = screen(with_poses(sound, poses))
+    assert kinds(done) == {"odometry breaks"}
+    np.testing.assert_allclose(done.screening.breaks.stamps, sound.odometry.stamps[1499])
+    off = se2.between(sound.odometry.poses, done.odometry.poses)
+    assert np.abs(off).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [((1000, 1000, 1), "millimetres"), ((100, 100, 1), "centimetres"), ((1, 1, 180 / np.pi), "degrees")]
+)
+def test_wrong_units_of_the_odometry_are_refused_by_name(sound, factor, unit):
+    with pytest.raises(DataError, match=unit):
+        screen(with_poses(sound, sound.odometry.poses * factor))
+
+
+def test_wrong_units_of_ranges_and_scans_are_refused_by_name(sound):
+    with pytest.raises(DataError, match="ranges look like millimetres"):
+        screen(replace(sound, ranges=replace(sound.ranges, ranges=sound.ranges.ranges * 1000)))
+    far = replace(sound.scans, ranges=sound.scans.ranges * 1000, range_max=5600.0)
+    with pytest.raises(DataError, match="laser's readings look like millimetres"):
+        screen(replace(sound, scans=far))
+
+
+def test_two_sources_in_one_log_are_refused(sound):
+    other = se2.compose(np.array([3.0, 2.0, 1.0]), sound.odometry.poses)
+    stamps = np.repeat(sound.odometry.stamps, 2) + np.tile([0.0, 0.01], len(other))
+    poses = np.stack([sound.odometry.poses, other], axis=1).reshape(-1, 3)
+    with pytest.raises(DataError, match="two robots"):
+        screen(replace(sound, odometry=Odometry(stamps, poses)))
+
+
+def test_readings_that_stand_in_a_log_twice_count_once(sound):
+    twice = {name: np.repeat(getattr(sound.ranges, name), 2) for name in ("stamps", "anchor", "ranges", "quality")}
+    log = replace(
+        sound,
+        odometry=Odometry(np.repeat(sound.odometry.stamps, 2), np.repeat(sound.odometry.poses, 2, axis=0)),
+        ranges=UwbRanges(**twice, anchor_ids=sound.ranges.anchor_ids),
+        scans=replace(sound.scans, stamps=np.repeat(sound.scans.stamps, 2), ranges=np.repeat(sound.scans.ranges, 2, axis=0)),
+    )
+    done = screen(log)
+    np.testing.assert_array_equal(done.odometry.stamps, sound.odometry.stamps)
+    np.testing.assert_array_equal(done.scans.stamps, sound.scans.stamps)
+    assert len(done.ranges.stamps) == len(sound.ranges.stamps)
+
+
+def test_scans_that_repeat_themselves_are_left_out(sound):
+    readings = sound.scans.ranges.copy()
+    readings[400:] = readings[400]
+    done = screen(replace(sound, scans=replace(sound.scans, ranges=readings)))
+    assert kinds(done) == {"repeated scans"}
+    assert len(done.scans.stamps) == 401
+
+
+def test_ranges_that_repeat_themselves_are_left_out(sound):
+    stuck = (sound.ranges.anchor == 1) & (sound.ranges.stamps > 180.0)
+    done = screen(replace(sound, ranges=replace(sound.ranges, ranges=np.where(stuck, 4.2, sound.ranges.ranges))))
+    assert kinds(done) == {"repeated ranges"}
+    assert len(done.ranges.stamps) == len(stuck) - stuck.sum()
+
+
+def test_a_heading_against_the_path_is_turned_and_the_laser_says_how(sound):
+    done = screen(with_poses(sound, sound.odometry.poses * (1, 1, -1)))
+    assert kinds(done) == {"heading against path"}
+    np.testing.assert_allclose(done.odometry.poses, sound.odometry.poses)
+    done = screen(with_poses(sound, sound.odometry.poses * (1, -1, 1)))
+    np.testing.assert_allclose(done.odometry.poses, sound.odometry.poses)
+
+
+def test_laser_and_wheels_that_turn_opposite_ways_are_a_doubt(sound):
+    done = screen(replace(sound, scans=replace(sound.scans, ranges=sound.scans.ranges[:, ::-1].copy())))
+    assert kinds(done, doubts=True) == {"laser turned over"}
+    assert done.mounting.laser_flipped
+    left = screen(replace(sound, scans=replace(sound.scans, ranges=sound.scans.ranges[:, ::-1].copy())), turn_laser=False)
+    assert not left.mounting.laser_flipped
+
+
+def test_a_base_that_drives_backwards_has_its_laser_turned(sound):
+    steps = se2.between(sound.odometry.poses[:-1], sound.odometry.poses[1:]) * (-1, -1, 1)
+    done = screen(with_poses(sound, chained(sound.odometry.poses[0], steps)))
+    assert kinds(done) == {"laser turned away"}
+    assert abs(se2.wrap_angle(done.mounting.T_base_laser[2] - np.pi)) < 0.05
+
+
+@pytest.mark.parametrize("without", [{}, {"uwb": True}, {"lidar": True}])
+def test_a_robot_that_was_carried_is_a_break_and_a_doubt(sound, without):
+    """From 150 s to 190 s the log lacks, and its stamps are closed up."""
+    log = sound.without(**without)
+    stamps, poses = log.odometry.stamps, log.odometry.poses
+    before, after = stamps < 150.0, stamps >= 190.0
+    put = se2.compose(poses[before][-1], se2.inverse(poses[after][0]))
+
+    def closed(t):
+        return np.concatenate([t[t < 150.0], t[t >= 190.0] - 40.0])
+
+    def kept(t, values):
+        return values[(t < 150.0) | (t >= 190.0)]
+
+    moved = np.concatenate([poses[before], se2.compose(put, poses[after])])
+    scans, ranges = log.scans, log.ranges
+    if scans is not None:
+        scans = replace(scans, stamps=closed(scans.stamps), ranges=kept(scans.stamps, scans.ranges))
+    if ranges is not None:
+        rows = {n: kept(ranges.stamps, getattr(ranges, n)) for n in ("anchor", "ranges", "quality")}
+        ranges = UwbRanges(closed(ranges.stamps), **rows, anchor_ids=ranges.anchor_ids)
+    done = screen(replace(log, odometry=Odometry(closed(stamps), moved), scans=scans, ranges=ranges))
+    assert kinds(done, doubts=True) == {"carried"}
+    assert np.all(np.abs(done.screening.breaks.stamps - 150.0) < 1.5)
+
+
+def test_a_gap_in_which_the_robot_drove_on_keeps_nothing_that_others_saw_meanwhile(sound):
+    kept = (sound.odometry.stamps < 140.0) | (sound.odometry.stamps > 160.0)
+    done = screen(replace(sound, odometry=Odometry(sound.odometry.stamps[kept], sound.odometry.poses[kept])))
+    assert kinds(done) == {"odometry gap"}
+    for stamps in (done.ranges.stamps, done.scans.stamps):
+        assert not np.any((stamps > 140.5) & (stamps < 159.5))
+
+
+def test_a_clock_that_was_set_back_is_a_doubt(sound):
+    done = screen(replace(sound, notes=LogNotes(set_back={"radio": 30.0, "odometry": 0.2})))
+    assert [r.kind for r in done.screening.remarks if r.doubt] == ["clock set back"]

@@ -1,0 +1,107 @@
+"""Motion from scan to scan, without wheels: what stands in for them where they say nothing.
+
+Scans a moment apart are aligned point to line from a guess; where few points then match, a correlative search around it
+finds the place.
+"""
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats, Ints
+from ..keyframes import ScanPoints
+from ..sensor_log import LaserScans, SensorMounting
+from . import clouds, scan_matching
+from .clouds import CloudConfig, Clouds
+from .correlative_matching import CorrelativeConfig, search
+from .pair_alignment import align_pairs
+from .point_cloud import make_cloud
+from .scan_matching import CloudRasters
+
+_FIRST_GATE, _LAST_GATE = 0.4, 0.12
+"""Farthest match in the first and last iteration, m."""
+_POINTS = 200
+"""Points looked up per pair."""
+_GOOD_SHARE = 0.75
+"""Pairs that share at least this part of their points need no search."""
+_GAIN = 0.05
+"""A search must raise the share by this to be believed."""
+_SEARCH = (0.6, 0.6, 0.6)
+"""Half-widths of the search, m, m, rad."""
+_LEAST_POINTS = 25
+"""Clouds with fewer points measure nothing."""
+_AT_ONCE = 128
+"""Pairs of scans whose rasters are held at once."""
+
+
+def scan_steps(
+    scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, guess: Floats, searches: int = 0
+) -> tuple[Floats, Floats]:
+    """Measure the motion of the base between pairs of scans.
+
+    What the scans do not show (the length of a bare corridor) keeps the guess.
+
+    Parameters
+    ----------
+    scans : with the mounting of their laser.
+    first, second : (e,) scan numbers, so near in time that the two see the same. guess : (e, 3).
+    searches : at most so many of the pairs that match worst are searched for around the guess, which takes long.
+
+    Returns
+    -------
+    Motions T_first_second (e, 3) and the share of points that match (e,), 0..1; 0 where there are too few.
+    """
+    steps, shares = [np.zeros((0, 3))], [np.zeros(0)]
+    for low in range(0, len(first), _AT_ONCE):
+        rows = slice(low, low + _AT_ONCE)
+        allowed = -(-searches * _AT_ONCE // len(first))
+        step, share = _block(scans, mounting, first[rows], second[rows], guess[rows], allowed)
+        steps.append(step)
+        shares.append(share)
+    return np.concatenate(steps), np.concatenate(shares)
+
+
+def _block(
+    scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, guess: Floats, searches: int
+) -> tuple[Floats, Floats]:
+    config = CloudConfig()
+    chosen, where = np.unique(np.concatenate([first, second]), return_inverse=True)
+    i, j = np.split(where.reshape(-1), 2)
+    built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
+    raster = scan_matching.rasterize(built, config.raster, _FIRST_GATE)
+    points = scan_matching.pair_points(built, j, _POINTS)
+    aligned = align_pairs(built, raster, i, j, guess, points, _FIRST_GATE, _LAST_GATE)
+    enough = aligned.factors.asked >= _LEAST_POINTS
+    pose, share = aligned.pose.copy(), np.where(enough, aligned.share, 0.0)
+    poor = np.flatnonzero((share < _GOOD_SHARE) & enough)
+    for row in poor[np.argsort(share[poor], kind="stable")][:searches].tolist():
+        found = _searched(built, raster, int(i[row]), int(j[row]), guess[row])
+        if found is not None and found[1] > share[row] + _GAIN:
+            pose[row], share[row] = found
+    return pose, share
+
+
+def _searched(built: Clouds, raster: CloudRasters, i: int, j: int, guess: Floats) -> tuple[Floats, float] | None:
+    """Return the best pose of cloud j in cloud i and the share of points that match there."""
+    target, source = (make_cloud(p, p + n) for p, n in (built.cloud(i), built.cloud(j)))
+    places = search(target, source, guess, _SEARCH, CorrelativeConfig())
+    if not len(places.poses):
+        return None
+    one = np.ones(len(places.poses), dtype=np.int64)
+    points = scan_matching.pair_points(built, one * j, _POINTS)
+    aligned = align_pairs(built, raster, one * i, one * j, places.poses, points, 0.3, _LAST_GATE)
+    best = int(np.argmax(aligned.share))
+    return aligned.pose[best], float(aligned.share[best])
+
+
+def _points(scans: LaserScans, mounting: SensorMounting, chosen: Ints, range_max: float) -> ScanPoints:
+    """Return the rays of the chosen scans as points in the frame of the base, each scan as a snapshot."""
+    readings = scans.ranges[chosen]
+    with np.errstate(invalid="ignore"):
+        scan, ray = np.nonzero((readings >= scans.range_min) & (readings <= min(range_max, scans.range_max)))
+    sign = -1.0 if mounting.laser_flipped else 1.0
+    reach = readings[scan, ray].astype(np.float64)
+    bearing = sign * scans.angles[ray]
+    in_laser = reach[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    points = se2.transform(mounting.T_base_laser, in_laser)
+    origins = np.broadcast_to(mounting.T_base_laser[:2], points.shape)
+    return ScanPoints(scan.astype(np.int64), points, origins, ray.astype(np.int64), chosen[scan])

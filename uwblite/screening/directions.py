@@ -1,0 +1,87 @@
+"""Which way is forward, which way is left: the heading's sign, the laser's side and the direction it looks in."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats
+from ..lidar import laser_mounting
+from ..sensor_log import Odometry, Remark, SensorLog
+from .units import heading_agreement
+from .wheel_motion import Pairs
+
+_AGREEMENT, _CLEARLY = 0.7, 0.2
+"""Agreement of heading and path below which the sign is looked at, and by how much the other sign must agree better."""
+_TURNS = 300
+"""Scan pairs looked at for the way up of the laser."""
+_LEAST_TURNED, _CONCENTRATED = 0.3, 0.8
+"""Angle, rad, by which a laser looks elsewhere than told, and the share of the motions' directions that must agree on it."""
+_CLEAR_WAY, _CLEAR_TURN = 0.05, 0.3
+"""Pairs of scans with a longer way, m, and a smaller turn, rad, show the direction of driving."""
+_LEAST_PAIRS = 15
+
+
+def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Return the recording with a heading that counts the way the path turns; where there is a lidar it says which is right."""
+    plain, varied = heading_agreement(log.odometry)
+    if not varied or plain >= _AGREEMENT or heading_agreement(log.odometry, -1.0)[0] < plain + _CLEARLY:
+        return log, []
+    mirrors = {"the sign of its heading": np.array([1.0, 1.0, -1.0]), "the sign of its y": np.array([1.0, -1.0, 1.0])}
+    tried = {what: replace(log, odometry=_scaled(log.odometry, sign)) for what, sign in mirrors.items()}
+    fits = {what: _fits_laser(other) for what, other in tried.items()}
+    best = max(fits, key=lambda what: fits[what])
+    known = fits[best] > 0.0
+    text = f"the odometry's heading turns against its path: {best} was changed"
+    if not known:
+        text += ", and nothing tells whether the map is the place or its mirror image"
+    return tried[best], [Remark("heading against path", text)]
+
+
+def _scaled(odometry: Odometry, factor: Floats) -> Odometry:
+    return Odometry(odometry.stamps, odometry.poses * factor)
+
+
+def _fits_laser(log: SensorLog) -> float:
+    """Return 1 where the laser's turns agree with the wheels', -1 where they are the other way round, 0 where none tell."""
+    seen = None if log.scans is None or not len(log.scans.stamps) else laser_mounting.compare(log, _TURNS)
+    if seen is None or not seen.agree:
+        return 0.0
+    return -1.0 if seen.turned_over else 1.0
+
+
+def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Return the recording with the laser the way up that its turns show.
+
+    A laser upside down, beams in the wrong order and swapped wheels look alike: scans and wheels turn opposite ways. The first
+    two are repaired so; the third would give the mirror image of the place, and nothing in the recording tells.
+    """
+    if _fits_laser(log) >= 0.0:
+        return log, []
+    flipped = not log.mounting.laser_flipped
+    text = (
+        f"laser and wheels turn opposite ways: the laser was taken as mounted {'upside down' if flipped else 'upright'}, "
+        "not as told; if the wheels are swapped instead, the map is a mirror image: settle it by "
+        f"{'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
+    )
+    return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [Remark("laser turned over", text, doubt=True)]
+
+
+def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
+    """Return the recording with the laser looking where the driving shows, where that is far from what was told."""
+    way = [np.hypot(m[:, 0], m[:, 1]) for m in (pairs.lidar, pairs.wheels)]
+    clear = pairs.measured & (np.minimum(*way) > _CLEAR_WAY) & (np.abs(pairs.lidar[:, 2]) < _CLEAR_TURN)
+    if clear.sum() < _LEAST_PAIRS:
+        return log, []
+    by_wheels, by_lidar = (m[clear, 0] + 1j * m[clear, 1] for m in (pairs.wheels, pairs.lidar))
+    turn = np.mean(np.exp(1j * (np.angle(by_wheels) - np.angle(by_lidar))))
+    angle = float(np.angle(turn))
+    if abs(angle) < _LEAST_TURNED or abs(turn) < _CONCENTRATED:
+        return log, []
+    told = log.mounting.T_base_laser
+    mount = np.array([told[0], told[1], float(se2.wrap_angle(told[2] + angle))])
+    text = (
+        f"the laser looks {np.degrees(angle):+.0f} degrees away from what was told, or the wheels drive that way; it was taken "
+        f"so: --laser-pose {mount[0]:g},{mount[1]:g},{mount[2]:.3f}"
+    )
+    return replace(log, mounting=replace(log.mounting, T_base_laser=mount)), [Remark("laser turned away", text)]

@@ -1,0 +1,126 @@
+"""Do the ranges change by more than the robot moves? By the triangle inequality no anchor's range can.
+
+Medians of a few readings of one anchor are compared over a time: their difference is at most the way that the wheels
+count, apart from noise and blocked sight. Where several anchors exceed that together, the wheels have missed a motion.
+"""
+
+import numpy as np
+
+from ..arrays import Floats
+from ..sensor_log import SensorLog
+
+_WINDOW = 3
+"""Readings whose median is taken."""
+_LONG = 8
+"""Readings over which a jump must last."""
+_SILENCE = 6.0
+"""Usual periods of an anchor after which a jump says nothing of when the robot moved."""
+_STRETCH = 1.5
+"""Factor by which wheels may count too little."""
+_MARGIN = 0.5
+"""Change, m, that blocked sight explains."""
+_TIMES_NOISE = 5.0
+"""Standard deviations of one reading that a median never is off."""
+_LEAST_VOTES = 2
+"""Anchors that must agree, where so many are heard."""
+_USABLE = (0.02, 200.0)
+"""Readings outside are no distances, m."""
+
+
+def excess(log: SensorLog, start: float, end: float) -> float:
+    """Return by how much the ranges say that the robot moved between two times beyond what the wheels count, m; 0 = not at all.
+
+    Parameters
+    ----------
+    start, end : s; the readings before start and those after end are compared, and those between with each other.
+    """
+    found = []
+    for stamps, ranges in _by_anchor(log):
+        noise = _noise(ranges)
+        before, after = ranges[stamps <= start][-_WINDOW:], ranges[stamps >= end][:_WINDOW]
+        inside = ranges[(stamps > start) & (stamps < end)]
+        chunks = [np.median(part) for part in (before, *_chunks(inside), after) if len(part) >= _WINDOW]
+        # Where the readings stand that are compared, the robot may have driven a little.
+        extra = _way(log, stamps[stamps <= start][-_WINDOW:]) + _way(log, stamps[stamps >= end][:_WINDOW])
+        if len(chunks) >= 2:
+            found.append(float(np.ptp(chunks)) - _way(log, np.array([start, end])) - extra - _MARGIN - _TIMES_NOISE * noise)
+    return _agreed(found)
+
+
+def cuts(log: SensorLog) -> list[float]:
+    """Return the times, s, at which the ranges to several anchors jump together, and for good, by more than the robot drove."""
+    votes: list[tuple[float, float, float]] = []
+    heard = _by_anchor(log)
+    for stamps, ranges in heard:
+        if len(ranges) < 4 * _LONG:
+            continue
+        way, margin = _travelled(log, stamps), _MARGIN + _TIMES_NOISE * _noise(ranges)
+        short, long = (_jumps(ranges, way, window) for window in (_WINDOW, _LONG))
+        over = np.minimum(short, long) - margin
+        over[:-1][np.diff(stamps) > _SILENCE * np.median(np.diff(stamps))] = 0.0
+        votes += [(float(stamps[k]), float(stamps[k + 1]), float(over[k])) for k in np.flatnonzero(over > 0.0)]
+    return _together(votes, len(heard))
+
+
+def _jumps(ranges: Floats, way: Floats, window: int) -> Floats:
+    """Return by how much medians of so many readings before and after each reading (n,) differ beyond the way driven, m."""
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(ranges, window), axis=1)
+    centres = np.mean(np.lib.stride_tricks.sliding_window_view(way, window), axis=1)
+    found = np.full(len(ranges), -np.inf)
+    driven = centres[window:] - centres[:-window]
+    found[window - 1 : len(ranges) - window] = np.abs(medians[window:] - medians[:-window]) - _STRETCH * driven
+    return found
+
+
+def _together(votes: list[tuple[float, float, float]], anchors: int) -> list[float]:
+    """Return the middles of the times, s, in which enough anchors jump."""
+    if not votes:
+        return []
+    found: list[float] = []
+    for start, end, _ in sorted(votes, key=lambda v: -v[2]):
+        same = [v for v in votes if v[0] <= end and v[1] >= start]
+        apart = all(abs(0.5 * (start + end) - t) > 10.0 for t in found)
+        if apart and len(same) >= max(_LEAST_VOTES, anchors // 2):
+            found.append(0.5 * (max(v[0] for v in same) + min(v[1] for v in same)))
+    return sorted(found)
+
+
+def _agreed(over: list[float]) -> float:
+    """Return the excess that enough anchors exceed."""
+    if not over:
+        return 0.0
+    needed = min(max(_LEAST_VOTES, len(over) // 2), len(over))
+    return max(0.0, sorted(over, reverse=True)[needed - 1])
+
+
+def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:
+    """Return stamps and usable ranges of each anchor while there is odometry."""
+    ranges = log.ranges
+    if ranges is None:
+        return []
+    usable = (ranges.ranges > _USABLE[0]) & (ranges.ranges < _USABLE[1])
+    usable &= (ranges.stamps >= log.odometry.stamps[0]) & (ranges.stamps <= log.odometry.stamps[-1])
+    own = [usable & (ranges.anchor == k) for k in range(len(ranges.anchor_ids))]
+    return [(ranges.stamps[o], ranges.ranges[o]) for o in own if o.sum() >= _WINDOW]
+
+
+def _chunks(values: Floats) -> list[Floats]:
+    return np.array_split(values, max(1, len(values) // (2 * _WINDOW)))
+
+
+def _noise(ranges: Floats) -> float:
+    """Return the standard deviation of one reading by second differences, m."""
+    if len(ranges) < 5:
+        return 0.1
+    return max(float(1.4826 * np.median(np.abs(ranges[1:-1] - 0.5 * (ranges[:-2] + ranges[2:]))) / np.sqrt(1.5)), 0.03)
+
+
+def _travelled(log: SensorLog, stamps: Floats) -> Floats:
+    """Return the way driven until each stamp, m."""
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T))])
+    return np.interp(stamps, log.odometry.stamps, way)
+
+
+def _way(log: SensorLog, stamps: Floats) -> float:
+    """Return the way driven between the first and the last stamp, m."""
+    return float(np.ptp(_travelled(log, stamps))) if len(stamps) else 0.0

@@ -1,0 +1,185 @@
+"""The screening of one recording: units first, then the chain of odometry, then sensors that stand still."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats
+from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
+from . import cuts, directions, odometry_chain, range_motion, stuck_sensors, units, wheel_motion
+
+_GAP = 2.0
+"""Silence of the odometry that is a gap, s; or twenty periods, where that is longer."""
+_STANDS = (0.05, 0.05)
+"""Way, m, and turn, rad, below which the wheels say that the robot stood meanwhile."""
+_ANYWHERE = (20.0, 20.0, 3.0)
+"""Standard deviation of a step that nothing measured, m, m, rad."""
+_STEP = 2.0
+"""Time between the steps of lost wheels, where no lidar stands in for them, s."""
+_KNOWN = 3.0
+"""A cut so near in time to another break is the same, s."""
+UNKNOWN = 3.0
+"""Steps uncertain by so much, m, are no guess of where the robot is."""
+
+
+def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
+    """Return the recording repaired, with what was found in its `screening`; a recording screened before stays as it is.
+
+    Parameters
+    ----------
+    log : any recording.
+    turn_laser : take the laser as mounted the way that its scans show, not as told.
+
+    Raises
+    ------
+    DataError : a unit is plainly wrong, or two recordings were written into one.
+    """
+    if log.screening is not None:
+        return log
+    remarks = _clock_remarks(log)
+    units.refuse_wrong_lengths(log)
+    odometry, repeats = odometry_chain.without_repeats(log.odometry)
+    odometry, glitches = odometry_chain.without_glitches(odometry)
+    units.refuse_degrees(odometry)
+    odometry, jumps, broken = odometry_chain.rejoined(odometry)
+    log = replace(log, odometry=odometry)
+    remarks += [*_repeats(repeats), *glitches, *broken]
+    repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_repeated_ranges, directions.heading_with_the_path]
+    for repair in repairs + [directions.laser_upright] * turn_laser:
+        log, more = repair(log)
+        remarks += more
+    breaks = [jumps]
+    for step in (_gaps, _lost_wheels):
+        log, own, more = step(log)
+        breaks.append(own)
+        remarks += more
+    own, more = _cuts(log, _sorted(breaks).stamps)
+    breaks.append(own)
+    remarks += more
+    return replace(log, screening=Screening(tuple(remarks), _sorted(breaks)))
+
+
+def _clock_remarks(log: SensorLog) -> list[Remark]:
+    """Return a doubt for each sensor whose clock was set back."""
+    return [
+        Remark("clock set back", f"the clock of the {sensor} was set back by up to {by:.1f} s: part the log there", doubt=True)
+        for sensor, by in log.notes.set_back.items()
+        if by > 1.0
+    ]
+
+
+def _repeats(count: int) -> list[Remark]:
+    text = f"{count} odometry readings stand in the log twice and were left out once"
+    return [Remark("repeated odometry", text)] if count else []
+
+
+def _sorted(breaks: list[OdometryBreaks]) -> OdometryBreaks:
+    stamps, sigma = np.concatenate([b.stamps for b in breaks]), np.concatenate([b.sigma for b in breaks])
+    order = np.argsort(stamps, kind="stable")
+    return OdometryBreaks(stamps[order], sigma[order])
+
+
+def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
+    """Judge silences of the odometry: did the robot stand, drive on, or was it carried?"""
+    stamps, poses = log.odometry.stamps, log.odometry.poses
+    span = np.diff(stamps)
+    period = float(np.median(span[span > 0])) if np.any(span > 0) else 0.0
+    gaps = np.flatnonzero(span > max(_GAP, 20.0 * period))
+    at, sigma, remarks, silent = [], [], list[Remark](), list[tuple[float, float]]()
+    for k in gaps.tolist():
+        a, b = float(stamps[k]), float(stamps[k + 1])
+        step = se2.between(poses[k], poses[k + 1])
+        stood = bool(np.hypot(*step[:2]) < _STANDS[0] and abs(step[2]) < _STANDS[1])
+        elsewhere = stood and _elsewhere(log, a, b)
+        when = f"the odometry is silent for {b - a:.0f} s from t = {a - stamps[0]:.0f} s"
+        if elsewhere:
+            text = f"{when} and counts no way, but the robot was moved meanwhile: other sensors alone tie the two sides"
+            remarks.append(Remark("carried", text, doubt=True))
+        elif not stood:
+            text = f"{when}, while the robot drove on; what other sensors saw then was left out"
+            remarks.append(Remark("odometry gap", text))
+            silent.append((a, b))
+        at.append(a)
+        sigma.append(_ANYWHERE if elsewhere else (0.02, 0.02, 0.02) if stood else (0.1, 0.1, 0.1))
+    found = OdometryBreaks(np.array(at), np.array(sigma)) if at else OdometryBreaks.none()
+    return _without(log, silent), found, remarks
+
+
+def _elsewhere(log: SensorLog, a: float, b: float) -> bool:
+    """Tell whether lidar or radio find the robot elsewhere after a time in which the wheels stood."""
+    same = cuts.same_place(log, a, b)
+    return not same if same is not None else range_motion.excess(log, a, b) > 0.0
+
+
+def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
+    """Leave out what was seen and heard while nobody knows where the robot was."""
+
+    def kept(stamps: Floats) -> Bools:
+        inside = np.zeros(len(stamps), dtype=bool)
+        for a, b in silent:
+            inside |= (stamps > a + 0.2) & (stamps < b - 0.2)
+        return ~inside
+
+    if not silent:
+        return log
+    ranges, scans = log.ranges, log.scans
+    if ranges is not None:
+        ranges = stuck_sensors.rows_of_ranges(ranges, kept(ranges.stamps))
+    if scans is not None:
+        scans = stuck_sensors.rows_of_scans(scans, kept(scans.stamps))
+    return replace(log, ranges=ranges, scans=scans)
+
+
+def _lost_wheels(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
+    """Find stretches in which the wheels stand and other sensors move, and put something in their place."""
+    pairs = wheel_motion.compare(log)
+    start = float(log.odometry.stamps[0])
+    if pairs is not None and pairs.measured.any():
+        log, turned = directions.laser_ahead(log, pairs)
+        if turned:
+            log, breaks, remarks = _lost_wheels(log)
+            return log, breaks, turned + remarks
+        stretches = wheel_motion.lost(log, pairs)
+        remarks = [_lost_remark(a - start, b - start, "the motion from scan to scan stands in for them") for a, b in stretches]
+        if stretches:
+            odometry, breaks = wheel_motion.replaced(log, stretches)
+            log = replace(log, odometry=odometry)
+            pairs = wheel_motion.compare(log) or pairs
+            return log, breaks, remarks + wheel_motion.disagreeing(pairs, start)
+        return log, OdometryBreaks.none(), wheel_motion.disagreeing(pairs, start)
+    stretches = [(a, b) for a, b in wheel_motion.standing(log.odometry, 5.0) if range_motion.excess(log, a, b) > 0.0]
+    text = "the trajectory there rests on ranges alone"
+    remarks = [replace(_lost_remark(a - start, b - start, text), doubt=True) for a, b in stretches]
+    return log, _unknown_steps(log.odometry, stretches), remarks
+
+
+def _lost_remark(a: float, b: float, outcome: str) -> Remark:
+    text = f"the wheels count nothing from t = {a:.0f} to {b:.0f} s while the robot moves: {outcome}"
+    return Remark("wheels stand still", text)
+
+
+def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> OdometryBreaks:
+    """Return steps every few seconds in which the robot may have driven as fast as usual, to anywhere."""
+    usual = float(odometry_chain.Motion.of(odometry).speed[0]) / 4.0
+    stamps = [np.arange(a + 0.5 * _STEP, b, _STEP) for a, b in stretches]
+    at = np.concatenate([np.zeros(0), *stamps])
+    before = np.clip(np.searchsorted(odometry.stamps, at) - 1, 0, max(len(odometry.stamps) - 2, 0))
+    sigma = np.broadcast_to([usual * _STEP, usual * _STEP, 0.5], (len(at), 3))
+    return OdometryBreaks(odometry.stamps[before], sigma)
+
+
+def _cuts(log: SensorLog, known: Floats) -> tuple[OdometryBreaks, list[Remark]]:
+    """Find moments at which the robot is suddenly elsewhere, away from breaks (b,) that are known, s."""
+    times = cuts.found(log)
+    times = times[[not np.any(np.abs(known - t) < _KNOWN) for t in times]] if len(times) else times
+    if not len(times):
+        return OdometryBreaks.none(), []
+    stamps, start = log.odometry.stamps, log.odometry.stamps[0]
+    before = stamps[np.clip(np.searchsorted(stamps, times) - 1, 0, len(stamps) - 1)]
+    where = ", ".join(f"t = {t - start:.0f} s" for t in times[:4])
+    text = (
+        f"at {where}{' ...' if len(times) > 4 else ''} the robot is suddenly elsewhere: it was carried, or the log was cut; "
+        "other sensors alone tie the two sides"
+    )
+    return OdometryBreaks(before, np.tile(_ANYWHERE, (len(times), 1))), [Remark("carried", text, doubt=True)]

@@ -1,0 +1,100 @@
+"""Sensors that say the same again and again while the robot moves, and readings that were written twice."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Bools, Floats
+from ..sensor_log import LaserScans, Remark, SensorLog, UwbRanges
+
+_SAME_RANGES = 12
+"""Equal ranges in a row that no radio gives while the robot moves: their noise is centimetres, their resolution millimetres."""
+_MOVED = 0.5
+"""Travelled distance, m, over which a range of noise alone would not stay the same to the last digit."""
+_SAME_SCANS = 3
+"""Equal scans in a row that no lidar gives: some beam of hundreds always changes."""
+_LEAST_SEEN = 10
+"""Beams that must see something; scans that see nothing are rightly equal."""
+
+
+def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Leave out scans that repeat the one before to the last digit."""
+    scans = log.scans
+    if scans is None or len(scans.stamps) < _SAME_SCANS:
+        return log, []
+    again = np.zeros(len(scans.stamps), dtype=bool)
+    again[1:] = [np.array_equal(a, b, equal_nan=True) for a, b in zip(scans.ranges[1:], scans.ranges[:-1], strict=True)]
+    twice = again & np.concatenate([[False], np.diff(scans.stamps) == 0.0])
+    seen = np.isfinite(scans.ranges).sum(axis=1) >= _LEAST_SEEN
+    stuck = again & seen & _in_runs(again & seen & ~twice, _SAME_SCANS - 1)
+    wrong = twice | stuck
+    if not wrong.any():
+        return log, []
+    kept = replace(scans, stamps=scans.stamps[~wrong], ranges=scans.ranges[~wrong])
+    remarks = []
+    if stuck.any():
+        start = float(log.odometry.stamps[0])
+        when = _when(scans.stamps, stuck, start)
+        share = f"{int(stuck.sum())} of {len(stuck)} scans repeat the one before to the last digit ({when})"
+        remarks.append(Remark("repeated scans", f"{share}: the lidar or its driver stood still; they were left out"))
+    return replace(log, scans=kept), remarks
+
+
+def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Leave out ranges that repeat themselves to the last digit while the robot moves, and ranges written twice."""
+    ranges = log.ranges
+    if ranges is None or len(ranges.stamps) < 2:
+        return log, []
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T))])
+    travelled = np.interp(ranges.stamps, log.odometry.stamps, way)
+    wrong, remarks, start = np.zeros(len(ranges.stamps), dtype=bool), [], float(log.odometry.stamps[0])
+    for anchor, name in enumerate(ranges.anchor_ids):
+        own = np.flatnonzero(ranges.anchor == anchor)
+        same = np.concatenate([[False], np.diff(ranges.ranges[own]) == 0.0])
+        twice = same & np.concatenate([[False], np.diff(ranges.stamps[own]) == 0.0])
+        stuck = np.zeros(len(own), dtype=bool)
+        for first, last in _runs(same & ~twice):
+            far = travelled[own[last - 1]] - travelled[own[first - 1]] > _MOVED
+            if last - first >= _SAME_RANGES and far and ranges.ranges[own[first]] > 0.0:
+                stuck[first - 1 : last] = True
+        if stuck.any():
+            when = _when(ranges.stamps[own], stuck, start)
+            text = f"anchor {name} repeats one range to the last digit while the robot moves ({when}); these were left out"
+            remarks.append(Remark("repeated ranges", text))
+        wrong[own[twice | stuck]] = True
+    return (replace(log, ranges=rows_of_ranges(ranges, ~wrong)), remarks) if wrong.any() else (log, [])
+
+
+def rows_of_ranges(ranges: UwbRanges, kept: Bools) -> UwbRanges | None:
+    """Return some of the ranges; None where none is left."""
+    if not kept.any():
+        return None
+    used, anchor = np.unique(ranges.anchor[kept], return_inverse=True)
+    ids = tuple(ranges.anchor_ids[k] for k in used)
+    return UwbRanges(ranges.stamps[kept], anchor.astype(np.int64), ranges.ranges[kept], ranges.quality[kept], ids)
+
+
+def rows_of_scans(scans: LaserScans, kept: Bools) -> LaserScans:
+    """Return some of the scans."""
+    return replace(scans, stamps=scans.stamps[kept], ranges=scans.ranges[kept])
+
+
+def _runs(flags: Bools) -> list[tuple[int, int]]:
+    """Return first and one past the last of each run of set flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int64)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _in_runs(flags: Bools, least: int) -> Bools:
+    """Tell which set flags stand in runs of at least so many."""
+    long = np.zeros(len(flags), dtype=bool)
+    for first, last in _runs(flags):
+        long[first:last] = last - first >= least
+    return long
+
+
+def _when(stamps: Floats, flags: Bools, start: float) -> str:
+    """Return when the flags are set, in words."""
+    runs = _runs(flags)
+    text = ", ".join(f"t = {stamps[a] - start:.0f} to {stamps[b - 1] - start:.0f} s" for a, b in runs[:3])
+    return text + (f", and {len(runs) - 3} more stretches" if len(runs) > 3 else "")

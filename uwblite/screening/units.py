@@ -1,0 +1,138 @@
+"""Units that are plainly wrong, told by name before anything is computed with them."""
+
+import numpy as np
+
+from ..errors import DataError
+from ..sensor_log import Odometry, SensorLog
+
+FASTEST = 3.0
+"""A ground robot that maps a building is not faster, m/s."""
+_FAR_TOO_FAST = 9.0
+"""Usual speed, m/s, that no such robot keeps; millimetres taken for metres give 20 m/s at a crawl."""
+_CENTIMETRES = 90.0
+"""Usual speed, m/s, from which positions are rather millimetres than centimetres."""
+_FAST_TURN, _MORE_THAN_A_TURN = 1.0, 7.0
+"""Usual turn rate, rad/s, and range of headings, rad, without which they cannot be degrees."""
+LONGEST = 200.0
+"""No radio of this kind reaches farther, m."""
+_LONGEST_READING = 150.0
+"""Nor does a lidar of this kind see farther as a rule, m."""
+_CHORD = 1.0
+"""Time over which speed is taken, s: readings of two robots by turns, or in bursts, jump from one to the next."""
+_ENOUGH = 10
+"""Readings from which a unit is judged."""
+_AGREEMENT = 0.7
+"""Agreement of heading and direction of motion below which the heading is not the path's."""
+_CLEARLY = 0.2
+"""Another reading of the heading must agree by so much better."""
+
+
+def refuse_wrong_lengths(log: SensorLog) -> None:
+    """Raise DataError where the recording's lengths have plainly another unit than metres."""
+    found = [text for text in (_positions(log.odometry), _of_ranges(log), _of_scans(log)) if text]
+    if found:
+        raise DataError("; ".join(found))
+
+
+def refuse_degrees(odometry: Odometry) -> None:
+    """Raise DataError where the odometry's heading is plainly written in degrees."""
+    text = _heading(odometry)
+    if text:
+        raise DataError(text)
+
+
+def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, bool]:
+    """Compare the heading times a factor with the direction of motion.
+
+    Returns
+    -------
+    |mean exp(2 i (direction - factor heading))|, 1 for wheels that do not slide, forwards or backwards, near 0 for a wrong
+    unit or sign; and whether the path turns enough to tell.
+    """
+    xy, heading = odometry.poses[:, :2], np.unwrap(odometry.poses[:, 2])
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    # A fifth of a metre at a time, or a part of a path whose unit is not known.
+    piece = np.floor(way / min(0.2, max(float(way[-1]) / 100.0, 1e-9)))
+    apart = np.flatnonzero(np.diff(piece, prepend=-1.0) > 0)
+    if len(apart) < 12:
+        return 1.0, False
+    move = np.diff(xy[apart], axis=0)
+    direction = np.arctan2(move[:, 1], move[:, 0])
+    weight = np.hypot(move[:, 0], move[:, 1])
+    half = 0.5 * (heading[apart[1:]] + heading[apart[:-1]])
+    varied = np.abs(np.sum(weight * np.exp(2j * direction))) / np.sum(weight) < 0.9
+    return float(np.abs(np.sum(weight * np.exp(2j * (direction - factor * half)))) / np.sum(weight)), bool(varied)
+
+
+def _positions(odometry: Odometry) -> str:
+    first = np.arange(len(odometry.stamps) - 1)
+    second = np.minimum(np.searchsorted(odometry.stamps, odometry.stamps[first] + _CHORD), len(first))
+    span = odometry.stamps[second] - odometry.stamps[first]
+    length = np.hypot(*(odometry.poses[second] - odometry.poses[first])[:, :2].T)
+    moving = (length > 1e-6) & (span > 0.5 * _CHORD)
+    if moving.sum() < _ENOUGH:
+        return ""
+    speed = float(np.median(length[moving] / span[moving]))
+    if speed > _FAR_TOO_FAST:
+        unit = "millimetres" if speed > _CENTIMETRES else "centimetres"
+        return (
+            f"the odometry's positions look like {unit}: the usual speed would be {speed:.0f} m/s; write metres into the log "
+            f"(uwblite convert --odometry-unit {0.001 if unit == 'millimetres' else 0.01:g})"
+        )
+    return ""
+
+
+def _heading(odometry: Odometry) -> str:
+    plain, varied = heading_agreement(odometry)
+    degrees, _ = _degrees(odometry)
+    mirrored, _ = heading_agreement(odometry, -1.0)
+    turn, span = np.abs(np.diff(odometry.poses[:, 2])), np.diff(odometry.stamps)
+    turning = (turn > 1e-6) & (span > 0)
+    rate = float(np.median(turn[turning] / span[turning])) if turning.sum() >= _ENOUGH else 0.0
+    large = rate > _FAST_TURN or float(np.ptp(odometry.poses[:, 2])) > _MORE_THAN_A_TURN
+    if varied and large and plain < _AGREEMENT and degrees > max(plain, mirrored) + _CLEARLY:
+        return (
+            f"the odometry's heading looks like degrees (as such it agrees with the path to {degrees:.2f} of 1, as radians to "
+            f"{plain:.2f}); write radians into the log (uwblite convert --angle-unit 0.0174533)"
+        )
+    return ""
+
+
+def _degrees(odometry: Odometry) -> tuple[float, bool]:
+    """Return the agreement of the heading taken as degrees, wrapped or not."""
+    radians = np.radians(odometry.poses[:, 2])
+    return heading_agreement(Odometry(odometry.stamps, np.column_stack([odometry.poses[:, :2], radians])))
+
+
+def _of_ranges(log: SensorLog) -> str:
+    if log.ranges is None:
+        return ""
+    positive = log.ranges.ranges[log.ranges.ranges > 0]
+    if len(positive) < _ENOUGH or np.median(positive) <= LONGEST:
+        return ""
+    usual = float(np.median(positive))
+    unit, factor = ("millimetres", 0.001) if usual > 1500.0 else ("centimetres", 0.01)
+    return (
+        f"the ranges look like {unit}: the usual one would be {usual:.0f} m; write metres into the log "
+        f"(uwblite convert --range-unit {factor:g})"
+    )
+
+
+def _of_scans(log: SensorLog) -> str:
+    scans = log.scans
+    if scans is None or not len(scans.stamps):
+        return ""
+    view = abs(scans.angle_increment) * (scans.ranges.shape[1] - 1)
+    if view > 2.0 * np.pi + 0.1:
+        return f"the laser's field of view is {np.degrees(view):.0f} degrees; angles must be radians, at most one turn in all"
+    sample = scans.ranges[:: max(1, len(scans.ranges) // 200)]
+    with np.errstate(invalid="ignore"):
+        seen = sample[(sample >= scans.range_min) & (sample <= scans.range_max)]
+    if len(seen) < _ENOUGH or np.median(seen) <= _LONGEST_READING:
+        return ""
+    usual = float(np.median(seen))
+    unit, factor = ("millimetres", 0.001) if usual > 500.0 else ("centimetres", 0.01)
+    return (
+        f"the laser's readings look like {unit}: the usual one would be {usual:.0f} m; write metres into the log "
+        f"(uwblite convert --laser-unit {factor:g})"
+    )

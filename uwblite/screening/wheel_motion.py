@@ -1,0 +1,241 @@
+"""Do wheels and lidar tell of the same motion, stretch by stretch? And what stands in for wheels that stand still.
+
+Pairs of scans a moment apart, spread over the recording, are matched and compared with the odometry of the same moment.
+One factor for all ways and one for all turns is calibration, and taken out before. What then remains over a stretch is a
+fault: wheels that count nothing while the scans move are replaced there by the motion from scan to scan; any other
+sustained disagreement is a doubt.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from ..lidar.scan_odometry import scan_steps
+from ..sensor_log import LaserScans, Odometry, OdometryBreaks, Remark, SensorLog
+from .odometry_chain import chained
+
+_PAIRS = 250
+"""Pairs of scans compared over the whole recording."""
+_PAIRS_STANDING = 8
+"""Pairs looked at in each stretch in which the wheels stand, besides."""
+_STRETCHES = 30
+"""Longest such stretches looked at."""
+_STILL = (0.005, 0.01)
+"""Way, m, and turn, rad, within a second below which wheels stand."""
+_HALF, _EDGE = 0.5, 0.45
+"""Half of that second, and how much of it belongs to the stretch on either side, s."""
+_LEAST_STANDING = 1.5
+"""Shorter stretches are lost on nobody, s."""
+_APART = 0.1
+"""Usual way between the scans of a pair, m."""
+_CLEAR_SHARE = 0.9
+"""Pairs that match so well from the wheels' guess are not matched from rest too."""
+_GAIN = 0.03
+"""Share by which rest must explain a pair better than the wheels do."""
+_SHARE = 0.6
+"""Pairs that match less measure nothing."""
+_ABSOLUTE, _RELATIVE = (0.05, 0.06), 0.35
+"""Difference, m and rad, and share of the larger motion, that noise of single scans explains."""
+_SEEN_MOVING = (0.03, 0.03)
+"""Motion between the scans of a pair that is no noise, m and rad."""
+_MOST = 0.6
+"""Share of a stretch's pairs from which it is told."""
+_LEAST_PAIRS, _LEAST_SECONDS = 6, 6.0
+"""Pairs and seconds of a sustained disagreement."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Motion between scans a moment apart by lidar and by wheels."""
+
+    start: Floats
+    """(e,) s."""
+    end: Floats
+    """(e,) s."""
+    lidar: Floats
+    """(e, 3) m, m, rad."""
+    wheels: Floats
+    """(e, 3)."""
+    share: Floats
+    """(e,) of points that match."""
+
+    @property
+    def measured(self) -> Bools:
+        """Which pairs measure a motion."""
+        return self.share >= _SHARE
+
+    def rows(self, which: Bools) -> "Pairs":
+        """Return some of them."""
+        return Pairs(self.start[which], self.end[which], self.lidar[which], self.wheels[which], self.share[which])
+
+
+def middle_stamps(scans: LaserScans) -> Floats:
+    """Return the time of the middle ray of each scan, s."""
+    return scans.stamps + 0.5 * scans.time_increment * scans.ranges.shape[1]
+
+
+def standing(odometry: Odometry, least: float = _LEAST_STANDING) -> list[tuple[float, float]]:
+    """Return the stretches (first and last stamp, s) in which the wheels count nothing."""
+    steps, stamps = se2.between(odometry.poses[:-1], odometry.poses[1:]), odometry.stamps
+    way, turn = (np.concatenate([[0.0], np.cumsum(s)]) for s in (np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])))
+    before, after = (np.interp(stamps + d, stamps, np.arange(len(stamps))) for d in (-_HALF, _HALF))
+    number = np.arange(len(stamps))
+    moving = np.zeros(len(stamps), dtype=bool)
+    for sums, still in ((way, _STILL[0]), (turn, _STILL[1])):
+        moving |= np.interp(after, number, sums) - np.interp(before, number, sums) > still
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~moving, [False]]).astype(np.int64))).reshape(-1, 2)
+    # Half a second before and after a stretch without motion around it there was none either.
+    runs = [(max(float(stamps[a]) - _EDGE, stamps[0]), min(float(stamps[b - 1]) + _EDGE, stamps[-1])) for a, b in edges]
+    return [(a, b) for a, b in runs if b - a >= least]
+
+
+def compare(log: SensorLog) -> Pairs | None:
+    """Match pairs of scans spread over the recording; None where there are too few scans."""
+    scans = log.scans
+    if scans is None or len(scans.stamps) < 20 or scans.ranges.shape[1] < 30:
+        return None
+    middle = middle_stamps(scans)
+    first, second = _chosen(log, middle)
+    if not len(first):
+        return None
+    wheels = _wheels(log.odometry, middle, first, second)
+    by_wheels, good = scan_steps(scans, log.mounting, first, second, wheels)
+    poor = np.flatnonzero(good < _CLEAR_SHARE)
+    by_rest, rest = scan_steps(scans, log.mounting, first[poor], second[poor], np.zeros((len(poor), 3)))
+    better = rest > good[poor] + _GAIN
+    by_wheels[poor[better]], good[poor[better]] = by_rest[better], rest[better]
+    return Pairs(middle[first], middle[second], by_wheels, wheels, good)
+
+
+def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
+    """Choose the pairs: some everywhere, some in every stretch in which the wheels stand."""
+    odometry = log.odometry
+    inside = (middle >= odometry.stamps[0]) & (middle <= odometry.stamps[-1])
+    period = max(float(np.median(np.diff(middle))), 1e-3)
+    apart = max(1, round(_span(odometry) / period))
+    first = np.flatnonzero(inside[:-apart] & inside[apart:] & (middle[apart:] - middle[:-apart] < 3.0 * apart * period))
+    spread = first[:: max(1, len(first) // _PAIRS)]
+    extra = [np.zeros(0, dtype=np.int64)]
+    for a, b in sorted(standing(odometry), key=lambda run: run[0] - run[1])[:_STRETCHES]:
+        own = first[(middle[first] > a) & (middle[first + apart] < b)]
+        extra.append(own[:: max(1, len(own) // _PAIRS_STANDING)])
+    chosen = np.unique(np.concatenate([spread, *extra]))
+    return chosen, chosen + apart
+
+
+def _span(odometry: Odometry) -> float:
+    """Return the time between the scans of a pair, s, in which the robot usually drives a little way."""
+    steps, span = se2.between(odometry.poses[:-1], odometry.poses[1:]), np.diff(odometry.stamps)
+    length = np.hypot(steps[:, 0], steps[:, 1])
+    moving = (length > 1e-4) & (span > 0)
+    speed = float(np.median(length[moving] / span[moving])) if moving.any() else 0.3
+    return float(np.clip(_APART / max(speed, 1e-3), 0.1, 1.0))
+
+
+def _wheels(odometry: Odometry, middle: Floats, first: Ints, second: Ints) -> Floats:
+    at = (se2.interpolate_trajectory(odometry.stamps, odometry.poses, middle[k]) for k in (first, second))
+    return se2.between(*at)
+
+
+def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
+    """Return the stretches in which the wheels stand and the scans move."""
+    moving = (np.hypot(*pairs.lidar[:, :2].T) > _SEEN_MOVING[0]) | (np.abs(pairs.lidar[:, 2]) > _SEEN_MOVING[1])
+    found = []
+    for a, b in standing(log.odometry):
+        own = pairs.measured & (pairs.start >= a) & (pairs.end <= b)
+        if own.sum() >= 3 and np.mean(moving[own]) > _MOST:
+            found.append((a, b))
+    return found
+
+
+def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
+    """Return a doubt where wheels and lidar tell of different motions for long, one factor for all taken out."""
+    own = pairs.rows(pairs.measured)
+    if len(own.start) < 4 * _LEAST_PAIRS:
+        return []
+    way, turn = _factor(own.wheels[:, :2], own.lidar[:, :2], 0.03), _factor(own.wheels[:, 2:], own.lidar[:, 2:], 0.03)
+    off = own.lidar - own.wheels * np.array([way, way, turn])
+    larger = np.maximum(np.abs(own.lidar), np.abs(own.wheels * np.array([way, way, turn])))
+    bad = np.hypot(off[:, 0], off[:, 1]) > _ABSOLUTE[0] + _RELATIVE * np.hypot(larger[:, 0], larger[:, 1])
+    bad |= np.abs(off[:, 2]) > _ABSOLUTE[1] + _RELATIVE * larger[:, 2]
+    smooth = np.convolve(bad, np.ones(_LEAST_PAIRS) / _LEAST_PAIRS, mode="same") > _MOST
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], smooth, [False]]).astype(np.int64))).reshape(-1, 2)
+    runs = [(own.start[a], own.end[b - 1]) for a, b in edges if own.end[b - 1] - own.start[a] >= _LEAST_SECONDS]
+    if not runs:
+        return []
+    when = ", ".join(f"t = {a - start:.0f} to {b - start:.0f} s" for a, b in runs[:3])
+    more = f", and {len(runs) - 3} more stretches" if len(runs) > 3 else ""
+    text = (
+        f"wheels and lidar tell of different motions ({when}{more}): one of the two stands still, slips or is wrong by another "
+        "factor there than elsewhere"
+    )
+    return [Remark("wheels against lidar", text, doubt=True)]
+
+
+def _factor(wheels: Floats, lidar: Floats, least: float) -> float:
+    """Return the factor of the wheels' motions (e, d) that most agree on; 1 where there are too few."""
+    size = np.sqrt(np.sum(wheels**2, axis=1))
+    clear = size > least
+    if clear.sum() < 2 * _LEAST_PAIRS:
+        return 1.0
+    return float(np.median(np.sum(wheels * lidar, axis=1)[clear] / size[clear] ** 2))
+
+
+_SCANS_APART = 0.25
+"""Time between the scans whose motion stands in for wheels, s."""
+_STEP_SIGMA = (0.02, 0.02, 0.01)
+"""Standard deviation of such a step, m, m, rad."""
+_UNKNOWN_STEP = (0.3, 0.3, 0.3)
+"""The same where the scans do not match either."""
+_SEARCHES = 100
+"""Steps of a stretch that are searched for, where they match badly."""
+_FASTEST_STEP = 1.0
+"""No such step is longer, m: a speed of 4 m/s."""
+
+
+def replaced(log: SensorLog, stretches: list[tuple[float, float]]) -> tuple[Odometry, OdometryBreaks]:
+    """Return the odometry with the motion from scan to scan in stretches in which the wheels were lost."""
+    odometry, scans = log.odometry, log.scans
+    assert scans is not None
+    breaks = [OdometryBreaks.none()]
+    for a, b in stretches:
+        odometry, own = _replaced(odometry, scans, log, a, b)
+        breaks.append(own)
+    stamps, sigma = np.concatenate([k.stamps for k in breaks]), np.concatenate([k.sigma for k in breaks])
+    order = np.argsort(stamps, kind="stable")
+    return odometry, OdometryBreaks(stamps[order], sigma[order])
+
+
+def _replaced(odometry: Odometry, scans: LaserScans, log: SensorLog, a: float, b: float) -> tuple[Odometry, OdometryBreaks]:
+    middle = middle_stamps(scans)
+    period = max(float(np.median(np.diff(middle))), 1e-3)
+    first_scan, last_scan = max(int(np.searchsorted(middle, a)) - 1, 0), min(int(np.searchsorted(middle, b)), len(middle) - 1)
+    inside = np.unique([*range(first_scan, last_scan, max(1, round(_SCANS_APART / period))), last_scan]).astype(np.int64)
+    inside = inside[(middle[inside] >= odometry.stamps[0]) & (middle[inside] <= odometry.stamps[-1])]
+    if len(inside) < 2:
+        return odometry, OdometryBreaks.none()
+    steps, share = _smooth_steps(scans, log, inside)
+    chain = chained(np.zeros(3), steps)
+    at = middle[inside]
+    own = (odometry.stamps > at[0]) & (odometry.stamps <= at[-1])
+    first, last = int(np.argmax(own)), len(own) - 1 - int(np.argmax(own[::-1]))
+    moved = se2.compose(odometry.poses[first - 1 if first else 0], se2.interpolate_trajectory(at, chain, odometry.stamps[own]))
+    rest = se2.compose(moved[-1], se2.between(odometry.poses[last], odometry.poses[last + 1 :]))
+    poses = np.concatenate([odometry.poses[:first], moved, rest])
+    sigma = np.where((share >= 0.5)[:, None], _STEP_SIGMA, _UNKNOWN_STEP)
+    before = np.clip(np.searchsorted(odometry.stamps, at[1:]) - 1, 0, len(odometry.stamps) - 1)
+    return Odometry(odometry.stamps, poses), OdometryBreaks(odometry.stamps[before], sigma)
+
+
+def _smooth_steps(scans: LaserScans, log: SensorLog, chosen: Ints) -> tuple[Floats, Floats]:
+    """Measure steps twice: what scans do not show, the second time goes on as before and after."""
+    first, second = chosen[:-1], chosen[1:]
+    steps, share = scan_steps(scans, log.mounting, first, second, np.zeros((len(first), 3)), _SEARCHES)
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(steps, ((3, 3), (0, 0)), mode="edge"), 7, axis=0)
+    usual = np.median(windows, axis=2)
+    again, better = scan_steps(scans, log.mounting, first, second, usual)
+    taken = np.where((better >= share - 0.1)[:, None], again, steps)
+    wild = (np.hypot(taken[:, 0], taken[:, 1]) > _FASTEST_STEP) | (np.maximum(share, better) < 0.3)
+    return np.where(wild[:, None], usual, taken), np.where(wild, 0.0, np.maximum(share, better))
