@@ -26,7 +26,7 @@ FLOORS = (
     ("mapping_config",),
     ("pipeline",),
     ("mapping",),
-    ("localize",),
+    ("localize", "server"),
     ("cli",),
     ("__main__",),
 )

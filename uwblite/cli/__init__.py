@@ -21,7 +21,7 @@ from .. import __version__
 from ..errors import UwbliteError
 from ..printable import printable
 
-VERBS = ("map", "localize", "check", "record", "devices", "plan-anchors", "convert", "evaluate", "optimize", "config")
+VERBS = ("map", "view", "localize", "check", "record", "devices", "plan-anchors", "convert", "evaluate", "optimize", "config")
 """In the order in which a user meets them; `uwblite VERB` is the module of the same name, with _ for -."""
 
 _DESCRIPTION = """\

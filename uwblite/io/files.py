@@ -1,10 +1,12 @@
 """Writing files so that a full disk, a crash or a pulled plug leaves the previous file whole."""
 
 import gzip
+import hashlib
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import BinaryIO
 
 from ..printable import encodable
@@ -95,3 +97,14 @@ def sync_files(folder: str | os.PathLike[str]) -> None:
         for handle in handles:
             os.close(handle)
     sync_folder(folder)
+
+
+def sha256_of(path: str | os.PathLike[str]) -> str:
+    """Return the hash of a file, or of all files of a folder in the order of their names, hexadecimal."""
+    digest = hashlib.sha256()
+    top = Path(path)
+    for file in sorted(p for p in top.rglob("*") if p.is_file()) if top.is_dir() else [top]:
+        with open(file, "rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

@@ -4,7 +4,6 @@ Reads ROS 1 bags and ROS 2 bags in sqlite3 or MCAP. Wheel odometry comes from na
 sensor_msgs/LaserScan, ranges by a mapping (see uwb_mapping), mountings from tf. Times are those of the headers.
 """
 
-import hashlib
 import os
 from collections import Counter
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from ..errors import FormatError, UwbliteError
 from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id
 from .bag_frames import Frames, planar
 from .bag_topics import GUESSED, ODOMETRY, BagTopic, BagTopics, TopicPlan, plan_topics, unread_warning
+from .files import sha256_of
 from .optional_packages import missing_package
 from .uwb_mapping import UwbMapping, readings_of, short_type
 
@@ -80,7 +80,7 @@ def read_bag(path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings
             found.take(connection.topic, recorded / 1e9, reader.deserialize(raw, connection.msgtype))
         if topics.base_frame:
             found.frames.check(topics.base_frame)
-        return found.log(os.fspath(path), _hash(Path(path)))
+        return found.log(os.fspath(path), sha256_of(path))
 
 
 @contextmanager
@@ -248,13 +248,3 @@ class _Collector:
             yield f"{self.unstamped} messages carry no time; the time of recording is used"
         if self.late and abs(delay := float(np.median(self.late))) > 5.0:
             yield f"headers and recording differ by {delay:.1f} s: the sensors' computers have other clocks"
-
-
-def _hash(path: Path) -> str:
-    """Return the hash of a file, or of all files of a folder in the order of their names."""
-    digest = hashlib.sha256()
-    for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
-        with open(file, "rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()

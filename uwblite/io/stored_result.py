@@ -43,6 +43,8 @@ class StoredClosure:
     """(2, 2) m, map frame: where the robot was at both times."""
     accepted: bool
     reason: str
+    pose: Floats | None = None
+    """(3,) measured pose of the second place in the first; m, m, rad; None where the report does not tell it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,6 +151,11 @@ def _anchors(path: Path) -> tuple[StoredAnchor, ...]:
     return tuple(found)
 
 
+def _pose(values: Any) -> Floats | None:
+    good = isinstance(values, list) and len(values) == 3 and all(isinstance(v, int | float) for v in values)
+    return np.array(values, dtype=np.float64) if good else None
+
+
 def _with_closures(result: StoredResult) -> StoredResult:
     """Return the result with the closures of its report; those of keyframes that the tables do not know are left out."""
     from dataclasses import replace
@@ -162,5 +169,5 @@ def _with_closures(result: StoredResult) -> StoredResult:
         stamps = tuple(float(result.keyframe_stamps[k]) for k in ends)
         places = np.array([result.pose_at(n, np.array(t))[:2] for n, t in zip(numbers, stamps, strict=True)])
         kept, why = entry.get("accepted", entry.get("outcome") == "accepted"), str(entry.get("reason", ""))
-        found.append(StoredClosure(stamps, numbers, places, bool(kept), why))  # type: ignore[arg-type]
+        found.append(StoredClosure(stamps, numbers, places, bool(kept), why, _pose(entry.get("T_i_j"))))  # type: ignore[arg-type]
     return replace(result, closures=tuple(found))

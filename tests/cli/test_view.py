@@ -1,0 +1,87 @@
+"""`uwblite view` as a user starts it, and in Chromium: a closure is rejected with a click and the map made again."""
+
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+from conftest import ROOT
+from helpers.browser import CHROMIUM, Browser
+
+from uwblite.cli import main
+from uwblite.io.constraints_file import parse_constraints
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory, room_log):
+    """A folder with a minute of the sample recording, and its map."""
+    folder = tmp_path_factory.mktemp("view")
+    assert main(["convert", str(room_log), str(folder / "run.log"), "--end", "70"]) == 0
+    assert main(["map", str(folder / "run.log"), "--out", str(folder / "map"), "-q"]) in (0, 3)
+    return folder
+
+
+class Served:
+    """The program at work, until the block ends."""
+
+    def __init__(self, *words, cwd):
+        command = [sys.executable, "-m", "uwblite", "view", *words]
+        self.process = subprocess.Popen(
+            command, cwd=cwd, env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        said = self.process.stdout.readline()
+        self.address = re.search(r"http://127\.0\.0\.1:\d+/", said).group()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.send_signal(signal.SIGINT)
+        self.code = self.process.wait(timeout=20)
+
+
+def test_it_says_its_address_and_ends_with_ctrl_c(mapped):
+    import urllib.request
+
+    with Served("map", cwd=mapped) as served, urllib.request.urlopen(served.address + "state", timeout=20) as answer:
+        assert b'"name": "map"' in answer.read()
+    assert served.code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{0}/run.log"], "holds no result; map it first: uwblite map"),
+        (["{0}/map", "{0}/none.log"], "no such file"),
+        (["{0}/map", "{0}/map/config.toml"], "is not the recording that the map was made of"),
+        (["{0}/map", "--constraints", "{0}/run.log"], "run.log"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_clear_line(mapped, capsys, words, message):
+    assert main(["view", *(w.format(mapped) for w in words)]) == 1
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+@pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, True)])
+def test_a_click_rejects_a_closure_and_maps_again(mapped, tmp_path, width, dark):
+    (mapped / "map_constraints.toml").unlink(missing_ok=True)
+    with Served("map", cwd=mapped) as served, Browser(tmp_path / "profile", width=width, dark=dark) as browser:
+        browser.open(served.address)
+        browser.until("document.querySelector('section svg line.closure')")
+        assert browser.run("document.documentElement.scrollWidth") <= width
+        rejected = browser.run("document.querySelector('line.closure').dataset.closure")
+        browser.run("document.querySelector('line.closure').dispatchEvent(new MouseEvent('click'))")
+        browser.run("document.querySelector('[data-wish=reject]').click()")
+        browser.until("document.querySelector('line.closure.reject')")
+        assert browser.run("document.querySelector('line.closure.reject').dataset.closure") == rejected
+        assert len(parse_constraints((mapped / "map_constraints.toml").read_text()).forbidden) == 1
+        before = browser.run("document.querySelectorAll('section').length")
+        browser.run("document.querySelector('button.map').click()")
+        browser.until(f"document.querySelectorAll('section').length > {before}", patience=180)
+        browser.until("document.getElementById('say').textContent.length > 0")
+        assert browser.complaints == []
+    assert (mapped / "map_2" / "map.png").is_file()

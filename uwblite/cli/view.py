@@ -1,0 +1,137 @@
+"""`uwblite view`: results in the browser, side by side, with closures and anchors to correct."""
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .options import number
+
+if TYPE_CHECKING:
+    from ..io.stored_result import StoredResult
+    from ..server.app import Job
+
+HELP = "look at results in the browser, side by side; reject or force closures, pin anchors, and map again"
+EPILOG = """\
+examples:
+  uwblite view map/                          one result
+  uwblite view before/ after/                two of them side by side: settings, days, presets
+  uwblite view map/ run.log                  with the recording, to map it again after a correction
+  uwblite view map/ run.log --port 8765      always the same address
+
+A click on a closure or an anchor offers what can be done with it; it goes into the constraints file that is named at the
+start, and "Map again" makes DIR_2, DIR_3 ... beside DIR. The page is served to this computer alone; Ctrl-C ends it.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the verb."""
+    text = "result of uwblite map, or a recording that one was made of; recordings beside the results are found by themselves"
+    parser.add_argument("paths", metavar="DIR|FILE", nargs="+", help=text)
+    parser.add_argument("--port", metavar="N", type=number(0, 65535, whole=True), default=0, help="port (any that is free)")
+    parser.add_argument("--constraints", metavar="FILE.toml", help="where corrections go (DIR_constraints.toml)")
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the verb."""
+    from ..errors import ConfigError
+    from ..io.stored_result import read_result
+    from ..server.app import app_of
+    from ..server.web import server_for
+    from . import console
+    from .formats import format_of
+
+    folders = [path for path in args.paths if format_of(path) == "map"]
+    if not folders:
+        raise ConfigError(f"{args.paths[0]} holds no result; map it first: uwblite map {args.paths[0]} --out map")
+    results = [read_result(folder) for folder in folders]
+    recordings = _recordings([path for path in args.paths if path not in folders], results)
+    first = os.path.abspath(folders[0])
+    constraints = Path(args.constraints or f"{first}_constraints.toml")
+    app = app_of(results, recordings, constraints, _launch)
+    server = server_for(app, args.port)
+    address = f"http://{app.host}/"
+    console.say(f"open {address} in a browser; Ctrl-C ends it")
+    console.note(f"uwblite: corrections go to {constraints}")
+    console.flush()
+    if args.open:
+        import webbrowser
+
+        webbrowser.open(address)
+    try:
+        server.serve_forever(poll_interval=0.2)
+    except KeyboardInterrupt:
+        console.note("uwblite: the page has ended")
+    finally:
+        if app.job is not None and app.job.code() is None:
+            app.job.stop()  # type: ignore[attr-defined]
+        server.server_close()
+    return 0
+
+
+def _recordings(named: Sequence[str], results: "Sequence[StoredResult]") -> dict[str, Path]:
+    """Return the recordings at hand by the SHA-256 of their bytes: those that are named, and those the results name."""
+    from ..errors import ConfigError
+    from ..io.files import sha256_of
+
+    wanted = {str(i.get("sha256")) for r in results for i in r.report.get("inputs") or ()}
+    found: dict[str, Path] = {}
+    for name in named:
+        if not os.path.exists(name):
+            raise ConfigError(f"{name}: no such file or folder")
+        found[sha256_of(name)] = Path(name).resolve()
+    if named and wanted and not wanted & found.keys():
+        raise ConfigError(f"{named[0]} is not the recording that the map was made of (its bytes differ)")
+    for result in results:
+        for entry in result.report.get("inputs") or ():
+            source, key = str(entry.get("source", "")), str(entry.get("sha256"))
+            places = (Path(source), result.folder.parent / source, result.folder.parent / os.path.basename(source))
+            file = next((p for p in places if source and p.exists()), None)
+            if key not in found and file is not None and sha256_of(file) == key:
+                found[key] = file.resolve()
+    return found
+
+
+class _Process:
+    """`uwblite` at work for the page."""
+
+    def __init__(self, words: Sequence[str]) -> None:
+        import subprocess
+        import sys
+        import tempfile
+
+        package = (__package__ or "uwblite.cli").rpartition(".")[0]
+        root = Path(__file__).resolve().parents[package.count(".") + 2]
+        path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
+        self._output = tempfile.TemporaryFile("w+b")  # noqa: SIM115
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", package, *words],
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "PYTHONPATH": path},
+        )
+
+    def code(self) -> int | None:
+        """Return its exit code; None while it runs."""
+        return self._process.poll()
+
+    def said(self) -> str:
+        """Return the last line that it said."""
+        size = os.fstat(self._output.fileno()).st_size
+        tail = os.pread(self._output.fileno(), 2000, max(size - 2000, 0)).decode(errors="replace").strip()
+        errors = [line for line in tail.splitlines() if "error:" in line]
+        return (errors or tail.splitlines() or [""])[-1][:400]
+
+    def stop(self) -> None:
+        """End it."""
+        self._process.terminate()
+        self._process.wait()
+
+
+def _launch(words: Sequence[str]) -> "Job":
+    return _Process(words)
+
+

@@ -1,0 +1,240 @@
+"""The page's requests and answers, without a socket: every rule of who may ask what stands here and is tested here.
+
+Only the computer itself may ask: the server listens on the loopback address alone, and a request must name it as its Host
+(a page elsewhere that has its name resolved to 127.0.0.1 cannot). A request of another page carries a foreign Origin and is
+refused. What changes anything must be a POST with JSON and the token that only the served page knows.
+"""
+
+import json
+import secrets
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import unquote, urlsplit
+
+from ..constraints import Constraints
+from ..errors import ConfigError, UwbliteError
+from ..io.files import write_text
+from ..io.results import is_of_result
+from ..io.stored_result import StoredResult, read_result
+from .edits import edits_text, parse_edits, with_anchor, with_closure
+from .page import page
+from .remap import remap_command
+from .runs import Run, described, run_of
+
+MOST_BYTES = 1 << 16
+"""Of a request's body."""
+_TYPES = {
+    ".html": "text/html; charset=utf-8", ".png": "image/png", ".json": "application/json", ".csv": "text/plain; charset=utf-8",
+    ".toml": "text/plain; charset=utf-8", ".tum": "text/plain; charset=utf-8", ".yaml": "text/plain; charset=utf-8",
+}  # fmt: skip
+_FARTHEST = 1e7
+"""m; no anchor is pinned beyond it."""
+
+
+class Job(Protocol):
+    """A command that runs."""
+
+    def code(self) -> int | None:
+        """Return its exit code; None while it runs."""
+
+    def said(self) -> str:
+        """Return the last thing it said."""
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """What is sent back."""
+
+    status: int
+    kind: str
+    body: bytes
+    framed: bool = False
+    """A report, which brings its own styles and scripts and may do nothing else."""
+
+
+@dataclass(slots=True)
+class App:
+    """The state behind the page."""
+
+    runs: list[Run]
+    recordings: dict[str, Path]
+    """Recordings at hand, by the SHA-256 of their bytes."""
+    constraints: Path
+    """The file that edits go to."""
+    launch: Callable[[Sequence[str]], Job]
+    """Starts `uwblite` with these arguments."""
+    token: str
+    host: str = ""
+    """Name and port under which the page is asked for, such as 127.0.0.1:8000."""
+    own: str = ""
+    """The user's part of the constraints file."""
+    edits: Constraints = field(default_factory=Constraints)
+    job: Job | None = None
+    making: Path | None = None
+
+    def load(self) -> None:
+        """Read the constraints file, where there is one."""
+        if self.constraints.is_file():
+            self.own, self.edits = parse_edits(self.constraints.read_text(encoding="utf-8"), str(self.constraints))
+
+    def handle(self, method: str, target: str, headers: dict[str, str], body: bytes = b"") -> Response:
+        """Answer a request.
+
+        Parameters
+        ----------
+        method, target : as in the request line.
+        headers : with names in lower case.
+        body : at most MOST_BYTES.
+        """
+        if refusal := self._refused(method, headers):
+            return refusal
+        path = unquote(urlsplit(target).path)
+        try:
+            return self._post(path, body) if method == "POST" else self._get(path)
+        except UwbliteError as error:
+            return _json({"error": str(error)}, 400)
+
+    def _refused(self, method: str, headers: dict[str, str]) -> Response | None:
+        port = self.host.rpartition(":")[2]
+        names = (self.host, f"localhost:{port}")
+        if headers.get("host", "") not in names:
+            return _text("this page is for this computer only", 403)
+        origin = headers.get("origin")
+        if origin is not None and origin not in tuple(f"http://{name}" for name in names):
+            return _text("another page may not ask", 403)
+        if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
+            return _text("another page may not ask", 403)
+        if method not in ("GET", "POST"):
+            return _text("only GET and POST are known", 405)
+        if method == "POST":
+            if not secrets.compare_digest(headers.get("x-token", "").encode(), self.token.encode()):
+                return _text("the token is missing: reload the page", 403)
+            if headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+                return _text("a POST must be application/json", 415)
+        return None
+
+    def _get(self, path: str) -> Response:
+        if path == "/":
+            return Response(200, _TYPES[".html"], page(self.token).encode())
+        if path == "/state":
+            return _json(self._state())
+        parts = path.strip("/").split("/")
+        runs = {str(k): run for k, run in enumerate(self.runs)}
+        if len(parts) == 3 and parts[0] == "run" and parts[1] in runs:
+            return self._file(runs[parts[1]], parts[2])
+        return _text("there is no such page", 404)
+
+    def _file(self, run: Run, name: str) -> Response:
+        """Return a file of a result; nothing but the names that a result may hold is looked for."""
+        if name == "grid.png" and run.grid_png is not None:
+            return Response(200, "image/png", run.grid_png)
+        file = run.result.folder / name
+        kind = _TYPES.get(file.suffix)
+        if not is_of_result(name) or kind is None or not file.is_file() or file.is_symlink():
+            return _text("there is no such file in this result", 404)
+        return Response(200, kind, file.read_bytes(), framed=file.suffix == ".html")
+
+    def _state(self) -> dict[str, Any]:
+        self._collect()
+        edited = len(self.edits.closures) + len(self.edits.forbidden) + len(self.edits.anchors)
+        return {
+            "runs": [described(run, self.edits) for run in self.runs],
+            "edits": edited,
+            "constraints": self.constraints.name,
+            "job": None if self.job is None else {"code": self.job.code(), "said": self.job.said()},
+        }
+
+    def _post(self, path: str, body: bytes) -> Response:
+        wish = _parsed(body)
+        if path == "/closure":
+            closures = self._run(wish).result.closures
+            number = _whole(wish, "number", len(closures))
+            self._keep(with_closure(self.edits, closures[number], str(wish.get("wish", ""))))
+        elif path == "/anchor":
+            self._keep(self._with_anchor(wish))
+        elif path == "/map":
+            self._start(self._run(wish))
+        else:
+            return _text("there is no such page", 404)
+        return _json(self._state())
+
+    def _run(self, wish: dict[str, Any]) -> Run:
+        return self.runs[_whole(wish, "run", len(self.runs))]
+
+    def _with_anchor(self, wish: dict[str, Any]) -> Constraints:
+        run, name, place = self._run(wish), wish.get("id"), wish.get("place")
+        if name not in {a.id for a in run.result.anchors}:
+            raise ConfigError("there is no such anchor in this result")
+        if place is None:
+            return with_anchor(self.edits, str(name), None)
+        sigma = wish.get("sigma", 0.05)
+        numbers = [*place, sigma] if isinstance(place, list) and len(place) == 2 else []
+        good = all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= _FARTHEST for v in numbers)
+        if not numbers or not good or sigma <= 0:
+            raise ConfigError("an anchor is pinned at two numbers, x and y in metres, with a positive sigma")
+        return with_anchor(self.edits, str(name), (float(place[0]), float(place[1])), float(sigma))
+
+    def _keep(self, edits: Constraints) -> None:
+        """Write the constraints file, then hold the edits to be true."""
+        write_text(self.constraints, edits_text(self.own, edits))
+        self.edits = edits
+
+    def _start(self, run: Run) -> None:
+        self._collect()
+        if self.job is not None and self.job.code() is None:
+            raise ConfigError("a map is being made already")
+        folder = run.result.folder.resolve()
+        out = next(p for k in range(2, 10_000) if not (p := folder.with_name(f"{folder.name}_{k}")).exists())
+        if not self.constraints.exists():
+            self._keep(self.edits)
+        self.job = self.launch(remap_command(run.result.report, folder, self.recordings, self.constraints, out))
+        self.making = out
+
+    def _collect(self) -> None:
+        """Put a result that has been finished beside the others."""
+        if self.job is None or self.making is None or self.job.code() is None:
+            return
+        made, self.making = self.making, None
+        if self.job.code() in (0, 3):
+            self.runs.append(run_of(read_result(made)))
+
+
+def app_of(
+    results: Sequence[StoredResult], recordings: dict[str, Path], constraints: Path, launch: Callable[[Sequence[str]], Job]
+) -> App:
+    """Return the page's state, with a token of its own.
+
+    Raises
+    ------
+    ConfigError : the constraints file is there and is none.
+    """
+    app = App([run_of(r) for r in results], recordings, constraints, launch, secrets.token_urlsafe(24))
+    app.load()
+    return app
+
+
+def _parsed(body: bytes) -> dict[str, Any]:
+    try:
+        wish = json.loads(body)
+    except ValueError:
+        raise ConfigError("the request is no JSON") from None
+    if not isinstance(wish, dict):
+        raise ConfigError("the request is no JSON object")
+    return wish
+
+
+def _whole(wish: dict[str, Any], name: str, end: int) -> int:
+    value = wish.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < end:
+        raise ConfigError(f"there is no {name} {str(value)[:40]}")
+    return value
+
+
+def _json(value: Any, status: int = 200) -> Response:
+    return Response(status, "application/json", json.dumps(value, allow_nan=False).encode())
+
+
+def _text(text: str, status: int) -> Response:
+    return Response(status, "text/plain; charset=utf-8", text.encode())

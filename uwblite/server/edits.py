@@ -1,0 +1,94 @@
+"""What the page changes: closures that are rejected or forced and anchors that are pinned, as a constraints file.
+
+The file may hold constraints of the user's own. They stay as they are, above a line that marks where the page's begin.
+"""
+
+import json
+from dataclasses import replace
+
+from ..constraints import Constraints, ForbiddenClosure, KnownAnchor, KnownClosure
+from ..errors import ConfigError
+from ..io.constraints_file import parse_constraints
+from ..io.stored_result import StoredClosure
+
+MARK = "# Below this line: made by uwblite view, which writes it anew. Constraints of your own belong above."
+_FORCED_SIGMA = (0.1, 0.1, 0.05)
+"""m, m, rad; of a closure that was forced: its match is taken at its word."""
+_REJECTED_WITHIN = 1.0
+"""s; a rejected closure forbids its own pair of places and not those driven through before and after."""
+
+
+def parse_edits(text: str, path: str = "") -> tuple[str, Constraints]:
+    """Return the user's own part of a constraints file and what the page wrote below it.
+
+    Raises
+    ------
+    ConfigError : a table or field is unknown, missing or of the wrong kind.
+    """
+    own, marked, edited = text.partition(MARK)
+    parse_constraints(own, path)
+    return own, parse_constraints(edited, path) if marked else Constraints()
+
+
+def edits_text(own: str, edits: Constraints) -> str:
+    """Return the constraints file: the user's own part, the mark, and the page's tables."""
+    parts = [f"{own.rstrip()}\n\n{MARK}\n" if own.strip() else f"{MARK}\n"]
+    for a in edits.anchors:
+        parts.append(f"\n[[anchor]]\nid = {json.dumps(a.id)}\nposition = {_numbers(a.position)}\nsigma = {a.sigma!r}\n")
+    for c in edits.closures:
+        parts.append(f"\n[[closure]]\n{_ends(c)}pose = {_numbers(c.pose)}\nsigma = {_numbers(c.sigma)}\n")
+    for f in edits.forbidden:
+        parts.append(f"\n[[forbidden_closure]]\n{_ends(f)}within = {f.within!r}\n")
+    return "".join(parts)
+
+
+def with_closure(edits: Constraints, closure: StoredClosure, wish: str) -> Constraints:
+    """Return the edits with another wish for a closure: 'reject', 'force', or 'leave' it to the mapper.
+
+    Raises
+    ------
+    ConfigError : there is no such wish, or the closure has no measured pose to force.
+    """
+    left = replace(
+        edits,
+        closures=tuple(c for c in edits.closures if not _same(c, closure)),
+        forbidden=tuple(c for c in edits.forbidden if not _same(c, closure)),
+    )
+    if wish == "leave":
+        return left
+    if wish == "reject":
+        ban = ForbiddenClosure(closure.stamps, _REJECTED_WITHIN, closure.recordings)
+        return replace(left, forbidden=(*left.forbidden, ban))
+    if wish != "force":
+        raise ConfigError(f"a closure can be rejected, forced or left, not {wish[:40]!r}")
+    if closure.pose is None:
+        raise ConfigError("the report does not tell the pose of this closure, so it cannot be forced")
+    x, y, theta = closure.pose.tolist()
+    forced = KnownClosure(closure.stamps, (x, y, theta), _FORCED_SIGMA, closure.recordings)
+    return replace(left, closures=(*left.closures, forced))
+
+
+def with_anchor(edits: Constraints, name: str, position: tuple[float, float] | None, sigma: float = 0.05) -> Constraints:
+    """Return the edits with an anchor pinned at a place, m, or with None no longer pinned."""
+    others = tuple(a for a in edits.anchors if a.id != name)
+    return replace(edits, anchors=others if position is None else (*others, KnownAnchor(name, position, sigma)))
+
+
+def wish_for(edits: Constraints, closure: StoredClosure) -> str:
+    """Return what the edits say of a closure: 'reject', 'force' or 'leave'."""
+    if any(_same(c, closure) for c in edits.forbidden):
+        return "reject"
+    return "force" if any(_same(c, closure) for c in edits.closures) else "leave"
+
+
+def _same(one: KnownClosure | ForbiddenClosure, closure: StoredClosure) -> bool:
+    near = all(abs(a - b) < 1e-4 for a, b in zip(one.stamps, closure.stamps, strict=True))
+    return near and tuple(one.recordings) == closure.recordings
+
+
+def _ends(c: KnownClosure | ForbiddenClosure) -> str:
+    return f"stamps = {_numbers(c.stamps)}\nrecordings = [{c.recordings[0]}, {c.recordings[1]}]\n"
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return "[" + ", ".join(repr(float(v)) for v in values) + "]"

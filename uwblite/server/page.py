@@ -1,0 +1,192 @@
+"""The page of `uwblite view`: one file of HTML, styles and script, without a framework and without a network.
+
+The script builds everything with text nodes, so that no name out of a recording becomes markup.
+"""
+
+_STYLE = """
+:root{--paper:#f6f7f9;--card:#fff;--ink:#1f2733;--faint:#6b7482;--line:#d8dde4;--accent:#2563eb;--path:#2563eb;
+--accepted:#ea7814;--rejected:#8a93a0;--anchor:#d01c3c;--force:#169650;--ban:#d01c3c;--warn:#fff4e0}
+@media (prefers-color-scheme:dark){:root{--paper:#14181e;--card:#1d232b;--ink:#e4e8ee;--faint:#98a2b0;--line:#36404c;
+--accent:#7aa5ff;--path:#6a9bff;--accepted:#ff9a40;--rejected:#7d8794;--anchor:#ff6480;--force:#3fc47c;--ban:#ff6480;
+--warn:#3a2f1a}image{filter:invert(1) hue-rotate(180deg) brightness(.85)}}*{box-sizing:border-box}body{margin:0;
+background:var(--paper);color:var(--ink);font:15px/1.45 system-ui,sans-serif}header{position:sticky;top:0;z-index:2;
+display:flex;flex-wrap:wrap;gap:.6rem 1rem;align-items:center;padding:.6rem 1rem;background:var(--card);
+border-bottom:1px solid var(--line)}h1{font-size:1.1rem;margin:0}h2{font-size:1rem;margin:0 0 .3rem}#say{
+color:var(--faint);flex:1 1 12rem}main{display:grid;gap:1rem;padding:1rem;
+grid-template-columns:repeat(auto-fit,minmax(min(100%,26rem),1fr))}section{background:var(--card);
+border:1px solid var(--line);border-radius:.5rem;padding:.8rem;min-width:0}svg{display:block;width:100%;
+max-height:62vh;background:#cdcdcd;border-radius:.3rem;touch-action:none}@media (prefers-color-scheme:dark){svg{
+background:#262d36}}image{image-rendering:pixelated}.path{fill:none;stroke:var(--path);stroke-width:2;
+vector-effect:non-scaling-stroke}.p1{stroke:#7c3ab4}.p2{stroke:#00808c}.p3{stroke:#5c4033}.closure{
+stroke:var(--accepted);stroke-width:1.6;vector-effect:non-scaling-stroke;cursor:pointer}.closure.no{
+stroke:var(--rejected);stroke-dasharray:4 3}.closure.force{stroke:var(--force);stroke-width:3}.closure.reject{
+stroke:var(--ban);stroke-width:3;stroke-dasharray:2 4}.hit{stroke:transparent;stroke-width:12;
+vector-effect:non-scaling-stroke;cursor:pointer}line.chosen{stroke-width:5}circle.chosen{stroke:var(--ink);
+stroke-width:2;vector-effect:non-scaling-stroke}.hideno .no{display:none}.anchor{fill:var(--anchor);cursor:pointer}
+.anchor.pinned{fill:var(--force)}button{font:inherit;padding:.35rem .8rem;border:1px solid var(--line);
+border-radius:.4rem;background:var(--card);color:inherit;cursor:pointer;min-height:2.4rem}button.main{
+background:var(--accent);border-color:var(--accent);color:#fff}button:disabled{opacity:.5;cursor:default}
+@media (prefers-color-scheme:dark){button.main{color:#10151c}}.detail{min-height:5.2rem;padding:.5rem 0;
+border-top:1px solid var(--line);margin-top:.6rem}.row{display:flex;flex-wrap:wrap;gap:.5rem;align-items:center}
+.faint{color:var(--faint)}.doubt{background:var(--warn);border-radius:.3rem;padding:.4rem .6rem;margin:.4rem 0}a{
+color:var(--accent)}table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.15rem .5rem .15rem 0;
+font-weight:400}th{color:var(--faint)}.list{max-height:16rem;overflow:auto;border-top:1px solid var(--line);
+margin-top:.5rem}.list button{min-height:0;padding:.1rem .5rem}.key{display:inline-block;width:1.2rem;
+border-top:3px solid;vertical-align:middle}input{font:inherit;width:6rem;padding:.25rem;border:1px solid var(--line);
+border-radius:.3rem;background:var(--card);color:inherit}
+"""
+
+_SCRIPT = r"""
+"use strict";
+const NS = "http://www.w3.org/2000/svg", say = document.getElementById("say"), main = document.querySelector("main");
+let state = null, chosen = null, timer = 0;
+function el(name, attrs = {}, ...children) {
+  const node = document.createElement(name);
+  for (const [k, v] of Object.entries(attrs)) k.startsWith("on") ? node.addEventListener(k.slice(2),
+    v) : node.setAttribute(k, v);
+  node.append(...children);
+  return node;
+}
+function shape(name, attrs) {
+  const node = document.createElementNS(NS, name);
+  for (const [k, v] of Object.entries(attrs)) node.setAttribute(k, v);
+  return node;
+}
+async function ask(path, wish) {
+  const options = wish ? {method: "POST", body: JSON.stringify(wish),
+    headers: {"Content-Type": "application/json", "X-Token": document.body.dataset.token}} : {};
+  try {
+    const answer = await fetch(path, options);
+    const text = await answer.text();
+    let content; try { content = JSON.parse(text); } catch { content = {error: text}; }
+    if (!answer.ok) { say.textContent = content.error; return; }
+    state = content; show();
+  } catch { say.textContent = "uwblite view has ended; start it again and reload this page"; }
+}
+const clock = (run, k) => run.closures.find(c => c.number === k);
+function status() {
+  const job = state.job;
+  if (job && job.code === null) return "mapping again ... " + job.said;
+  if (job && job.code !== 0 && job.code !== 3) return "the map was not made: " + job.said;
+  if (job && job.code === 3) return "mapped again; the result is doubted, see there";
+  return state.edits ? state.edits + " changes in " + state.constraints : "click a closure or an anchor to correct it";
+}
+function show() {
+  say.textContent = status();
+  main.replaceChildren(...state.runs.map(card));
+  highlight();
+  clearTimeout(timer);
+  if (state.job && state.job.code === null) timer = setTimeout(() => ask("/state"), 1000);
+}
+function card(run, number) {
+  const detail = el("div", {class: "detail"}), busy = state.job && state.job.code === null;
+  const facts = [run.recordings.join(", "), run.preset, run.accepted + " of " + run.candidates + " closures accepted",
+    run.anchors.length + " anchors"].filter(Boolean).join(" · ");
+  const svg = picture(run, number, detail);
+  const rejected = el("input", {type: "checkbox", style: "width:auto", onchange: e => svg.classList.toggle("hideno",
+    !e.target.checked)});
+  const key = (name, text) => el("span", {}, el("i", {class: "key", style: "color:var(--" + name + ")"}), " " + text);
+  const node = el("section", {}, el("h2", {}, run.name), el("div", {class: "faint"}, facts));
+  for (const text of run.doubts) node.append(el("div", {class: "doubt"}, "Doubt: " + text));
+  node.append(svg, el("div", {class: "row faint"}, key("path", "path"), key("accepted", "accepted"),
+    el("label", {}, rejected, " ", key("rejected", "rejected")), key("force", "forced, pinned"), key("ban",
+      "rejected by you")));
+  node.append(detail, el("div", {class: "row"},
+    el("button", {class: "main map", onclick: () => ask("/map", {run: number}), ...(busy ? {disabled: ""} : {})},
+      "Map again"),
+    el("a", {href: "/run/" + number + "/report.html", target: "_blank", rel: "noopener"}, "report"),
+    el("a", {href: "/run/" + number + "/map.png", target: "_blank", rel: "noopener"}, "picture")));
+  node.append(table(run, number, detail));
+  if (chosen && chosen.run === number) chosen.tell(detail); else hint(detail);
+  return node;
+}
+function hint(detail) { detail.replaceChildren(el("span", {class: "faint"}, "Nothing chosen.")); }
+function picture(run, number, detail) {
+  const points = run.paths.flat().concat(run.anchors.filter(a => a.place).map(a => a.place));
+  if (run.image) points.push([run.image.x, run.image.y], [run.image.x + run.image.width, run.image.y + run.image.height]);
+  const xs = points.map(p => p[0]), ys = points.map(p => p[1]);
+  const x0 = Math.min(...xs) - .5, x1 = Math.max(...xs) + .5, y0 = Math.min(...ys) - .5, y1 = Math.max(...ys) + .5;
+  const size = Math.max(x1 - x0, y1 - y0);
+  const svg = shape("svg", {viewBox: [x0, -y1, x1 - x0, y1 - y0].join(" "), class: "hideno", role: "img",
+    "aria-label": "map of " + run.name});
+  if (run.image) svg.append(shape("image", {href: "/run/" + number + "/grid.png", x: run.image.x,
+    y: -run.image.y - run.image.height,
+    width: run.image.width, height: run.image.height, preserveAspectRatio: "none"}));
+  run.paths.forEach((path, k) => svg.append(shape("polyline", {class: "path p" + k % 4,
+    points: path.map(p => p[0] + "," + -p[1]).join(" ")})));
+  for (const c of run.closures.slice().reverse()) {
+    const [a, b] = c.places, line = {x1: a[0], y1: -a[1], x2: b[0], y2: -b[1]};
+    const mark = " " + (c.accepted || c.wish !== "leave" ? "" : "no") + " " + c.wish;
+    const drawn = shape("line", {...line, class: "closure" + mark, "data-closure": c.number});
+    const hit = shape("line", {...line, class: "hit" + mark});
+    const open = () => choose(number, detail, d => tellClosure(d, run, number, c.number), `[data-closure="${c.number}"]`);
+    for (const node of [drawn, hit]) node.addEventListener("click", open);
+    svg.append(drawn, hit);
+  }
+  for (const a of run.anchors) {
+    if (!a.place) continue;
+    const node = shape("circle", {cx: a.place[0], cy: -a.place[1], r: size / 80, class: "anchor" + (a.pinned
+      ? " pinned" : ""), "data-anchor": a.id});
+    node.append(Object.assign(shape("title", {}), {textContent: "anchor " + a.id}));
+    node.addEventListener("click", () => choose(number, detail, d => tellAnchor(d, run, number, a.id), null));
+    svg.append(node);
+  }
+  return svg;
+}
+function choose(number, detail, tell, mark) {
+  chosen = {run: number, tell, mark};
+  tell(detail);
+  highlight();
+}
+function highlight() {
+  document.querySelectorAll(".chosen").forEach(node => node.classList.remove("chosen"));
+  if (chosen && chosen.mark) document.querySelectorAll("section")[chosen.run].querySelectorAll(chosen.mark)
+    .forEach(node => node.classList.add("chosen"));
+}
+function tellClosure(detail, run, number, k) {
+  const c = clock(state.runs[number], k);
+  if (!c) return hint(detail);
+  const button = (wish, text) => el("button", {"data-wish": wish, ...(c.wish === wish ? {disabled: ""} : {}),
+    onclick: () => ask("/closure", {run: number, number: k, wish})}, text);
+  detail.replaceChildren(el("div", {}, "Closure at " + c.stamps.map((t,
+    i) => t.toFixed(2) + " s" + (c.recordings[i] > 1 ? " of recording "
+    + c.recordings[i] : "")).join(" and ") + ": " + (c.accepted ? "accepted" : "rejected") + ", " + c.reason),
+    el("div", {class: "row"}, button("reject", "Reject"), button("force", "Force"), button("leave",
+      "Leave it to the mapper")));
+}
+function tellAnchor(detail, run, number, id) {
+  const a = state.runs[number].anchors.find(a => a.id === id);
+  if (!a) return hint(detail);
+  const place = a.pinned || a.place, x = el("input", {value: place[0].toFixed(3), "aria-label": "x"});
+  const y = el("input", {value: place[1].toFixed(3), "aria-label": "y"});
+  const sigma = a.sigma ? " ± " + a.sigma.map(v => v.toFixed(2)).join(", ") : "";
+  const [px, py] = a.place.map(v => v.toFixed(2) + " m"), pinned = a.pinned ? ", pinned" : "";
+  const pin = () => ask("/anchor", {run: number, id, place: [Number(x.value), Number(y.value)]});
+  const free = () => ask("/anchor", {run: number, id, place: null});
+  detail.replaceChildren(
+    el("div", {}, "Anchor " + a.id + " (" + a.status + ") at x " + px + ", y " + py + sigma + pinned),
+    el("div", {class: "row"}, "x", x, "y", y, "m", el("button", {"data-wish": "pin", onclick: pin}, "Pin here"),
+      el("button", {"data-wish": "free", ...(a.pinned ? {} : {disabled: ""}), onclick: free}, "Free")));
+}
+function table(run, number, detail) {
+  const rows = run.closures.slice(0, 400).map(c => el("tr", {}, el("td", {},
+    c.stamps.map(t => t.toFixed(1)).join(" – ") + " s"),
+    el("td", {}, c.wish === "leave" ? (c.accepted ? "accepted" : "rejected") : c.wish === "force"
+      ? "forced" : "rejected by you"),
+    el("td", {}, el("button", {onclick: () => choose(number, detail, d => tellClosure(d, run, number, c.number),
+      `[data-closure="${c.number}"]`)},
+      "choose"))));
+  return el("details", {}, el("summary", {}, "All closures"), el("div", {class: "list"}, el("table", {}, ...rows)));
+}
+ask("/state");
+"""
+
+
+def page(token: str) -> str:
+    """Return the page; the token lets its own posts in, and no other page's."""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>uwblite view</title><link rel=icon href=data:,><style>{_STYLE}</style></head>"
+        f'<body data-token="{token}"><header><h1>uwblite view</h1><span id="say" role="status">loading ...</span></header>'
+        f"<main></main><script>{_SCRIPT}</script></body></html>"
+    )

@@ -1,0 +1,93 @@
+"""A result as the page shows it: figures, path, anchors and closures, ready for JSON."""
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..constraints import Constraints
+from ..io.map_server import trinary_image
+from ..io.png import encode_png
+from ..io.stored_result import StoredResult
+from .edits import wish_for
+
+_MOST_POINTS = 3000
+"""Of a path."""
+_MOST_CLOSURES = 3000
+"""Accepted ones come first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """A result on the page."""
+
+    name: str
+    result: StoredResult
+    grid_png: bytes | None
+    """The map as a grey picture, largest y on top."""
+
+
+def run_of(result: StoredResult) -> Run:
+    """Return a result as the page needs it."""
+    grid = None if result.grid is None else encode_png(trinary_image(result.grid))
+    return Run(os.path.basename(os.path.abspath(result.folder)), result, grid)
+
+
+def described(run: Run, edits: Constraints) -> dict[str, Any]:
+    """Return everything that the page shows of a run; lengths in metres, map frame."""
+    result, report = run.result, run.result.report
+    pinned = {a.id: a for a in edits.anchors}
+    order = sorted(range(len(result.closures)), key=lambda k: not result.closures[k].accepted)[:_MOST_CLOSURES]
+    return {
+        "name": run.name,
+        "doubts": [_text(d) for d in report.get("doubts") or ()],
+        "warnings": [_text(w) for w in report.get("warnings") or ()],
+        "recordings": [os.path.basename(str(i.get("source", ""))) for i in report.get("inputs") or ()],
+        "preset": report.get("preset") or "defaults",
+        "accepted": sum(c.accepted for c in result.closures),
+        "candidates": len(result.closures),
+        "seconds": (report.get("timings") or {}).get("total"),
+        "image": _image(result),
+        "paths": [_thinned(poses) for _, poses in result.trajectories],
+        "anchors": [
+            {
+                "id": a.id,
+                "place": [float(v) for v in a.position] if np.isfinite(a.position).all() else None,
+                "sigma": [float(v) for v in np.sqrt(np.diag(a.covariance))] if np.isfinite(a.covariance).all() else None,
+                "status": a.status,
+                "pinned": list(pinned[a.id].position) if a.id in pinned else None,
+            }
+            for a in result.anchors
+        ],
+        "closures": [
+            {
+                "number": k,
+                "stamps": list(result.closures[k].stamps),
+                "recordings": list(result.closures[k].recordings),
+                "places": result.closures[k].places.tolist(),
+                "accepted": result.closures[k].accepted,
+                "reason": result.closures[k].reason,
+                "wish": wish_for(edits, result.closures[k]),
+            }
+            for k in order
+        ],
+    }
+
+
+def _text(notice: Any) -> str:
+    """Return the words of a doubt or warning, which may be a text or a table with a text."""
+    return str(notice.get("text", "")) if isinstance(notice, dict) else str(notice)
+
+
+def _image(result: StoredResult) -> dict[str, float] | None:
+    if result.grid is None:
+        return None
+    g = result.grid.geometry
+    x, y = g.origin.tolist()
+    return {"x": x, "y": y, "width": g.cols * g.resolution, "height": g.rows * g.resolution}
+
+
+def _thinned(poses: np.ndarray[Any, Any]) -> list[list[float]]:
+    step = max(-(-len(poses) // _MOST_POINTS), 1)
+    return [[round(x, 3), round(y, 3)] for x, y in poses[::step, :2].tolist()]
