@@ -3,6 +3,7 @@
     python tools/emulate.py --lidar ./lidar --uwb ./uwb --kobuki ./base
     python tools/emulate.py --lidar ./lidar --uwb ./uwb --kobuki ./base --play run.log --speed 2 --truth t.jsonl
     python tools/emulate.py --lidar tcp:10940
+    python tools/emulate.py --lidar ./lidar --lidar-kind ld06 --uwb ./uwb --uwb-kind linktrack --kobuki ./b --base-kind create2
     python tools/emulate.py --lidar ./lidar --scip1 --fault lidar:noise=0.01@10+20 --fault lidar:unplug@40+3
 
 Each device gets a path (a symbolic link to its pseudo-terminal) or ``tcp:[HOST:]PORT``. Without --play the robot drives a
@@ -26,12 +27,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from emulators import faults
 from emulators.dwm_device import DwmDevice, DwmOptions
 from emulators.faults import FaultyLine, parse_fault
-from emulators.kobuki_device import KobukiDevice
+from emulators.kobuki_device import Create2Device, KobukiDevice, TickLineDevice
 from emulators.scip_device import ScipDevice, ScipOptions
+from emulators.spinning_device import LIDARS
+from emulators.uwb_boards import BOARDS, UwbBoard
 from emulators.wires import PtyWire, TcpWire
 from emulators.world import LogWorld, RoomWorld, WorldClock
 
 DEVICES = ("lidar", "uwb", "kobuki")
+BASES = {"kobuki": KobukiDevice, "create2": Create2Device, "line": TickLineDevice}
 
 
 class Plug:
@@ -76,7 +80,9 @@ class Plug:
         """Tell whether a host has begun to read measurements."""
         if isinstance(self.device, ScipDevice):
             return self.device.is_streaming
-        return self.device.asked if isinstance(self.device, DwmDevice) else self.wire.connected()
+        if isinstance(self.device, DwmDevice):
+            return self.device.asked
+        return self.wire.connected() and getattr(self.device, "is_streaming", True)
 
 
 def parse_arguments(argv=None):
@@ -87,6 +93,9 @@ def parse_arguments(argv=None):
     )
     for name, what in (("lidar", "URG-04LX"), ("uwb", "DWM1001"), ("kobuki", "Kobuki")):
         parser.add_argument(f"--{name}", metavar="PATH|tcp:PORT", help=f"emulate a {what} here")
+    parser.add_argument("--lidar-kind", choices=("scip", *LIDARS), default="scip", help="which lidar (scip)")
+    parser.add_argument("--uwb-kind", choices=("dwm1001", *BOARDS), default="dwm1001", help="which tag (dwm1001)")
+    parser.add_argument("--base-kind", choices=tuple(BASES), default="kobuki", help="which base (kobuki)")
     parser.add_argument("--play", metavar="LOG", type=Path, help="CARMEN log to play")
     parser.add_argument("--speed", type=float, default=1.0, help="world seconds per second (1)")
     parser.add_argument("--no-wait", action="store_true", help="start the world at once")
@@ -136,10 +145,14 @@ def build(args, clock, world, truth) -> list[Plug]:
         place = getattr(args, name)
         if not place:
             continue
-        if name == "lidar":
+        if name == "lidar" and args.lidar_kind != "scip":
+            device = LIDARS[args.lidar_kind](world, clock, on_turn=lambda t: truth("turn", t, 0))
+        elif name == "lidar":
             options = ScipOptions(args.scip1, args.lidar_clock, args.lidar_skew, args.lidar_streaming)
             options.random = random.Random(args.seed + 10)
             device = ScipDevice(world.scans(), clock, options, lambda t, v: truth("lidar", t, v))
+        elif name == "uwb" and args.uwb_kind != "dwm1001":
+            device = UwbBoard(world.epochs(), clock, BOARDS[args.uwb_kind], lambda t, r: truth("uwb", t, r))
         elif name == "uwb":
             settings = DwmOptions(
                 shell=args.uwb_shell, stream=args.uwb_stream, stationary_detection=args.uwb_stationary,
@@ -147,7 +160,7 @@ def build(args, clock, world, truth) -> list[Plug]:
             )  # fmt: skip
             device = DwmDevice(world.epochs(), clock, settings, lambda t, r: truth("uwb", t, r))
         else:
-            device = KobukiDevice(
+            device = BASES[args.base_kind](
                 world.poses(), clock, clock_start=args.kobuki_clock, clock_skew=args.kobuki_skew,
                 on_packet=lambda t, *pose: truth("odometry", t, pose),
             )  # fmt: skip

@@ -1,18 +1,15 @@
-"""An emulated Kobuki base: fifty feedback packets a second, wheels and gyro from a played odometry."""
+"""Emulated bases, whose wheels and gyro follow a played odometry: a Kobuki, a Create 2, and one that prints ticks."""
 
 import math
 import struct
 from collections.abc import Iterator
+from types import MappingProxyType
 
 from .world import Feed, Pose, WorldClock
 
-PERIOD = 0.020
-METRES_PER_TICK = 0.0024369168713639 * 0.035
-WHEEL_BASE = 0.230
 
-
-class KobukiDevice:
-    """The base.
+class WheeledDevice:
+    """A base with two wheels.
 
     Parameters
     ----------
@@ -22,6 +19,12 @@ class KobukiDevice:
     clock_skew : relative error of its crystal.
     on_packet : called with (host time, x, y, theta) of each packet sent.
     """
+
+    PERIOD = 0.020
+    """s between packets."""
+    METRES_PER_TICK = 0.0024369168713639 * 0.035
+    WHEEL_BASE = 0.230
+    """m."""
 
     def __init__(
         self, poses: Iterator[Pose], clock: WorldClock, *, clock_start: int = 0, clock_skew: float = 0.0, on_packet=None
@@ -42,7 +45,7 @@ class KobukiDevice:
         """Return when the next packet is due, host s."""
         if self._began is None:
             self._began = now
-        return self._began + self._sent * PERIOD
+        return self._began + self._sent * self.PERIOD
 
     def receive(self, data: bytes, now: float) -> bytes:
         """Take commands; there are no motors."""
@@ -73,16 +76,27 @@ class KobukiDevice:
         turn = math.remainder(pose.theta - before.theta, 2 * math.pi)
         middle = before.theta + turn / 2
         travel = math.cos(middle) * dx + math.sin(middle) * dy
-        self._left += (travel - turn * WHEEL_BASE / 2) / METRES_PER_TICK
-        self._right += (travel + turn * WHEEL_BASE / 2) / METRES_PER_TICK
+        self._left += (travel - turn * self.WHEEL_BASE / 2) / self.METRES_PER_TICK
+        self._right += (travel + turn * self.WHEEL_BASE / 2) / self.METRES_PER_TICK
         self._on_packet(due, pose.x, pose.y, pose.theta)
         assert self._began is not None
-        ms = (self._ms + math.floor((due - self._began) * 1000 * (1 + self._skew))) & 0xFFFF
-        angle = round(math.degrees(math.remainder(pose.theta, 2 * math.pi)) * 100)
-        rate = max(-32768, min(32767, round(math.degrees(turn / PERIOD) * 100)))
-        left, right = round(self._left) & 0xFFFF, round(self._right) & 0xFFFF
+        ms = self._ms + math.floor((due - self._began) * 1000 * (1 + self._skew))
+        return self.encode(ms, round(self._left), round(self._right), pose.theta, turn / self.PERIOD)
+
+    def encode(self, ms: int, left: int, right: int, theta: float, turn_rate: float) -> bytes:
+        """Return a packet: the base's clock, the ticks of its wheels, what its gyro says (rad, rad/s)."""
+        raise NotImplementedError
+
+
+class KobukiDevice(WheeledDevice):
+    """A Kobuki: fifty feedback packets a second."""
+
+    def encode(self, ms: int, left: int, right: int, theta: float, turn_rate: float) -> bytes:
+        """Return a feedback packet."""
+        angle = round(math.degrees(math.remainder(theta, 2 * math.pi)) * 100)
+        rate = max(-32768, min(32767, round(math.degrees(turn_rate) * 100)))
         subs = [
-            (0x01, struct.pack("<HBBBHHbbBBBB", ms, 0, 0, 0, left, right, 0, 0, 0, 0, 160, 0)),
+            (0x01, struct.pack("<HBBBHHbbBBBB", ms & 0xFFFF, 0, 0, 0, left & 0xFFFF, right & 0xFFFF, 0, 0, 0, 0, 160, 0)),
             (0x03, b"\0\0\0"),
             (0x04, struct.pack("<hh3x", max(-32768, min(32767, angle)), rate)),
             (0x05, struct.pack("<HHH", 2000, 2000, 2000)),
@@ -91,6 +105,57 @@ class KobukiDevice:
             (0x10, struct.pack("<H4H6x", 0, 4095, 4095, 4095, 4095)),
         ]
         return encode_packet(subs)
+
+
+class Create2Device(WheeledDevice):
+    """An iRobot Create 2: streams the packets that it was asked for, every 15 ms."""
+
+    PERIOD = 0.015
+    METRES_PER_TICK = math.pi * 0.072 / 508.8
+    WHEEL_BASE = 0.235
+    SIZES = MappingProxyType({7: 1, 22: 2, 43: 2, 44: 2})
+
+    def power_up(self, now: float) -> None:
+        """The port was opened anew; a stream that was asked for goes on."""
+        self.packets = getattr(self, "packets", b"")
+        self.streaming, self.awake = bool(self.packets), False
+
+    def receive(self, data: bytes, now: float) -> bytes:
+        """Take ``128``, ``148 n packets`` and ``150 flag``."""
+        at = 0
+        while at < len(data):
+            code, at = data[at], at + 1
+            if code == 128:
+                self.awake = True
+            elif code == 148 and self.awake:
+                self.packets, at = data[at + 1 : at + 1 + data[at]], at + 1 + data[at]
+                self.streaming = True
+            elif code == 150:
+                self.streaming, at = bool(data[at]), at + 1
+        return b""
+
+    def advance(self, now: float) -> bytes:
+        """Return the frames due up to host time `now`; the wheels count also while nobody listens."""
+        out = super().advance(now)
+        return out if self.streaming else b""
+
+    def encode(self, ms: int, left: int, right: int, theta: float, turn_rate: float) -> bytes:
+        """Return a frame of the stream."""
+        values = {7: 0, 22: 15800, 43: left & 0xFFFF, 44: right & 0xFFFF}
+        body = b"".join(bytes([p]) + values[p].to_bytes(self.SIZES[p], "big") for p in self.packets)
+        frame = bytes((19, len(body))) + body
+        return frame + bytes([-sum(frame) & 0xFF])
+
+
+class TickLineDevice(WheeledDevice):
+    """A hobby controller that prints ``ms,left,right`` fifty times a second."""
+
+    METRES_PER_TICK = 0.0001
+    WHEEL_BASE = 0.30
+
+    def encode(self, ms: int, left: int, right: int, theta: float, turn_rate: float) -> bytes:
+        """Return a line."""
+        return f"{ms},{left},{right}\r\n".encode()
 
 
 def encode_packet(subs: list[tuple[int, bytes]]) -> bytes:

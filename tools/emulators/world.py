@@ -51,6 +51,7 @@ class LogWorld:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._looking: Feed | None = None
         first = islice(self._lines("ODOM", "ROBOTLASER1", "UWB"), 50)
         self._zero = min(float(line.split()[-3]) for line in first)
 
@@ -68,6 +69,23 @@ class LogWorld:
             count = int(fields[8])
             start, step, limit = float(fields[2]), float(fields[4]), float(fields[5])
             yield Scan(float(fields[-3]) - self._zero, _to_steps(fields[9 : 9 + count], start, step, limit))
+
+    def look(self, times: list[float], bearings: list[float]) -> list[int]:
+        """Return what the log's laser saw last at world times `times`, mm, at bearings in turns clockwise; 0 = nothing."""
+        if self._looking is None:
+            self._looking = Feed(self._lines("ROBOTLASER1 "))
+            self._view: tuple[float, float, list[str]] = (0.0, 1.0, [])
+        while self._looking.head is not None and float(self._looking.head.split()[-3]) - self._zero <= times[-1]:
+            fields = self._looking.pop().split()
+            self._view = (float(fields[2]), float(fields[4]), fields[9 : 9 + int(fields[8])])
+            self._limit = 1000 * float(fields[5])
+        start, step, ranges = self._view
+        seen = []
+        for bearing in bearings:
+            index = round((-2 * math.pi * bearing - start) % (2 * math.pi * math.copysign(1, step)) / step)
+            mm = round(1000 * float(ranges[index])) if index < len(ranges) else 0
+            seen.append(mm if 20 <= mm < self._limit else 0)
+        return seen
 
     def epochs(self) -> Iterator[Epoch]:
         """Yield the ranges, those within 20 ms together, at most four at a time as a DWM1001 has it."""
@@ -145,6 +163,15 @@ class RoomWorld:
                 values.append(min(MAX_MM, round(1000 * self._distance(pose.x, pose.y, math.cos(angle), math.sin(angle)))))
             yield Scan(time, [value if value < MAX_MM else 0 for value in values])
             k += 1
+
+    def look(self, times: list[float], bearings: list[float]) -> list[int]:
+        """Return what a laser on the base sees at world times `times`, mm, at bearings in turns clockwise."""
+        seen = []
+        for time, bearing in zip(times, bearings, strict=True):
+            pose = self.pose(time)
+            angle = pose.theta - 2 * math.pi * bearing
+            seen.append(round(1000 * self._distance(pose.x, pose.y, math.cos(angle), math.sin(angle))))
+        return seen
 
     def _distance(self, x: float, y: float, cos: float, sin: float) -> float:
         left, bottom, right, top = self.WALLS

@@ -83,10 +83,11 @@ class ClockMap:
     ----------
     window : s of device time that the envelope looks back.
     bucket : s; one minimum is kept per bucket, so memory is bounded by window / bucket.
+    max_skew : share by which the rate of the device's clock may be wrong.
     """
 
-    def __init__(self, window: float = 120.0, bucket: float = 1.0) -> None:
-        self._bucket = bucket
+    def __init__(self, window: float = 120.0, bucket: float = 1.0, max_skew: float = MAX_SKEW) -> None:
+        self._bucket, self._max_skew = bucket, max_skew
         self._minima: deque[tuple[float, float]] = deque(maxlen=max(2, round(window / bucket)))
         self._index: int | None = None
         self._slope, self._origin, self._offset = 0.0, 0.0, 0.0
@@ -123,7 +124,7 @@ class ClockMap:
             middle = (points[0][0] + points[-1][0]) / 2
             for (x0, y0), (x1, y1) in pairwise(hull):
                 if x0 <= middle <= x1:
-                    self._slope = max(-MAX_SKEW, min(MAX_SKEW, (y1 - y0) / (x1 - x0)))
+                    self._slope = max(-self._max_skew, min(self._max_skew, (y1 - y0) / (x1 - x0)))
         self._offset = min(y - self._slope * (x - self._origin) for x, y in points)
 
 

@@ -6,18 +6,28 @@ Rows of one sensor stand in the order in which an unknown port is looked at: fir
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from urllib.parse import parse_qsl, urlencode
 
 from ..errors import ConfigError
+from .create2 import Create2Driver
 from .dwm1001_driver import Dwm1001Driver
 from .events import Pose
 from .kobuki import KobukiDriver
+from .ldlidar import LdLidarDriver
+from .lds01 import Lds01Driver
+from .linktrack import BU03_BAUD, LINKTRACK_BAUD, Bu03Protocol, LinkTrackProtocol, TagFrameDriver
 from .odometry_line import LineDriver, parse_format
+from .rplidar import RpLidarDriver
 from .scip_driver import ScipDriver
 from .session import Driver, Session
+from .uwb_line import BOARDS, Parse, UwbLineDriver, by_columns, parse_columns
+from .ydlidar import YdLidarX2Driver, YdLidarX4Driver
 
 BAUD = 1200, 4_000_000
 """bit/s, least and most, that a serial port is opened with."""
+CP2102 = ("10c4:ea60",)
+"""A USB-serial chip that the adapters of many lidars have."""
 SENSORS = ("uwb", "lidar", "odometry")
 
 
@@ -118,12 +128,41 @@ def _line(options: Options, setup: Setup) -> Driver:
     return LineDriver(parse_format({k: v for k, v in options.values.items() if k != "baud"}), baud, setup.start)
 
 
+def _uwb_line(options: Options, _setup: Setup) -> Driver:
+    form = parse_columns(
+        options.text("columns", "id,range"), options.number("unit", 1.0, 1e-6, 1e3), options.text("prefix")
+    )  # fmt: skip
+    return _board(by_columns(form), "UWB tag that prints lines", options)
+
+
+def _board(parse: Parse, title: str, options: Options) -> Driver:
+    baud, unit = options.whole("baud", UwbLineDriver.baud, *BAUD), options.number("time_unit", 1.0, 1e-12, 1e6)
+    return UwbLineDriver(parse, title, baud, unit, options.text("tag"))
+
+
+def _tag_frames(protocol: type[LinkTrackProtocol | Bu03Protocol], title: str, usual: int) -> Callable[[Options, Setup], Driver]:
+    return lambda options, _setup: TagFrameDriver(protocol(), title, options.whole("baud", usual, *BAUD))
+
+
+def _printing_board(name: str, title: str) -> DeviceKind:
+    make = partial(lambda parse, options, _setup: _board(parse, title, options), BOARDS[name])
+    return DeviceKind(name, "uwb", title, make, talks=True, probe=False, options="baud, tag (where it prints several)")
+
+
+def _rplidar(options: Options, _setup: Setup) -> Driver:
+    return RpLidarDriver(not options.whole("standard", 0, 0, 1), options.whole("baud", RpLidarDriver.baud, *BAUD))
+
+
 DEVICES = {
     kind.name: kind
     for kind in (
         DeviceKind(
             "kobuki", "odometry", "Kobuki base", _kobuki, product="kobuki", talks=True,
             silent="the base is silent: switch it on (its USB chip is powered by this computer, the base is not)",
+        ),
+        DeviceKind(
+            "create2", "odometry", "iRobot Create 2, Roomba 500 to 900", lambda _o, setup: Create2Driver(setup.start),
+            silent="the base is silent: press its power button, check the cable (115200 bit/s, 5 V levels)",
         ),
         DeviceKind(
             "line", "odometry", "base that prints text lines", _line, talks=True, probe=False,
@@ -140,15 +179,45 @@ DEVICES = {
             lambda _o, setup: Dwm1001Driver(shell=True, stream=setup.stream), probe=False,
         ),
         DeviceKind(
+            "uwb-line", "uwb", "UWB tag that prints lines (also line:PORT)", _uwb_line, talks=True, probe=False,
+            options="columns (id,range | range:NAME,... | t, quality, tag, - to skip), unit (m), time_unit (s), prefix,"
+            " tag, baud",
+        ),
+        _printing_board("makerfabs", "Makerfabs ESP32 UWB (DW1000 example)"),
+        _printing_board("makerfabs-at", "Makerfabs ESP32 UWB DW3000 (AT firmware)"),
+        _printing_board("bu01", "Ai-Thinker BU01"),
+        _printing_board("dwm3001", "Qorvo DWM3001CDK (CLI firmware, INITF)"),
+        DeviceKind(
+            "bu03", "uwb", "Ai-Thinker BU03", _tag_frames(Bu03Protocol, "Ai-Thinker BU03", BU03_BAUD), talks=True,
+            probe=False, options="baud",
+        ),
+        DeviceKind(
+            "linktrack", "uwb", "Nooploop LinkTrack (Tag_Frame0)",
+            _tag_frames(LinkTrackProtocol, "Nooploop LinkTrack", LINKTRACK_BAUD), talks=True, options="baud",
+        ),
+        DeviceKind(
             "scip", "lidar", "Hokuyo URG-04LX and others that speak SCIP", _scip, usb=("15d1:0000",),
             silent="the lidar is silent: unplug and replug it, check its 5 V supply (it draws up to 0.8 A at start)",
             options="steps (first:last), cluster, skip, narrow (1: 2-character readings), baud",
         ),
+        DeviceKind(
+            "ld06", "lidar", "LDROBOT LD06, LD19, STL-19P", lambda _o, _s: LdLidarDriver(), LdLidarDriver.baud, CP2102,
+            talks=True, silent="the lidar is silent: its motor must turn, and its PWM wire must lie on ground or hang free",
+        ),
+        DeviceKind(
+            "ydlidar-x2", "lidar", "YDLIDAR X2", lambda _o, _s: YdLidarX2Driver(), YdLidarX2Driver.baud, CP2102, talks=True,
+        ),
+        DeviceKind("ydlidar-x4", "lidar", "YDLIDAR X4", lambda _o, _s: YdLidarX4Driver(), YdLidarX4Driver.baud, CP2102),
+        DeviceKind(
+            "rplidar", "lidar", "Slamtec RPLIDAR A1, A2, A3", _rplidar, usb=CP2102,
+            options="standard (1: standard instead of express scan), baud (found by itself)",
+        ),
+        DeviceKind("lds01", "lidar", "Hitachi-LG LDS-01 (HLS-LFCD2)", lambda _o, _s: Lds01Driver(), Lds01Driver.baud, CP2102),
     )
 }  # fmt: skip
 """By name. The first kind of a sensor that has no name of its own in what the user wrote is DEFAULT's."""
 DEFAULT = {"uwb": "tlv", "lidar": "scip"}
-ALIASES = {"dwm1001": "tlv"}
+ALIASES = {("uwb", "dwm1001"): "tlv", ("uwb", "line"): "uwb-line"}
 
 
 def open_device(sensor: str, spec: str, setup: Setup | None = None, more: dict[str, str] | None = None) -> tuple[Session, str]:
@@ -170,7 +239,7 @@ def open_device(sensor: str, spec: str, setup: Setup | None = None, more: dict[s
     ConfigError : no such device, no port, or an option that it does not have.
     """
     name, separator, rest = spec.partition(":")
-    name = ALIASES.get(name, name)
+    name = ALIASES.get((sensor, name), name)
     kind = DEVICES.get(name)
     if not separator or kind is None:
         if sensor not in DEFAULT:

@@ -164,6 +164,35 @@ class FrameReader:
             events.append(corrupt(bytes(self.held.data[start:end]), self.noise))
 
 
+class PacketReader(FrameReader):
+    """Frames that prove themselves by a check; a protocol derives from this and says `size_at` and `decode`.
+
+    A head in noise may claim more bytes than ever come. Where a whole frame stands behind a head that still waits, that
+    head was noise.
+    """
+
+    def size_at(self, buffer: bytearray, at: int) -> int:
+        """Return the size of the good frame that begins at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
+        raise NotImplementedError
+
+    def measure(self, at: int) -> int:
+        """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
+        buffer = self.held.data
+        size, behind = self.size_at(buffer, at), at + 1
+        while size == 0 and behind < len(buffer):
+            found = self.size_at(buffer, behind)
+            if found > 0:
+                return at - behind
+            behind += max(1, -found)
+        return size
+
+
+def to_next(buffer: bytearray, at: int, *firsts: int) -> int:
+    """Return -n, the distance from `at` to the next byte after it that can begin a frame, for `size_at`."""
+    found = [place for first in firsts if (place := buffer.find(first, at + 1)) >= 0]
+    return at - min(found, default=len(buffer))
+
+
 @dataclass(frozen=True, slots=True)
 class Line:
     """A line without its end."""

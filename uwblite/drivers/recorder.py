@@ -321,7 +321,7 @@ class Recorder:
         for link in self.links:
             if link.port is not None:
                 for action in link.session.stop():
-                    if isinstance(action, Send):
+                    if isinstance(action, Send | SetDtr):
                         self._send(link, action)
             if link.port is not None:
                 link.port.close()

@@ -1,0 +1,125 @@
+"""Create 2: frames of the stream, and odometry from them."""
+
+import math
+import random
+
+import pytest
+from emulators.kobuki_device import Create2Device
+from emulators.world import Pose, RoomWorld, WorldClock
+from helpers.driver_harness import check_transcript, feed_whole, of_kind, simulate
+
+from uwblite.drivers.create2 import MODULUS, TICK, WHEEL_BASE, Create2Driver, Create2Protocol, WheelOdometer
+from uwblite.drivers.events import Corrupt, Lost, Note, OdometryPose
+
+RNG = random.Random(2)
+NOISES = [b"", b"\x13", b"\x13\x0b", b"\x13\x0b\x07\x00\x2b", b"\x2b\x00\x00", RNG.randbytes(3), RNG.randbytes(90)]
+
+
+def emulated(world=None, **options):
+    clock, sent = WorldClock(), []
+    clock.start(1000.0)
+    poses = (world or RoomWorld()).poses()
+    return Create2Device(poses, clock, on_packet=lambda *pose: sent.append(pose), **options), sent
+
+
+def frames(count):
+    device, _ = emulated()
+    device.power_up(1000.0)
+    device.receive(b"\x80", 1000.0)
+    device.receive(bytes((148, 4, 7, 43, 44, 22)), 1000.0)
+    return [device.advance(device.next_time(1000.0)) for _ in range(count)]
+
+
+def test_transcript_in_every_split_and_among_noise():
+    transcript = frames(20)
+    assert {len(frame) for frame in transcript} == {14}
+    expected = feed_whole(Create2Protocol, b"".join(transcript))
+    assert len(expected) == 20
+    check_transcript(Create2Protocol, transcript, expected, NOISES, splits=100)
+
+
+def test_a_frame_by_hand():
+    """13h, 11 bytes: no bumps, left 513, right 65534, 15.8 V; all bytes together are 0 modulo 256."""
+    body = bytes((0x13, 11, 7, 0x08, 43, 2, 1, 44, 255, 254, 22, 0x3D, 0xB8))
+    (event,) = feed_whole(Create2Protocol, body + bytes([-sum(body) & 0xFF]))
+    assert (event.left, event.right, event.wheel_drop, event.voltage) == (513, 65534, 2, 15.8)
+
+
+def test_every_single_damaged_byte_is_noticed():
+    (frame,) = frames(1)
+    for at in range(len(frame)):
+        for bit in (0x01, 0x80):
+            broken = bytearray(frame)
+            broken[at] ^= bit
+            assert all(isinstance(event, Corrupt) for event in feed_whole(Create2Protocol, bytes(broken)))
+
+
+def test_wheels_wrap_both_ways_and_turn():
+    odometer = WheelOdometer(TICK, WHEEL_BASE, MODULUS, (0.0, 0.0, 0.0))
+    for tick in (65000, 200, 65400):
+        odometer.update(tick, tick)
+    assert odometer.pose[0] == pytest.approx(400 * TICK)
+    quarter = math.pi / 2 * WHEEL_BASE / 2 / TICK
+    odometer = WheelOdometer(TICK, WHEEL_BASE, MODULUS, (0.0, 0.0, 0.0))
+    odometer.update(0, 0)
+    odometer.update(-round(quarter) % MODULUS, round(quarter))
+    assert odometer.pose[2] == pytest.approx(math.pi / 2, abs=0.005)
+    assert math.hypot(*odometer.pose[:2]) < 1e-3
+
+
+def test_it_asks_for_the_stream_and_follows_the_circle():
+    """Ticks of 0.44 mm, heading by the wheels alone: within 3 mm of the emulated circle in a minute.
+
+    Besides the 12 mm that the robot drove before its stream began.
+    """
+    rng = random.Random(0)
+    device, sent = emulated()
+    actions, _ = simulate(Create2Driver((0.0, -1.5, 0.0)), device, 60.0, jitter=lambda: rng.expovariate(500.0))
+    poses = of_kind(actions, OdometryPose)
+    assert len(poses) > 3900
+    assert not of_kind(actions, Corrupt)
+    assert not of_kind(actions, Lost)
+    truth = {round(at, 3): (x, y, theta) for at, x, y, theta in sent}
+    errors, late = [], []
+    for pose in poses[200:]:
+        at = round(1000.0 + 0.015 * round((pose.stamp - 1000.0) / 0.015), 3)
+        x, y, theta = truth[at]
+        errors.append(max(math.hypot(pose.x - x, pose.y - y), abs(math.remainder(pose.theta - theta, 2 * math.pi))))
+        late.append(abs(pose.stamp - at))
+    assert max(errors) < 0.2 * 0.06 + 0.003
+    assert max(late) < 0.003
+
+
+def test_a_robot_that_fell_asleep_is_woken_and_its_gap_told():
+    class Still:
+        def poses(self):
+            yield Pose(0.0, 0.0, 0.0, 0.0)
+            yield Pose(1e6, 0.0, 0.0, 0.0)
+
+    device, _ = emulated(Still())
+    receive, heard = device.receive, []
+
+    def sleepy(data, now):
+        heard.append((now, data))
+        return receive(data, now) if not 1005.0 < now < 1012.0 else b""
+
+    device.receive = sleepy
+    session_actions, _ = simulate(Create2Driver(), _Asleep(device), 20.0)
+    assert sum(data == b"\x80" for _, data in heard) > 3
+    assert sum(event.count for event in of_kind(session_actions, Lost)) == pytest.approx(7 / 0.015, rel=0.2)
+    assert not of_kind(session_actions, Note)  # shorter than an encoder may take to turn by half its range
+
+
+class _Asleep:
+    """A robot that stops to stream by itself at 1005 s."""
+
+    def __init__(self, device):
+        self._device, self._slept = device, False
+
+    def __getattr__(self, name):
+        return getattr(self._device, name)
+
+    def advance(self, now):
+        if now > 1005.0 and not self._slept:
+            self._slept, self._device.streaming, self._device.awake = True, False, False
+        return self._device.advance(now)

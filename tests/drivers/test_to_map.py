@@ -1,0 +1,76 @@
+"""Every device from its emulator through record, check and map to a map: in simulated time, as good as the URG-04LX's."""
+
+import math
+
+import numpy as np
+import pytest
+from emulators.dwm_device import DwmDevice
+from emulators.kobuki_device import Create2Device, KobukiDevice, TickLineDevice
+from emulators.simulated_world import SimulatedWorld
+from emulators.spinning_device import LIDARS
+from emulators.uwb_boards import BOARDS, UwbBoard
+from emulators.world import WorldClock
+from helpers.virtual_recording import record
+from simulation.recording import Settings, simulate
+
+from uwblite.cli import main
+from uwblite.drivers.devices import open_device
+
+MINUTES, LEAD = 1.5, 3.0
+"""min of driving, s of standing before."""
+BASES = {"kobuki": KobukiDevice, "create2": Create2Device, "line": TickLineDevice}
+OPTIONS = {
+    "line": "?columns=t,left,right&time_unit=0.001&tick=0.0001&wheel_base=0.30",
+    "uwb-line": "?columns=t,id,range,quality&prefix=UWB&unit=0.001&time_unit=0.001",
+    "rplidar-standard": "?standard=1",
+}
+TOGETHER = [
+    ("ld06", "linktrack", "create2"), ("lds01", "makerfabs", "line"), ("rplidar", "makerfabs-at", "kobuki"),
+    ("rplidar-standard", "bu01", "create2"), ("ydlidar-x2", "dwm3001", "line"), ("ydlidar-x4", "bu03", "kobuki"),
+    ("ld06", "uwb-line", "kobuki"), ("lds01", "tlv", "create2"),
+]  # fmt: skip
+
+
+def session(sensor, name):
+    kind = name.removesuffix("-standard")
+    return open_device(sensor, f"{kind}:port{OPTIONS.get(name, '')}")[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lidar", "uwb", "base"), TOGETHER)
+def test_from_emulator_to_map(tmp_path, lidar, uwb, base):
+    settings = Settings(world="room", seed=3, minutes=MINUTES, uwb_rate=5.0, without=("laser",), tell_heights=True)
+    recording = simulate(settings)
+    world, clock = SimulatedWorld(recording), WorldClock()
+    write = BOARDS.get({"uwb-line": "line"}.get(uwb, uwb))
+    tag = UwbBoard(world.epochs(), clock, write) if write else DwmDevice(world.epochs(), clock)
+    devices = [
+        ("lidar", session("lidar", lidar), LIDARS[lidar](world, clock, wobble=0.01)),
+        ("odometry", session("odometry", base), BASES[base](world.poses(), clock)),
+        ("uwb", session("uwb", uwb), tag),
+    ]
+    params = [("uwb_tag_offset_x", f"{settings.tag[0]}"), ("uwb_tag_offset_y", f"{settings.tag[1]}"),
+              ("uwb_tag_height", "0.6"), ("uwb_anchor_height", "0.6")]  # fmt: skip
+    recorder = record(
+        tmp_path / "run.log", devices, 60.0 * MINUTES + LEAD, laser=settings.laser_pose, params=params,
+        begin=lambda now: clock.start(now + LEAD),
+    )  # fmt: skip
+    assert recorder.doubts() == []
+    for link in recorder.links:
+        assert link.counts.messages > 100
+        assert sum(link.counts.corrupt.values()) == 0
+    assert main(["check", str(tmp_path / "run.log")]) == 0
+    assert main(["map", str(tmp_path / "run.log"), "--out", str(tmp_path / "map"), "-q"]) in (0, 3)
+    assert absolute_error(tmp_path / "map" / "trajectory.tum", recording, 1000.0 + LEAD) < 0.05
+
+
+def absolute_error(path, recording, zero):
+    """Return the RMS distance of a trajectory to the truth after the best rigid alignment, m."""
+    rows = np.loadtxt(path)
+    inside = (rows[:, 0] > zero + 0.1) & (rows[:, 0] < zero + recording.stamps[-1] - 0.1)
+    said = rows[inside, 1:3]
+    true = np.stack([np.interp(rows[inside, 0] - zero, recording.stamps, recording.truth[:, k]) for k in range(2)], axis=1)
+    a, b = said - said.mean(axis=0), true - true.mean(axis=0)
+    angle = math.atan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    turned = a @ np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    return float(np.sqrt(np.mean(np.sum((turned - b) ** 2, axis=1))))

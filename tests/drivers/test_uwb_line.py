@@ -1,0 +1,141 @@
+"""UWB boards that print lines: what they say, what is refused, and ranges from their emulators."""
+
+import random
+
+import pytest
+from emulators.uwb_boards import BOARDS, UwbBoard, slots
+from emulators.world import Epoch, RoomWorld, WorldClock
+from helpers.driver_harness import check_transcript, good, of_kind, simulate
+
+from uwblite.drivers.devices import open_device
+from uwblite.drivers.events import Corrupt, Lost, Note, RangeEpoch
+from uwblite.drivers.uwb_line import BOARDS as FORMS
+from uwblite.drivers.uwb_line import UwbLineProtocol, by_columns, parse_columns
+from uwblite.errors import ConfigError
+
+SPECS = {name: f"{name}:port" for name in BOARDS} | {
+    "line": "line:port?columns=t,id,range,quality&prefix=UWB&unit=0.001&time_unit=0.001"
+}
+NUMBERED = ("makerfabs-at", "bu01", "bu03", "linktrack")
+"""Boards that number their anchors."""
+STEP = {"makerfabs": 0.01, "makerfabs-at": 0.01, "bu01": 0.01, "dwm3001": 0.01}
+"""m in which they speak; the others in mm."""
+
+REAL_LINES = {
+    "makerfabs": ("from: 1782\t Range: 3.21 m\t RX power: -65.10 dBm", [("1782", 3.21)]),
+    "makerfabs-at": (
+        "AT+RANGE=tid:7,mask:0F,seq:128,range:(997,1321,911,738,0,0,0,0),ancid:(0,1,2,3,-1,-1,-1,-1)",
+        [("0", 9.97), ("1", 13.21), ("2", 9.11), ("3", 7.38)],
+    ),
+    "bu01": ("an1:1.24m", [("1", 1.24)]),
+    "dwm3001": (
+        'SESSION_INFO_NTF: {session_handle=1, sequence_number=39, block_index=39, n_measurements=1 '
+        '[mac_address=0x0001, status="SUCCESS", distance[cm]=71]}',
+        [("0001", 0.71)],
+    ),
+}  # fmt: skip
+"""As users show them (sources in firmware_notes)."""
+
+
+@pytest.mark.parametrize("name", REAL_LINES)
+def test_lines_that_users_show(name):
+    text, expected = REAL_LINES[name]
+    (line,) = UwbLineProtocol(FORMS[name]).feed(text.encode() + b"\r\n", 1.0)
+    assert [(r.anchor_id, pytest.approx(r.range)) for r in line.content.readings] == expected
+
+
+def test_older_at_firmware_says_rssi_and_no_ids():
+    text = "AT+RANGE=tid:1,mask:04,seq:63,range:(0,0,30,0,0,0,0,0),rssi:(0.00,0.00,-77.93,0.00,0.00,0.00,0.00,0.00)"
+    (line,) = UwbLineProtocol(FORMS["makerfabs-at"]).feed(text.encode() + b"\n", 1.0)
+    assert [(r.anchor_id, r.range) for r in line.content.readings] == [("2", 0.3)]
+    assert line.content.tag == "1"
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_transcript_in_every_split_and_among_noise(name):
+    epochs = RoomWorld().epochs()
+    lines = [line + b"\n" for k in range(12) for line in BOARDS[name](next(epochs), k, 100 * k).split(b"\n") if line.strip()]
+    expected = good(UwbLineProtocol(FORMS[name]).feed(b"".join(lines), 1.0))
+    assert len(expected) >= 12
+    noises = [b"", b"\n", b"\xff\xfe\n", b"from: 12\n", b"an1\n", b"boot: ok\r\n", random.Random(3).randbytes(40) + b"\n"]
+    check_transcript(lambda: UwbLineProtocol(FORMS[name]), lines, expected, noises, splits=60)
+
+
+def board(name):
+    clock, fixes = WorldClock(), []
+    clock.start(1000.0)
+    write = BOARDS[name]
+    return UwbBoard(RoomWorld().epochs(), clock, write, lambda at, readings: fixes.append((at, readings))), fixes
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_ranges_come_out_as_they_were_measured(name):
+    device, fixes = board(name)
+    session = open_device("uwb", SPECS[name])[0]
+    rng = random.Random(1)
+    actions, _ = simulate(session, device, 8.0, jitter=lambda: rng.expovariate(1000.0))
+    assert not of_kind(actions, Corrupt)
+    assert not of_kind(actions, Lost)
+    got = {}
+    for epoch in of_kind(actions, RangeEpoch):
+        for reading in epoch.readings:
+            got.setdefault(round((epoch.stamp - 1000.0) * 10), {})[reading.anchor_id] = (epoch.stamp, reading.range)
+    fixes = fixes[1:-1]  # the first line is passed over
+    silent = 0
+    for at, readings in fixes:
+        row = got.get(round((at - 1000.0) * 10), {})
+        expected = {f"{a:X}" if name == "makerfabs" else f"{a:04X}": mm for a, mm, _ in readings}
+        if name in NUMBERED:
+            expected = {str(i): mm for i, mm in enumerate(slots(Epoch(0.0, readings))) if mm}
+        silent += len(expected) - len(row)
+        for anchor, (stamp, metres) in row.items():
+            assert metres == pytest.approx(expected[anchor] / 1000, abs=STEP.get(name, 0.001) * 0.501)
+            assert -0.0011 < stamp - at < 0.008  # clocks of 1 ms, 1 ms of jitter
+    assert silent == (len([1 for k in range(2, len(fixes) + 2) if k % 10 == 0]) if name == "dwm3001" else 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "line", "expected"),
+    [
+        ("id,range", "A1 2.5", [("A1", 2.5)]),
+        ("-,range,id", "x;1.25;7", [("7", 1.25)]),
+        ("t,range:N,range:S", "100,1.5,2.5", [("N", 1.5), ("S", 2.5)]),
+        ("tag,id,range,quality", "0 9 3.0 250", [("9", 3.0)]),
+    ],
+)
+def test_columns(options, line, expected):
+    ranges = by_columns(parse_columns(options, 1.0, ""))(line)
+    assert [(r.anchor_id, r.range) for r in ranges.readings] == expected
+    assert all(r.quality == 100 for r in ranges.readings)
+
+
+@pytest.mark.parametrize("line", ["A1", "A1 x", "A1 2.5 9", "A/1 2.5", "A1 nan", "A1 1e999"])
+def test_lines_that_do_not_fit_are_damage(line):
+    protocol = UwbLineProtocol(by_columns(parse_columns("id,range", 1.0, "")))
+    (event,) = protocol.feed(line.encode() + b"\n", 1.0)
+    assert isinstance(event, Corrupt)
+
+
+@pytest.mark.parametrize("columns", ["range", "id", "id,range,range", "x,y", "t,range:"])
+def test_columns_that_make_no_range_are_refused(columns):
+    with pytest.raises(ConfigError, match="uwb line"):
+        open_device("uwb", f"line:port?columns={columns}")
+
+
+def test_what_is_no_range_is_refused_in_words_and_once():
+    session = open_device("uwb", "makerfabs:port")[0]
+    session.start(0.0)
+    actions = session.feed(b"POS 0 0 0\n" + b"POS 1.0 2.0 3.0\n" * 5, 1.0)
+    notes = [action for action in actions if isinstance(action, Note)]
+    assert [note.name for note in notes] == ["uwb-no-ranges"]
+    assert "two-way ranging" in notes[0].text
+    assert not any(isinstance(action, RangeEpoch) for action in actions)
+
+
+def test_ranges_of_other_tags_are_left_out_and_that_is_said():
+    session = open_device("uwb", "makerfabs-at:port")[0]
+    session.start(0.0)
+    line = "AT+RANGE=tid:{},mask:01,seq:1,range:({},0,0,0,0,0,0,0)\n"
+    actions = session.feed((line.format(3, 50) + line.format(3, 100) + line.format(4, 200) + line.format(3, 300)).encode(), 1.0)
+    assert [r.range for a in actions if isinstance(a, RangeEpoch) for r in a.readings] == [1.0, 3.0]
+    assert [a.name for a in actions if isinstance(a, Note)] == ["uwb-other-tag"]

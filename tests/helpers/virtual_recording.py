@@ -1,0 +1,129 @@
+"""`uwblite record` in simulated time: the real recorder and sessions against emulated devices, without ports or waiting."""
+
+from unittest import mock
+
+from uwblite.drivers import recorder as recorder_module
+from uwblite.drivers.link import Link, Mounting
+from uwblite.drivers.log_file import LogFile
+from uwblite.drivers.recorder import Recorder
+
+LATENCY = 0.0008
+"""s from the host to a device."""
+
+
+class VirtualTime:
+    """A clock that moves when the recorder waits."""
+
+    def __init__(self, start=1000.0):
+        self.now = start
+
+    def __call__(self):
+        return self.now
+
+
+class VirtualPort:
+    """A port with an emulated device at its other end."""
+
+    def __init__(self, device, clock):
+        self.device, self._clock = device, clock
+        self._answers = []
+        device.power_up(clock.now)
+
+    def fileno(self):
+        return None
+
+    def read(self):
+        now, data = self._clock.now, b""
+        while self._answers and self._answers[0][0] <= now:
+            data += self._answers.pop(0)[1]
+        return data + self.device.advance(now)
+
+    def write(self, data):
+        answer = self.device.receive(data, self._clock.now)
+        if answer:
+            self._answers.append((self._clock.now + LATENCY, answer))
+
+    def next_time(self):
+        return min(self.device.next_time(self._clock.now), self._answers[0][0] if self._answers else float("inf"))
+
+    def set_baud(self, rate):
+        pass
+
+    def set_dtr(self, on):
+        pass
+
+    def close(self):
+        pass
+
+
+class OpenedAtOnce:
+    """Instead of a thread that opens a port."""
+
+    def __init__(self, open_port, url, baud):
+        self._port = open_port(url, baud)
+
+    def result(self):
+        return self._port
+
+    def give_up(self):
+        pass
+
+
+class VirtualSelector:
+    """Instead of waiting, moves the clock to the next thing that happens."""
+
+    def __init__(self, clock, ports):
+        self._clock, self._ports = clock, ports
+
+    def select(self, timeout):
+        due = min((port.next_time() for port in self._ports.values()), default=float("inf"))
+        self._clock.now = max(self._clock.now + 1e-4, min(self._clock.now + timeout, due))
+        return []
+
+    def register(self, *_):
+        pass
+
+    def unregister(self, *_):
+        pass
+
+    def close(self):
+        pass
+
+
+def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), params=(), begin=None):
+    """Record emulated devices into a log.
+
+    Parameters
+    ----------
+    path : of the log.
+    devices : list of (name of the link, session, device).
+    seconds : how long.
+    begin : told the clock's time at the start.
+
+    Returns
+    -------
+    Recorder
+    """
+    clock, ports = VirtualTime(), {}
+    by_url = {f"virtual{i}": device for i, (_, _, device) in enumerate(devices)}
+    links = [Link(name, f"virtual{i}", session) for i, (name, session, _) in enumerate(devices)]
+
+    def open_port(url, _baud):
+        ports[url] = VirtualPort(by_url[url], clock)
+        return ports[url]
+
+    log = LogFile(path)
+    recorder = Recorder(
+        links, log, monotonic=clock, wall_offset=0.0, host="virtual", mounting=Mounting(laser, tuple(params)),
+        open_port=open_port,
+    )  # fmt: skip
+    recorder._selector = VirtualSelector(clock, ports)
+    if begin:
+        begin(clock.now)
+    try:
+        recorder.begin(["recorded in simulated time"])
+        with mock.patch.object(recorder_module, "Opening", OpenedAtOnce):
+            recorder.run(duration=seconds, stopping=lambda: False)
+    finally:
+        log.close()
+    return recorder

@@ -1,0 +1,73 @@
+"""A simulated building as the world of the emulators: any lidar can look about in it. Needs numpy, as the simulator does."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from simulation import laser
+from simulation.floorplans import ANCHOR_IDS
+from simulation.recording import Recording
+
+from .world import Epoch, Pose, RoomWorld
+
+NEAR = 25.0
+"""m around the robot within which walls are looked at."""
+AGAIN = 1.0
+"""s after which the walls near the robot are chosen anew."""
+
+
+class SimulatedWorld(RoomWorld):
+    """What a robot measures that drives as a recording of the simulator does.
+
+    Parameters
+    ----------
+    recording : truth, odometry and ranges; its own scans are not used.
+    reach : m, of the lidar.
+    sigma : m, of a reading.
+    """
+
+    def __init__(self, recording: Recording, reach: float = 12.0, sigma: float = 0.01) -> None:
+        self.recording, self._reach, self._sigma = recording, reach, sigma
+        self._random = np.random.default_rng(recording.settings.seed + 77)
+        self._near: tuple[float, np.ndarray, np.ndarray] = (-np.inf, *(np.empty((0, n)) for n in (4, 3)))
+        calibration = recording.calibration["laser"]
+        self._mounting = np.array([calibration[name] for name in ("x", "y", "theta")])
+
+    def poses(self) -> Iterator[Pose]:
+        """Yield the odometry."""
+        for time, (x, y, theta) in zip(self.recording.stamps.tolist(), self.recording.odometry.tolist(), strict=True):
+            yield Pose(time, x, y, theta)
+
+    def epochs(self) -> Iterator[Epoch]:
+        """Yield the ranging rounds."""
+        stamps, first = np.unique(self.recording.range_stamps, return_index=True)
+        for time, start, end in zip(stamps.tolist(), first, [*first[1:], len(self.recording.ranges)], strict=True):
+            part = slice(start, end)
+            names = [int(ANCHOR_IDS[a], 16) for a in self.recording.range_anchors[part]]
+            mm = [round(1000 * r) for r in self.recording.ranges[part].tolist()]
+            yield Epoch(time, [(name, value, 100) for name, value in zip(names, mm, strict=True)][:4])
+
+    def length(self) -> float:
+        """Return the time of the last odometry, s."""
+        return float(self.recording.stamps[-1])
+
+    def look(self, times: list[float], bearings: list[float]) -> list[int]:
+        """Return what the lidar sees at world times, mm, at bearings in turns clockwise; 0 = nothing."""
+        at = np.clip(times, *self.recording.stamps[[0, -1]])
+        pose = np.stack([np.interp(at, self.recording.stamps, self.recording.truth[:, k]) for k in range(3)], axis=1)
+        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        x, y, theta = self._mounting
+        origin = pose[:, :2] + np.stack([c * x - s * y, s * x + c * y], axis=1)
+        walls, columns = self._things_near(float(at[0]), origin[0])
+        angles = pose[:, 2] + theta - 2 * np.pi * np.asarray(bearings)
+        seen, _, _ = laser.cast(origin, angles, walls, columns, self._reach)
+        seen = seen + self._sigma * self._random.standard_normal(len(seen))
+        return [round(1000 * r) if r < self._reach else 0 for r in seen.tolist()]
+
+    def _things_near(self, time: float, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        since, walls, columns = self._near
+        if abs(time - since) > AGAIN:
+            plan = self.recording.plan
+            w, c = laser.near(plan.walls, plan.columns, place, min(NEAR, self._reach + 2.0))
+            walls, columns = plan.walls[w], plan.columns[c]
+            self._near = time, walls, columns
+        return walls, columns

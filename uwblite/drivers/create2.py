@@ -1,0 +1,202 @@
+"""iRobot Create 2 and Roomba 500 to 900: wheel odometry from the encoder counts of the Open Interface. Sans-I/O.
+
+115200 bit/s. ``128`` starts the interface (passive mode: the robot drives as its buttons say, nothing moves by itself),
+``148 n packets...`` streams packets every 15 ms, big-endian::
+
+    13h | length | 7, bumps and wheel drops (1) | 43, left encoder (2) | 44, right encoder (2) | 22, mV (2) | check
+
+where the sum of all bytes is 0 modulo 256. ``150 0`` pauses the stream. Encoders wrap at 2**16. Packets 19 and 20
+(distance and angle since the last time) are wrong on some firmware and not used. Source: iRobot, Create 2 Open Interface
+specification; users (packets 19 and 20).
+"""
+
+import math
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+from .clock import ClockMap
+from .events import Action, Corrupt, Lost, Note, OdometryPose, Pose, Send
+from .framing import PacketReader, to_next
+from .session import Driver, Identity, Script, Wait
+
+BAUD = 115200
+PERIOD = 0.015
+"""s between frames."""
+TICKS_PER_TURN, WHEEL_DIAMETER, WHEEL_BASE = 508.8, 0.072, 0.235
+"""1, m, m; the specification's."""
+TICK = math.pi * WHEEL_DIAMETER / TICKS_PER_TURN
+"""m of wheel travel per encoder tick."""
+MODULUS = 1 << 16
+MAX_SPEED = 0.6
+"""m/s; a little above what the robot can do."""
+MAX_BLIND = MODULUS / 2 * TICK / MAX_SPEED
+"""s after which an encoder may have turned by half its range unseen."""
+HEAD, PACKETS = 0x13, bytes((7, 43, 44, 22))
+LAYOUT = struct.Struct(">BB BB BH BH BH B".replace(" ", ""))
+LENGTH = LAYOUT.size - 3
+START, STREAM, PAUSE, RESUME = b"\x80", bytes((0x94, len(PACKETS))) + PACKETS, b"\x96\x00", b"\x96\x01"
+SILENCE = 1.0
+"""s without a frame after which the stream is asked for again."""
+STALL = 0.3
+"""s by which a frame may come late because the computer stalled; later, frames were lost."""
+LOW_VOLTAGE = 13.0
+"""V."""
+WINDOW, BUCKET, MOST_SKEW = 4.0, 0.05, 0.1
+"""s, s, share: how far back the map from frames to time looks; the period is told as 15 ms, and is not measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Encoders:
+    """One frame."""
+
+    stamp: float
+    """s, arrival of its first byte."""
+    left: int
+    right: int
+    """Encoder ticks, wrap at 2**16."""
+    wheel_drop: int
+    """Bits: 1 right, 2 left."""
+    voltage: float
+    """V."""
+
+
+class Create2Protocol(PacketReader):
+    """Bytes of the robot in, Encoders and Corrupt out."""
+
+    def size_at(self, buffer: bytearray, at: int) -> int:
+        """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
+        if buffer[at] != HEAD:
+            return to_next(buffer, at, HEAD)
+        frame = buffer[at : at + LAYOUT.size]
+        marks = {0: HEAD, 1: LENGTH, 2: PACKETS[0], 4: PACKETS[1], 7: PACKETS[2], 10: PACKETS[3]}
+        if any(frame[place] != byte for place, byte in marks.items() if place < len(frame)):
+            return -1
+        if len(frame) < LAYOUT.size:
+            return 0
+        return LAYOUT.size if sum(frame) & 0xFF == 0 else -1
+
+    def decode(self, frame: bytes, stamp: float) -> Encoders:
+        """Decode a frame."""
+        _, _, _, bumps, _, left, _, right, _, millivolts, _ = LAYOUT.unpack(frame)
+        return Encoders(stamp, left, right, bumps >> 2 & 3, millivolts / 1000)
+
+
+class WheelOdometer:
+    """Integrate two wheels to a pose: each step a chord along the mean of both headings.
+
+    Parameters
+    ----------
+    tick : m per tick. base : m between the wheels. modulus : the counters wrap there.
+    start : x, y, theta; m, m, rad.
+    """
+
+    def __init__(self, tick: float, base: float, modulus: int, start: Pose) -> None:
+        self.pose = start
+        self._tick, self._base, self._modulus = tick, base, modulus
+        self._last: tuple[int, int] | None = None
+
+    def update(self, left: int, right: int) -> tuple[float, float]:
+        """Take both counters; return travel, m, and turn, rad, since the last time."""
+        last, self._last = self._last, (left, right)
+        if last is None:
+            return 0.0, 0.0
+        a, b = (self._wrapped(now - then) * self._tick for now, then in zip((left, right), last, strict=True))
+        travel, turn = (a + b) / 2, (b - a) / self._base
+        x, y, theta = self.pose
+        middle = theta + turn / 2
+        theta = math.remainder(theta + turn, 2 * math.pi)
+        self.pose = (x + travel * math.cos(middle), y + travel * math.sin(middle), theta)
+        return travel, turn
+
+    def forget(self) -> None:
+        """Hold the pose over a gap: what the counters did meanwhile is unknown."""
+        self._last = None
+
+    def _wrapped(self, difference: int) -> int:
+        half = self._modulus // 2
+        return (difference + half) % self._modulus - half
+
+
+class Create2Driver(Driver):
+    """A Create 2 or Roomba. It is only listened to: the stream is asked for, no motor is ever moved.
+
+    Parameters
+    ----------
+    start : pose of the base at the first frame; m, m, rad.
+    """
+
+    baud = BAUD
+
+    def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
+        super().__init__()
+        self._protocol = Create2Protocol()
+        self._odometer = WheelOdometer(TICK, WHEEL_BASE, MODULUS, start)
+        self._last: Encoders | None = None
+        self._new_clock()
+
+    def _new_clock(self) -> None:
+        self._frames, self._map = 0, ClockMap(WINDOW, BUCKET, MOST_SKEW)
+
+    def begin(self) -> None:
+        """Forget half a frame; the encoders counted on."""
+        self._protocol.reset()
+        self._new_clock()
+
+    def parse(self, data: bytes, now: float) -> list[Any]:
+        """Return Encoders and Corrupt."""
+        return self._protocol.feed(data, now)
+
+    def script(self) -> Script[None]:
+        """Ask for the stream, again whenever it stops: the robot falls asleep after five minutes, or was switched off."""
+        while True:
+            yield Send(START)
+            yield from self.sleep(0.05)
+            yield Send(STREAM)
+            while (event := (yield Wait(self.now + SILENCE))) is not None:
+                if isinstance(event, Corrupt):
+                    self._new_clock()  # frames were lost: how many is not known
+                else:
+                    yield from self.take(event)
+
+    def take(self, event: Encoders) -> list[Action]:
+        """Turn a frame into a pose."""
+        self.ready, last, self._last = True, self._last, event
+        actions: list[Action] = []
+        stamp = self._stamp(event)
+        pause = event.stamp - last.stamp if last is not None else 0.0
+        if pause > STALL:
+            actions.append(Lost(stamp, round(pause / PERIOD) - 1))
+        if pause > MAX_BLIND:
+            self._odometer.forget()
+            text = f"odometry: the base was not heard for {pause:.1f} s: its motion meanwhile is unknown, pose held"
+            actions.append(Note("warning", "odometry-gap", text))
+        travel, turn = self._odometer.update(event.left, event.right)
+        if event.wheel_drop and not (last and last.wheel_drop):
+            actions.append(Note("warning", "wheel-drop", "odometry: a wheel hangs in the air; travel is not to be trusted"))
+        elapsed = max(pause, PERIOD)
+        return [*actions, OdometryPose(stamp, *self._odometer.pose, travel / elapsed, turn / elapsed)]
+
+    def _stamp(self, event: Encoders) -> float:
+        """Return the host time of a frame: they come every 15 ms, and the computer or its adapter hands them on in lumps."""
+        self._frames += 1
+        if self._last is not None and self._frames > 1 and event.stamp - self._map.host(self._frames * PERIOD) > STALL:
+            self._new_clock()
+        self._map.add(self._frames * PERIOD, event.stamp)
+        return self._map.host(self._frames * PERIOD)
+
+    def stop(self) -> list[Action]:
+        """Pause the stream."""
+        return [Send(PAUSE)]
+
+    def identity(self) -> Identity:
+        """Say who answered."""
+        if self._last is None:
+            return Identity("iRobot Create 2")
+        findings = []
+        if self._last.wheel_drop:
+            findings.append(Note("warning", "wheel-drop", "a wheel hangs in the air: travel will be wrong"))
+        if 0 < self._last.voltage < LOW_VOLTAGE:
+            text = f"the battery is low ({self._last.voltage:.1f} V): charge it before a run"
+            findings.append(Note("warning", "low-battery", text))
+        return Identity("iRobot Create 2", (("battery", f"{self._last.voltage:.1f} V"),), tuple(findings))

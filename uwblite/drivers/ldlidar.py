@@ -1,0 +1,93 @@
+"""LDROBOT LD06, LD19 and STL-19P: packets of twelve readings, streamed unasked. Sans-I/O.
+
+230400 bit/s, 47 bytes, little-endian::
+
+    54 2C | speed (2, degrees/s) | start angle (2, 0.01 degrees) | 12 x (range (2, mm), intensity (1))
+    | end angle (2) | time (2, ms, wraps at 30000) | CRC-8, polynomial 0x4D
+
+Angles run clockwise. Between start and end angle the readings are evenly spaced; a range of 0 is none.
+Sources: LD19 development manual 2.3 (its example packet is a test); the maker's driver ldlidar_stl_ros2.
+"""
+
+import math
+import struct
+
+from .clock import DeviceClock
+from .framing import PacketReader, to_next
+from .spinning import SpinningDriver
+from .sweep import Fan, Samples
+
+BAUD = 230400
+HEAD = b"\x54\x2c"
+SIZE, READINGS = 47, 12
+CLOCK_MODULUS, CLOCK_TICK = 30000, 1e-3
+RATE = 4500.0
+"""Readings per second of LD06 and LD19; the STL-19P has 5000."""
+MOST_SPEED = 20 * 360
+"""Degrees/s; the motor turns 5 to 13 times a second."""
+FAN = Fan(450, 0.02, 12.0)
+
+
+def _crc_table(polynomial: int) -> bytes:
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = (value << 1 ^ polynomial if value & 0x80 else value << 1) & 0xFF
+        table.append(value)
+    return bytes(table)
+
+
+_CRC = _crc_table(0x4D)
+
+
+def crc8(data: bytes | bytearray) -> int:
+    """Return the check byte of a packet."""
+    crc = 0
+    for byte in data:
+        crc = _CRC[crc ^ byte]
+    return crc
+
+
+class LdLidarProtocol(PacketReader):
+    """Bytes of the lidar in, Samples and Corrupt out."""
+
+    def size_at(self, buffer: bytearray, at: int) -> int:
+        """Return the size of the packet at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
+        if buffer[at] != HEAD[0]:
+            return to_next(buffer, at, HEAD[0])
+        packet = buffer[at : at + SIZE]
+        if packet[:2] != HEAD[: len(packet)]:
+            return -1
+        if len(packet) < SIZE:
+            return 0
+        return SIZE if crc8(packet[:-1]) == packet[-1] and _is_sound(packet) else -1
+
+    def decode(self, frame: bytes, stamp: float) -> Samples:
+        """Decode a packet."""
+        speed, start = struct.unpack_from("<HH", frame, 2)
+        fields = struct.unpack_from("<" + "HB" * READINGS + "HH", frame, 6)
+        end, time = fields[-2:]
+        step = (end - start) % 36000 / (READINGS - 1)
+        turned = tuple([(start + step * i) / 36000 % 1.0 for i in range(READINGS)])
+        ranges = tuple([mm / 1000 if mm else math.nan for mm in fields[:-2:2]])
+        period = step / 100 / speed if speed else 1.0 / RATE
+        return Samples(stamp, time, period, turned, turned, ranges)
+
+
+def _is_sound(packet: bytearray) -> bool:
+    """Tell whether the angles are angles and fit the speed; in the manual's example they span twice what the rate says."""
+    (speed, start), (end,) = struct.unpack_from("<HH", packet, 2), struct.unpack_from("<H", packet, SIZE - 5)
+    if speed > MOST_SPEED or start >= 36000 or end >= 36000:
+        return False
+    return bool((end - start) % 36000 <= 100.0 * (3.0 * speed * READINGS / RATE + 1.0))
+
+
+class LdLidarDriver(SpinningDriver):
+    """An LD06, LD19 or STL-19P. Nothing is ever sent."""
+
+    baud = BAUD
+    title = "LDROBOT LD06/LD19"
+
+    def __init__(self) -> None:
+        clock = DeviceClock(CLOCK_TICK, CLOCK_MODULUS, period=READINGS / RATE)
+        super().__init__(LdLidarProtocol(), FAN, clock)

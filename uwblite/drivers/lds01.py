@@ -1,0 +1,86 @@
+"""Hitachi-LG HLS-LFCD2, sold as LDS-01: the lidar of the first TurtleBot3. Sans-I/O.
+
+230400 bit/s; ``b`` starts the motor and the stream, ``e`` stops them. Sixty packets a turn, 42 bytes, little-endian::
+
+    FA | A0 + number | speed (2, 0.1 rev/min) | 6 x (intensity (2), range (2, mm), reserved (2)) | sum | sum
+
+Readings are one degree apart, clockwise. The two last bytes are equal; how they are computed is told differently: the
+complement of the sum of the bytes before, or that sum plus one. Both are tried, and a unit that uses neither is believed
+when the bytes are equal. Sources: the maker's driver hls_lfcd_lds_driver (layout, commands; it checks no sum), users'
+decoders (sums).
+"""
+
+import math
+import struct
+
+from .events import Action, Corrupt, Send, corrupt
+from .framing import PacketReader, to_next
+from .session import Script
+from .spinning import SpinningDriver
+from .sweep import Fan, Samples
+
+BAUD = 230400
+START, STOP = b"b", b"e"
+HEAD, FIRST, PACKETS = 0xFA, 0xA0, 60
+SIZE, READINGS = 42, 6
+DEGREE = 1.0 / 360.0
+"""Turns."""
+FAN = Fan(360, 0.12, 3.5)
+TRUST = 2 * PACKETS
+"""Packets with equal last bytes and another sum than the known ones, after which equality is enough: two turns."""
+
+
+class Lds01Protocol(PacketReader):
+    """Bytes of the lidar in, Samples and Corrupt out."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._other_sums = 0
+
+    def size_at(self, buffer: bytearray, at: int) -> int:
+        """Return the size of the packet at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
+        if buffer[at] != HEAD:
+            return to_next(buffer, at, HEAD)
+        if at + 1 < len(buffer) and not FIRST <= buffer[at + 1] < FIRST + PACKETS:
+            return -1
+        if at + SIZE > len(buffer):
+            return 0
+        return SIZE if buffer[at + SIZE - 1] == buffer[at + SIZE - 2] else -1
+
+    def decode(self, frame: bytes, stamp: float) -> Samples | Corrupt:
+        """Decode a packet."""
+        if not self._sum_is_right(frame):
+            return corrupt(frame, "packet with a wrong sum")
+        (speed,) = struct.unpack_from("<H", frame, 2)
+        fields = struct.unpack_from("<" + "HHH" * READINGS, frame, 4)
+        first = (frame[1] - FIRST) * READINGS
+        turned = tuple([(first + i) * DEGREE for i in range(READINGS)])
+        ranges = tuple([mm / 1000 if mm else math.nan for mm in fields[1::3]])
+        return Samples(stamp, None, DEGREE * 600.0 / max(speed, 1), turned, turned, ranges)
+
+    def _sum_is_right(self, packet: bytes) -> bool:
+        total = sum(packet[:-2])
+        if packet[-1] in ((~total) & 0xFF, (total + 1) & 0xFF):
+            self._other_sums = 0
+            return True
+        self._other_sums += 1
+        return self._other_sums > TRUST
+
+
+class Lds01Driver(SpinningDriver):
+    """An LDS-01."""
+
+    baud = BAUD
+    title = "Hitachi-LG LDS-01"
+
+    def __init__(self) -> None:
+        super().__init__(Lds01Protocol(), FAN)
+
+    def start_up(self) -> Script[bool]:
+        """Start motor and stream."""
+        yield Send(START)
+        return True
+
+    def stop(self) -> list[Action]:
+        """Stop motor and stream."""
+        return [Send(STOP)]
