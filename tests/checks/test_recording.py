@@ -89,6 +89,13 @@ def test_jumps_gaps_and_equal_stamps(sound):
     assert_named(replace(sound, odometry=coarse), "warning", "stamps equal the one before")
 
 
+def test_the_ranges_of_one_round_share_its_stamp_and_that_is_right(sound):
+    said = [f.what for f in diagnose(sound).findings if "equal the one before" in f.what]
+    assert said == []
+    coarse = replace(sound.ranges, stamps=np.floor(sound.ranges.stamps))
+    assert_named(replace(sound, ranges=coarse), "note", "stamps equal the one before")
+
+
 def with_ranges(log, values):
     return replace(log, ranges=replace(log.ranges, ranges=values))
 

@@ -1,10 +1,13 @@
 """What `uwblite record` and `uwblite devices` say to mistakes: one clear line, at once, and no log is begun."""
 
 import socket
+import sys
 
 import pytest
 
 from uwblite.cli import main
+from uwblite.drivers import transport
+from uwblite.drivers.devices import DEVICES
 from uwblite.drivers.transport import check_url
 from uwblite.errors import ConfigError
 
@@ -36,6 +39,11 @@ REFUSED = {
     "no speed": ["--odometry", "line:/dev/null?columns=t,x,y,theta&baud=0"],
     "speed beyond all ports": ["--odometry", "line:/dev/null?columns=t,x,y,theta&baud=10000000000"],
     "modulus": ["--odometry", f"line:/dev/null?columns=t,left,right&tick=1e-4&wheel_base=0.3&tick_modulus=1{'0' * 400}"],
+    "two lidars": ["--lidar", "/dev/null", "--lidar", "/dev/zero"],
+    "a tag as lidar": ["--lidar", "tlv:/dev/null"],
+    "an option that it does not have": ["--lidar", "/dev/null?colour=3"],
+    "no port": ["--uwb", "shell:"],
+    "a packed log": ["--lidar", "/dev/null", "--out", "run.log.gz"],
     "steps of no laser": ["--lidar", "/dev/null", "--lidar-steps", "5000:99999"],
 }
 
@@ -90,3 +98,27 @@ def test_devices_refuses_what_is_no_port_and_reports_what_does_not_answer(tmp_pa
 def test_numbers_beyond_all_measure_are_usage_errors(words, capfd):
     assert main([*words, "1" + "0" * 400]) == 2
     assert "is not a whole number" in capfd.readouterr().err
+
+
+def test_without_pyserial_nothing_is_tried_for_ever(tmp_path, monkeypatch, capfd):
+    monkeypatch.setitem(sys.modules, "serial", None)
+    for words in (["devices"], ["record", "--lidar", "/dev/null", "--out", str(tmp_path / "run.log")]):
+        assert main(words) == 1
+        assert "pyserial is missing" in capfd.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
+    """A Raspberry Pi's header has a UART, whether something hangs on it or not."""
+    monkeypatch.setattr(transport, "plugged_in", lambda: [transport.PluggedIn("/dev/ttyS0", "ttyS0", "")])
+    assert main(["devices"]) == 1
+    said = capfd.readouterr()
+    assert "all is well" not in said.err + said.out
+    assert "devices /dev/ttyS0" in said.out
+
+
+def test_every_kind_of_device_is_listed_with_its_options(capfd):
+    assert main(["devices", "--kinds"]) == 0
+    listed = capfd.readouterr().out
+    assert all(f"--{kind.sensor} {kind.name}:PORT" in listed for kind in DEVICES.values())
+    assert "time_unit" in listed

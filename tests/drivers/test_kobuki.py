@@ -58,11 +58,11 @@ def test_the_sum_covers_the_length():
     assert all(isinstance(e, Corrupt) for e in feed_whole(KobukiProtocol, bytes(broken)))
 
 
-BASIC = "010f" "3412" "05" "02" "00" "0201" "feff" "1020" "00" "00" "a5" "00"
+BASIC = "010f34120502000201feff10200000a500"
 """4660 ms; bumpers right and left; left wheel dropped; encoders 258 and 65534; ... 16.5 V; currents."""
-INERTIA = "0407" "d8dc" "d204" "000000"
+INERTIA = "0407d8dcd204000000"
 """-90.00 degrees, 12.34 degrees per second, three bytes that mean nothing."""
-OTHERS = ["0303" "112233", "0506" "010203040506", "0602" "0102", "0d0e" "0006" + "00" * 12, "1010" + "00" * 16]
+OTHERS = ["0303112233", "0506010203040506", "06020102", "0d0e0006" + "00" * 12, "1010" + "00" * 16]
 """Docking infra-red, cliff voltages, motor currents, raw gyro, inputs and outputs: the rest of what the base streams."""
 
 
@@ -80,7 +80,7 @@ def test_a_packet_byte_by_byte_of_the_protocol_description(others):
 @pytest.mark.parametrize("damage", ["shorter", "longer", "cut"])
 def test_parts_that_do_not_fill_the_packet_exactly_are_no_packet(damage):
     """The sum is right, the length of the last part is not."""
-    last = {"shorter": "0301" "112233", "longer": "0305" "112233", "cut": "03"}[damage]
+    last = {"shorter": "0301112233", "longer": "0305112233", "cut": "03"}[damage]
     payload = bytes.fromhex(BASIC + INERTIA + last)
     packet = b"\xaa\x55" + bytes([len(payload)]) + payload
     events = feed_whole(KobukiProtocol, packet + bytes([reduce(xor, packet[2:])]))

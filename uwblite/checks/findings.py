@@ -51,7 +51,9 @@ class Findings:
         return tuple(sorted(self._found, key=lambda f: RANKS.index(f.rank)))
 
 
-def timing(stamps: Floats, topic: str, found: Findings, *, expected_gap: float) -> dict[str, float]:
+def timing(
+    stamps: Floats, topic: str, found: Findings, *, expected_gap: float, repeats: float | None = None
+) -> dict[str, float]:  # fmt: skip
     """Check the rhythm of a sensor: rate, gaps, equal stamps.
 
     Parameters
@@ -60,6 +62,7 @@ def timing(stamps: Floats, topic: str, found: Findings, *, expected_gap: float) 
     topic : sensor.
     found : takes the findings.
     expected_gap : a silence longer than this is a gap, s (or five periods, where that is longer).
+    repeats : share of equal stamps that is not right, where some are; None = any is wrong.
     """
     steps = np.diff(stamps)
     period = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
@@ -67,6 +70,7 @@ def timing(stamps: Floats, topic: str, found: Findings, *, expected_gap: float) 
     gap = max(expected_gap, 5.0 * period)
     gaps = np.flatnonzero(steps > gap)
     equal = float(np.mean(steps == 0)) if len(steps) else 0.0
+    suspect = equal if repeats is None else repeats
     if len(gaps):
         worst = gaps[np.argmax(steps[gaps])]
         found.add(
@@ -76,11 +80,11 @@ def timing(stamps: Floats, topic: str, found: Findings, *, expected_gap: float) 
             f" at t = {stamps[worst] - stamps[0]:.1f} s",
             "check cable, power and processor load at these times",
         )
-    if equal > 0.02:
+    if suspect > 0.02:
         found.add(
             "warning" if topic != "radio" else "note",
             topic,
-            f"{100 * equal:.0f} % of the stamps equal the one before",
+            f"{100 * suspect:.0f} % of the stamps equal the one before",
             "stamps of low resolution, or readings that arrived in one piece: stamp each reading when it is made",
         )
     return {

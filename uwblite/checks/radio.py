@@ -8,7 +8,7 @@ from .. import se2
 from ..arrays import Floats
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.units import LONGEST
-from ..sensor_log import SensorLog
+from ..sensor_log import SensorLog, UwbRanges
 from .findings import Findings, timing
 from .odometry import STRAIGHT
 
@@ -20,7 +20,7 @@ def check_ranges(log: SensorLog, found: Findings) -> dict[str, Any]:
     """Check the ranges and return their figures."""
     ranges = log.ranges
     assert ranges is not None
-    figures: dict[str, Any] = timing(ranges.stamps, "radio", found, expected_gap=3.0)
+    figures: dict[str, Any] = timing(ranges.stamps, "radio", found, expected_gap=3.0, repeats=_repeats(ranges))
     positive = ranges.ranges[ranges.ranges > 0]
     if len(positive) > FEW and np.quantile(positive, 0.95) < 0.1:
         found.warning("radio", f"95 % of the ranges are below {np.quantile(positive, 0.95):.3f} m", "check the unit: metres")
@@ -35,6 +35,17 @@ def check_ranges(log: SensorLog, found: Findings) -> dict[str, Any]:
         )
     figures["coverage"] = _check_coverage(log, found)
     return figures
+
+
+def _repeats(ranges: UwbRanges) -> float:
+    """Return the share of readings of an anchor that have the stamp of another of the same anchor.
+
+    The ranges of one round share its stamp: only a second one of the same anchor tells of stamps that are too coarse.
+    """
+    order = np.lexsort((ranges.stamps, ranges.anchor))
+    stamps, anchor = ranges.stamps[order], ranges.anchor[order]
+    again = (stamps[1:] == stamps[:-1]) & (anchor[1:] == anchor[:-1])
+    return float(np.mean(again)) if len(again) else 0.0
 
 
 def _check_anchor(

@@ -16,6 +16,7 @@ and some published logs leave out ipc_timestamp: both are accepted, and then the
 A reading at or above the maximum range saw nothing (+inf); a reading below range_min is an error code (nan).
 """  # noqa: E501
 
+import hashlib
 import os
 from array import array
 from collections.abc import Callable
@@ -29,7 +30,8 @@ from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, tim
 from .carmen_params import Params
 from .carmen_readings import Block
 from .carmen_writer import write_log
-from .source import OVERLONG_LINE, TextSource, open_source
+from .log_parts import parts_of
+from .source import OVERLONG_LINE, open_source
 
 __all__ = ["read_log", "write_log"]
 
@@ -50,6 +52,7 @@ _HOPELESS = 20_000
 def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broken_share: float = 0.05) -> SensorLog:
     """Read one CARMEN log, plain or gzip; ``-`` reads standard input.
 
+    A log that was cut into parts by `uwblite record --rotate` is read whole, whichever of its parts is named.
     Memory grows with what is kept (four bytes a reading), not with the text.
 
     Parameters
@@ -68,11 +71,15 @@ def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broke
     """
     if every_nth_scan < 1:
         raise FormatError(f"every_nth_scan is {every_nth_scan}; it must be 1 or more")
-    with open_source(path) as source:
-        reader = _Reader(source.path, every_nth_scan, max_broken_share)
-        for block in source.blocks():
-            reader.feed(block)
-        return reader.finish(source)
+    parts, missing = parts_of(os.fspath(path))
+    digest = hashlib.sha256()
+    reader = _Reader("stdin" if parts[0] == "-" else ", ".join(parts), every_nth_scan, max_broken_share)
+    for part in parts:
+        with open_source(part, digest) as source:
+            for block in source.blocks():
+                reader.feed(block)
+            source.read_rest()
+    return reader.finish(digest.hexdigest(), missing)
 
 
 class _Reader:
@@ -189,18 +196,18 @@ class _Reader:
             number,
         )
 
-    def finish(self, source: TextSource) -> SensorLog:
-        """Return what was collected, sorted by time."""
+    def finish(self, sha256: str, missing: str = "") -> SensorLog:
+        """Return what was collected, sorted by time; `missing` is a part of the log that is not there."""
         # A recorder that is switched off leaves half a line at the end: that one says nothing about the rest.
         if self.broken - self.ends_broken > self.max_broken_share * self.messages:
             self._refuse()
-        warnings: list[str] = []
+        warnings = [f"part {missing} of this recording is not there: put it beside the others"] if missing else []
         odometry = self._finish_odometry(warnings)
         ranges = self._finish_ranges(warnings)
         scans, T_base_laser = self.laser.finish(self.params, self.skipped, warnings, self.set_back)
         notes = LogNotes(
             source=self.path,
-            sha256=source.sha256(),
+            sha256=sha256,
             lines=self.lines,
             broken_lines=tuple(self.broken_lines),
             broken=self.broken,

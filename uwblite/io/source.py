@@ -44,9 +44,9 @@ _OTHER_FORMATS = (
 class _HashingReader(io.RawIOBase):
     """Pass bytes on and hash them on the way."""
 
-    def __init__(self, stream: BinaryIO) -> None:
+    def __init__(self, stream: BinaryIO, digest: "hashlib._Hash | None" = None) -> None:
         self._stream = stream
-        self.hash = hashlib.sha256()
+        self.hash = digest or hashlib.sha256()
         self.count = 0
 
     def readable(self) -> bool:
@@ -63,9 +63,9 @@ class _HashingReader(io.RawIOBase):
 class TextSource:
     """An open text file: `blocks()` gives its lines, `sha256()` the hash of the bytes as stored."""
 
-    def __init__(self, stream: BinaryIO, path: str) -> None:
+    def __init__(self, stream: BinaryIO, path: str, digest: "hashlib._Hash | None" = None) -> None:
         self.path = path
-        self._hashing = _HashingReader(stream)
+        self._hashing = _HashingReader(stream, digest)
         self._buffered = io.BufferedReader(self._hashing, BLOCK_BYTES)
         start = self._buffered.peek(16)
         for magic, problem in _OTHER_FORMATS:
@@ -74,10 +74,14 @@ class TextSource:
         packed = start.startswith(_GZIP)
         self._text: BinaryIO = gzip.GzipFile(fileobj=self._buffered) if packed else self._buffered  # type: ignore[assignment]
 
-    def sha256(self) -> str:
-        """Read what is left and return the hash of all bytes of the file, hexadecimal."""
+    def read_rest(self) -> None:
+        """Read what is left, so that the hash is that of the whole file."""
         while self._buffered.read(BLOCK_BYTES):
             pass
+
+    def sha256(self) -> str:
+        """Read what is left and return the hash of all bytes of the file, hexadecimal."""
+        self.read_rest()
         return self._hashing.hash.hexdigest()
 
     def blocks(self, size: int = BLOCK_BYTES) -> Iterator[bytes]:
@@ -115,8 +119,13 @@ class TextSource:
 
 
 @contextmanager
-def open_source(path: str | os.PathLike[str]) -> Iterator[TextSource]:
+def open_source(path: str | os.PathLike[str], digest: "hashlib._Hash | None" = None) -> Iterator[TextSource]:
     """Open a text file, gzip or not (told by its content), or standard input for ``-``.
+
+    Parameters
+    ----------
+    path : the file.
+    digest : takes the bytes as stored, where several files are hashed together.
 
     Raises
     ------
@@ -125,7 +134,7 @@ def open_source(path: str | os.PathLike[str]) -> Iterator[TextSource]:
     name = os.fspath(path)
     stream = open_input(name)
     try:
-        yield TextSource(stream, "stdin" if name == "-" else name)
+        yield TextSource(stream, "stdin" if name == "-" else name, digest)
     except EOFError:
         raise FormatError("the gzip data is cut off; copy the file again, or save what zcat can read", name) from None
     except (gzip.BadGzipFile, zlib.error) as error:
