@@ -13,6 +13,7 @@ from uwblite import se2
 from uwblite.errors import Cancelled
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.io.carmen import read_log
+from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.sensor_log import Odometry, UwbRanges
@@ -322,3 +323,16 @@ def test_a_large_grid_is_announced_and_may_be_declined(minute, monkeypatch):
     with pytest.raises(Cancelled, match="MB"):
         build_map(minute, progress=decline)
     assert told.count("occupancy grid") == 0
+
+
+@pytest.mark.slow
+def test_wheels_in_another_unit_are_told_by_the_radio(shared_data):
+    """A lawn mower whose log has wheels 1.4 times too short: its map has the size of the radios' own survey."""
+    folder = shared_data / "dwm1001_mower"
+    result = build_map(read_log(folder / "run.log.gz"))
+    survey = read_csv(folder / "anchors_autoposition.csv")
+    place = {a.id: a.position for a in result.anchors}
+    found, there = np.array([place[i] for i in survey.texts("id")]), survey.numbers("x", "y")
+    off = se2.transform(se2.align(found, there), found) - there
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.35
+    assert any("unit of the wheels is wrong" in text for text in result.warnings)

@@ -77,15 +77,12 @@ def build_map(
     stages.note(logs)
     logs = [thinned(log, config.keyframes, config.grid) for log in logs]
 
-    recordings = gather(logs, config.keyframes)
-    travelled = sum(float(s.frames.path.sum()) for s in recordings.each)
-    stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(travelled, 3))
-
-    estimates = [radio_stages.measurements(recording, config) for recording in recordings.each]
-    ranges = sum(len(estimate.radio) for estimate in estimates if estimate.radio is not None)
-    stages.end("edges", odometry=sum(len(estimate.wheels) for estimate in estimates), ranges=ranges)
-
-    estimate = radio_stages.first_optimisation(estimates, recordings, config, stages)
+    recordings, estimate = _without_lidar(logs, config, stages)
+    units = radio_stages.units(estimate, recordings)
+    if np.any(units != 1.0):
+        stages.warnings += radio_stages.unit_warnings(recordings, units)
+        logs = [log.with_odometry_times(unit) for log, unit in zip(logs, units.tolist(), strict=True)]
+        recordings, estimate = _without_lidar(logs, config, stages)
     estimate = radio_stages.constrained(estimate, known, recordings, config, stages)
 
     scans = Scans.of(recordings, known, config)
@@ -127,6 +124,22 @@ def build_map(
     )
     stages.end("summary")
     return replace(result, stages=tuple(stages.done))
+
+
+def _without_lidar(
+    logs: Sequence[SensorLog], config: MappingConfig, stages: Stages
+) -> tuple[Recordings, Estimate]:
+    """Return keyframes and edges of the recordings, and what wheels and radio alone make of them."""
+    recordings = gather(logs, config.keyframes)
+    travelled = sum(float(s.frames.path.sum()) for s in recordings.each)
+    stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(travelled, 3))
+
+    estimates = [radio_stages.measurements(recording, config) for recording in recordings.each]
+    ranges = sum(len(estimate.radio) for estimate in estimates if estimate.radio is not None)
+    stages.end("edges", odometry=sum(len(estimate.wheels) for estimate in estimates), ranges=ranges)
+
+    estimate = radio_stages.first_optimisation(estimates, recordings, config, stages)
+    return recordings, estimate
 
 
 def _final(

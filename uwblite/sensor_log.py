@@ -212,6 +212,11 @@ class SensorLog:
         """Return the same recording with a sensor left out."""
         return replace(self, ranges=None if uwb else self.ranges, scans=None if lidar else self.scans)
 
+    def with_odometry_times(self, factor: float) -> "SensorLog":
+        """Return the recording with all lengths of its odometry multiplied by a factor."""
+        poses = self.odometry.poses * np.array([factor, factor, 1.0])
+        return self if factor == 1.0 else replace(self, odometry=replace(self.odometry, poses=poses))
+
     def with_later_scans(self, delay: float) -> "SensorLog":
         """Return the same recording with every scan later by delay, s."""
         if self.scans is None or delay == 0.0:

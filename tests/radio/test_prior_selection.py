@@ -15,6 +15,7 @@ from uwblite.radio.prior_selection import log_evidence, select_priors
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
+from uwblite.wheels import OdometryNoiseConfig, wheel_edges
 
 LEVEL = SensorMounting(anchor_height=0.0)
 CONFIG = CalibrationConfig()
@@ -87,7 +88,7 @@ def test_a_radio_with_another_idea_of_the_metre_gets_a_wide_scale(scale):
     assert widths(select_priors(graph, (edges,), CONFIG))["range_scale"] > 0.9 * CONFIG.range_scale
 
 
-def test_only_priors_of_range_scale_and_biases_change():
+def test_only_priors_of_units_and_biases_change():
     """Priors on poses and anchors stay as they are, and so does what is known of every other calibration value."""
     graph, edges = solved(0)
     surveyed = PriorEdges("anchors", np.arange(2), PLACES[:2], np.tile(20.0 * np.eye(2), (2, 1, 1)))
@@ -99,6 +100,40 @@ def test_only_priors_of_range_scale_and_biases_change():
     assert changed == {"range_scale", "bias:A00", "bias:A01", "bias:A02", "bias:A03"}
     np.testing.assert_array_equal(chosen.edges[0].value, graph.edges[0].value)
     np.testing.assert_array_equal(chosen.edges[0].index, graph.edges[0].index)
+
+
+def driven(seed, scale=1.0, unit=1.0):
+    """Return the graph of a drive whose wheels count other units and whose radio has another scale, solved, and its edges."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, 60.0)
+    radio = ranges(rng, stamps, truth, PLACES, sigma=0.05)
+    radio = replace(radio, ranges=radio.ranges * scale)
+    wheels = Odometry(stamps, truth * np.array([1.0 / unit, 1.0 / unit, 1.0]))
+    frames, ids = select(wheels, KeyframeConfig(distance=0.05)), radio.anchor_ids
+    listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
+    attached = attach_ranges(radio, wheels, frames, LEVEL)
+    edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
+    steps = wheel_edges(frames, 0, OdometryNoiseConfig(), block(listed))
+    held = np.array([u.name.split(":")[0] not in ("range_scale", "bias", "odometry_scale") for u in listed])
+    graph = Graph(frames.odometry, PLACES / unit, (prior_edges(listed),), block(listed), None, None, held)
+    done = optimize(graph.with_edges(edges, steps))[0]
+    return graph.updated(done.poses, done.anchors, done.calibration.values), (edges, steps)
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit", "wide"),
+    [
+        (1.0, 1.0, None), (1.004, 0.97, None),
+        (1.08, 1.0, "range_scale"), (0.93, 1.0, "range_scale"),
+        (1.0, 1.4, "odometry_scale"), (1.0, 0.7, "odometry_scale"), (1.0, 2.0, "odometry_scale"),
+    ],
+)
+def test_the_likeliest_unit_of_length_is_the_wrong_one(scale, unit, wide):
+    """A radio measures times of flight; a wheel's radius is a setting."""
+    graph, edges = driven(1, scale, unit)
+    found = widths(select_priors(graph, edges, CONFIG))
+    assert found["range_scale"] == (CONFIG.range_scale if wide == "range_scale" else CONFIG.range_scale_sound)
+    assert found["odometry_scale"] == (CONFIG.odometry_unit if wide == "odometry_scale" else CONFIG.odometry_scale)
 
 
 def test_nothing_free_leaves_the_graph_alone():

@@ -132,7 +132,7 @@ def test_the_search_starts_at_ten_places_at_least_two_cells_apart(seed):
     rng = np.random.default_rng(seed)
     path = np.column_stack([np.linspace(-8, 8, 160), 0.005 * rng.standard_normal(160)])
     said = measured(rng, path, np.array([1.0, 5.0]), 0.1)
-    starts, step = _raster_search(path, said, CONFIG)
+    starts, _, step = _raster_search(path, said, CONFIG)
     apart = np.abs(starts[:, None] - starts[None]).max(axis=2) + 99.0 * np.eye(len(starts))
     assert len(starts) == 10
     # Cells are whole steps apart: nearer than two of them lie only neighbours.

@@ -100,6 +100,8 @@ class Recording:
     """(k, 3) odometry pose written into the scan."""
     scans: NDArray[np.int32]
     """(k, beams) mm."""
+    surfaces: NDArray[np.int16]
+    """(k, beams) wall, or number of walls plus column, that each ray measured; -1 = none, a passer-by, or a mixed pixel."""
     range_stamps: Floats
     """(m,) on the radio's clock."""
     range_anchors: NDArray[np.int64]
@@ -132,7 +134,7 @@ def simulate(settings: Settings) -> Recording:
     slips = wheels.draw_slips(motion, _rng(settings, 2), settings.slips)
     said = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3))
     crowd = _people(settings, plan, seconds)
-    scan_stamps, scans = _scan(settings, plan, motion, crowd)
+    scan_stamps, scans, surfaces = _scan(settings, plan, motion, crowd)
     told = scan_stamps + settings.laser_delay
     range_stamps, range_anchors, ranges, truth_uwb = _range(settings, plan, motion, anchors, crowd)
     scan_poses = np.stack([np.interp(told, stamps, said[:, k]) for k in range(3)], axis=1)
@@ -156,6 +158,7 @@ def simulate(settings: Settings) -> Recording:
         told,
         scan_poses,
         scans,
+        surfaces,
         range_stamps,
         range_anchors,
         ranges,
@@ -201,11 +204,11 @@ def _bodies(crowd: list[drive.Motion], times: Floats, robot: Floats) -> Floats:
 
 def _scan(
     settings: Settings, plan: FloorPlan, motion: drive.Motion, crowd: list[drive.Motion]
-) -> tuple[Floats, NDArray[np.int32]]:
-    """Return stamps (k,) on the odometry's clock and ranges (k, beams), mm."""
+) -> tuple[Floats, NDArray[np.int32], NDArray[np.int16]]:
+    """Return stamps (k,) on the odometry's clock, ranges (k, beams), mm, and the surfaces (k, beams) they are of."""
     model = settings.laser
     if "laser" in settings.without:
-        return np.empty(0), np.empty((0, model.beams), dtype=np.int32)
+        return np.empty(0), np.empty((0, model.beams), dtype=np.int32), np.empty((0, model.beams), dtype=np.int16)
     rng = _rng(settings, 5)
     every = max(1, round(10.0 / settings.scan_rate))
     stamps = np.round(np.arange(0.037, motion.stamps[-1] - 0.1, 0.1 * every), 6)
@@ -214,6 +217,7 @@ def _scan(
     surfaces = _lasting(settings.building, 5, rng)
     colour = model.surface_sd * surfaces.standard_normal(len(plan.walls) + len(plan.columns) + len(crowd))
     out = np.empty((len(stamps), model.beams), dtype=np.int32)
+    surfaces = np.empty(out.shape, dtype=np.int16)
     for first in range(0, len(stamps), _CHUNK):
         chunk = stamps[first : first + _CHUNK]
         times = (chunk[:, None] + model.time_increment * np.arange(model.beams)).ravel()
@@ -229,8 +233,12 @@ def _scan(
         true, cosine, surface = laser.cast(origin, heading, plan.walls[walls], round_things, model.max_range)
         shape = (len(chunk), model.beams)
         true, cosine, surface = true.reshape(shape), cosine.reshape(shape), ids[surface].reshape(shape)
-        out[first : first + len(chunk)] = laser.disturb(true, cosine, surface, model, colour, rng)
-    return stamps, out
+        said = laser.disturb(true, cosine, surface, model, colour, rng)
+        out[first : first + len(chunk)] = said
+        most = 5.0 * np.maximum(model.near_sd, model.far_sd * true) + 3.0 * model.surface_sd
+        own = (np.abs(0.001 * said - true) < most) & (surface < len(plan.walls) + len(plan.columns))
+        surfaces[first : first + len(chunk)] = np.where(own, surface, -1)
+    return stamps, out, surfaces
 
 
 def _range(

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import keyframes, se2
+from ..arrays import Floats
 from ..constraints import Constraints
 from ..errors import ConfigError
 from ..graph import calibration
@@ -91,6 +92,28 @@ def _settled(estimate: Estimate, config: MappingConfig, stages: Stages) -> Estim
         stages.report("first optimisation", lap + 1, 3)
     stages.end("first optimisation", placed=int(estimate.first.placed.sum()), **solver_figures(result))
     return replace(estimate, graph=graph, radio=radio)
+
+
+def units(estimate: Estimate, recordings: Recordings) -> Floats:
+    """Return by what the odometry of each recording (r,) is to be multiplied to be in metres; 1 where it is, or nearly so."""
+    known = estimate.graph.calibration
+    names = [calibration.of_recording("odometry_scale", n) for n in range(len(recordings))]
+    factor = np.array([1.0 + known.get(name) for name in names])
+    return np.where(np.abs(factor - 1.0) > _OTHER_UNIT, factor, 1.0)
+
+
+def unit_warnings(recordings: Recordings, factors: Floats) -> list[str]:
+    """Return what to say of odometry that was in another unit; factors (r,), see units."""
+    whose = [f"{r.name}: " if len(recordings) > 1 else "" for r in recordings.each]
+    return [
+        f"{name}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its odometry says: "
+        "the unit of the wheels is wrong; the odometry was multiplied by that"
+        for name, factor in zip(whose, factors.tolist(), strict=True) if factor != 1.0
+    ]
+
+
+_OTHER_UNIT = 0.12
+"""Relative error of travelled distance from which on it is no wheel radius to be calibrated but another unit."""
 
 
 def constrained(

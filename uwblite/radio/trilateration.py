@@ -71,8 +71,8 @@ def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift
         return []
     pick = np.unique(np.linspace(0, len(ranges) - 1, config.samples).astype(np.int64))
     path, ranges = path[pick], ranges[pick]
-    starts, step = _raster_search(path, ranges, config)
-    states, covariances, sigmas = _refine(path, ranges, starts, step, drift, config)
+    cells, biases, step = _raster_search(path, ranges, config)
+    states, covariances, sigmas = _refine(path, ranges, _starts(cells, biases, step), step, drift, config)
     floor = max(float(sigmas.min()), 0.5 * drift, 0.02)
     fits = zip(states, covariances, sigmas.tolist(), strict=True)
     scored = sorted((_score(path, ranges, *fit, floor, config) for fit in fits), key=lambda h: h.cost)
@@ -100,8 +100,8 @@ def agreement(path: Floats, ranges: Floats, place: Floats, height: Floats | floa
     return float(np.max(np.searchsorted(error, error + width, "right") - np.arange(len(error)))) / len(error)
 
 
-def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) -> tuple[Floats, float]:
-    """Return the best raster cells (s, 2) and the cell size, m."""
+def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) -> tuple[Floats, Floats, float]:
+    """Return the best raster cells (s, 2), the bias (s,) that suits each, and the cell size, m."""
     reach = float(np.quantile(ranges, 0.9)) + config.bias_sigma
     low, high = path.min(axis=0) - reach, path.max(axis=0) + reach
     step = float(np.max(high - low)) / config.raster
@@ -118,20 +118,30 @@ def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) ->
             best.append(int(cell))
         if len(best) == 10:
             break
-    return cells[best], step
+    return cells[best], bias[best], step
+
+
+def _starts(cells: Floats, bias: Floats, step: float) -> Floats:
+    """Return where descent starts (s, 3): each cell with no bias, and with the one that suits it where that is not small."""
+    plain, biased = np.column_stack([cells, np.zeros(len(cells))]), np.column_stack([cells, bias])
+    return np.concatenate([plain, biased[np.abs(bias) > _NO_BIAS * step]])
+
+
+_NO_BIAS = 0.5
+"""Cells; descent takes up a smaller bias by itself."""
 
 
 def _refine(
     path: Floats, ranges: Floats, starts: Floats, step: float, drift: float, config: TrilaterationConfig
 ) -> tuple[Floats, Floats, Floats]:
-    """Refine starts (s, 2) by Gauss-Newton with a shrinking kernel.
+    """Refine starts (s, 3) by Gauss-Newton with a shrinking kernel.
 
     Returns
     -------
     Position and bias (s, 3), their covariances (s, 3, 3) for unit sigma, and robust sigmas (s,).
     """
     count = len(starts)
-    state = np.concatenate([starts, np.zeros((count, 1))], axis=1)
+    state = starts.copy()
     scale, normal = np.full(count, 1.5 * step), np.tile(np.eye(3), (count, 1, 1))
     robust, on = np.zeros(count), np.arange(count)
     for _ in range(25):
@@ -142,13 +152,14 @@ def _refine(
         jacobian = np.stack([dx / distance, dy / distance, np.ones_like(dx)], axis=1)
         equations = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
         gradient = np.einsum("skm,sm->sk", jacobian, weight * error)
-        prior = (scale[on] / config.bias_sigma) ** 2
+        robust[on] = 1.4826 * np.median(np.abs(error), axis=1)
+        prior = (np.clip(robust[on], drift, scale[on]) / config.bias_sigma) ** 2
         equations[:, 2, 2] += prior
         gradient[:, 2] -= prior * state[on, 2]
         equations += 1e-3 * equations * np.eye(3) + 1e-9 * np.eye(3)
         delta = np.linalg.solve(equations, gradient[:, :, None])[:, :, 0]
         state[on] += delta * np.minimum(1.0, 2.0 * step / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), 1e-12))[:, None]
-        normal[on], robust[on] = equations, 1.4826 * np.median(np.abs(error), axis=1)
+        normal[on] = equations
         tight = np.maximum(2.0 * robust[on], max(drift, 0.05))
         done = (scale[on] <= tight * 1.01) & (np.abs(delta).max(axis=1) < 1e-3)
         scale[on] = np.maximum(0.7 * scale[on], tight)

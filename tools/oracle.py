@@ -1,0 +1,378 @@
+"""What the measurements of a simulated drive allow: least squares with true associations and true noise, from the truth.
+
+Poses, anchors, walls, columns, the wheels' calibration, the anchors' biases and the antennas' patterns are all unknown.
+Known are which surface each ray hit, which steps slipped, which ranges were shadowed, and how all errors are
+distributed: the multipath of an anchor as a Gaussian process over the floor. The maximum-likelihood optimum is found by
+Gauss-Newton from the truth; its covariance is the Cramer-Rao bound.
+
+    residuals   wheels   log of the step against the calibrated step, (x, y, theta)
+                wall     n . (R p + t) - d            n, d of the wall; p a point in the base frame
+                column   |R p + t - c| - radius
+                range    scale |tag - anchor| + bias + patterns - range, white noise + Gaussian process
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
+from simulation import radio
+from simulation.recording import Recording
+
+from uwblite import keyframes, se2
+from uwblite.evaluation.trajectory import align
+from uwblite.keyframes import KeyframeConfig
+from uwblite.sensor_log import SensorLog
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+_ROUNDS = 8
+"""Gauss-Newton steps, at most."""
+_SETTLED = 1e-5
+"""m and rad; the largest step at which the search ends."""
+_AT_ONCE = 200_000
+"""Rays linearised at once."""
+_SLIP = 0.5
+"""m and rad; standard deviation of a step during a slip."""
+_ROUNDING = 2e-4
+"""m and rad; of odometry and truth as written, and of steps taken as arcs."""
+_WHEELS = 3
+"""Unknowns of the wheels: scale of distance, scale of heading, heading per metre."""
+_PATTERN = 6
+"""Unknowns of an antenna's pattern: cosine and sine of one, two and three times the direction."""
+
+
+@dataclass(frozen=True)
+class OracleFigures:
+    """How far the optimum is from the truth, and how far the Cramer-Rao bound says it is."""
+
+    ate: float
+    """m, of the keyframes after rigid alignment."""
+    anchors: float
+    """m, rms, in the same alignment; nan without any."""
+    bound_ate: float
+    """m, expected by the Cramer-Rao bound."""
+    bound_anchors: float
+    """m."""
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays of known surfaces, as points."""
+
+    pose: Ints
+    surface: Ints
+    points: Floats
+    """(p, 2) m, frame of the keyframe."""
+    directions: Floats
+    """(p, 2) unit, same frame."""
+    sd: Floats
+    """(p,) m, along the ray."""
+
+
+class _Layout:
+    """Where each unknown stands in the vector of all: poses after the first, anchors, surfaces, scalars."""
+
+    def __init__(self, poses: int, anchors: int, surfaces: int) -> None:
+        self.poses = np.arange(poses)[:, None] * 3 + np.arange(3) - 3
+        begin = 3 * poses - 3
+        self.anchors = begin + np.arange(2 * anchors).reshape(-1, 2)
+        begin += 2 * anchors
+        self.surfaces = begin + np.arange(2 * surfaces).reshape(-1, 2)
+        begin += 2 * surfaces
+        self.wheels = begin + np.arange(_WHEELS)
+        begin += _WHEELS
+        self.bias = begin + np.arange(anchors)
+        begin += anchors
+        self.patterns = begin + np.arange(_PATTERN * (anchors + 1)).reshape(-1, _PATTERN)
+        self.size = begin + _PATTERN * (anchors + 1)
+
+
+class Oracle:
+    """The least-squares problem of one recording."""
+
+    def __init__(self, recording: Recording, log: SensorLog, lidar: bool = True) -> None:
+        self.recording, self.log = recording, log
+        self.frames = keyframes.select(log.odometry, KeyframeConfig())
+        self.truth = self._at(self.frames.stamps)
+        self.rays = self._rays() if lidar and len(recording.scans) else None
+        self.walls = recording.plan.walls
+        self.heard = log.ranges is not None
+        seen = np.unique(self.rays.surface) if self.rays is not None else np.zeros(0, dtype=np.int64)
+        self.seen = seen
+        self.anchors = len(recording.anchors) if self.heard else 0
+        self.layout = _Layout(len(self.frames), self.anchors, len(seen))
+        self.x = self._start()
+
+    def _at(self, stamps: Floats) -> Floats:
+        r = self.recording
+        return np.stack([np.interp(stamps, r.stamps, r.truth[:, k]) for k in range(3)], axis=-1)
+
+    def _rays(self) -> _Rays:
+        """Return the rays of the scans at the keyframes, moved to these by the odometry as the estimator does."""
+        log, model = self.log, self.recording.settings.laser
+        assert log.scans is not None
+        owner, chosen = keyframes.choose_scans(log.scans, self.frames, KeyframeConfig())
+        found = keyframes.scan_points(log, self.frames, owner, chosen)
+        surface = self.recording.surfaces[found.scan, found.ray].astype(np.int64)
+        kept = surface >= 0
+        way = found.points[kept] - found.origins[kept]
+        reach = np.hypot(way[:, 0], way[:, 1])
+        sd = np.maximum(model.near_sd, model.far_sd * reach)
+        return _Rays(found.keyframe[kept], surface[kept], found.points[kept], way / reach[:, None], sd)
+
+    def _start(self) -> Floats:
+        """Return the truth as the vector of unknowns."""
+        x, layout, plan = np.zeros(self.layout.size), self.layout, self.recording.plan
+        x[layout.poses[1:].ravel()] = self.truth[1:].ravel()
+        if self.anchors:
+            x[layout.anchors] = self.recording.anchors
+        for k, surface in enumerate(self.seen.tolist()):
+            if surface < len(self.walls):
+                x1, y1, x2, y2 = self.walls[surface]
+                angle = np.arctan2(x2 - x1, y1 - y2)
+                x[layout.surfaces[k]] = angle, np.cos(angle) * x1 + np.sin(angle) * y1
+            else:
+                x[layout.surfaces[k]] = plan.columns[surface - len(self.walls), :2]
+        return x
+
+    def poses(self) -> Floats:
+        """Return the poses (k, 3), the first held at its true place."""
+        return np.concatenate([self.truth[:1], self.x[self.layout.poses[1:].ravel()].reshape(-1, 3)])
+
+    def solve(self) -> OracleFigures:
+        """Descend from the truth and judge the optimum and its covariance."""
+        for _ in range(_ROUNDS):
+            matrix, gradient = self._normal()
+            factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+            step = -cho_solve(factor, gradient, check_finite=False)
+            self.x += step
+            if np.abs(step).max() < _SETTLED:
+                break
+        return self._figures(factor)
+
+    def _normal(self) -> tuple[Floats, Floats]:
+        """Return the normal equations at the present estimate."""
+        size = self.layout.size
+        parts = [self._wheel_rows(), self._priors()]
+        sparse_part = sparse.csr_matrix((size, size))
+        gradient = np.zeros(size)
+        for jacobian, residual in parts:
+            sparse_part = sparse_part + jacobian.T @ jacobian
+            gradient += jacobian.T @ residual
+        matrix = sparse_part.toarray()
+        if self.rays is not None:
+            self._add_rays(matrix, gradient)
+        if self.heard:
+            self._add_ranges(matrix, gradient)
+        return matrix, gradient
+
+    def _rows(self, columns: Ints, values: Floats) -> sparse.csr_matrix:
+        """Return rows (m,) that are non-zero in these columns (m, c); a column below 0 is held."""
+        row = np.broadcast_to(np.arange(len(columns))[:, None], columns.shape)
+        free = columns >= 0
+        return sparse.csr_matrix((values[free], (row[free], columns[free])), shape=(len(columns), self.layout.size))
+
+    def _wheel_rows(self) -> tuple[sparse.csr_matrix, Floats]:
+        frames, poses, layout = self.frames, self.poses(), self.layout
+        s, k, b = self.x[layout.wheels]
+        turn = frames.motion[:, 2] * k + frames.length * b
+        along = se2.rotate(0.5 * turn, frames.motion[:, :2]) * (1.0 + s)
+        z = np.concatenate([along, (frames.motion[:, 2] + turn)[:, None]], axis=1)
+        error = self._step_error(z, poses)
+        whitening = self._wheel_whitening()
+        columns = np.concatenate(
+            [layout.poses[:-1], layout.poses[1:], np.broadcast_to(layout.wheels, (len(z), _WHEELS))], axis=1
+        )
+        jacobian = np.empty((len(z), 3, 9))
+        small = 1e-6
+        for c in range(3):
+            for side, first in ((0, 0), (1, 3)):
+                ends = [poses[:-1].copy(), poses[1:].copy()]
+                ends[side][:, c] += small
+                jacobian[:, :, first + c] = (_between_error(z, *ends) - error) / small
+        ahead = np.stack([-z[:, 1], z[:, 0]], axis=1)
+        jacobian[:, :, 6] = -np.concatenate([z[:, :2] / (1.0 + s), np.zeros((len(z), 1))], axis=1)
+        for c, turned in ((7, frames.motion[:, 2]), (8, frames.length)):
+            jacobian[:, :, c] = -np.concatenate([0.5 * turned[:, None] * ahead, turned[:, None]], axis=1)
+        white = np.einsum("eij,ejc->eic", whitening, jacobian)
+        rows = self._rows(np.repeat(columns, 3, axis=0), white.reshape(-1, 9))
+        return rows, np.einsum("eij,ej->ei", whitening, error).ravel()
+
+    def _step_error(self, z: Floats, poses: Floats) -> Floats:
+        return _between_error(z, poses[:-1], poses[1:])
+
+    def _wheel_whitening(self) -> Floats:
+        """Return L (e, 3, 3) with L^T L the information of each step: a heading that errs in mid-step errs sideways too."""
+        frames, truth = self.frames, self.recording.calibration["odometry"]
+        length, turned = frames.path, frames.turned
+        heading = truth["heading_noise_travel"] ** 2 * length + truth["heading_noise_turn"] ** 2 * turned
+        covariance = np.zeros((len(length), 3, 3))
+        covariance[:, 0, 0] = truth["distance_noise"] ** 2 * length
+        covariance[:, 1, 1] = heading * length**2 / 3.0
+        covariance[:, 1, 2] = covariance[:, 2, 1] = 0.5 * heading * length
+        covariance[:, 2, 2] = heading
+        covariance += np.eye(3) * _ROUNDING**2
+        for slip in self.recording.calibration["slips"]:
+            first, last = slip["start"] - 0.1, slip["start"] + slip["seconds"] + 0.1
+            during = (frames.stamps[1:] > first) & (frames.stamps[:-1] < last)
+            covariance[during] += np.eye(3) * _SLIP**2
+        # Along the mean direction of the step, as the noise was made.
+        half = np.zeros((len(length), 3, 3))
+        c, s = np.cos(0.5 * frames.motion[:, 2]), np.sin(0.5 * frames.motion[:, 2])
+        half[:, 0, 0], half[:, 0, 1], half[:, 1, 0], half[:, 1, 1], half[:, 2, 2] = c, s, -s, c, 1.0
+        return np.linalg.inv(np.linalg.cholesky(covariance)) @ half
+
+    def _priors(self) -> tuple[sparse.csr_matrix, Floats]:
+        """Return what is known of the scalars beforehand: the distributions they were drawn from."""
+        layout, model = self.layout, self.recording.settings.radio
+        pattern = model.antenna_sd * np.sqrt(0.5 / 3.0)
+        which = np.concatenate([layout.wheels, layout.bias, layout.patterns.ravel()])
+        bias = np.full(len(layout.bias), max(model.bias_sd, 1e-4))
+        sd = np.concatenate([[0.05, 0.05, 0.02], bias, np.full(layout.patterns.size, max(pattern, 1e-6))])
+        return self._rows(which[:, None], 1.0 / sd[:, None]), self.x[which] / sd
+
+    def _add_rays(self, matrix: Floats, gradient: Floats) -> None:
+        rays, layout = self.rays, self.layout
+        assert rays is not None
+        poses, place = self.poses(), np.searchsorted(self.seen, rays.surface)
+        for first in range(0, len(rays.pose), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            own = poses[rays.pose[part]]
+            arm = se2.rotate(own[:, 2], rays.points[part])
+            at, direction = own[:, :2] + arm, se2.rotate(own[:, 2], rays.directions[part])
+            surface = self.x[layout.surfaces[place[part]]]
+            wall = rays.surface[part] < len(self.walls)
+            normal = np.stack([np.cos(surface[:, 0]), np.sin(surface[:, 0])], axis=1)
+            away = at - surface
+            reach = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
+            radius = self.recording.plan.columns[np.maximum(rays.surface[part] - len(self.walls), 0), 2] if len(
+                self.recording.plan.columns
+            ) else np.zeros(len(wall))
+            residual = np.where(wall, (normal * at).sum(axis=1) - surface[:, 1], reach - radius)
+            normal = np.where(wall[:, None], normal, away / reach[:, None])
+            # A grazing ray errs along the wall; what the estimator could at best know of it is kept finite.
+            sd = rays.sd[part] * np.maximum(np.abs((normal * direction).sum(axis=1)), 0.05)
+            rows = np.empty((len(wall), 5))
+            rows[:, :2] = normal
+            rows[:, 2] = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
+            rows[:, 3] = np.where(wall, normal[:, 0] * at[:, 1] - normal[:, 1] * at[:, 0], -normal[:, 0])
+            rows[:, 4] = np.where(wall, -1.0, -normal[:, 1])
+            columns = np.concatenate([layout.poses[rays.pose[part]], layout.surfaces[place[part]]], axis=1)
+            jacobian = self._rows(columns, rows / sd[:, None])
+            product = (jacobian.T @ jacobian).tocoo()
+            matrix[product.row, product.col] += product.data
+            gradient += jacobian.T @ (residual / sd)
+
+    def _add_ranges(self, matrix: Floats, gradient: Floats) -> None:
+        r, log, layout, model = self.recording, self.log, self.layout, self.recording.settings.radio
+        assert log.ranges is not None
+        attached = keyframes.attach_ranges(log.ranges, log.odometry, self.frames, log.mounting)
+        known = {name: k for k, name in enumerate(r.plan.anchor_ids[: self.anchors])}
+        number = np.array([known[i] for i in log.ranges.anchor_ids])[attached.anchor]
+        poses, tag_arm = self.poses(), np.asarray(r.settings.tag)
+        height = r.settings.anchor_height - r.settings.tag_height
+        own = poses[attached.keyframe]
+        arm = se2.rotate(own[:, 2], attached.lever_arm + se2.rotate(attached.turn, tag_arm))
+        tag = own[:, :2] + arm
+        away = tag - self.x[layout.anchors[number]]
+        distance = np.sqrt((away**2).sum(axis=1) + height**2)
+        bearing = np.arctan2(-away[:, 1], -away[:, 0])
+        heading = own[:, 2] + attached.turn
+        wave = [_harmonics(bearing - heading), _harmonics(bearing)]
+        body, world = layout.patterns[-1], layout.patterns[number]
+        patterns = (wave[0] * self.x[body]).sum(axis=1) + (wave[1] * self.x[world]).sum(axis=1)
+        residual = model.scale * distance + self.x[layout.bias[number]] + patterns - attached.ranges
+        unit = model.scale * away / distance[:, None]
+        values = np.concatenate(
+            [
+                unit, (unit[:, 1] * arm[:, 0] - unit[:, 0] * arm[:, 1])[:, None], -unit, np.ones((len(unit), 1)), *wave
+            ], axis=1,
+        )
+        columns = np.concatenate(
+            [
+                layout.poses[attached.keyframe], layout.anchors[number], layout.bias[number][:, None],
+                np.broadcast_to(body, (len(unit), _PATTERN)), world,
+            ], axis=1,
+        )
+        mean, spread, sound = self._excess(log.ranges.stamps, number, log.ranges.ranges)
+        for anchor in range(self.anchors):
+            rows = np.flatnonzero((number == anchor) & sound)
+            if not len(rows):
+                continue
+            covariance = self._covariance(tag[rows]) + np.diag(model.noise_sd**2 + spread[rows] ** 2)
+            jacobian = self._rows(columns[rows], values[rows])
+            used = np.unique(jacobian.indices)
+            dense = jacobian[:, used].toarray()
+            weighted = cho_solve(cho_factor(covariance, lower=True), np.column_stack([dense, residual[rows] + mean[rows]]))
+            matrix[np.ix_(used, used)] += dense.T @ weighted[:, :-1]
+            gradient[used] += dense.T @ weighted[:, -1]
+
+    def _covariance(self, tag: Floats) -> Floats:
+        """Return the covariance (m, m) of the multipath of one anchor at these places."""
+        model = self.recording.settings.radio
+        squared = ((tag[:, None] - tag[None]) ** 2).sum(axis=2)
+        return np.asarray(model.multipath_sd**2 * np.exp(-0.5 * squared / model.multipath_length**2))
+
+    def _excess(self, stamps: Floats, number: Ints, said: Floats) -> tuple[Floats, Floats, Bools]:
+        """Return the mean and the spread of what obstacles add to each range, and which ranges are sound at all."""
+        r, model = self.recording, self.recording.settings.radio
+        pose = self._at(stamps - r.settings.uwb_delay)
+        tag = se2.transform(pose, np.asarray(r.settings.tag))
+        shadow = np.zeros(len(stamps))
+        for anchor, place in enumerate(r.anchors):
+            own = number == anchor
+            shadow[own] = r.plan.opacity * radio.crossings(tag[own], place, r.plan.walls, r.plan.columns)
+        heavy = np.isin(number + 1, r.settings.nlos_anchors) if r.settings.nlos_anchors else np.ones(len(number), dtype=bool)
+        level = np.where(heavy, radio.NLOS_LEVELS[r.settings.nlos][0], radio.NLOS_LEVELS["normal"][0])
+        mean = level * np.minimum(shadow, 2.0)
+        height = r.settings.anchor_height - r.settings.tag_height
+        true = model.scale * np.hypot(np.hypot(*(r.anchors[number] - tag).T), height) + mean
+        usual = np.hypot(np.hypot(model.noise_sd, model.multipath_sd), np.hypot(model.antenna_sd, model.bias_sd))
+        return mean, 0.8 * mean, np.abs(said - true) < 4.0 * usual + 4.0 * mean
+
+    def _figures(self, factor: tuple[Floats, bool]) -> OracleFigures:
+        layout, poses = self.layout, self.poses()
+        motion = align(poses[:, :2], self.truth[:, :2])
+        off = se2.transform(motion, poses[:, :2]) - self.truth[:, :2]
+        nan = float("nan")
+        at, anchors = self.truth[1:, :2], nan
+        columns = layout.poses[1:, :2]
+        if self.anchors:
+            error = se2.transform(motion, self.x[layout.anchors]) - self.recording.anchors
+            anchors = float(np.sqrt((error**2).sum(axis=1).mean()))
+            columns, at = np.concatenate([columns, layout.anchors]), np.concatenate([at, self.recording.anchors])
+        unit = np.zeros((layout.size, columns.size))
+        unit[columns.ravel(), np.arange(columns.size)] = 1.0
+        covariance = cho_solve(factor, unit, check_finite=False)[columns.ravel()]
+        del unit
+        # Expected after alignment: a rigid motion fitted to the poses is taken out of poses and anchors alike.
+        rigid = np.zeros((columns.size, 3))
+        rigid[0::2, 0] = rigid[1::2, 1] = 1.0
+        rigid[0::2, 2], rigid[1::2, 2] = -at[:, 1], at[:, 0]
+        path = 2 * (len(poses) - 1)
+        onto = rigid @ np.linalg.pinv(rigid[:path])
+        left = covariance - onto @ covariance[:path]
+        left = left - left[:, :path] @ onto.T
+        variance = np.diag(left)
+        bound = float(np.sqrt(variance[path:].reshape(-1, 2).sum(axis=1).mean())) if self.anchors else nan
+        return OracleFigures(
+            float(np.sqrt((off**2).sum(axis=1).mean())), anchors, float(np.sqrt(2.0 * variance[:path].mean())), bound
+        )
+
+
+def _between_error(z: Floats, first: Floats, second: Floats) -> Floats:
+    return se2.between(z, se2.between(first, second))
+
+
+def _harmonics(angle: Floats) -> Floats:
+    """Return cosine and sine of one, two and three times an angle (m, 6)."""
+    return np.stack([f(k * angle) for k in (1, 2, 3) for f in (np.cos, np.sin)], axis=1)
+
+
+def solve(recording: Recording, log: SensorLog, lidar: bool = True) -> OracleFigures:
+    """Return what the measurements of a drive allow."""
+    return Oracle(recording, log, lidar).solve()
