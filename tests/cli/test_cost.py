@@ -1,20 +1,26 @@
-"""The estimate of time and memory: positive, growing with everything it depends on."""
+"""The estimate of time and memory: positive, growing with everything it depends on, scaled by the work itself."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 
 from uwblite.cli import cost
+from uwblite.sensor_log import Odometry, SensorLog
 
 
-@pytest.fixture(autouse=True)
-def _one_speed(monkeypatch):
-    monkeypatch.setattr(cost, "_slowness", lambda: 1.0)
+def of_length(log, seconds):
+    first = log.odometry.stamps[0]
+    return log.crop(first, first + seconds)
 
 
-@pytest.mark.parametrize("place", range(4))
-def test_time_grows_with_path_ranges_scans_and_beams(place):
-    few, many = [100.0, 1000, 5000, 682], [100.0, 1000, 5000, 682]
-    many[place] *= 2
-    assert 0 < cost.expected_seconds(*few) < cost.expected_seconds(*many)
+def test_work_grows_with_path_ranges_and_readings(log):
+    whole, half = cost.work_seconds(log), cost.work_seconds(of_length(log, 120.0))
+    assert 0 < half < whole
+    assert cost.work_seconds(log.without(uwb=True)) < whole
+    assert cost.work_seconds(log.without(lidar=True)) < 0.5 * whole
+    longer = dataclasses.replace(log.odometry, poses=log.odometry.poses * (2.0, 2.0, 1.0))
+    assert cost.work_seconds(dataclasses.replace(log, odometry=longer)) > whole
 
 
 @pytest.mark.parametrize("place", range(4))
@@ -24,8 +30,39 @@ def test_memory_grows_with_path_scans_beams_and_cells(place):
     assert 50 < cost.expected_megabytes(*few) < cost.expected_megabytes(*many)
 
 
-def test_without_lidar_it_costs_less():
-    assert cost.expected_seconds(300.0, 2000, 0, 0) < 0.5 * cost.expected_seconds(300.0, 2000, 9000, 682)
+def test_without_lidar_it_takes_less_memory():
     assert cost.expected_megabytes(300.0, 0, 0, 0) < 0.5 * cost.expected_megabytes(300.0, 9000, 682, 300_000)
 
 
+def test_a_beginning_has_the_work_that_was_asked_for(log):
+    for seconds in (0.1, 0.5):
+        assert cost.work_seconds(cost.beginning(log, seconds)) == pytest.approx(seconds, rel=0.1)
+    short = of_length(log, 5.0)
+    assert cost.beginning(short, 10.0) is short
+
+
+def test_a_robot_that_stands_at_first_is_waited_for(log):
+    """The beginning is counted in work, not in time."""
+    stamps = np.concatenate([log.odometry.stamps[0] - 600.0 + np.arange(6000) * 0.1, log.odometry.stamps])
+    poses = np.concatenate([np.tile(log.odometry.poses[0], (6000, 1)), log.odometry.poses])
+    late = dataclasses.replace(log, odometry=Odometry(stamps, poses))
+    assert cost.work_seconds(cost.beginning(late, 0.5)) == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("slow", [0.2, 1.0, 30.0])
+def test_the_estimate_is_that_of_a_computer_whose_time_grows_with_the_work(log, monkeypatch, slow):
+    """A map that takes a + b w seconds for work w, and a clock that says so: the estimate is a + b w of the whole."""
+    clock = [0.0]
+
+    def build_map(part):
+        clock[0] += 0.1 + slow * cost.work_seconds(part)
+
+    monkeypatch.setattr("uwblite.mapping.build_map", build_map)
+    monkeypatch.setattr(cost.time, "perf_counter", lambda: clock[0])
+    expected = cost._SECONDS_AT_LEAST + 0.1 + slow * cost.work_seconds(log)
+    assert cost.expected_seconds(log) == pytest.approx(expected, rel=1e-6)
+
+
+def test_what_cannot_be_mapped_costs_as_the_model_says():
+    still = SensorLog(Odometry(np.array([0.0]), np.zeros((1, 3))))
+    assert cost.expected_seconds(still) == pytest.approx(cost._SECONDS_AT_LEAST)

@@ -75,9 +75,8 @@ def expected_cost(log: "SensorLog") -> dict[str, float]:
     scans = 0 if log.scans is None else len(log.scans.stamps)
     beams = 0 if log.scans is None else log.scans.ranges.shape[1]
     path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
-    ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     return {
-        "seconds": round(expected_seconds(path, ranges, scans, beams), 1),
+        "seconds": round(expected_seconds(log), 1),
         "megabytes": round(expected_megabytes(path, scans, beams, cells), 0),
         "map width m": round(float(size[0]), 1) if cells else 0.0,
         "map height m": round(float(size[1]), 1) if cells else 0.0,
