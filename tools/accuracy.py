@@ -216,7 +216,7 @@ def real(args: argparse.Namespace) -> str:
         error = evaluate_trajectory(result.stamps, result.trajectory, *truth, max_gap=30.0).ate.rmse
         note = ""
         if name == "labyrinth":
-            note = "no heading in the truth; " + ("; ".join(result.doubts) or "no doubts")
+            note = "no heading in the truth; " + ("; ".join(map(str, result.doubts)) or "no doubts")
         wheels = evaluate_trajectory(log.odometry.stamps, log.odometry.poses, *truth, max_gap=30.0).ate.rmse
         rows.append([name, wheels, error, f"{REAL[name]:g}", "yes" if error <= REAL[name] else "**no**", note])
         print(f"{name}: {error:.4f}", file=sys.stderr, flush=True)

@@ -131,7 +131,7 @@ def judged(result: MapResult, trial: Trial, max_gap: float = 1.0) -> Figures:
         anchors=anchors.rmse,
         anchor_errors=tuple((i, by_id.get(i, float("inf"))) for i in ids),
         closures=(sum(c.accepted for c in result.closures), len(result.closures)),
-        doubts=result.doubts,
+        doubts=tuple(map(str, result.doubts)),
         stages=tuple((s.name, s.seconds) for s in result.stages),
     )
 

@@ -20,7 +20,7 @@ from .grid.occupancy_grid import OccupancyGrid
 from .lidar.correlative_matching import CorrelativeConfig, search
 from .lidar.point_cloud import PointCloud, make_cloud
 from .lidar.point_to_point import IcpConfig, Registration, align
-from .map_result import MapResult, StageSummary
+from .map_result import MapResult, Notice, StageSummary
 from .mapping import MappingConfig, Progress, build_map
 from .pipeline import map_frame
 from .sensor_log import SensorLog
@@ -83,7 +83,8 @@ def localize(
         return Localization(result, np.zeros(3), float("nan"))
     if alone:
         text = f"it hears {len(shared)} of the map's anchors: the walls alone say where it was"
-        result = replace(result, warnings=(*result.warnings, text))
+        notice = Notice("few-common-anchors", text, {"anchors": len(shared)})
+        result = replace(result, warnings=(*result.warnings, notice))
     return _laid_over(result, grid, anywhere=alone)
 
 
@@ -99,15 +100,18 @@ def _laid_over(result: MapResult, grid: OccupancyGrid, *, anywhere: bool) -> Loc
     found = fits[0]
     figures = {"overlap": round(found.overlap, 4), "rmse": round(found.rmse, 4), "reason": found.reason}
     if not found.converged or found.overlap < LEAST_OVERLAP:
-        doubt = (
+        doubt = Notice(
+            "walls-differ",
             f"the walls do not lie on those of the map (overlap {found.overlap:.0%}, {found.reason}): the place has changed, "
-            f"or it is another; the position {'is not known' if anywhere else 'rests on the anchors alone'}"
+            f"or it is another; the position {'is not known' if anywhere else 'rests on the anchors alone'}",
+            {"overlap": round(found.overlap, 4)},
         )
         stages = (*result.stages, StageSummary("walls", 0.0, figures))
         return Localization(replace(result, doubts=(*result.doubts, doubt), stages=stages), np.zeros(3), found.overlap)
     rival = max((fit.overlap for fit in fits[1:] if _elsewhere(fit, found)), default=0.0)
     if rival > _UNIQUE * found.overlap:
-        doubt = f"the walls fit elsewhere in the map about as well (overlap {rival:.0%} against {found.overlap:.0%})"
+        text = f"the walls fit elsewhere in the map about as well (overlap {rival:.0%} against {found.overlap:.0%})"
+        doubt = Notice("ambiguous-place", text, {"overlap": round(found.overlap, 4), "rival": round(rival, 4)})
         result = replace(result, doubts=(*result.doubts, doubt))
     motion = se2.compose(found.T_target_source, se2.inverse(middle))
     figures["shift"] = [round(v, 4) for v in motion.tolist()]

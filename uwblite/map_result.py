@@ -4,8 +4,23 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .arrays import Floats, Ints
-from .graph.graph import Graph
+from .graph.graph import Graph, UnknownKey
 from .grid.occupancy_grid import OccupancyGrid
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """A warning, or a reason not to trust a result."""
+
+    kind: str
+    """Fixed name for scripts and tests, such as ``mirror-ambiguity``; docs/formats.md lists them."""
+    text: str
+    """For people: what, where, and how to mend it."""
+    figures: dict[str, Any] = field(default_factory=dict)
+    """Named figures behind the text (JSON-ready)."""
+
+    def __str__(self) -> str:
+        return self.text
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +54,7 @@ class AnchorEstimate:
 class CalibrationEstimate:
     """One calibration value that the recording was asked for."""
 
-    name: str
+    key: UnknownKey
     value: float
     sigma: float
     """Standard deviation, same unit."""
@@ -49,6 +64,27 @@ class CalibrationEstimate:
     """'estimated', or 'prior': the recording cannot show it."""
     reason: str = ""
     """Why it stayed at the prior."""
+
+    @property
+    def name(self) -> str:
+        """The key as text, such as ``bias:5C0B``."""
+        return self.key.label
+
+
+OUTCOMES = {
+    "accepted": "accepted",
+    "not-found": "the search found no place",
+    "few-matches": "too few points match",
+    "far-matches": "matches lie too far apart",
+    "free-space-violation": "points would stand in free space",
+    "degenerate": "the surfaces do not fix the pose",
+    "ambiguous": "another place matches as well",
+    "contradicts-graph": "contradicts the graph",
+    "contradicts-closures": "contradicts the other closures",
+    "not-converged": "the alignment did not converge",
+    "forbidden": "forbidden by the constraints",
+}
+"""What may become of a candidate for a loop closure, and its name for people."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,9 +103,15 @@ class LoopClosure:
     """Root mean square distance of matched points, m."""
     overlap: float
     """Share of source points that found a match, 0..1."""
-    accepted: bool
+    outcome: str
+    """One of OUTCOMES."""
     reason: str
-    """Why it was accepted or rejected, in words."""
+    """The outcome in words, with its figures."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it holds the map together."""
+        return self.outcome == "accepted"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +153,7 @@ class MapResult:
     grid: OccupancyGrid | None
     """None without lidar."""
     stages: tuple[StageSummary, ...]
-    warnings: tuple[str, ...]
-    """Things the user should know, in words."""
-    doubts: tuple[str, ...]
-    """Named reasons not to trust the result; non-empty means exit code 3."""
+    warnings: tuple[Notice, ...]
+    """Things the user should know."""
+    doubts: tuple[Notice, ...]
+    """Reasons not to trust the result; non-empty means exit code 3."""

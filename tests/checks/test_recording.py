@@ -8,6 +8,7 @@ from helpers.room_drive import recording, two_rounds
 
 from uwblite import se2
 from uwblite.checks.recording import diagnose
+from uwblite.graph.graph import UnknownKey
 from uwblite.map_result import CalibrationEstimate
 from uwblite.sensor_log import LogNotes, Odometry, SensorLog, SensorMounting
 
@@ -151,7 +152,7 @@ def test_missing_sensors_and_notes_of_the_reader(sound):
 
 
 def test_what_the_radio_says_of_the_wheels(sound):
-    scale = CalibrationEstimate("odometry_scale", 0.06, 0.004, "1", "error of travelled distance", "estimated")
+    scale = CalibrationEstimate(UnknownKey("odometry_scale"), 0.06, 0.004, "1", "error of travelled distance", "estimated")
     assert_named(sound, "warning", "the wheels are off against the radio by +6.0%", calibration=(scale,))
     unsure = replace(scale, sigma=0.05)
     assert not [t for t in texts(sound, calibration=(unsure,)) if "wheels are off" in t]

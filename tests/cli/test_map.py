@@ -189,7 +189,7 @@ def test_a_result_to_trust_exits_with_0_and_one_in_doubt_with_3(radio_only, tmp_
             assert summary["doubts"] == report["doubts"]
         else:
             doubts = [line.removeprefix("DOUBT: ") for line in said.splitlines() if line.startswith("DOUBT: ")]
-            assert doubts == report["doubts"]
+            assert doubts == [doubt["text"] for doubt in report["doubts"]]
             assert all("mirror-ambiguous" in doubt for doubt in doubts)
 
 
@@ -351,7 +351,7 @@ def test_localize_in_a_map_without_anchors_goes_by_its_walls(mapped, room_log, t
     assert main(["localize", str(part), "--map", str(bare), "--out", str(tmp_path / "p.tum"), "--json"]) in (0, 3)
     summary = json.loads(capsys.readouterr().out)
     assert summary["overlap"] > 0.9
-    assert any("walls alone" in w for w in summary["warnings"])
+    assert any("walls alone" in w["text"] for w in summary["warnings"])
     (bare / "map.yaml").unlink()
     assert main(["localize", str(part), "--map", str(bare), "--out", str(tmp_path / "q.tum")]) == 1
     assert "no anchor in it has a place" in capsys.readouterr().err

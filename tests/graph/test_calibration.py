@@ -21,13 +21,13 @@ TOLD = np.array([False, True, False])
 
 def test_every_unknown_has_a_name_of_its_own_a_unit_and_a_meaning():
     listed = unknowns(CalibrationConfig(), IDS, TOLD)
-    assert len({u.name for u in listed}) == len(listed)
+    assert len({u.key.label for u in listed}) == len(listed)
     assert all(u.unit and u.meaning and u.sigma > 0 for u in listed)
-    assert {f"bias:{a}" for a in IDS} <= {u.name for u in listed}
+    assert {f"bias:{a}" for a in IDS} <= {u.key.label for u in listed}
 
 
 def test_height_is_unknown_only_where_nobody_told():
-    names = {u.name for u in unknowns(CalibrationConfig(), IDS, TOLD)}
+    names = {u.key.label for u in unknowns(CalibrationConfig(), IDS, TOLD)}
     assert {n for n in names if n.startswith("height2:")} == {"height2:1E05", "height2:91A3"}
 
 
@@ -42,8 +42,8 @@ def test_height_is_unknown_only_where_nobody_told():
     ],
 )
 def test_a_prior_of_zero_switches_its_unknowns_off_and_no_others(field, names):
-    every = {u.name for u in unknowns(CalibrationConfig(), IDS, TOLD)}
-    left = {u.name for u in unknowns(CalibrationConfig(**{field: 0.0}), IDS, TOLD)}
+    every = {u.key.label for u in unknowns(CalibrationConfig(), IDS, TOLD)}
+    left = {u.key.label for u in unknowns(CalibrationConfig(**{field: 0.0}), IDS, TOLD)}
     assert every - left == names
     assert left <= every
 
@@ -51,7 +51,7 @@ def test_a_prior_of_zero_switches_its_unknowns_off_and_no_others(field, names):
 def test_priors_weigh_one_standard_deviation_as_one():
     listed = unknowns(CalibrationConfig(), IDS, TOLD)
     sigma = np.array([u.sigma for u in listed])
-    graph = Graph(np.zeros((1, 3)), calibration=Calibration(block(listed).names, 2.0 * sigma))
+    graph = Graph(np.zeros((1, 3)), calibration=Calibration(block(listed).keys, 2.0 * sigma))
     residuals = prior_edges(listed).residuals(graph)
     np.testing.assert_allclose(residuals, 2.0)
     assert np.all(prior_edges(listed).residuals(Graph(np.zeros((1, 3)), calibration=block(listed))) == 0.0)
@@ -63,20 +63,30 @@ def test_tables_name_the_right_scalar_in_the_right_column():
     table = range_indices(calibration, anchor, IDS)
     assert table.shape == (4, 6)
     for row, a in zip(table, anchor, strict=True):
-        said = [calibration.names[k] if k >= 0 else None for k in row]
+        said = [calibration.keys[k].label if k >= 0 else None for k in row]
         height = None if TOLD[a] else f"height2:{IDS[a]}"
         assert said == ["range_scale", f"bias:{IDS[a]}", height, "tag_x", "tag_y", "range_delay"]
     wheels = odometry_indices(calibration, 3)
     assert wheels.shape == (3, 4)
     for row in wheels:
-        assert [calibration.names[k] for k in row] == ["odometry_scale", "heading_scale", "heading_per_metre", "heading_rate"]
-    assert [calibration.names[k] for k in scan_indices(calibration)] == ["laser_x", "laser_y", "laser_theta", "laser_delay"]
+        assert [calibration.keys[k].label for k in row] == [
+            "odometry_scale",
+            "heading_scale",
+            "heading_per_metre",
+            "heading_rate",
+        ]
+    assert [calibration.keys[k].label for k in scan_indices(calibration)] == [
+        "laser_x",
+        "laser_y",
+        "laser_theta",
+        "laser_delay",
+    ]
 
 
 def test_what_is_switched_off_has_index_minus_one():
     nothing = CalibrationConfig(**dict.fromkeys(CalibrationConfig.__dataclass_fields__, 0.0))
     calibration = block(unknowns(nothing, IDS, TOLD))
-    assert calibration.names == ()
+    assert calibration.keys == ()
     assert len(prior_edges(unknowns(nothing, IDS, TOLD))) == 0
     assert np.all(range_indices(calibration, np.array([0, 1]), IDS) == -1)
     assert np.all(odometry_indices(calibration, 2) == -1)
@@ -86,5 +96,5 @@ def test_what_is_switched_off_has_index_minus_one():
 
 def test_no_anchors_no_range_table():
     calibration = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
-    assert not any(":" in name for name in calibration.names)
+    assert all(key.anchor is None for key in calibration.keys)
     assert range_indices(calibration, np.zeros(0, dtype=np.int64), ()).shape == (0, 6)

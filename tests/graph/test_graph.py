@@ -7,7 +7,7 @@ from helpers.planted_graphs import every_kind
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.graph.graph import Calibration, Graph, PriorEdges, edge_cost
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_cost
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
@@ -164,7 +164,7 @@ def test_jacobians_near_an_anchor_equal_differences_whatever_the_squared_height(
 
 def one_range(away):
     """Return a range to an anchor that stands so far, m, in front of the robot, its squared height unknown; and the graph."""
-    graph = Graph(np.zeros((1, 3)), np.array([[away, 0.0]]), (), Calibration(("height2:A",), np.zeros(1)))
+    graph = Graph(np.zeros((1, 3)), np.array([[away, 0.0]]), (), Calibration((UnknownKey("height2", "A"),), np.zeros(1)))
     one, none = np.array([0]), np.zeros((1, 2))
     height = np.array([[-1, -1, 0, -1, -1, -1]])
     said, sigma, zero = np.array([away]), np.array([0.1]), np.zeros(1)
@@ -218,7 +218,7 @@ def test_graphs_are_extended_not_changed():
 
 
 def test_calibration_by_name():
-    calibration = Calibration(("a", "b"), np.array([1.0, 2.0]))
+    calibration = Calibration((UnknownKey("a"), UnknownKey("b")), np.array([1.0, 2.0]))
     assert (calibration.index("b"), calibration.index("c")) == (1, -1)
     assert (calibration.get("b"), calibration.get("c"), calibration.get("c", 7.0)) == (2.0, 0.0, 7.0)
 

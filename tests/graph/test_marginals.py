@@ -5,7 +5,7 @@ import pytest
 from helpers.planted_graphs import dense_system, loop, relative_edges
 
 from uwblite import se2
-from uwblite.graph.graph import Calibration, Graph, PriorEdges
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.marginals import JointCovariance, calibration_covariance, marginals
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import optimize
@@ -26,7 +26,11 @@ def calibrated(seed=0, n=60):
     ranges = replace(ranges, calibration=np.tile([0, 1, -1, -1, -1, -1], (len(ranges), 1)))
     prior = PriorEdges("calibration", np.arange(2), np.zeros((2, 1)), np.array([[[50.0]], [[5.0]]]))
     closures = replace(closures, kernel=Kernel("cauchy", 2.0))
-    graph = replace(graph, calibration=Calibration(("scale", "bias"), np.zeros(2)), edges=(odometry, closures, ranges, prior))
+    graph = replace(
+        graph,
+        calibration=Calibration((UnknownKey("scale"), UnknownKey("bias")), np.zeros(2)),
+        edges=(odometry, closures, ranges, prior),
+    )
     return optimize(graph)[0], truth
 
 

@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 
 from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
-from uwblite.graph.graph import Calibration, Graph, PriorEdges
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.robust import Kernel
@@ -111,7 +111,9 @@ def test_every_structure_solves_like_a_dense_matrix(anchors, closures, kind):
         pose, anchor = np.repeat(each, anchors), np.tile(np.arange(anchors), n - 1)
         ranges = plain_ranges(pose, anchor, rng.uniform(1.0, 5.0, len(pose)), 0.1)
         ranges = replace(ranges, calibration=np.tile([0, 1, -1, -1, -1, -1], (len(pose), 1)))
-        graph = replace(graph, calibration=Calibration(("scale", "bias"), np.zeros(2))).with_edges(ranges)
+        graph = replace(graph, calibration=Calibration((UnknownKey("scale"), UnknownKey("bias")), np.zeros(2))).with_edges(
+            ranges
+        )
     normal = filled(graph)
     H, g, number = dense_system(graph)
     order = in_solver_order(normal, number)
@@ -377,7 +379,7 @@ def test_a_long_chain_takes_up_a_wrong_wheel_in_a_few_steps():
     matched = step[seen] + rng.normal(scale=0.002, size=(len(seen), 3))
     lidar = RelativePoseEdges(seen, seen + 1, matched, np.tile(500.0 * np.eye(3), (len(seen), 1, 1)))
     prior = PriorEdges("calibration", np.array([0]), np.zeros((1, 1)), np.full((1, 1, 1), 10.0))
-    graph = Graph(start, np.zeros((0, 2)), (wheels, lidar, prior), Calibration(("heading_per_metre",), np.zeros(1)))
+    graph = Graph(start, np.zeros((0, 2)), (wheels, lidar, prior), Calibration((UnknownKey("heading_per_metre"),), np.zeros(1)))
     solved, summary = optimize(graph)
     assert summary.converged
     assert summary.iterations <= 12

@@ -4,7 +4,7 @@ import numpy as np
 
 from uwblite import se2
 from uwblite.graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
-from uwblite.graph.graph import Calibration, Graph, PriorEdges
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from uwblite.graph.range_edges import RangeEdges
@@ -25,7 +25,7 @@ def every_kind(seed, calibrated=True, edges=8):
         random_poses(rng, n, 2.0),
         rng.normal(scale=4.0, size=(a, 2)),
         (),
-        Calibration(NAMES + RANGE_NAMES, rng.normal(scale=0.1, size=len(NAMES + RANGE_NAMES))),
+        Calibration(tuple(map(UnknownKey, NAMES + RANGE_NAMES)), rng.normal(scale=0.1, size=len(NAMES + RANGE_NAMES))),
     )
     i = rng.integers(0, n, e)
     j = (i + rng.integers(1, n, e)) % n

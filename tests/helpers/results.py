@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from uwblite import se2
-from uwblite.graph.graph import Graph
+from uwblite.graph.graph import Graph, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
-from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult, StageSummary
+from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult, Notice, StageSummary
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 
 FILES = {
@@ -45,37 +45,59 @@ def small_result(*, evil: str = "", lidar: bool = True, each: int = 1, seconds: 
     motion = np.array([[0.5, 0.0, 0.1]] * (k - 1))
     chain = RelativePoseEdges(i, i + 1, motion, np.tile(np.eye(3) * 50, (k - 1, 1, 1)))
     closures = (
-        LoopClosure(0, 12, np.zeros(3), np.eye(3) * 100, 0.02, 0.8, True, "consistent with the others" + evil),
-        LoopClosure(2, 14, np.ones(3), np.eye(3) * 100, 0.09, 0.3, False, "overlap too small" + evil),
-        LoopClosure(3, 15, np.ones(3), np.eye(3) * 100, 0.09, 0.3, False, "overlap too small" + evil),
+        LoopClosure(0, 12, np.zeros(3), np.eye(3) * 100, 0.02, 0.8, "accepted", "consistent with the others" + evil),
+        LoopClosure(2, 14, np.ones(3), np.eye(3) * 100, 0.09, 0.3, "few-matches", "overlap too small" + evil),
+        LoopClosure(3, 15, np.ones(3), np.eye(3) * 100, 0.09, 0.3, "few-matches", "overlap too small" + evil),
     )
     geometry = GridGeometry(0.1, np.array([-5.0, -4.0]), 80, 100)
     log_odds = np.where(rng.uniform(size=(80, 100)) < 0.1, 4.0, -4.0).astype(np.float32)
     log_odds[:10] = 0.0
     agrees = (rng.uniform(size=2 * k) > 0.1).astype(np.float64)
     return MapResult(
-        stamps, poses, np.repeat(np.arange(each), 24),
-        stamps, np.repeat(np.arange(each), 24), covariances, Graph(poses, anchors, (chain, edges)),
+        stamps,
+        poses,
+        np.repeat(np.arange(each), 24),
+        stamps,
+        np.repeat(np.arange(each), 24),
+        covariances,
+        Graph(poses, anchors, (chain, edges)),
         (
             AnchorEstimate("5C0B" + evil, anchors[0], np.diag([0.0016, 0.0004]), k, 0.94, 0.46, 0.02, 0.05, "ok"),
             AnchorEstimate(
-                "91A3", anchors[1], np.array([[0.01, 0.004], [0.004, 0.01]]), k, 0.5, 0.1, 0.2, 0.3,
-                "mirror-ambiguous", "the path is straight" + evil, np.array([-4.0, 3.0]),
+                "91A3",
+                anchors[1],
+                np.array([[0.01, 0.004], [0.004, 0.01]]),
+                k,
+                0.5,
+                0.1,
+                0.2,
+                0.3,
+                "mirror-ambiguous",
+                "the path is straight" + evil,
+                np.array([-4.0, 3.0]),
             ),
         ),
         (
-            CalibrationEstimate("odometry_scale", -0.012, 0.002, "1", "error of travelled distance" + evil, "estimated"),
-            CalibrationEstimate("laser_delay", 0.0, 0.03, "s", "clock offset", "prior", "the robot hardly turns" + evil),
+            CalibrationEstimate(
+                UnknownKey("odometry_scale"), -0.012, 0.002, "1", "error of travelled distance" + evil, "estimated"
+            ),
+            CalibrationEstimate(
+                UnknownKey("laser_delay"), 0.0, 0.03, "s", "clock offset", "prior", "the robot hardly turns" + evil
+            ),
         ),
         closures,
         {
-            "stamp": stamps[pose], "anchor": anchor.astype(np.float64), "range": distance,
-            "residual": rng.normal(0, 0.05, 2 * k), "weight": agrees, "agrees": agrees,
+            "stamp": stamps[pose],
+            "anchor": anchor.astype(np.float64),
+            "range": distance,
+            "residual": rng.normal(0, 0.05, 2 * k),
+            "weight": agrees,
+            "agrees": agrees,
         },
         OccupancyGrid(geometry, log_odds, 24) if lidar else None,
         (StageSummary("first optimisation", seconds, {"chi2": 40.0, "dof": 50, "iterations": 7, "note": "x" + evil}),),
-        ("anchor 91A3 may be mirrored" + evil,),
-        ("few closures" + evil,) if evil else (),
+        (Notice("anchor-mirror-ambiguous", "anchor 91A3 may be mirrored" + evil, {"anchor": "91A3" + evil}),),
+        (Notice("few-closures" + evil, "few closures" + evil),) if evil else (),
     )
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.errors import FormatError
-from uwblite.graph.graph import Calibration, Graph, PriorEdges
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from uwblite.graph.range_edges import RangeEdges
@@ -70,7 +70,7 @@ def calibrated_graph(seed=0):
     X, A = base.poses, base.anchors
     i, j, T = relative(rng, X, 8)
     names = ("odometry_scale", "laser_x", "laser_theta", "laser_delay", "bias")
-    calibration = Calibration(names, np.array([0.02, 0.05, 0.03, 0.02, 0.3]))
+    calibration = Calibration(tuple(map(UnknownKey, names)), np.array([0.02, 0.05, 0.03, 0.02, 0.3]))
     odometry = OdometryEdges(
         i, j, T, np.ones(8), np.ones(8), roots(rng, 8, 3), np.broadcast_to(np.array([0, -1, -1, -1]), (8, 4))
     )

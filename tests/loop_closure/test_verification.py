@@ -236,7 +236,7 @@ def planted_closures(rng, truth, count, false_share) -> tuple[Closures, np.ndarr
     root = np.tile(np.diag([100.0, 100.0, 250.0]), (count, 1, 1))
     information = root @ root
     story = tuple(
-        LoopClosure(int(a), int(b), z, h, 0.01, 0.9, True, "planted")
+        LoopClosure(int(a), int(b), z, h, 0.01, 0.9, "accepted", "planted")
         for a, b, z, h in zip(i, j, pose, information, strict=True)
     )
     return Closures(RelativePoseEdges(i, j, pose, root), story), false

@@ -29,7 +29,7 @@ def start(wheels: Odometry, radio: UwbRanges) -> tuple[BootstrapResult, np.ndarr
     listed = unknowns(CalibrationConfig(anchor_height=0.0), ids, np.zeros(len(ids), dtype=bool))
     calibration = block(listed)
     free = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate", "bias", "range_scale")
-    held = np.array([name.split(":")[0] not in free for name in calibration.names])
+    held = ~calibration.of_kinds(*free)
     graph = Graph(frames.odometry, np.zeros((len(ids), 2)), (prior_edges(listed),), calibration, fixed_calibration=held)
     mounting = SensorMounting()
     attached = attach_ranges(radio, wheels, frames, mounting)

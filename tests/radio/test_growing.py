@@ -6,7 +6,7 @@ from helpers.planted_graphs import plain_ranges, relative_edges
 
 from uwblite import se2
 from uwblite.errors import ConfigError
-from uwblite.graph.graph import Calibration, Graph, PriorEdges
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
@@ -104,7 +104,9 @@ def test_calibration_is_found_on_the_way():
     odometry, ranges = graph.edges
     ranges = replace(ranges, ranges=1.05 * ranges.ranges + 0.2, calibration=np.tile([0, 1, -1, -1, -1, -1], (len(ranges), 1)))
     prior = PriorEdges("calibration", np.arange(2), np.zeros((2, 1)), np.array([[[20.0]], [[2.0]]]))
-    graph = replace(graph, edges=(odometry, ranges, prior), calibration=Calibration(("scale", "bias"), np.zeros(2)))
+    graph = replace(
+        graph, edges=(odometry, ranges, prior), calibration=Calibration((UnknownKey("scale"), UnknownKey("bias")), np.zeros(2))
+    )
     found, summary = optimize_growing(graph)
     # Hundreds of ranges per anchor: the scale is known to about 0.1 %, the bias to about 1 cm.
     np.testing.assert_array_less(np.abs(found.calibration.values - [0.05, 0.2]), [4e-3, 4e-2])

@@ -11,7 +11,7 @@ from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unk
 from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.solver import optimize
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
-from uwblite.radio.prior_selection import log_evidence, select_priors
+from uwblite.radio.prior_selection import log_marginal_likelihood, select_priors
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
@@ -35,12 +35,12 @@ def test_evidence_is_the_integral_over_the_unknowns(seed):
     def direct(width):
         return multivariate_normal.logpdf(y, np.zeros(7), a @ np.diag(width**2) @ a.T + noise**2 * np.eye(7))
 
-    assert log_evidence(mean, covariance, before, after) == pytest.approx(direct(after) - direct(before), abs=1e-8)
+    assert log_marginal_likelihood(mean, covariance, before, after) == pytest.approx(direct(after) - direct(before), abs=1e-8)
 
 
 def test_the_prior_in_use_is_the_measure_of_others():
     covariance, width = np.array([[0.04, 0.01], [0.01, 0.09]]), np.array([0.5, 0.7])
-    assert log_evidence(np.array([0.3, -0.1]), covariance, width, width) == pytest.approx(0.0, abs=1e-12)
+    assert log_marginal_likelihood(np.array([0.3, -0.1]), covariance, width, width) == pytest.approx(0.0, abs=1e-12)
 
 
 def solved(seed, bias=(0.0,) * 4, scale=1.0):
@@ -63,7 +63,7 @@ def solved(seed, bias=(0.0,) * 4, scale=1.0):
 
 def widths(graph):
     sigma = 1.0 / graph.edges[0].sqrt_information[:, 0, 0]
-    return dict(zip(graph.calibration.names, sigma, strict=True))
+    return dict(zip((key.label for key in graph.calibration.keys), sigma, strict=True))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.results import EVIL, small_result
 
+from uwblite.map_result import OUTCOMES
 from uwblite.report.html import render
 
 VOID = {"meta", "link", "input", "br", "img"}
@@ -87,11 +88,11 @@ def test_marked_ranges_are_those_that_disagree():
     assert (min(xs), max(xs)) == (0.0, 1000.0)
 
 
-def test_reasons_that_differ_in_figures_only_are_counted_together():
+def test_rejected_closures_are_counted_by_outcome():
     result = small_result()
     more = [replace(result.closures[1], reason=f"only {k}% of its points match (least 40%)") for k in (3, 12, 37)]
     text = render(replace(result, closures=(*result.closures, *more)), title="a", command="b")
-    assert "only \u2026% of its points match (least \u2026%)</td><td>3</td>" in text
+    assert f"{OUTCOMES['few-matches']}</td><td>5</td>" in text
     assert "only 12% of its points" in text
 
 

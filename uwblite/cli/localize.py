@@ -138,6 +138,8 @@ def _picture(found: "Localization", grid: "OccupancyGrid | None", caption: str) 
 
 def _summary(found: "Localization", files: list[str]) -> dict[str, Any]:
     """Return what was found, ready for JSON."""
+    from ..io.result_text import notices
+
     result = found.result
     x, y, theta = found.correction.tolist()
     return {
@@ -145,8 +147,8 @@ def _summary(found: "Localization", files: list[str]) -> dict[str, Any]:
         "poses": len(result.stamps),
         "correction_by_walls": {"x": x, "y": y, "theta": theta},
         "overlap": found.overlap if found.overlap == found.overlap else None,
-        "warnings": list(result.warnings),
-        "doubts": list(result.doubts),
+        "warnings": notices(result.warnings),
+        "doubts": notices(result.doubts),
         "exit_code": 3 if result.doubts else 0,
     }
 

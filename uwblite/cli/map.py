@@ -90,8 +90,7 @@ def _map(args: argparse.Namespace) -> int:
     from ..io.result_text import RunRecord
     from ..io.results import write_result
     from ..parallel import in_order
-    from ..pipeline.scan_selection import thinned
-    from ..screening.screen import screen
+    from ..pipeline.scan_selection import prepared
     from . import console
     from .formats import read_recording
     from .options import apply_mounting, bag_choices
@@ -106,7 +105,7 @@ def _map(args: argparse.Namespace) -> int:
     if args.dry_run:
         return max(_dry_run(args, log) for log in logs)
     # The scans that no map looks at are most of the memory.
-    logs = [thinned(screen(log, config.turn_laser), config.keyframes, config.grid) for log in logs]
+    logs = [prepared(log, config) for log in logs]
     result = _build(logs, config, constraints, args.jobs)
     record = RunRecord(
         command=repeat_command(args),
@@ -257,12 +256,14 @@ def summary_json(
     """Return the summary for programs; report.json has everything."""
     import os
 
+    from ..io.result_text import notices
+
     return {
         "out": args.out,
         "files": [os.path.join(args.out, name) for name in names],
         "trusted": not result.doubts,
-        "doubts": result.doubts,
-        "warnings": result.warnings,
+        "doubts": notices(result.doubts),
+        "warnings": notices(result.warnings),
         "anchors": {
             a.id: {"x": a.position[0], "y": a.position[1], "bias": a.bias, "ranges": a.ranges, "status": a.status}
             for a in result.anchors
@@ -292,7 +293,7 @@ def summary_lines(
         size = f"{g.cols * g.resolution:.1f} x {g.rows * g.resolution:.1f} m at {g.resolution:g} m"
         lines[0] += f": {size}, {len(result.keyframe_stamps)} keyframes, {kept} of {len(result.closures)} loop closures"
     lines += [anchor_line(a) for a in result.anchors]
-    shown = (c for c in result.calibration if c.state == "estimated" and ":" not in c.name and abs(c.value) > 2.0 * c.sigma)
+    shown = (c for c in result.calibration if c.state == "estimated" and c.key.anchor is None and abs(c.value) > 2.0 * c.sigma)
     lines += [calibration_line(c) for c in shown]
     lines += [f"warning: {text}" for text in result.warnings]
     lines += [f"DOUBT: {text}" for text in result.doubts]

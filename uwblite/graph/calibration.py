@@ -1,18 +1,21 @@
-"""Self-calibration: which scalar unknowns the graph may carry, what is known of them beforehand, and their names."""
+"""Self-calibration: the scalar unknowns that a graph may carry, their kinds, and what is known of them beforehand."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..arrays import Bools, Ints
-from .graph import Calibration, Graph, PriorEdges
+from .graph import Calibration, Graph, PriorEdges, UnknownKey
 
-WHEELS = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
-"""Unknowns of the wheels."""
+ODOMETRY = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
+"""Kinds of unknowns of the odometry."""
 LASER = ("laser_x", "laser_y", "laser_theta", "laser_delay")
-"""Unknowns of the lidar."""
-RADIO = ("height2", "tag_x", "tag_y", "range_delay")
-"""Unknowns of the radio that a first estimate does without, by stem."""
+"""Kinds of unknowns of the lidar."""
+BIAS, HEIGHT, RANGE_SCALE = "bias", "height2", "range_scale"
+RADIO = (HEIGHT, "tag_x", "tag_y", "range_delay")
+"""Kinds of unknowns of the radio that the bootstrap does without."""
+SHARED = (*LASER, RANGE_SCALE)
+"""Kinds that all recordings have in common."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +58,7 @@ class CalibrationConfig:
 class Unknown:
     """One scalar of the calibration block."""
 
-    name: str
-    """For an anchor's own unknowns ``name:anchor_id``."""
+    key: UnknownKey
     sigma: float
     """Prior standard deviation around 0."""
     unit: str
@@ -64,63 +66,56 @@ class Unknown:
 
 
 def unknowns(
-    config: CalibrationConfig, anchor_ids: tuple[str, ...], told_height: Bools, recording: int = 0
+    config: CalibrationConfig, anchor_ids: tuple[str, ...], given_height: Bools, recording: int = 0
 ) -> tuple[Unknown, ...]:
     """List the scalar unknowns that a recording with these anchors brings into a graph.
 
-    Wheels, tag and clocks, and what an anchor's ranges are wrong by, are each recording's own: another robot, another
-    tag, another day. The scale of the radios and the mounting of the laser are those of the first recording.
+    Odometry, tag and clocks, and the systematic errors of ranges to an anchor, are each recording's own: another robot,
+    another tag, another day. The scale of the ranges and the mounting of the laser are shared by all.
 
     Parameters
     ----------
-    told_height : (a,) whose height is known.
-    recording : which one of the graph's; all but the first add their number to the names, see of_recording.
+    given_height : (a,) anchors whose height is given.
+    recording : which one of the graph's.
     """
     common = (
-        Unknown("odometry_scale", config.odometry_scale, "1", "relative error of travelled distance"),
-        Unknown("heading_scale", config.heading_scale, "1", "relative error of turned angle"),
-        Unknown("heading_per_metre", config.heading_per_metre, "rad/m", "heading drift per travelled metre"),
-        Unknown("heading_rate", config.heading_rate, "rad/s", "heading drift per second of motion"),
-        Unknown("laser_x", config.laser_offset, "m", "correction of the laser's x on the base"),
-        Unknown("laser_y", config.laser_offset, "m", "correction of the laser's y on the base"),
-        Unknown("laser_theta", config.laser_angle, "rad", "correction of the laser's heading on the base"),
-        Unknown("laser_delay", config.laser_delay, "s", "laser clock against odometry clock"),
-        Unknown("range_scale", config.range_scale, "1", "relative error of all ranges"),
-        Unknown("tag_x", config.tag_offset, "m", "correction of the tag's x on the base"),
-        Unknown("tag_y", config.tag_offset, "m", "correction of the tag's y on the base"),
-        Unknown("range_delay", config.range_delay, "s", "radio clock against odometry clock"),
+        ("odometry_scale", config.odometry_scale, "1", "relative error of travelled distance"),
+        ("heading_scale", config.heading_scale, "1", "relative error of turned angle"),
+        ("heading_per_metre", config.heading_per_metre, "rad/m", "heading drift per travelled metre"),
+        ("heading_rate", config.heading_rate, "rad/s", "heading drift per second of motion"),
+        ("laser_x", config.laser_offset, "m", "correction of the laser's x on the base"),
+        ("laser_y", config.laser_offset, "m", "correction of the laser's y on the base"),
+        ("laser_theta", config.laser_angle, "rad", "correction of the laser's heading on the base"),
+        ("laser_delay", config.laser_delay, "s", "laser clock against odometry clock"),
+        (RANGE_SCALE, config.range_scale, "1", "relative error of all ranges"),
+        ("tag_x", config.tag_offset, "m", "correction of the tag's x on the base"),
+        ("tag_y", config.tag_offset, "m", "correction of the tag's y on the base"),
+        ("range_delay", config.range_delay, "s", "radio clock against odometry clock"),
     )
-    own: list[Unknown] = []
-    for anchor_id, told in zip(anchor_ids, told_height, strict=True):
-        own.append(Unknown(f"bias:{anchor_id}", config.range_bias, "m", f"constant error of ranges to anchor {anchor_id}"))
-        if not told:
-            text = f"squared height of anchor {anchor_id} above the tag"
-            own.append(Unknown(f"height2:{anchor_id}", config.anchor_height**2, "m\u00b2", text))
-    listed = tuple(u for u in (*common, *own) if u.sigma > 0)
-    if recording > 0:
-        where = f" in recording {recording + 1}"
-        renamed = (replace(u, name=of_recording(u.name, recording), meaning=u.meaning + where) for u in listed)
-        listed = tuple(u for u in renamed if u.name not in SHARED)
-    return listed
+    where = f" in recording {recording + 1}" if recording else ""
+
+    def own(kind: str, sigma: float, unit: str, meaning: str, anchor: str | None = None) -> Unknown:
+        shared = kind in SHARED
+        key = UnknownKey(kind, anchor, None if shared else recording)
+        return Unknown(key, sigma, unit, meaning if shared else meaning + where)
+
+    listed = [own(*row) for row in common]
+    for anchor, given in zip(anchor_ids, given_height, strict=True):
+        listed.append(own(BIAS, config.range_bias, "m", f"constant error of ranges to anchor {anchor}", anchor))
+        if not given:
+            text = f"squared height of anchor {anchor} above the tag"
+            listed.append(own(HEIGHT, config.anchor_height**2, "m\u00b2", text, anchor))
+    return tuple(u for u in listed if u.sigma > 0 and (u.key.recording is not None or recording == 0))
 
 
-SHARED = ("laser_x", "laser_y", "laser_theta", "laser_delay", "range_scale")
-"""Unknowns that all recordings have in common."""
-
-
-def of_recording(name: str, recording: int) -> str:
-    """Return what an unknown is called in a recording: ``name`` in the first (0), ``name#2`` in the second ..., where own."""
-    return name if recording == 0 or name in SHARED else f"{name}#{recording + 1}"
-
-
-def stem(name: str) -> str:
-    """Return the name of an unknown without the anchor and the recording that it belongs to."""
-    return name.split(":")[0].split("#")[0]
+def of_recording(key: UnknownKey, recording: int) -> UnknownKey:
+    """Return the key of an unknown in a recording; a shared one is the same in all."""
+    return key if key.recording is None else key._replace(recording=recording)
 
 
 def block(listed: tuple[Unknown, ...]) -> Calibration:
     """Return the calibration block with every unknown at its nominal value, 0."""
-    return Calibration(tuple(u.name for u in listed), np.zeros(len(listed)))
+    return Calibration(tuple(u.key for u in listed), np.zeros(len(listed)))
 
 
 def prior_edges(listed: tuple[Unknown, ...]) -> PriorEdges:
@@ -129,23 +124,22 @@ def prior_edges(listed: tuple[Unknown, ...]) -> PriorEdges:
     return PriorEdges("calibration", np.arange(len(listed)), np.zeros((len(listed), 1)), (1.0 / sigma)[:, None, None])
 
 
-def indices(calibration: Calibration, *names: str) -> Ints:
-    """Return the positions (len(names),) of names in the block, -1 where one is not an unknown."""
-    return np.array([calibration.index(name) for name in names], dtype=np.int64)
+def indices(calibration: Calibration, *kinds: str) -> Ints:
+    """Return the positions (len(kinds),) in the block, -1 where one is not an unknown."""
+    return np.array([calibration.index(kind) for kind in kinds], dtype=np.int64)
 
 
 def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str, ...]) -> Ints:
     """Return the (m, 6) calibration indices of RangeEdges for ranges to the given anchors (m,)."""
-    bias = indices(calibration, *(f"bias:{a}" for a in anchor_ids))
-    height = indices(calibration, *(f"height2:{a}" for a in anchor_ids))
-    scale, tag_x, tag_y, delay = indices(calibration, "range_scale", "tag_x", "tag_y", "range_delay")
-    table = np.stack([np.full(len(bias), scale), bias, height, *(np.full(len(bias), k) for k in (tag_x, tag_y, delay))], axis=1)
-    return table[anchor]
+    own = [[calibration.index(kind, a) for kind in (BIAS, HEIGHT)] for a in anchor_ids]
+    scale, tag_x, tag_y, delay = indices(calibration, RANGE_SCALE, "tag_x", "tag_y", "range_delay").tolist()
+    table = [(scale, bias, height, tag_x, tag_y, delay) for bias, height in own]
+    return np.array(table, dtype=np.int64).reshape(-1, 6)[anchor]
 
 
 def odometry_indices(calibration: Calibration, edges: int) -> Ints:
     """Return the (e, 4) calibration indices of OdometryEdges."""
-    return np.broadcast_to(indices(calibration, *WHEELS), (edges, 4))
+    return np.broadcast_to(indices(calibration, *ODOMETRY), (edges, 4))
 
 
 def scan_indices(calibration: Calibration) -> Ints:
@@ -153,17 +147,16 @@ def scan_indices(calibration: Calibration) -> Ints:
     return indices(calibration, *LASER)
 
 
-def with_free(graph: Graph, *names: str) -> Graph:
-    """Return the graph with calibration unknowns of these names (an anchor's or a recording's own by their stem) set free."""
+def with_free(graph: Graph, *kinds: str) -> Graph:
+    """Return the graph with the calibration unknowns of these kinds set free."""
     assert graph.fixed_calibration is not None
-    named = np.array([stem(name) in names for name in graph.calibration.names], dtype=bool)
-    return replace(graph, fixed_calibration=graph.fixed_calibration & ~named)
+    return replace(graph, fixed_calibration=graph.fixed_calibration & ~graph.calibration.of_kinds(*kinds))
 
 
 def with_nonnegative_heights(graph: Graph) -> Graph:
-    """Return the graph with squared heights that came out negative put back to 0 and held."""
-    names, values = graph.calibration.names, graph.calibration.values.copy()
-    below = np.array([n.startswith("height2:") for n in names], dtype=bool) & (values < 0.0)
+    """Return the graph with squared heights that came out negative put back to 0 and fixed."""
+    values = graph.calibration.values.copy()
+    below = graph.calibration.of_kinds(HEIGHT) & (values < 0.0)
     values[below] = 0.0
     fixed = np.asarray(graph.fixed_calibration) | below
     return replace(graph.updated(graph.poses, graph.anchors, values), fixed_calibration=fixed)

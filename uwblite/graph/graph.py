@@ -12,7 +12,7 @@ residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with 
 """
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -64,22 +64,46 @@ class Edges(Protocol):
         """Return whitened residuals and Jacobians."""
 
 
+class UnknownKey(NamedTuple):
+    """What a scalar unknown is: its kind, and the anchor and the recording that it belongs to."""
+
+    kind: str
+    """One of the kinds of calibration.py."""
+    anchor: str | None = None
+    """Id; None = of no single anchor."""
+    recording: int | None = None
+    """0, 1, ...; None = all recordings have it in common."""
+
+    @property
+    def label(self) -> str:
+        """The key as text: ``bias:5C0B``, in the second recording ``bias:5C0B#2``."""
+        anchor = "" if self.anchor is None else f":{self.anchor}"
+        return f"{self.kind}{anchor}{f'#{self.recording + 1}' if self.recording else ''}"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """Named scalar unknowns."""
+    """Scalar unknowns."""
 
-    names: tuple[str, ...] = ()
+    keys: tuple[UnknownKey, ...] = ()
     values: Floats = field(default_factory=lambda: np.zeros(0))
-    """(c,), unit by name: see calibration.py."""
+    """(c,), unit by kind: see calibration.py."""
 
-    def index(self, name: str) -> int:
-        """Return the position of a name, -1 where it is not an unknown of this graph."""
-        return self.names.index(name) if name in self.names else -1
+    def index(self, kind: str, anchor: str | None = None, recording: int | None = None) -> int:
+        """Return the position of an unknown, -1 where the graph has none such; recording None = the first that has one."""
+        for number, key in enumerate(self.keys):
+            if key.kind == kind and key.anchor == anchor and recording in (None, key.recording):
+                return number
+        return -1
 
-    def get(self, name: str, default: float = 0.0) -> float:
-        """Return the value of a name, or the default where it is not an unknown of this graph."""
-        i = self.index(name)
+    def get(self, kind: str, default: float = 0.0) -> float:
+        """Return the value of an unknown of no single anchor, or the default where the graph has none such."""
+        i = self.index(kind)
         return default if i < 0 else float(self.values[i])
+
+    def of_kinds(self, *kinds: str) -> Bools:
+        """Return which unknowns (c,) are of these kinds."""
+        return np.array([key.kind in kinds for key in self.keys], dtype=bool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..map_result import MapResult
+from ..map_result import MapResult, Notice
 from ..printable import encodable
 from ..sensor_log import LogNotes, SensorLog
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of report.json; it grows when a field changes its meaning or goes."""
 
 _CALIBRATION_FIELDS = ("name", "value", "sigma", "unit", "meaning", "state", "reason")
@@ -106,8 +106,8 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "inputs": [_input_entry(log.notes) for log in logs],
         "recording": recording_figures(logs, result),
         "trusted": not result.doubts,
-        "doubts": list(result.doubts),
-        "warnings": list(result.warnings),
+        "doubts": notices(result.doubts),
+        "warnings": notices(result.warnings),
         "anchors": [_anchor_entry(a) for a in result.anchors],
         "calibration": [{name: getattr(c, name) for name in _CALIBRATION_FIELDS} for c in result.calibration],
         "closures": [_closure_entry(c, result.keyframe_stamps) for c in result.closures],
@@ -132,6 +132,11 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         }
     ready: dict[str, Any] = _ready(content)
     return ready
+
+
+def notices(found: Sequence[Notice]) -> list[dict[str, Any]]:
+    """Return warnings or doubts as JSON-ready records."""
+    return [{"kind": n.kind, "text": n.text, "figures": n.figures} for n in found]
 
 
 def recording_figures(logs: Sequence[SensorLog], result: MapResult) -> dict[str, Any]:
@@ -174,7 +179,7 @@ def _anchor_entry(anchor: Any) -> dict[str, Any]:
 
 
 def _closure_entry(closure: Any, stamps: NDArray[np.float64]) -> dict[str, Any]:
-    names = ("i", "j", "T_i_j", "information", "fitness", "overlap", "accepted", "reason")
+    names = ("i", "j", "T_i_j", "information", "fitness", "overlap", "accepted", "outcome", "reason")
     entry = {name: getattr(closure, name) for name in names}
     return {**entry, "stamp_i": float(stamps[closure.i]), "stamp_j": float(stamps[closure.j])}
 

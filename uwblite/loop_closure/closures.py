@@ -72,16 +72,16 @@ class Closures:
     """One per accepted candidate, in their order."""
     candidates: tuple[LoopClosure, ...]
 
-    def without(self, keep: Bools, reasons: Sequence[str]) -> "Closures":
+    def without(self, keep: Bools, outcome: str, reasons: Sequence[str]) -> "Closures":
         """Return the collection with some accepted candidates rejected.
 
         Parameters
         ----------
-        keep : (e,) of the edges. reasons : (e,) why each other one goes.
+        keep : (e,) of the edges. outcome : of each other one. reasons : (e,) its outcome in words.
         """
         story, standing = list(self.candidates), [k for k, c in enumerate(self.candidates) if c.accepted]
         for k in np.flatnonzero(~keep).tolist():
-            story[standing[k]] = replace(story[standing[k]], accepted=False, reason=reasons[k])
+            story[standing[k]] = replace(story[standing[k]], outcome=outcome, reason=reasons[k])
         return Closures(self.edges.rows(np.flatnonzero(keep)), tuple(story))
 
 

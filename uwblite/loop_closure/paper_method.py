@@ -134,8 +134,9 @@ def _align(batch: _Batch) -> list[Registration]:
 
 
 def _story(i: int, j: int, found: Registration, information: Floats) -> LoopClosure:
+    outcome = "accepted" if found.converged else "not-converged"
     why = f"fitness score {found.fitness:.3g} m2 after {found.iterations} iterations" if found.converged else found.reason
-    return LoopClosure(i, j, found.T_target_source, information, found.rmse, found.overlap, found.converged, why)
+    return LoopClosure(i, j, found.T_target_source, information, found.rmse, found.overlap, outcome, why)
 
 
 def _root(information: Floats) -> Floats:

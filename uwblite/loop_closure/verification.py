@@ -50,14 +50,14 @@ def find(
     result = fits.best
     variance = np.full(len(result.pose), config.match_sigma**2 * config.correlation)
     z, sqrt_information = measured(result.factors, result.pose, variance)
-    why = _judge(candidates, fits, z, sqrt_information, config)
-    return _collect(candidates, submaps, result, z, sqrt_information, why)
+    verdicts = _judge(candidates, fits, z, sqrt_information, config)
+    return _collect(candidates, submaps, result, z, sqrt_information, verdicts)
 
 
 def _judge(
     candidates: Candidates, fits: ClosureMatches, z: Floats, sqrt_information: Floats, config: LoopClosureConfig
-) -> list[str]:
-    """Return why each candidate is rejected; '' = accepted so far."""
+) -> list[tuple[str, str]]:
+    """Return the outcome of each candidate so far, one of map_result.OUTCOMES, and its reason in words."""
     result, searched = fits.best, candidates.spread > config.direct
     error = se2.between(z, candidates.guess)
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
@@ -69,42 +69,45 @@ def _judge(
     distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), visible)
     strength = np.linalg.eigvalsh(information)[:, 1]
     most = config.consistency if candidates.held else np.inf
-    why: list[str] = []
+    verdicts: list[tuple[str, str]] = []
     for k in range(len(z)):
         least = config.overlap_after_search if searched[k] else config.overlap
         if not fits.found[k]:
-            text = "the search found no place for it"
+            verdict = "not-found", "the search found no place for it"
         elif result.share[k] < least:
-            text = f"only {result.share[k]:.0%} of its points match (least {least:.0%})"
+            verdict = "few-matches", f"only {result.share[k]:.0%} of its points match (least {least:.0%})"
         elif result.rms[k] > config.sigma:
-            text = f"matches lie {result.rms[k]:.3f} m apart (most {config.sigma:g} m)"
+            verdict = "far-matches", f"matches lie {result.rms[k]:.3f} m apart (most {config.sigma:g} m)"
         elif fits.through[k] > config.through:
             text = f"{fits.through[k]:.0%} of its points would stand where free space was seen (most {config.through:.0%})"
+            verdict = "free-space-violation", text
         elif strength[k] < 1.0:
-            text = "the surfaces fix neither position nor heading"
+            verdict = "degenerate", "the surfaces fix neither position nor heading"
         elif searched[k] and fits.second[k] > config.uniqueness:
-            text = f"another place matches {fits.second[k]:.0%} as well"
+            verdict = "ambiguous", f"another place matches {fits.second[k]:.0%} as well"
         elif distance[k] > most:
             text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {most:g})"
+            verdict = "contradicts-graph", text
         else:
-            text = ""
-        why.append(text)
-    return why
+            verdict = "accepted", f"{result.share[k]:.0%} of its points match within {result.rms[k]:.3f} m"
+        verdicts.append(verdict)
+    return verdicts
 
 
 def _collect(
-    candidates: Candidates, submaps: Submaps, result: Aligned, z: Floats, sqrt_information: Floats, why: list[str]
+    candidates: Candidates, submaps: Submaps, result: Aligned, z: Floats, sqrt_information: Floats,
+    verdicts: list[tuple[str, str]],
 ) -> Closures:
+    """Return every candidate with its outcome, and the accepted ones as edges between the sub-maps' keyframes."""
     i, j = submaps.reference[candidates.target], submaps.reference[candidates.source]
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
     story = tuple(
         LoopClosure(
-            int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), not why[k],
-            why[k] or f"{result.share[k]:.0%} of its points match within {result.rms[k]:.3f} m",
+            int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), outcome, reason
         )
-        for k in range(len(z))
+        for k, (outcome, reason) in enumerate(verdicts)
     )
-    good = np.array([not text for text in why], dtype=bool)
+    good = np.array([closure.accepted for closure in story], dtype=bool)
     return Closures(RelativePoseEdges(i[good], j[good], z[good], sqrt_information[good]), story)
 
 
@@ -125,5 +128,6 @@ def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solve
     residuals = closures.edges.residuals(solved)
     squared = np.einsum("ed,ed->e", residuals, residuals)
     kept = squared < config.consistency
-    left = closures.without(kept, [f"contradicts the other closures: chi2 {chi2:.0f}" for chi2 in squared])
+    reasons = [f"contradicts the other closures: chi2 {chi2:.0f}" for chi2 in squared]
+    left = closures.without(kept, "contradicts-closures", reasons)
     return solved, replace(left, edges=replace(left.edges, kernel=Kernel("cauchy", 3.0)))

@@ -1,79 +1,77 @@
-"""Rounds of closing loops: sub-maps, candidates, matches, second optimisation, until nothing new is found."""
+"""Rounds of loop closing: sub-maps, candidates, matches, second optimisation, until nothing new is found."""
 
-from concurrent.futures import Executor
 from dataclasses import replace
 
-from ..graph.graph import Edges
 from ..graph.marginals import JointCovariance
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
 from ..loop_closure import candidates as closure_candidates
 from ..loop_closure import closures, paper_method, verification
 from ..loop_closure.closures import Closures
-from ..mapping_config import MappingConfig
-from .lidar_stages import Scans
-from .progress import Stages, solver_figures
-from .recordings import Estimate, Recordings
+from .estimate import Estimate, Task
+from .progress import solver_figures
 
 
-def close(
-    estimate: Estimate, edges: tuple[Edges, ...], scans: Scans, recordings: Recordings, config: MappingConfig, stages: Stages,
-    executor: Executor | None,
-) -> tuple[Estimate, Closures]:
+def close_loops(estimate: Estimate, task: Task) -> Estimate:
     """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
-    recording = recordings.of_keyframe
-    base = estimate.graph.with_edges(*edges)
+    config, recordings, scans = task.config, task.recordings, estimate.scans
+    assert scans is not None
+    base = estimate.graph.with_edges(*estimate.odometry_and_ranges, *estimate.steps_and_closures)
     found = closures.no_closures()
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
-    held = estimate.radio is not None
+    with_ranges = estimate.ranges is not None
     for lap in range(config.loops.rounds):
-        pieces = submaps.build(scans.clouds, base.poses, recordings.path, recording, config.submaps)
+        pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
         free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
         pieces = visibility.static_points(pieces, free)
-        known = JointCovariance(base.with_edges(found.edges), pieces.reference)
-        candidates = closure_candidates.propose(base, known, pieces, recording, tried, missed, held, config.loops)
-        tried |= candidates.names(config.loops)
-        reporter = stages.reporter("loop closure")
-        rules = replace(
-            config.loops, through=max(config.loops.through, visibility.dynamic_share(pieces, free, base.poses, recording))
+        covariance = JointCovariance(base.with_edges(found.edges), pieces.reference)
+        candidates = closure_candidates.propose(
+            base, covariance, pieces, recordings.of_keyframe, tried, missed, with_ranges, config.loops
         )
-        new = verification.find(candidates, pieces, rules, config.search, reporter, free, executor)
-        new = _without_forbidden(new, scans)
-        missed |= set() if held else closure_candidates.missed(candidates, new, config.loops)
+        tried |= candidates.names(config.loops)
+        dynamic = visibility.dynamic_share(pieces, free, base.poses, recordings.of_keyframe)
+        rules = replace(config.loops, through=max(config.loops.through, dynamic))
+        reporter = task.stages.reporter("loop closure")
+        new = verification.find(candidates, pieces, rules, config.search, reporter, free, task.executor)
+        new = _without_forbidden(new, task)
+        missed |= set() if with_ranges else closure_candidates.missed(candidates, new, config.loops)
         found = closures.merged(found, new)
         base, found = verification.reconcile(base, found, config.loops, config.solver)
-        stages.end(
+        task.stages.end(
             f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(candidates.target),
-            accepted=len(new.edges), standing=len(found.edges),
-        )
+            accepted=len(new.edges), kept=len(found.edges),
+        )  # fmt: skip
         tied = len(found.edges) >= config.loops.enough * len(pieces)
         unsearched = missed - {(a, b) for a, b, searched in tried if searched}
         if (tied or len(new.edges) <= 0.05 * len(found.edges)) and not unsearched:
             break
-    return replace(estimate, graph=estimate.graph.with_estimates_of(base)), found
+    return replace(estimate, closures=found).with_estimates_of(base)
 
 
-def close_plainly(
-    estimate: Estimate, edges: tuple[Edges, ...], scans: Scans, recordings: Recordings, config: MappingConfig, stages: Stages,
-    executor: Executor | None,
-) -> tuple[Estimate, Closures]:
-    """Align sub-maps pair by pair and solve once more with those that fit (paper: second optimisation)."""
-    graph, recording = estimate.graph, recordings.of_keyframe
-    found = closures.no_closures()
+def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
+    """Align sub-maps pair by pair by ICP and solve once more with those that fit (paper: second optimisation)."""
+    config, recordings, scans = task.config, task.recordings, estimate.scans
+    assert scans is not None
+    edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
     for lap in range(config.loops.rounds):
-        pieces = submaps.build(scans.clouds, graph.poses, recordings.path, recording, config.submaps)
-        reporter = stages.reporter("loop closure")
-        found = paper_method.find(graph, pieces, recording, config.loops, config.icp, reporter, executor)
-        found = _without_forbidden(found, scans)
-        stages.end(f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(found.candidates), accepted=len(found.edges))
+        graph = estimate.graph
+        pieces = submaps.build(scans.clouds, graph.poses, recordings.path, recordings.of_keyframe, config.submaps)
+        reporter = task.stages.reporter("loop closure")
+        found = paper_method.find(
+            graph, pieces, recordings.of_keyframe, config.loops, config.icp, reporter, task.executor
+        )
+        found = _without_forbidden(found, task)
+        task.stages.end(
+            f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(found.candidates), accepted=len(found.edges)
+        )
         solved, result = optimize(graph.with_edges(*edges, found.edges), config.solver)
-        graph = graph.with_estimates_of(solved)
-        stages.end(f"second optimisation {lap + 1}", **solver_figures(result))
-    return replace(estimate, graph=graph), found
+        estimate = replace(estimate, closures=found).with_estimates_of(solved)
+        task.stages.end(f"second optimisation {lap + 1}", **solver_figures(result))
+    return estimate
 
 
-def _without_forbidden(found: Closures, scans: Scans) -> Closures:
+def _without_forbidden(found: Closures, task: Task) -> Closures:
     """Return closures with those the user has forbidden rejected."""
-    kept = scans.may_meet(found.edges.i, found.edges.j)
-    return found if kept.all() else found.without(kept, ["forbidden by the constraints"] * len(kept))
+    kept = task.allowed(found.edges.i, found.edges.j)
+    return found if kept.all() else found.without(kept, "forbidden", ["forbidden by the constraints"] * len(kept))

@@ -18,7 +18,31 @@ from ..graph.distance_edges import AnchorDistanceEdges
 from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
+from ..graph.solver import optimize
 from ..se2 import align
+from .estimate import Estimate, Task
+
+
+def apply_given(estimate: Estimate, task: Task) -> Estimate:
+    """Bring the estimate into the user's frame, where one is given, and add what is given to the edges.
+
+    Raises
+    ------
+    ConfigError : an anchor is not in the recording, a stamp lies outside it, or places are given together with `align`.
+    """
+    given, config = task.given, task.config
+    if given.places and config.align != "odometry":
+        raise ConfigError("given places say where the map lies; leave out align, or the places")
+    done = apply(given, estimate.graph, estimate.anchor_ids, estimate.placed, task.recordings.clock)
+    for anchor, off in done.moved.items():
+        task.stages.warn(
+            "moved-anchor", f"anchor {anchor} stands {off:.2f} m from its earlier place: it was moved",
+            anchor=anchor, distance=off,
+        )  # fmt: skip
+    solved = optimize(done.graph.with_edges(*estimate.odometry_and_ranges), config.solver)[0]
+    shift = [round(v, 4) for v in done.motion.tolist()]
+    task.stages.end("constraints", moved=sorted(done.moved), shift=shift)
+    return replace(estimate, graph=done.graph).with_estimates_of(solved).with_hypotheses_moved(done.motion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,32 +23,31 @@ from ..graph.range_edges import RangeEdges
 from ..radio.bootstrap import BootstrapResult
 from ..radio.trilateration import AnchorHypothesis
 from .constraint_edges import consensus
-from .recordings import Estimate, JoinResult, Recording, Recordings, moved_anchor_text, moved_hypotheses, numbered
+from .estimate import Estimate, Task
+from .recordings import Recording, Recordings
 
 _FIRST_TOLERANCE = 0.5
 """How far first estimates of one anchor may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""
 
 
-def join(estimates: Sequence[Estimate], recordings: Recordings) -> JoinResult:
+def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
     """Bring all recordings into the frame of the first, by the anchors they have in common, and make them one graph.
 
     Recordings join in the order of how many anchors they share with those already in, so that a third may link two.
 
     Parameters
     ----------
-    parts : each recording's own estimates, in its own frame and numbering.
-    recordings : all of them, their keyframes in one numbering.
+    estimates : of each recording, in its own frame and numbering.
+    task : takes a warning for each anchor that was moved.
 
     Raises
     ------
     DataError : a recording shares fewer than two placed anchors with the others.
     """
-    if len(estimates) == 1:
-        return JoinResult(estimates[0], ())
+    recordings = task.recordings
     known = _places(estimates[0])
     motions = [np.zeros(3) for _ in estimates]
     names = [list(estimate.anchor_ids) for estimate in estimates]
-    warnings: list[str] = []
     waiting = list(range(1, len(estimates)))
     while waiting:
         found = {n: _places(estimates[n]) for n in waiting}
@@ -62,9 +61,23 @@ def join(estimates: Sequence[Estimate], recordings: Recordings) -> JoinResult:
             here = se2.transform(motions[number], here)
             if name in moved:
                 names[number][k] = _other_name(name, here, spread, number, known)
-                warnings.append(moved_anchor_text(name, moved[name], number, names[number][k]))
+                warn_of_moved_anchor(task, name, moved[name], number, names[number][k])
             known.setdefault(names[number][k], (here, spread))
-    return JoinResult(_one_graph(estimates, motions, names, recordings), tuple(warnings))
+    return _one_graph(estimates, motions, names, recordings)
+
+
+def warn_of_moved_anchor(task: Task, anchor: str, distance: float, recording: int, new_id: str) -> None:
+    """Warn that an anchor stands elsewhere in a recording (0, 1, ...) than before, by a distance, m."""
+    task.stages.warn(
+        "moved-anchor",
+        f"anchor {anchor} was moved: in recording {recording + 1} it stands {distance:.2f} m away, and is called {new_id}",
+        anchor=anchor, distance=round(distance, 4), recording=recording + 1, new_id=new_id,
+    )  # fmt: skip
+
+
+def numbered(anchor: str, recording: int) -> str:
+    """Return the id of an anchor that stands elsewhere in a recording than before."""
+    return f"{anchor}#{recording + 1}"
 
 
 def _other_name(name: str, here: Floats, spread: float, number: int, known: dict[str, tuple[Floats, float]]) -> str:
@@ -77,13 +90,13 @@ def _other_name(name: str, here: Floats, spread: float, number: int, known: dict
 
 
 def _places(estimate: Estimate) -> dict[str, tuple[Floats, float]]:
-    """Return place (2,) and standard deviation (m) of the anchors of a part that are clear; of all placed if these are few."""
-    if estimate.first is None:
+    """Return place (2,) and standard deviation (m) of the unambiguous anchors; of all placed if these are few."""
+    if estimate.bootstrap is None:
         return {}
-    placed = np.flatnonzero(estimate.first.placed & ~estimate.first.ambiguous)
+    placed = np.flatnonzero(estimate.placed & ~estimate.bootstrap.ambiguous)
     if len(placed) < 2:
-        placed = np.flatnonzero(estimate.first.placed)
-    spread = marginals(estimate.graph.with_edges(*estimate.edges)).anchors
+        placed = np.flatnonzero(estimate.placed)
+    spread = marginals(estimate.graph.with_edges(*estimate.odometry_and_ranges)).anchors
     return {
         estimate.anchor_ids[k]: (estimate.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, 25.0))))
         for k in placed
@@ -111,32 +124,32 @@ def _laid_on(
 def _one_graph(
     estimates: Sequence[Estimate], motions: Sequence[Floats], names: Sequence[Sequence[str]], recordings: Recordings
 ) -> Estimate:
-    """Make the parts one, each moved by its motion, its anchors under the given names."""
+    """Make the estimates one, each moved by its motion, its anchors under the given names."""
     ids = tuple(dict.fromkeys(name for own in names for name in own))
     place = [np.array([ids.index(name) for name in own], dtype=np.int64) for own in names]
     block, priors, fixed, at = _one_calibration([estimate.graph for estimate in estimates])
     poses = np.concatenate([se2.compose(m, estimate.graph.poses) for m, estimate in zip(motions, estimates, strict=True)])
-    first = _one_first_estimate(estimates, motions, place, len(ids))
+    joined = _one_bootstrap(estimates, motions, place, len(ids))
     anchors = np.zeros((len(ids), 2))
     for estimate, motion, own in zip(reversed(estimates), reversed(motions), reversed(place), strict=True):
-        known = np.zeros(len(own), dtype=bool) if estimate.first is None else estimate.first.placed
-        anchors[own[known]] = se2.transform(motion, estimate.graph.anchors[known])
+        placed = estimate.placed
+        anchors[own[placed]] = se2.transform(motion, estimate.graph.anchors[placed])
     graph = Graph(
-        poses, anchors, (priors,), block, fixed_anchors=None if first is None else ~first.placed, fixed_calibration=fixed
+        poses, anchors, (priors,), block, fixed_anchors=None if joined is None else ~joined.placed, fixed_calibration=fixed
     )
     return replace(
-        estimates[0], graph=graph, wheels=_one_wheels([p.wheels for p in estimates], at, recordings),
-        radio=_one_radio([p.radio for p in estimates], at, place, recordings), first=first, anchor_ids=ids,
+        estimates[0], graph=graph, odometry=_one_odometry([e.odometry for e in estimates], at, recordings),
+        ranges=_one_ranges([e.ranges for e in estimates], at, place, recordings), bootstrap=joined, anchor_ids=ids,
     )  # fmt: skip
 
 
 def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, Bools, list[Ints]]:
     """Return the block of all recordings' unknowns, its priors, which are held, and where each graph's are in it."""
-    named = [tuple(calibration.of_recording(name, n) for name in graph.calibration.names) for n, graph in enumerate(graphs)]
-    names = tuple(dict.fromkeys(name for own in named for name in own))
-    block = Calibration(names, np.zeros(len(names)))
-    at = [calibration.indices(block, *own) for own in named]
-    values, roots, fixed = block.values, np.zeros((len(names), 1, 1)), np.ones(len(names), dtype=bool)
+    keyed = [[calibration.of_recording(key, n) for key in graph.calibration.keys] for n, graph in enumerate(graphs)]
+    keys = tuple(dict.fromkeys(key for own in keyed for key in own))
+    block, place = Calibration(keys, np.zeros(len(keys))), {key: k for k, key in enumerate(keys)}
+    at = [np.array([place[key] for key in own], dtype=np.int64) for own in keyed]
+    values, roots, fixed = block.values, np.zeros((len(keys), 1, 1)), np.ones(len(keys), dtype=bool)
     for graph, own in zip(reversed(graphs), reversed(at), strict=True):
         assert graph.fixed_calibration is not None
         fixed[own] &= graph.fixed_calibration
@@ -144,18 +157,18 @@ def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, 
         for edges in graph.edges:
             if isinstance(edges, PriorEdges) and edges.block == "calibration":
                 roots[own[edges.index]] = edges.sqrt_information
-    return block, PriorEdges("calibration", np.arange(len(names)), np.zeros((len(names), 1)), roots), fixed, at
+    return block, PriorEdges("calibration", np.arange(len(keys)), np.zeros((len(keys), 1)), roots), fixed, at
 
 
-def _one_first_estimate(
+def _one_bootstrap(
     estimates: Sequence[Estimate], motions: Sequence[Floats], place: Sequence[Ints], anchors: int
 ) -> BootstrapResult | None:
-    """Return the first estimates as one: an anchor that one recording shows clearly is clear."""
+    """Return the bootstraps as one: an anchor that one recording shows clearly is clear."""
     placed, clear = np.zeros(anchors, dtype=bool), np.zeros(anchors, dtype=bool)
     hypotheses: list[tuple[AnchorHypothesis, ...]] = [()] * anchors
-    some = [estimate.first for estimate in estimates if estimate.first is not None]
+    some = [estimate.bootstrap for estimate in estimates if estimate.bootstrap is not None]
     for estimate, motion, own in zip(estimates, motions, place, strict=True):
-        moved = moved_hypotheses(estimate.first, motion)
+        moved = estimate.with_hypotheses_moved(motion).bootstrap
         if moved is None:
             continue
         for k, here in enumerate(own.tolist()):
@@ -172,38 +185,33 @@ def _renamed(indices: Ints, at: Ints) -> Ints:
     return np.append(at, -1)[indices]
 
 
-def _one_wheels(wheels: Sequence[OdometryEdges], at: Sequence[Ints], recordings: Recordings) -> OdometryEdges:
-    first = [s.first for s in recordings.each]
-    return replace(
-        wheels[0],
-        i=np.concatenate([w.i + f for w, f in zip(wheels, first, strict=True)]),
-        j=np.concatenate([w.j + f for w, f in zip(wheels, first, strict=True)]),
-        motion=np.concatenate([w.motion for w in wheels]),
-        length=np.concatenate([w.length for w in wheels]),
-        duration=np.concatenate([w.duration for w in wheels]),
-        sqrt_information=np.concatenate([w.sqrt_information for w in wheels]),
-        calibration=np.concatenate([_renamed(w.calibration, a) for w, a in zip(wheels, at, strict=True)]),
-    )
+def _one_odometry(odometry: Sequence[OdometryEdges], at: Sequence[Ints], recordings: Recordings) -> OdometryEdges:
+    """Return the odometry edges of all recordings."""
+    first = [recording.first for recording in recordings.each]
+    rows: dict[str, Any] = {name: np.concatenate([getattr(e, name) for e in odometry]) for name in _ODOMETRY_ROWS}
+    for end in ("i", "j"):
+        rows[end] = np.concatenate([getattr(e, end) + f for e, f in zip(odometry, first, strict=True)])
+    rows["calibration"] = np.concatenate([_renamed(e.calibration, a) for e, a in zip(odometry, at, strict=True)])
+    return replace(odometry[0], **rows)
 
 
-def _one_radio(
-    radios: Sequence[RangeEdges | None], at: Sequence[Ints], place: Sequence[Ints], recordings: Recordings
+_ODOMETRY_ROWS = ("motion", "length", "duration", "sqrt_information")
+_RANGE_ROWS = ("pose", "anchor", "ranges", "sigma", "lever_arm", "turn", "velocity", "height", "calibration", "stamps")
+
+
+def _one_ranges(
+    ranges: Sequence[RangeEdges | None], at: Sequence[Ints], place: Sequence[Ints], recordings: Recordings
 ) -> RangeEdges | None:
-    """Return the ranges of all; what tags sit elsewhere than the first goes into the lever arms."""
+    """Return the ranges of all recordings; the offset of a tag from the first recording's goes into the lever arms."""
     moved = []
-    tag = next((r.tag for r in radios if r is not None), None)
-    for radio, recording, own, rename in zip(radios, recordings.each, place, at, strict=True):
-        if radio is not None and tag is not None:
-            arm = radio.lever_arm + se2.rotate(radio.turn, radio.tag - tag)
-            moved.append(
-                replace(
-                    radio, pose=radio.pose + recording.first, anchor=own[radio.anchor], lever_arm=arm, tag=tag,
-                    calibration=_renamed(radio.calibration, rename),
-                )
-            )  # fmt: skip
+    tag = next((r.tag for r in ranges if r is not None), None)
+    for own, recording, anchors, rename in zip(ranges, recordings.each, place, at, strict=True):
+        if own is not None and tag is not None:
+            arm = own.lever_arm + se2.rotate(own.turn, own.tag - tag)
+            own = replace(own, pose=own.pose + recording.first, anchor=anchors[own.anchor], lever_arm=arm, tag=tag)
+            moved.append(replace(own, calibration=_renamed(own.calibration, rename)))
     if not moved:
         return None
-    stacked = ("pose", "anchor", "ranges", "sigma", "lever_arm", "turn", "velocity", "height", "calibration", "stamps")
-    rows: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in moved]) for name in stacked}
+    rows: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in moved]) for name in _RANGE_ROWS}
     rows["weights"] = np.concatenate([np.ones(len(r)) if r.weights is None else r.weights for r in moved])
     return replace(moved[0], **rows)

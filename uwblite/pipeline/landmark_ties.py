@@ -6,7 +6,7 @@ visit of one landmark to each visit of the other, so that walls, wheels and cali
 weigh as much as the one measurement that they are.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,12 @@ from ..constraints import Constraints, KnownLandmark
 from ..errors import ConfigError
 from ..graph.distance_edges import PointDistanceEdges
 from ..graph.graph import Graph
+from ..graph.solver import optimize
 from ..lidar.clouds import Clouds
 from ..lidar.columns import Landmarks, find_columns, fit_circle
+from . import map_frame
+from .estimate import Estimate, Task
+from .lidar_stages import refine_jointly
 
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
@@ -86,6 +90,27 @@ def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
     return centre if np.hypot(*(centre - place)) < _NEAR else place
 
 
+def tie_landmarks(estimate: Estimate, task: Task) -> Estimate:
+    """Let given distances between landmarks act on the map as it is without them.
+
+    Raises
+    ------
+    ConfigError : there is no lidar, or see ties.
+    """
+    given, config, scans = task.given, task.config, estimate.scans
+    if scans is None:
+        raise ConfigError("constraints: distances between landmarks need the lidar, which sees them")
+    motion = map_frame.alignment_of(estimate, task)
+    tied = ties(given, scans.clouds, se2.compose(motion, estimate.graph.poses), task.recordings.path)
+    solved = optimize(estimate.problem.with_edges(tied.edges), config.solver)[0]
+    estimate = replace(estimate, graph=estimate.graph.with_edges(tied.edges)).with_estimates_of(solved)
+    if estimate.joint is not None:
+        estimate = refine_jointly(estimate, task)
+    figures = outcome(task, tied, estimate.graph)
+    task.stages.end("landmark distances", distances=figures)
+    return estimate
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Ties:
     """Measured distances as edges between the poses that see the landmarks."""
@@ -105,7 +130,7 @@ def ties(known: Constraints, clouds: Clouds, poses: Floats, path: Floats) -> Tie
 
     Raises
     ------
-    ConfigError : a landmark is not told of, or is not there.
+    ConfigError : a landmark is not given of, or is not there.
     """
     listed = {landmark.name: landmark for landmark in known.landmarks}
     wanted = [name for d in known.landmark_distances for name in d.landmarks]
@@ -114,29 +139,30 @@ def ties(known: Constraints, clouds: Clouds, poses: Floats, path: Floats) -> Tie
         raise ConfigError(f"constraints: [[landmark_distance]] names {missing[0]!r}, of which there is no [[landmark]]")
     found = {name: sightings(listed[name], clouds, poses, path) for name in dict.fromkeys(wanted)}
     rows: list[tuple[NDArray[Any], ...]] = []
-    for number, told in enumerate(known.landmark_distances):
-        one, other = (found[name] for name in told.landmarks)
+    for number, given in enumerate(known.landmark_distances):
+        one, other = (found[name] for name in given.landmarks)
         a, b = np.indices((len(one.keyframe), len(other.keyframe))).reshape(2, -1)
         flat = np.ones(len(a))
         ends = (one.keyframe[a], other.keyframe[b], one.position[a], other.position[b])
         # All ties of one measurement together weigh as much as it does.
-        rows.append((*ends, told.distance * flat, told.sigma * np.sqrt(len(a)) * flat, np.full(len(a), number)))
+        rows.append((*ends, given.distance * flat, given.sigma * np.sqrt(len(a)) * flat, np.full(len(a), number)))
     i, j, p, q, distance, sigma, measured = (np.concatenate(column) for column in zip(*rows, strict=True))
     return Ties(PointDistanceEdges(i, j, p, q, distance, sigma), measured)
 
 
-def outcome(known: Constraints, tied: Ties, graph: Graph) -> tuple[list[dict[str, object]], list[str]]:
-    """Return the distances as a map has them, ready for a report, and in words those that it does not keep."""
+def outcome(task: Task, tied: Ties, graph: Graph) -> list[dict[str, object]]:
+    """Return the distances as a map has them, ready for a report; warn of those that it does not keep."""
     lengths = tied.edges.lengths(graph)
     figures: list[dict[str, object]] = []
-    warnings: list[str] = []
-    for number, told in enumerate(known.landmark_distances):
+    for number, given in enumerate(task.given.landmark_distances):
         length = float(np.mean(lengths[tied.measured == number]))
-        names = " - ".join(told.landmarks)
-        figures.append({"landmarks": names, "measured": told.distance, "map": round(length, 4)})
-        if abs(length - told.distance) > 3.0 * told.sigma:
-            warnings.append(
-                f"the distance {names} is {length:.3f} m in the map, not the {told.distance:.3f} m that were measured: "
-                "everything else speaks against it"
+        names = " - ".join(given.landmarks)
+        figures.append({"landmarks": names, "measured": given.distance, "map": round(length, 4)})
+        if abs(length - given.distance) > 3.0 * given.sigma:
+            task.stages.warn(
+                "landmark-distance",
+                f"the distance {names} is {length:.3f} m in the map, not the {given.distance:.3f} m that were measured: "
+                "all other measurements contradict it",
+                **figures[-1],
             )
-    return figures, warnings
+    return figures

@@ -10,6 +10,7 @@ from ..errors import ConfigError, DataError
 from ..graph.graph import Graph, PriorEdges
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid
+from .estimate import Estimate, Task
 
 ALIGNMENTS = ("odometry", "first-pose", "walls", "anchors")
 """odometry: the first pose is where the odometry began. first-pose: it is the origin, looking along x. walls: as
@@ -52,6 +53,21 @@ _BINS = 90
 def _quarter(angle: Floats) -> Floats:
     """Return the angle moved into (-pi/4, pi/4]."""
     return np.asarray(-(np.remainder(-angle + np.pi / 4, np.pi / 2) - np.pi / 4), dtype=np.float64)
+
+
+def align_axes(estimate: Estimate, task: Task) -> Estimate:
+    """Put the map's axes where the settings want them."""
+    motion = alignment_of(estimate, task)
+    return replace(estimate, graph=moved(estimate.graph, motion)).with_hypotheses_moved(motion)
+
+
+def alignment_of(estimate: Estimate, task: Task) -> Floats:
+    """Return T_new_map (3,), the motion that turns the map to where the settings want its axes."""
+    graph, normals = estimate.graph, np.zeros((0, 2))
+    if task.config.align == "walls" and estimate.scans is not None:
+        clouds = estimate.scans.clouds
+        normals = se2.rotate(graph.poses[clouds.owner, 2], clouds.normals)
+    return alignment(task.config.align, graph, estimate.placed, normals)
 
 
 def alignment(how: str, graph: Graph, placed: Bools, normals: Floats) -> Floats:
@@ -127,5 +143,5 @@ def cropped(grid: OccupancyGrid, box: tuple[float, float, float, float]) -> Occu
         )
     cols, rows = slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
     origin = geometry.origin + geometry.resolution * low
-    estimate = GridGeometry(geometry.resolution, origin, rows.stop - rows.start, cols.stop - cols.start)
-    return replace(grid, geometry=estimate, log_odds=grid.log_odds[rows, cols].copy())
+    part = GridGeometry(geometry.resolution, origin, rows.stop - rows.start, cols.stop - cols.start)
+    return replace(grid, geometry=part, log_odds=grid.log_odds[rows, cols].copy())

@@ -1,75 +1,153 @@
-"""What in the estimates themselves tells against them: values far from usual, turns of the wrong sign, readings out of time."""
+"""What speaks against a result: warnings and doubts from the estimates themselves.
 
-from collections.abc import Sequence
+Each check adds its notices to the task's stages; docs/formats.md lists their kinds.
+"""
+
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from ..arrays import Bools, Floats
-from ..graph.calibration import CalibrationConfig, Unknown, stem
-from ..graph.graph import Graph, PriorEdges
-from ..map_result import CalibrationEstimate
-from .recordings import Recordings
+from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
+from ..graph.graph import PriorEdges, UnknownKey
+from ..grid.occupancy_grid import OccupancyGrid
+from ..keyframes import OUTSIDE
+from ..map_result import AnchorEstimate, CalibrationEstimate
+from .estimate import Estimate, Task
 
 _UNUSUAL = 3.0
-"""Prior standard deviations beyond which an estimate is told."""
+"""Prior standard deviations beyond which an estimate is worth a warning."""
 _RADIO_OR_WHEELS = "check the radio's settings and, where no lidar measures the distances, the scale of the wheels"
 _WRONG_TURNS = 0.25
-"""Relative error of the wheels' turns beyond which their sign is no longer sure."""
+"""Relative error of the odometry's turns beyond which their sign is no longer sure."""
+_POOR_FIT = 4.0
+"""chi2 per degree of freedom beyond which errors are twice what the noise allows: the model does not hold."""
 
 
-def implausible_calibration(
-    calibrated: Sequence[CalibrationEstimate], usual: dict[str, Unknown], config: CalibrationConfig
-) -> list[str]:
-    """Return a warning for each estimate clearly far outside what is usual.
+def judge(
+    estimate: Estimate, anchors: Sequence[AnchorEstimate], calibrated: Sequence[CalibrationEstimate],
+    usual: Mapping[UnknownKey, Unknown], table: dict[str, Floats], grid: OccupancyGrid | None, task: Task,
+) -> None:
+    """Add the warnings and doubts that a finished estimate gives rise to.
 
     Parameters
     ----------
-    calibrated : estimates.
-    usual : unknowns with their prior standard deviations, by name.
-    config : says what scale of its ranges a sound radio has.
+    anchors, calibrated, grid : see MapResult. table : MapResult.range_table.
+    usual : unknowns with their prior standard deviations.
     """
-    told = []
+    check_anchors(anchors, task)
+    check_sensors(grid, task)
+    check_closures(estimate, anchors, grid, task)
+    check_calibration(calibrated, usual, task)
+    check_range_stamps(task, OUTSIDE)
+    if table:
+        check_sustained_outliers(table, estimate.anchor_ids, task)
+    check_handedness(estimate, task)
+    check_fit(task)
+
+
+def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
+    """Name anchors that are not ok; a mirror ambiguity is a doubt."""
+    for anchor in anchors:
+        if anchor.status != "ok":
+            add = task.stages.doubt if anchor.status == "mirror-ambiguous" else task.stages.warn
+            text = f"anchor {anchor.id} is {anchor.status}: {anchor.reason}"
+            add(f"anchor-{anchor.status}", text, anchor=anchor.id)
+    if anchors and all(a.status == "unplaced" for a in anchors):
+        text = "no anchor could be placed: the trajectory rests on odometry and lidar alone"
+        task.stages.doubt("no-anchor", text)
+
+
+def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:
+    """Warn of what was not recorded."""
+    logs = [recording.log for recording in task.recordings.each]
+    if not any(log.ranges is not None and len(log.ranges.ranges) for log in logs):
+        task.stages.warn("no-ranges", "no UWB ranges in use: the map rests on odometry and lidar")
+    if grid is None:
+        task.stages.warn("no-lidar", "no lidar in use: trajectory and anchors only, no map")
+    elif not any(log.scans is not None and np.isfinite(log.scans.ranges).any() for log in logs):
+        task.stages.warn("empty-scans", "the lidar saw nothing in any scan: the map is empty")
+
+
+def check_closures(
+    estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task
+) -> None:
+    """Name a map without loop closures, or one that more of them contradict than hold together."""
+    candidates = estimate.closures.candidates
+    accepted = sum(c.accepted for c in candidates)
+    placed = any(a.status != "unplaced" for a in anchors)
+    if grid is not None and candidates and accepted == 0:
+        add = task.stages.warn if placed else task.stages.doubt
+        add("no-closure", "no loop closure was accepted", candidates=len(candidates))
+    contradicted = sum(c.outcome == "contradicts-closures" for c in candidates)
+    if contradicted > max(accepted, 4):
+        text = f"{contradicted} loop closures contradict the rest, {accepted} agree"
+        task.stages.doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
+
+
+def check_calibration(
+    calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task
+) -> None:
+    """Warn of each calibration value far outside what is usual.
+
+    Parameters
+    ----------
+    usual : unknowns with their prior standard deviations; of sound radios it is the settings' range_scale_sound.
+    """
     for value in calibrated:
-        sigma = config.range_scale_sound if value.name == "range_scale" else usual[value.name].sigma
+        scale = value.key.kind == RANGE_SCALE
+        sigma = task.config.calibration.range_scale_sound if scale else usual[value.key].sigma
         clear = abs(value.value) > _UNUSUAL * max(sigma, value.sigma)
-        if value.state == "estimated" and not value.name.startswith("height2") and clear:
-            unit = "" if value.unit == "1" else f" {value.unit}"
-            told.append(
-                f"{value.meaning} came out as {value.value:+.3g} +- {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
-                + (_RADIO_OR_WHEELS if value.name == "range_scale" else "check that sensor and its settings")
-            )
-    return told
+        if value.state != "estimated" or value.key.kind == HEIGHT or not clear:
+            continue
+        unit = "" if value.unit == "1" else f" {value.unit}"
+        task.stages.warn(
+            "unusual-calibration",
+            f"{value.meaning} came out as {value.value:+.3g} +- {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
+            + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings"),
+            name=value.name, value=value.value, sigma=value.sigma, usual=sigma,
+        )  # fmt: skip
 
 
-def mirror_ambiguity(graph: Graph, recordings: Recordings, config: CalibrationConfig) -> list[str]:
-    """Return a doubt for each recording whose ranges or scans fit only where the wheels' turns are scaled grossly.
+def check_handedness(estimate: Estimate, task: Task) -> None:
+    """Doubt a map whose ranges or scans fit only where the odometry's turns are scaled grossly.
 
-    Ranges alone do not tell a map from its mirror image: a drive mirrored together with its anchors has the same ranges.
-    Only the sign of the wheels' turns does, and a laser, or anchors known beforehand. Where turns must be scaled by a
-    factor far from 1, by minus that factor the mirror image fits as well, and nothing vouches for the sign. A laser that
+    Ranges alone do not tell a map from its mirror image: a trajectory mirrored together with its anchors has the same
+    ranges. Only the sign of the odometry's turns does, and a laser, or given anchors. Where turns must be scaled by a
+    factor far from 1, by minus that factor the mirror image fits as well, and nothing decides the sign. A laser that
     sees the turns go the other way may itself be upside down.
     """
-    known = sum(len(e) for e in graph.edges if isinstance(e, PriorEdges) and e.block == "anchors")
-    if known > 2 or config.heading_scale <= 0.0:
-        return []
-    factors = [
-        1.0 + float(value)
-        for name, value in zip(graph.calibration.names, graph.calibration.values, strict=True)
-        if stem(name) == "heading_scale" and abs(value) > _WRONG_TURNS
-    ]
-    if any(recording.has_scans for recording in recordings.each):
-        return [
-            f"the map may be mirrored: the wheels' turns agree with the laser's only when multiplied by {factor:.2f}; "
-            "is the laser upside down (--laser-flipped), or does the odometry's heading count the other way?"
-            for factor in factors
-            if factor < 0.0
-        ]
-    return [
-        f"the map may be mirrored: the wheels' turns agree with the ranges only when multiplied by {factor:.2f}, "
-        f"and by {-factor:.2f} its mirror image fits as well; check sign and scale of the odometry's heading, "
-        "or give the places of three anchors"
-        for factor in factors
-    ]
+    graph = estimate.graph
+    given = sum(len(e) for e in graph.edges if isinstance(e, PriorEdges) and e.block == "anchors")
+    if given > 2 or task.config.calibration.heading_scale <= 0.0:
+        return
+    of_turns = graph.calibration.of_kinds("heading_scale")
+    for error in graph.calibration.values[of_turns].tolist():
+        factor = 1.0 + error
+        if task.recordings.have_scans:
+            wrong = factor < 0.0
+            text = (
+                f"the map may be mirrored: the odometry's turns agree with the laser's only when multiplied by {factor:.2f}; "
+                "is the laser upside down (--laser-flipped), or does the odometry's heading count the other way?"
+            )
+        else:
+            wrong = True
+            text = (
+                f"the map may be mirrored: the odometry's turns agree with the ranges only when multiplied by {factor:.2f}, "
+                f"and by {-factor:.2f} its mirror image fits as well; check sign and scale of the odometry's heading, "
+                "or give the places of three anchors"
+            )
+        if wrong and abs(error) > _WRONG_TURNS:
+            task.stages.doubt("mirrored", text, factor=factor)
+
+
+def check_fit(task: Task) -> None:
+    """Doubt a map whose residuals are far larger than the noise allows."""
+    fits = [float(stage.figures["chi2_per_dof"]) for stage in task.stages.done if "chi2_per_dof" in stage.figures]
+    if fits and fits[-1] > _POOR_FIT:
+        times = float(np.sqrt(fits[-1]))
+        text = f"measurements lie {times:.1f} times as far off as their noise allows (chi2/dof {fits[-1]:.1f})"
+        task.stages.doubt("poor-fit", text, chi2_per_dof=fits[-1])
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
@@ -87,37 +165,38 @@ def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]
     return [(float(stamps[bins[a][0]]), float(stamps[bins[b - 1][-1]])) for a, b in runs if b - a >= 2]
 
 
-def sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], start: float) -> list[str]:
-    """Return a warning for each anchor that is wrong for long: something stood in its way, or it was moved.
+def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], task: Task) -> None:
+    """Warn of each anchor whose ranges disagree with the map for long: its line of sight was blocked, or it was moved.
 
     Parameters
     ----------
-    table : MapResult.range_table. anchor_ids : names. start : stamp from which times are told, s.
+    table : MapResult.range_table. anchor_ids : names.
     """
-    told = []
+    start = float(task.recordings.stamps[0])
     for k, name in enumerate(anchor_ids):
         own = (table["anchor"] == k) & (table["weight"] > 0)
         stretches = outlier_stretches(table["stamp"][own], table["agrees"][own] > 0.5) if own.any() else []
         if stretches:
             when = ", ".join(f"{a - start:.0f} to {b - start:.0f} s" for a, b in stretches[:4])
-            told.append(
+            task.stages.warn(
+                "sustained-outliers",
                 f"anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
-                "its sight was blocked, or it was moved; these ranges count for little"
-            )
-    return told
+                "its line of sight was blocked, or it was moved; these ranges count for little",
+                anchor=name, stretches=stretches,
+            )  # fmt: skip
 
 
-def ranges_outside_odometry(recordings: Recordings, slack: float) -> list[str]:
-    """Return a warning where ranges were stamped outside the odometry's time by more than the slack, s."""
-    told = []
-    for recording in recordings.each:
+def check_range_stamps(task: Task, slack: float) -> None:
+    """Warn where ranges are stamped outside the odometry's time by more than the slack, s."""
+    for recording in task.recordings.each:
         ranges, odometry = recording.log.ranges, recording.log.odometry.stamps
         if ranges is None or not len(ranges.stamps):
             continue
         outside = int(np.sum((ranges.stamps < odometry[0] - slack) | (ranges.stamps > odometry[-1] + slack)))
         if outside:
-            told.append(
+            task.stages.warn(
+                "ranges-outside-odometry",
                 f"{outside} of {len(ranges.stamps)} ranges were stamped outside the odometry's time and left out: "
-                "start the odometry first and stop it last, and use one clock"
-            )
-    return told
+                "start the odometry first and stop it last, and use one clock",
+                ranges=len(ranges.stamps), outside=outside,
+            )  # fmt: skip

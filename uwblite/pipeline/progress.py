@@ -1,10 +1,10 @@
-"""Stage summaries in the making, and the wire to the caller: progress, clock, cancellation."""
+"""Summaries of the stages, warnings and doubts, and the caller's progress callback and clock."""
 
 from collections.abc import Callable, Sequence
 
 from ..errors import Cancelled
 from ..graph.solver import SolverSummary
-from ..map_result import StageSummary
+from ..map_result import Notice, StageSummary
 from ..sensor_log import SensorLog
 
 Progress = Callable[[str, int, int], object]
@@ -12,26 +12,35 @@ Progress = Callable[[str, int, int], object]
 
 
 class Stages:
-    """Stage summaries in the making: names, figures, the caller's clock and progress callback."""
+    """Collects what the stages have to say; calls the caller's progress callback."""
 
     def __init__(self, progress: Progress | None, clock: Callable[[], float] | None) -> None:
         self._progress, self._clock = progress, clock
         self._since = clock() if clock else 0.0
         self.done: list[StageSummary] = []
-        self.warnings: list[str] = []
-        self.doubts: list[str] = []
+        self.warnings: list[Notice] = []
+        self.doubts: list[Notice] = []
 
     def note(self, logs: Sequence[SensorLog]) -> None:
         """Take over what the screening of the recordings found."""
         for number, log in enumerate(logs):
             where = f"recording {number + 1}: " if len(logs) > 1 else ""
             for remark in log.screening.remarks if log.screening is not None else ():
-                (self.doubts if remark.doubt else self.warnings).append(where + remark.text)
+                add = self.doubt if remark.doubt else self.warn
+                add(remark.kind, where + remark.text)
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Report progress; raises Cancelled where the callback returns False."""
         if self._progress is not None and self._progress(stage, done, total) is False:
             raise Cancelled(f"stopped by the caller during {stage}")
+
+    def warn(self, kind: str, text: str, **figures: object) -> None:
+        """Add something the user should know."""
+        self.warnings.append(Notice(kind, text, figures))
+
+    def doubt(self, kind: str, text: str, **figures: object) -> None:
+        """Add a reason not to trust the result."""
+        self.doubts.append(Notice(kind, text, figures))
 
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage."""

@@ -1,170 +1,167 @@
-"""The walk's first half: what wheels and radio say, from nothing to the first optimisation.
+"""Odometry and ranges: from dead reckoning to the first optimisation, and re-estimating the ranges later.
 
-Each recording grows on its own, recordings are joined, what the user knows is added; later, when the lidar has
-stiffened the trajectory, the ranges are judged anew.
+Each recording is bootstrapped on its own, then the recordings are joined. Once the lidar has stiffened the trajectory,
+the ranges are re-estimated: first the anchors' places, then the noise and the priors of systematic errors.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from .. import keyframes, se2
-from ..arrays import Floats
-from ..constraints import Constraints
-from ..errors import ConfigError
+from ..arrays import Bools, Floats
 from ..graph import calibration
-from ..graph.calibration import RADIO, WHEELS, with_free, with_nonnegative_heights
-from ..graph.graph import Edges, Graph
+from ..graph.calibration import BIAS, ODOMETRY, RADIO, RANGE_SCALE, with_free, with_nonnegative_heights
+from ..graph.graph import Graph
 from ..graph.solver import optimize
-from ..lidar.joint_refinement import RefinementResult
 from ..mapping_config import MappingConfig
 from ..radio import bootstrap, prior_selection
 from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
 from ..wheels import wheel_edges
 from . import joining, map_frame
-from .constraint_edges import apply as apply_constraints
-from .progress import Stages, solver_figures
-from .recordings import Estimate, Recording, Recordings, moved_hypotheses
+from .estimate import Estimate, Task
+from .progress import solver_figures
+from .recordings import Recording
 
 
-def measurements(recording: Recording, config: MappingConfig) -> Estimate:
-    """Return a recording's graph by dead reckoning with its calibration priors, and what its wheels and radio measured."""
+def first_optimisation(task: Task) -> Estimate:
+    """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation)."""
+    recordings = task.recordings
+    task.stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(recordings.travelled, 3))
+    estimates = [dead_reckoning(recording, task.config) for recording in recordings.each]
+    ranges = sum(len(estimate.ranges) for estimate in estimates if estimate.ranges is not None)
+    task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
+    estimates = [_optimised(_bootstrapped(estimate, n, task), task) for n, estimate in enumerate(estimates)]
+    if len(estimates) == 1:
+        return estimates[0]
+    return _optimised(joining.join(estimates, task), task)
+
+
+def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
+    """Return a recording's graph by dead reckoning, with its calibration priors, odometry edges and range edges."""
     log, frames, ids = recording.log, recording.frames, recording.anchor_ids
-    told = np.array([log.mounting.height_difference(a) is not None for a in ids], dtype=bool)
-    listed = calibration.unknowns(config.calibration, ids, told)
+    listed = calibration.unknowns(config.calibration, ids, heights_given(recording))
     block = calibration.block(listed)
     graph = Graph(frames.odometry.copy(), np.zeros((len(ids), 2)), (), block)
     graph = graph.with_edges(calibration.prior_edges(listed))
-    graph = with_free(replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool)), *WHEELS, "bias", "range_scale")
-    wheels = wheel_edges(frames, 0, config.odometry, block)
+    graph = replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool))
+    graph = with_free(graph, *ODOMETRY, BIAS, RANGE_SCALE)
+    odometry = wheel_edges(frames, 0, config.odometry, block)
     if log.ranges is None:
-        return Estimate(graph, wheels, None, None, ids)
+        return Estimate(graph, odometry, None, ids)
     attached = keyframes.attach_ranges(log.ranges, log.odometry, frames, log.mounting)
-    radio = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.anchors, config.ranges.kernel)
-    return Estimate(graph, wheels, radio if np.any(radio.weights) else None, None, ids)
+    ranges = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.anchors, config.ranges.kernel)
+    return Estimate(graph, odometry, ranges if np.any(ranges.weights) else None, ids)
 
 
-def first_optimisation(
-    estimates: Sequence[Estimate], recordings: Recordings, config: MappingConfig, stages: Stages
-) -> Estimate:
-    """Grow each recording from nothing, bring them together and optimise wheels and radio (paper: first optimisation)."""
-    estimates = [
-        _settled(_grown(estimate, recordings, n, config, stages), config, stages) for n, estimate in enumerate(estimates)
-    ]
-    joined = joining.join(estimates, recordings)
-    stages.warnings += joined.warnings
-    if len(estimates) == 1:
-        return joined.estimate
-    return _settled(joined.estimate, config, stages)
+def heights_given(recording: Recording) -> Bools:
+    """Return which of a recording's anchors (a,) have a given height above the tag."""
+    heights = [recording.log.mounting.height_difference(a) for a in recording.anchor_ids]
+    return np.array([height is not None for height in heights], dtype=bool)
 
 
-def _grown(estimate: Estimate, recordings: Recordings, number: int, config: MappingConfig, stages: Stages) -> Estimate:
-    """Grow trajectory and anchors of one recording."""
-    radio, path = estimate.radio, recordings.path[recordings.each[number].rows]
-    if radio is None:
+def _bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
+    """Find trajectory and anchors of one recording without any guess of the anchors."""
+    ranges, recordings, config = estimate.ranges, task.recordings, task.config
+    if ranges is None:
         return estimate
-    alive = np.asarray(radio.weights) > 0
-    sigma = short_term_sigma(radio.stamps[alive], radio.anchor[alive], radio.ranges[alive], config.ranges)
-    growth = replace(config.growth, range_sigma=max(1.5 * sigma, config.growth.least_sigma))
-    first = bootstrap.bootstrap_graph(estimate.graph, estimate.wheels, radio, path - path[0], growth, config.anchors)
+    path = recordings.path[recordings.each[number].rows]
+    used = np.asarray(ranges.weights) > 0
+    sigma = short_term_sigma(ranges.stamps[used], ranges.anchor[used], ranges.ranges[used], config.ranges)
+    settings = replace(config.growth, range_sigma=max(1.5 * sigma, config.growth.least_sigma))
+    found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.anchors)
     whose = {"recording": number + 1} if len(recordings) > 1 else {}
-    stages.end("first estimate", range_sigma=round(sigma, 4), placed=int(first.placed.sum()), **whose)
-    # It grew from the middle; the map begins where the odometry did.
-    back = se2.compose(estimate.graph.poses[0], se2.inverse(first.graph.poses[0]))
-    graph = replace(estimate.graph.with_estimates_of(map_frame.moved(first.graph, back)), fixed_anchors=~first.placed)
-    radio = replace(radio, weights=(alive & first.placed[radio.anchor]).astype(np.float64))
-    return replace(estimate, graph=graph, radio=radio, first=moved_hypotheses(first, back))
+    task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
+    # The bootstrap starts in the middle of the path; the map begins where the odometry did.
+    back = se2.compose(estimate.graph.poses[0], se2.inverse(found.graph.poses[0]))
+    graph = estimate.graph.with_estimates_of(map_frame.moved(found.graph, back))
+    graph = replace(graph, fixed_anchors=~found.placed)
+    ranges = replace(ranges, weights=(used & found.placed[ranges.anchor]).astype(np.float64))
+    return replace(estimate, graph=graph, ranges=ranges, bootstrap=found).with_hypotheses_moved(back)
 
 
-def _settled(estimate: Estimate, config: MappingConfig, stages: Stages) -> Estimate:
-    """Optimise wheels and radio together, the ranges' noise learnt by the way."""
-    graph, radio = estimate.graph, estimate.radio
-    if radio is None or estimate.first is None:
+def _optimised(estimate: Estimate, task: Task) -> Estimate:
+    """Optimise odometry and ranges together, estimating the ranges' noise on the way."""
+    if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
-    for lap in range(3):
-        radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
-        if lap == 2:
-            graph = with_free(prior_selection.select_priors(graph, (estimate.wheels, radio), config.calibration), *RADIO)
-        solved, result = optimize(graph.with_edges(estimate.wheels, radio), config.solver)
-        graph = with_nonnegative_heights(graph.with_estimates_of(solved))
-        stages.report("first optimisation", lap + 1, 3)
-    stages.end("first optimisation", placed=int(estimate.first.placed.sum()), **solver_figures(result))
-    return replace(estimate, graph=graph, radio=radio)
+    config = task.config
+    for lap in range(_NOISE_ROUNDS):
+        estimate = with_range_noise(estimate, config)
+        if lap == _NOISE_ROUNDS - 1:
+            graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
+            estimate = replace(estimate, graph=with_free(graph, *RADIO))
+        solved, result = optimize(estimate.graph.with_edges(*estimate.odometry_and_ranges), config.solver)
+        estimate = replace(estimate, graph=with_nonnegative_heights(estimate.graph.with_estimates_of(solved)))
+        task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
+    task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
+    return estimate
 
 
-def units(estimate: Estimate, recordings: Recordings) -> Floats:
-    """Return by what the odometry of each recording (r,) is to be multiplied to be in metres; 1 where it is, or nearly so."""
-    known = estimate.graph.calibration
-    names = [calibration.of_recording("odometry_scale", n) for n in range(len(recordings))]
-    factor = np.array([1.0 + known.get(name) for name in names])
-    return np.where(np.abs(factor - 1.0) > _OTHER_UNIT, factor, 1.0)
+_NOISE_ROUNDS = 3
+"""Times that noise is estimated and the graph optimised; in the last one the radio's calibration is free too."""
 
 
-def unit_warnings(recordings: Recordings, factors: Floats) -> list[str]:
-    """Return what to say of odometry that was in another unit; factors (r,), see units."""
-    whose = [f"{r.name}: " if len(recordings) > 1 else "" for r in recordings.each]
-    return [
-        f"{name}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its odometry says: "
-        "the unit of the wheels is wrong; the odometry was multiplied by that"
-        for name, factor in zip(whose, factors.tolist(), strict=True) if factor != 1.0
-    ]
+def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
+    """Return the factor (r,) by which the odometry of each recording is to be multiplied to be in metres; warn of it.
+
+    It is 1 where the unit is right up to what a calibration of the wheels' radius may take up.
+    """
+    known, recordings = estimate.graph.calibration, task.recordings
+    places = [known.index("odometry_scale", recording=n) for n in range(len(recordings))]
+    factors = np.array([1.0 if place < 0 else 1.0 + float(known.values[place]) for place in places])
+    factors = np.where(np.abs(factors - 1.0) > _OTHER_UNIT, factors, 1.0)
+    for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
+        if factor != 1.0:
+            whose = f"{recording.name}: " if len(recordings) > 1 else ""
+            task.stages.warn(
+                "odometry-unit",
+                f"{whose}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its "
+                "odometry says: the unit of the wheels is wrong; the odometry was multiplied by that",
+                recording=recording.number + 1, factor=round(factor, 4),
+            )  # fmt: skip
+    return factors
 
 
 _OTHER_UNIT = 0.12
-"""Relative error of travelled distance from which on it is no wheel radius to be calibrated but another unit."""
+"""Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
 
 
-def constrained(
-    estimate: Estimate, known: Constraints, recordings: Recordings, config: MappingConfig, stages: Stages
-) -> Estimate:
-    """Bring the first estimate into the user's frame, where one is known, and add what is known beforehand."""
-    if known == Constraints():
+def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool = False) -> Estimate:
+    """Re-estimate the ranges' noise from their residuals; steady: see range_measurements.learn_noise."""
+    if estimate.ranges is None:
         return estimate
-    if known.places and config.align != "odometry":
-        raise ConfigError("known places say where the map lies; leave out align, or the places")
-    placed = np.zeros(len(estimate.anchor_ids), dtype=bool) if estimate.first is None else estimate.first.placed
-    done = apply_constraints(known, estimate.graph, estimate.anchor_ids, placed, recordings.clock)
-    stages.warnings += [
-        f"anchor {name} stands {off:.2f} m from its earlier place: it was moved" for name, off in done.moved.items()
-    ]
-    graph = done.graph.with_estimates_of(optimize(done.graph.with_edges(*estimate.edges), config.solver)[0])
-    stages.end("constraints", moved=sorted(done.moved), shift=[round(v, 4) for v in done.motion.tolist()])
-    return replace(estimate, graph=graph, first=moved_hypotheses(estimate.first, done.motion))
+    ranges, _ = learn_noise(estimate.ranges, estimate.graph, len(estimate.anchor_ids), config.ranges, steady=steady)
+    return replace(estimate, ranges=ranges)
 
 
-def reestimate_ranges(estimate: Estimate, tracked: RefinementResult, config: MappingConfig, stages: Stages) -> Estimate:
-    """Judge the ranges anew on the trajectory that neighbouring clouds have stiffened.
+def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
+    """Re-estimate anchors and range noise on the trajectory that matches of neighbouring clouds have stiffened.
 
-    Wheels alone are soft enough to be bent until anchors that lie for minutes seem to tell the truth. On the stiffer
-    chain lies stand out.
+    Odometry alone is soft enough to be bent until ranges with errors that last for minutes seem to fit. On the stiffer
+    chain such errors stand out.
     """
-    graph, radio = estimate.graph, estimate.radio
-    if radio is None:
+    config, steps = task.config, estimate.steps
+    if estimate.ranges is None or steps is None:
         return estimate
-    roughly = replace(config.solver, max_iterations=min(config.solver.max_iterations, _ROUGHLY))
+    roughly = replace(config.solver, max_iterations=min(config.solver.max_iterations, _ROUGH_ITERATIONS))
     for solver in (roughly, config.solver):
-        graph = relocate(radio, graph, ~np.asarray(graph.fixed_anchors), config.anchors)
-        radio, _ = learn_noise(radio, graph, len(graph.anchors), config.ranges)
-        graph = graph.with_estimates_of(optimize(graph.with_edges(estimate.wheels, radio, tracked.edges), solver)[0])
-    stages.end("ranges judged anew")
-    return replace(estimate, graph=with_nonnegative_heights(graph), radio=radio)
+        graph = relocate(estimate.ranges, estimate.graph, ~np.asarray(estimate.graph.fixed_anchors), config.anchors)
+        estimate = with_range_noise(replace(estimate, graph=graph), config)
+        problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
+        estimate = estimate.with_estimates_of(optimize(problem, solver)[0])
+    task.stages.end("ranges re-estimated")
+    return replace(estimate, graph=with_nonnegative_heights(estimate.graph))
 
 
-def reestimate_range_noise(estimate: Estimate, lidar: Sequence[Edges], config: MappingConfig) -> Estimate:
-    """Learn the ranges' noise where the lidar puts them, and how wide their errors' priors ought to be.
+_ROUGH_ITERATIONS = 12
+"""Iterations of an optimisation that another one follows."""
 
-    Parameters
-    ----------
-    lidar : what scans measured.
-    """
-    if estimate.radio is None:
+
+def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
+    """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors."""
+    if estimate.ranges is None:
         return estimate
-    radio, _ = learn_noise(estimate.radio, estimate.graph, len(estimate.graph.anchors), config.ranges, steady=True)
-    estimate = replace(estimate, radio=radio)
-    return replace(estimate, graph=prior_selection.select_priors(estimate.graph, (*estimate.edges, *lidar), config.calibration))
-
-
-_ROUGHLY = 12
-"""Iterations of an optimisation that another follows."""
+    estimate = with_range_noise(estimate, task.config, steady=True)
+    edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
+    return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))

@@ -1,19 +1,15 @@
-"""Recordings among others: their keyframes in one numbering, and what is known of one or of several."""
+"""One or more recordings, their keyframes in one numbering."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from .. import keyframes, se2
+from .. import keyframes
 from ..arrays import Floats, Ints
 from ..constraints import Clock
 from ..errors import DataError
-from ..graph.graph import Edges, Graph
-from ..graph.pose_edges import OdometryEdges
-from ..graph.range_edges import RangeEdges
 from ..keyframes import KeyframeConfig, Keyframes
-from ..radio.bootstrap import BootstrapResult
 from ..sensor_log import SensorLog
 
 _APART = 1000.0
@@ -75,6 +71,16 @@ class Recordings:
         return len(self.each)
 
     @property
+    def have_scans(self) -> bool:
+        """Whether any of them has lidar."""
+        return any(recording.has_scans for recording in self.each)
+
+    @property
+    def travelled(self) -> float:
+        """Distance of all together, m."""
+        return sum(float(recording.frames.path.sum()) for recording in self.each)
+
+    @property
     def clock(self) -> Clock:
         """When the keyframes were."""
         return Clock(self.stamps, self.of_keyframe)
@@ -104,49 +110,3 @@ def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
         np.concatenate(paths),
         np.concatenate([s.frames.twist for s in each]),
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
-    """What is known of one recording, or of several joined: estimates and measurements."""
-
-    graph: Graph
-    """Estimates and calibration priors."""
-    wheels: OdometryEdges
-    radio: RangeEdges | None
-    first: BootstrapResult | None
-    """None without ranges."""
-    anchor_ids: tuple[str, ...]
-    """(a,) of the graph's anchors."""
-
-    @property
-    def edges(self) -> tuple[Edges, ...]:
-        """Wheels, and ranges where there are any."""
-        return (self.wheels,) if self.radio is None else (self.wheels, self.radio)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class JoinResult:
-    """All recordings in the frame of the first."""
-
-    estimate: Estimate
-    warnings: tuple[str, ...]
-    """Anchors that were moved, in words."""
-
-
-def moved_hypotheses(first: BootstrapResult | None, motion: Floats) -> BootstrapResult | None:
-    """Return the first estimate, where there is one, with its places of anchors in a frame moved by T_new_old."""
-    if first is None:
-        return None
-    moved = tuple(tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in first.hypotheses)
-    return replace(first, hypotheses=moved)
-
-
-def numbered(name: str, recording: int) -> str:
-    """Return what an anchor is called that stands elsewhere in a recording than before."""
-    return f"{name}#{recording + 1}"
-
-
-def moved_anchor_text(name: str, distance: float, recording: int, own: str) -> str:
-    """Return what to tell of a moved anchor."""
-    return f"anchor {name} was moved: in recording {recording + 1} it stands {distance:.2f} m away, and is called {own}"

@@ -1,4 +1,4 @@
-"""Scans that no map looks at: most of a recording's bytes, left out before the work begins.
+"""What of a recording is used: its sensors, and the scans that a map looks at.
 
 A map looks at the scans nearest to each keyframe, and traces one whenever the laser has moved far enough. Of a slow
 robot's recording that is every fifth scan or so.
@@ -12,10 +12,18 @@ from .. import keyframes, se2
 from ..grid.occupancy_grid import GridConfig
 from ..grid.scan_rays import moved_scans
 from ..keyframes import KeyframeConfig
+from ..mapping_config import MappingConfig
+from ..screening.screen import screen
 from ..sensor_log import SensorLog
 
 _STEPS = 2
 """Scans kept within the distance after which the grid traces the next one: odometry does not know that distance exactly."""
+
+
+def prepared(log: SensorLog, config: MappingConfig) -> SensorLog:
+    """Return a recording screened, with the sensors in use and only the scans that a map looks at."""
+    log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
+    return thinned(screen(log, config.turn_laser), config.keyframes, config.grid)
 
 
 def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorLog:

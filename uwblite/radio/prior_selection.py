@@ -23,7 +23,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from ..graph.calibration import CalibrationConfig, stem
+from ..graph.calibration import CalibrationConfig
 from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.marginals import calibration_covariance
 
@@ -58,7 +58,7 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     units, odds = _units(len(groups[0]), len(groups[1]), config)
     biases = np.array(_between(config.range_bias_sound, config.range_bias, _STEPS) if len(groups[2]) else [1.0])
     tried = [[np.append(unit, np.full(len(groups[2]), bias)) for bias in biases] for unit in units]
-    worth = np.array([[log_evidence(mean, covariance, before, widths) for widths in row] for row in tried])
+    worth = np.array([[log_marginal_likelihood(mean, covariance, before, widths) for widths in row] for row in tried])
     if not np.isfinite(worth).any():
         return graph
     if len(groups[0]):
@@ -93,7 +93,7 @@ def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats)
     return np.asarray(np.linalg.solve(precision + np.diag(after**-2.0 - before**-2.0), precision @ mean))
 
 
-def log_evidence(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> float:
+def log_marginal_likelihood(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> float:
     """Return the logarithm of the evidence of other prior standard deviations, relative to those in use.
 
     Parameters
@@ -118,7 +118,7 @@ def _between(low: float, high: float, steps: int) -> Sequence[float]:
 
 def _free(graph: Graph, name: str) -> Ints:
     held = graph.fixed_calibration
-    named = np.array([stem(n) == name for n in graph.calibration.names], dtype=bool)
+    named = graph.calibration.of_kinds(name)
     return np.flatnonzero(named if held is None else named & ~held)
 
 

@@ -4,7 +4,6 @@ Everything that comes from a log (names of files and anchors, reasons) is escape
 from elsewhere, and its script reads only the page itself.
 """
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from html import escape as escape_markup
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
+from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
 from ..printable import printable
 from .page import PAGE, SCRIPT, STYLE
 from .svg_map import draw, number, shown_closures, sigma, thin
@@ -69,12 +68,12 @@ def _section(title: str, content: str) -> str:
 def _banner(result: MapResult) -> str:
     parts = []
     if result.doubts:
-        items = "".join(f"<li>{escape(text)}</li>" for text in result.doubts)
+        items = "".join(f"<li>{escape(doubt.text)}</li>" for doubt in result.doubts)
         parts.append(
             f'<div class="box bad" role=alert><b>Do not trust this map before these are settled:</b><ul>{items}</ul></div>'
         )
     if result.warnings:
-        items = "".join(f"<li>{escape(text)}</li>" for text in result.warnings)
+        items = "".join(f"<li>{escape(warning.text)}</li>" for warning in result.warnings)
         parts.append(f'<div class="box warn"><b>Worth knowing:</b><ul>{items}</ul></div>')
     if not parts:
         parts.append('<div class="box good">No warnings.</div>')
@@ -147,11 +146,10 @@ def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
 def _closure_table(result: MapResult) -> str:
     kept, rejected = shown_closures(result)
     count = sum(c.accepted for c in result.closures)
-    # Reasons that differ in their figures only are one kind.
-    reasons = Counter(re.sub(r"\d+(\.\d+)?", "\u2026", c.reason) for c in result.closures if not c.accepted)
+    outcomes = Counter(OUTCOMES[c.outcome] for c in result.closures if not c.accepted)
     text = f"<p>{count} of {len(result.closures)} candidates kept.</p>" if result.closures else ""
-    if reasons:
-        text += _table(("rejected because", "candidates"), [(why, str(n)) for why, n in reasons.most_common(30)], "")
+    if outcomes:
+        text += _table(("rejected because", "candidates"), [(why, str(n)) for why, n in outcomes.most_common()], "")
     rows = [
         (f"{c.i}\u2013{c.j}", "kept" if c.accepted else "rejected", f"{c.fitness:.3f}", f"{100 * c.overlap:.0f} %", c.reason)
         for c in [*kept, *rejected]

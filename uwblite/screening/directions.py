@@ -35,7 +35,7 @@ def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     text = f"the odometry's heading turns against its path: {best} was changed"
     if not known:
         text += ", and nothing tells whether the map is the place or its mirror image"
-    return tried[best], [Remark("heading against path", text)]
+    return tried[best], [Remark("heading-against-path", text)]
 
 
 def _scaled(odometry: Odometry, factor: Floats) -> Odometry:
@@ -64,7 +64,7 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         "not as told; if the wheels are swapped instead, the map is a mirror image: settle it by "
         f"{'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
     )
-    return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [Remark("laser turned over", text, doubt=True)]
+    return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [Remark("laser-turned-over", text, doubt=True)]
 
 
 def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
@@ -84,4 +84,4 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
         f"the laser looks {np.degrees(angle):+.0f} degrees away from what was told, or the wheels drive that way; it was taken "
         f"so: --laser-pose {mount[0]:g},{mount[1]:g},{mount[2]:.3f}"
     )
-    return replace(log, mounting=replace(log.mounting, T_base_laser=mount)), [Remark("laser turned away", text)]
+    return replace(log, mounting=replace(log.mounting, T_base_laser=mount)), [Remark("laser-turned-away", text)]

@@ -91,7 +91,7 @@ def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Remark]]:
         return odometry, []
     first = float(odometry.stamps[np.argmax(wrong)] - odometry.stamps[0])
     text = f"{int(wrong.sum())} odometry readings lie far off the path (the first at t = {first:.1f} s) and were left out"
-    return Odometry(odometry.stamps[~wrong], odometry.poses[~wrong]), [Remark("odometry glitches", text)]
+    return Odometry(odometry.stamps[~wrong], odometry.poses[~wrong]), [Remark("odometry-glitches", text)]
 
 
 def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Remark]]:
@@ -116,7 +116,7 @@ def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Remark]
         "sensors alone tie the two sides"
     )
     joined = Odometry(odometry.stamps, chained(odometry.poses[0], steps))
-    return joined, OdometryBreaks(odometry.stamps[at], np.array(sigma)), [Remark("odometry breaks", text)]
+    return joined, OdometryBreaks(odometry.stamps[at], np.array(sigma)), [Remark("odometry-breaks", text)]
 
 
 def chained(start: Floats, steps: Floats) -> Floats:

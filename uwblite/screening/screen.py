@@ -63,7 +63,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
 def _clock_remarks(log: SensorLog) -> list[Remark]:
     """Return a doubt for each sensor whose clock was set back."""
     return [
-        Remark("clock set back", f"the clock of the {sensor} was set back by up to {by:.1f} s: part the log there", doubt=True)
+        Remark("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: part the log there", doubt=True)
         for sensor, by in log.notes.set_back.items()
         if by > 1.0
     ]
@@ -71,7 +71,7 @@ def _clock_remarks(log: SensorLog) -> list[Remark]:
 
 def _repeats(count: int) -> list[Remark]:
     text = f"{count} odometry readings stand in the log twice and were left out once"
-    return [Remark("repeated odometry", text)] if count else []
+    return [Remark("repeated-odometry", text)] if count else []
 
 
 def _sorted(breaks: list[OdometryBreaks]) -> OdometryBreaks:
@@ -98,7 +98,7 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
             remarks.append(Remark("carried", text, doubt=True))
         elif not stood:
             text = f"{when}, while the robot drove on; what other sensors saw then was left out"
-            remarks.append(Remark("odometry gap", text))
+            remarks.append(Remark("odometry-gap", text))
             silent.append((a, b))
         at.append(a)
         sigma.append(_ANYWHERE if elsewhere else (0.02, 0.02, 0.02) if stood else (0.1, 0.1, 0.1))
@@ -156,7 +156,7 @@ def _lost_wheels(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark
 
 def _lost_remark(a: float, b: float, outcome: str) -> Remark:
     text = f"the wheels count nothing from t = {a:.0f} to {b:.0f} s while the robot moves: {outcome}"
-    return Remark("wheels stand still", text)
+    return Remark("wheels-stand-still", text)
 
 
 def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> OdometryBreaks:

@@ -36,7 +36,7 @@ def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         start = float(log.odometry.stamps[0])
         when = _when(scans.stamps, stuck, start)
         share = f"{int(stuck.sum())} of {len(stuck)} scans repeat the one before to the last digit ({when})"
-        remarks.append(Remark("repeated scans", f"{share}: the lidar or its driver stood still; they were left out"))
+        remarks.append(Remark("repeated-scans", f"{share}: the lidar or its driver stood still; they were left out"))
     return replace(log, scans=kept), remarks
 
 
@@ -60,7 +60,7 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         if stuck.any():
             when = _when(ranges.stamps[own], stuck, start)
             text = f"anchor {name} repeats one range to the last digit while the robot moves ({when}); these were left out"
-            remarks.append(Remark("repeated ranges", text))
+            remarks.append(Remark("repeated-ranges", text))
         wrong[own[twice | stuck]] = True
     return (replace(log, ranges=rows_of_ranges(ranges, ~wrong)), remarks) if wrong.any() else (log, [])
 

@@ -171,7 +171,7 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
         f"wheels and lidar tell of different motions ({when}{more}): one of the two stands still, slips or is wrong by another "
         "factor there than elsewhere"
     )
-    return [Remark("wheels against lidar", text, doubt=True)]
+    return [Remark("wheels-against-lidar", text, doubt=True)]
 
 
 def _factor(wheels: Floats, lidar: Floats, least: float) -> float:

@@ -1,0 +1,105 @@
+"""One value on its way through the stages: estimates, and the measurements they rest on, by origin."""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from ..constraints import Constraints
+from ..graph.graph import Edges, Graph
+from ..graph.pose_edges import OdometryEdges, ScanEdges
+from ..graph.range_edges import RangeEdges
+from ..lidar.clouds import Clouds
+from ..lidar.scan_matching import CloudRasters
+from ..loop_closure.closures import Closures, no_closures
+from ..mapping_config import MappingConfig
+from ..radio.bootstrap import BootstrapResult
+from .progress import Stages
+from .recordings import Recordings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What every stage is given beside the estimate."""
+
+    recordings: Recordings
+    config: MappingConfig
+    given: Constraints
+    """What the user knows beforehand."""
+    stages: Stages
+    """Takes the stages' figures, warnings and doubts."""
+    executor: Executor | None = None
+
+    def allowed(self, i: Ints, j: Ints) -> Bools:
+        """Tell which pairs of keyframes (e,), (e,) the user has not forbidden to match."""
+        return self.given.allowed(self.recordings.clock, i, j)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanClouds:
+    """The lidar of all recordings, ready for matching."""
+
+    clouds: Clouds
+    """One per keyframe."""
+    raster: CloudRasters
+    """Of the same clouds."""
+    delay: float
+    """Offset of the lidar's clock with which the clouds were made, s."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """What is known of one recording, or of several joined, after a stage."""
+
+    graph: Graph
+    """Estimates and priors; what the user gave stands among its edges. After the final optimisation it holds every
+    measurement."""
+    odometry: OdometryEdges
+    ranges: RangeEdges | None
+    anchor_ids: tuple[str, ...]
+    """(a,) of the graph's anchors."""
+    bootstrap: BootstrapResult | None = None
+    """None without ranges."""
+    scans: ScanClouds | None = None
+    """None without lidar, and again after the final optimisation."""
+    steps: ScanEdges | None = None
+    """Between neighbouring clouds; None before scan-to-scan matching."""
+    closures: Closures = field(default_factory=no_closures)
+    joint: ScanEdges | None = None
+    """Between all overlapping clouds, in place of steps and closures; None before the joint refinement."""
+
+    @property
+    def placed(self) -> Bools:
+        """(a,) anchors that have a position."""
+        return np.zeros(len(self.anchor_ids), dtype=bool) if self.bootstrap is None else self.bootstrap.placed
+
+    @property
+    def odometry_and_ranges(self) -> tuple[Edges, ...]:
+        """The edges of the first optimisation."""
+        return (self.odometry,) if self.ranges is None else (self.odometry, self.ranges)
+
+    @property
+    def steps_and_closures(self) -> tuple[Edges, ...]:
+        """The edges that the lidar adds before the joint refinement."""
+        return (self.closures.edges,) if self.steps is None else (self.steps, self.closures.edges)
+
+    @property
+    def problem(self) -> Graph:
+        """The graph with every measurement in it."""
+        lidar = self.steps_and_closures if self.joint is None else (self.joint,)
+        return self.graph.with_edges(*self.odometry_and_ranges, *lidar)
+
+    def with_estimates_of(self, solved: Graph) -> "Estimate":
+        """Return the estimate with poses, anchors and calibration of a solved graph."""
+        return replace(self, graph=self.graph.with_estimates_of(solved))
+
+    def with_hypotheses_moved(self, motion: Floats) -> "Estimate":
+        """Return the estimate with the bootstrap's hypotheses of anchors in a frame moved by T_new_old (3,)."""
+        if self.bootstrap is None:
+            return self
+        moved = tuple(
+            tuple(replace(h, position=se2.transform(motion, h.position)) for h in found) for found in self.bootstrap.hypotheses
+        )
+        return replace(self, bootstrap=replace(self.bootstrap, hypotheses=moved))

@@ -1,0 +1,70 @@
+"""The last stages: every measurement in one graph, and the occupancy grid along its trajectory."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..graph.calibration import with_nonnegative_heights
+from ..graph.graph import Graph
+from ..graph.solver import optimize
+from ..grid import occupancy_grid as grids
+from ..grid.geometry import GridGeometry
+from ..grid.occupancy_grid import OccupancyGrid, Sweeps
+from .estimate import Estimate, Task
+from .map_frame import cropped
+from .recordings import Recording
+
+_LARGE_GRID = 5_000_000
+"""Cells from which on a grid's memory is announced."""
+
+
+def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
+    """Put every measurement into the graph, and optimise once more where range noise was re-estimated at the end."""
+    graph, reestimated = estimate.problem, estimate.joint is not None and estimate.ranges is not None
+    # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
+    scans = estimate.scans if task.config.align == "walls" else None
+    estimate = replace(estimate, graph=graph, scans=scans, steps=None, joint=None)
+    if not reestimated:
+        return estimate
+    return replace(estimate, graph=with_nonnegative_heights(optimize(graph, task.config.solver)[0]))
+
+
+def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
+    """Trace every scan from where the laser was at its first and last ray (paper: Bresenham, binary Bayes filter)."""
+    sweeps = [_sweeps(recording, estimate.graph) for recording in task.recordings.each if recording.has_scans]
+    if not sweeps:
+        return None
+    config, stages = task.config, task.stages
+
+    def announce(geometry: GridGeometry) -> None:
+        """Say what a large grid will take; the caller may still stop."""
+        if geometry.cells >= _LARGE_GRID:
+            cells, megabytes = geometry.cells / 1e6, geometry.megabytes
+            stages.report(f"occupancy grid of {cells:.0f} million cells, about {megabytes:.0f} MB", 0, 1)
+
+    reporter = stages.reporter("occupancy grid")
+    grid = grids.from_sweeps(sweeps, config.grid, executor=task.executor, progress=reporter, announce=announce)
+    if grid.scans_astray:
+        stages.doubt(
+            "scans-astray",
+            f"{grid.scans_astray} of {grid.scans_astray + grid.scans_used} scans lie so far from the others that no map holds"
+            " both; they are not drawn",
+            scans=grid.scans_astray,
+        )
+    if config.crop is not None:
+        grid = cropped(grid, config.crop)
+    stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)
+    return grid
+
+
+def _sweeps(recording: Recording, graph: Graph) -> Sweeps:
+    """Return the scans of a recording with where its laser was."""
+    scans, mounting, cal = recording.log.scans, recording.log.mounting, graph.calibration
+    assert scans is not None
+    correction = np.array([cal.get("laser_x"), cal.get("laser_y"), cal.get("laser_theta")])
+    mount = se2.compose(correction, mounting.T_base_laser)
+    first = scans.stamps + cal.get("laser_delay")
+    last = first + scans.time_increment * (scans.ranges.shape[1] - 1)
+    ends = [se2.compose(recording.dense_trajectory(graph.poses, stamps), mount) for stamps in (first, last)]
+    return Sweeps(scans, ends[0], ends[1], mounting.laser_flipped)
