@@ -1,5 +1,6 @@
 """g2o, TORO and PyFG: what is written is read, with the same chi2, and wrong files are named."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -324,3 +325,35 @@ def test_plaza_with_ranges_reaches_its_stated_optimum(shared_data):
     read = read_pyfg(shared_data / "plaza1" / "plaza1.pyfg.gz")
     assert len(read.anchor_ids) == 4
     assert optimize(read.graph)[1].chi2 == pytest.approx(2660.5, abs=0.1)
+
+
+@pytest.mark.parametrize(("ending", "there"), [("pyfg", "pyfg"), ("g2o", "g2o"), ("g2o", "pyfg")])
+def test_names_of_vertices_survive(tmp_path, ending, there, capsys):
+    """Names of several robots in PyFG, numbers with gaps in g2o, which become A and L in PyFG."""
+    from uwblite.cli import main
+
+    pyfg = "VERTEX_SE2 0 A225 0 0 0\nVERTEX_SE2 1 A226 1 0 0\nVERTEX_SE2 0 b7 0 1 0\nVERTEX_XY L9 3 3\n" + "".join(
+        f"EDGE_SE2 0 {i} {j} 1 0 0 0.01 0 0 0.01 0 0.01\n" for i, j in (("A225", "A226"), ("A225", "b7"))
+    )
+    g2o = "VERTEX_SE2 225 0 0 0\nVERTEX_SE2 300 1 0 0\nVERTEX_XY 226 3 3\nEDGE_SE2 225 300 1 0 0 9 0 0 9 0 9\n"
+    sight = {"pyfg": "EDGE_RANGE 0 A225 L9 4 0.01\nEDGE_RANGE 1 A226 L9 4 0.01\n", "g2o": "EDGE_SE2_XY 225 226 3 3 1 0 1\n"}
+    (tmp_path / f"in.{ending}").write_text({"pyfg": pyfg, "g2o": g2o}[ending] + sight[ending])
+    assert main(["optimize", str(tmp_path / f"in.{ending}"), "--out", str(tmp_path / f"out.{there}")]) == 0
+    lines = lines_of(tmp_path / f"out.{there}", "VERTEX")
+    names = {line.split()[1 + (there == "pyfg" and "_XY" not in line)] for line in lines}
+    expected = {"pyfg": {"A225", "A226", "b7", "L9"}, "g2o": {"225", "300", "226"}}[ending]
+    assert names == ({"A225", "A300", "L226"} if ending != there else expected)
+
+
+def lines_of(path, tag):
+    return [line for line in path.read_text().splitlines() if line.startswith(tag)]
+
+
+def test_all_edges_of_a_kind_are_counted(tmp_path, capsys):
+    """Robust kernels part the edges of one kind in two: they are counted together."""
+    from uwblite.cli import main
+
+    edges = "".join(f"EDGE_SE2 {i} {j} {j - i} 0 0 9 0 0 9 0 9\n" for i, j in ((0, 1), (1, 2), (0, 2)))
+    (tmp_path / "a.g2o").write_text(edges)
+    assert main(["optimize", str(tmp_path / "a.g2o"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["edges"] == {"RelativePoseEdges": 3}

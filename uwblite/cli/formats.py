@@ -93,9 +93,9 @@ def write_graph(path: str, file: "GraphFile") -> None:
     from ..io.pyfg import write_pyfg
 
     if graph_format(path) == "pyfg":
-        write_pyfg(path, file.graph, file.anchor_ids, file.stamps)
+        write_pyfg(path, file.graph, file.anchor_ids, file.stamps, pose_ids=file.pose_ids)
     else:
-        write_g2o(path, file.graph, ranges=True)
+        write_g2o(path, file.graph, file.anchor_ids, pose_ids=file.pose_ids, ranges=True)
 
 
 def refuse_existing(force: bool, *paths: str | None) -> None:

@@ -101,10 +101,13 @@ def _with_kernel(graph: "Graph", name: str, scale: float) -> "Graph":
 
 
 def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> dict[str, Any]:
+    edges: dict[str, int] = {}
+    for kind in file.graph.edges:
+        edges[type(kind).__name__] = edges.get(type(kind).__name__, 0) + len(kind)
     return {
         "poses": len(file.graph.poses),
         "anchors": len(file.graph.anchors),
-        "edges": {type(e).__name__: len(e) for e in file.graph.edges},
+        "edges": edges,
         "skipped": file.skipped,
         "chi2_initial": summary.chi2_initial,
         "chi2": summary.chi2,

@@ -112,18 +112,27 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
 
 
 def write_g2o(
-    path: str | os.PathLike[str], graph: Graph, anchor_ids: Sequence[str] = (), *, ranges: bool = False
+    path: str | os.PathLike[str],
+    graph: Graph,
+    anchor_ids: Sequence[str] = (),
+    *,
+    pose_ids: Sequence[str] = (),
+    ranges: bool = False,
 ) -> None:
     """Write a graph for g2o and its kin: poses, anchors, edges between poses, and what is held fixed.
 
-    Poses are vertices 0..n-1 and anchors follow. Calibration and lever arms are worked in at the present estimate
-    (see graph_file.plain_edges); robust kernels are not written.
+    gtsam stops reading edges at the first line whose tag it does not know, and SE-Sync knows poses and edges between
+    them alone: these stand first, and the first pose, which readers hold of themselves, is named only where more is
+    held or poses are known beforehand. Poses are vertices 0..n-1 and anchors follow. Calibration and lever arms are
+    worked in at the present estimate (see graph_file.plain_edges); robust kernels are not written.
 
     Parameters
     ----------
     path : the file, compressed where its name ends in ``.gz``.
     graph : the graph; anchors that are not finite are left out with their ranges.
     anchor_ids : (a,) names of the anchors; a comment tells which vertex is which.
+    pose_ids : (n,) names of the poses; vertices bear these names and the anchors' where all of them are numbers, else the
+        numbers of their order, and comments tell the names.
     ranges : also write EDGE_RANGE_SE2_XY, which stock g2o does not know.
 
     Raises
@@ -131,31 +140,42 @@ def write_g2o(
     OSError : the file cannot be written.
     """
     with replacing(path) as stream:
-        for vertex, name in enumerate(anchor_ids, len(graph.poses)):
-            stream.write(f"# vertex {vertex} is anchor {name}\n".encode())
-        for line in _lines(graph, ranges):
+        names = [*(pose_ids or map(str, range(len(graph.poses)))), *anchor_ids]
+        kept = bool(pose_ids) and len(names) == len(graph.poses) + len(graph.anchors) and _are_numbers(names)
+        number = np.array([int(name) for name in names]) if kept else np.arange(len(graph.poses) + len(graph.anchors))
+        for line in _lines(graph, ranges, number):
             stream.write(line.encode())
+        if not kept:
+            first = 0 if pose_ids else len(graph.poses)
+            for vertex, name in enumerate(names[first:], first):
+                stream.write(f"# vertex {vertex} is {'anchor ' if vertex >= len(graph.poses) else ''}{name}\n".encode())
 
 
-def _lines(graph: Graph, ranges: bool) -> Iterator[str]:
+def _are_numbers(names: Sequence[str]) -> bool:
+    return len(set(names)) == len(names) and all(_ID.fullmatch(name.encode()) for name in names)
+
+
+def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:
+    """Yield the lines; `number` (poses + anchors,) is the id of each vertex."""
     plain, n = plain_edges(graph), len(graph.poses)
     placed = np.isfinite(graph.anchors).all(axis=1)
-    yield from _rows("VERTEX_SE2", [np.arange(n)], graph.poses)
-    yield from _rows("VERTEX_XY", [n + np.flatnonzero(placed)], graph.anchors[placed])
+    yield from _rows("VERTEX_SE2", [number[:n]], graph.poses)
+    yield from _rows("EDGE_SE2", [number[plain.i], number[plain.j]], plain.T_i_j, upper_triangle(plain.information))
+    yield from _rows("VERTEX_XY", [number[n:][placed]], graph.anchors[placed])
+    pose, anchor, position, information = plain.sightings
+    yield from _rows("EDGE_SE2_XY", [number[pose], number[n + anchor]], position, upper_triangle(information))
+    pose, value, information = plain.pose_priors
+    yield from _rows("EDGE_PRIOR_SE2", [number[pose]], value, upper_triangle(information))
+    anchor, value, information = plain.landmark_priors
+    yield from _rows("EDGE_PRIOR_XY", [number[n + anchor]], value, upper_triangle(information))
+    if ranges:
+        pose, anchor, distance, sigma = plain.ranges
+        yield from _rows("EDGE_RANGE_SE2_XY", [number[pose], number[n + anchor]], np.stack([distance, 1.0 / sigma**2], axis=1))
     held = np.zeros(1, dtype=np.int64) if graph.fixed_poses is None else np.flatnonzero(graph.fixed_poses)
     if graph.fixed_anchors is not None:
         held = np.concatenate([held, n + np.flatnonzero(graph.fixed_anchors & placed)])
-    yield from _rows("FIX", [held], np.zeros((len(held), 0)))
-    yield from _rows("EDGE_SE2", [plain.i, plain.j], plain.T_i_j, upper_triangle(plain.information))
-    pose, anchor, position, information = plain.sightings
-    yield from _rows("EDGE_SE2_XY", [pose, n + anchor], position, upper_triangle(information))
-    pose, value, information = plain.pose_priors
-    yield from _rows("EDGE_PRIOR_SE2", [pose], value, upper_triangle(information))
-    anchor, value, information = plain.landmark_priors
-    yield from _rows("EDGE_PRIOR_XY", [n + anchor], value, upper_triangle(information))
-    if ranges:
-        pose, anchor, distance, sigma = plain.ranges
-        yield from _rows("EDGE_RANGE_SE2_XY", [pose, n + anchor], np.stack([distance, 1.0 / sigma**2], axis=1))
+    if held.tolist() != [0] or len(plain.pose_priors[0]):
+        yield from _rows("FIX", [number[held]], np.zeros((len(held), 0)))
 
 
 def _rows(tag: str, ids: Sequence[Ints], *columns: Floats) -> Iterator[str]:

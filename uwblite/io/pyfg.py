@@ -19,6 +19,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
@@ -111,7 +112,12 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
 
 
 def write_pyfg(
-    path: str | os.PathLike[str], graph: Graph, anchor_ids: Sequence[str] = (), stamps: Floats | None = None
+    path: str | os.PathLike[str],
+    graph: Graph,
+    anchor_ids: Sequence[str] = (),
+    stamps: Floats | None = None,
+    *,
+    pose_ids: Sequence[str] = (),
 ) -> None:
     """Write a graph with its ranges; poses are A0, A1, ... and anchors L0, L1, ... in the order of the graph.
 
@@ -122,8 +128,10 @@ def write_pyfg(
     ----------
     path : the file, compressed where its name ends in ``.gz``.
     graph : the graph; anchors that are not finite are left out with their ranges.
-    anchor_ids : accepted for symmetry with write_g2o; the format has no room for names or comments.
+    anchor_ids : (a,) names of the anchors, kept where all of them are such as the format knows: L and a number.
     stamps : (n,) s, time of each pose; None = its number.
+    pose_ids : (n,) names of the poses, kept where all are such as the format knows: another letter and a number. Plain
+        numbers get the letter A.
 
     Raises
     ------
@@ -131,33 +139,45 @@ def write_pyfg(
     """
     stamps = np.arange(len(graph.poses), dtype=np.float64) if stamps is None else stamps
     with replacing(path) as stream:
-        for line in _lines(graph, stamps):
+        poses = _names("A", pose_ids, len(graph.poses), b"[A-KM-Za-z]")
+        anchors = _names("L", anchor_ids, len(graph.anchors), b"L")
+        for line in _lines(graph, stamps, poses, anchors):
             stream.write(line.encode())
 
 
-def _lines(graph: Graph, stamps: Floats) -> Iterator[str]:
+def _names(letter: str, names: Sequence[str], count: int, letters: bytes) -> NDArray[np.str_]:
+    """Return the names of vertices as the format has them."""
+    named = [letter + name if name.isdigit() else name for name in names]
+    fit = re.compile(letters + rb"\d{1,15}")
+    if len(named) == count == len(set(named)) and all(fit.fullmatch(name.encode(errors="replace")) for name in named):
+        return np.array(named, dtype=np.str_)
+    return np.array([f"{letter}{number}" for number in range(count)], dtype=np.str_)
+
+
+def _lines(graph: Graph, stamps: Floats, poses: NDArray[np.str_], anchors: NDArray[np.str_]) -> Iterator[str]:
     plain = plain_edges(graph)
     first = int(np.flatnonzero(graph.fixed_poses)[0]) if graph.fixed_poses is not None and graph.fixed_poses.any() else 0
     placed = np.isfinite(graph.anchors).all(axis=1)
-    yield from _rows("VERTEX_SE2", stamps, [("A", np.arange(len(graph.poses)))], graph.poses)
-    yield from _rows("VERTEX_XY", None, [("L", np.flatnonzero(placed))], graph.anchors[placed])
+    yield from _rows("VERTEX_SE2", stamps, [poses], graph.poses)
+    yield from _rows("VERTEX_XY", None, [anchors[placed]], graph.anchors[placed])
     pose, value, information = plain.pose_priors
-    yield from _rows("VERTEX_SE2:PRIOR", stamps[pose], [("A", pose)], value, _covariances(information))
+    yield from _rows("VERTEX_SE2:PRIOR", stamps[pose], [poses[pose]], value, _covariances(information))
     anchor, value, information = plain.landmark_priors
-    yield from _rows("VERTEX_XY:PRIOR", np.full(len(anchor), stamps[first]), [("L", anchor)], value, _covariances(information))
-    ends = [("A", plain.i), ("A", plain.j)]
+    when = np.full(len(anchor), stamps[first])
+    yield from _rows("VERTEX_XY:PRIOR", when, [anchors[anchor]], value, _covariances(information))
+    ends = [poses[plain.i], poses[plain.j]]
     yield from _rows("EDGE_SE2", stamps[plain.j], ends, plain.T_i_j, _covariances(plain.information))
     pose, anchor, position, information = plain.sightings
-    yield from _rows("EDGE_SE2_XY", stamps[pose], [("A", pose), ("L", anchor)], position, _covariances(information))
+    yield from _rows("EDGE_SE2_XY", stamps[pose], [poses[pose], anchors[anchor]], position, _covariances(information))
     pose, anchor, distance, sigma = plain.ranges
-    yield from _rows("EDGE_RANGE", stamps[pose], [("A", pose), ("L", anchor)], np.stack([distance, sigma**2], axis=1))
+    yield from _rows("EDGE_RANGE", stamps[pose], [poses[pose], anchors[anchor]], np.stack([distance, sigma**2], axis=1))
 
 
-def _rows(tag: str, stamps: Floats | None, names: list[tuple[str, Ints]], *columns: Floats) -> Iterator[str]:
+def _rows(tag: str, stamps: Floats | None, names: list[NDArray[np.str_]], *columns: Floats) -> Iterator[str]:
     """Yield lines of one tag; numbers are written so that they read back as they were."""
     numbers = np.concatenate(columns, axis=1).tolist()
     times = [""] * len(numbers) if stamps is None else [f" {stamp:.6f}" for stamp in stamps.tolist()]
-    ends = zip(*([f"{letter}{number}" for number in column.tolist()] for letter, column in names), strict=True)
+    ends = zip(*(column.tolist() for column in names), strict=True)
     for time, name, row in zip(times, ends, numbers, strict=True):
         yield f"{tag}{time} {' '.join(name)} {' '.join(repr(value + 0.0) for value in row)}\n"
 
