@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import sqlite3
 from dataclasses import replace
 
 import numpy as np
@@ -248,3 +249,13 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, storage):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_database_that_is_no_bag(tmp_path):
+    connection = sqlite3.connect(tmp_path / "x.db3")
+    connection.execute("create table topics(id)")
+    connection.commit()
+    connection.close()
+    with pytest.raises(UwbliteError):
+        read_bag(tmp_path / "x.db3")
+    assert [p.name for p in tmp_path.iterdir()] == ["x.db3"]

@@ -1,0 +1,224 @@
+"""Who reads what: every reader, and every verb that reads, with a whole input to damage."""
+
+import contextlib
+import io
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwblite.cli import main
+from uwblite.config import merge, parse_toml
+from uwblite.errors import UwbliteError
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
+from uwblite.io.carmen import read_log
+from uwblite.io.constraints_file import parse_constraints, read_anchors
+from uwblite.io.csv_folder import read_csv_folder, write_csv_folder
+from uwblite.io.csv_table import read_csv
+from uwblite.io.g2o import read_g2o
+from uwblite.io.map_server import read_map, write_map
+from uwblite.io.png import decode_png
+from uwblite.io.pyfg import read_pyfg
+from uwblite.io.tum import read_tum
+from uwblite.io.uwb_mapping import parse_mappings
+from uwblite.mapping import MappingConfig
+
+from .small_files import ANCHORS, G2O, KNOWN, LOG, MAPPING, PYFG, SETTINGS, TABLE, TORO, TUM
+
+Read = Callable[[Path], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One reader and a whole input of its."""
+
+    file: str
+    """What is damaged, below the folder of the case."""
+    read: Read
+    """Reads the file; a UwbliteError is its good right."""
+    prepare: Callable[[Path], object]
+    """Makes the whole input in an empty folder."""
+    cost: int = 1
+    """How many times fewer inputs it gets, because each takes long."""
+
+
+class Fault(Exception):
+    """What must not happen; the text says what did."""
+
+
+def _text(parse: Callable[[str, str], object]) -> Read:
+    """Parse as the command line does: bytes that are no text never come so far."""
+    return lambda path: parse(path.read_bytes().decode(errors="replace"), str(path))
+
+
+def _settings(text: str, path: str) -> object:
+    return merge(MappingConfig(), parse_toml(text, path))
+
+
+def _log(readings: int = 40) -> bytes:
+    """Return a recording of a drive along a wall with two anchors, as large as it takes to be mapped."""
+    rng = np.random.default_rng(1)
+    lines = [LOG.decode()]
+    for k in range(readings):
+        t, x = 4.0 + 0.25 * k, 1.5 + 0.1 * k
+        lines.append(f"ODOM {x:.3f} {0.3 * np.sin(x):.3f} {0.3 * np.cos(x):.3f} 0.4 0 0 {t:.2f} h {t:.2f}\n")
+        name, distance = ("5C0B", np.hypot(x - 3, 4)) if k % 2 else ("91A3", np.hypot(x - 3, 6))
+        lines.append(f"UWB {name} {distance + rng.normal(0, 0.1):.2f} 90 {t:.2f} h {t:.2f}\n")
+        if k % 2:
+            rays = " ".join(f"{r:.3f}" for r in rng.uniform(1.0, 5.7, 12))
+            place = f"{x:.3f} 0 0 {x:.3f} 0 0 0 0 0 0 0 {t:.2f} h {t:.2f}"
+            lines.append(f"ROBOTLASER1 2 -1.5 3.0 0.27 5.6 0.01 0 12 {rays} 0 {place}\n")
+    return "".join(lines).encode()
+
+
+def _grid() -> OccupancyGrid:
+    odds = np.where(np.random.default_rng(0).random((40, 60)) < 0.2, 4.0, -4.0).astype(np.float32)
+    odds[:5] = 0.0
+    return OccupancyGrid(GridGeometry(0.05, np.array([-1.0, -1.0]), 40, 60), odds)
+
+
+def _map_folder(folder: Path) -> None:
+    write_map(folder, _grid())
+    write_map(folder, _grid(), name="map_scale", mode="scale")
+    (folder / "anchors.csv").write_bytes(ANCHORS)
+    (folder / "trajectory.tum").write_bytes(TUM)
+
+
+def _put(folder: Path, **files: bytes) -> None:
+    for name, data in files.items():
+        (folder / name.replace("_DOT_", ".")).write_bytes(data)
+
+
+def _file(name: str, data: bytes, read: Read, cost: int = 1) -> Case:
+    return Case(name, read, lambda folder: (folder / name).write_bytes(data), cost)
+
+
+def _verb(name: str, data: bytes, *words: str, cost: int = 20, prepare: Callable[[Path], object] | None = None) -> Case:
+    """Return a verb of the command line; {} in its words is the folder of the case."""
+
+    def made(folder: Path) -> None:
+        if prepare is not None:
+            prepare(folder)
+        (folder / "good.log").write_bytes(_log())
+        if data:
+            (folder / name).write_bytes(data)
+
+    def run(path: Path) -> None:
+        before = {p.name for p in path.parent.iterdir()}
+        out, said = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+            code = main([word.format(path.parent) for word in words])
+        left = {p.name for p in path.parent.iterdir()} - before - {"out", "out.g2o", "out.pyfg", "out.log", "out.tum"}
+        text = said.getvalue()
+        last = text.rstrip("\n").rpartition("\n")[2]
+        for wrong, what in (
+            (code not in (0, 1, 2, 3), f"exit code {code}"),
+            ("internal error" in text or "Traceback" in text, last),
+            ("out of memory" in text, last),
+            (code == 1 and not last.startswith("uwblite: error: "), f"exit code 1 and {last!r}"),
+            (not (out.getvalue() + text).replace("\n", "").isprintable(), "what a terminal would obey"),
+            (bool(left), f"files {left}"),
+        ):
+            if wrong:
+                raise Fault(what)
+        if code == 1:
+            raise UwbliteError(last)
+
+    return Case(name, run, made, cost)
+
+
+def _bags() -> Iterator[tuple[str, Case]]:
+    """Yield a case for every kind of bag, where rosbags is there."""
+    try:
+        import rosbags.highlevel  # noqa: F401
+    except ImportError:
+        return
+    from uwblite.io.rosbag import read_bag
+    from uwblite.io.rosbag_writer import write_bag
+
+    def whole(folder: Path, storage: str) -> None:
+        (folder / "x.log").write_bytes(_log(10))
+        write_bag(folder / "bag", read_log(folder / "x.log"), storage=storage)
+        shutil.copy(next(p for p in (folder / "bag").iterdir() if p.name != "metadata.yaml"), folder / "bag" / "messages")
+
+    def reader(storage: str) -> Read:
+        def read(path: Path) -> object:
+            bag = path.parent
+            if path.name == "messages":
+                shutil.copy(path, next(p for p in bag.iterdir() if p.suffix in (".mcap", ".db3")))
+            return read_bag(bag)
+
+        return read
+
+    for storage in ("mcap", "sqlite3"):
+        for part in ("messages", "metadata.yaml"):
+            name = f"bag/{part}"
+            yield f"{storage} {part}", Case(name, reader(storage), lambda folder, s=storage: whole(folder, s), 8)  # type: ignore[misc]
+    yield "ros1 bag", Case("one.bag", lambda path: read_bag(path), _ros1, 4)
+
+
+def _ros1(folder: Path) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store: Any = get_typestore(Stores.ROS1_NOETIC)
+    t = store.types
+    header = t["std_msgs/msg/Header"](seq=0, stamp=t["builtin_interfaces/msg/Time"](5, 0), frame_id="5C0B")
+    message = t["sensor_msgs/msg/Range"](header, 0, 0.1, 0.1, 9.0, 3.0)
+    with Writer(folder / "one.bag") as writer:
+        radio = writer.add_connection("/uwb/a/distance", "sensor_msgs/msg/Range", typestore=store)
+        for k in range(5):
+            writer.write(radio, k * 10**9, store.serialize_ros1(message, "sensor_msgs/msg/Range"))
+
+
+def _tables(folder: Path) -> None:
+    (folder / "x.log").write_bytes(_log(10))
+    write_csv_folder(folder / "tables", read_log(folder / "x.log"))
+
+
+def cases() -> dict[str, Case]:
+    """Return every case by name."""
+    found = {
+        "carmen": _file("x.log", _log(20), read_log),
+        "g2o": _file("x.g2o", G2O, read_g2o),
+        "toro": _file("x.graph", TORO, read_g2o),
+        "pyfg": _file("x.pyfg", PYFG, read_pyfg),
+        "tum": _file("x.tum", TUM * 4, read_tum),
+        "csv table": _file("x.csv", TABLE * 2, read_csv),
+        "anchors": _file("x.csv", ANCHORS, read_anchors),
+        "settings": _file("x.toml", SETTINGS, _text(_settings)),
+        "constraints": _file("x.toml", KNOWN, _text(parse_constraints)),
+        "mapping": _file("x.toml", MAPPING, _text(parse_mappings)),
+    }
+    for name in ("odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"):
+        found[name] = Case(f"tables/{name}", lambda path: read_csv_folder(path.parent), _tables)
+    for name in ("map.yaml", "map.pgm", "map_scale.yaml", "map_scale.png"):
+        found[name] = Case(name, lambda path: read_map(path.with_suffix(".yaml")), _map_folder)
+    found["png"] = Case("map_scale.png", lambda path: decode_png(path.read_bytes(), str(path)), _map_folder)
+    found |= dict(_bags())
+    log, shared = _log(), ("-q", "--force")
+    found |= {
+        "check": _verb("x.log", log, "check", "{}/x.log"),
+        "map": _verb("x.log", log, "map", "{}/x.log", "--out", "{}/out", *shared, cost=100),
+        "map of tables": _verb(
+            "tables/odometry.csv", b"", "map", "{}/../tables", "--out", "{}/out", *shared, cost=100, prepare=_tables
+        ),
+        "convert": _verb("x.log", log, "convert", "{}/x.log", "{}/out.log", "-q", "--force", cost=5),
+        "localize": _verb(
+            "x.log", log, "localize", "{}/x.log", "--map", "{}", "--out", "{}/out.tum", *shared, cost=100, prepare=_map_folder
+        ),
+        "optimize g2o": _verb("x.g2o", G2O, "optimize", "{}/x.g2o", "--out", "{}/out.pyfg", *shared, cost=10),
+        "optimize toro": _verb("x.graph", TORO, "optimize", "{}/x.graph", "--out", "{}/out.g2o", *shared, cost=10),
+        "optimize pyfg": _verb(
+            "x.pyfg", PYFG, "optimize", "{}/x.pyfg", "--from-odometry", "--out", "{}/out.g2o", *shared, cost=10
+        ),
+        "evaluate": _verb("trajectory.tum", b"", "evaluate", "{}", "--truth", "{}/trajectory.tum", cost=5, prepare=_map_folder),
+        "constraints of map": _verb(
+            "x.toml", KNOWN, "map", "{}/good.log", "--out", "{}/out", "--constraints", "{}/x.toml", *shared, cost=100
+        ),
+    }
+    return {name: replace(case) for name, case in found.items()}
