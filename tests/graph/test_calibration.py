@@ -12,6 +12,7 @@ from uwblite.graph.calibration import (
     range_indices,
     scan_indices,
     unknowns,
+    with_free,
 )
 from uwblite.graph.graph import Calibration, Graph
 
@@ -55,6 +56,25 @@ def test_priors_weigh_one_standard_deviation_as_one():
     residuals = prior_edges(listed).residuals(graph)
     np.testing.assert_allclose(residuals, 2.0)
     assert np.all(prior_edges(listed).residuals(Graph(np.zeros((1, 3)), calibration=block(listed))) == 0.0)
+
+
+def test_a_height_of_so_much_is_a_prior_on_its_square():
+    with_heights, without = (
+        sorted(u.sigma for u in unknowns(CalibrationConfig(anchor_height=3.0), IDS, given)) for given in (TOLD, ~TOLD | TOLD)
+    )
+    assert [s for s in with_heights if s > 1.0] == [9.0, 9.0]
+    assert not [s for s in without if s > 1.0]
+
+
+def test_what_is_freed_joins_what_was_free():
+    listed = unknowns(CalibrationConfig(), IDS, TOLD)
+    fixed = np.ones(len(listed), dtype=bool)
+    fixed[0] = False
+    graph = Graph(np.zeros((1, 3)), calibration=block(listed), fixed_calibration=fixed)
+    freed = with_free(graph, "bias", "laser_delay").fixed_calibration
+    free = {u.key.label for u, held in zip(listed, freed, strict=True) if not held}
+    assert free == {listed[0].key.label, "laser_delay", *(f"bias:{a}" for a in IDS)}
+    assert fixed.sum() == len(listed) - 1
 
 
 def test_tables_name_the_right_scalar_in_the_right_column():

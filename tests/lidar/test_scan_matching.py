@@ -70,7 +70,7 @@ def test_pair_points_are_spread_over_the_points_with_normals(seed, limit):
 
 
 def by_hand(clouds, raster, i, pose, rows, gate, scale):
-    """Return the matches of one pair by a loop: source points (m, 2), target points, normals."""
+    """Return the matches of one pair by a loop: source points (m, 2), target points, normals, variances (m,)."""
     found = []
     for row in rows:
         at = se2.transform(pose, clouds.points[row])
@@ -82,7 +82,8 @@ def by_hand(clouds, raster, i, pose, rows, gate, scale):
         if number < 0 or np.hypot(*(at - clouds.points[target])) > gate:
             continue
         if clouds.normals[target] @ se2.rotate(pose[2], clouds.normals[row]) > np.sqrt(0.5):
-            found.append((clouds.points[row], clouds.points[target], clouds.normals[target]))
+            scatter = clouds.normal_variance[row] + clouds.normal_variance[target]
+            found.append((clouds.points[row], clouds.points[target], clouds.normals[target], scatter))
     return [np.array(part) for part in zip(*found, strict=True)]
 
 
@@ -98,7 +99,7 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
     factors = match(clouds, raster, i, pose, points, gate, scale)
     for e in range(3):
         rows = points.of(e)
-        source, target, normal = by_hand(clouds, raster, i[e], pose[e], rows, gate, scale)
+        source, target, normal, scatter = by_hand(clouds, raster, i[e], pose[e], rows, gate, scale)
         assert factors.asked[e] == len(rows)
         assert factors.matched[e] == len(source)
 
@@ -112,6 +113,12 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
         np.testing.assert_allclose(factors.gradient[e], jacobian.T @ (w * r), rtol=1e-5, atol=1e-7)
         assert factors.squared[e] == pytest.approx(np.sum(w * r * r))
         assert factors.weight[e] == pytest.approx(np.sum(w))
+        along = np.column_stack([-normal[:, 1], normal[:, 0]])
+        slide = np.column_stack([
+            (residual(pose[e] + d, normal=along) - residual(pose[e] - d, normal=along)) / (2 * step) for d in step * np.eye(3)
+        ])
+        feigned = (slide * (w * scatter)[:, None]).T @ slide
+        np.testing.assert_allclose(factors.feigned[e], feigned, rtol=1e-4, atol=1e-4 * np.abs(feigned).max())
 
         def cost(x, residual=residual):
             s = residual(x) ** 2

@@ -1,6 +1,7 @@
 """Loop closures: planted ones are accepted, false ones rejected for a stated reason, contradicting ones dropped."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig, build
 from uwblite.loop_closure.candidates import Candidates, missed, propose
 from uwblite.loop_closure.closures import Closures, LoopClosureConfig, merged, no_closures
-from uwblite.loop_closure.verification import find, reconcile
+from uwblite.loop_closure.matching import ClosureMatches
+from uwblite.loop_closure.verification import _judge, find, reconcile
 from uwblite.map_result import LoopClosure
 
 PERIOD = 1.2
@@ -59,6 +61,14 @@ def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess
     assert len(pairs) <= 2 * CONFIG.partners * len(pieces)
 
 
+def test_where_nothing_is_near_nothing_is_proposed(hall):
+    _, graph, known, pieces, recording, _ = hall
+    none = propose(graph, known, pieces, recording, set(), set(), True, replace(CONFIG, reach=0.0, search_limit=0.0))
+    assert [getattr(none, name).shape for name in ("target", "source", "guess", "covariance", "spread")] == [
+        (0,), (0,), (0, 3), (0, 3, 3), (0,)
+    ]  # fmt: skip
+
+
 def test_what_was_tried_is_not_proposed_again(hall):
     _, graph, known, pieces, recording, candidates = hall
     tried = candidates.names(CONFIG)
@@ -89,6 +99,40 @@ def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
     candidates = propose(graph, known, pieces, half, set(), set(), True, replace(CONFIG, partners=99))
     close = candidates.source - candidates.target == 1
     assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
+
+
+GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "spread": 9.0, "off": 0.0,
+        "held": True, "strength": 1e4}  # fmt: skip
+"""Figures of a match that no rule objects to, found by a search."""
+
+
+@pytest.mark.parametrize(("figures", "outcome"), [
+    ({}, "accepted"),
+    ({"found": False}, "not-found"),
+    ({"share": CONFIG.overlap_after_search - 0.001}, "few-matches"),
+    ({"share": CONFIG.overlap - 0.001, "spread": 0.0}, "few-matches"),
+    ({"share": CONFIG.overlap + 0.001, "spread": 0.0}, "accepted"),
+    ({"rms": CONFIG.sigma + 1e-4}, "far-matches"),
+    ({"through": CONFIG.through + 0.001}, "free-space-violation"),
+    ({"strength": 0.9}, "degenerate"),
+    ({"strength": 1.1}, "accepted"),
+    ({"second": CONFIG.uniqueness + 0.001}, "ambiguous"),
+    ({"second": CONFIG.uniqueness + 0.001, "spread": 0.0}, "accepted"),
+    ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 1.01}, "contradicts-graph"),
+    ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 0.97}, "accepted"),
+    ({"off": 5.0, "held": False}, "accepted"),
+])  # fmt: skip
+def test_each_rule_rejects_by_its_own_limit(figures, outcome):
+    """A guess known to 0.1 m and 0.1 rad, a measurement to 0.01; the matched surfaces see every direction."""
+    f = {**GOOD, **figures}
+    best = SimpleNamespace(share=np.array([f["share"]]), rms=np.array([f["rms"]]))
+    fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through")})
+    guess, covariance = np.array([[f["off"], 0.0, 0.0]]), 0.01 * np.eye(3)[None]
+    candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, np.array([f["spread"]]), f["held"])
+    root = np.sqrt(np.diag([f["strength"], f["strength"], 1e4]))[None]
+    ((found, reason),) = _judge(candidates, fits, np.zeros((1, 3)), root, CONFIG)
+    assert found == outcome
+    assert reason
 
 
 def true_overlap(hall, candidates) -> np.ndarray:
