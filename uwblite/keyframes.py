@@ -67,13 +67,15 @@ class AttachedRanges:
     ranges: Floats
     """(m,) m."""
     lever_arm: Floats
-    """(m, 2) base at the moment of ranging in the keyframe's frame, m."""
+    """(m, 2) base at the moment of ranging in the keyframe's frame, m; moved by a further tag's offset from the first."""
     turn: Floats
     """(m,) rad."""
     velocity: Floats
     """(m, 2) velocity of the tag in the keyframe's frame, m/s."""
     inside: Bools
     """(m,) whether the range was made while there was odometry; elsewhere nobody knows where the robot was."""
+    rise: Floats
+    """(m,) height of the tag that measured above the first one, m."""
 
 
 OUTSIDE = 0.2
@@ -176,22 +178,28 @@ def velocity_at(odometry: Odometry, stamps: Floats, window: float = 0.1) -> Floa
 
 
 def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframes, mounting: SensorMounting) -> AttachedRanges:
-    """Tie each range to the keyframe at or before it; ranges outside the odometry's time keep the nearest end's pose."""
+    """Tie each range to the keyframe at or before it; ranges outside the odometry's time keep the nearest end's pose.
+
+    The range of a further tag is as if the base stood so that the first tag is where that one is: what lies between them
+    goes into the lever arm.
+    """
     keyframe = np.clip(np.searchsorted(keyframes.stamps, log_ranges.stamps, "right") - 1, 0, len(keyframes) - 1)
     base = se2.interpolate_trajectory(odometry.stamps, odometry.poses, log_ranges.stamps)
     arm = se2.between(keyframes.odometry[keyframe], base)
     twist = velocity_at(odometry, log_ranges.stamps)
-    tag = mounting.tag_position[:2]
-    in_base = np.stack([twist[:, 0] - twist[:, 2] * tag[1], twist[:, 1] + twist[:, 2] * tag[0]], axis=1)
+    tag = mounting.tags[np.zeros(len(arm), dtype=np.int64) if log_ranges.tag is None else log_ranges.tag]
+    in_base = np.stack([twist[:, 0] - twist[:, 2] * tag[:, 1], twist[:, 1] + twist[:, 2] * tag[:, 0]], axis=1)
+    beside = tag - mounting.tag_position
     return AttachedRanges(
         keyframe.astype(np.int64),
         log_ranges.stamps,
         log_ranges.anchor,
         log_ranges.ranges,
-        arm[:, :2],
+        arm[:, :2] + se2.rotate(arm[:, 2], beside[:, :2]),
         arm[:, 2],
         se2.rotate(arm[:, 2], in_base),
         (log_ranges.stamps >= odometry.stamps[0] - OUTSIDE) & (log_ranges.stamps <= odometry.stamps[-1] + OUTSIDE),
+        beside[:, 2],
     )
 
 

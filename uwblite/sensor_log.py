@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import Floats, Ints
+from .arrays import Bools, Floats, Ints
 from .errors import DataError
 
 
@@ -37,6 +37,20 @@ class UwbRanges:
     """(m,) 0..100 as the radio said it; 100 where it says nothing."""
     anchor_ids: tuple[str, ...]
     """Names of the anchors, sorted; each has at least one range."""
+    tag: Ints | None = None
+    """(m,) which of the robot's tags measured, an index into SensorMounting.tags; None = all the first."""
+
+    def require_one_tag(self, place: str) -> None:
+        """Raise DataError where the ranges of several tags would lose whose they are."""
+        if self.tag is not None:
+            raise DataError(f"{place} does not keep the ranges of several tags apart; convert to a .log, which does")
+
+    def rows(self, which: slice | Ints | Bools) -> "UwbRanges":
+        """Return some of the ranges, with the anchors that they are to."""
+        used, anchor = np.unique(self.anchor[which], return_inverse=True)
+        ids = tuple(self.anchor_ids[k] for k in used)
+        tag = None if self.tag is None else self.tag[which]
+        return UwbRanges(self.stamps[which], anchor.astype(np.int64), self.ranges[which], self.quality[which], ids, tag)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,6 +91,13 @@ class SensorMounting:
     """Height of the anchors above the floor, m; None = not told (taken as the tag's height)."""
     anchor_heights: dict[str, float] = field(default_factory=dict)
     """Heights of single anchors above the floor, m, by id; they win over anchor_height."""
+    more_tags: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(t, 3) x, y, z of further tags on the base."""
+
+    @property
+    def tags(self) -> Floats:
+        """(1 + t, 3) x, y, z of all tags on the base, m."""
+        return np.concatenate([self.tag_position[None], self.more_tags])
 
     def height_difference(self, anchor_id: str) -> float | None:
         """Height of an anchor above the tag, m; None where nobody told."""
@@ -196,6 +217,9 @@ class SensorLog:
                 )
             _check(self.ranges.ranges, "ranges.ranges", (m,), most=MOST_METRES)
             _check(self.ranges.quality, "ranges.quality", (m,))
+            tag, tags = self.ranges.tag, len(self.mounting.tags)
+            if tag is not None and (tag.shape != (m,) or not np.all((tag >= 0) & (tag < tags))):
+                raise DataError(f"ranges.tag does not say one of {tags} tags for each of {m} ranges")
             if self.ranges.anchor.shape != (m,):
                 raise DataError(f"ranges.anchor has shape {self.ranges.anchor.shape}, expected ({m},)")
             if m and not 0 <= self.ranges.anchor.min() <= self.ranges.anchor.max() < len(self.ranges.anchor_ids):
@@ -234,9 +258,7 @@ class SensorLog:
         odometry = Odometry(odometry.stamps[cut], odometry.poses[cut])
         if ranges is not None:
             cut = part(ranges.stamps)
-            used, anchor = np.unique(ranges.anchor[cut], return_inverse=True)
-            ids = tuple(ranges.anchor_ids[i] for i in used)
-            ranges = UwbRanges(ranges.stamps[cut], anchor.astype(np.int64), ranges.ranges[cut], ranges.quality[cut], ids)
+            ranges = ranges.rows(cut)
         if scans is not None:
             cut = part(scans.stamps)
             scans = replace(scans, stamps=scans.stamps[cut], ranges=scans.ranges[cut])

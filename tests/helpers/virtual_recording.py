@@ -90,13 +90,13 @@ class VirtualSelector:
         pass
 
 
-def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), params=(), begin=None):
+def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), params=(), begin=None):
     """Record emulated devices into a log.
 
     Parameters
     ----------
     path : of the log.
-    devices : list of (name of the link, session, device).
+    devices : list of (sensor, session, device); several of a sensor are numbered in this order.
     seconds : how long.
     begin : told the clock's time at the start.
 
@@ -106,7 +106,10 @@ def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), params=(), begin=No
     """
     clock, ports = VirtualTime(), {}
     by_url = {f"virtual{i}": device for i, (_, _, device) in enumerate(devices)}
-    links = [Link(name, f"virtual{i}", session) for i, (name, session, _) in enumerate(devices)]
+    names = [name for name, _, _ in devices]
+    links = [
+        Link(name, f"virtual{i}", session, names[: i + 1].count(name)) for i, (name, session, _) in enumerate(devices)
+    ]  # fmt: skip
 
     def open_port(url, _baud):
         ports[url] = VirtualPort(by_url[url], clock)
@@ -114,7 +117,7 @@ def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), params=(), begin=No
 
     log = LogFile(path)
     recorder = Recorder(
-        links, log, monotonic=clock, wall_offset=0.0, host="virtual", mounting=Mounting(laser, tuple(params)),
+        links, log, monotonic=clock, wall_offset=0.0, host="virtual", mounting=Mounting(laser, tuple(params), more_lasers),
         open_port=open_port,
     )  # fmt: skip
     recorder._selector = VirtualSelector(clock, ports)

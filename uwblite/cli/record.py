@@ -23,6 +23,8 @@ examples:
                  --uwb shell:/dev/ttyACM0 --out run.log --duration 600
   uwblite record --lidar socket://robot.local:2001 --odometry kobuki:socket://robot.local:2002 --out run.log
   uwblite record ... --out run.log --append           go on after a crash
+  uwblite record --uwb tlv:/dev/ttyACM0 --tag 0.2,0,0.6 --uwb tlv:/dev/ttyACM1 --tag=-0.2,0,0.6 --odometry ...
+                                                      a tag in front and one behind
 
 devices (a path, a by-id path, socket://host:port or any other pyserial URL):
   each is written [NAME:]PORT[?option=value&...]; `uwblite devices --kinds` lists the names with their options
@@ -37,11 +39,15 @@ computer's monotonic clock, s).
 """
 
 
+MOST = {"uwb": 9, "lidar": 5, "odometry": 1}
+"""How many of a kind a log keeps apart."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     devices = parser.add_argument_group("devices")
-    devices.add_argument("--uwb", metavar="[NAME:]PORT", action="append", help="UWB tag (a DWM1001 without a name)")
-    devices.add_argument("--lidar", metavar="[NAME:]PORT", action="append", help="lidar (a Hokuyo without a name)")
+    devices.add_argument("--uwb", metavar="[NAME:]PORT", action="append", help="UWB tag (a DWM1001 without a name); repeatable")
+    devices.add_argument("--lidar", metavar="[NAME:]PORT", action="append", help="lidar (a Hokuyo without a name); repeatable")
     devices.add_argument("--odometry", metavar="NAME:PORT", action="append", help="base: kobuki:PORT, line:PORT?columns=...")
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=place, metavar="FILE", required=True, help="the log; must not exist unless --append")
@@ -60,9 +66,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     laser.add_argument("--lidar-narrow", action="store_const", const=1, help=narrow)
     laser.add_argument("--lidar-baud", metavar="N", type=number(whole=True), help="bit/s to try first on RS-232 (115200)")
     mounting = parser.add_argument_group("mounting, for the log")
-    mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
+    pose = "laser on the base: m, m, rad; once for each --lidar, in their order"
+    mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), action="append", help=pose)
     mounting.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
-    mounting.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), help="UWB tag on the base, z above the floor: m")
+    tag = "UWB tag on the base, z above the floor: m; once for each --uwb, in their order"
+    mounting.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), action="append", help=tag)
     mounting.add_argument("--anchor-height", metavar="H", type=number(), help="height of the anchors above the floor, m")
 
 
@@ -98,7 +106,8 @@ def run(args: argparse.Namespace) -> int:
         check_url(link.url)
         check_pyserial(link.url)
     log = LogFile(path, append=args.append, rotate=args.rotate, sync=args.sync)
-    mounting = Mounting(args.laser_pose or (0.0, 0.0, 0.0), tuple(_mounting_params(args, offset)))
+    lasers = args.laser_pose or [(0.0, 0.0, 0.0)]
+    mounting = Mounting(lasers[0], tuple(_mounting_params(args, offset)), more_lasers=tuple(lasers[1:]))
     stopped: list[int] = []
     recorder = Recorder(
         links, log, monotonic=time.monotonic, wall_offset=offset, host=re.sub(r"\s+", "_", socket.gethostname()) or "host",
@@ -169,19 +178,19 @@ def _links(args: argparse.Namespace, pose: "Pose") -> list["Link"]:
     links = []
     for sensor in reversed(SENSORS):
         specs = getattr(args, sensor) or []
-        if len(specs) > 1:
-            raise ConfigError(f"--{sensor} is given {len(specs)} times: one {sensor} can be recorded at a time")
-        for spec in specs:
+        if len(specs) > MOST[sensor]:
+            raise ConfigError(f"--{sensor} is given {len(specs)} times; a log keeps {MOST[sensor]} apart")
+        for k, spec in enumerate(specs, start=1):
             session, url = open_device(sensor, spec, Setup(pose), lidar if sensor == "lidar" else None)
-            links.append(Link(sensor, url, session))
+            links.append(Link(sensor, url, session, k))
     return links
 
 
 def _mounting_params(args: argparse.Namespace, offset: float) -> list[tuple[str, str]]:
     params = [("host_monotonic_zero", f"{offset:.6f}")]
-    if args.tag:
-        names = ("uwb_tag_offset_x", "uwb_tag_offset_y", "uwb_tag_height")
-        params += [(name, f"{value:.6f}") for name, value in zip(names, args.tag, strict=True)]
+    for k, position in enumerate(args.tag or [], start=1):
+        names = (f"uwb{k if k > 1 else ''}_tag_{name}" for name in ("offset_x", "offset_y", "height"))
+        params += [(name, f"{value:.6f}") for name, value in zip(names, position, strict=True)]
     if args.anchor_height is not None:
         params.append(("uwb_anchor_height", f"{args.anchor_height:.6f}"))
     if args.laser_flipped:

@@ -40,6 +40,8 @@ class Mounting:
     """x, y, theta on the base; m, m, rad."""
     params: tuple[tuple[str, str], ...] = ()
     """PARAM name, value."""
+    more_lasers: tuple[tuple[float, float, float], ...] = ()
+    """x, y, theta of the second lidar, the third ..."""
 
 
 class Link:
@@ -47,13 +49,15 @@ class Link:
 
     Parameters
     ----------
-    name : "uwb", "lidar" or "odometry".
+    sensor : "uwb", "lidar" or "odometry".
     url : of the port.
     session : start-up, running and recovery.
+    number : the robot's first (1), second ... of its kind.
     """
 
-    def __init__(self, name: str, url: str, session: Session) -> None:
-        self.name, self.url, self.session = name, url, session
+    def __init__(self, sensor: str, url: str, session: Session, number: int = 1) -> None:
+        self.name = sensor if number == 1 else f"{sensor}{number}"
+        self.url, self.session, self.number = url, session, number
         self.counts = Counts()
         self.port: Port | None = None
         self.opening: Opening | None = None
@@ -66,6 +70,11 @@ class Link:
         self.new_lost = self.new_corrupt = 0
         self.rate = 0.0
         self._rate_base = (0.0, 0)
+
+    def param_name(self, name: str) -> str:
+        """Return what a fact about this device is called in the log: ``laser_serial``, ``laser2_serial`` ..."""
+        kind, _, rest = name.partition("_")
+        return name if self.number == 1 else f"{kind}{self.number}_{rest}"
 
     def update_rate(self, now: float) -> None:
         """Refresh `rate`, messages per second over the last two seconds."""

@@ -40,13 +40,20 @@ def pose_line(pose: OdometryPose, tail: str) -> str:
     return f"ODOM {' '.join(number_text(field) for field in fields)} {tail}"
 
 
-def range_lines(epoch: RangeEpoch, tail: str) -> list[str]:
-    """Write one UWB line per reading."""
-    return [f"UWB {r.anchor_id} {r.range:.3f} {r.quality} {tail}" for r in epoch.readings]
+def numbered(name: str, number: int) -> str:
+    """Return the name of a message of a robot's first (1), second ... tag: UWB, UWB2 ..."""
+    return name if number == 1 else f"{name}{number}"
 
 
-def scan_line(scan: LaserScan, laser: tuple[float, float, float], robot: OdometryPose | None, tail: str) -> str:
-    """Write ROBOTLASER1.
+def range_lines(epoch: RangeEpoch, tail: str, number: int = 1) -> list[str]:
+    """Write one UWB line per reading, of the robot's first (1), second ... tag."""
+    return [f"{numbered('UWB', number)} {r.anchor_id} {r.range:.3f} {r.quality} {tail}" for r in epoch.readings]
+
+
+def scan_line(
+    scan: LaserScan, laser: tuple[float, float, float], robot: OdometryPose | None, tail: str, number: int = 1
+) -> str:
+    """Write ROBOTLASER1, ROBOTLASER2 ...
 
     Parameters
     ----------
@@ -54,6 +61,7 @@ def scan_line(scan: LaserScan, laser: tuple[float, float, float], robot: Odometr
     laser : x, y, theta of the laser on the base; m, m, rad.
     robot : latest odometry, None = origin. The reader interpolates odometry itself; this is for other readers.
     tail : ipc timestamp, host and logger timestamp.
+    number : of the robot's first (1), second ... lidar.
 
     Returns
     -------
@@ -68,7 +76,7 @@ def scan_line(scan: LaserScan, laser: tuple[float, float, float], robot: Odometr
     poses = " ".join(number_text(v) for v in (*laser_pose, x, y, theta))
     velocity = f"{number_text(robot.speed)} {number_text(robot.turn_rate)}" if robot else "0.000000 0.000000"
     return (
-        f"ROBOTLASER1 0 {scan.angle_min:.9f} {scan.angle_increment * (count - 1):.9f} {scan.angle_increment:.9f}"
+        f"ROBOTLASER{number} 0 {scan.angle_min:.9f} {scan.angle_increment * (count - 1):.9f} {scan.angle_increment:.9f}"
         f" {scan.range_max:.3f} 0.010 0 {count} {readings} 0 {poses} {velocity} 0.0 0.0 0.0 {tail}"
     )
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from ..errors import DeviceError
 from .events import Action, Corrupt, LaserScan, Lost, Note, OdometryPose, Param, RangeEpoch, Reopen, Send, SetBaud, SetDtr
-from .link import Counts, Link, Mounting, doubts, summary_lines
+from .link import Link, Mounting, doubts, summary_lines
 from .log_file import LogFile, number_text, pose_line, range_lines, scan_line
 from .transport import Opening, Port, open_port
 
@@ -135,7 +135,7 @@ class Recorder:
         for action in actions:
             if isinstance(action, LaserScan | RangeEpoch | OdometryPose):
                 self._message(link, now)
-                self._write(action, counts)
+                self._write(action, link)
             elif isinstance(action, Send | SetBaud | SetDtr):
                 if not self._send(link, action):
                     return
@@ -148,7 +148,7 @@ class Recorder:
             elif isinstance(action, Note):
                 self._note(link, action)
             elif isinstance(action, Param):
-                self.param(action.name, action.value)
+                self.param(link.param_name(action.name), action.value)
             elif isinstance(action, Reopen):
                 self._down(link, action.why)
                 return
@@ -178,19 +178,21 @@ class Recorder:
             link.said.clear()
         link.last_message = now
 
-    def _write(self, measured: LaserScan | RangeEpoch | OdometryPose, counts: Counts) -> None:
-        tail = self._tail(measured.stamp)
+    def _write(self, measured: LaserScan | RangeEpoch | OdometryPose, link: Link) -> None:
+        tail, counts = self._tail(measured.stamp), link.counts
         if isinstance(measured, OdometryPose):
             self._pose = measured
             self._lines.append(pose_line(measured, tail))
         elif isinstance(measured, RangeEpoch):
-            self._lines += range_lines(measured, tail)
+            self._lines += range_lines(measured, tail, link.number)
             counts.spread, counts.widest = counts.spread + measured.spread, max(counts.widest, measured.spread)
             counts.anchors.update(reading.anchor_id for reading in measured.readings)
         else:
-            self.param("laser_time_increment", f"{measured.time_increment:.9f}")
-            self.param("laser_range_min", f"{measured.range_min:.3f}")
-            self._lines.append(scan_line(measured, self._mounting.laser, self._pose, tail))
+            self.param(link.param_name("laser_time_increment"), f"{measured.time_increment:.9f}")
+            self.param(link.param_name("laser_range_min"), f"{measured.range_min:.3f}")
+            lasers = (self._mounting.laser, *self._mounting.more_lasers, (0.0, 0.0, 0.0))
+            laser = lasers[min(link.number, len(lasers)) - 1]
+            self._lines.append(scan_line(measured, laser, self._pose, tail, link.number))
 
     # ---- the log
 

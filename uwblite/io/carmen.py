@@ -9,7 +9,7 @@
 | ROBOTLASER1 | laser_type start_angle fov angular_resolution maximum_range accuracy remission_mode num_readings [readings] num_remissions [remissions] laser_x laser_y laser_theta robot_x robot_y robot_theta laser_tv laser_rv forward_safety side_safety turn_axis |
 | RAWLASER1 | as ROBOTLASER1 up to the remissions |
 | FLASER | num_readings [readings] x y theta odom_x odom_y odom_theta |
-| UWB | anchor_id range quality(0..100) |
+| UWB | anchor_id range quality(0..100); UWB2 ... UWB9 = by the robot's second ... ninth tag |
 
 UWB is uwblite's own; other CARMEN readers skip it. ROBOTLASER1 exists with and without num_remissions and turn_axis,
 and some published logs leave out ipc_timestamp: both are accepted, and then the logger's time counts.
@@ -35,6 +35,8 @@ from .source import OVERLONG_LINE, open_source
 
 __all__ = ["read_log", "write_log"]
 
+MOST_TAGS = 9
+"""Tags on one robot that a log keeps apart: UWB, UWB2 ... UWB9."""
 BROKEN_LINES_KEPT = 20
 """Broken lines reported one by one; all are counted."""
 _UNUSED = frozenset(
@@ -91,6 +93,7 @@ class _Reader:
         self.laser = LaserMessages(every_nth_scan)
         self.odometry = array("d")
         self.uwb = array("d")
+        self.tags = 1
         self.uwb_ids: dict[bytes, int] = {}
         self.skipped: dict[str, int] = {}
         self.set_back: dict[str, float] = {}
@@ -101,6 +104,7 @@ class _Reader:
         self.handlers: dict[bytes, Callable[[list[bytes]], None]] = {
             b"ODOM": self._odom,
             b"UWB": self._uwb,
+            **{f"UWB{k}".encode(): self._uwb for k in range(2, MOST_TAGS + 1)},
             b"PARAM": self.params.take,
         }
 
@@ -166,7 +170,7 @@ class _Reader:
             if fault := fault_of_id(name):
                 raise BrokenLine(f"UWB anchor_id {fault}")
             anchor = self.uwb_ids.setdefault(tokens[1], len(self.uwb_ids))
-        self.uwb.extend((stamp, anchor, distance, quality))
+        self.uwb.extend((stamp, anchor, distance, quality, int(tokens[0][3:] or b"1") - 1))
 
     def _stamp(self, tokens: list[bytes], fields: int, name: str) -> float:
         """Return ipc_timestamp behind the name and contents (`fields` tokens); logger_timestamp where it is left out."""
@@ -215,7 +219,7 @@ class _Reader:
             warnings=tuple(warnings),
             set_back=self.set_back,
         )
-        return SensorLog(odometry, ranges, scans, self.params.mounting(T_base_laser), notes)
+        return SensorLog(odometry, ranges, scans, self.params.mounting(T_base_laser, self.tags), notes)
 
     def _finish_odometry(self, warnings: list[str]) -> Odometry:
         rows = np.array(self.odometry).reshape(-1, 4)
@@ -234,11 +238,18 @@ class _Reader:
     def _finish_ranges(self, warnings: list[str]) -> UwbRanges | None:
         if not self.uwb:
             return None
-        rows = np.array(self.uwb).reshape(-1, 4)
+        rows = np.array(self.uwb).reshape(-1, 5)
         names = [name.decode() for name in self.uwb_ids]
         ids = sorted(names)
         place = {name: i for i, name in enumerate(ids)}
         rank = np.array([place[name] for name in names], dtype=np.int64)
         order = time_order(rows[:, 0], "UWB", warnings, self.set_back)
         rows = rows[order]
-        return UwbRanges(rows[:, 0], rank[rows[:, 1].astype(np.int64)], rows[:, 2], rows[:, 3], tuple(ids))
+        tag = rows[:, 4].astype(np.int64)
+        self.tags = int(tag.max()) + 1
+        silent = [k + 1 for k in np.unique(tag[tag > 0]) if not self.params.tells_tag(k + 1)]
+        if silent:
+            name = f"uwb{silent[0]}_tag_offset_x"
+            warnings.append(f"no PARAM {name} says where tag {silent[0]} is; the middle of the base is taken")
+        anchor = rank[rows[:, 1].astype(np.int64)]
+        return UwbRanges(rows[:, 0], anchor, rows[:, 2], rows[:, 3], tuple(ids), tag if self.tags > 1 else None)

@@ -1,6 +1,7 @@
 """PARAM lines of a CARMEN log: where the sensors sit and what the laser does not say of itself."""
 
 import math
+import re
 
 import numpy as np
 
@@ -25,6 +26,8 @@ _NUMBERS = frozenset(
         "laser_range_min",
     ]
 )
+_TAG = ("tag_offset_x", "tag_offset_y", "tag_height")
+_FURTHER_TAG = re.compile(r"uwb[2-9]_tag_(offset_x|offset_y|height)")
 _FLIPPED = ("laser_flipped", "laser_front_laser_flipped", "laser_laser1_flipped", "robot_frontlaser_flipped")
 _TRUE = {b"1": True, b"on": True, b"true": True, b"yes": True, b"0": False, b"off": False, b"false": False, b"no": False}
 
@@ -45,8 +48,8 @@ class Params:
             if tokens[2].lower() not in _TRUE:
                 raise BrokenLine(f"PARAM {name} must be on or off")
             self._flipped = _TRUE[tokens[2].lower()]
-        elif name in _NUMBERS or name.startswith(_ANCHOR_HEIGHT):
-            if name not in _NUMBERS and (fault := fault_of_id(name.removeprefix(_ANCHOR_HEIGHT))):
+        elif name in _NUMBERS or _FURTHER_TAG.fullmatch(name) or name.startswith(_ANCHOR_HEIGHT):
+            if name.startswith(_ANCHOR_HEIGHT) and (fault := fault_of_id(name.removeprefix(_ANCHOR_HEIGHT))):
                 raise BrokenLine(f"PARAM {_ANCHOR_HEIGHT}*: the anchor's id {fault}")
             (self._numbers[name],) = numbers(tokens[2:3], f"PARAM {name[:40]}", 1)
 
@@ -54,8 +57,22 @@ class Params:
         """Return the first of these numbers that was told."""
         return next((self._numbers[name] for name in names if name in self._numbers), None)
 
-    def mounting(self, T_base_laser: Floats | None) -> SensorMounting:
-        """Return the mounting; where the laser messages tell no pose of the laser, CARMEN's robot_frontlaser_* count."""
+    def _tag(self, prefix: str) -> Floats:
+        """Return x, y, z of a tag on the base, m."""
+        return np.array([self._numbers.get(prefix + name, 0.0) for name in _TAG], dtype=np.float64)
+
+    def tells_tag(self, number: int) -> bool:
+        """Return whether the place of a further tag, 2 to 9, was told."""
+        return any(f"uwb{number}_{name}" in self._numbers for name in _TAG)
+
+    def mounting(self, T_base_laser: Floats | None, tags: int = 1) -> SensorMounting:
+        """Return the mounting; where the laser messages tell no pose of the laser, CARMEN's robot_frontlaser_* count.
+
+        Parameters
+        ----------
+        T_base_laser : (3,) by the laser messages, None = not told.
+        tags : how many tags the robot has.
+        """
         told = self._numbers
         if T_base_laser is None:
             offsets = ("robot_frontlaser_offset", "robot_frontlaser_side_offset", "robot_frontlaser_angular_offset")
@@ -63,9 +80,8 @@ class Params:
         return SensorMounting(
             T_base_laser=T_base_laser,
             laser_flipped=self._flipped,
-            tag_position=np.array(
-                [told.get(f"uwb_tag_{name}", 0.0) for name in ("offset_x", "offset_y", "height")], dtype=np.float64
-            ),
+            tag_position=self._tag("uwb_"),
+            more_tags=np.array([self._tag(f"uwb{k}_") for k in range(2, tags + 1)]).reshape(-1, 3),
             anchor_height=told.get("uwb_anchor_height"),
             anchor_heights={
                 name.removeprefix(_ANCHOR_HEIGHT): height

@@ -52,6 +52,9 @@ def _params(log: SensorLog) -> Iterator[tuple[str, str]]:
     if log.ranges is not None:
         x, y, z = mounting.tag_position
         yield from (("uwb_tag_offset_x", f"{x:.6f}"), ("uwb_tag_offset_y", f"{y:.6f}"), ("uwb_tag_height", f"{z:.6f}"))
+        for k, (x, y, z) in enumerate(mounting.more_tags.tolist(), start=2):
+            names = (f"uwb{k}_tag_{name}" for name in ("offset_x", "offset_y", "height"))
+            yield from zip(names, (f"{v:.6f}" for v in (x, y, z)), strict=True)
         if mounting.anchor_height is not None:
             yield "uwb_anchor_height", f"{mounting.anchor_height:.6f}"
         for anchor, height in sorted(mounting.anchor_heights.items()):
@@ -72,8 +75,9 @@ def _range_lines(log: SensorLog) -> Iterator[bytes]:
         return
     names = [log.ranges.anchor_ids[i] for i in log.ranges.anchor.tolist()]
     columns = (log.ranges.stamps, log.ranges.ranges, log.ranges.quality)
-    for name, stamp, distance, quality in zip(names, *(c.tolist() for c in columns), strict=True):
-        yield f"UWB {name} {distance:.4f} {quality:g} {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
+    tags = [""] * len(names) if log.ranges.tag is None else [str(k + 1) if k else "" for k in log.ranges.tag.tolist()]
+    for tag, name, stamp, distance, quality in zip(tags, names, *(c.tolist() for c in columns), strict=True):
+        yield f"UWB{tag} {name} {distance:.4f} {quality:g} {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
 
 
 def scan_lines(log: SensorLog) -> Iterator[bytes]:

@@ -93,6 +93,7 @@ def _write_tables(path: Path, log: SensorLog) -> None:
     odometry = np.column_stack([log.odometry.stamps, log.odometry.poses])
     _write(path / "odometry.csv", "stamp,x,y,theta", (",".join(f"{v:.6f}" for v in row) for row in odometry.tolist()))
     if log.ranges is not None:
+        log.ranges.require_one_tag("a CSV folder")
         _write(path / "ranges.csv", "stamp,anchor,range,quality", _range_rows(log.ranges))
     if log.scans is not None:
         beams = ",".join(f"r{k}" for k in range(log.scans.ranges.shape[1]))

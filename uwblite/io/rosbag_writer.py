@@ -142,6 +142,7 @@ def recording_messages(log: SensorLog, make: Messages, *, prefix: str = "") -> I
     ]
     if log.ranges is not None:
         ranges = log.ranges
+        ranges.require_one_tag("a bag")
         names = _topic_names(ranges.anchor_ids, topic)
         sources.append((ranges.stamps, lambda k: (names[ranges.anchor[k]], make.range(log, k))))
     if log.scans is not None:

@@ -32,7 +32,9 @@ def range_edges(
     sigma : m, for all ranges until noise is learnt.
     search : says which readings can be distances. kernel : robust kernel of all ranges.
     """
-    told = np.array([mounting.height_difference(a) or 0.0 for a in anchor_ids])
+    above = [mounting.height_difference(a) for a in anchor_ids]
+    told = np.array([height or 0.0 for height in above])
+    is_told = np.array([height is not None for height in above], dtype=bool)
     return RangeEdges(
         attached.keyframe + first,
         attached.anchor,
@@ -42,7 +44,7 @@ def range_edges(
         attached.turn,
         attached.velocity,
         np.asarray(mounting.tag_position[:2], dtype=np.float64),
-        told[attached.anchor],
+        told[attached.anchor] - np.where(is_told[attached.anchor], attached.rise, 0.0),
         range_indices(calibration, attached.anchor, anchor_ids),
         kernel,
         (usable(attached.ranges, search) & attached.inside).astype(np.float64),

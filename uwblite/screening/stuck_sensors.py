@@ -69,9 +69,7 @@ def rows_of_ranges(ranges: UwbRanges, kept: Bools) -> UwbRanges | None:
     """Return some of the ranges; None where none is left."""
     if not kept.any():
         return None
-    used, anchor = np.unique(ranges.anchor[kept], return_inverse=True)
-    ids = tuple(ranges.anchor_ids[k] for k in used)
-    return UwbRanges(ranges.stamps[kept], anchor.astype(np.int64), ranges.ranges[kept], ranges.quality[kept], ids)
+    return ranges.rows(kept)
 
 
 def rows_of_scans(scans: LaserScans, kept: Bools) -> LaserScans:

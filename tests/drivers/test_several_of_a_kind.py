@@ -1,0 +1,49 @@
+"""Two tags and two lidars in one recording, kept apart."""
+
+import pytest
+from emulators.kobuki_device import KobukiDevice
+from emulators.spinning_device import LdLidarDevice, Lds01Device
+from emulators.uwb_boards import BOARDS, UwbBoard
+from emulators.world import RoomWorld, WorldClock
+from helpers.virtual_recording import record
+
+from uwblite.cli import main
+from uwblite.drivers.devices import open_device
+from uwblite.io.carmen import read_log
+
+
+def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever(tmp_path):
+    world, clock = RoomWorld(), WorldClock()
+    devices = [
+        ("odometry", open_device("odometry", "kobuki:x")[0], KobukiDevice(world.poses(), clock)),
+        ("lidar", open_device("lidar", "ld06:x")[0], LdLidarDevice(world, clock)),
+        ("lidar", open_device("lidar", "lds01:x")[0], Lds01Device(world, clock)),
+        ("uwb", open_device("uwb", "linktrack:x")[0], UwbBoard(world.epochs(), clock, BOARDS["linktrack"])),
+        ("uwb", open_device("uwb", "bu03:x")[0], UwbBoard(world.epochs(), clock, BOARDS["bu03"])),
+    ]
+    recorder = record(
+        tmp_path / "run.log", devices, 5.0, laser=(0.1, 0.0, 0.0), more_lasers=((-0.2, 0.0, 3.141593),),
+        params=[("uwb2_tag_offset_x", "-0.3")], begin=clock.start,
+    )  # fmt: skip
+    assert [link.name for link in recorder.links] == ["odometry", "lidar", "lidar2", "uwb", "uwb2"]
+    assert all(link.counts.messages > 15 for link in recorder.links)
+    lines = [line.split() for line in (tmp_path / "run.log").read_text().splitlines()]
+    beams = {name: {int(line[8]) for line in lines if line[0] == name} for name in ("ROBOTLASER1", "ROBOTLASER2")}
+    assert beams == {"ROBOTLASER1": {450}, "ROBOTLASER2": {360}}
+    told = {line[1]: line[2] for line in lines if line[0] == "PARAM"}
+    assert float(told["laser_range_min"]) == 0.02
+    assert float(told["laser2_range_min"]) == 0.12
+    log = read_log(tmp_path / "run.log")
+    assert log.scans.ranges.shape[1] == 450
+    assert log.notes.skipped["ROBOTLASER2"] > 15
+    assert set(log.ranges.tag.tolist()) == {0, 1}
+    assert log.mounting.tags[1].tolist() == [-0.3, 0.0, 0.0]
+
+
+def test_more_than_a_log_keeps_apart_is_refused(tmp_path, capsys):
+    out = str(tmp_path / "run.log")
+    assert main(["record", "--odometry", "kobuki:a", "--odometry", "kobuki:b", "--out", out]) == 1
+    assert "keeps 1 apart" in capsys.readouterr().err
+    assert main(["record", *["--uwb", "tlv:a"] * 10, "--out", out]) == 1
+    assert "keeps 9 apart" in capsys.readouterr().err
+    assert pytest.approx(0) == len(list(tmp_path.iterdir()))
