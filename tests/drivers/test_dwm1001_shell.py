@@ -3,6 +3,8 @@
 import random
 
 import pytest
+from emulators.dwm_device import DwmDevice, DwmOptions
+from emulators.world import WorldClock
 from helpers.driver_harness import check_transcript, feed_split, feed_whole, good
 
 from uwblite.drivers import dwm1001_shell
@@ -141,3 +143,13 @@ def test_memory_is_bounded():
     for _ in range(3000):
         protocol.feed(b"DIST,4,AN0," * 100, 0.0)
         assert protocol._lines.held <= dwm1001_shell.MAX_LINE
+
+
+def test_the_emulated_shell_takes_lf_and_cr_lf_as_one_line_end():
+    """RevEng_pydwm1001 sends LF alone; CR LF is one line end, not two (an empty line repeats the last command)."""
+    for ending in (b"\r", b"\n", b"\r\n"):
+        device = DwmDevice(iter(()), WorldClock(), DwmOptions(shell=True))
+        device.power_up(0.0)
+        answer = device.receive(b"apg" + ending, 1.0)
+        assert answer.count(b"x:0 y:0") == 1
+        assert answer.count(b"dwm> ") == 1

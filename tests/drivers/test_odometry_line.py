@@ -6,8 +6,16 @@ import random
 import pytest
 from helpers.driver_harness import check_transcript, feed_whole, good
 
-from uwblite.drivers.events import Corrupt
-from uwblite.drivers.odometry_line import MAX_LINE, LineFormat, LineOdometer, OdometryLineProtocol, parse_format
+from uwblite.drivers.events import Corrupt, Note, OdometryPose
+from uwblite.drivers.odometry_line import (
+    MAX_LINE,
+    LineDriver,
+    LineFormat,
+    LineOdometer,
+    OdometryLineProtocol,
+    Sample,
+    parse_format,
+)
 from uwblite.errors import ConfigError
 
 
@@ -71,3 +79,42 @@ def test_memory_is_bounded():
     for _ in range(2000):
         protocol.feed(rng.randbytes(500).replace(b"\n", b"x").replace(b"\r", b"x"), 0.0)
         assert protocol._lines.held <= MAX_LINE
+
+
+def lines_of(driver, rows):
+    """Return what a driver makes of lines that come every 20 ms."""
+    return [
+        a
+        for k, row in enumerate(rows)
+        for a in driver.take(Sample(50 + 0.02 * k, (*zip("txy", row, strict=True), ("theta", 0.0))))
+    ]
+
+
+def rows(count, start=0.0, x=0.0):
+    return [(start + 0.02 * k, x + 0.004 * k, 0.0) for k in range(count)]
+
+
+@pytest.mark.parametrize("broken", [(1.0, 40.2, 0.0), (1.0, 0.2, -7.0), (11.0, 0.2, 0.0), (0.01, 0.2, 0.0)])
+def test_a_line_that_leaps_away_and_back_is_damage(broken):
+    """Lines have no sum: a digit that was lost makes another number of it."""
+    good_rows = rows(400)
+    actions = lines_of(LineDriver(LineFormat()), [*good_rows[:200], broken, *good_rows[200:]])
+    poses = [a for a in actions if isinstance(a, OdometryPose)]
+    assert [pose.x for pose in poses] == pytest.approx([row[1] for row in good_rows])
+    assert [a.why for a in actions if isinstance(a, Corrupt)] == ["line that leaps away and back"]
+
+
+def test_a_base_that_begins_anew_is_followed_from_its_second_line():
+    actions = lines_of(LineDriver(LineFormat()), [*rows(200, 100.0, 3.0), *rows(200)])
+    assert len([a for a in actions if isinstance(a, OdometryPose)]) == 400
+    assert [a.name for a in actions if isinstance(a, Note)] == ["odometry-clock"]
+
+
+def test_a_stall_of_the_computer_costs_no_line():
+    driver, poses = LineDriver(LineFormat()), []
+    for k, (time, x, y) in enumerate(rows(600)):
+        stamp = 50 + (0.02 * k if not 300 < k < 500 else 10.0)
+        sample = Sample(stamp, (("t", time), ("x", x), ("y", y), ("theta", 0.0)))
+        poses += [a for a in driver.take(sample) if isinstance(a, OdometryPose)]
+    assert len(poses) == 600
+    assert [pose.stamp for pose in poses[200:]] == pytest.approx([50 + 0.02 * k for k in range(200, 600)], abs=1e-6)

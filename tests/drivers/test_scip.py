@@ -1,7 +1,9 @@
 """SCIP: frames in every shape, codes, sums, commands."""
 
+import gzip
 import math
 import random
+import struct
 
 import pytest
 from emulators.scip_device import ScipDevice, ScipOptions, data_lines, encode
@@ -11,7 +13,8 @@ from helpers.driver_harness import check_transcript, feed_whole, good
 from uwblite.drivers import scip, scip_codes, scip_commands
 from uwblite.drivers.events import Corrupt
 from uwblite.drivers.scip import Distances, Reply, ScipProtocol
-from uwblite.drivers.scip_commands import Geometry
+from uwblite.drivers.scip_codes import RANGE_CODES
+from uwblite.drivers.scip_commands import Geometry, parse_geometry
 from uwblite.errors import ProtocolError
 
 RNG = random.Random(1)
@@ -335,3 +338,37 @@ def test_emulator_in_time_adjust_mode_takes_nothing_else(unit):
 def test_corrupt_keeps_little():
     events = feed_whole(ScipProtocol, b"z" * 5000 + b"\n")
     assert all(isinstance(e, Corrupt) and len(e.raw) <= 64 for e in events)
+
+
+def test_timed_capture_of_a_real_unit(shared_data):
+    """A URG-04LX, firmware 3.1.04: chunks with their arrival. II tells the clock, and GD is stamped with it.
+
+    The clock was read before the first byte of II's answer, so host time minus device time is at most the difference of
+    these two, and the stamp of the scan lies at least 101 ms before its first byte.
+    """
+    data = gzip.decompress((shared_data / "captures" / "urg04lx_timed_fw3104.logr.gz").read_bytes())
+    protocol, events, at = ScipProtocol(), [], 0
+    while at < len(data):
+        seconds, micros, size = struct.unpack_from(">III", data, at)
+        events += protocol.feed(data[at + 12 : at + 12 + size], seconds + 1e-6 * micros)
+        at += 12 + size
+    assert not [event for event in events if isinstance(event, Corrupt)]
+    assert [event.command for event in events] == ["VV", "VV", "PP", "II", "BM", "CR00", "VV", "PP", "II", "GD"]
+    assert parse_geometry(events[2]) == Geometry()
+    scan, info = events[-1], events[-2]
+    assert 10 in scan.values
+    assert all(value in RANGE_CODES for value in scan.values if value < 20)
+    offset = info.stamp - int(info.fields()["TIME"], 16) / 1000
+    late = scan.stamp - (scan.time / 1000 + offset)
+    assert 0.100 < late < 0.110
+
+
+def test_emulator_measures_once_after_bm_without_a_stream():
+    """BM answers 00 and switches the laser on; GD gives a scan then, as hokuyolx asks for it."""
+    clock = WorldClock()
+    device = ScipDevice(RoomWorld().scans(), clock)
+    device.power_up(0.0)
+    assert device.receive(b"GD0044072501\n", 0.5).split(b"\n")[1] == b"10Q"
+    assert device.receive(b"BM\n", 0.6) == b"BM\n00P\n\n"
+    (scan,) = good(ScipProtocol().feed(device.receive(b"GD0044072501\n", 0.7), 0.7))
+    assert len(scan.values) == 682

@@ -110,7 +110,7 @@ class ScipDevice:
 
     def power_up(self, now: float) -> None:
         """Forget everything, as after plugging in."""
-        self._power, self._input = now, bytearray()
+        self._power, self._now, self._input = now, now, bytearray()
         self._scip1, self._laser, self._adjusting = self.options.scip1, False, False
         self._stream: Stream | None = None
         self._fault_told, self._last_command = None, b""
@@ -148,7 +148,7 @@ class ScipDevice:
 
     def advance(self, now: float) -> bytes:
         """Return what the unit sends by itself up to host time `now`."""
-        out = b""
+        out, self._now = b"", now
         while self._feed.head is not None and self.next_time(now) <= now:
             self._latest = self._feed.pop()
             if self._stream is not None and not self.hung:
@@ -189,7 +189,7 @@ class ScipDevice:
         return frame
 
     def _scan_block(self, echo: bytes, status: str, scan: Scan, start: int, end: int, cluster: int, wide: bool) -> bytes:
-        first_ray = self._clock.host(scan.time)
+        first_ray = min(self._clock.host(scan.time), self._now - TURN)  # GD before the world began: the turn just over
         values = self._values(scan, start, end, cluster)
         self._on_scan(first_ray + max(0, start - FIRST_STEP) * STEP_TIME, values)
         width = 3 if wide else 2
@@ -216,6 +216,7 @@ class ScipDevice:
 
     def receive(self, data: bytes, now: float) -> bytes:
         """Take bytes from the host and return the answer."""
+        self._now = now
         if self.hung or not self._understood():
             return b""
         out = b""

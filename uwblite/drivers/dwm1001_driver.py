@@ -5,6 +5,7 @@ Two ways to read it. *TLV* (default): status until a fix is ready, then the fix 
 that died, is brought round.
 """
 
+import math
 from typing import Any
 
 from .dwm1001 import BAUD, STATUS_GET, TlvProtocol, request
@@ -22,7 +23,7 @@ from .dwm1001_shell import (
     parse_node_info,
     shell_command,
 )
-from .events import Action, Corrupt, Note, Param, RangeEpoch, Reopen, Send
+from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, Reopen, Send
 from .session import Driver, Identity, Script, Wait
 
 DRAIN = 0.25
@@ -35,6 +36,8 @@ QUIET = 0.15, 0.35
 QUERIES = ("ver_get", "nodeid_get", "panid_get", "cfg_get", "upd_rate_get")
 ANSWERS = {"ver_get": "hardware", "nodeid_get": "node_id", "panid_get": "pan_id"}
 """The value that completes the answer to a query."""
+DISTRUST, LEAP = 5.0, 0.25
+"""s for which a stream counts as damaged; m by which a range may change from one line to the next meanwhile."""
 SHORTEST_PERIOD = 0.1
 """s between fixes at the highest rate."""
 
@@ -59,6 +62,11 @@ class Dwm1001Driver(Driver):
         self.joined: bool | None = None
         self._shell, self._stream = shell, stream
         self._poller: FixPoller | None = None
+        self._ranges: dict[str, float] = {}
+        """m, the last range of each anchor in the stream."""
+        self._damaged, self._last_line = -math.inf, 0.0
+        """s, when the stream was damaged; when its last line came."""
+        self._missed = False
         self.begin()
 
     def begin(self) -> None:
@@ -102,7 +110,8 @@ class Dwm1001Driver(Driver):
             if self._shell:
                 yield from self._read_lines()
             else:
-                yield from FixPoller(self, self.period).script()
+                self._poller = self._poller or FixPoller(self, self.period)
+                yield from self._poller.script()
             yield Note("warning", "uwb-restart", "uwb: no fix and no answer; starting the module again")
         text = (
             "uwb: no answer. The USB bridge of the DEV board can hang: unplug it and plug it in again;"
@@ -184,17 +193,35 @@ class Dwm1001Driver(Driver):
 
     def _read_lines(self) -> Script[None]:
         """Read the stream until no more lines come; the command toggles it, so it is sent until they do."""
-        self._streaming, tries = True, 4
+        self._streaming, tries, self._missed = True, 4, True
         while tries:
             tries -= 1
             yield Send(shell_command("lec"))
             until = self.now + max(1.0, 3 * self.period)
             while (event := (yield Wait(until))) is not None:
-                if isinstance(event, RangeLine):
+                if isinstance(event, Corrupt):
+                    self._damaged, self._missed = self.now, True
+                elif isinstance(event, RangeLine):
                     until, tries = self.now + max(3.0, 3 * self.period), 4
-                    if event.readings:
-                        yield RangeEpoch(event.stamp, event.readings)
+                    yield from self._take_line(event)
         self._streaming = False
+
+    def _take_line(self, line: RangeLine) -> Script[None]:
+        """Log a line. It has no sum: where others were damaged, a range that leaps or a new anchor must come twice."""
+        doubted = {
+            r.anchor_id for r in line.readings
+            if self.now - self._damaged < DISTRUST and abs(r.range - self._ranges.get(r.anchor_id, math.inf)) > LEAP
+        }  # fmt: skip
+        self._ranges.update((r.anchor_id, r.range) for r in line.readings)
+        gap = round((line.stamp - self._last_line) / self.period) - 1 if self._last_line else 0
+        if gap > 0 and self._missed:
+            yield Lost(line.stamp, gap)
+        self._last_line, self._missed = line.stamp, False
+        if doubted:
+            yield Corrupt(b"", "range that leaps on a damaged line")
+        readings = tuple(r for r in line.readings if r.anchor_id not in doubted)
+        if readings:
+            yield RangeEpoch(line.stamp, readings)
 
     # ---- TLV
 

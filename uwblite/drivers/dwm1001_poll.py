@@ -57,22 +57,20 @@ class FixPoller:
 
     def __init__(self, driver: Driver, period: float) -> None:
         self._driver, self._period = driver, period
-        self._trip: float | None = None
-        self._failures = 0
         self._distrust_until = 0.0
         self._known: set[str] = set()
-        self._lead = LEAD
-        self._low: float | None = None
-        """s, when the last look was sent that would have shown any fix made before it."""
         self._last_fix = driver.now
         self._latest: Readings | None = None
-        self._pending: tuple[Bracket, Readings, Bracket] | None = None
-        """Bracket and readings of a fix; and the bracket to take if another fix is found to be close behind."""
-        self._hidden = self._missed = False
-        """An answer was lost that may have announced a fix; a fix may have been missed."""
 
     def script(self) -> Script[None]:
         """Poll until the module answers no more."""
+        self._trip: float | None = None
+        self._failures, self._lead = 0, LEAD
+        self._low: float | None = None  # s, when the last look was sent that would have shown any fix made before it
+        # Bracket and readings of a fix, and the bracket to take if another fix is found to be close behind.
+        self._pending: tuple[Bracket, Readings, Bracket] | None = None
+        self._hidden = False  # an answer was lost that may have announced a fix
+        self._missed = self._latest is not None  # a fix may have been missed
         while self._failures < MAX_FAILURES:
             if self._trip is not None and self._trip > SLOW * self._period:
                 yield from self._watch_fixes()

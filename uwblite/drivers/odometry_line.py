@@ -19,6 +19,12 @@ from .session import Driver, Identity, Script, Wait
 _Number = TypeVar("_Number", int, float)
 
 MAX_LINE = 256
+LEAP_SPEED, LEAP_TURN = 3.0, 10.0
+"""m/s and rad/s that no base of this kind reaches: a line that asks for more is damaged, or the base began anew."""
+LEAST_STEP = 0.1
+"""s; over shorter times rounded numbers may seem faster."""
+LEAP_TIME = 1.0
+"""s by which the base's clock may run ahead of the arrivals between two lines."""
 COLUMNS = ("t", "x", "y", "theta", "left", "right", "speed", "turn_rate", "-")
 
 
@@ -209,16 +215,18 @@ class LineOdometer:
         if last is None:
             self._theta = self._theta if theta is None else theta
             return
-        left, right = (self._difference(values[name] - last[name]) * spec.tick for name in ("left", "right"))
+        left, right = (_difference(spec, values[name] - last[name]) * spec.tick for name in ("left", "right"))
         turn = (right - left) / spec.wheel_base if theta is None else math.remainder(theta - self._theta, 2 * math.pi)
         middle = self._theta + turn / 2
         self._x += (left + right) / 2 * math.cos(middle)
         self._y += (left + right) / 2 * math.sin(middle)
         self._theta = math.remainder(self._theta + turn, 2 * math.pi)
 
-    def _difference(self, ticks: float) -> float:
-        wrap = self._format.tick_modulus
-        return (ticks + wrap / 2) % wrap - wrap / 2 if wrap else ticks
+
+def _difference(spec: LineFormat, ticks: float) -> float:
+    """Return a difference of tick counters that may have wrapped in between."""
+    wrap = spec.tick_modulus
+    return (ticks + wrap / 2) % wrap - wrap / 2 if wrap else ticks
 
 
 class LineDriver(Driver):
@@ -238,10 +246,13 @@ class LineDriver(Driver):
         self._protocol = OdometryLineProtocol(line_format)
         self._odometer = LineOdometer(line_format, start)
         self._clock = DeviceClock(line_format.time_unit, proven=False)
+        self._last: Sample | None = None
+        self._doubtful: Sample | None = None
 
     def begin(self) -> None:
         """Forget half a line."""
         self._protocol = OdometryLineProtocol(self._format)
+        self._doubtful = None
 
     def parse(self, data: bytes, now: float) -> list[Any]:
         """Return Sample and Corrupt."""
@@ -253,8 +264,32 @@ class LineDriver(Driver):
         yield from super().script()
 
     def take(self, event: Sample) -> list[Action]:
-        """Turn a line into a pose."""
+        """Turn a line into a pose. Lines have no sum: one that leaps counts only if the next one goes on from it."""
         self.ready = True
+        doubtful, self._doubtful = self._doubtful, None
+        if self._last is None or self._follows(self._last, event):
+            dropped: list[Action] = [Corrupt(b"", "line that leaps away and back")] if doubtful else []
+            return dropped + self._pose(event)
+        if doubtful and self._follows(doubtful, event):
+            return self._pose(doubtful) + self._pose(event)
+        self._doubtful = event
+        return [Corrupt(b"", "line that leaps away and back")] if doubtful else []
+
+    def _follows(self, before: Sample, after: Sample) -> bool:
+        """Tell whether a base can have moved so, and its clock have gone on so."""
+        spec, old, new = self._format, dict(before.values), dict(after.values)
+        waited = max(after.stamp - before.stamp, 0.0)
+        elapsed = (new["t"] - old["t"]) * spec.time_unit if "t" in new else waited
+        if self._clock.proven and self._clock.rate is None and not -1e-9 <= elapsed <= waited + LEAP_TIME:
+            return False
+        seconds = max(elapsed if self._clock.proven else waited, LEAST_STEP)
+        ways = [abs(_difference(spec, new[name] - old[name])) * spec.tick for name in ("left", "right") if name in new]
+        ways += [abs(new[name] - old[name]) * abs(spec.length_unit) for name in ("x", "y") if name in new]
+        turn = abs(math.remainder((new["theta"] - old["theta"]) * spec.angle_unit, 2 * math.pi)) if "theta" in new else 0.0
+        return max(ways) <= LEAP_SPEED * seconds and turn <= LEAP_TURN * seconds
+
+    def _pose(self, event: Sample) -> list[Action]:
+        self._last = event
         time = dict(event.values).get("t")
         if time is None:
             return [self._odometer.update(event)]

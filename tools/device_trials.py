@@ -1,0 +1,179 @@
+"""Every device against every kind of link: false readings, what is missing and what was said, stamps, processor time.
+
+    python tools/device_trials.py                     all devices and links, a table in Markdown
+    python tools/device_trials.py scip tlv --link noise --seconds 60
+
+Sessions talk to the emulators in simulated time, so that the machine's load does not matter. A reading is false when the
+emulator never sent it; a stamp's error is against the emulator's own time. Missing counts what was sent after the first
+reading and did not come; lost is what the session says. Processor time is that of the session alone.
+"""
+
+import argparse
+import math
+import random
+import sys
+import time
+from bisect import bisect_left
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
+
+from emulators.dwm_device import DwmDevice
+from emulators.faults import FaultyLine, parse_fault
+from emulators.kobuki_device import KobukiDevice, TickLineDevice
+from emulators.scip_device import ScipDevice
+from emulators.simulated_time import of_kind, simulate
+from emulators.world import RoomWorld, WorldClock
+
+from uwblite.drivers.devices import open_device
+from uwblite.drivers.events import LaserScan, Lost, OdometryPose, RangeEpoch
+from uwblite.drivers.session import Session
+
+START = 1000.0
+TICKS = "columns=t,left,right&tick=1e-4&wheel_base=0.3&time_unit=0.001"
+DEVICES = {
+    "scip": ("lidar", "scip:port"), "tlv": ("uwb", "tlv:port"), "shell": ("uwb", "shell:port"),
+    "kobuki": ("odometry", "kobuki:port"), "line": ("odometry", f"line:port?{TICKS}"),
+}  # fmt: skip
+LINKS = ("whole", "bytes", "noise", "loss", "replug", "reset", "slow")
+"""As it comes; byte by byte; 1 byte in 2,000 changed; 1 in 2,000 lost; the cable pulled for 3 s; the device's clock or the
+device reset; 40 ms round trip, 16 ms steps and up to 10 ms of jitter."""
+HALFWAY = 0.5
+
+
+class TimedSession(Session):
+    """A session that knows its processor time."""
+
+    cpu = 0.0
+
+    def feed(self, data, now):
+        """Take bytes."""
+        began = time.process_time()
+        actions = super().feed(data, now)
+        self.cpu += time.process_time() - began
+        return actions
+
+    def tick(self, now):
+        """Do what is due."""
+        began = time.process_time()
+        actions = super().tick(now)
+        self.cpu += time.process_time() - began
+        return actions
+
+
+def emulator(name, seconds, *, reset):
+    """Return an emulated device in the room and the list of (time, content) of what it sends."""
+    world, clock, sent = RoomWorld(), WorldClock(), []
+    clock.start(START)
+    if name == "scip":
+        device = ScipDevice(world.scans(), clock, on_scan=lambda t, values: sent.append((t, tuple(values))))
+    elif name in ("tlv", "shell"):
+        device = DwmDevice(world.epochs(), clock, on_fix=lambda t, rows: sent.append((t, readings(rows, name))))
+    else:
+        kind = KobukiDevice if name == "kobuki" else TickLineDevice
+        device = kind(world.poses(), clock, on_packet=lambda t, x, y, theta: sent.append((t, (x, y, theta))))
+    if reset:
+        advance, done = device.advance, []
+
+        def scripted(now):
+            if now > START + HALFWAY * seconds and not done:
+                done.append(now)
+                if name == "scip":
+                    device._power = now
+                elif name in ("tlv", "shell"):
+                    device._reboot_at = now + 1.0
+                else:
+                    device._ms -= 20_000
+            return advance(now)
+
+        device.advance = scripted
+    return device, sent
+
+
+def readings(rows, name):
+    """Return the ranges of a round as the device prints them."""
+    digits = 3 if name == "tlv" else 2
+    return tuple((f"{a:04X}", f"{mm / 1000:.{digits}f}") for a, mm, _ in rows)
+
+
+def measured(name, actions):
+    """Return (stamp, content) of what a session measured."""
+    if name == "scip":
+        return [(scan.stamp, tuple(round(1000 * r) if math.isfinite(r) else 0 for r in scan.ranges))
+                for scan in of_kind(actions, LaserScan)]  # fmt: skip
+    if name in ("tlv", "shell"):
+        digits = 3 if name == "tlv" else 2
+        return [(epoch.stamp, tuple((r.anchor_id, f"{r.range:.{digits}f}") for r in epoch.readings))
+                for epoch in of_kind(actions, RangeEpoch)]  # fmt: skip
+    return [(pose.stamp, (pose.x, pose.y, pose.theta)) for pose in of_kind(actions, OdometryPose)]
+
+
+def judge(name, got, sent):
+    """Return the number of false readings and the stamp errors, s."""
+    if name in ("tlv", "shell"):
+        rounds = [(stamp, set(content)) for stamp, content in sent]
+        times = [[stamp for stamp, content in rounds if content >= set(seen)] for _, seen in got]
+        errors = [min(abs(stamp - t) for t in found) for (stamp, _), found in zip(got, times, strict=True) if found]
+        return len(got) - len(errors), errors
+    if name == "scip":
+        times = {}
+        for stamp, content in sent:
+            times.setdefault(content, []).append(stamp)
+        errors = [min(abs(stamp - t) for t in times[content]) for stamp, content in got if content in times]
+        return len(got) - len(errors), errors
+    stamps, errors, false, shift = [t for t, _ in sent], [], 0, (0.0, 0.0)
+    for stamp, pose in got:
+        at = bisect_left(stamps, stamp)
+        near = min(range(max(0, at - 1), min(len(sent), at + 1)), key=lambda k: abs(stamps[k] - stamp))
+        errors.append(abs(stamps[near] - stamp))
+        here = pose[0] - sent[near][1][0], pose[1] - sent[near][1][1]
+        step = math.hypot(here[0] - shift[0], here[1] - shift[1])
+        false += bool(errors[1:]) and step > 0.02  # m: no damage may move the pose
+        shift = here
+    return false, errors
+
+
+def trial(name, link, seconds, seed=0):
+    """Run one device on one link and return its row."""
+    sensor, spec = DEVICES[name]
+    rng = random.Random(seed)
+    device, sent = emulator(name, seconds, reset=link == "reset")
+    session = TimedSession(open_device(sensor, spec)[0].driver)
+    options = {
+        "bytes": {"piece": 1}, "noise": {"line": FaultyLine([parse_fault("noise=0.0005@3")], seed)},
+        "loss": {"line": FaultyLine([parse_fault("drop=0.0005@3")], seed)}, "replug": {"replug": (HALFWAY * seconds, 3.0)},
+        "slow": {"latency": 0.040, "tick": 0.016},
+    }.get(link, {})  # fmt: skip
+    jitter = (lambda: rng.uniform(0, 0.010)) if link == "slow" else (lambda: rng.expovariate(1000.0))
+    actions, _ = simulate(session, device, seconds, jitter=jitter, **options)
+    got = measured(name, actions)
+    false, errors = judge(name, got, sent)
+    errors = sorted(errors) or [math.nan]
+    missing = sum(got[0][0] - 0.01 <= t <= got[-1][0] + 0.01 for t, _ in sent) - len(got) if got else len(sent)
+    lost = sum(action.count for action in of_kind(actions, Lost))
+    return {
+        "device": name, "link": link, "readings": len(got), "false": false, "missing": missing, "lost": lost,
+        "median ms": 1000 * errors[len(errors) // 2], "95 % ms": 1000 * errors[int(0.95 * len(errors))],
+        "CPU %": 100 * session.cpu / seconds,
+    }  # fmt: skip
+
+
+def main(argv=None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("devices", nargs="*", metavar="DEVICE", help=f"of {', '.join(DEVICES)} (all)")
+    parser.add_argument("--link", action="append", choices=LINKS, help="repeatable (all)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="simulated time of each (60)")
+    args = parser.parse_args(argv)
+    header = ("device", "link", "readings", "false", "missing", "lost", "median ms", "95 % ms", "CPU %")
+    print("| " + " | ".join(header) + " |\n|" + "---|" * len(header))
+    for name in args.devices or DEVICES:
+        for link in args.link or LINKS:
+            row = trial(name, link, args.seconds)
+            cells = [f"{row[key]:.2f}" if isinstance(row[key], float) else str(row[key]) for key in header]
+            print("| " + " | ".join(cells) + " |", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
