@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uwblite.cli import main
-from uwblite.config import merge, parse_toml
+from uwblite.config import merge, parse_toml, to_toml
 from uwblite.errors import UwbliteError
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
@@ -27,7 +27,7 @@ from uwblite.io.tum import read_tum
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.mapping import MappingConfig
 
-from .small_files import ANCHORS, G2O, KNOWN, LOG, MAPPING, PYFG, SETTINGS, TABLE, TORO, TUM
+from .small_files import ANCHORS, G2O, KNOWN, LOG, MAPPING, PYFG, TABLE, TORO, TUM
 
 Read = Callable[[Path], object]
 
@@ -84,13 +84,15 @@ def _grid() -> OccupancyGrid:
 def _map_folder(folder: Path) -> None:
     write_map(folder, _grid())
     write_map(folder, _grid(), name="map_scale", mode="scale")
+    for yaml in folder.glob("*.yaml"):
+        yaml.write_text("# a map\n" + yaml.read_text() + "# width: 60, height: 40, drawn on Monday\n" * 8)
     (folder / "anchors.csv").write_bytes(ANCHORS)
     (folder / "trajectory.tum").write_bytes(TUM)
 
 
-def _put(folder: Path, **files: bytes) -> None:
-    for name, data in files.items():
-        (folder / name.replace("_DOT_", ".")).write_bytes(data)
+def _toro(poses: int) -> bytes:
+    edges = (f"EDGE2 {k} {k + 1} 1 0.1 0.2 100 0 100 100 0 0" for k in range(1, poses))
+    return TORO + "".join(f"{edge}\n" for edge in edges).encode()
 
 
 def _file(name: str, data: bytes, read: Read, cost: int = 1) -> Case:
@@ -185,14 +187,14 @@ def cases() -> dict[str, Case]:
     found = {
         "carmen": _file("x.log", _log(20), read_log),
         "g2o": _file("x.g2o", G2O, read_g2o),
-        "toro": _file("x.graph", TORO, read_g2o),
+        "toro": _file("x.graph", _toro(12), read_g2o),
         "pyfg": _file("x.pyfg", PYFG, read_pyfg),
         "tum": _file("x.tum", TUM * 4, read_tum),
-        "csv table": _file("x.csv", TABLE * 2, read_csv),
-        "anchors": _file("x.csv", ANCHORS, read_anchors),
-        "settings": _file("x.toml", SETTINGS, _text(_settings)),
-        "constraints": _file("x.toml", KNOWN, _text(parse_constraints)),
-        "mapping": _file("x.toml", MAPPING, _text(parse_mappings)),
+        "csv table": _file("x.csv", TABLE * 6, read_csv),
+        "anchors": _file("x.csv", ANCHORS + b"".join(b"A%d,%d,2.5,0.1,0.2,ok\n" % (k, k) for k in range(20)), read_anchors),
+        "settings": _file("x.toml", to_toml(MappingConfig()).encode()[:2500].rpartition(b"\n")[0], _text(_settings)),
+        "constraints": _file("x.toml", KNOWN * 3, _text(parse_constraints)),
+        "mapping": _file("x.toml", MAPPING * 3, _text(parse_mappings)),
     }
     for name in ("odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"):
         found[name] = Case(f"tables/{name}", lambda path: read_csv_folder(path.parent), _tables)
