@@ -139,3 +139,12 @@ def test_plaza_from_odometry(shared_data, tmp_path, capsys):
     figures = json.loads(capsys.readouterr().out)
     # The measurements in this file are calibrated; an independent solver says chi2 2660.5.
     assert figures["chi2"] == pytest.approx(2660.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("target", ["a.log", "tables/", "a.tum"])
+def test_json_is_one_object(tmp_path, room_log, target, capsys):
+    assert main(["convert", str(room_log), str(tmp_path / target) + "/" * target.endswith("/"), "--json", "--end", "20"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["exit_code"] == 0
+    assert said["counts"]["odometry readings"] == 401
+    assert said["out"].startswith(str(tmp_path))

@@ -312,3 +312,12 @@ def test_nothing_is_written_outside_the_folder(tmp_path):
     write_result(tmp_path / "map", [hostile], small_result(evil="/../../x"), RECORD)
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
     assert set(contents(tmp_path / "map")) == FILES
+
+
+def test_times_of_closures_keep_their_microseconds(tmp_path):
+    result = small_result()
+    late = replace(result, keyframe_stamps=1.7e9 + np.arange(len(result.keyframe_stamps)) * 0.123457)
+    write_result(tmp_path / "map", [small_log()], late, RunRecord(command="", config=""))
+    for closure in json.loads((tmp_path / "map" / "report.json").read_text())["closures"]:
+        for end in "ij":
+            assert abs(closure[f"stamp_{end}"] - late.keyframe_stamps[closure[end]]) < 1e-6

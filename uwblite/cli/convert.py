@@ -7,6 +7,8 @@ from ..errors import ConfigError
 from .options import add_bag_arguments, add_mounting_arguments, number, place
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ..arrays import Floats
     from ..sensor_log import SensorLog
 
@@ -37,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", type=place, nargs="?", help="what to make; its name tells the format, or --to does")
     parser.add_argument("--to", choices=_TARGETS, help="format of the target where its name does not tell")
     parser.add_argument("--force", action="store_true", help="replace a file that is already there")
+    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
     text = "recording that a map was made of, for its scans and odometry; repeatable, in their order"
     parser.add_argument("--recording", metavar="LOG", action="append", default=[], help=text)
     parser.add_argument("--list", action="store_true", help="list the topics of a bag and stop")
@@ -91,6 +94,10 @@ def _list(args: argparse.Namespace, kind: str) -> int:
     if kind != "bag":
         raise ConfigError(f"{args.source} is not a bag; --list shows the topics of bags")
     topics, plan = plan_bag(args.source, *bag_choices(args))
+    if args.json:
+        rows = [{"topic": t.name, "type": t.type, "messages": t.count, "role": plan.role(t.name) or None} for t in topics]
+        console.say_json({"topics": rows, "unread": list(plan.unread), "exit_code": 0})
+        return 0
     width = max((len(t.name) for t in topics), default=0)
     for t in topics:
         role = plan.role(t.name) or ("ranges?" if t.name in plan.unread else "")
@@ -110,9 +117,8 @@ def _convert_graph(args: argparse.Namespace) -> int:
     for warning in file.warnings:
         console.note(f"uwblite: {args.source}: {warning}")
     write_graph(args.target, file)
-    skipped = "".join(f", {count} {name} skipped" for name, count in file.skipped.items())
-    console.say(f"{args.target}: {len(file.graph.poses)} poses, {len(file.graph.anchors)} landmarks{skipped}")
-    return 0
+    skipped = {f"{name} skipped": count for name, count in file.skipped.items()}
+    return _say(args, {"poses": len(file.graph.poses), "landmarks": len(file.graph.anchors), **skipped}, warnings=file.warnings)
 
 
 def _convert_map(args: argparse.Namespace, to: str) -> int:
@@ -130,17 +136,14 @@ def _convert_map(args: argparse.Namespace, to: str) -> int:
     if to in ("tum", "kitti"):
         if len(result.trajectories) > 1:
             console.note(f"uwblite: {args.source} holds {len(result.trajectories)} trajectories; this is the first of them")
-        return _say_trajectory(args.target, to, *result.trajectories[0])
+        return _write_trajectory(args, to, *result.trajectories[0])
     logs = [apply_mounting(read_recording(name, bag=bag_choices(args)), args) for name in args.recording]
     if to == "g2o":
         scans = write_graph_with_scans(args.target, result, logs)
-        console.say(f"{args.target}: {len(result.keyframe_stamps)} poses, {scans} with a scan")
-        return 0
+        return _say(args, {"poses": len(result.keyframe_stamps), "poses with a scan": scans})
     write_result_bag(args.target, result, logs, storage=to)
-    without = "" if logs else " (without scans and odometry: --recording adds them)"
-    counts = f"{len(result.anchors)} anchors, {len(result.closures)} closures"
-    console.say(f"{args.target}: map, transforms, path, {counts}{without}")
-    return 0
+    without = "" if logs else "without scans and odometry, which --recording adds"
+    return _say(args, {"anchors": len(result.anchors), "closures": len(result.closures)}, note=without)
 
 
 def _convert_trajectory(args: argparse.Namespace, to: str) -> int:
@@ -152,15 +155,25 @@ def _convert_trajectory(args: argparse.Namespace, to: str) -> int:
     if to not in ("tum", "kitti"):
         raise ConfigError(f"{args.target}: not a format for a trajectory; use --to tum or kitti")
     refuse_existing(args.force, args.target)
-    return _say_trajectory(args.target, to, *read_tum(args.source))
+    return _write_trajectory(args, to, *read_tum(args.source))
 
 
-def _say_trajectory(path: str, to: str, stamps: "Floats", poses: "Floats") -> int:
+def _write_trajectory(args: argparse.Namespace, to: str, stamps: "Floats", poses: "Floats") -> int:
     from ..io.tum import write_trajectory
+
+    write_trajectory(args.target, to, stamps, poses)
+    return _say(args, {"poses": len(poses)})
+
+
+def _say(args: argparse.Namespace, counts: dict[str, int], *, note: str = "", warnings: "Sequence[str]" = ()) -> int:
+    """Say what was written, as text or as one JSON object."""
     from . import console
 
-    write_trajectory(path, to, stamps, poses)
-    console.say(f"{path}: {len(poses)} poses")
+    if args.json:
+        console.say_json({"out": args.target, "counts": counts, "note": note, "warnings": list(warnings), "exit_code": 0})
+    else:
+        made = ", ".join(f"{count} {name}" for name, count in counts.items())
+        console.say(f"{args.target}: {made}{f'; {note}' if note else ''}")
     return 0
 
 
@@ -180,8 +193,9 @@ def _convert_recording(args: argparse.Namespace, to: str) -> int:
     _write(args, to, log)
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     scans = 0 if log.scans is None else len(log.scans.stamps)
-    console.say(f"{args.target}: {len(log.odometry.stamps)} odometry readings, {ranges} ranges, {scans} scans")
-    if to == "log":
+    counts = {"odometry readings": len(log.odometry.stamps), "ranges": ranges, "scans": scans}
+    _say(args, counts, warnings=log.notes.warnings)
+    if to == "log" and not args.json:
         console.say(f"next: uwblite check {args.target}")
     return 0
 

@@ -185,7 +185,7 @@ def _closure_entry(closure: Any, stamps: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _ready(value: Any) -> Any:
-    """Return a value as JSON has it: nine significant digits, null where it is not finite."""
+    """Return a value as JSON has it: nine significant digits, six decimals of large numbers, null where it is not finite."""
     if isinstance(value, dict):
         return {encodable(str(k)): _ready(v) for k, v in value.items()}
     if isinstance(value, np.generic | np.ndarray):
@@ -195,5 +195,6 @@ def _ready(value: Any) -> Any:
     if isinstance(value, str):
         return encodable(value)
     if isinstance(value, float):
-        return float(f"{value:.9g}") if np.isfinite(value) else None
+        # Nine digits of a measurement; of a time since 1970 a microsecond.
+        return (round(value, 6) if abs(value) > 1e3 else float(f"{value:.9g}")) if np.isfinite(value) else None
     return value
