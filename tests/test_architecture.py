@@ -16,8 +16,8 @@ MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACK
 
 FLOORS = (
     ("errors", "printable", "arrays", "parallel"),
-    ("se2",),
-    ("config", "sensor_log", "graph", "drivers"),
+    ("se2", "config"),
+    ("sensor_log", "graph", "drivers"),
     ("constraints", "keyframes", "grid"),
     ("wheels", "map_result", "radio"),
     ("lidar", "report"),

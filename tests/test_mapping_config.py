@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwblite.config import from_dict, to_dict
-from uwblite.errors import DataError
+from uwblite.errors import ConfigError
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.pose_edges import OdometryEdges
 from uwblite.graph.range_edges import RangeEdges
@@ -23,7 +23,7 @@ def test_presets_are_settings_that_survive_a_file(name):
 
 def test_the_default_changes_nothing_and_others_are_unknown():
     assert preset("default") == MappingConfig()
-    with pytest.raises(DataError, match="unknown preset 'best'; choose default or paper"):
+    with pytest.raises(ConfigError, match="unknown preset 'best'; choose default or paper"):
         preset("best")
 
 

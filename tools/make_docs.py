@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from uwblite.config import field_docs, permitted, toml_value
+from uwblite.config import field_docs, permitted, shown_fields, toml_value
 from uwblite.mapping import MappingConfig
 from uwblite.mapping_config import preset
 
@@ -22,7 +22,8 @@ Written by `tools/make_docs.py` from the source; do not edit. The defaults are m
 setting when a row of the table below, or of [troubleshooting](troubleshooting.md), tells you to.
 
 ```sh
-uwblite config                                  # all of them, as a file for --config
+uwblite config                                  # these, as a file for --config
+uwblite config --all                            # also those for experiments
 uwblite config --preset paper                   # the paper's plain choices
 uwblite map run.log --out tuned --set grid.resolution=0.02 --set keyframes.distance=0.2
 ```
@@ -44,7 +45,7 @@ def table(config: Any, path: str = "") -> str:
     """Return the settings of a class as a table, and those of the classes within it below."""
     docs, hints = field_docs(type(config)), get_type_hints(type(config))
     rows, below = [], []
-    for field in dataclasses.fields(config):
+    for field in shown_fields(config):
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
             below.append(table(value, f"{path}{field.name}."))

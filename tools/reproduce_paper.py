@@ -129,7 +129,7 @@ def planned(args: argparse.Namespace, pictures: Path) -> list[Task]:
     # fmt: on
     hall = Settings(world="hall", seed=1, minutes=minutes)
     tasks += [Task(hall, runs) for runs in (_sizes(args.quick), _grid("paper", "icp.fitness_sigma", args.quick))]
-    tasks.append(Task(hall, _grid("default", "loops.sigma", args.quick)))
+    tasks.append(Task(hall, _grid("default", "loop_closure.sigma", args.quick)))
     return tasks
 
 
@@ -146,7 +146,7 @@ def _sizes(quick: bool) -> tuple[Run, ...]:
     runs = []
     for epsilon in (0.0, 9.0) if quick else EPSILONS:
         # So many sub-maps have too many pairs: of the smallest, the best four partners each.
-        few = ("loops.partners=4",) if epsilon < 3.0 else ()
+        few = ("loop_closure.partners=4",) if epsilon < 3.0 else ()
         change = (f"submaps.epsilon={epsilon}", *QUICK_WITHOUT_MAP)
         runs += [Run(("III", f"{epsilon:g}", p), p, (*change, *(few if p == "paper" else ()))) for p in PRESETS]
     for count in (10, 300) if quick else ITERATIONS:
@@ -157,7 +157,7 @@ def _sizes(quick: bool) -> tuple[Run, ...]:
 
 
 def _grid(name: str, threshold: str, quick: bool) -> tuple[Run, ...]:
-    distance = "icp.max_correspondence_distance" if name == "paper" else "loops.gate"
+    distance = "icp.max_correspondence_distance" if name == "paper" else "loop_closure.gate"
     sigmas: tuple[float, ...] = FITNESS if name == "paper" else (0.02, 0.05, 0.1)
     distances = DISTANCES[1:3] if quick else DISTANCES
     sigmas = sigmas[1:3] if quick else sigmas

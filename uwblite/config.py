@@ -24,6 +24,7 @@ from .errors import ConfigError
 Settings = TypeVar("Settings")
 
 _RANGE = "uwblite range"
+_ADVANCED = "uwblite advanced"
 
 
 def setting(
@@ -33,10 +34,15 @@ def setting(
     minimum: float | None = None,
     maximum: float | None = None,
     below: float | None = None,
+    advanced: bool = False,
 ) -> Any:
-    """Return a dataclass field with a default and a permitted range: above < value < below, minimum <= value <= maximum."""
+    """Return a dataclass field with a default and a permitted range: above < value < below, minimum <= value <= maximum.
+
+    An advanced setting is for experiments and presets; lists for users leave it out where it has its default.
+    """
     limits = {"above": above, "minimum": minimum, "maximum": maximum, "below": below}
-    return dataclasses.field(default=default, metadata={_RANGE: {k: v for k, v in limits.items() if v is not None}})
+    limits = {k: v for k, v in limits.items() if v is not None}
+    return dataclasses.field(default=default, metadata={_ADVANCED: advanced, **({_RANGE: limits} if limits else {})})
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -119,7 +125,7 @@ def _merge(config: Any, data: Any, path: tuple[str, ...], root: type) -> Any:
     for name, value in data.items():
         where = (*path, str(name))
         if name not in fields:
-            raise ConfigError(f"unknown setting {'.'.join(where)!r}{_did_you_mean(where, root)}")
+            raise ConfigError(_unknown(where, type(config), root))
         old = getattr(config, name)
         if dataclasses.is_dataclass(old):
             changes[name] = _merge(old, value, where, root)
@@ -129,6 +135,18 @@ def _merge(config: Any, data: Any, path: tuple[str, ...], root: type) -> Any:
         return dataclasses.replace(config, **changes)
     except ConfigError as error:
         raise ConfigError(f"[{'.'.join(path)}] {error}" if path else str(error)) from None
+
+
+def _unknown(where: tuple[str, ...], cls: type, root: type) -> str:
+    """Return why a name is no setting: it was renamed, is a constant of its class now, or never was one."""
+    name = ".".join(where)
+    renamed: Mapping[str, str] = getattr(root, "RENAMED", {})
+    for old, new in renamed.items():
+        if name == old or name.startswith(f"{old}."):
+            return f"the setting {name!r} is called {new + name[len(old) :]!r} now"
+    if where[-1] in cls.__annotations__:
+        return f"{name!r} is no setting any more: it is now a constant of {cls.__name__}, {getattr(cls, where[-1])!r}"
+    return f"unknown setting {name!r}{_did_you_mean(where, root)}"
 
 
 def _did_you_mean(where: tuple[str, ...], root: type) -> str:
@@ -240,7 +258,7 @@ def field_docs(cls: type) -> dict[str, str]:
     return docs
 
 
-def to_toml(config: Any, *, comments: bool = False, header: str = "") -> str:
+def to_toml(config: Any, *, comments: bool = False, header: str = "", advanced: bool = True) -> str:
     """Return the settings as TOML, with the meaning of each setting as a comment where asked for.
 
     Parameters
@@ -248,19 +266,32 @@ def to_toml(config: Any, *, comments: bool = False, header: str = "") -> str:
     config : settings.
     comments : write each field's docstring, permitted range and choices above it.
     header : text for the first lines, written as comments.
+    advanced : also write advanced settings that have their defaults.
     """
     lines = [f"# {line}".rstrip() for line in header.splitlines()]
-    _write_table(lines, config, (), comments)
+    _write_table(lines, config, (), comments, advanced)
     return "\n".join(lines).strip("\n") + "\n"
 
 
-def _write_table(lines: list[str], config: Any, path: tuple[str, ...], comments: bool) -> None:
+def shown_fields(config: Any, advanced: bool = False) -> "list[dataclasses.Field[Any]]":
+    """Return the fields to list for a user: without advanced ones that have their defaults, unless these are asked for."""
+
+    def shown(f: "dataclasses.Field[Any]") -> bool:
+        value = getattr(config, f.name)
+        if f.metadata.get(_ADVANCED) and not advanced:
+            return bool(value != f.default)
+        return not dataclasses.is_dataclass(value) or bool(shown_fields(value, advanced))
+
+    return [f for f in dataclasses.fields(config) if shown(f)]
+
+
+def _write_table(lines: list[str], config: Any, path: tuple[str, ...], comments: bool, advanced: bool) -> None:
     docs = field_docs(type(config)) if comments else {}
     hints = get_type_hints(type(config))
     tables = []
     if path:
         lines += ["", *(_wrapped(_first_sentence(type(config))) if comments else []), f"[{'.'.join(path)}]"]
-    for f in dataclasses.fields(config):
+    for f in shown_fields(config, advanced):
         value = getattr(config, f.name)
         if dataclasses.is_dataclass(value):
             tables.append((f.name, value))
@@ -269,7 +300,7 @@ def _write_table(lines: list[str], config: Any, path: tuple[str, ...], comments:
             lines += _wrapped(" ".join(filter(None, (docs.get(f.name, ""), permitted(f, hints[f.name])))))
         lines.append(f"{f.name} = {toml_value(value)}")
     for name, value in tables:
-        _write_table(lines, value, (*path, name), comments)
+        _write_table(lines, value, (*path, name), comments, advanced)
 
 
 def permitted(field: "dataclasses.Field[Any]", hint: Any) -> str:

@@ -9,6 +9,10 @@ class ConfigError(UwbliteError):
     """A setting is unknown, of the wrong type or out of its range."""
 
 
+class UsageError(UwbliteError):
+    """The command line, or a file of settings that it names, asks for what there is not; exit code 2."""
+
+
 class FormatError(UwbliteError):
     """A file or stream is not what it should be.
 

@@ -87,11 +87,11 @@ def _stages(task: Task) -> Iterator[Stage]:
         yield constraint_edges.apply_given
     if task.recordings.have_scans:
         yield lidar_stages.make_clouds
-        if config.tracking.on:
+        if config.scan_to_scan.on:
             yield lidar_stages.match_scan_to_scan
             yield radio_stages.reestimate_ranges
         if config.use_loops:
-            yield closure_rounds.close_loops if config.loops.method == "search" else closure_rounds.close_loops_as_paper
+            yield closure_rounds.close_loops if config.loop_closure.method == "search" else closure_rounds.close_loops_as_paper
             yield radio_stages.select_range_priors
             if config.refinement.rounds:
                 yield lidar_stages.refine_jointly

@@ -1,9 +1,9 @@
 """All settings of the stages from recordings to a map, and presets of them."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
-from .errors import DataError
+from .errors import ConfigError
 from .graph.calibration import CalibrationConfig
 from .graph.robust import SQUARED
 from .graph.solver import SolverConfig
@@ -26,13 +26,18 @@ from .wheels import OdometryNoiseConfig
 class MappingConfig:
     """All settings, a group per stage."""
 
+    RENAMED: ClassVar[dict[str, str]] = {
+        "growth": "bootstrap", "anchors": "trilateration", "loops": "loop_closure", "tracking": "scan_to_scan",
+        "search": "correlative", "turn_laser": "detect_laser_flip",
+    }
+    """Earlier names, for error messages."""
     use_uwb: bool = True
     """Use the ranges."""
     use_lidar: bool = True
     """Use the scans."""
     use_loops: bool = True
     """Search loop closures and match clouds of different times."""
-    turn_laser: bool = True
+    detect_laser_flip: bool = True
     """Take the laser as mounted the other way up than told where its turns agree with the wheels' only so."""
     align: Literal["odometry", "first-pose", "walls", "anchors"] = "odometry"
     """Where the map's axes lie: where the odometry began; at the first pose; there, turned so that most walls run along x
@@ -42,15 +47,15 @@ class MappingConfig:
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
     ranges: RangeNoiseConfig = field(default_factory=RangeNoiseConfig)
-    anchors: TrilaterationConfig = field(default_factory=TrilaterationConfig)
-    growth: BootstrapConfig = field(default_factory=BootstrapConfig)
+    trilateration: TrilaterationConfig = field(default_factory=TrilaterationConfig)
+    bootstrap: BootstrapConfig = field(default_factory=BootstrapConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     clouds: CloudConfig = field(default_factory=CloudConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
-    loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)
+    loop_closure: LoopClosureConfig = field(default_factory=LoopClosureConfig)
     icp: IcpConfig = field(default_factory=IcpConfig)
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
+    scan_to_scan: TrackingConfig = field(default_factory=TrackingConfig)
+    correlative: CorrelativeConfig = field(default_factory=CorrelativeConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
     grid: GridConfig = field(default_factory=GridConfig)
@@ -69,7 +74,7 @@ def preset(name: str) -> MappingConfig:
 
     Raises
     ------
-    DataError : there is no such preset.
+    ConfigError : there is no such preset.
     """
     if name == "default":
         return MappingConfig()
@@ -80,11 +85,11 @@ def preset(name: str) -> MappingConfig:
             calibration=CalibrationConfig(**dict.fromkeys(CalibrationConfig.__slots__, 0.0)),
             clouds=CloudConfig(linearity=1.0),
             submaps=SubmapConfig(epsilon=9.0),
-            tracking=TrackingConfig(on=False),
-            loops=LoopClosureConfig(method="icp", partners=1000, rounds=1),
+            scan_to_scan=TrackingConfig(on=False),
+            loop_closure=LoopClosureConfig(method="icp", partners=1000, rounds=1),
             icp=IcpConfig(
                 method="point_to_point", max_correspondence_distance=0.1, max_iterations=300, fitness_sigma=0.1
             ),
             refinement=RefinementConfig(rounds=0),
         )
-    raise DataError(f"unknown preset {name!r}; choose {' or '.join(PRESETS)}")
+    raise ConfigError(f"unknown preset {name!r}; choose {' or '.join(PRESETS)}")

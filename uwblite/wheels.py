@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from . import se2
+from .config import setting
 from .graph.calibration import odometry_indices
 from .graph.graph import Calibration, Graph
 from .graph.pose_edges import OdometryEdges, RelativePoseEdges
@@ -26,7 +27,7 @@ class OdometryNoiseConfig:
     """Standard deviation of heading after one radian of turning, rad; grows with the square root of the angle."""
     standing: float = 0.0005
     """Standard deviation of position (m) and heading (rad) of a robot that stands."""
-    kernel: Kernel = _STEPS
+    kernel: Kernel = setting(_STEPS, advanced=True)
     """Robust kernel: a step that slipped must not bend the rest; none = squared errors (the paper)."""
 
 

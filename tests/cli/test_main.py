@@ -153,11 +153,43 @@ def test_settings_are_printed_checked_and_overridden(tmp_path, capsys):
     assert main(["config", "--config", str(file), "--no-comments"]) == 0
     assert "resolution = 0.02" in capsys.readouterr().out
     file.write_text("[grid]\nresolutoin = 1\n")
-    assert main(["config", "--config", str(file)]) == 1
+    assert main(["config", "--config", str(file)]) == 2
     assert "did you mean 'grid.resolution'" in capsys.readouterr().err
     assert main(["config", "--config", str(tmp_path / "none.toml")]) == 1
-    assert main(["config", "--preset", "papre"]) == 1
+    assert main(["config", "--preset", "papre"]) == 2
     assert "papre" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("growth.drift=1", "'bootstrap' now"),
+        ("loop_closure.uniqueness=1", "it is now a constant of LoopClosureConfig, 0.85"),
+        ("loop_closure.partnerz=1", "did you mean 'loop_closure.partners'"),
+        ("turn_laser=false", "is called 'detect_laser_flip' now"),
+    ],
+)
+def test_names_of_settings_that_are_gone_say_what_became_of_them(setting, words, tmp_path, capsys):
+    assert main(["config", "--set", setting]) == 2
+    assert words in capsys.readouterr().err
+    name, value = setting.split("=")
+    file = tmp_path / "old.toml"
+    file.write_text(f"{name} = {value}\n")
+    assert main(["config", "--config", str(file)]) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+
+
+def test_advanced_settings_are_listed_on_request_and_where_they_were_changed(capsys):
+    def listed(*words):
+        assert main(["config", "--no-comments", *words]) == 0
+        return capsys.readouterr().out
+
+    assert "slow_share" not in listed()
+    assert "slow_share = 0.5" in listed("--all")
+    assert "slow_share = 0.0" in listed("--preset", "paper")
+    assert listed().count(" = ") <= 70
 
 
 @pytest.mark.parametrize("verb", ["map", "localize", "check", "record"])

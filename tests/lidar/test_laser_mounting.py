@@ -92,5 +92,5 @@ def test_a_laser_upside_down_is_mapped_and_said():
     told = build_map(replace(log, mounting=DOWN))
     assert not [w for w in told.warnings if "upside down" in w.text]
     np.testing.assert_array_equal(told.trajectory, result.trajectory)
-    believed = build_map(log, MappingConfig(turn_laser=False))
+    believed = build_map(log, MappingConfig(detect_laser_flip=False))
     assert not [w for w in believed.warnings if "upside down" in w.text]

@@ -18,7 +18,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from .. import __version__
-from ..errors import UwbliteError
+from ..errors import UsageError, UwbliteError
 from ..printable import printable
 
 VERBS = ("map", "view", "localize", "check", "record", "devices", "plan-anchors", "convert", "evaluate", "optimize", "config")
@@ -212,7 +212,7 @@ def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) ->
     except KeyboardInterrupt:
         return console.fail("interrupted", 130)
     except UwbliteError as error:
-        return console.fail(str(error), 1, trace=args.debug)
+        return console.fail(str(error), 2 if isinstance(error, UsageError) else 1, trace=args.debug)
     except MemoryError:
         return console.fail(_OUT_OF_MEMORY, 1, trace=args.debug)
     except OSError as error:

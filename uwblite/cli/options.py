@@ -22,17 +22,25 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def effective_config(args: argparse.Namespace) -> "MappingConfig":
-    """Return the settings that --preset, --config and --set amount to."""
-    from ..config import merge, override, parse_toml
-    from ..mapping import MappingConfig
-    from ..mapping_config import preset
+    """Return the settings that --preset, --config and --set amount to.
 
-    config = preset(args.preset) if args.preset else MappingConfig()
-    if args.config:
-        config = merge(config, parse_toml(read_text(args.config), args.config))
-    # Who says how the laser hangs is believed.
-    told = ["turn_laser=false"] if getattr(args, "laser_flipped", False) else []
-    return override(config, [*told, *args.set])
+    Raises
+    ------
+    UsageError : a preset or setting does not exist, or has a value that it cannot have.
+    """
+    from ..config import merge, override, parse_toml
+    from ..errors import ConfigError, UsageError
+    from ..mapping_config import MappingConfig, preset
+
+    # A user who says how the laser is mounted is believed.
+    given = ["detect_laser_flip=false"] if getattr(args, "laser_flipped", False) else []
+    text = read_text(args.config) if args.config else ""
+    try:
+        config = preset(args.preset) if args.preset else MappingConfig()
+        config = merge(config, parse_toml(text, args.config))
+        return override(config, [*given, *args.set])
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
 
 
 def read_text(path: str) -> str:

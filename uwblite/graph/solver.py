@@ -33,10 +33,12 @@ only confirm. With them, reweighting converges linearly at an unknown rate, and 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..config import setting
 from ..errors import ConfigError, SolverError
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost
@@ -53,11 +55,11 @@ class SolverConfig:
 
     max_iterations: int = 100
     """Most linear systems solved."""
-    relative_decrease: float = 1e-7
+    relative_decrease: float = setting(1e-7, advanced=True)
     """Stop when chi2 is about to decrease by no more than this fraction of it."""
-    gradient_tolerance: float = 1e-9
+    gradient_tolerance: float = setting(1e-9, advanced=True)
     """Stop when no gradient component exceeds this, in standard deviations: max |g_i| / sqrt(H_ii)."""
-    initial_damping: float = 1e-10
+    initial_damping: ClassVar[float] = 1e-10
     """First lambda; 1e-10 starts with a Gauss-Newton step, 1e-3 distrusts the starting values."""
 
     def __post_init__(self) -> None:

@@ -18,11 +18,13 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, Ints
+from ..config import setting
 from ..errors import ConfigError, DataError
 from ..sensor_log import LaserScans
 from .geometry import GridGeometry, central_box
@@ -56,13 +58,13 @@ class GridConfig:
     """Probability that a cell in which a ray ended is occupied, 0.5..1. Lower: more scans needed to draw a wall."""
     p_miss: float = 0.45
     """Probability that a cell through which a ray passed is occupied, 0..0.5. Lower: moving things vanish sooner."""
-    clamp: float = 12.0
+    clamp: float = setting(12.0, advanced=True)
     """Largest absolute log-odds of a cell."""
     max_range: float = 0.0
     """Longer readings are not used, m; 0 = up to what the scanner reaches."""
     max_clear_distance: float = 3.0
     """Beams that saw nothing clear space up to this distance or the first wall, m; 0 = they clear nothing."""
-    clear_run: int = 5
+    clear_run: ClassVar[int] = 5
     """Least number of adjacent beams that saw nothing before they clear space."""
     clear_weight: float = 0.5
     """Weight of a beam that saw nothing against one that passed through to a hit, 0..1 (in steps of 1/16)."""

@@ -7,12 +7,14 @@ a few micrometres at the reach of a lidar, and coordinates in one piece each: ho
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
+from ..config import setting
 from ..keyframes import ScanPoints
 from .point_cloud import Lines, estimate_normals, make_tree
 
@@ -26,14 +28,14 @@ class CloudConfig:
 
     voxel: float = 0.05
     """Cell over which points are averaged, m."""
-    normal_radius: float = 0.2
+    normal_radius: float = setting(0.2, advanced=True)
     """Neighbourhood of a normal, m."""
-    min_neighbours: int = 3
+    min_neighbours: int = setting(3, advanced=True)
     """Points with fewer neighbours are left out as noise."""
-    linearity: float = 0.7
+    linearity: float = setting(0.7, advanced=True)
     """Least share of a neighbourhood's spread that lies along the line for its normal to count, 0..1. A right angle has
     about 0.75: corners say where along a corridor the robot is."""
-    raster: float = 0.1
+    raster: ClassVar[float] = 0.1
     """Cell of the tables of nearest points, m; smaller takes memory with the square and gains nothing on lines."""
     range_max: float = 30.0
     """Longer readings do not enter clouds, m."""

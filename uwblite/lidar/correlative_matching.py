@@ -10,6 +10,7 @@ seen from its other side counts against a pose. Every pose of the grid is scored
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,19 +30,19 @@ _CELLS_PER_REACH = 4
 class CorrelativeConfig:
     """Grid of poses and what is made of its scores."""
 
-    resolution: float = setting(0.15, above=0.0)
+    resolution: float = setting(0.15, above=0.0, advanced=True)
     """Step of x and y, m; time goes with its inverse square."""
-    angle_step: float = setting(0.03, above=0.0)
+    angle_step: float = setting(0.03, above=0.0, advanced=True)
     """Step of the heading, rad; at the source's far points about the resolution."""
-    spread: float = setting(0.12, above=0.0)
+    spread: float = setting(0.12, above=0.0, advanced=True)
     """Standard deviation of a point about the target's surface, m; about the resolution."""
-    candidates: int = setting(5, minimum=1)
+    candidates: int = setting(5, minimum=1, advanced=True)
     """Most poses that are returned."""
-    separation: float = 0.5
+    separation: float = setting(0.5, advanced=True)
     """m; poses closer than that and than separation_angle are one candidate."""
-    separation_angle: float = 0.2
+    separation_angle: ClassVar[float] = 0.2
     """rad."""
-    least_share: float = 0.5
+    least_share: ClassVar[float] = 0.5
     """Of the best score, that another candidate must reach."""
 
 

@@ -7,12 +7,14 @@ round to round. Both poses of a pair are free, so errors spread over the loop in
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy import sparse
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
+from ..config import setting
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph
 from ..graph.normal_equations import NormalEquations
@@ -36,39 +38,39 @@ class RefinementConfig:
 
     rounds: int = 12
     """Most rounds of matching and solving; 0 = no joint refinement (the paper)."""
-    track_rounds: int = 12
+    track_rounds: ClassVar[int] = 12
     """Most rounds of matching neighbouring clouds before loops are sought."""
-    selections: int = 3
+    selections: int = setting(3, advanced=True)
     """How often, at most, the pairs are chosen anew and refined."""
-    same_pairs: float = 0.04
+    same_pairs: ClassVar[float] = 0.04
     """The pairs are not chosen anew when the poses moved by less than this (root mean square) since they were, m."""
-    first_gate: float = 0.5
+    first_gate: float = setting(0.5, advanced=True)
     """Farthest match in the first round, m."""
-    later_gate: float = 0.2
+    later_gate: ClassVar[float] = 0.2
     """Farthest match in the first round where the poses are good already: after tracking, and when pairs are chosen anew."""
-    last_gate: float = 0.12
+    last_gate: ClassVar[float] = 0.12
     """Farthest match in the last rounds, m."""
-    shrink: float = 0.7
+    shrink: ClassVar[float] = 0.7
     """Gate of a round as a share of the one before."""
     partners: int = 6
     """Clouds from other times that each cloud is matched with; fewer, but two at least, where that makes too many."""
-    most: int = 40_000
+    most: ClassVar[int] = 40_000
     """Pairs of clouds from different times that are too many: recordings of hours are tied richly by less."""
-    epoch: float = 2.0
+    epoch: ClassVar[float] = 2.0
     """Travelled distance within which only the best partner counts, m."""
-    neighbours: tuple[int, ...] = (1, 2, 4)
+    neighbours: ClassVar[tuple[int, ...]] = (1, 2, 4)
     """Following keyframes that each cloud is matched with."""
-    points: int = 60
+    points: ClassVar[int] = 60
     """Points looked up per pair."""
-    min_matches: int = 15
+    min_matches: ClassVar[int] = 15
     """Pairs with fewer matches do not count."""
-    min_share: float = 0.3
+    min_share: ClassVar[float] = 0.3
     """Pairs that match a smaller share of the points looked up do not count."""
-    sigma: float = 0.02
+    sigma: float = setting(0.02, advanced=True)
     """Standard deviation of a point-to-line distance before it is learnt, m."""
-    correlation: float = 4.0
+    correlation: float = setting(4.0, advanced=True)
     """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
-    settled: float = 0.0002
+    settled: float = setting(0.0002, advanced=True)
     """Rounds end early when the places of clouds in the frames of their partners change by less than this (root mean
     square) at the last gate, m."""
 

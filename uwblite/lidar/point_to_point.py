@@ -6,7 +6,7 @@ stage on a part of the points, whose gate shrinks, brings the clouds together; a
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -42,34 +42,34 @@ _MOST_SCORED = 250
 class IcpConfig:
     """How two clouds are aligned."""
 
-    method: Literal["point_to_line", "point_to_point"] = "point_to_line"
+    method: Literal["point_to_line", "point_to_point"] = setting("point_to_line", advanced=True)
     """point_to_point is the paper's; it knows neither lines nor corridors."""
     max_correspondence_distance: float = setting(0.15, above=0.0)
     """m; points farther apart are no pair (the paper's d)."""
     max_iterations: int = setting(50, minimum=1)
     """Of all stages together."""
-    tolerance_translation: float = 5e-4
+    tolerance_translation: float = setting(5e-4, advanced=True)
     """m; a smaller step in both senses ends the iteration."""
-    tolerance_rotation: float = 2.5e-4
+    tolerance_rotation: ClassVar[float] = 2.5e-4
     """rad."""
-    coarse_distance: float = 1.0
+    coarse_distance: float = setting(1.0, advanced=True)
     """m; gate of the first iteration of point_to_line, from which it shrinks to max_correspondence_distance: about the
     error of the initial guess. No larger than that distance = no coarse stage."""
-    coarse_stride: int = setting(4, minimum=1)
+    coarse_stride: ClassVar[int] = 4
     """The coarse stage takes every so-many-th point."""
-    sigma: float = setting(0.02, above=0.0)
+    sigma: float = setting(0.02, above=0.0, advanced=True)
     """m, standard deviation of a point about a line by the noise of both clouds; scale of the kernel. (The coarse
     stage widens it with the gate.)"""
-    min_sigma: float = 0.01
+    min_sigma: float = setting(0.01, advanced=True)
     """m; residuals smaller than that do not make the result more certain."""
-    kernel: Kernel = CAUCHY
+    kernel: Kernel = setting(CAUCHY, advanced=True)
     """On residual / sigma; point_to_line only."""
-    max_normal_angle: float = 0.8
+    max_normal_angle: ClassVar[float] = 0.8
     """rad; points whose normals differ by more are no pair, nor are the two sides of a wall; point_to_line only."""
-    degeneracy: float = 2.0
+    degeneracy: ClassVar[float] = 2.0
     """Multiple of the information feigned by scattering normals that a direction must exceed to be measured;
     point_to_line only."""
-    min_matches: int = setting(10, minimum=1)
+    min_matches: int = setting(10, minimum=1, advanced=True)
     """Fewer pairs are no registration."""
     fitness_sigma: float = float("inf")
     """m^2; a fitness score above it is no registration (the paper's sigma)."""

@@ -5,6 +5,7 @@ sharp turn between sparse scans): a correlative search around it finds the place
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,25 +27,25 @@ class TrackingConfig:
 
     on: bool = True
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
-    good_share: float = 0.75
+    good_share: ClassVar[float] = 0.75
     """Neighbours that share at least this part of their points need no search."""
-    gain: float = 0.08
+    gain: ClassVar[float] = 0.08
     """A search must raise the share by this to be believed."""
     distance: float = 0.4
     """Half-width of the search, m."""
     angle: float = 0.45
     """Half-width of the search, rad."""
-    least_share: float = 0.4
+    least_share: ClassVar[float] = 0.4
     """A step whose clouds share a smaller part is left to the wheels."""
-    gate: float = 0.15
+    gate: ClassVar[float] = 0.15
     """Farthest match at the end, m."""
-    points: int = 150
+    points: ClassVar[int] = 150
     """Points looked up per step."""
-    min_points: int = 30
+    min_points: ClassVar[int] = 30
     """Clouds with fewer points with a normal measure nothing."""
-    sigma: float = 0.03
+    sigma: ClassVar[float] = 0.03
     """Standard deviation of a match, m."""
-    correlation: float = 8.0
+    correlation: ClassVar[float] = 8.0
     """Matches that together weigh as one."""
 
 

@@ -5,12 +5,14 @@
 
 import itertools
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..config import setting
 from .clouds import Clouds, joined, mean_by_key
 from .point_cloud import radius_outlier_filter, statistical_outlier_filter
 
@@ -24,15 +26,15 @@ class SubmapConfig:
 
     epsilon: float = 5.0
     """Travelled distance of one sub-map, m (the paper's epsilon; it uses 9)."""
-    voxel: float = 0.08
+    voxel: float = setting(0.08, advanced=True)
     """Cell over which points are averaged, m."""
-    neighbours: int = 8
+    neighbours: ClassVar[int] = 8
     """Statistical filter: nearest neighbours looked at."""
-    std_ratio: float = 3.0
+    std_ratio: float = setting(3.0, advanced=True)
     """Statistical filter: a point whose neighbours lie farther than the mean by so many standard deviations goes."""
-    radius: float = 0.25
+    radius: ClassVar[float] = 0.25
     """Radius filter: m."""
-    min_neighbours: int = 2
+    min_neighbours: int = setting(2, advanced=True)
     """Radius filter: a point with fewer neighbours within the radius goes."""
 
 

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from ..arrays import Bools
+from ..config import setting
 from ..graph.pose_edges import RelativePoseEdges
 from ..map_result import LoopClosure
 
@@ -22,15 +23,15 @@ class LoopClosureConfig:
     """Candidates per sub-map and round, best expected overlap first."""
     rounds: int = 4
     """Most rounds of searching and solving; ends early when a round finds nothing new."""
-    enough: float = 5.0
+    enough: ClassVar[float] = 5.0
     """Closures per sub-map, on average, after which no further round is made."""
-    direct: float = 0.5
+    direct: ClassVar[float] = 0.5
     """Matching starts from the graph's guess when its uncertainty (3 sigma) is below this, m; else a search comes first."""
-    reach: float = 6.0
+    reach: float = setting(6.0, advanced=True)
     """Sub-maps whose middles lie farther apart than this, after the uncertainty is taken off, are no candidates, m."""
-    search_limit: float = 8.0
+    search_limit: float = setting(8.0, advanced=True)
     """Largest half-width of a search, m."""
-    search_angle: float = 0.7
+    search_angle: ClassVar[float] = 0.7
     """Largest half-width of a search, rad."""
     gate: float = 0.15
     """Outlier distance d of the final matching, m (the paper uses 0.1)."""
@@ -38,29 +39,29 @@ class LoopClosureConfig:
     """Fitness: greatest root mean square distance of matched points, m."""
     overlap: float = 0.4
     """Least share of points with a match when the graph's guess was good."""
-    overlap_after_search: float = 0.5
+    overlap_after_search: ClassVar[float] = 0.5
     """Least share of points with a match after a search, which can be fooled."""
-    uniqueness: float = 0.85
+    uniqueness: ClassVar[float] = 0.85
     """A second place that matches this share as well as the first makes a search ambiguous."""
-    slip: float = 1.0
+    slip: ClassVar[float] = 1.0
     """Standard deviation, m, added to the graph's guess where matching from it failed although the sub-maps ought to
     overlap and no radio holds the trajectory: the wheels may have slipped. Such pairs are searched anew."""
-    slip_angle: float = 0.2
+    slip_angle: ClassVar[float] = 0.2
     """The same for the heading, rad."""
-    consistency: float = 16.0
+    consistency: ClassVar[float] = 16.0
     """Largest squared Mahalanobis distance between match and graph, and of an accepted match in the second optimisation (3
     degrees of freedom; 16 = 0.1 %). Where no radio holds the trajectory, one slip or false step puts a chain of steps wrong
     far beyond its covariance, and only the second counts."""
-    points: int = 250
+    points: ClassVar[int] = 250
     """Points looked up per pair."""
-    match_sigma: float = 0.03
+    match_sigma: ClassVar[float] = 0.03
     """Standard deviation of a match, m."""
-    correlation: float = 24.0
+    correlation: float = setting(24.0, advanced=True)
     """Matches that together weigh as one: they share the bending of both sub-maps."""
-    through: float = 0.12
+    through: float = setting(0.12, advanced=True)
     """Largest share of one sub-map's points that may stand where the other saw free space. Where sub-maps driven one after
     the other disagree more, because people walk about, it is by how much these do."""
-    places: int = 3
+    places: ClassVar[int] = 3
     """Places found by a search that are matched before one is chosen."""
 
 

@@ -21,28 +21,28 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
     with_ranges = estimate.ranges is not None
-    for lap in range(config.loops.rounds):
+    for lap in range(config.loop_closure.rounds):
         pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
         free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
         pieces = visibility.static_points(pieces, free)
         covariance = JointCovariance(base.with_edges(found.edges), pieces.reference)
         candidates = closure_candidates.propose(
-            base, covariance, pieces, recordings.of_keyframe, tried, missed, with_ranges, config.loops
+            base, covariance, pieces, recordings.of_keyframe, tried, missed, with_ranges, config.loop_closure
         )
-        tried |= candidates.names(config.loops)
+        tried |= candidates.names(config.loop_closure)
         dynamic = visibility.dynamic_share(pieces, free, base.poses, recordings.of_keyframe)
-        rules = replace(config.loops, through=max(config.loops.through, dynamic))
+        rules = replace(config.loop_closure, through=max(config.loop_closure.through, dynamic))
         reporter = task.stages.reporter("loop closure")
-        new = verification.find(candidates, pieces, rules, config.search, reporter, free, task.executor)
+        new = verification.find(candidates, pieces, rules, config.correlative, reporter, free, task.executor)
         new = _without_forbidden(new, task)
-        missed |= set() if with_ranges else closure_candidates.missed(candidates, new, config.loops)
+        missed |= set() if with_ranges else closure_candidates.missed(candidates, new, config.loop_closure)
         found = closures.merged(found, new)
-        base, found = verification.reconcile(base, found, config.loops, config.solver)
+        base, found = verification.reconcile(base, found, config.loop_closure, config.solver)
         task.stages.end(
             f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(candidates.target),
             accepted=len(new.edges), kept=len(found.edges),
         )  # fmt: skip
-        tied = len(found.edges) >= config.loops.enough * len(pieces)
+        tied = len(found.edges) >= config.loop_closure.enough * len(pieces)
         unsearched = missed - {(a, b) for a, b, searched in tried if searched}
         if (tied or len(new.edges) <= 0.05 * len(found.edges)) and not unsearched:
             break
@@ -54,12 +54,12 @@ def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
     config, recordings, scans = task.config, task.recordings, estimate.scans
     assert scans is not None
     edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
-    for lap in range(config.loops.rounds):
+    for lap in range(config.loop_closure.rounds):
         graph = estimate.graph
         pieces = submaps.build(scans.clouds, graph.poses, recordings.path, recordings.of_keyframe, config.submaps)
         reporter = task.stages.reporter("loop closure")
         found = paper_method.find(
-            graph, pieces, recordings.of_keyframe, config.loops, config.icp, reporter, task.executor
+            graph, pieces, recordings.of_keyframe, config.loop_closure, config.icp, reporter, task.executor
         )
         found = _without_forbidden(found, task)
         task.stages.end(

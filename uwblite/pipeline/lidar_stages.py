@@ -87,7 +87,7 @@ def _match_neighbours(estimate: Estimate, task: Task) -> Estimate:
     graph = estimate.graph.with_estimates_of(optimize(estimate.graph.with_edges(*whole), config.solver)[0])
     rules = config.refinement
     found = scan_to_scan.follow(
-        scans.clouds, scans.raster, odometry, graph, rules.first_gate, config.tracking, config.search
+        scans.clouds, scans.raster, odometry, graph, rules.first_gate, config.scan_to_scan, config.correlative
     )
     estimate, weak = replace(estimate, odometry=found.wheels), replace(weak, odometry=found.wheels)
     problem = graph.with_edges(*weak.odometry_and_ranges, found.steps)

@@ -51,7 +51,7 @@ def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
     if log.ranges is None:
         return Estimate(graph, odometry, None, ids)
     attached = keyframes.attach_ranges(log.ranges, log.odometry, frames, log.mounting)
-    ranges = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.anchors, config.ranges.kernel)
+    ranges = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.trilateration, config.ranges.kernel)
     return Estimate(graph, odometry, ranges if np.any(ranges.weights) else None, ids)
 
 
@@ -69,8 +69,8 @@ def _bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     path = recordings.path[recordings.each[number].rows]
     used = np.asarray(ranges.weights) > 0
     sigma = short_term_sigma(ranges.stamps[used], ranges.anchor[used], ranges.ranges[used], config.ranges)
-    settings = replace(config.growth, range_sigma=max(1.5 * sigma, config.growth.least_sigma))
-    found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.anchors)
+    settings = replace(config.bootstrap, range_sigma=max(1.5 * sigma, config.bootstrap.least_sigma))
+    found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.trilateration)
     whose = {"recording": number + 1} if len(recordings) > 1 else {}
     task.stages.end("bootstrap", range_sigma=round(sigma, 4), placed=int(found.placed.sum()), **whose)
     # The bootstrap starts in the middle of the path; the map begins where the odometry did.
@@ -146,7 +146,7 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     roughly = replace(config.solver, max_iterations=min(config.solver.max_iterations, _ROUGH_ITERATIONS))
     for solver in (roughly, config.solver):
-        graph = relocate(estimate.ranges, estimate.graph, ~np.asarray(estimate.graph.fixed_anchors), config.anchors)
+        graph = relocate(estimate.ranges, estimate.graph, ~np.asarray(estimate.graph.fixed_anchors), config.trilateration)
         estimate = with_range_noise(replace(estimate, graph=graph), config)
         problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
         estimate = estimate.with_estimates_of(optimize(problem, solver)[0])

@@ -23,7 +23,7 @@ _STEPS = 2
 def prepared(log: SensorLog, config: MappingConfig) -> SensorLog:
     """Return a recording screened, with the sensors in use and only the scans that a map looks at."""
     log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
-    return thinned(screen(log, config.turn_laser), config.keyframes, config.grid)
+    return thinned(screen(log, config.detect_laser_flip), config.keyframes, config.grid)
 
 
 def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorLog:

@@ -8,11 +8,13 @@ again and anchors not yet placed are searched from the poses so far.
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
+from ..config import setting
 from ..graph.graph import Calibration, Graph
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
@@ -25,27 +27,27 @@ from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, tri
 class BootstrapConfig:
     """How the first estimate grows."""
 
-    seed_distances: tuple[float, ...] = (25.0, 10.0, 4.0, 60.0, 150.0)
+    seed_distances: ClassVar[tuple[float, ...]] = (25.0, 10.0, 4.0, 60.0, 150.0)
     """Travelled distances of the first stretch, m, tried in this order until the anchors in it are clear; then all of it."""
-    piece: float = 0.3
+    piece: ClassVar[float] = 0.3
     """Distance laid on at once, as a share of the first stretch; more where the prediction holds."""
-    resolve_growth: float = 1.35
+    resolve_growth: ClassVar[float] = 1.35
     """All poses so far are solved again when their number has grown by this factor."""
-    range_sigma: float = 0.15
+    range_sigma: float = setting(0.15, advanced=True)
     """Assumed standard deviation of ranges until it is learnt, m."""
-    least_sigma: float = 0.05
+    least_sigma: ClassVar[float] = 0.05
     """Ranges are not trusted below this while it grows, m."""
-    drift: float = 0.015
+    drift: ClassVar[float] = 0.015
     """Assumed drift of the odometry per travelled metre, m/m."""
-    heading_scales: tuple[float, ...] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
+    heading_scales: ClassVar[tuple[float, ...]] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
     """Relative heading errors of the odometry tried in this order until the ranges agree: a wrong track width in the
     base's settings is the commonest gross fault, and a factor of two the commonest value."""
-    agreement: float = 2.0
+    agreement: ClassVar[float] = 2.0
     """Ranges agree when their median error is below so many standard deviations."""
-    tear: float = 1.0
+    tear: ClassVar[float] = 1.0
     """No slip throws a step between keyframes off by more than this, m or rad: then a piece was laid on mirrored or in the
     wrong place, however well its ranges agree."""
-    clear_enough: float = 0.35
+    clear_enough: ClassVar[float] = 0.35
     """A first stretch is good when its anchors (up to three) are worth this each; 1 = placed without error, 0 = unclear."""
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..arrays import Floats, Ints
+from ..config import setting
 from ..graph.robust import Kernel
 
 _ROBUST = Kernel("cauchy", 2.5)
@@ -24,18 +25,18 @@ class RangeNoiseConfig:
 
     sigma: float = 0.12
     """Assumed standard deviation, m, before it is learnt."""
-    slow_share: float = 0.5
+    slow_share: float = setting(0.5, advanced=True)
     """Assumed share of the variance that is slow."""
-    correlation_length: float = 1.5
+    correlation_length: float = setting(1.5, advanced=True)
     """Distance over which the slow part stays alike, m, before it is learnt."""
-    min_sigma: float = 0.03
+    min_sigma: float = setting(0.03, advanced=True)
     """No radio of this kind is trusted beyond this, m."""
     steady: float = 0.06
     """Standard deviation of what an anchor's errors have in common in one direction and at one distance from it, m: radiation
     patterns and received power alone make so much, and no residual shows what a wrong place of the anchor explains as well."""
     learn: bool = True
     """Estimate white and slow part from the residuals."""
-    kernel: Kernel = _ROBUST
+    kernel: Kernel = setting(_ROBUST, advanced=True)
     """Robust kernel: ranges through walls are long; none = squared errors (the paper)."""
 
 

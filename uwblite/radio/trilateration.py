@@ -6,19 +6,21 @@ cells are refined one by one. A straight path leaves two mirrored positions of e
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from ..arrays import Bools, Floats
+from ..config import setting
 
 
 @dataclass(frozen=True, slots=True)
 class TrilaterationConfig:
     """Search for anchor positions."""
 
-    raster: int = 40
+    raster: int = setting(40, advanced=True)
     """Cells along the longer side of the searched area."""
-    samples: int = 100
+    samples: ClassVar[int] = 100
     """Ranges used for the search, spread evenly over the path."""
     min_ranges: int = 8
     """An anchor with fewer usable ranges is not placed."""
@@ -26,9 +28,9 @@ class TrilaterationConfig:
     """Longer readings are no ranges of such a radio, m."""
     bias_sigma: float = 0.6
     """Plausible size of one anchor's constant error, m."""
-    outlier: float = 3.0
+    outlier: ClassVar[float] = 3.0
     """Standard deviations beyond which a range counts as an outlier when hypotheses are compared."""
-    ambiguity: float = 0.2
+    ambiguity: float = setting(0.2, advanced=True)
     """A second hypothesis within this share of the ranges' total cost makes the anchor ambiguous."""
 
 
