@@ -422,3 +422,21 @@ def test_tag_on_a_slow_link_is_stamped_within_what_is_stated(latency, tick, spre
     begun = sum(t >= epochs[0].stamp - 0.05 for t, _ in sent)
     assert len(epochs) + lost == pytest.approx(begun, abs=2)
     assert len(epochs) > 0.97 * begun
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tag_on_a_link_whose_delay_comes_and_goes(seed):
+    """A busy computer: for seconds every answer takes up to 70 ms. No fix is logged twice, each lies within its bracket."""
+    device, sent = tag(seed=seed)
+    rng, calls = random.Random(seed), itertools.count()
+    jitter = lambda: rng.uniform(0, 0.07) if (next(calls) // 150) % 2 else 0.001  # noqa: E731
+    actions, reopens = simulate(Dwm1001Driver(), device, 120.0, jitter=jitter)
+    assert not reopens
+    fixes = {tuple((f"{a:04X}", d) for a, d, _ in readings): t for t, readings in sent}
+    epochs = of_kind(actions, RangeEpoch)
+    for epoch in epochs:
+        true = fixes.pop(tuple((r.anchor_id, round(1000 * r.range)) for r in epoch.readings))
+        assert abs(epoch.stamp - true) <= epoch.spread + 1e-9
+    lost = sum(a.count for a in of_kind(actions, Lost))
+    begun = sum(t >= epochs[0].stamp - 0.05 for t, _ in sent)
+    assert len(epochs) + lost == pytest.approx(begun, abs=0.05 * begun)

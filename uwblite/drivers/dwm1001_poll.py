@@ -70,6 +70,7 @@ class FixPoller:
         # Bracket and readings of a fix, and the bracket to take if another fix is found to be close behind.
         self._pending: tuple[Bracket, Readings, Bracket] | None = None
         self._hidden = False  # an answer was lost that may have announced a fix
+        self._stale = False  # the status may still announce a fix that was read without asking for the status
         self._missed = self._latest is not None  # a fix may have been missed
         while self._failures < MAX_FAILURES:
             if self._trip is not None and self._trip > SLOW * self._period:
@@ -79,7 +80,9 @@ class FixPoller:
 
     def _watch_fixes(self) -> Script[None]:
         """Read the fix; other readings than before are a new one."""
-        sent = self._driver.now
+        if self._pending:
+            yield from self._accept(self._pending[2], self._pending[1])
+        self._stale, sent = True, self._driver.now
         readings = yield from self._read_fix()
         if readings is not None:
             if self._low is not None and readings != self._latest:
@@ -99,9 +102,10 @@ class FixPoller:
         if status.location_ready or self._hidden:
             bracket = None if since is None else (since, self._driver.now)
             self._missed |= bracket is not None and bracket[1] - bracket[0] > GAP * self._period
-            yield from self._take(bracket, sure=status.location_ready)
-            self._hidden = False
+            yield from self._take(bracket, sure=status.location_ready and not self._stale)
+            self._hidden = self._stale = False
             return
+        self._stale = False
         if self._pending:
             yield from self._accept(*self._pending[:2])
         yield from self._rest(status)
@@ -125,7 +129,7 @@ class FixPoller:
         if readings is not None and bracket is not None:
             newest = sent - self._period  # what is read is the last fix: it is no older than that
             either = max(bracket[0], newest), self._driver.now
-            self._pending = (max(bracket[0], newest), bracket[1]), readings, either
+            self._pending = (max(bracket[0], newest), bracket[1]) if sure else either, readings, either
 
     def _accept(self, bracket: Bracket, readings: Readings) -> Script[None]:
         """Log a fix; where its bracket holds several, the last of them was read."""
