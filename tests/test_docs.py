@@ -17,6 +17,7 @@ from uwblite.cli import VERBS, main, module_of
 from uwblite.io.constraints_file import parse_constraints
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.io.uwb_messages import KNOWN
+from uwblite.map_result import OUTCOMES
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -157,3 +158,24 @@ def test_first_screen_of_the_readme():
     assert any(line.startswith("![") for line in head)
     assert any(line.startswith("tools/quickstart test ") for line in head)
     assert any("What it is not" in line for line in head)
+
+
+KIND = re.compile(r"""\b(?:warn|doubt|Notice|Remark|add)\(\s*f?"([a-z{}.a-z-]+)",""")
+
+
+def test_every_kind_of_warning_and_doubt_is_listed():
+    """Kinds that name a status, like ``anchor-{anchor.status}``, are listed one by one."""
+    page = (ROOT / "docs" / "formats.md").read_text()
+    listed = set(re.findall(r"`([a-z-]+)`", page[page.index("### Warnings and doubts") :].split("\n## ")[0]))
+    sources = [file.read_text() for file in (ROOT / "uwblite").rglob("*.py") if file.parent.name != "checks"]
+    used = {kind for source in sources for kind in KIND.findall(source)}
+    assert len(used) > 20
+    missing = {kind for kind in used if kind not in listed and "{" not in kind}
+    assert not missing
+    assert {f"anchor-{status}" for status in ("unplaced", "mirror-ambiguous", "distrusted")} <= listed
+    assert set(OUTCOMES) <= listed
+
+
+@pytest.mark.parametrize("page", sorted(p.name for p in (ROOT / "docs").glob("*.md")))
+def test_every_page_is_linked_from_the_readme(page):
+    assert f"docs/{page}" in (ROOT / "README.md").read_text()
