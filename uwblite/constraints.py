@@ -1,4 +1,4 @@
-"""What the user knows beforehand: surveyed anchors, pinned poses, distances, closures that must or must not be.
+"""What the user gives beforehand: surveyed anchors, pinned poses, distances, closures that must or must not be.
 
 Surveyed anchors and pinned poses are given in the user's own frame. ``constraint_edges`` brings a first estimate there.
 """

@@ -73,7 +73,7 @@ class AttachedRanges:
     velocity: Floats
     """(m, 2) velocity of the tag in the keyframe's frame, m/s."""
     inside: Bools
-    """(m,) whether the range was made while there was odometry; elsewhere nobody knows where the robot was."""
+    """(m,) whether the range was made while there was odometry; elsewhere the robot's place is not known."""
     rise: Floats
     """(m,) height of the tag that measured above the first one, m."""
 

@@ -38,7 +38,7 @@ class MappingConfig:
     use_loops: bool = True
     """Search loop closures and match clouds of different times."""
     detect_laser_flip: bool = True
-    """Take the laser as mounted the other way up than told where its turns agree with the wheels' only so."""
+    """Take the laser as mounted the other way up than given where its turns agree with the odometry's only so."""
     align: Literal["odometry", "first-pose", "walls", "anchors"] = "odometry"
     """Where the map's axes lie: where the odometry began; at the first pose; there, turned so that most walls run along x
     and y; or at the first placed anchor, x towards the last."""

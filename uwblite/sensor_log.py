@@ -88,7 +88,7 @@ class SensorMounting:
     tag_position: Floats = field(default_factory=lambda: np.zeros(3))
     """(3,) x, y, z of the tag on the base; z is the height above the floor."""
     anchor_height: float | None = None
-    """Height of the anchors above the floor, m; None = not told (taken as the tag's height)."""
+    """Height of the anchors above the floor, m; None = not given (taken as the tag's height)."""
     anchor_heights: dict[str, float] = field(default_factory=dict)
     """Heights of single anchors above the floor, m, by id; they win over anchor_height."""
     more_tags: Floats = field(default_factory=lambda: np.zeros((0, 3)))
@@ -100,7 +100,7 @@ class SensorMounting:
         return np.concatenate([self.tag_position[None], self.more_tags])
 
     def height_difference(self, anchor_id: str) -> float | None:
-        """Height of an anchor above the tag, m; None where nobody told."""
+        """Height of an anchor above the tag, m; None where none is given."""
         height = self.anchor_heights.get(anchor_id, self.anchor_height)
         return None if height is None else height - float(self.tag_position[2])
 

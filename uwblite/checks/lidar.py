@@ -48,7 +48,7 @@ def _check_valid(hit: np.ndarray[Any, np.dtype[np.bool_]], figures: dict[str, An
         found.warning(
             "lidar",
             f"only {100 * share:.0f} % of the beams hit anything within {figures['range max m']:.1f} m",
-            "the place is wider than the laser reaches: drive along the walls; the radio must hold the middle",
+            "the place is wider than the laser reaches: drive along the walls; in the middle only ranges constrain the pose",
         )
     elif figures["share that is invalid"] > 0.4:
         found.note(

@@ -11,9 +11,9 @@ from ..sensor_log import Odometry
 from .findings import Findings, timing
 
 SHORTEST_PATH = 2.0
-"""A shorter drive shows little of anything, m."""
+"""A shorter path shows little of anything, m."""
 STRAIGHT = 0.02
-"""Width of the path by its length below which the two sides of it cannot be told apart."""
+"""Width of the path by its length below which the two sides of it cannot be distinguished."""
 
 
 def check_odometry(odometry: Odometry, found: Findings) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def _check_motion(length: Floats, speed: float, odometry: Odometry, found: Findi
 
 
 def _check_heading(odometry: Odometry, found: Findings) -> dict[str, float]:
-    """Compare the heading with the direction of motion; a wrong unit or sign is told by screening."""
+    """Compare the heading with the direction of motion; the screening finds a wrong unit or sign."""
     plain, varied = heading_agreement(odometry)
     others = (heading_agreement(odometry, -1.0)[0], heading_agreement(odometry, np.pi / 180.0)[0])
     if varied and plain < 0.7 and max(others) < plain + 0.2:

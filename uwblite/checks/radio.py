@@ -1,4 +1,4 @@
-"""Checks of the UWB ranges: who was heard how often, nonsense, spikes, noise, coverage, sides that cannot be told apart."""
+"""Checks of UWB ranges: counts, implausible readings, spikes, noise, coverage, mirror ambiguity."""
 
 from typing import Any
 
@@ -72,7 +72,7 @@ def _check_anchor(
         found.add(
             "warning" if share > 0.15 else "note",
             "radio",
-            f"anchor {anchor_id}: {100 * share:.0f} % of the ranges jump farther than the robot drove (blocked sight?)",
+            f"anchor {anchor_id}: {100 * share:.0f} % of the ranges jump farther than the robot drove (line of sight blocked?)",
             "they are down-weighted; a higher or more open place helps the anchor",
         )
     width = _width(where[usable])
@@ -96,10 +96,10 @@ def _check_anchor(
 
 
 def _spikes(values: Floats, travelled: Floats) -> tuple[int, float]:
-    """Count readings that no drive explains, and estimate the short-term noise, m.
+    """Count readings that no motion explains, and estimate the short-term noise, m.
 
     Of two readings of one anchor the later differs by at most the distance driven, apart from noise. A spike leaves the
-    median of its neighbours (two before, two after) by more than that drive and five times the noise.
+    median of its neighbours (two before, two after) by more than that motion and five times the noise.
     """
     if len(values) < 5:
         return 0, 0.0
@@ -125,7 +125,7 @@ def _check_coverage(log: SensorLog, found: Findings, window: float = 2.0) -> dic
     assert ranges is not None
     start, end = float(log.odometry.stamps[0]), float(log.odometry.stamps[-1])
     usable = (ranges.ranges > 0.02) & (ranges.ranges < LONGEST) & (ranges.stamps >= start) & (ranges.stamps <= end)
-    # Windows in which nobody is heard are only counted, however long the recording claims to be.
+    # Windows without ranges are only counted, however long the recording claims to be.
     windows = max(1.0, np.ceil((end - start) / window))
     slot = np.floor((ranges.stamps[usable] - start) / window)
     heard = np.unique(np.stack([slot, ranges.anchor[usable].astype(np.float64)]), axis=1)

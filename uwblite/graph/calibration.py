@@ -20,7 +20,7 @@ SHARED = (*LASER, RANGE_SCALE)
 
 @dataclass(frozen=True, slots=True)
 class CalibrationConfig:
-    """Prior standard deviation of each unknown; 0 switches it off (held at its nominal value)."""
+    """Prior standard deviation of each unknown; 0 switches it off (fixed at its nominal value)."""
 
     odometry_scale: float = 0.02
     """Relative error of travelled distance (wheel radius), 1."""
@@ -37,11 +37,11 @@ class CalibrationConfig:
     range_scale_sound: float = 0.005
     """The same for radios that are sound, as most are: they measure times of flight."""
     range_bias: float = 0.8
-    """Constant error of one anchor's ranges where nobody calibrated the radios' antennas, m."""
+    """Constant error of one anchor's ranges where the radios' antenna delays are not calibrated, m."""
     range_bias_sound: float = 0.1
-    """The same where the maker did, m. The data choose between these and what lies between."""
+    """The same where they are, m. The marginal likelihood chooses between the two."""
     anchor_height: float = 1.5
-    """Height of anchors above the tag where nobody told, m."""
+    """Height of anchors above the tag where none is given, m."""
     tag_offset: float = 0.03
     """Error of the tag's position on the base in x and y, m."""
     range_delay: float = 0.1

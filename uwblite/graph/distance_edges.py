@@ -1,4 +1,4 @@
-"""Distances that somebody measured, with a tape say: between anchors, and between what poses saw. Two kinds of edges."""
+"""Given distances, between anchors, and between points seen from poses.."""
 
 from dataclasses import dataclass
 

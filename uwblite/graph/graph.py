@@ -108,7 +108,7 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
-    """Estimates, what of them is held fixed, and the measurements between them."""
+    """Estimates, which of them are fixed, and the measurements between them."""
 
     poses: Floats
     """(n, 3) T_map_base."""
@@ -117,11 +117,11 @@ class Graph:
     edges: tuple[Edges, ...] = ()
     calibration: Calibration = field(default_factory=Calibration)
     fixed_poses: Bools | None = None
-    """(n,) True = held; None = the first pose is held (gauge)."""
+    """(n,) True = fixed; None = the first pose is fixed (gauge)."""
     fixed_anchors: Bools | None = None
-    """(a,) True = held; None = all free."""
+    """(a,) True = fixed; None = all free."""
     fixed_calibration: Bools | None = None
-    """(c,) True = held; None = all free."""
+    """(c,) True = fixed; None = all free."""
 
     def with_edges(self, *edges: Edges) -> "Graph":
         """Return the graph with further edges; empty ones are left out."""

@@ -24,7 +24,7 @@ _DEPENDENT = 1e-13
 class Marginals:
     """Covariances of the unknowns of a graph given all its measurements.
 
-    Zero where an unknown is held fixed, infinite on the diagonal where no edge touches it. A direction that edges
+    Zero where an unknown is fixed, infinite on the diagonal where no edge touches it. A direction that edges
     leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
     """
 
@@ -74,7 +74,7 @@ class Marginals:
         return cross
 
     def _columns(self, numbers: Ints) -> Floats:
-        """Return columns (size + 1, m) of the covariance; the last row and the columns of held scalars (-1) are 0."""
+        """Return columns (size + 1, m) of the covariance; the last row and the columns of fixed scalars (-1) are 0."""
         right = np.zeros((self._unknowns.size + 1, len(numbers)))
         right[numbers, np.arange(len(numbers))] = 1.0
         right[-1] = 0.0
@@ -110,7 +110,7 @@ class JointCovariance:
 
 
 def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
-    """Return the end of the factor with these poses last: their places among the unknowns (k, 3), -1 = held, and what it
+    """Return the end of the factor with these poses last: their places among the unknowns (k, 3), -1 = fixed, and what it
     takes to read it: where the block begins, L2 (n, n), the diagonal of D2 (n,), and each unknown's row in them (n,)."""
     normal = _filled(graph, last=poses)
     factor, number = _factor(normal), normal.unknowns.number["poses"]
@@ -158,7 +158,7 @@ def marginals(graph: Graph) -> Marginals:
 
 
 def calibration_covariance(graph: Graph) -> Floats:
-    """Return the covariance (c, c) of the calibration values at the graph's estimates; 0 where they are held.
+    """Return the covariance (c, c) of the calibration values at the graph's estimates; 0 where they are fixed.
 
     Raises
     ------

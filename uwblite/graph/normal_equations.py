@@ -20,10 +20,10 @@ from .schwarz_cg import cut
 from .unknowns import WIDTHS, Unknowns, free_unknowns
 
 _AT_ONCE = 1 << 15
-"""Edges whose products are held at once; a bound on the memory."""
+"""Edges whose products are in memory at once; a bound on the memory."""
 _NONE = np.zeros(0, dtype=np.int64)
 _Touched = tuple[Ints, bool]
-"""Node (e,) touched by each edge, -1 = held; and whether it takes part in the ordering."""
+"""Node (e,) touched by each edge, -1 = fixed; and whether it takes part in the ordering."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -225,7 +225,7 @@ class NormalEquations:
 
 
 def _parts(edges: int) -> list[slice]:
-    """Return the edges whose products are held at once."""
+    """Return the edges whose products are in memory at once."""
     return [slice(first, first + _AT_ONCE) for first in range(0, max(edges, 1), _AT_ONCE)]
 
 

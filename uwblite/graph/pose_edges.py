@@ -85,12 +85,12 @@ class RelativePoseEdges:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryEdges:
-    """Motion from pose i to pose j by the wheels, corrected by the wheels' calibration.
+    """Motion from pose i to pose j by odometry, corrected by its calibration.
 
     With distance scale 1 + s and heading error delta = k dtheta + b length + g duration, the measured motion
     (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s in
-    x and y and by 1 + k in heading: it is the wheels' own, before the correction. Without that, noise alone would
-    draw s and k towards wheels that count less (errors in variables).
+    x and y and by 1 + k in heading: it is the odometry's own, before the correction. Without that, noise alone would
+    draw s and k towards smaller motions (errors in variables).
     """
 
     i: Ints
@@ -118,7 +118,7 @@ class OdometryEdges:
         return self._corrected(graph)[0]
 
     def own_scale(self, graph: Graph) -> Floats:
-        """Return by what (e, 3) an error of the corrected motion is divided to be one of the wheels' own."""
+        """Return by what (e, 3) an error of the corrected motion is divided to be one of the raw odometry."""
         s, k, _, _ = np.append(graph.calibration.values, 0.0)[self.calibration].T
         return np.maximum(np.stack([1.0 + s, 1.0 + s, 1.0 + k], axis=1), _LEAST_SCALE)
 
@@ -152,7 +152,7 @@ class OdometryEdges:
             nx, ny = se2.rotate(xi[2], direction).T
             half = 0.5 * (1.0 + s)
             shift = axes[0] * m[0] + axes[1] * m[1]
-            # A scale held at its least no longer changes what errors are divided by.
+            # A scale clamped at its least no longer changes what errors are divided by.
             across, turning = np.where(stretch[:, 1:] > _LEAST_SCALE, 1.0 / stretch[:, 1:], 0.0).T
             by_scale = -axes[0] * nx - axes[1] * ny - shift * across
             by_delta = axes[0] * (m[1] + half * ny) - axes[1] * (m[0] + half * nx) - axes[2]
@@ -165,7 +165,7 @@ class OdometryEdges:
 
 
 _LEAST_SCALE = 0.1
-"""Wheels that count more than ten times what they do are not believed: nothing is divided by less."""
+"""Least scale that errors are divided by: odometry is not ten times too long."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

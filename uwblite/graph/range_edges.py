@@ -1,4 +1,4 @@
-"""Edges between a pose and an anchor: what the radio measures."""
+"""Edges between a pose and an anchor: UWB ranges."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar, cast
@@ -16,11 +16,11 @@ class RangeEdges:
     """Distance between the tag, carried by a pose, and an anchor (paper: UWB distance edges).
 
     The tag stands at ``u = lever_arm + R(turn) tag + velocity delay`` in the frame of the pose; with the planar
-    distance D = |x + R(theta) u - a|, the radio is expected to say ``(1 + scale) sqrt(D^2 + height^2 + q) + bias``.
+    distance D = |x + R(theta) u - a|, the expected range is ``(1 + scale) sqrt(D^2 + height^2 + q) + bias``.
 
     A squared height q below 0 is none, but descent may pass there, or end there and be put back to 0. The root of a
-    negative number being no distance, what q adds for q > 0 is then taken off: with P^2 = D^2 + height^2, the radio is
-    taken to measure ``2 P - sqrt(P^2 - q)``, smooth at q = 0; right at the anchor that is below 0.
+    negative number being no distance, what q adds for q > 0 is then taken off: with P^2 = D^2 + height^2, the expected
+    distance is ``2 P - sqrt(P^2 - q)``, smooth at q = 0; right at the anchor that is below 0.
     """
 
     pose: Ints
@@ -40,7 +40,7 @@ class RangeEdges:
     tag: Floats
     """(2,) nominal position of the tag on the base, m."""
     height: Floats
-    """(e,) height of the anchor above the tag, m, where it was told, else 0."""
+    """(e,) height of the anchor above the tag, m, where it is given, else 0."""
     calibration: Ints
     """(e, 6) indices of scale, bias (m), q (m^2, unknown squared height), tag x, tag y (m, corrections) and delay (s);
     -1 = not an unknown (taken as 0)."""
@@ -69,7 +69,7 @@ class RangeEdges:
         return arm, offset, np.sqrt(np.maximum(np.stack([squared, squared + np.abs(cal[2])]), _NEAREST**2)), cal
 
     def distances(self, graph: Graph) -> Floats:
-        """Return what the radio is taken to measure (e,), m, before scale and bias: the slant distances."""
+        """Return the expected slant distances (e,), m, before scale and bias."""
         _, _, reach, cal = self._geometry(graph)
         return _slant(reach, cal)
 
@@ -113,4 +113,4 @@ def _slant(reach: Floats, calibration: Floats) -> Floats:
 
 
 _NEAREST = 1e-3
-"""Tag on top of an anchor, m: nearer than this the direction is not defined, and the distance is held here."""
+"""Tag on top of an anchor, m: nearer than this the direction is not defined, and the distance is clamped."""

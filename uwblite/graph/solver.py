@@ -18,7 +18,7 @@ nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-R
 O. Tingleff, Methods for non-linear least squares problems, 2004, algorithm 3.16).
 
 Where a step turns poses by much, it is tried in two ways that agree to first order, each pose on its own and link by
-link along the trajectory, and the cheaper one counts: a fault of the wheels that bends a drive of hundreds of metres is
+link along the trajectory, and the cheaper one counts: an error of the odometry that bends a path of hundreds of metres is
 taken up in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard, S. Teller, Fast
 iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
 
@@ -122,7 +122,7 @@ def optimize(
 
     Parameters
     ----------
-    graph : estimates to start from, what is held fixed, and the edges; it is not changed.
+    graph : estimates to start from, what is fixed, and the edges; it is not changed.
     config : stopping rules.
     progress : called after every iteration with (done, most).
 
@@ -248,7 +248,7 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
 
     Parameters
     ----------
-    factor : of a step before, to be used again; None = factorise anew.
+    factor : of a step before, to be used again; None = factorise again.
     """
     try:
         if factor is not None:
@@ -293,7 +293,7 @@ def _cost(graph: Graph, linearized: list[Linearization]) -> float:
 def check(graph: Graph) -> None:
     """Raise SolverError where nothing is free, nothing is measured, or a starting value is not finite."""
     if not any(mask.any() for mask in free_unknowns(graph).values()):
-        raise SolverError("nothing to optimise: every pose, anchor and calibration value is held fixed")
+        raise SolverError("nothing to optimise: every pose, anchor and calibration value is fixed")
     if not sum(len(edges) for edges in graph.edges):
         raise SolverError("nothing to optimise: the graph has no edges")
     for name, values in (

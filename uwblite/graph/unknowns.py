@@ -17,12 +17,12 @@ class Unknowns:
     """Where each free scalar of a graph stands in the vector of unknowns."""
 
     number: dict[str, Ints]
-    """By block (unknowns, scalars): position in the vector, -1 = held fixed."""
+    """By block (unknowns, scalars): position in the vector, -1 = fixed."""
     size: int
     """Length of the vector."""
 
     def spread(self, name: str, vector: Floats) -> Floats:
-        """Return the part of a vector that belongs to a block, (unknowns, scalars), 0 where held fixed."""
+        """Return the part of a vector that belongs to a block, (unknowns, scalars), 0 where fixed."""
         return np.append(vector, 0.0)[self.number[name]]
 
 
@@ -79,10 +79,10 @@ def _moved_to(graph: Graph, unknowns: Unknowns, step: Floats, poses: Floats) -> 
 
 
 def free_unknowns(graph: Graph) -> dict[str, Bools]:
-    """Return by block which unknowns are not held fixed."""
-    held = {"poses": graph.fixed_poses, "anchors": graph.fixed_anchors, "calibration": graph.fixed_calibration}
+    """Return by block which unknowns are free."""
+    fixed = {"poses": graph.fixed_poses, "anchors": graph.fixed_anchors, "calibration": graph.fixed_calibration}
     counts = {"poses": len(graph.poses), "anchors": len(graph.anchors), "calibration": len(graph.calibration.values)}
-    free = {name: np.ones(counts[name], dtype=bool) if mask is None else ~mask for name, mask in held.items()}
+    free = {name: np.ones(counts[name], dtype=bool) if mask is None else ~mask for name, mask in fixed.items()}
     if graph.fixed_poses is None:
         free["poses"][:1] = False
     return free

@@ -9,7 +9,7 @@ scans Bayes' rule adds log-odds,
 so only two counts per cell need be kept, their order does not matter, and work can be split and added up exactly. A person
 who stood somewhere for a few scans is outvoted by the scans that look through the place later.
 
-A beam that saw nothing is weak evidence: the URG-04LX cannot tell "nothing there" from "too dark or too oblique". Such
+A beam that saw nothing is weak evidence: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique". Such
 beams never draw anything; runs of adjacent ones clear space, with less weight, up to a stated distance and never beyond a
 wall that other beams have drawn. That takes a second walk over the scans, once the walls are known.
 """
@@ -187,7 +187,7 @@ def from_sweeps(
     progress: Progress | None = None,
     announce: Callable[[GridGeometry], object] | None = None,
 ) -> OccupancyGrid:
-    """Make one map of the scans of all recordings; see from_scans. `announce` is told the grid before it is allocated."""
+    """Make one map of the scans of all recordings; see from_scans. `announce` is called before it is allocated."""
     if not any(len(sweeps.first) for sweeps in recordings):
         raise DataError("there are no scans to make a map of")
     tasks = [_task(sweeps, config) for sweeps in recordings if len(sweeps.first)]

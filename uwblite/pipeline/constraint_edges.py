@@ -1,4 +1,4 @@
-"""What the user knows beforehand, as edges of a graph in the user's frame.
+"""What the user gives beforehand, as edges of a graph in the user's frame.
 
 When the first estimate stands in the frame of the odometry, a rigid motion found from surveyed anchors and pinned poses
 brings it over; which of them agree is found at the same time, so that an anchor that was moved since does not bend the
@@ -63,7 +63,7 @@ def apply(known: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed:
     Parameters
     ----------
     known : what is known.
-    graph : first estimate; its first pose is held.
+    graph : first estimate; its first pose is fixed.
     anchor_ids : (a,) names of its anchors.
     placed : (a,) which of them have a position.
     clock : when its poses were.
@@ -140,7 +140,7 @@ def _strayed(known: Constraints, graph: Graph, index: dict[str, int], placed: Bo
 
 
 def _anchor_priors(known: Constraints, index: dict[str, int], moved: dict[str, float]) -> list[Edges]:
-    """Surveyed anchors are believed; those of an earlier map under a kernel that lets go of a moved one."""
+    """Surveyed anchors are taken as they are; those of an earlier map get a kernel that gives up a moved one."""
     edges: list[Edges] = []
     for movable, kernel in ((False, Kernel()), (True, Kernel("geman-mcclure", 4.0))):
         anchors = [a for a in known.anchors if a.movable == movable and a.id not in moved]

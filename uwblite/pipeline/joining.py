@@ -1,9 +1,9 @@
 """Many recordings in one graph: anchors have ids, so recordings of other days and robots share a frame.
 
-Each recording grows its own first estimate. The anchors that two have in common then say how one lies in the frame of
+Each recording is bootstrapped on its own. The anchors that two have in common then give the pose of one in the frame of
 the other; one that was moved in between does not join in, gets a place of its own for each recording (``5C0B`` and
 ``5C0B#2``) and is named. Poses, wheels and ranges of all recordings become one graph with one numbering of poses.
-What is wrong with wheels, tag and ranges stays each recording's own, see calibration.unknowns.
+Systematic errors of odometry, tag and ranges stay each recording's own, see calibration.unknowns.
 """
 
 from collections.abc import Sequence
@@ -144,7 +144,7 @@ def _one_graph(
 
 
 def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, Bools, list[Ints]]:
-    """Return the block of all recordings' unknowns, its priors, which are held, and where each graph's are in it."""
+    """Return the block of all recordings' unknowns, its priors, which are fixed, and where each graph's are in it."""
     keyed = [[calibration.of_recording(key, n) for key in graph.calibration.keys] for n, graph in enumerate(graphs)]
     keys = tuple(dict.fromkeys(key for own in keyed for key in own))
     block, place = Calibration(keys, np.zeros(len(keys))), {key: k for k, key in enumerate(keys)}

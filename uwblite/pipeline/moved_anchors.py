@@ -1,4 +1,4 @@
-"""Anchors that were moved between recordings, told once the lidar holds all poses."""
+"""Anchors that were moved between recordings, found once the lidar constrains all poses."""
 
 from dataclasses import replace
 
@@ -79,9 +79,9 @@ def _places_by_recording(
     pairs, which = np.unique(np.stack([ranges.anchor[alive], heard[alive]], axis=1), axis=0, return_inverse=True)
     own = graph.calibration.of_kinds(BIAS)
     priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration")
-    held, fixed = np.ones(len(graph.poses), dtype=bool), graph.fixed_calibration | ~own
-    alone = Graph(graph.poses, graph.anchors[pairs[:, 0]], priors, graph.calibration, held, None, fixed)
-    # What the joint map held to be outliers may be an anchor that was moved: first all ranges count alike.
+    all_poses, fixed = np.ones(len(graph.poses), dtype=bool), graph.fixed_calibration | ~own
+    alone = Graph(graph.poses, graph.anchors[pairs[:, 0]], priors, graph.calibration, all_poses, None, fixed)
+    # Outliers of the joint map may be of an anchor that was moved: first all ranges count alike.
     alike = np.ones(len(alive))
     edges = replace(
         ranges.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5), weights=alike

@@ -16,7 +16,7 @@ _STEPS = (0.1, 0.2, 0.5, 1.0, 2.0)
 _COLOURS = np.array(
     [[33, 120, 180], [86, 180, 190], [190, 225, 170], [250, 220, 120], [240, 150, 70], [200, 60, 60]], dtype=np.uint8
 )
-"""From better than the first bound to worse than the last; told apart in grey as well (dark, light, dark with a legend)."""
+"""From better than the first bound to worse than the last; distinct in grey as well (dark, light, dark with a legend)."""
 
 
 def draw_errors(

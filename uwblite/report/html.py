@@ -70,7 +70,7 @@ def _banner(result: MapResult) -> str:
     if result.doubts:
         items = "".join(f"<li>{escape(doubt.text)}</li>" for doubt in result.doubts)
         parts.append(
-            f'<div class="box bad" role=alert><b>Do not trust this map before these are settled:</b><ul>{items}</ul></div>'
+            f'<div class="box bad" role=alert><b>Do not trust this map before these are resolved:</b><ul>{items}</ul></div>'
         )
     if result.warnings:
         items = "".join(f"<li>{escape(warning.text)}</li>" for warning in result.warnings)
@@ -190,7 +190,7 @@ def _residuals(result: MapResult) -> str:
     along = "one recording after another" if several else f"{span:.0f} s"
     parts = [
         "<p class=hint>Expected minus measured range over time; <span class=nlos-text>marked</span>: does not agree with the"
-        " map, as where something blocks the radio's sight (NLOS).</p>"
+        " map, as where something blocks the line of sight (NLOS).</p>"
     ]
     for index, anchor in enumerate(result.anchors):
         mine = np.flatnonzero(table["anchor"] == index)

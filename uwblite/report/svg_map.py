@@ -18,7 +18,7 @@ def number(value: float, digits: int = 3, sign: bool = False) -> str:
     """Return a number with a true minus sign; a dash where it is not finite."""
     if not np.isfinite(value):
         return "\u2013"
-    # What rounds to zero has no sign to be told.
+    # What rounds to zero has no sign.
     return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}".replace("-", "\u2212")
 
 
