@@ -8,11 +8,9 @@ from emulators.dwm_device import BANNER, DwmDevice, DwmOptions
 from emulators.world import Epoch, WorldClock
 from helpers.driver_harness import check_transcript, feed_whole, good
 
-from uwblite.drivers import dwm1001
 from uwblite.drivers.dwm1001 import TlvProtocol
 from uwblite.drivers.dwm1001_blocks import Answer, Distances, NodeConfig, Position, Status, UpdateRate, Value
 from uwblite.drivers.events import RangeReading
-from uwblite.errors import ProtocolError
 
 POSITION = "4b0a00001f0400009c0e000064"
 RNG = random.Random(2)
@@ -26,7 +24,6 @@ def tag_block(readings):
 
 
 READINGS = [(0xCD37, 2801, 100), (0x1495, 2742, 98), (0x592F, 3600, 100), (0x5B01, 3700, 77)]
-ANCHORS = tuple(Position(1.0, 0.0, 3.99, 0.0, 100) for _ in READINGS)
 RANGES = tuple(RangeReading(f"{a:04X}", d / 1000, q) for a, d, q in READINGS)
 
 
@@ -48,12 +45,12 @@ def transcript():
     position = Position(1.0, 2.635, 1.055, 3.740, 100)
     expected = [
         Answer(1.0, 0), Status(1.0, 3),
-        Answer(1.0, 0), position, Distances(1.0, RANGES, ANCHORS),
-        Answer(1.0, 0), Distances(1.0, RANGES[:1], ANCHORS[:1]),
-        Answer(1.0, 0), position, Distances(1.0, (), ()),
+        Answer(1.0, 0), position, Distances(1.0, RANGES),
+        Answer(1.0, 0), Distances(1.0, RANGES[:1]),
+        Answer(1.0, 0), position, Distances(1.0, ()),
         Answer(1.0, 0), Distances(1.0, (RangeReading("1495", 12.345, 90),)),
         Answer(1.0, 0), UpdateRate(1.0, 0.1, 10.0),
-        Answer(1.0, 0), NodeConfig(1.0, False, False, False, True, 0, False, False, False, False, False, True, 3),
+        Answer(1.0, 0), NodeConfig(1.0, anchor=False, stationary_detection=True, low_power=False, uwb_mode=3),
         Answer(1.0, 0), Value(1.0, "firmware", 0x01030001), Value(1.0, "configuration", 0x00010700),
         Value(1.0, "hardware", 0xDECA002A),
         Answer(1.0, 0), Value(1.0, "pan_id", 0xBACA),
@@ -118,15 +115,6 @@ def test_the_head_of_an_answer_is_no_status():
 def test_distances_that_no_module_sends_are_damage(readings):
     events = feed_whole(TlvProtocol, b"\x40\x01\x00" + tag_block(readings))
     assert not [event for event in events if isinstance(event, Distances)]
-
-
-def test_requests():
-    assert dwm1001.request("loc_get") == b"\x0c\x00" == dwm1001.LOC_GET
-    assert dwm1001.request("status_get") == b"\x32\x00" == dwm1001.STATUS_GET
-    with pytest.raises(ProtocolError):
-        dwm1001.request("explode")
-    with pytest.raises(ProtocolError):
-        dwm1001.request("loc_get", bytes(300))
 
 
 def test_memory_is_bounded():

@@ -15,10 +15,8 @@ from uwblite.drivers.dwm1001_shell import (
     ShellProtocol,
     TextLine,
     parse_node_info,
-    shell_command,
 )
 from uwblite.drivers.events import Corrupt, RangeReading
-from uwblite.errors import ProtocolError
 
 RNG = random.Random(5)
 NOISES = [b"", b"\x00", b"\xff\r\n", b"\x1b[1H", b"le", b"1H", b"DIST,4,AN0,12", b"POS,1.0", b"garbage\r\n", b"=[,]", b"\r\n",
@@ -128,14 +126,6 @@ def test_a_line_that_broke_off_does_not_take_the_next_one_with_it():
             last = good(feed_whole(ShellProtocol, whole[:cut] + whole))[-1]
             assert isinstance(last, RangeLine)
             assert last == feed_whole(ShellProtocol, whole)[0]
-
-
-def test_commands():
-    assert shell_command("aurs 1 1") == b"aurs 1 1\r"
-    assert shell_command("nis 0xC0DE") == b"nis 0xC0DE\r"
-    for bad in ("", "nis C0DE", "rm -rf", "si\rreset"):
-        with pytest.raises(ProtocolError):
-            shell_command(bad)
 
 
 def test_memory_is_bounded():

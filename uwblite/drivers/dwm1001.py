@@ -11,41 +11,16 @@ request after 0.76 ms without a byte, so a request must be written in one write.
 Sources: DWM1001 firmware API guide 2.3; the vendor's host code.
 """
 
-from ..errors import ProtocolError
 from .dwm1001_blocks import Answer, Event, block_length, decode
 from .events import Corrupt
 from .framing import FrameReader
 
 BAUD = 115200
 
-REQUESTS = {
-    "pos_get": 0x02, "upd_rate_get": 0x04, "cfg_get": 0x08, "loc_get": 0x0C, "baddr_get": 0x10, "stnry_cfg_get": 0x12,
-    "reset": 0x14, "ver_get": 0x15, "panid_get": 0x2F, "nodeid_get": 0x30, "status_get": 0x32, "int_cfg_get": 0x35,
-}  # fmt: skip
 LOC_GET, STATUS_GET = b"\x0c\x00", b"\x32\x00"
-
-
-def request(name: str, value: bytes = b"") -> bytes:
-    """Build a request that reads something, or `reset`.
-
-    Parameters
-    ----------
-    name : key of REQUESTS.
-    value : payload, for requests that take one.
-
-    Returns
-    -------
-    bytes : to be written in one write.
-
-    Raises
-    ------
-    ProtocolError : no such request, or a payload too long.
-    """
-    if name not in REQUESTS:
-        raise ProtocolError(f"no TLV request {name!r}; known are {', '.join(sorted(REQUESTS))}")
-    if len(value) > 255:
-        raise ProtocolError(f"TLV request {name}: {len(value)} bytes of payload, at most 255 are possible")
-    return bytes((REQUESTS[name], len(value))) + value
+QUERIES = {"ver_get": b"\x15\x00", "nodeid_get": b"\x30\x00", "panid_get": b"\x2f\x00", "cfg_get": b"\x08\x00",
+           "upd_rate_get": b"\x04\x00"}  # fmt: skip
+"""What a module is asked once; nothing is ever set."""
 
 
 class TlvProtocol(FrameReader):

@@ -50,8 +50,6 @@ class Distances:
     stamp: float
     """s, arrival of the block's first byte."""
     readings: tuple[RangeReading, ...]
-    anchors: tuple[Position, ...] = ()
-    """Configured positions of the anchors, in the order of `readings`; empty when an anchor answers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,17 +86,9 @@ class NodeConfig:
 
     stamp: float
     anchor: bool
-    initiator: bool
-    bridge: bool
+    """Not a tag."""
     stationary_detection: bool
-    measurement_mode: int
-    """0 = two-way ranging."""
     low_power: bool
-    location_engine: bool
-    encryption: bool
-    leds: bool
-    bluetooth: bool
-    firmware_update: bool
     uwb_mode: int
     """0 off, 1 passive, 2 active."""
 
@@ -109,24 +99,14 @@ class Value:
 
     stamp: float
     name: str
-    """"firmware", "configuration", "hardware", "pan_id", "node_id", "sensitivity", "interrupts", "ble_address"."""
+    """"firmware", "configuration", "hardware", "pan_id" or "node_id"."""
     value: int
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
-    """A block of a known type that is passed on undecoded (anchor list)."""
-
-    stamp: float
-    kind: int
-    data: bytes
-
-
-Event = Answer | Position | Distances | Status | UpdateRate | NodeConfig | Value | Block | Corrupt
+Event = Answer | Position | Distances | Status | UpdateRate | NodeConfig | Value | Corrupt
 
 _VALUES = {
-    0x47: (2, "interrupts"), 0x4A: (1, "sensitivity"), 0x4D: (2, "pan_id"), 0x4E: (8, "node_id"),
-    0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware"), 0x5F: (6, "ble_address"),
+    0x4D: (2, "pan_id"), 0x4E: (8, "node_id"), 0x50: (4, "firmware"), 0x51: (4, "configuration"), 0x52: (4, "hardware"),
 }  # fmt: skip
 _LENGTHS = {0x41: 13, 0x45: 4, 0x46: 2, 0x5A: 2, **{kind: size for kind, (size, _) in _VALUES.items()}}
 _HEAD_AS_STATUS = 0x0140
@@ -144,15 +124,13 @@ def short_id(address: int) -> str:
 def block_length(head: bytes) -> int:
     """Return the length in a block's head (type, length, count), 0 = not all here yet, -1 = no such block."""
     kind = head[0]
-    if kind not in _LENGTHS and kind not in (0x48, 0x49, 0x56):
+    if kind not in _LENGTHS and kind not in (0x48, 0x49):
         return -1
     if len(head) < 2:
         return 0
     length = head[1]
     if kind in _LENGTHS:
         return length if length == _LENGTHS[kind] else -1
-    if kind == 0x56:
-        return length if length else -1
     row, most = (13, 15) if kind == 0x48 else (20, 12)
     count, rest = divmod(length - 1, row)
     if rest or not 0 <= count <= most or (len(head) > 2 and head[2] != count):
@@ -182,31 +160,24 @@ def decode(piece: bytes, stamp: float) -> Event:
         return Status(stamp, bits)  # a firmware may set bits that the guide does not name
     if kind in _VALUES:
         return Value(stamp, _VALUES[kind][1], int.from_bytes(value, "little"))
-    if kind == 0x56:
-        return Block(stamp, kind, value)
     return _decode_distances(piece, stamp)
 
 
 def _decode_config(value: bytes, stamp: float) -> NodeConfig:
     low, high = value
-    return NodeConfig(
-        stamp, bool(high & 32), bool(high & 16), bool(high & 8), bool(high & 4), high & 3, bool(low & 128),
-        bool(low & 64), bool(low & 32), bool(low & 16), bool(low & 8), bool(low & 4), low & 3,
-    )  # fmt: skip
+    return NodeConfig(stamp, bool(high & 32), bool(high & 4), bool(low & 128), low & 3)
 
 
 def _decode_distances(piece: bytes, stamp: float) -> Event:
     rows = piece[3:]
-    readings, anchors = [], []
     if piece[0] == 0x49:
-        for address, distance, quality, x, y, z, position_quality in _TAG_ROW.iter_unpack(rows):
-            readings.append((address, distance, quality))
-            anchors.append(Position(stamp, x / 1000, y / 1000, z / 1000, position_quality))
+        table = list(_TAG_ROW.iter_unpack(rows))
+        readings = [row[:3] for row in table]
+        far = any(abs(millimetres) > MAX_PLACE_MM for row in table for millimetres in row[3:6])
     else:
-        readings = list(_ANCHOR_ROW.iter_unpack(rows))
-    far = any(max(abs(a.x), abs(a.y), abs(a.z)) * 1000 > MAX_PLACE_MM for a in anchors)
+        readings, far = list(_ANCHOR_ROW.iter_unpack(rows)), False
     if far or any(distance > MAX_RANGE_MM or quality > 100 for _, distance, quality in readings):
         return corrupt(piece, "distance or quality out of range")
     if len({address for address, _, _ in readings}) < len(readings):
         return corrupt(piece, "one anchor twice in a fix")
-    return Distances(stamp, tuple([RangeReading(short_id(a), d / 1000, q) for a, d, q in readings]), tuple(anchors))
+    return Distances(stamp, tuple([RangeReading(short_id(a), d / 1000, q) for a, d, q in readings]))

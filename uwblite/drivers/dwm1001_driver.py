@@ -8,7 +8,7 @@ that died, is brought round.
 import math
 from typing import Any
 
-from .dwm1001 import BAUD, STATUS_GET, TlvProtocol, request
+from .dwm1001 import BAUD, QUERIES, STATUS_GET, TlvProtocol
 from .dwm1001_advice import advise, not_joined
 from .dwm1001_blocks import NodeConfig, Status, UpdateRate, Value, short_id
 from .dwm1001_poll import FixPoller
@@ -21,7 +21,6 @@ from .dwm1001_shell import (
     ShellProtocol,
     TextLine,
     parse_node_info,
-    shell_command,
 )
 from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, Reopen, Send
 from .session import Driver, Identity, Script, Wait
@@ -33,7 +32,6 @@ PROBES = ((STATUS_GET, PATIENCE), (ENTER, 0.6), (STATUS_GET, PATIENCE), (STATUS_
 """What finds out the mode: the status in generic mode; Enter in the shell, which also wakes a sleeping tag."""
 QUIET = 0.15, 0.35
 """s: lines may still come at first; after that, a stream that was stopped must be silent."""
-QUERIES = ("ver_get", "nodeid_get", "panid_get", "cfg_get", "upd_rate_get")
 ANSWERS = {"ver_get": "hardware", "nodeid_get": "node_id", "panid_get": "pan_id"}
 """The value that completes the answer to a query."""
 DISTRUST, LEAP = 5.0, 0.25
@@ -98,7 +96,7 @@ class Dwm1001Driver(Driver):
 
     def stop(self) -> list[Action]:
         """Return what ends a stream; polling ends by itself."""
-        return [Send(shell_command("lec"))] if self._streaming else []
+        return [Send(b"lec\r")] if self._streaming else []
 
     def script(self) -> Script[None]:
         """Find the module, learn who it is, and read fixes; begin again when it falls silent."""
@@ -134,7 +132,7 @@ class Dwm1001Driver(Driver):
             return prompt is not None
         if shell:
             self._text, self._binary = True, False
-            yield Send(shell_command("quit"))
+            yield Send(b"quit\r")
             yield from self.sleep(PATIENCE)
         self._text, self._binary = False, True
         self._tlv.reset()
@@ -161,7 +159,7 @@ class Dwm1001Driver(Driver):
         yield from self.say_once(Note("info", "uwb-stream-left", text))
         for _ in range(4):
             if left:
-                yield Send(shell_command(left))
+                yield Send(left.encode() + b"\r")
                 yield from self.sleep(QUIET[0])
                 left = _source((yield from self.sleep(QUIET[1])))
         return True
@@ -170,7 +168,7 @@ class Dwm1001Driver(Driver):
 
     def _ask_shell(self) -> Script[None]:
         texts: list[str] = []
-        yield Send(shell_command("si"))
+        yield Send(b"si\r")
         until = self.now + 1.0
         while (event := (yield Wait(until))) is not None and not (texts and isinstance(event, Prompt)):
             if isinstance(event, TextLine):
@@ -196,7 +194,7 @@ class Dwm1001Driver(Driver):
         self._streaming, tries, self._missed = True, 4, True
         while tries:
             tries -= 1
-            yield Send(shell_command("lec"))
+            yield Send(b"lec\r")
             until = self.now + max(1.0, 3 * self.period)
             while (event := (yield Wait(until))) is not None:
                 if isinstance(event, Corrupt):
@@ -226,14 +224,14 @@ class Dwm1001Driver(Driver):
     # ---- TLV
 
     def _query(self) -> Script[None]:
-        for name in QUERIES:
+        for name, request in QUERIES.items():
 
             def answers(event: Any, name: str = name) -> bool:
                 if isinstance(event, Value):
                     return event.name == ANSWERS.get(name)
                 return isinstance(event, NodeConfig if name == "cfg_get" else UpdateRate)
 
-            yield from self.ask(request(name), answers, PATIENCE)
+            yield from self.ask(request, answers, PATIENCE)
         for name, key in (("uwb_tag_id", "node_id"), ("uwb_pan_id", "pan_id")):
             if key in self.values:
                 yield Param(name, short_id(self.values[key]))

@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from ..errors import ProtocolError
 from .events import Corrupt, RangeReading, corrupt
 from .framing import Line, LineReader
 
@@ -71,30 +70,6 @@ COMMANDS = (
 )  # fmt: skip
 
 
-def shell_command(text: str) -> bytes:
-    """Build a command line.
-
-    Parameters
-    ----------
-    text : for example ``si`` or ``aurs 1 1``.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ProtocolError : empty (that would repeat the last command), not a command, or ``nis`` without 0x, which the firmware
-        accepts and turns into zero.
-    """
-    words = text.split()
-    if not words or words[0] not in COMMANDS or not text.isprintable():
-        raise ProtocolError(f"{text!r} is not a shell command of PANS R2; `?` in the shell lists them")
-    if words[0] == "nis" and not re.fullmatch(r"nis 0x[0-9A-Fa-f]{1,4}", text):
-        raise ProtocolError(f"{text!r}: the network id needs 0x and 1 to 4 hexadecimal digits, as in `nis 0xC0DE`")
-    return " ".join(words).encode("ascii") + b"\r"
-
-
 _NUMBER = r"(-?\d{1,6}\.\d\d)"
 _DISTANCE = r"(\d{1,4}\.\d\d)"
 _QUALITY = r"(\d{1,3})"
@@ -120,17 +95,7 @@ class ShellProtocol:
         self._lines = LineReader(MAX_LINE, ends=(b"\r", b"\n", PROMPT))
 
     def feed(self, data: bytes, stamp: float) -> list[Event]:
-        """Take bytes that arrived at `stamp` s and return the events they complete.
-
-        Parameters
-        ----------
-        data : bytes from the port.
-        stamp : arrival, s, clock of the host.
-
-        Returns
-        -------
-        list of events, in the order of the bytes.
-        """
+        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Event] = []
         for line in self._lines.feed(data, stamp):
             if isinstance(line, Corrupt):

@@ -133,17 +133,7 @@ class OdometryLineProtocol:
         self._lines = LineReader(MAX_LINE)
 
     def feed(self, data: bytes, stamp: float) -> list[Sample | Corrupt]:
-        """Take bytes that arrived at `stamp` s and return the events they complete.
-
-        Parameters
-        ----------
-        data : bytes from the port.
-        stamp : arrival, s, clock of the host.
-
-        Returns
-        -------
-        list of Sample or Corrupt.
-        """
+        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Sample | Corrupt] = []
         for line in self._lines.feed(data, stamp):
             if isinstance(line, Corrupt):

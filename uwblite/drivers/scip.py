@@ -124,17 +124,7 @@ class ScipProtocol:
         self._text_owner = ""
 
     def feed(self, data: bytes, stamp: float) -> list[Event]:
-        """Take bytes that arrived at `stamp` s and return the events they complete.
-
-        Parameters
-        ----------
-        data : bytes from the port.
-        stamp : arrival, s, clock of the host.
-
-        Returns
-        -------
-        list of Reply, Distances or Corrupt.
-        """
+        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
         events: list[Event] = []
         for line in self._lines.feed(data, stamp):
             if not isinstance(line, Corrupt):
