@@ -142,7 +142,7 @@ def _verb_parser(verb: str, module: Any) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    # argparse takes "-0.05,0,0.6" for an option unless told that numbers may be joined by commas.
+    # argparse takes "-0.05,0,0.6" for an option unless it is set that numbers may be joined by commas.
     parser._negative_number_matcher = re.compile(r"-[\d.][\d.,eE+-]*$")
     module.add_arguments(parser)
     common = parser.add_argument_group("common options")
@@ -206,7 +206,7 @@ def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) ->
     try:
         with warnings.catch_warnings():
             if not args.debug:
-                # numpy's remarks on overflows say nothing to a user; what comes of them is told in our own words.
+                # numpy's remarks on overflows say nothing to a user; what comes of them is told in a message of ours.
                 warnings.simplefilter("ignore", RuntimeWarning)
             return int(module.run(args))
     except KeyboardInterrupt:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..evaluation.trajectory import AnchorErrors, ErrorStatistics, TrajectoryErrors
     from ..lidar.columns import Landmarks
 
-    Drive = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+    Timed = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
     """Stamps (n,) s and poses (n, 3) of a result, and the true ones."""
 
 HELP = "compare a map, its trajectory and anchors with the truth"
@@ -40,7 +40,7 @@ files (lengths in metres):
 """
 
 DEFAULT_RADIUS = 0.3
-"""m, of a column whose radius is not told."""
+"""m, of a column whose radius is not given."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,16 +87,18 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
 
     folder = Path(args.dir)
     mend_result(folder)
-    drives = [_drive(folder, truth, number) for number, truth in enumerate(args.truth, args.recording or 1)]
-    stamps, poses, true_stamps, true_poses = _one_after_another(drives)
+    recordings = [_recording(folder, truth, number) for number, truth in enumerate(args.truth, args.recording or 1)]
+    stamps, poses, true_stamps, true_poses = _one_after_another(recordings)
     trajectory = evaluate_trajectory(stamps, poses, true_stamps, true_poses, max_gap=args.max_gap, rpe_delta=args.delta)
     summary: dict[str, Any] = {"trajectory": _trajectory_summary(trajectory, len(true_stamps))}
-    lines = _trajectory_lines(trajectory, len(true_stamps), "together" if len(drives) > 1 else "trajectory")
-    if len(drives) > 1:
-        alone = [evaluate_trajectory(*drive, max_gap=args.max_gap, rpe_delta=args.delta) for drive in drives]
-        summary["recordings"] = [_trajectory_summary(own, len(drive[2])) for own, drive in zip(alone, drives, strict=True)]
-        for number, (own, drive) in enumerate(zip(alone, drives, strict=True), 1):
-            lines += _trajectory_lines(own, len(drive[2]), f"recording {number} alone")
+    lines = _trajectory_lines(trajectory, len(true_stamps), "together" if len(recordings) > 1 else "trajectory")
+    if len(recordings) > 1:
+        alone = [evaluate_trajectory(*recording, max_gap=args.max_gap, rpe_delta=args.delta) for recording in recordings]
+        summary["recordings"] = [
+            _trajectory_summary(own, len(recording[2])) for own, recording in zip(alone, recordings, strict=True)
+        ]
+        for number, (own, recording) in enumerate(zip(alone, recordings, strict=True), 1):
+            lines += _trajectory_lines(own, len(recording[2]), f"recording {number} alone")
     if args.anchors:
         anchors = _anchors(folder / "anchors.csv", args.anchors, trajectory.T_truth_map)
         summary["anchors"] = {**_plain(anchors), "errors": dict(zip(anchors.ids, anchors.distances.tolist(), strict=True))}
@@ -128,7 +130,7 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     return summary, lines
 
 
-def _drive(folder: Path, truth: str, number: int) -> "Drive":
+def _recording(folder: Path, truth: str, number: int) -> "Timed":
     """Return stamps and poses of a recording in a result, and the true ones."""
     from ..errors import ConfigError
     from ..io.tum import read_tum
@@ -139,15 +141,15 @@ def _drive(folder: Path, truth: str, number: int) -> "Drive":
     return (*in_order(*read_tum(own)), *in_order(*read_tum(truth)))
 
 
-def _one_after_another(drives: "Sequence[Drive]") -> "Drive":
-    """Return all recordings as one; their stamps are moved apart, for they may be of the same hour or of clocks set anew."""
+def _one_after_another(recordings: "Sequence[Timed]") -> "Timed":
+    """Return all recordings as one; their stamps are moved apart, for they may be of the same hour or of clocks set again."""
     import numpy as np
 
-    if len(drives) == 1:
-        return drives[0]
-    moved: list[Drive] = []
+    if len(recordings) == 1:
+        return recordings[0]
+    moved: list[Timed] = []
     free = 0.0
-    for stamps, poses, true_stamps, true_poses in drives:
+    for stamps, poses, true_stamps, true_poses in recordings:
         begin = free - min(stamps[0], true_stamps[0])
         moved.append((stamps + begin, poses, true_stamps + begin, true_poses))
         free = max(moved[-1][0][-1], moved[-1][2][-1]) + _PAUSE

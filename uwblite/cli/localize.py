@@ -160,10 +160,10 @@ def _say(found: "Localization", files: list[str]) -> None:
     result = found.result
     x, y, theta = found.correction.tolist()
     start = result.trajectory[0]
-    console.say(f"{len(result.stamps)} poses; the drive began at x {signed(start[0])} m, y {signed(start[1])} m")
+    console.say(f"{len(result.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m")
     if found.overlap == found.overlap:
         console.say(
-            f"{100 * found.overlap:.0f} % of the walls lie on those of the map; they moved the path by"
+            f"{100 * found.overlap:.0f} % of the walls lie on those of the map; the path was moved by"
             f" x {signed(x, 3, plus=True)} m, y {signed(y, 3, plus=True)} m, {signed(theta, 4, plus=True)} rad"
         )
     else:

@@ -28,7 +28,7 @@ examples:
   uwblite map run.log --out b/ --preset paper          the paper's plain choices
   uwblite map run.log --out c/ --set grid.resolution=0.02
   uwblite map run.log --out d/ --align walls --crop 0,0,12,8
-  uwblite map monday.log tuesday.log --out both/       one map of several drives: anchors tie them together
+  uwblite map monday.log tuesday.log --out both/       one map of several recordings: anchors tie them together
   uwblite map monday.log --out monday/ --anchors-from sunday/anchors.csv    in the frame of Sunday's map
   uwblite map drive.bag --out map/ --uwb-mapping uwb.toml    a ROS bag with ranges of one's own kind
   uwblite map run.log --out map/ --dry-run             read, check and estimate only
@@ -153,7 +153,7 @@ def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Const
 
     progress = console.Progress()
 
-    def told(stage: str, done: int, total: int) -> None:
+    def report(stage: str, done: int, total: int) -> None:
         if stage.startswith("occupancy grid of"):
             console.note(f"uwblite: {stage}")
         progress(stage, done, total)
@@ -162,7 +162,7 @@ def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Const
     try:
         with _workers(jobs) as executor:
             clock = time.perf_counter
-            return build_map(log, config, constraints=constraints, progress=told, executor=executor, clock=clock)
+            return build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=clock)
     finally:
         progress.close()
 
@@ -279,7 +279,7 @@ def summary_json(
 def summary_lines(
     args: argparse.Namespace, logs: list["SensorLog"], result: "MapResult", names: list[str], seconds: float
 ) -> list[str]:
-    """Return what the user is told at the end."""
+    """Return the summary for people."""
     import os
 
     from .console import duration

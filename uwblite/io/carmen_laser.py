@@ -18,7 +18,7 @@ from .carmen_readings import Block, Pending
 DEFAULT_RANGE_MIN = 0.02
 """m; what a scanner reports below is an error code (URG-04LX: 0..19 mm). PARAM laser_range_min wins."""
 DEFAULT_RANGE_MAX = 80.0
-"""m; reach of the scanners whose logs (FLASER) do not tell it. PARAM robot_front_laser_max wins."""
+"""m; reach of the scanners whose logs (FLASER) do not give it. PARAM robot_front_laser_max wins."""
 MAX_BEAMS = 100_000
 """A message that claims more readings is broken."""
 POSE_TOLERANCE = 0.01
@@ -35,13 +35,13 @@ _URG_PERIOD = 0.1
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """Geometry that a message tells; messages with equal layout go into one array."""
+    """Geometry that a message gives; messages with equal layout go into one array."""
 
     beams: int
     angle_min: float = 0.0
     angle_increment: float = 0.0
     range_max: float = 0.0
-    """m; 0 where the message does not tell it."""
+    """m; 0 where the message does not give it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -67,7 +67,7 @@ class LaserMessages:
         self._layouts: dict[bytes, _Layout] = {}
         self._scans: dict[_Layout, _Scans] = {}
         self._poses = array("d")
-        """stamp, laser pose (3), robot pose (3) of every message that tells them."""
+        """stamp, laser pose (3), robot pose (3) of every message that gives them."""
 
     def begin(self, block: Block) -> None:
         """Start a block of lines."""
@@ -165,13 +165,13 @@ class LaserMessages:
                 yield from ((p.number, e) for p, e in zip(pending, errors, strict=True) if e is not None)
 
     def robot_poses(self) -> Floats:
-        """Return (k, 4) stamp and pose of the robot of every message that tells them."""
+        """Return (k, 4) stamp and pose of the robot of every message that gives them."""
         return np.array(self._poses).reshape(-1, 7)[:, [0, 4, 5, 6]]
 
     def finish(
         self, params: Params, skipped: dict[str, int], warnings: list[str], set_back: dict[str, float] | None = None
     ) -> tuple[LaserScans | None, Floats | None]:
-        """Return the scans of the commonest layout, sorted by time, and T_base_laser where the messages tell it."""
+        """Return the scans of the commonest layout, sorted by time, and T_base_laser where the messages give it."""
         for name, count in self._counts.items():
             if count and name != self._kind:
                 skipped[name.decode()] = count
@@ -190,8 +190,8 @@ class LaserMessages:
         stamps = np.array(scans.stamps)
         order = time_order(stamps, what, warnings, set_back)
         angle_min, increment = (kept.angle_min, kept.angle_increment) if what != "FLASER" else params.guess_scanner(kept.beams)
-        told = params.get("robot_front_laser_max", "laser_front_laser_max_range")
-        range_max = kept.range_max or told or DEFAULT_RANGE_MAX
+        given = params.get("robot_front_laser_max", "laser_front_laser_max_range")
+        range_max = kept.range_max or given or DEFAULT_RANGE_MAX
         range_min = params.get("laser_range_min")
         range_min = DEFAULT_RANGE_MIN if range_min is None else range_min
         time_increment = params.get("laser_time_increment")

@@ -54,7 +54,7 @@ class Params:
             (self._numbers[name],) = numbers(tokens[2:3], f"PARAM {name[:40]}", 1)
 
     def get(self, *names: str) -> float | None:
-        """Return the first of these numbers that was told."""
+        """Return the first of these numbers that was given."""
         return next((self._numbers[name] for name in names if name in self._numbers), None)
 
     def _tag(self, prefix: str) -> Floats:
@@ -62,36 +62,36 @@ class Params:
         return np.array([self._numbers.get(prefix + name, 0.0) for name in _TAG], dtype=np.float64)
 
     def tells_tag(self, number: int) -> bool:
-        """Return whether the place of a further tag, 2 to 9, was told."""
+        """Return whether the place of a further tag, 2 to 9, was given."""
         return any(f"uwb{number}_{name}" in self._numbers for name in _TAG)
 
     def mounting(self, T_base_laser: Floats | None, tags: int = 1) -> SensorMounting:
-        """Return the mounting; where the laser messages tell no pose of the laser, CARMEN's robot_frontlaser_* count.
+        """Return the mounting; where the laser messages give no pose of the laser, CARMEN's robot_frontlaser_* count.
 
         Parameters
         ----------
-        T_base_laser : (3,) by the laser messages, None = not told.
+        T_base_laser : (3,) by the laser messages, None = not given.
         tags : how many tags the robot has.
         """
-        told = self._numbers
+        given = self._numbers
         if T_base_laser is None:
             offsets = ("robot_frontlaser_offset", "robot_frontlaser_side_offset", "robot_frontlaser_angular_offset")
-            T_base_laser = np.array([told.get(name, 0.0) for name in offsets])
+            T_base_laser = np.array([given.get(name, 0.0) for name in offsets])
         return SensorMounting(
             T_base_laser=T_base_laser,
             laser_flipped=self._flipped,
             tag_position=self._tag("uwb_"),
             more_tags=np.array([self._tag(f"uwb{k}_") for k in range(2, tags + 1)]).reshape(-1, 3),
-            anchor_height=told.get("uwb_anchor_height"),
+            anchor_height=given.get("uwb_anchor_height"),
             anchor_heights={
                 name.removeprefix(_ANCHOR_HEIGHT): height
-                for name, height in sorted(told.items())
+                for name, height in sorted(given.items())
                 if name.startswith(_ANCHOR_HEIGHT)
             },
         )
 
     def guess_scanner(self, beams: int) -> tuple[float, float]:
-        """Return angle_min and angle_increment, rad, of an FLASER message, which tells only its number of readings.
+        """Return angle_min and angle_increment, rad, of an FLASER message, which gives only its number of readings.
 
         The usual conventions: SICK LMS with 180/181 readings of 1 degree, 360/361 of half a degree, 401 of a quarter
         (100 degrees); 0.5 and 0.25 degrees over 270 (541, 1081); 682/683 steps of 1/1024 turn (URG-04LX); otherwise

@@ -100,8 +100,8 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     )
     poses = told_places(vertices, pose_of, len(pose_ids), content, from_odometry)
     anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
-    held = records["FIX"].names[:, 0]
-    graph = assembled(plain, poses, anchors, *(index[held][index[held] >= 0] for index in (pose_of, landmark_of)))
+    fixed = records["FIX"].names[:, 0]
+    graph = assembled(plain, poses, anchors, *(index[fixed][index[fixed] >= 0] for index in (pose_of, landmark_of)))
     return GraphFile.checked(
         graph,
         tuple(map(str, pose_ids.tolist())),
@@ -119,20 +119,20 @@ def write_g2o(
     pose_ids: Sequence[str] = (),
     ranges: bool = False,
 ) -> None:
-    """Write a graph for g2o and its kin: poses, anchors, edges between poses, and what is held fixed.
+    """Write a graph for g2o and its kin: poses, anchors, edges between poses, and what is fixed.
 
     gtsam stops reading edges at the first line whose tag it does not know, and SE-Sync knows poses and edges between
     them alone: these stand first, and the first pose, which readers hold of themselves, is named only where more is
-    held or poses are known beforehand. Poses are vertices 0..n-1 and anchors follow. Calibration and lever arms are
+    fixed or poses are known beforehand. Poses are vertices 0..n-1 and anchors follow. Calibration and lever arms are
     worked in at the present estimate (see graph_file.plain_edges); robust kernels are not written.
 
     Parameters
     ----------
     path : the file, compressed where its name ends in ``.gz``.
     graph : the graph; anchors that are not finite are left out with their ranges.
-    anchor_ids : (a,) names of the anchors; a comment tells which vertex is which.
+    anchor_ids : (a,) names of the anchors; a comment gives which vertex is which.
     pose_ids : (n,) names of the poses; vertices bear these names and the anchors' where all of them are numbers, else the
-        numbers of their order, and comments tell the names.
+        numbers of their order, and comment gives the names.
     ranges : also write EDGE_RANGE_SE2_XY, which stock g2o does not know.
 
     Raises
@@ -171,11 +171,11 @@ def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:
     if ranges:
         pose, anchor, distance, sigma = plain.ranges
         yield from _rows("EDGE_RANGE_SE2_XY", [number[pose], number[n + anchor]], np.stack([distance, 1.0 / sigma**2], axis=1))
-    held = np.zeros(1, dtype=np.int64) if graph.fixed_poses is None else np.flatnonzero(graph.fixed_poses)
+    fixed = np.zeros(1, dtype=np.int64) if graph.fixed_poses is None else np.flatnonzero(graph.fixed_poses)
     if graph.fixed_anchors is not None:
-        held = np.concatenate([held, n + np.flatnonzero(graph.fixed_anchors & placed)])
-    if held.tolist() != [0] or len(plain.pose_priors[0]):
-        yield from _rows("FIX", [number[held]], np.zeros((len(held), 0)))
+        fixed = np.concatenate([fixed, n + np.flatnonzero(graph.fixed_anchors & placed)])
+    if fixed.tolist() != [0] or len(plain.pose_priors[0]):
+        yield from _rows("FIX", [number[fixed]], np.zeros((len(fixed), 0)))
 
 
 def _rows(tag: str, ids: Sequence[Ints], *columns: Floats) -> Iterator[str]:

@@ -31,7 +31,7 @@ class GraphFile:
     anchor_ids: tuple[str, ...]
     """Name of each landmark in the file; they are the graph's anchors."""
     stamps: Floats
-    """(n,) s, time of each pose; its number where the file tells no time."""
+    """(n,) s, time of each pose; its number where the file gives no time."""
     skipped: dict[str, int] = field(default_factory=dict)
     """Lines of kinds that are not used, by tag."""
     warnings: tuple[str, ...] = ()
@@ -51,7 +51,7 @@ class GraphFile:
         if len(lost):
             raise content.error(f"pose {pose_ids[lost[0]]} is not connected to the first one ({len(lost)} such poses)")
         nowhere = [name for name, xy in zip(anchor_ids, graph.anchors, strict=True) if np.isnan(xy[0])]
-        warnings = (f"no position is told of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}",) if nowhere else ()
+        warnings = (f"no position is given of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}",) if nowhere else ()
         return GraphFile(graph, pose_ids, anchor_ids, stamps, dict(sorted(content.skipped.items())), warnings)
 
 
@@ -173,11 +173,11 @@ def upper_triangle(matrices: Floats) -> Floats:
 
 
 def told_places(vertices: Records, index_of: Ints, count: int, content: RecordFile, forget: bool) -> Floats:
-    """Return the places (count, numbers) that vertices tell, nan where none does or all are to be forgotten.
+    """Return the places (count, numbers) that vertices give, nan where none does or all are to be forgotten.
 
     Raises
     ------
-    FormatError : a vertex is told twice.
+    FormatError : a vertex is given twice.
     """
     places = np.full((count, vertices.numbers.shape[1]), np.nan)
     index = index_of[vertices.names[:, 0]]
@@ -221,9 +221,9 @@ def assembled(plain: PlainEdges, poses: Floats, anchors: Floats, fixed: Ints = _
     Parameters
     ----------
     plain : measurements.
-    poses : (n, 3) told poses, nan where the file tells none; these are reached from the others along edges.
-    anchors : (a, 2) told landmarks; nan where none is told; these are placed by the first edge that sees them.
-    fixed, fixed_anchors : indices of what is held. Nothing named and no prior on a pose: the first pose is held.
+    poses : (n, 3) given poses, nan where the file gives none; these are reached from the others along edges.
+    anchors : (a, 2) given landmarks; nan where none is given; these are placed by the first edge that sees them.
+    fixed, fixed_anchors : indices of what is fixed. Nothing named and no prior on a pose: the first pose is fixed.
 
     Returns
     -------
@@ -242,13 +242,13 @@ def assembled(plain: PlainEdges, poses: Floats, anchors: Floats, fixed: Ints = _
         PriorEdges("poses", prior, value, root(strength) @ _turned(-value[:, 2])),
         PriorEdges("anchors", plain.landmark_priors[0], plain.landmark_priors[1], root(plain.landmark_priors[2])),
     )
-    held = np.isin(np.arange(len(poses)), fixed)
-    told = len(fixed) or len(prior) or len(fixed_anchors) > 1
+    fixed_pose = np.isin(np.arange(len(poses)), fixed)
+    given = len(fixed) or len(prior) or len(fixed_anchors) > 1
     return Graph(
         poses,
         anchors,
         tuple(e for e in edges if len(e)),
-        fixed_poses=held if told else None,
+        fixed_poses=fixed_pose if given else None,
         fixed_anchors=np.isin(np.arange(len(anchors)), fixed_anchors),
     )
 
@@ -265,7 +265,7 @@ def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:
 
     Parameters
     ----------
-    poses : (n, 3) told poses, nan where unknown; where all are, the first pose is the origin.
+    poses : (n, 3) given poses, nan where unknown; where all are, the first pose is the origin.
     i, j, T_i_j : (e,), (e,), (e, 3) measured poses of j in i.
 
     Returns
@@ -278,10 +278,10 @@ def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:
     if not known.any():
         known[0], poses = True, np.zeros((n, 3))
     # One more node stands for everything known; its links are the shortest.
-    told = np.flatnonzero(known)
-    rows = np.concatenate([i, np.full(len(told), n)])
-    cols = np.concatenate([j, told])
-    cost = np.concatenate([np.where(np.abs(j - i) == 1, 2.0, 3.0), np.ones(len(told))])
+    given = np.flatnonzero(known)
+    rows = np.concatenate([i, np.full(len(given), n)])
+    cols = np.concatenate([j, given])
+    cost = np.concatenate([np.where(np.abs(j - i) == 1, 2.0, 3.0), np.ones(len(given))])
     key = np.minimum(rows, cols) * (n + 1) + np.maximum(rows, cols)
     key, link = np.unique(key, return_index=True)
     links = csr_matrix((cost[link], (key // (n + 1), key % (n + 1))), shape=(n + 1, n + 1))

@@ -120,7 +120,7 @@ def readings_of(message: Any, topic: str, mappings: Sequence[UwbMapping]) -> lis
     """Return the readings of a message by the first mapping that finds some.
 
     Mappings with the same patterns describe forms of one kind of message: fields that were renamed between releases, or
-    directions that are told apart by `only`.
+    directions that are distinguished by `only`.
 
     Raises
     ------

@@ -12,7 +12,7 @@ Progress = Callable[[str, int, int], object]
 
 
 class Stages:
-    """Collects what the stages have to say; calls the caller's progress callback."""
+    """Collects figures, warnings and doubts of the stages; calls the caller's progress callback."""
 
     def __init__(self, progress: Progress | None, clock: Callable[[], float] | None) -> None:
         self._progress, self._clock = progress, clock
@@ -55,7 +55,7 @@ class Stages:
 
 
 def solver_figures(result: SolverSummary) -> dict[str, object]:
-    """Return what a stage tells of its optimisation."""
+    """Return the figures of an optimisation."""
     return {
         "converged": result.converged,
         "reason": result.reason,
