@@ -1,5 +1,7 @@
 """Text from files and file names as a terminal, a page and a table may have it."""
 
+import math
+
 
 def printable(text: str) -> str:
     """Return text on one line without anything that a terminal would obey, written as escapes instead.
@@ -20,3 +22,18 @@ def _escape(character: str) -> str:
         # So Python keeps the byte of a name that is not UTF-8.
         return f"\\x{code - 0xDC00:02x}"
     return character.encode("unicode_escape", "surrogatepass").decode()
+
+
+def spread(sigma: float, digits: int) -> str:
+    """Return a standard deviation with so many decimals, or more where it would show less than two digits of itself.
+
+    What is not finite is a dash, and 0 is "0": it was given, not estimated.
+    """
+    if not math.isfinite(sigma):
+        return "\u2013"
+    if sigma <= 0.0:
+        return "0"
+    return f"{sigma:.{max(digits, min(1 - math.floor(math.log10(sigma)), _MOST_DIGITS))}f}"
+
+
+_MOST_DIGITS = 9

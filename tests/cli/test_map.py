@@ -72,15 +72,33 @@ def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(mapped, roo
     assert one == two
 
 
-def test_the_command_in_the_report_makes_the_same_map(mapped, tmp_path, monkeypatch, capsys):
+def test_the_command_in_the_report_makes_the_same_map(mapped, room_log, tmp_path, monkeypatch, capsys):
     import shlex
+    import shutil
 
     words = shlex.split(json.loads((mapped[0] / "report.json").read_text())["command"])
     monkeypatch.chdir(tmp_path)
+    shutil.copy(room_log, tmp_path)
     (tmp_path / "config.toml").write_bytes((mapped[0] / "config.toml").read_bytes())
     assert main(words[1:]) == mapped[1]
     assert (tmp_path / "map_again" / "map.pgm").read_bytes() == (mapped[0] / "map.pgm").read_bytes()
     assert (tmp_path / "map_again" / "trajectory.tum").read_bytes() == (mapped[0] / "trajectory.tum").read_bytes()
+
+
+def test_the_same_log_in_another_folder_gives_the_same_bytes(radio_only, tmp_path, monkeypatch, capsys):
+    """What a result says does not depend on where the recording lies, nor on how its path was written."""
+    import shutil
+
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copy(radio_only / "around.log", tmp_path / "elsewhere" / "around.log")
+    words = ["--out", str(tmp_path / "one"), "--no-timings", "-q"]
+    assert main(["map", str(radio_only / "around.log"), *words]) == 0
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    words[1] = str(tmp_path / "two")
+    assert main(["map", "around.log", *words]) == 0
+    one, two = contents(tmp_path / "one"), contents(tmp_path / "two")
+    assert one == two
+    assert str(tmp_path).encode() not in b"".join(one.values())
 
 
 def test_a_result_is_not_replaced_unasked(mapped, room_log, capsys):

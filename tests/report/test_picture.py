@@ -9,7 +9,9 @@ from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
 from uwblite.report.bitmap_font import HEIGHT, WIDTH, text_mask
 from uwblite.report.canvas import Canvas
-from uwblite.report.picture import ANCHOR, CLOSURE, PAPER, PATH, PATHS, WALL, PictureAnchor, _paste, _round_length, draw_map
+from uwblite.report.palette import ACCEPTED, ANCHOR, PATH, PATHS, START
+from uwblite.report.picture import WALL, PictureAnchor, _paste, draw_map
+from uwblite.report.picture_frame import INK, PAPER, Key, _rows, foot_height, round_length
 
 
 def room(rows=80, cols=120, resolution=0.05):
@@ -23,6 +25,8 @@ def share(image, colour, tolerance=12):
     return (np.abs(image.astype(int) - colour).max(axis=-1) <= tolerance).mean()
 
 
+KEYS = [Key("path", PATH, "line"), Key("start", START, "disc"), Key("end", PATH, "ring")]
+"""What the legend of a path alone says."""
 PATH_IN_ROOM = np.stack([np.linspace(-1.0, 3.0, 50), np.linspace(2.0, 4.0, 50), np.zeros(50)], axis=1)
 
 
@@ -32,7 +36,7 @@ def test_everything_is_on_it():
     assert image.dtype == np.uint8
     for colour in (WALL, PAPER, (255, 255, 255), ANCHOR):
         assert share(image, colour) > 1e-4
-    for colour in (PATH, CLOSURE):
+    for colour in (PATH, ACCEPTED):
         assert share(image, colour, 60) > 1e-4
     np.testing.assert_array_equal(decode_png(encode_png(image)), image)
     again = draw_map(room(), PATH_IN_ROOM, anchors=anchors, closures=np.array([[0.0, 2.0, 2.0, 4.0]]), caption="a room")
@@ -45,7 +49,7 @@ def test_what_is_north_is_on_top_and_the_path_lies_on_its_cells():
     image = draw_map(grid, np.array([[-1.0, 1.5, 0.0], [-1.0, 1.6, 0.0]]), size=600)
     dark = np.abs(image.astype(int) - WALL).max(axis=-1) < 12
     rows = np.flatnonzero(dark.mean(axis=1) > 0.5)
-    below = image[rows.max() + 5 : -50]
+    below = image[rows.max() + 5 : -100]
     assert rows.mean() < image.shape[0] / 2
     assert share(below, PATH, 60) > 0
     assert share(image[: rows.max()], PATH, 60) == 0
@@ -54,10 +58,11 @@ def test_what_is_north_is_on_top_and_the_path_lies_on_its_cells():
 @pytest.mark.parametrize("size", [240, 300, 2000])
 @pytest.mark.parametrize("resolution", [0.01, 0.05, 0.3])
 def test_thin_walls_survive_every_scale(size, resolution):
-    image = draw_map(room(200, 300, resolution), PATH_IN_ROOM[:1], size=size)[:-44]
+    image = draw_map(room(200, 300, resolution), PATH_IN_ROOM[:1], size=size)
+    image = image[: -foot_height(image.shape[1], KEYS)]
     dark = np.abs(image.astype(int) - WALL).max(axis=-1) < 12
     assert (dark.any(axis=0).mean(), dark.any(axis=1).mean()) > (0.3, 0.3)
-    assert image.shape[0] <= size * 1.2 + 44
+    assert image.shape[0] <= max(size * 1.2, 240)
 
 
 def test_parts_may_be_missing():
@@ -70,7 +75,7 @@ def test_parts_may_be_missing():
 
 
 def test_round_lengths():
-    assert [_round_length(x) for x in (0.99, 1.0, 4.9, 5.0, 37.0, 0.03)] == [0.5, 1.0, 2.0, 5.0, 20.0, 0.02]
+    assert [round_length(x) for x in (0.99, 1.0, 4.9, 5.0, 37.0, 0.03)] == [0.5, 1.0, 2.0, 5.0, 20.0, 0.02]
 
 
 def test_a_stroke_has_its_width_and_smooth_edges():
@@ -163,3 +168,48 @@ def test_many_cells_in_one_pixel_equal_a_loop_over_blocks():
             if len(block):
                 expected = block.min(axis=0) if block[:, 0].min() < PAPER[0] - 20 else block.max(axis=0)
                 np.testing.assert_array_equal(image[16 - row, col], expected)
+
+
+def test_the_legend_is_of_what_is_drawn_and_never_cut():
+    keys = [Key(text, PATH, "line") for text in ("path", "recording 2", "anchor, 2 sigma", "loop closure")]
+    for width in (240, 500, 2000):
+        rows = _rows(width, keys)
+        assert [key for row in rows for key in row] == keys
+        assert foot_height(width, keys) == 44 + 26 * len(rows)
+    assert len(_rows(2000, keys)) == 1
+    assert len(_rows(240, keys)) > 1
+    anchor = PictureAnchor("A", np.zeros(2))
+    plain, with_anchor = draw_map(room(), PATH_IN_ROOM), draw_map(room(), PATH_IN_ROOM, anchors=[anchor])
+    assert share(plain[-26:], ANCHOR) == 0
+    assert share(with_anchor[-60:], ANCHOR) > 0
+
+
+def test_the_origin_and_the_axes_are_on_it():
+    """A grid with the origin in its middle: the mark is where x and y are 0."""
+    grid = OccupancyGrid(GridGeometry(0.05, np.array([-2.0, -1.5]), 60, 80), np.full((60, 80), -5.0, np.float32))
+    image = draw_map(grid, np.zeros((0, 3)), size=600)
+    ink = np.argwhere(np.abs(image[:-50].astype(int) - INK).max(axis=-1) < 8)
+    inner = ink[(ink[:, 0] < image.shape[0] - 120) & (ink[:, 1] > 60)]
+    corner = [inner[:, 0].max(), inner[:, 1].min()]
+    height = image.shape[0] - foot_height(image.shape[1], [])
+    scale = 600 // (5.6 / 0.05) / 0.05
+    low = np.array([-2.0, -1.5]) - 0.775
+    expected = [height + low[1] * scale, -low[0] * scale]
+    np.testing.assert_allclose(corner, expected, atol=0.1 * scale)
+
+
+def test_ellipses_and_names_at_the_edge_are_whole():
+    anchor = PictureAnchor("A-LONG-NAME", np.array([3.9, 3.0]), np.diag([0.25, 0.01]))
+    image = draw_map(room(), PATH_IN_ROOM, anchors=[anchor], size=700)
+    edge = image[: -foot_height(image.shape[1], KEYS) - 60, -3:]
+    assert share(edge, ANCHOR, 60) == 0
+
+
+def test_start_and_end_have_the_marks_of_the_legend():
+    image = draw_map(room(), PATH_IN_ROOM, size=700)
+    drawn = image[: -foot_height(image.shape[1], KEYS)]
+    rows, cols = np.nonzero(np.abs(drawn.astype(int) - START).max(axis=-1) < 12)
+    assert len(rows) > 40
+    assert cols.max() - cols.min() < 14
+    # The path leads right and up: it starts on the left.
+    assert cols.mean() < drawn.shape[1] / 2

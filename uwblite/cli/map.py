@@ -208,19 +208,24 @@ def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
 
 
 def repeat_command(args: argparse.Namespace) -> str:
-    """Return the command that makes the same map again, from the config.toml beside the result."""
-    words = ["uwblite", "map", *args.logs, "--config", "config.toml"]
+    """Return the command that makes the same map again, with the recordings and the result's config.toml at hand.
+
+    Files stand with their names alone: the result is the same wherever they lie.
+    """
+    from ..io.result_text import base_name
+
+    words = ["uwblite", "map", *map(base_name, args.logs), "--config", "config.toml"]
     if args.every_nth_scan > 1:
         words.append(f"--every-nth-scan={args.every_nth_scan}")
     for option, value in (("--constraints", args.constraints), ("--anchors-from", args.anchors_from)):
-        words += [option, value] if value else []
+        words += [option, base_name(value)] if value else []
     if args.laser_pose is not None:
         words.append("--laser-pose=" + ",".join(map(repr, args.laser_pose)))
     if args.laser_flipped:
         words.append("--laser-flipped")
     for option in ("odometry_topic", "scan_topic", "uwb_mapping", "base_frame"):
         if value := getattr(args, option):
-            words.append(f"--{option.replace('_', '-')}={value}")
+            words.append(f"--{option.replace('_', '-')}={base_name(value) if option == 'uwb_mapping' else value}")
     words += [f"--uwb-topic={topic}" for topic in args.uwb_topic]
     if args.tag is not None:
         words.append("--tag=" + ",".join(map(repr, args.tag)))

@@ -92,13 +92,11 @@ def _table(figures: dict[str, Any]) -> str:
 
 def _picture(result: "StoredResult", plan: "AnchorPlan", from_nothing: bool) -> Any:
     """Return the map today and with the new anchors, side by side, coloured by the expected error."""
-    import numpy as np
-
-    from ..report.error_map import draw_errors
+    from ..report.error_map import draw_errors, side_by_side
     from ..report.picture import PictureAnchor
 
     assert result.grid is not None
     there = [] if from_nothing else [PictureAnchor(a.id, a.position) for a in result.anchors]
     new = [PictureAnchor(f"new{k}", place) for k, place in enumerate(plan.places, 1)]
     shown = [(plan.errors[0], there, "today"), (plan.errors[-1], [*there, *new], f"with {len(new)} more")]
-    return np.concatenate([draw_errors(result.grid, plan.points, *panel) for panel in shown], axis=1)
+    return side_by_side([draw_errors(result.grid, plan.points, *panel) for panel in shown])

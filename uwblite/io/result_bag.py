@@ -8,6 +8,8 @@ import numpy as np
 
 from .. import se2
 from ..errors import ConfigError
+from ..report import palette
+from ..report.palette import share
 from ..sensor_log import SensorLog
 from .ros_messages import BASE, MAP, ODOM, Messages
 from .rosbag_writer import Stamped, recording_messages, write_messages
@@ -17,8 +19,7 @@ _MOST_POSES = 10_000
 """Of a path; more are thinned out evenly."""
 _LINES, _SPHERE, _CYLINDER, _TEXT = 5, 2, 3, 9
 """Types of visualization_msgs/Marker."""
-_ANCHOR, _ACCEPTED, _REJECTED = (0.84, 0.15, 0.16, 1.0), (0.17, 0.63, 0.17, 1.0), (1.0, 0.5, 0.05, 0.5)
-"""Colours: red, green, blue, alpha."""
+_ANCHOR, _ACCEPTED, _REJECTED = share(palette.ANCHOR), share(palette.ACCEPTED), share(palette.REJECTED, 0.5)
 
 
 def write_result_bag(

@@ -150,9 +150,14 @@ def recording_figures(logs: Sequence[SensorLog], result: MapResult) -> dict[str,
     }
 
 
+def base_name(path: str) -> str:
+    """Return the last part of a path: what a result says must not depend on the folder that the recording lies in."""
+    return path.rstrip("/").rpartition("/")[2] or path
+
+
 def _input_entry(notes: LogNotes) -> dict[str, Any]:
     return {
-        "source": notes.source,
+        "source": base_name(notes.source),
         "sha256": notes.sha256,
         "lines": notes.lines,
         "broken_lines": notes.broken,

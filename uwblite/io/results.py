@@ -38,7 +38,7 @@ from .g2o import write_g2o
 from .map_server import trinary_image, write_map
 from .png import encode_png, write_png
 from .pyfg import write_pyfg
-from .result_text import RunRecord, anchors_csv, covariance_csv, json_lines, recording_figures, stamps_csv, summary
+from .result_text import RunRecord, anchors_csv, base_name, covariance_csv, json_lines, recording_figures, stamps_csv, summary
 from .tum import write_tum
 
 _CONTRACT = re.compile(
@@ -104,7 +104,7 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
             grid_png = encode_png(trinary_image(result.grid))
             if record.scale_map:
                 write_map(waiting, result.grid, name="map_scale", mode="scale")
-        write_png(waiting / "map.png", picture(result, ", ".join(os.path.basename(log.notes.source) for log in logs)))
+        write_png(waiting / "map.png", picture(result, _caption(logs, result)))
         _write_graphs(waiting, result)
         write_text(waiting / "config.toml", record.config)
         page = render(
@@ -128,7 +128,14 @@ def _order(name: str) -> tuple[int, str]:
 
 
 def _title(logs: Sequence[SensorLog]) -> str:
-    return ", ".join(log.notes.source or "recording" for log in logs)
+    return ", ".join(base_name(log.notes.source) or "recording" for log in logs)
+
+
+def _caption(logs: Sequence[SensorLog], result: MapResult) -> str:
+    """Return what the picture shows in a line: a name alone, mostly run.log, says nothing."""
+    sums, kept = recording_figures(logs, result), sum(c.accepted for c in result.closures)
+    counts = f"{sums['travelled']:.0f} m in {sums['duration'] / 60:.0f} min, {len(result.anchors)} anchors, {kept} closures"
+    return f"{_title(logs[:2])}{' ...' if len(logs) > 2 else ''}: {counts}"
 
 
 def _write_trajectories(folder: Path, result: MapResult) -> None:

@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 from ..arrays import Floats
 from ..grid.occupancy_grid import FREE, OccupancyGrid
 from .canvas import Canvas
-from .picture import FLOOR, INK, PictureAnchor, draw_map, shaded
+from .picture import PictureAnchor, draw_map, shaded
+from .picture_frame import FLOOR, INK
 
 _STEPS = (0.1, 0.2, 0.5, 1.0, 2.0)
 """m; bounds of the colours."""
@@ -42,6 +43,13 @@ def draw_errors(
     colours[rows, cols] = _COLOURS[np.searchsorted(_STEPS, errors[nearest])]
     image = draw_map(grid, np.zeros((0, 2)), anchors=anchors, caption=title, size=size, colours=colours)
     return np.concatenate([image, _legend(image.shape[1])], axis=0)
+
+
+def side_by_side(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Return pictures beside each other, the lower ones filled up below."""
+    height = max(len(image) for image in images)
+    fill = [((0, height - len(image)), (0, 0), (0, 0)) for image in images]
+    return np.concatenate([np.pad(i, f, constant_values=FLOOR[0]) for i, f in zip(images, fill, strict=True)], axis=1)
 
 
 def _legend(width: int) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
-from ..printable import printable
+from ..printable import printable, spread
 from .page import PAGE, SCRIPT, STYLE
 from .svg_map import draw, number, shown_closures, sigma, thin
 
@@ -111,11 +111,11 @@ def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
         (
             a.id,
             number(a.position[0]),
-            number(sigma(a, 0)),
+            spread(sigma(a, 0), 3),
             number(a.position[1]),
-            number(sigma(a, 1)),
+            spread(sigma(a, 1), 3),
             number(a.bias, sign=True),
-            number(a.bias_sigma),
+            spread(a.bias_sigma, 3),
             str(a.ranges),
             f"{100 * (1 - a.used_share):.0f} %" if np.isfinite(a.used_share) else "\u2013",
             number(a.residual_rms),
@@ -140,7 +140,7 @@ def _calibration_table(result: MapResult) -> str:
 def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
     """Return name, value, sigma, unit and meaning; ratios in per cent."""
     scale, digits, unit = (100.0, 2, "%") if value.unit == "1" else (1.0, 4, value.unit)
-    return (value.name, number(scale * value.value, digits, True), number(scale * value.sigma, digits), unit, value.meaning)
+    return (value.name, number(scale * value.value, digits, True), spread(scale * value.sigma, digits), unit, value.meaning)
 
 
 def _closure_table(result: MapResult) -> str:
@@ -164,18 +164,23 @@ def _stage_table(result: MapResult, timings: bool) -> str:
     for stage in result.stages:
         chi2, dof = stage.figures.get("chi2"), stage.figures.get("dof")
         ratio = number(chi2 / dof) if chi2 is not None and dof else ""
-        others = ", ".join(f"{k} {_figure(v)}" for k, v in stage.figures.items() if k not in ("chi2", "dof"))
+        others = ", ".join(f"{_words(k)} {_figure(v)}" for k, v in stage.figures.items() if k not in ("chi2", "dof"))
         time = (f"{stage.seconds:.2f}",) if timings else ()
         rows.append((stage.name, "" if chi2 is None else f"{chi2:.1f}", "" if dof is None else str(dof), ratio, *time, others))
     hint = "" if timings else "<p class=hint>The timings of each stage stand in report.json, beside this page.</p>"
     return _table(head, rows, "") + hint
 
 
+def _words(name: str) -> str:
+    """Return the name of a figure as words."""
+    return name.replace("_", " ")
+
+
 def _figure(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, dict):
-        return "(" + ", ".join(f"{k} {_figure(v)}" for k, v in value.items()) + ")"
+        return "(" + ", ".join(f"{_words(k)} {_figure(v)}" for k, v in value.items()) + ")"
     if isinstance(value, list | tuple):
         return f"{len(value)} values" if len(value) > 6 else ", ".join(map(_figure, value))
     return str(value)

@@ -1,5 +1,8 @@
 """The frame of the HTML report: page, style, and the script that zooms the map."""
 
+from . import palette
+from .palette import hexadecimal
+
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -12,21 +15,24 @@ PAGE = """<!doctype html>
 <body><main>{body}</main><script>{script}</script></body></html>
 """
 
-STYLE = """
-:root{--bg:#fff;--fg:#1b1f24;--dim:#667;--line:#d5d9de;--path:#1769aa;--anchor:#b3261e;--kept:#2e7d32;--rej:#d81b60;
---good:#e7f5e9;--warn:#fff4d6;--bad:#fde4e1;--nlos:#d81b60}
-@media (prefers-color-scheme:dark){:root{--bg:#15181c;--fg:#e4e7eb;--dim:#9aa3ad;--line:#3a4049;--path:#4aa3ff;
---anchor:#ff7a70;--kept:#5fce67;--rej:#ff6aa5;--good:#17301b;--warn:#3a2f10;--bad:#451c19;--nlos:#ff6aa5}#map-view{filter:brightness(.85)}}
+_STYLE = """
+:root{--bg:#fff;--fg:#1b1f24;--dim:#667;--line:#d5d9de;--path:@path@;--anchor:@anchor@;--kept:@accepted@;--rej:@rejected@;
+--shade:#0003;--good:#e7f5e9;--warn:#fff4d6;--bad:#fde4e1;--nlos:@nlos@}
+@media (prefers-color-scheme:dark){:root{--bg:#15181c;--fg:#e4e7eb;--dim:#9aa3ad;--line:#3a4049;--path:@path-dark@;
+--anchor:@anchor-dark@;--kept:@accepted-dark@;--rej:@rejected-dark@;--shade:#fff4;--good:#17301b;--warn:#3a2f10;--bad:#451c19;--nlos:@nlos-dark@}#map-view{filter:brightness(.85)}}
 *{box-sizing:border-box}
 body{margin:0;background:var(--bg);color:var(--fg);font:16px/1.45 system-ui,sans-serif}
 main{max-width:70rem;margin:0 auto;padding:1rem}
 h1{font-size:1.5rem;overflow-wrap:anywhere}h2{font-size:1.15rem;margin:1.6rem 0 .5rem}
-.scroll{overflow-x:auto}
+.scroll{overflow-x:auto;background:linear-gradient(90deg,var(--bg) 40%,transparent) 0 0/2.5rem 100% local no-repeat,
+linear-gradient(270deg,var(--bg) 40%,transparent) 100% 0/2.5rem 100% local no-repeat,
+linear-gradient(90deg,var(--shade),transparent) 0 0/.9rem 100% no-repeat,
+linear-gradient(270deg,var(--shade),transparent) 100% 0/.9rem 100% no-repeat}
 table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.9rem}
 th,td{text-align:left;padding:.2rem .6rem;border-bottom:1px solid var(--line);vertical-align:top}
 td{white-space:nowrap}td.words{white-space:normal;min-width:15rem}
-.key{display:inline-block;width:1.1rem;height:.25rem;border-radius:.1rem;vertical-align:middle;background:#1769aa}
-.key-kept{background:#2e7d32}.key-rejected{background:#d81b60}.key-anchors{background:#b3261e}.key-grid{background:#888}
+.key{display:inline-block;width:1.1rem;height:.25rem;border-radius:.1rem;vertical-align:middle;background:@path@}
+.key-kept{background:@accepted@}.key-rejected{background:@rejected@}.key-anchors{background:@anchor@}.key-grid{background:#888}
 summary{cursor:pointer;padding:.4rem 0}
 .facts td{white-space:normal}.facts th{font-weight:500;color:var(--dim);white-space:nowrap}.facts td{overflow-wrap:anywhere}
 .box{padding:.6rem .9rem;border-radius:.4rem;margin:.6rem 0}.box ul{margin:.3rem 0;padding-left:1.2rem}
@@ -39,14 +45,14 @@ pre{background:var(--warn);padding:.6rem;border-radius:.4rem;white-space:pre-wra
 .mapbox{border:1px solid var(--line);border-radius:.4rem;overflow:hidden}
 #map-view{display:block;width:100%;max-height:80vh;touch-action:none;cursor:grab;background:#cdcdcd}
 image.grid{image-rendering:pixelated}
-.trajectory polyline{fill:none;stroke:#1769aa;stroke-width:calc(var(--s)*2px);stroke-linejoin:round}
-.trajectory .s1{stroke:#8e24aa}.trajectory .s2{stroke:#00838f}.trajectory .s3{stroke:#ef6c00}.trajectory .s4{stroke:#5d4037}
-.trajectory .s5{stroke:#455a64}
-.start{fill:#1769aa;stroke:#fff;r:calc(var(--s)*5px);stroke-width:calc(var(--s)*1px)}
-.anchor path{fill:#b3261e;stroke:#fff;stroke-width:1px;transform:scale(var(--s))}
+.trajectory polyline{fill:none;stroke:@path@;stroke-width:calc(var(--s)*2px);stroke-linejoin:round}
+.trajectory .s1{stroke:@path1@}.trajectory .s2{stroke:@path2@}.trajectory .s3{stroke:@path3@}
+.end{fill:#fff;stroke:@path@;r:calc(var(--s)*5px);stroke-width:calc(var(--s)*3px)}
+.start{fill:@start@;stroke:#fff;r:calc(var(--s)*5px);stroke-width:calc(var(--s)*1px)}
+.anchor path{fill:@anchor@;stroke:#fff;stroke-width:1px;transform:scale(var(--s))}
 .anchor text{transform:translateX(calc(var(--s)*10px))}
 .anchor.doubt path{fill:#ef6c00}
-.anchor ellipse{fill:#b3261e33;stroke:#b3261e;stroke-width:calc(var(--s)*1px)}
+.anchor ellipse{fill:@anchor@33;stroke:@anchor@;stroke-width:calc(var(--s)*1px)}
 .anchor .mirror{fill:none;stroke:#ef6c00;r:calc(var(--s)*8px);stroke-width:calc(var(--s)*2px);
 stroke-dasharray:calc(var(--s)*4px)}
 .anchor text,.bar text{font-size:calc(var(--s)*14px);fill:#1b1f24;paint-order:stroke;
@@ -54,7 +60,7 @@ stroke:#fff;stroke-width:calc(var(--s)*4px)}
 .bar path{stroke:#1b1f24;stroke-width:calc(var(--s)*3px)}
 .closure path{fill:none;stroke-width:calc(var(--s)*1.5px);stroke-linecap:round;opacity:.45}
 .closure path:hover{stroke-width:calc(var(--s)*6px);opacity:1}
-.kept path{stroke:#2e7d32}.rejected path{stroke:#d81b60;stroke-dasharray:calc(var(--s)*5px)}
+.kept path{stroke:@accepted@}.rejected path{stroke:@rejected@;stroke-dasharray:calc(var(--s)*5px)}
 #place{font-variant-numeric:tabular-nums;float:right;color:var(--fg)}
 .hidden{display:none}
 figure{margin:.6rem 0}figcaption{font-weight:600}
@@ -63,6 +69,21 @@ figure{margin:.6rem 0}figcaption{font-weight:600}
 .residuals .axis{stroke:var(--line);stroke-width:1}.residuals .los{stroke:var(--path)}.residuals .nlos{stroke:var(--nlos)}
 @media (max-width:40rem){main{padding:.6rem}body{font-size:15px}}
 """
+
+
+def coloured(style: str) -> str:
+    """Return a style with the palette's colours in place of their names, such as @path@ and @path-dark@."""
+    names = {
+        "path": palette.PATH, "accepted": palette.ACCEPTED, "rejected": palette.REJECTED, "anchor": palette.ANCHOR,
+        "start": palette.START, "nlos": palette.NLOS, **{f"path{k}": c for k, c in enumerate(palette.PATHS)},
+    }  # fmt: skip
+    for name, colour in names.items():
+        style = style.replace(f"@{name}@", hexadecimal(colour)).replace(f"@{name}-dark@", hexadecimal(colour, dark=True))
+    return style
+
+
+STYLE = coloured(_STYLE)
+
 
 SCRIPT = """
 (function () {

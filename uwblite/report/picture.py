@@ -11,28 +11,21 @@ from ..arrays import Floats
 from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
 from .canvas import Canvas, Colour
+from .palette import ACCEPTED, ANCHOR, PATHS, START
+from .picture_frame import FLOOR, PAPER, Key, draw_axes, draw_foot, foot_height
 
 Image = NDArray[np.uint8]
 
-PAPER: Colour = (226, 229, 233)
-FLOOR: Colour = (255, 255, 255)
 WALL: Colour = (24, 28, 36)
-PATH: Colour = (37, 99, 235)
-PATHS: tuple[Colour, ...] = (PATH, (124, 58, 180), (0, 128, 140), (92, 64, 51))
-"""Of the recordings, in turn."""
-CLOSURE: Colour = (234, 120, 20)
-ANCHOR: Colour = (208, 28, 60)
-START: Colour = (22, 150, 80)
-INK: Colour = (52, 58, 68)
 
+_MOST_SPREAD = 2.0
+"""m of an ellipse's half axes for which room is made."""
 _MARGIN = 0.8
 """m; free border around what is drawn."""
 _ANCHOR_REACH = 100.0
 """m; an anchor is heard no farther away than this and the extent of the path."""
 _SMALLEST = 240
 """Pixels; the picture is at least this wide and high, so that the strip below has room."""
-_FOOT = 44
-"""Pixels of the strip below the map with scale and caption."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +73,9 @@ def draw_map(
     scale = _pixels_per_metre(float((high - low).max()), resolution, size)
     low = np.floor(low / resolution) * resolution
     width, height = (np.maximum(np.ceil((high - low) * scale), _SMALLEST).astype(int)).tolist()
-    image = np.empty((height + _FOOT, width, 3), dtype=np.uint8)
+    tracks = _recordings(path)
+    keys = _legend(len(tracks), bool(placed), any(a.covariance is not None for a in placed), closures)
+    image = np.empty((height + foot_height(width, keys), width, 3), dtype=np.uint8)
     image[:] = PAPER
     if grid is not None:
         _paste(image[:height], shaded(grid) if colours is None else colours, grid.geometry, low, scale)
@@ -88,20 +83,32 @@ def draw_map(
     def pixel(points: Floats) -> Floats:
         return np.stack([(points[..., 0] - low[0]) * scale, height - (points[..., 1] - low[1]) * scale], axis=-1)
 
+    draw_axes(image[:height], low, scale)
     canvas = Canvas(image[:height])
     if closures is not None and len(closures):
         ends = np.concatenate([pixel(closures[:, :2]), pixel(closures[:, 2:])], axis=1)
-        canvas.lines(ends, 1.3, CLOSURE, 0.75)
-    for number, track in enumerate(_recordings(pixel(path))):
+        canvas.lines(ends, 1.3, ACCEPTED, 0.75)
+    for number, track in enumerate(map(pixel, tracks)):
         colour = PATHS[number % len(PATHS)]
         canvas.polyline(track, 2.2, colour, 0.85)
-        for end, fill in ((track[:1], START), (track[-1:], colour)):
-            canvas.discs(end, 7.0, FLOOR)
-            canvas.discs(end, 5.0, fill)
+        canvas.discs(track[:1], 7.0, FLOOR)
+        canvas.discs(track[:1], 5.5, START)
+        canvas.discs(track[-1:], 7.0, colour)
+        canvas.discs(track[-1:], 4.0, FLOOR)
     for anchor in placed:
         _draw_anchor(canvas, anchor, pixel)
-    _draw_foot(image, height, scale, caption)
+    draw_foot(image, height, scale, caption, keys)
     return image
+
+
+def _legend(recordings: int, anchors: bool, ellipses: bool, closures: Floats | None) -> list[Key]:
+    """Return the entries for what is on the picture."""
+    names = ["path"] if recordings == 1 else [f"recording {k}" for k in range(1, min(recordings, len(PATHS)) + 1)]
+    keys = [Key(name, colour, "line") for name, colour in zip(names, PATHS, strict=False)] if recordings else []
+    keys += [Key("start", START, "disc"), Key("end", PATHS[0], "ring")] if recordings else []
+    keys += [Key("anchor, 2 sigma" if ellipses else "anchor", ANCHOR, "triangle")] if anchors else []
+    keys += [Key("loop closure", ACCEPTED, "line")] if closures is not None and len(closures) else []
+    return keys
 
 
 def _recordings(track: Floats) -> list[Floats]:
@@ -113,7 +120,8 @@ def _recordings(track: Floats) -> list[Floats]:
 
 def _extent(grid: OccupancyGrid | None, path: Floats, anchors: list[PictureAnchor]) -> tuple[Floats, Floats]:
     """Return the corners of the box around everything known but for what strays far from the rest, m."""
-    boxes = [path[np.isfinite(path).all(axis=1)], np.array([a.position for a in anchors]).reshape(-1, 2)]
+    ellipses = [a.position + away for a in anchors for away in _spread(a)]
+    boxes = [path[np.isfinite(path).all(axis=1)], np.array(ellipses).reshape(-1, 2)]
     if len(boxes[0]):
         low, high = central_box(boxes[0])
         reach = max(float((high - low).max()), _ANCHOR_REACH)
@@ -128,6 +136,14 @@ def _extent(grid: OccupancyGrid | None, path: Floats, anchors: list[PictureAncho
     if len(points) == 0:
         points = np.zeros((1, 2))
     return points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
+
+
+def _spread(anchor: PictureAnchor) -> Floats:
+    """Return the corners (2, 2) of an anchor's ellipse from its middle, m; of a vast one only a part."""
+    if anchor.covariance is None or not np.isfinite(anchor.covariance).all():
+        return np.zeros((1, 2))
+    reach = np.minimum(2.0 * np.sqrt(np.maximum(np.diag(anchor.covariance), 0.0)), _MOST_SPREAD)
+    return np.stack([-reach, reach])
 
 
 def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
@@ -189,30 +205,6 @@ def _draw_anchor(canvas: Canvas, anchor: PictureAnchor, pixel: Callable[[Floats]
     height, width = canvas.image.shape[:2]
     name = anchor.id if len(anchor.id) <= 16 else anchor.id[:14] + ".."
     wide = 12 * len(name)
-    canvas.text(
-        min(max(x + 14.0, 4.0), max(width - wide - 4.0, 4.0)), min(max(y - 9.0, 4.0), height - 22.0), name, ANCHOR, 2, FLOOR
-    )
-
-
-def _draw_foot(image: Image, top: int, scale: float, caption: str) -> None:
-    """Draw the strip below the map: a scale bar of a round length and the caption."""
-    image[top:] = FLOOR
-    image[top : top + 1] = PAPER
-    canvas = Canvas(image)
-    width = image.shape[1]
-    length = _round_length(min(220.0, width / 4.0) / scale)
-    bar, y = length * scale, top + 24.0
-    canvas.polygon(np.array([[16, y - 2.5], [16 + bar, y - 2.5], [16 + bar, y + 2.5], [16, y + 2.5]]), INK)
-    for x in (16.0, 16.0 + bar):
-        canvas.polygon(np.array([[x - 1, y - 7], [x + 1, y - 7], [x + 1, y + 7], [x - 1, y + 7]]), INK)
-    canvas.text(16 + bar + 12, y - 7, f"{length:g} m", INK)
-    left = 16 + bar + 12 + 12 * len(f"{length:g} m") + 36
-    room = int((width - left - 12) / 12)
-    if room >= len(caption) > 0:
-        canvas.text(width - 16 - 12 * len(caption), y - 7, caption, INK)
-
-
-def _round_length(longest: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not longer, m."""
-    power = 10.0 ** math.floor(math.log10(longest))
-    return float(max(f * power for f in (1.0, 2.0, 5.0) if f * power <= longest))
+    # Where there is no room to the right of the mark the name stands to the left of it.
+    left = x + 14.0 if x + 14.0 + wide <= width - 4.0 else x - 14.0 - wide
+    canvas.text(max(left, 4.0), min(max(y - 9.0, 4.0), height - 22.0), name, ANCHOR, 2, FLOOR)

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
+from ..printable import spread
 
 MOST_POINTS = 4000
 """Points of one line drawn at most."""
@@ -68,11 +69,13 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     parts.append('<g class="trajectory">')
     for recording in np.unique(result.recording):
         path = result.trajectory[result.recording == recording, :2]
-        parts.append(f'<polyline class="s{int(recording) % 6}" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
+        parts.append(f'<polyline class="s{int(recording) % 4}" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
     start = result.trajectory[0]
     parts.append(
-        f'<circle class="start" cx="{start[0]:.3f}" cy="{-start[1]:.3f}" r="{size / 150:.3f}"><title>start</title></circle></g>'
+        f'<circle class="start" cx="{start[0]:.3f}" cy="{-start[1]:.3f}" r="{size / 150:.3f}"><title>start</title></circle>'
     )
+    parts += [_end_mark(result, recording, size) for recording in np.unique(result.recording).tolist()]
+    parts.append("</g>")
     parts.append('<g class="anchors">' + "".join(_anchor_mark(a, size) for a in result.anchors) + "</g>")
     bar = _scale_length(size)
     svg = (
@@ -85,8 +88,15 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     boxes = "".join(_switch(name, text, True) for name, text in layers) + _switch("rejected", "closures rejected", False)
     names = (("zoom-in", "+", "zoom in"), ("zoom-out", "\u2212", "zoom out"), ("zoom-all", "all", "all of the map"))
     buttons = " ".join(f'<button id="{name}" aria-label="{label}">{text}</button>' for name, text, label in names)
-    hint = '<p class=hint><output id="place"></output>Wheel or pinch zooms, dragging moves, point at things for details.</p>'
+    words = "Green: start; ring: end. Wheel or pinch zooms, dragging moves; point at things for details."
+    hint = f'<p class=hint><output id="place"></output>{words}</p>'
     return f"<div class=controls>{boxes}<span class=buttons>{buttons}</span></div><div class=mapbox>{svg}</div>{hint}"
+
+
+def _end_mark(result: MapResult, recording: int, size: float) -> str:
+    """Return the ring where a recording ends."""
+    x, y = result.trajectory[result.recording == recording][-1, :2].tolist()
+    return f'<circle class="end s{recording % 4}" cx="{x:.3f}" cy="{-y:.3f}" r="{size / 150:.3f}"><title>end</title></circle>'
 
 
 def _switch(name: str, text: str, on: bool) -> str:
@@ -106,8 +116,8 @@ def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:
         return ""
     cx, cy = float(anchor.position[0]), -float(anchor.position[1])
     label = (
-        f"anchor {anchor.id}: x {number(anchor.position[0], 2)} \u00b1{sigma(anchor, 0):.2f} m, "
-        f"y {number(anchor.position[1], 2)} \u00b1{sigma(anchor, 1):.2f} m, {anchor.status} {anchor.reason}"
+        f"anchor {anchor.id}: x {number(anchor.position[0], 2)} \u00b1{spread(sigma(anchor, 0), 2)} m, "
+        f"y {number(anchor.position[1], 2)} \u00b1{spread(sigma(anchor, 1), 2)} m, {anchor.status} {anchor.reason}"
     )
     r = size / 110
     state = "ok" if anchor.status == "ok" else "doubt"

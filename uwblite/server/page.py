@@ -3,11 +3,13 @@
 The script builds everything with text nodes, so that no name out of a recording becomes markup.
 """
 
+from ..report.page import coloured
+
 _STYLE = """
-:root{--paper:#f6f7f9;--card:#fff;--ink:#1f2733;--faint:#6b7482;--line:#d8dde4;--accent:#2563eb;--path:#2563eb;
---accepted:#ea7814;--rejected:#8a93a0;--anchor:#d01c3c;--force:#169650;--ban:#d01c3c;--warn:#fff4e0}
+:root{--paper:#f6f7f9;--card:#fff;--ink:#1f2733;--faint:#6b7482;--line:#d8dde4;--accent:#2563eb;--path:@path@;
+--accepted:@accepted@;--rejected:@rejected@;--anchor:@anchor@;--force:@start@;--ban:@anchor@;--warn:#fff4e0}
 @media (prefers-color-scheme:dark){:root{--paper:#14181e;--card:#1d232b;--ink:#e4e8ee;--faint:#98a2b0;--line:#36404c;
---accent:#7aa5ff;--path:#6a9bff;--accepted:#ff9a40;--rejected:#7d8794;--anchor:#ff6480;--force:#3fc47c;--ban:#ff6480;
+--accent:#7aa5ff;--path:@path-dark@;--accepted:@accepted-dark@;--rejected:@rejected-dark@;--anchor:@anchor-dark@;--force:@start-dark@;--ban:@anchor-dark@;
 --warn:#3a2f1a}image{filter:invert(1) hue-rotate(180deg) brightness(.85)}}*{box-sizing:border-box}body{margin:0;
 background:var(--paper);color:var(--ink);font:15px/1.45 system-ui,sans-serif}header{position:sticky;top:0;z-index:2;
 display:flex;flex-wrap:wrap;gap:.6rem 1rem;align-items:center;padding:.6rem 1rem;background:var(--card);
@@ -17,7 +19,7 @@ grid-template-columns:repeat(auto-fit,minmax(min(100%,26rem),1fr))}section{backg
 border:1px solid var(--line);border-radius:.5rem;padding:.8rem;min-width:0}svg{display:block;width:100%;
 max-height:62vh;background:#cdcdcd;border-radius:.3rem;touch-action:none}@media (prefers-color-scheme:dark){svg{
 background:#262d36}}image{image-rendering:pixelated}.path{fill:none;stroke:var(--path);stroke-width:2;
-vector-effect:non-scaling-stroke}.p1{stroke:#7c3ab4}.p2{stroke:#00808c}.p3{stroke:#5c4033}.closure{
+vector-effect:non-scaling-stroke}.p1{stroke:@path1@}.p2{stroke:@path2@}.p3{stroke:@path3@}.closure{
 stroke:var(--accepted);stroke-width:1.6;vector-effect:non-scaling-stroke;cursor:pointer}.closure.no{
 stroke:var(--rejected);stroke-dasharray:4 3}.closure.force{stroke:var(--force);stroke-width:3}.closure.reject{
 stroke:var(--ban);stroke-width:3;stroke-dasharray:2 4}.hit{stroke:transparent;stroke-width:12;
@@ -186,7 +188,7 @@ def page(token: str) -> str:
     """Return the page; the token lets its own posts in, and no other page's."""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>uwblite view</title><link rel=icon href=data:,><style>{_STYLE}</style></head>"
+        f"<title>uwblite view</title><link rel=icon href=data:,><style>{coloured(_STYLE)}</style></head>"
         f'<body data-token="{token}"><header><h1>uwblite view</h1><span id="say" role="status">loading ...</span></header>'
         f"<main></main><script>{_SCRIPT}</script></body></html>"
     )
