@@ -150,14 +150,42 @@ def test_scans_go_to_the_nearest_keyframe_and_to_one_only(seed, limit):
     frames = select(Odometry(stamps, truth), CONFIG)
     begin = np.sort(rng.uniform(0, stamps[-1], 80))
     lidar = LaserScans(begin, np.ones((80, 10), dtype=np.float32), 0.0, 0.1, 0.01, 0.1, 5.0)
+    frames = replace(frames, alone=rng.random(len(frames)) < 0.3)
     owner, chosen = choose_scans(lidar, frames, KeyframeConfig(scans=limit))
     assert len(np.unique(chosen)) == len(chosen)
     assert np.all(np.diff(owner) >= 0)
     gap = np.abs((begin + 0.05)[:, None] - frames.stamps)
     for k in range(len(frames)):
         own = np.flatnonzero(np.argmin(gap, axis=1) == k)
-        best = own[np.argsort(gap[own, k], kind="stable")[:limit]]
+        best = own[np.argsort(gap[own, k], kind="stable")[: 1 if frames.alone[k] else limit]]
         assert sorted(chosen[owner == k]) == sorted(best)
+
+
+def test_keyframes_are_scans_where_there_are_any():
+    """The last scan within the thresholds; the next one where none is; samples of the odometry where the lidar was silent."""
+    stamps, truth = drive([(0.5, 0, 0)], [20.0])
+    begin = np.concatenate([np.arange(0.03, 8.0, 0.17), np.arange(14.0, 19.9, 0.9)])
+    lidar = LaserScans(begin, np.ones((len(begin), 10), dtype=np.float32), 0.0, 0.1, 0.01, 0.1, 5.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig(distance=0.3, duration=100.0), scans=lidar)
+    looks = np.isin(frames.stamps, lidar.middles)
+    dense, silent = (frames.stamps > 0) & (frames.stamps < 7.5), (frames.stamps > 8.2) & (frames.stamps < 13.5)
+    assert looks[dense].all()
+    assert not looks[silent].any()
+    assert np.isin(lidar.middles[begin > 14.0], frames.stamps).all()
+    np.testing.assert_allclose(frames.odometry, se2.interpolate_trajectory(stamps, truth, frames.stamps), atol=1e-9)
+    step = np.diff(frames.stamps)[dense[:-1]]
+    assert step.max() <= 0.6 + 1e-9
+    assert step[1:-1].min() > 0.6 - 0.17
+    assert frames.path.sum() == pytest.approx(10.0)
+
+
+def test_keyframes_come_in_time_where_a_robot_creeps():
+    stamps, truth = drive([(0.05, 0, 0), (0.0, 0, 0)], [30.0, 30.0])
+    begin = np.arange(0.0, 59.0, 0.1)
+    lidar = LaserScans(begin, np.ones((len(begin), 10), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 5.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig(duration=1.5), scans=lidar)
+    assert np.diff(frames.stamps[frames.stamps < 30.0]).max() < 1.7
+    assert np.sum(frames.stamps > 30.2) == 1
 
 
 @pytest.mark.parametrize("flipped", [False, True])
@@ -221,7 +249,7 @@ def test_dense_trajectory_passes_through_the_keyframes_and_is_continuous(seed):
     poses = truth[frames.index]
     dense = dense_trajectory(wheels, frames, poses)
     assert dense.shape == truth.shape
-    np.testing.assert_array_equal(dense[frames.index], poses)
+    np.testing.assert_allclose(dense[frames.index], poses, atol=1e-12)
     fine = np.linspace(stamps[0], stamps[-1], 20 * len(stamps))
     path = dense_trajectory(wheels, frames, poses, fine)
     step = se2.between(path[:-1], path[1:])
@@ -271,4 +299,4 @@ def test_equal_stamps_do_no_harm():
     poses = frames.odometry + np.array([0.0, 1.0, 0.0])
     dense = dense_trajectory(wheels, frames, poses)
     assert np.isfinite(dense).all()
-    np.testing.assert_array_equal(dense[frames.index], poses)
+    np.testing.assert_allclose(dense[frames.index], poses, atol=1e-12)

@@ -4,7 +4,7 @@ The only module that knows about time. Ranges and rays arrive between keyframes;
 becomes their lever arm, so they need no poses of their own and none is thrown away.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,16 +21,18 @@ class KeyframeConfig:
     """Travelled distance after which a new keyframe begins, m. Smaller: finer trajectory, slower."""
     angle: float = 0.35
     """Turned angle after which a new keyframe begins, rad."""
+    duration: float = 1.5
+    """Time in motion after which a new keyframe begins where there is a lidar, s: wheels that slip tell little of distance."""
     scans: int = 2
     """Scans gathered into the cloud of one keyframe, nearest in time first; more average the lidar's noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframes:
-    """Poses chosen on the odometry and the motion between them."""
+    """Poses chosen along the odometry, at scans where there are any, and the motion between them."""
 
     index: Ints
-    """(k,) odometry sample of each keyframe."""
+    """(k,) odometry sample at or last before each keyframe."""
     stamps: Floats
     """(k,) s."""
     odometry: Floats
@@ -49,9 +51,11 @@ class Keyframes:
     """(k, 3) velocity of the base at each keyframe, own frame, m/s, m/s, rad/s."""
     slack: Floats
     """(k-1, 3) standard deviation of the steps among them that were not measured, m, m, rad."""
+    alone: Bools
+    """(k,) its cloud is of a single scan: a further one would be laid to it by an odometry that is not believed there."""
 
     def __len__(self) -> int:
-        return len(self.index)
+        return len(self.stamps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,47 +102,59 @@ class ScanPoints:
     """(p,) which scan of the log."""
 
 
-def select(odometry: Odometry, config: KeyframeConfig, breaks: OdometryBreaks | None = None) -> Keyframes:
-    """Choose keyframes on the odometry by travelled distance and turned angle; the first and last sample are always in.
+def select(
+    odometry: Odometry, config: KeyframeConfig, breaks: OdometryBreaks | None = None, scans: LaserScans | None = None
+) -> Keyframes:
+    """Choose keyframes along the odometry by travelled distance and turned angle; its first and last sample are always in.
 
     Parameters
     ----------
     odometry : n >= 1 samples.
     config : thresholds.
     breaks : steps that were not measured; a keyframe stands on either side of each.
+    scans : keyframes are then moments at which the lidar looked, for at no other moment does it measure a pose: what the
+        odometry says between two moments, and the jitter of both clocks, stays an edge of the graph and bends no cloud.
 
     Returns
     -------
     Keyframes, k >= 1.
     """
-    stamps, poses = odometry.stamps, odometry.poses
-    steps = se2.between(poses[:-1], poses[1:])
-    forward = np.where(steps[:, 0] >= 0, 1.0, -1.0) * np.hypot(steps[:, 0], steps[:, 1])
-    path = np.concatenate([[0.0], np.cumsum(np.abs(forward))])
-    turned = np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 2]))])
-    signed = np.concatenate([[0.0], np.cumsum(forward)])
-    index = _advance(path / config.distance, turned / config.angle)
-    broken = np.zeros(0, dtype=np.int64) if breaks is None else _broken_steps(stamps, breaks)
-    index = np.union1d(index, np.concatenate([broken, broken + 1]))
-    first, last = index[:-1], index[1:]
-    duration = stamps[last] - stamps[first]
-    return Keyframes(
-        index,
-        stamps[index],
-        poses[index],
-        se2.between(poses[first], poses[last]),
-        signed[last] - signed[first],
-        path[last] - path[first],
-        turned[last] - turned[first],
-        duration,
-        velocity_at(odometry, stamps[index]),
-        _slack(index, broken, breaks),
-    )
+    moments, sample, seen = _moments(odometry, scans)
+    _, path, turned = _travelled(odometry, moments, sample)
+    ways = [path / config.distance, turned / config.angle]
+    if scans is not None:
+        moves = np.hypot(np.diff(ways[0]), np.diff(ways[1])) > _STANDING * np.diff(moments)
+        ways.append(np.concatenate([[0.0], np.cumsum(moves * np.diff(moments))]) / config.duration)
+    chosen = _advance(np.stack(ways), seen)
+    if breaks is not None and len(breaks.stamps):
+        broken = _broken_steps(odometry.stamps, breaks)
+        own = (
+            np.searchsorted(moments, odometry.stamps[broken]),
+            np.searchsorted(moments, odometry.stamps[broken + 1], "right") - 1,
+        )
+        chosen = np.union1d(chosen, np.concatenate(own))
+    return _keyframes(odometry, moments[chosen], sample[chosen], breaks)
 
 
 def of(log: SensorLog, config: KeyframeConfig) -> Keyframes:
     """Choose the keyframes of a recording, see select."""
-    return select(log.odometry, config, None if log.screening is None else log.screening.breaks)
+    return select(log.odometry, config, None if log.screening is None else log.screening.breaks, log.scans)
+
+
+def at(log: SensorLog, stamps: Floats, alone: Bools) -> Keyframes:
+    """Return keyframes of a recording at given moments (k,), s; for alone (k,) see Keyframes."""
+    breaks = None if log.screening is None else log.screening.breaks
+    return replace(_keyframes(log.odometry, stamps, _sample(log.odometry, stamps), breaks), alone=alone)
+
+
+def _keyframes(odometry: Odometry, stamps: Floats, index: Ints, breaks: OdometryBreaks | None) -> Keyframes:
+    """Return keyframes at given moments (k,), s, the last odometry samples (k,) before them being known."""
+    between = se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps)
+    poses = np.where((odometry.stamps[index] == stamps)[:, None], odometry.poses[index], between)
+    length, path, turned = (np.diff(way) for way in _travelled(odometry, stamps, index))
+    motion, alone = se2.between(poses[:-1], poses[1:]), np.zeros(len(stamps), dtype=bool)
+    twist, slack = velocity_at(odometry, stamps), _slack(stamps, odometry.stamps, breaks)
+    return Keyframes(index, stamps, poses, motion, length, path, turned, np.diff(stamps), twist, slack, alone)
 
 
 def _broken_steps(stamps: Floats, breaks: OdometryBreaks) -> Ints:
@@ -146,25 +162,92 @@ def _broken_steps(stamps: Floats, breaks: OdometryBreaks) -> Ints:
     return np.clip(np.searchsorted(stamps, breaks.stamps, "right") - 1, 0, max(len(stamps) - 2, 0)).astype(np.int64)
 
 
-def _slack(index: Ints, broken: Ints, breaks: OdometryBreaks | None) -> Floats:
-    """Return the standard deviation (k-1, 3) that the breaks add to the steps between keyframes."""
-    variance = np.zeros((max(len(index) - 1, 0), 3))
-    if breaks is not None and len(variance):
-        np.add.at(variance, np.searchsorted(index, broken, "right") - 1, breaks.sigma**2)
+def _slack(stamps: Floats, odometry: Floats, breaks: OdometryBreaks | None) -> Floats:
+    """Return the standard deviation (k-1, 3) that breaks of an odometry with stamps (n,) add to the steps between keyframes.
+
+    A step has the slack of every break with which it has time in common.
+    """
+    variance = np.zeros((max(len(stamps) - 1, 0), 3))
+    if breaks is None or not len(variance) or len(odometry) < 2:
+        return variance
+    broken = _broken_steps(odometry, breaks)
+    first = np.maximum(np.searchsorted(stamps, odometry[broken], "right") - 1, 0)
+    last = np.minimum(np.searchsorted(stamps, odometry[broken + 1], "left"), len(variance))
+    for low, high, sigma in zip(first.tolist(), last.tolist(), breaks.sigma, strict=True):
+        variance[low : max(high, low + 1)] += sigma**2
     return np.sqrt(variance)
 
 
-def _advance(path: Floats, turned: Floats) -> Ints:
-    """Return samples as far apart as possible with at most 1 of path and turning between neighbours, if there are such."""
+def _sample(odometry: Odometry, stamps: Floats) -> Ints:
+    """Return the last odometry sample (k,) at or before stamps (k,), s; the first for earlier ones."""
+    return np.maximum(np.searchsorted(odometry.stamps, stamps, "right") - 1, 0)
+
+
+def _travelled(odometry: Odometry, moments: Floats, sample: Ints) -> tuple[Floats, Floats, Floats]:
+    """Return signed distance, distance and turning since the beginning at moments (m,); m, m, rad.
+
+    Parameters
+    ----------
+    sample : (m,) the last odometry sample before each.
+    """
+    steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
+    forward = np.where(steps[:, 0] >= 0, 1.0, -1.0) * np.hypot(steps[:, 0], steps[:, 1])
+    span = np.append(np.diff(odometry.stamps), 0.0)[sample]
+    fraction = np.clip((moments - odometry.stamps[sample]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
+    signed, path, turned = (
+        np.concatenate([[0.0], np.cumsum(part)])[sample] + np.append(part, 0.0)[sample] * fraction
+        for part in (forward, np.abs(forward), np.abs(steps[:, 2]))
+    )
+    return signed, path, turned
+
+
+def _moments(odometry: Odometry, scans: LaserScans | None) -> tuple[Floats, Ints, Bools]:
+    """Return the moments (m,) at which a keyframe may be, s, the last odometry sample before each, and whether it is
+    preferred: moments at which the lidar looked."""
+    stamps = odometry.stamps
+    if scans is None:
+        return stamps, np.arange(len(stamps)), np.ones(len(stamps), dtype=bool)
+    middle = scans.middles
+    looks = np.unique(middle[(middle > stamps[0]) & (middle < stamps[-1])])
+    looks = np.setdiff1d(looks, stamps, assume_unique=False)
+    moments = np.concatenate([stamps, looks])
+    order = np.argsort(moments, kind="stable")
+    sample = np.concatenate([np.arange(len(stamps)), _sample(odometry, looks)])
+    return moments[order], sample[order], np.isin(moments[order], middle)
+
+
+def _advance(ways: Floats, preferred: Bools) -> Ints:
+    """Return moments as far apart as possible with at most 1 of each way (w, m) between neighbours, if there are such.
+
+    Preferred moments come before others; only where the next one is farther than _GAP do others serve.
+    """
     chosen = [0]
-    last = len(path) - 1
+    last = ways.shape[1] - 1
+    stops = np.flatnonzero(preferred)
     while chosen[-1] < last:
         here = chosen[-1]
-        beyond = min(np.searchsorted(path, path[here] + 1.0, "right"), np.searchsorted(turned, turned[here] + 1.0, "right"))
-        chosen.append(min(max(int(beyond) - 1, here + 1), last))
-    if len(chosen) > 2 and path[last] - path[chosen[-2]] < 0.5 and turned[last] - turned[chosen[-2]] < 0.5:
+        within = _reached(ways, here, 1.0)
+        number = int(np.searchsorted(stops, within, "right"))
+        stop = int(stops[number - 1]) if number else here
+        if stop <= here:
+            stop = int(stops[number]) if number < len(stops) else here
+            if stop <= here or stop > _reached(ways, here, _GAP):
+                stop = max(within, here + 1)
+        chosen.append(min(stop, last))
+    if len(chosen) > 2 and (ways[:2, last] - ways[:2, chosen[-2]] < 0.5).all():
         del chosen[-2]
     return np.array(chosen, dtype=np.int64)
+
+
+_GAP = 10.0
+"""Keyframe distances, angles or durations without any scan after which keyframes go on without."""
+_STANDING = 0.1
+"""Keyframe distances or angles per second below which a robot stands, 1/s."""
+
+
+def _reached(ways: Floats, here: int, most: float) -> int:
+    """Return the last moment that is at most so far from this one by all ways."""
+    return min(int(np.searchsorted(way, way[here] + most, "right")) for way in ways) - 1
 
 
 def velocity_at(odometry: Odometry, stamps: Floats, window: float = 0.1) -> Floats:
@@ -210,12 +293,12 @@ def choose_scans(scans: LaserScans, keyframes: Keyframes, config: KeyframeConfig
     -------
     keyframe (s,), non-decreasing, and scan (s,) indices.
     """
-    middle = scans.stamps + 0.5 * scans.time_increment * scans.ranges.shape[1]
+    middle = scans.middles
     owner = np.searchsorted((keyframes.stamps[:-1] + keyframes.stamps[1:]) / 2.0, middle)
     distance = np.abs(middle - keyframes.stamps[owner])
     order = np.lexsort((distance, owner))
     rank = np.arange(len(order)) - np.searchsorted(owner[order], owner[order])
-    kept = np.sort(order[rank < config.scans])
+    kept = np.sort(order[rank < np.where(keyframes.alone, 1, config.scans)[owner[order]]])
     return owner[kept].astype(np.int64), kept
 
 
@@ -278,6 +361,4 @@ def dense_trajectory(odometry: Odometry, keyframes: Keyframes, poses: Floats, st
     fraction = (query - keyframes.stamps[left]) / np.where(keyframes.duration[left] > 0, keyframes.duration[left], 1.0)
     fraction = np.where(keyframes.duration[left] > 0, np.clip(fraction, 0.0, 1.0), 0.0)
     dense = se2.compose(poses[left], se2.compose(since, se2.exp(fraction[:, None] * missed[left])))
-    if stamps is None:
-        dense[keyframes.index] = poses
     return dense

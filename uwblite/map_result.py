@@ -130,7 +130,7 @@ class MapResult:
     """The map of one or more recordings."""
 
     stamps: Floats
-    """(n,) s, one per odometry stamp."""
+    """(n,) s, one per odometry stamp, and one per keyframe between two that are far apart."""
     trajectory: Floats
     """(n, 3) T_map_base at the stamps."""
     recording: Ints

@@ -73,6 +73,7 @@ def build_map(
         estimate = radio_stages.first_optimisation(task)
     for stage in _stages(task):
         estimate = stage(estimate, task)
+        task = task.following(estimate)
     grid = final_stages.occupancy_grid(estimate, task)
     return summary.summarise(estimate, grid, task)
 

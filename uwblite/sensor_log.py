@@ -76,6 +76,11 @@ class LaserScans:
         """(b,) angle of each ray in the laser frame, rad."""
         return np.asarray(self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1]), dtype=np.float64)
 
+    @property
+    def middles(self) -> Floats:
+        """(k,) s, time of the ray in the middle of each scan."""
+        return self.stamps + 0.5 * self.time_increment * self.ranges.shape[1]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorMounting:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from . import se2
+from .arrays import Floats
 from .config import setting
 from .graph.calibration import odometry_indices
 from .graph.graph import Calibration, Graph
@@ -40,18 +41,21 @@ def wheel_edges(keyframes: Keyframes, first: int, config: OdometryNoiseConfig, c
     heading = np.sqrt(config.standing**2 + config.heading_per_metre**2 * keyframes.path + turning + slack[:, 2] ** 2)
     sqrt_information = np.zeros((n, 3, 3))
     sqrt_information[:, 0, 0], sqrt_information[:, 1, 1], sqrt_information[:, 2, 2] = 1.0 / along, 1.0 / across, 1.0 / heading
-    # What drifts by the second drifts while wheels are read: a log that pauses for an hour drifts no more than one second.
-    duration = np.where(slack[:, 2] > 0.0, np.minimum(keyframes.duration, 1.0), keyframes.duration)
     return OdometryEdges(
         first + np.arange(n),
         first + np.arange(1, n + 1),
         keyframes.motion,
         keyframes.length,
-        duration,
+        drift_time(keyframes),
         sqrt_information,
         odometry_indices(calibration, n),
         config.kernel,
     )
+
+
+def drift_time(keyframes: Keyframes) -> Floats:
+    """Return the time (k-1,) of each step in which its heading drifts, s: a log that pauses for an hour drifts one second."""
+    return np.where(keyframes.slack[:, 2] > 0.0, np.minimum(keyframes.duration, 1.0), keyframes.duration)
 
 
 def learn_wheels(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:

@@ -9,7 +9,6 @@ from helpers.planted import box
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
-from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.scan_matching import rasterize
 from uwblite.lidar.scan_to_scan import TrackingConfig, follow
 
@@ -24,7 +23,7 @@ def followed(truth, clouds, said):
     for step in said:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
-    result = follow(clouds, raster, wheels, Graph(np.array(poses)), GATE, TrackingConfig(), CorrelativeConfig())
+    result = follow(clouds, raster, wheels, Graph(np.array(poses)), GATE, TrackingConfig())
     return result.steps, result.wheels, result.searched
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.grid.occupancy_grid import GridConfig
-from uwblite.keyframes import KeyframeConfig, choose_scans, select
+from uwblite.keyframes import KeyframeConfig, choose_scans, of
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.scan_selection import thinned
 
@@ -34,7 +34,7 @@ def test_what_is_kept_stays_and_holds_all_that_is_looked_at(seed):
     kept = np.searchsorted(log.scans.stamps, once.scans.stamps)
     np.testing.assert_array_equal(log.scans.ranges[kept], once.scans.ranges)
     assert once.notes.scans_left_out == len(log.scans.stamps) - len(kept) > 0
-    _, near = choose_scans(log.scans, select(log.odometry, FRAMES), FRAMES)
+    _, near = choose_scans(log.scans, of(log, FRAMES), FRAMES)
     assert np.isin(near, kept).all()
     # Between neighbours the laser moved no farther than half the grid's step and one more scan.
     poses = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, log.scans.stamps)

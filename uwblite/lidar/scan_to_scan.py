@@ -1,24 +1,24 @@
-"""Following the robot from cloud to cloud, where the wheels' word is not good enough to start matching from.
+"""Scan-to-scan matching: the step from every keyframe to the next, measured by their clouds.
 
-Neighbouring clouds are aligned from the wheels' guess. A pair that then shares few points got a bad guess (slip, a
-sharp turn between sparse scans): a correlative search around it finds the place.
+Neighbouring clouds are aligned from the odometry's guess, all at once. A pair that then shares few points got a bad guess
+(slip, a fast turn between sparse scans, wheels that count backwards as forwards): it is searched for in the local sub-map
+of the keyframes before. Where that finds nothing, or two places alike, the step is left to an odometry of little weight.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..wheels import learn_wheels
 from .clouds import Clouds
-from .correlative_matching import CorrelativeConfig, search
 from .pair_alignment import align_pairs
-from .point_cloud import make_cloud
 from .scan_matching import CloudRasters, match, measured, pair_points
+from .step_search import StepSearch
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +29,10 @@ class TrackingConfig:
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""
     good_share: ClassVar[float] = 0.75
     """Neighbours that share at least this part of their points need no search."""
-    gain: ClassVar[float] = 0.08
-    """A search must raise the share by this to be believed."""
     distance: float = 0.4
-    """Half-width of the search, m."""
+    """Half-width of the search beyond twice the motion by the odometry, m: wheels may count backwards as forwards."""
     angle: float = 0.45
-    """Half-width of the search, rad."""
-    least_share: ClassVar[float] = 0.4
-    """A step whose clouds share a smaller part is left to the wheels."""
+    """Half-width of the search in heading beyond half the turn by the odometry, rad."""
     gate: ClassVar[float] = 0.15
     """Farthest match at the end, m."""
     points: ClassVar[int] = 150
@@ -63,36 +59,104 @@ class ScanOdometry:
     """Steps that were searched for."""
 
 
+def contradicted(
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig
+) -> Ints:
+    """Return the keyframes (s,) whose step to the next the clouds contradict: they share little there, or fit elsewhere."""
+    first = _Steps.of(clouds, raster, wheels, graph, gate, config)
+    off = se2.between(first.guess, first.pose)
+    elsewhere = (np.hypot(off[:, 0], off[:, 1]) > _ELSEWHERE) | (np.abs(off[:, 2]) > _ELSEWHERE)
+    return wheels.i[first.enough & ((first.share < config.good_share) | elsewhere)]
+
+
+_ELSEWHERE = 0.12
+"""m or rad; what a step of sound wheels is never wrong by."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Steps:
+    """Steps as descent from the wheels' guess leaves them."""
+
+    guess: Floats
+    pose: Floats
+    share: Floats
+    enough: Bools
+
+    @classmethod
+    def of(
+        cls, clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig
+    ) -> "_Steps":
+        i, tight = wheels.i, min(config.gate, gate)
+        guess = se2.between(graph.poses[i], graph.poses[i + 1])
+        aligned = align_pairs(clouds, raster, i, i + 1, guess, pair_points(clouds, i + 1, config.points), gate, tight)
+        return cls(guess, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
+
+
 def follow(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig,
-    search_config: CorrelativeConfig,
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig
 ) -> ScanOdometry:
     """Measure every step between neighbouring keyframes by their clouds, searching where the guess may have been bad.
 
     Parameters
     ----------
-    clouds, raster : see clouds.build and pair_matching.paint.
+    clouds, raster : see clouds.build and scan_matching.rasterize.
     wheels : edges between neighbouring keyframes. graph : poses by wheels and radio, the guess.
     gate : reach of the raster, m.
 
     """
     i, tight = wheels.i, min(config.gate, gate)
-    points = pair_points(clouds, i + 1, config.points)
-    aligned = align_pairs(clouds, raster, i, i + 1, se2.between(graph.poses[i], graph.poses[i + 1]), points, gate, tight)
-    enough = aligned.factors.asked >= config.min_points
-    share, step = aligned.share.copy(), aligned.pose.copy()
-    good = enough & (share >= config.good_share)
-    learnt = learn_wheels(wheels, _edges(clouds, raster, i[good], step[good], tight, config), graph)
+    steps = _Steps.of(clouds, raster, wheels, graph, gate, config)
+    good = steps.enough & (steps.share >= config.good_share)
+    learnt = learn_wheels(wheels, _edges(clouds, raster, i[good], steps.pose[good], tight, config), graph)
     miss = _miss(clouds, learnt)
-    rows = np.flatnonzero(enough & ~good & (miss > 0.7 * gate))
-    for row in rows:
-        found = _search_step(clouds, raster, int(i[row]), step[row], gate, config, search_config)
-        if found is not None and found[1] > share[row] + config.gain:
-            step[row], share[row] = found
-    kept = enough & (share >= config.least_share)
-    steps = _edges(clouds, raster, i[kept], step[kept], tight, config)
-    learnt = learn_wheels(wheels, steps, graph)
-    return ScanOdometry(steps, learnt, float(np.median(miss)) if len(miss) else 0.0, len(rows))
+    pose, lost, wrong = _searched(clouds, i, steps, steps.enough & ~good, config)
+    kept = steps.enough & ~lost
+    measured_steps = _edges(clouds, raster, i[kept], pose[kept], tight, config)
+    learnt = _loosened(learn_wheels(wheels, measured_steps, graph), wrong)
+    searched = int((steps.enough & ~good).sum())
+    return ScanOdometry(measured_steps, learnt, float(np.median(miss)) if len(miss) else 0.0, searched)
+
+
+def _searched(
+    clouds: Clouds, i: Ints, steps: _Steps, doubtful: Bools, config: TrackingConfig
+) -> tuple[Floats, Bools, Bools]:
+    """Search for doubtful steps (e,), each against the sub-map of those before it.
+
+    Returns
+    -------
+    Poses of all steps (e, 3), which were not found (e,), and where the odometry is wrong all the same (e,).
+    """
+    pose, lost, wrong = steps.pose.copy(), np.zeros(len(i), dtype=bool), np.zeros(len(i), dtype=bool)
+    searching = StepSearch(clouds, config.distance, config.angle)
+    chain = np.zeros((len(clouds), 3))
+    chain[i] = pose
+    # Sub-maps begin behind the last step that nothing measured.
+    blind = np.setdiff1d(np.arange(len(clouds)), i[steps.enough])
+    first = 0
+    for row in np.flatnonzero(doubtful).tolist():
+        k, before = int(i[row]), blind[blind < i[row]]
+        first = max(first, int(before[-1]) + 1 if len(before) else 0)
+        guess = steps.guess[row]
+        found = searching.find(k, first, chain, np.stack([guess, steps.pose[row], guess * [0.0, 0.0, 1.0]]))
+        lost[row], wrong[row] = not found.clear, not found.clear and found.contradicts
+        if found.clear:
+            chain[k] = pose[row] = found.pose
+        else:
+            first = k + 1
+    return pose, lost, wrong
+
+
+def _loosened(wheels: OdometryEdges, wrong: Bools) -> OdometryEdges:
+    """Return the wheels' edges with less weight where the clouds contradict them and do not tell what is right."""
+    sigma = 1.0 / np.einsum("eii->ei", wheels.sqrt_information)
+    wide = np.where(wrong[:, None], np.clip(_LOOSER * sigma, sigma, np.maximum(sigma, _LOOSEST)), sigma)
+    return replace(wheels, sqrt_information=wheels.sqrt_information * (sigma / wide)[:, None, :])
+
+
+_LOOSER = 10.0
+"""Factor on the standard deviations of wheels that the clouds contradict."""
+_LOOSEST = np.array([0.3, 0.3, 0.2])
+"""What these become at most along, across, m, and in heading, rad."""
 
 
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:
@@ -110,19 +174,3 @@ def _edges(
     factors = match(clouds, raster, i, step, pair_points(clouds, i + 1, config.points), gate, gate / 2.0)
     z, sqrt_information = measured(factors, step, np.full(len(i), config.sigma**2 * config.correlation))
     return RelativePoseEdges(i, i + 1, z, sqrt_information)
-
-
-def _search_step(
-    clouds: Clouds, raster: CloudRasters, i: int, guess: Floats, gate: float, config: TrackingConfig,
-    search_config: CorrelativeConfig,
-) -> tuple[Floats, float] | None:
-    """Return the best pose of cloud i + 1 in cloud i and the share of points that match there."""
-    target, source = (make_cloud(p, p + n) for p, n in (clouds.cloud(i), clouds.cloud(i + 1)))
-    places = search(target, source, guess, (config.distance, config.distance, config.angle), search_config)
-    if not len(places.poses):
-        return None
-    one = np.full(len(places.poses), i)
-    points = pair_points(clouds, one + 1, config.points)
-    aligned = align_pairs(clouds, raster, one, one + 1, places.poses, points, min(0.3, gate), min(config.gate, gate))
-    best = int(np.argmax(aligned.share))
-    return aligned.pose[best], float(aligned.share[best])

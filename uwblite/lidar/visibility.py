@@ -43,7 +43,7 @@ def nearest_by_bearing(clouds: Clouds) -> Floats:
     return nearest
 
 
-def _free(poses: Floats, nearest: Floats) -> FreeSpace:
+def free_from(poses: Floats, nearest: Floats) -> FreeSpace:
     step = 2.0 * np.pi / _BEARINGS
     return free_space(poses, nearest, -np.pi + 0.5 * step, step, blur=1)
 
@@ -59,7 +59,7 @@ def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list
     free = []
     for first, last, reference in zip(submaps.first, submaps.last, submaps.reference, strict=True):
         views = np.unique(np.linspace(first, last - 1, _VIEWS).round().astype(np.int64))
-        free.append(_free(se2.between(poses[reference], poses[views]), nearest[views]))
+        free.append(free_from(se2.between(poses[reference], poses[views]), nearest[views]))
     return free
 
 
@@ -127,7 +127,7 @@ def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording:
     through, seen, visits = 0.0, 0.0, 0
     for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
         points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
-        share, visible = contradiction(_free(np.zeros((1, 3)), nearest[a : a + 1]), points, _MARGIN)
+        share, visible = contradiction(free_from(np.zeros((1, 3)), nearest[a : a + 1]), points, _MARGIN)
         if visible * len(points) >= _COMMON:
             through += share * visible * len(points)
             seen += visible * len(points)

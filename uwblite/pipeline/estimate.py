@@ -32,6 +32,10 @@ class Task:
     """Takes the stages' figures, warnings and doubts."""
     executor: Executor | None = None
 
+    def following(self, estimate: "Estimate") -> "Task":
+        """Return the task for the keyframes of an estimate."""
+        return self if estimate.recordings is None else replace(self, recordings=estimate.recordings)
+
     def allowed(self, i: Ints, j: Ints) -> Bools:
         """Tell which pairs of keyframes (e,), (e,) the user has not forbidden to match."""
         return self.given.allowed(self.recordings.clock, i, j)
@@ -67,6 +71,8 @@ class Estimate:
     steps: ScanEdges | None = None
     """Between neighbouring clouds; None before scan-to-scan matching."""
     closures: Closures = field(default_factory=no_closures)
+    recordings: Recordings | None = None
+    """With the keyframes of the graph's poses; None while these are the task's."""
     joint: ScanEdges | None = None
     """Between all overlapping clouds, in place of steps and closures; None before the joint refinement."""
 

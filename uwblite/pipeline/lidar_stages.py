@@ -19,9 +19,10 @@ from ..lidar.clouds import Clouds
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult
 from ..mapping_config import MappingConfig
 from .estimate import Estimate, ScanClouds, Task
+from .keyframe_changes import with_keyframes
 from .progress import solver_figures
 from .radio_stages import with_range_noise
-from .recordings import Recording
+from .recordings import Recording, denser, later
 
 _BLOCK = 32
 """Keyframes whose rays are held in memory at once."""
@@ -59,18 +60,41 @@ def _blocks(recording: Recording, config: MappingConfig, delay: float) -> list[C
 
 
 def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
-    """Match neighbouring clouds; where the lidar's clock is off by much, make the clouds again with that, and repeat."""
-    estimate = _match_neighbours(estimate, task)
+    """Match neighbouring clouds; where the lidar's clock is off by much, move keyframes and clouds with it, and repeat."""
+    estimate = _cut_contradicted(estimate, task)
+    estimate = _match_neighbours(estimate, task.following(estimate))
     for _ in range(_RETIMINGS):
         delay = estimate.graph.calibration.get("laser_delay")
         if estimate.scans is None or abs(delay - estimate.scans.delay) < _CLOCK_TOLERANCE:
             break
-        estimate = replace(estimate, scans=_scan_clouds(task, delay))
+        before = task.following(estimate).recordings
+        estimate = with_keyframes(estimate, before, later(before, delay - estimate.scans.delay))
+        estimate = replace(estimate, scans=_scan_clouds(task.following(estimate), delay))
         task.stages.end("clouds made again", laser_delay=round(delay, 4))
-        estimate = _match_neighbours(estimate, task)
+        estimate = _match_neighbours(estimate, task.following(estimate))
     return estimate
 
 
+def _cut_contradicted(estimate: Estimate, task: Task) -> Estimate:
+    """Cut the steps of the odometry that the clouds contradict at the scans within them.
+
+    Where little happens between two scans, the second is found whatever the odometry says.
+    """
+    scans, config = estimate.scans, task.config
+    assert scans is not None
+    steps = scan_to_scan.contradicted(
+        scans.clouds, scans.raster, estimate.odometry, estimate.graph, config.refinement.first_gate, config.scan_to_scan
+    )
+    after = denser(task.recordings, steps, _CUTS)
+    if len(after.stamps) == len(task.recordings.stamps):
+        return estimate
+    estimate = with_keyframes(estimate, task.recordings, after)
+    task.stages.end("keyframes added", steps=len(steps), keyframes=len(after.stamps))
+    return replace(estimate, scans=_scan_clouds(task.following(estimate), scans.delay))
+
+
+_CUTS = 4
+"""Keyframes added within a step that the clouds contradict, at most."""
 _CLOCK_TOLERANCE = 0.015
 """Offset of the lidar's clock that clouds may have, s: the robot's velocity hardly changes in that time."""
 _RETIMINGS = 3
@@ -86,9 +110,7 @@ def _match_neighbours(estimate: Estimate, task: Task) -> Estimate:
     whole = replace(weak, odometry=replace(odometry, kernel=SQUARED)).odometry_and_ranges
     graph = estimate.graph.with_estimates_of(optimize(estimate.graph.with_edges(*whole), config.solver)[0])
     rules = config.refinement
-    found = scan_to_scan.follow(
-        scans.clouds, scans.raster, odometry, graph, rules.first_gate, config.scan_to_scan, config.correlative
-    )
+    found = scan_to_scan.follow(scans.clouds, scans.raster, odometry, graph, rules.first_gate, config.scan_to_scan)
     estimate, weak = replace(estimate, odometry=found.wheels), replace(weak, odometry=found.wheels)
     problem = graph.with_edges(*weak.odometry_and_ranges, found.steps)
     graph = graph.with_estimates_of(optimize(problem, config.solver)[0])

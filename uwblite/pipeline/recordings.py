@@ -16,6 +16,10 @@ _APART = 1000.0
 """Travelled distance between the end of a recording and the begin of the next, m: never the same epoch."""
 
 
+_SPARSE = 0.15
+"""Time between samples of the odometry that interpolation does not bridge well, s."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """One recording among others."""
@@ -41,6 +45,15 @@ class Recording:
     def anchor_ids(self) -> tuple[str, ...]:
         """Names of the anchors it heard."""
         return self.log.ranges.anchor_ids if self.log.ranges is not None else ()
+
+    @property
+    def trajectory_stamps(self) -> Floats:
+        """(n,) s of its odometry, and of keyframes where its samples are too far apart to interpolate between."""
+        stamps, own = self.log.odometry.stamps, self.frames.stamps
+        after = np.searchsorted(stamps, own)
+        inside = (after > 0) & (after < len(stamps))
+        gap = np.diff(stamps)[after[inside] - 1] if inside.any() else np.zeros(0)
+        return np.union1d(stamps, own[inside][gap > _SPARSE]) if (gap > _SPARSE).any() else stamps
 
     def dense_trajectory(self, poses: Floats, stamps: Floats | None = None) -> Floats:
         """Return T_map_base (n, 3) at stamps (default: all of its odometry's), given the poses of all keyframes."""
@@ -95,14 +108,53 @@ def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
     """
     if not logs:
         raise DataError("no recording to map; give one or more")
+    return _joined(logs, [keyframes.of(log, config) for log in logs])
+
+
+def later(recordings: Recordings, shift: float) -> Recordings:
+    """Return the recordings with all keyframes of those with lidar later by a shift, s: its clock is late by so much more."""
+    shifts = [shift if s.has_scans else 0.0 for s in recordings.each]
+    frames = [
+        keyframes.at(s.log, s.frames.stamps + t, s.frames.alone) for s, t in zip(recordings.each, shifts, strict=True)
+    ]
+    return _joined([s.log for s in recordings.each], frames)
+
+
+def denser(recordings: Recordings, steps: Ints, most: int) -> Recordings:
+    """Return the recordings with the scans inside some steps as keyframes, too; clouds there are of single scans.
+
+    Parameters
+    ----------
+    steps : (s,) keyframes at which the steps begin. most : keyframes added to one step.
+    """
+    frames = []
+    for recording in recordings.each:
+        stamps, log = recording.frames.stamps, recording.log
+        own = steps[(steps >= recording.first) & (steps < recording.first + len(stamps) - 1)] - recording.first
+        added = [np.zeros(0)] if log.scans is None else [
+            _spread(log.scans.middles, stamps[k], stamps[k + 1], most) for k in own.tolist()
+        ]
+        moments = np.union1d(stamps, np.concatenate([np.zeros(0), *added]))
+        alone = np.isin(moments, np.concatenate([stamps[own], stamps[own + 1], *added]))
+        frames.append(keyframes.at(log, moments, alone))
+    return _joined([s.log for s in recordings.each], frames)
+
+
+def _spread(stamps: Floats, begin: float, end: float, most: int) -> Floats:
+    """Return stamps between two others, both excluded, evenly chosen where they are too many."""
+    within = stamps[np.searchsorted(stamps, begin, "right") : np.searchsorted(stamps, end, "left")]
+    return within if len(within) <= most else within[np.linspace(0, len(within) - 1, most + 2).round().astype(np.int64)[1:-1]]
+
+
+def _joined(logs: Sequence[SensorLog], frames: Sequence[Keyframes]) -> Recordings:
+    """Number keyframes of all recordings through."""
     each: list[Recording] = []
     paths: list[Floats] = []
     first, start = 0, 0.0
-    for number, log in enumerate(logs):
-        frames = keyframes.of(log, config)
-        each.append(Recording(number, log, frames, first))
-        paths.append(start + np.concatenate([[0.0], np.cumsum(frames.path)]))
-        first, start = first + len(frames), float(paths[-1][-1]) + _APART
+    for number, (log, own) in enumerate(zip(logs, frames, strict=True)):
+        each.append(Recording(number, log, own, first))
+        paths.append(start + np.concatenate([[0.0], np.cumsum(own.path)]))
+        first, start = first + len(own), float(paths[-1][-1]) + _APART
     return Recordings(
         tuple(each),
         np.repeat(np.arange(len(each)), [len(s.frames) for s in each]),

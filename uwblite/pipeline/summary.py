@@ -38,10 +38,10 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     }
     plausibility.judge(estimate, anchors, calibrated, listed, table, grid, task)
     stages.end("summary")
-    stamps = [recording.log.odometry.stamps for recording in recordings.each]
+    stamps = [recording.trajectory_stamps for recording in recordings.each]
     return MapResult(
         stamps=np.concatenate(stamps),
-        trajectory=np.concatenate([recording.dense_trajectory(graph.poses) for recording in recordings.each]),
+        trajectory=np.concatenate([r.dense_trajectory(graph.poses, t) for r, t in zip(recordings.each, stamps, strict=True)]),
         recording=np.repeat(np.arange(len(recordings)), [len(own) for own in stamps]),
         keyframe_stamps=recordings.stamps,
         keyframe_recording=recordings.of_keyframe,

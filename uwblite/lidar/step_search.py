@@ -1,0 +1,141 @@
+"""Steps that descent from the odometry's guess leaves in doubt, searched for in the local sub-map of the keyframes before.
+
+The neighbouring cloud alone shows too little after a fast turn or a gap; the last few together show what was in view
+before. Every pose that the window allows is scored (see raster_search), matching descends from the best few and from the
+guesses, and free space decides between them: of two scans in their true places hardly any surface of the one stands where
+the other looked through. A step for which two distinct places score alike is ambiguous and counts as not found.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from .clouds import Clouds
+from .pair_alignment import align_pairs
+from .raster_search import Window, best_poses
+from .scan_matching import pair_points, rasterize
+from .visibility import free_from, nearest_by_bearing, violates_free_space
+
+_VIEWS = 6
+"""Keyframes before the step that make its local sub-map."""
+_SPAN = 10.0
+"""Half the edge of the square around the robot within which points are matched, m: farther ones only take time."""
+_FARTHEST = 1.2
+"""Largest half-width of the search, m."""
+_TURNING = 0.5
+"""Share of the turn by the odometry by which the search is wider in heading."""
+_STARTS = 4
+"""Places of the search from which matching descends."""
+_POINTS = 120
+"""Points looked up per place."""
+_FIRST_GATE, _LAST_GATE = 0.3, 0.15
+"""Farthest match in the first and in the last iteration, m."""
+_ITERATIONS = 12
+_CELL, _REACH = 0.1, 0.5
+"""Cell of the raster of nearest points and distance up to which a point is near, m."""
+_DISTINCT = 0.15
+"""Places farther apart than this, m or rad, are distinct."""
+_MARGIN = 0.08
+"""By how much the score of a place must exceed that of every distinct one."""
+_THROUGH = 0.12
+"""Share in free space that a true place does not have."""
+_LEAST = 0.45
+"""Least score of a step: share of points that match, less the share that stands in free space."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundStep:
+    """Outcome of a search."""
+
+    pose: Floats
+    """(3,) of the next keyframe in the one before."""
+    score: float
+    """Share of points that match less the share that stands in free space."""
+    second: float
+    """Score of the best distinct place; -1 = there is none."""
+    expected: float
+    """Score where descent from the odometry's guess ends, if it ends near to it; -1 = it does not."""
+    through: float
+    """Share that would stand in free space at the odometry's guess."""
+
+    @property
+    def clear(self) -> bool:
+        """Whether enough matches, and no distinct place matches nearly as well."""
+        return self.score >= _LEAST and self.second < self.score - _MARGIN
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the odometry's guess is clearly worse than what was found, or stands in free space."""
+        return self.expected < self.score - _MARGIN or self.through > _THROUGH
+
+
+class StepSearch:
+    """The clouds of all keyframes, ready for searches."""
+
+    def __init__(self, clouds: Clouds, distance: float, angle: float) -> None:
+        """Take half-widths of the search in x and y, m, and in heading, rad."""
+        self._clouds, self._distance, self._angle = clouds, distance, angle
+        self._nearest = nearest_by_bearing(clouds)
+
+    def find(self, k: int, first: int, steps: Floats, guesses: Floats) -> FoundStep:
+        """Search for the pose of keyframe k + 1 in keyframe k.
+
+        Parameters
+        ----------
+        first : keyframe from which on the steps before k are sound.
+        steps : (n, 3) from every keyframe to the next.
+        guesses : (g, 3) poses to start from, too; the first is the odometry's, the middle of the search.
+        """
+        views = np.arange(max(first, k + 1 - _VIEWS), k + 1)
+        pair = _sub_map_and_next(self._clouds, views, _chained(steps, views), k + 1)
+        raster = rasterize(pair, _CELL, _REACH)
+        motion = guesses[0]
+        distance = min(self._distance + 2.0 * float(np.hypot(motion[0], motion[1])), _FARTHEST)
+        window = Window(distance, self._angle + _TURNING * abs(float(motion[2])))
+        rows = pair_points(pair, np.ones(1, dtype=np.int64), _POINTS).of(0)
+        starts = np.concatenate([guesses, best_poses(pair, raster, rows, motion, window, _STARTS)])
+        target = np.zeros(len(starts), dtype=np.int64)
+        points = pair_points(pair, target + 1, _POINTS)
+        tried = align_pairs(pair, raster, target, target + 1, starts, points, _FIRST_GATE, _LAST_GATE, _ITERATIONS)
+        score = tried.share - self._through(k, tried.pose)
+        best = int(np.argmax(score))
+        second = float(score[_apart(tried.pose[best], tried.pose)].max(initial=-1.0))
+        expected = float(score[~_apart(motion, tried.pose)].max(initial=-1.0))
+        return FoundStep(tried.pose[best], float(score[best]), second, expected, float(self._through(k, motion[None])[0]))
+
+    def _through(self, k: int, poses: Floats) -> Floats:
+        """Return the shares (c,) of either scan that would stand in free space for poses (c, 3) of keyframe k + 1 in k."""
+        here, there = (free_from(np.zeros((1, 3)), self._nearest[n : n + 1]) for n in (k, k + 1))
+        own, following = (self._clouds.cloud(n)[0] for n in (k, k + 1))
+        return np.array([violates_free_space(here, own, there, following, pose) for pose in poses])
+
+
+def _apart(pose: Floats, others: Floats) -> Bools:
+    """Tell which other poses (c, 3) are distinct from one."""
+    off = se2.between(pose, others)
+    return np.asarray((np.hypot(off[:, 0], off[:, 1]) > _DISTINCT) | (np.abs(off[:, 2]) > _DISTINCT))
+
+
+def _chained(steps: Floats, views: Ints) -> Floats:
+    """Return the poses (v, 3) of following keyframes in the last of them, chained by steps (n, 3)."""
+    poses = np.zeros((len(views), 3))
+    for n in range(len(views) - 2, -1, -1):
+        poses[n] = se2.compose(poses[n + 1], se2.inverse(steps[views[n]]))
+    return poses
+
+
+def _sub_map_and_next(clouds: Clouds, views: Ints, poses: Floats, following: int) -> Clouds:
+    """Return two clouds: those of the views (v,), at poses (v, 3), as one, and the following keyframe's."""
+    rows, last = (
+        slice(int(clouds.offsets[a]), int(clouds.offsets[b + 1])) for a, b in ((views[0], views[-1]), (following, following))
+    )
+    own = poses[clouds.owner[rows] - views[0]]
+    points = np.concatenate([se2.transform(own, clouds.points[rows]), clouds.points[last]])
+    normals = np.concatenate([se2.rotate(own[:, 2], clouds.normals[rows]), clouds.normals[last]])
+    variance = np.concatenate([clouds.normal_variance[rows], clouds.normal_variance[last]])
+    size = rows.stop - rows.start
+    owner = np.repeat(np.arange(2, dtype=np.int32), [size, len(points) - size])
+    pair = Clouds(np.array([0, size, len(points)]), points, normals, owner, variance)
+    return pair.only(np.abs(points).max(axis=1) < _SPAN)
