@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from ..config import override
     from ..graph.solver import SolverConfig, optimize
     from ..radio.anchor_starts import place_anchors
+    from ..radio.chain_starts import place_chains
     from . import console
     from .formats import graph_format, read_graph, refuse_existing, write_graph
 
@@ -54,12 +55,16 @@ def run(args: argparse.Namespace) -> int:
     file = read_graph(args.graph, from_odometry=args.from_odometry)
     for warning in file.warnings:
         console.note(f"uwblite: {args.graph}: {warning}")
-    graph, lost = place_anchors(_with_kernel(file.graph, args.kernel, args.kernel_scale))
+    starts = place_chains(_with_kernel(file.graph, args.kernel, args.kernel_scale), file.chains)
     progress = console.Progress()
     try:
-        solved, summary = optimize(graph, config, lambda done, most: progress("optimising", done, most))
+        solutions = []
+        for start in starts:
+            graph, lost = place_anchors(start)
+            solutions.append((*optimize(graph, config, lambda done, most: progress("optimising", done, most)), lost))
     finally:
         progress.close()
+    solved, summary, lost = min(solutions, key=lambda solution: solution[1].chi2)
     solved_file = dataclasses.replace(file, graph=solved)
     if args.out:
         write_graph(args.out, solved_file)
@@ -116,6 +121,8 @@ def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> di
         "iterations": summary.iterations,
         "converged": summary.converged,
         "reason": summary.reason,
+        "chains": int(file.chains.max(initial=0)) + 1,
+        "certificate": "none: the minimum is a local one",
         "unplaced_anchors": lost,
         "exit_code": 0 if summary.converged else 3,
     }
@@ -130,6 +137,9 @@ def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
     )
     if not figures["converged"]:
         lines.append("DOUBT: not converged; try --set max_iterations=1000, --from-odometry or a robust --kernel")
+    lines.append("no certificate: whether a lower minimum exists is not known")
+    if figures["chains"] > 1:
+        lines[0] += f"; {figures['chains']} chains that nothing but ranges ties together"
     if figures["unplaced_anchors"]:
         lines.append(f"warning: no position for anchors {', '.join(figures['unplaced_anchors'])}: too few ranges")
     written = [name for name in (args.out, args.trajectory) if name]

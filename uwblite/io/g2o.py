@@ -10,6 +10,7 @@
 | EDGE_PRIOR_XY | id x y I11 I12 I22 |
 | FIX | id |
 | EDGE_RANGE_SE2_XY | id_pose id_landmark range I11 (not part of g2o; seen in other projects) |
+| EDGE_RANGE_SE2 | id_pose id_pose range I11 (not part of g2o: our own, for robots that range to each other) |
 | VERTEX2 | id x y theta (TORO) |
 | EDGE2 | id_i id_j dx dy dtheta I11 I12 I22 I33 I13 I23 (TORO: another order) |
 
@@ -38,9 +39,11 @@ _LAYOUTS = {
     "EDGE_PRIOR_XY": Layout(1, 5, places=2),
     "FIX": Layout(1, 0),
     "EDGE_RANGE_SE2_XY": Layout(2, 2, places=1),
+    "EDGE_RANGE_SE2": Layout(2, 2, places=1),
     "VERTEX2": Layout(1, 3, places=3),
     "EDGE2": Layout(2, 9, places=3),
 }
+_NONE = np.zeros(0, dtype=np.int64)
 _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 """Where dx dy dtheta I11 I12 I13 I22 I23 I33 stand among the numbers of an EDGE2."""
 _SPATIAL = ("VERTEX_SE3", "EDGE_SE3", "VERTEX_TRACKXYZ", "VERTEX3", "EDGE3")
@@ -71,14 +74,15 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     toro = Records(toro.lines, toro.stamps, toro.names, toro.numbers[:, _FROM_TORO])
     steps = _together(records["EDGE_SE2"], toro)
     vertices = _together(records["VERTEX_SE2"], records["VERTEX2"])
-    seen, ranged = records["EDGE_SE2_XY"], records["EDGE_RANGE_SE2_XY"]
+    seen, ranged, meetings = records["EDGE_SE2_XY"], records["EDGE_RANGE_SE2_XY"], records["EDGE_RANGE_SE2"]
     pinned, surveyed = records["EDGE_PRIOR_SE2"], records["EDGE_PRIOR_XY"]
     ids = _ids(content)
-    pose_names = (vertices.names, steps.names, seen.names[:, :1], ranged.names[:, :1], pinned.names)
+    pose_names = (vertices.names, steps.names, seen.names[:, :1], ranged.names[:, :1], pinned.names, meetings.names)
     pose_ids, pose_of = _numbered(ids, pose_names)
     landmark_names = (records["VERTEX_XY"].names, seen.names[:, 1:], ranged.names[:, 1:], surveyed.names)
     landmark_ids, landmark_of = _numbered(ids, landmark_names)
     _check(content, pose_ids, landmark_ids, pose_of[steps.names], steps.lines, ranged)
+    _check(content, pose_ids, landmark_ids, pose_of[meetings.names], meetings.lines, meetings)
 
     def matrices(of: Records, size: int, first: int) -> Floats:
         return read_matrices(of.numbers[:, first:], size, of.lines, content.path, "information")
@@ -97,6 +101,8 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
         ),
         (pose_of[pinned.names[:, 0]], pinned.numbers[:, :3], matrices(pinned, 3, 3)),
         (landmark_of[surveyed.names[:, 0]], surveyed.numbers[:, :2], matrices(surveyed, 2, 2)),
+        (*pose_of[meetings.names.T], meetings.numbers[:, 0], 1.0 / np.sqrt(meetings.numbers[:, 1])),
+        (_NONE, _NONE, np.zeros(0), np.zeros(0)),
     )
     poses = told_places(vertices, pose_of, len(pose_ids), content, from_odometry)
     anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
@@ -132,8 +138,8 @@ def write_g2o(
     graph : the graph; anchors that are not finite are left out with their ranges.
     anchor_ids : (a,) names of the anchors; a comment gives which vertex is which.
     pose_ids : (n,) names of the poses; vertices bear these names and the anchors' where all of them are numbers, else the
-        numbers of their order, and comment gives the names.
-    ranges : also write EDGE_RANGE_SE2_XY, which stock g2o does not know.
+        numbers of their order, and comments give the names.
+    ranges : also write EDGE_RANGE_SE2_XY and EDGE_RANGE_SE2, which stock g2o does not know.
 
     Raises
     ------
@@ -171,6 +177,8 @@ def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:
     if ranges:
         pose, anchor, distance, sigma = plain.ranges
         yield from _rows("EDGE_RANGE_SE2_XY", [number[pose], number[n + anchor]], np.stack([distance, 1.0 / sigma**2], axis=1))
+        i, j, distance, sigma = plain.pose_ranges
+        yield from _rows("EDGE_RANGE_SE2", [number[i], number[j]], np.stack([distance, 1.0 / sigma**2], axis=1))
     fixed = np.zeros(1, dtype=np.int64) if graph.fixed_poses is None else np.flatnonzero(graph.fixed_poses)
     if graph.fixed_anchors is not None:
         fixed = np.concatenate([fixed, n + np.flatnonzero(graph.fixed_anchors & placed)])

@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..errors import FormatError
+from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.graph import Graph, PriorEdges
 from ..graph.point_edges import LandmarkEdges
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
@@ -32,6 +33,9 @@ class GraphFile:
     """Name of each landmark in the file; they are the graph's anchors."""
     stamps: Floats
     """(n,) s, time of each pose; its number where the file gives no time."""
+    chains: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(n,) chain of each pose: 0 stands where the file puts it or at the first pose; the others, which no edges but ranges
+    tie to it, begin at the origin and want a place."""
     skipped: dict[str, int] = field(default_factory=dict)
     """Lines of kinds that are not used, by tag."""
     warnings: tuple[str, ...] = ()
@@ -47,12 +51,42 @@ class GraphFile:
         ------
         FormatError : a pose hangs on nothing.
         """
-        lost = np.flatnonzero(np.isnan(graph.poses[:, 0]))
+        poses, chains = with_origins(graph)
+        lost = np.flatnonzero(~_tied(graph, chains)[chains])
         if len(lost):
             raise content.error(f"pose {pose_ids[lost[0]]} is not connected to the first one ({len(lost)} such poses)")
+        graph = replace(graph, poses=poses)
         nowhere = [name for name, xy in zip(anchor_ids, graph.anchors, strict=True) if np.isnan(xy[0])]
         warnings = (f"no position is given of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}",) if nowhere else ()
-        return GraphFile(graph, pose_ids, anchor_ids, stamps, dict(sorted(content.skipped.items())), warnings)
+        return GraphFile(graph, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())), warnings)
+
+
+def with_origins(graph: Graph) -> tuple[Floats, Ints]:
+    """Return poses (n, 3), each chain that nothing but ranges ties to the first begun at the origin, and their chains (n,)."""
+    poses, chains = graph.poses, np.zeros(len(graph.poses), dtype=np.int64)
+    relative = [e for e in graph.edges if isinstance(e, RelativePoseEdges)]
+    while len(lost := np.flatnonzero(np.isnan(poses[:, 0]))):
+        start = poses.copy()
+        start[lost[0]] = 0.0
+        ends = [np.concatenate([getattr(e, name) for e in relative]) for name in ("i", "j", "T_i_j")] if relative else None
+        poses = start if ends is None else chained_poses(start, *ends)
+        chains[np.isnan(graph.poses[:, 0]) & ~np.isnan(poses[:, 0]) & (chains == 0)] = chains.max() + 1
+    return poses, chains
+
+
+def _tied(graph: Graph, chains: Ints) -> Bools:
+    """Tell of each chain whether ranges tie it to the first one, directly, over others or over landmarks."""
+    count, landmarks = int(chains.max()) + 1, len(graph.anchors)
+    ends = [(np.zeros(0, dtype=np.int64),) * 2]
+    for e in graph.edges:
+        if isinstance(e, PointDistanceEdges):
+            ends.append((chains[e.i], chains[e.j]))
+        elif isinstance(e, RangeEdges):
+            ends.append((chains[e.pose], count + e.anchor))
+    one, other = (np.concatenate(column) for column in zip(*ends, strict=True))
+    links = csr_matrix((np.ones(len(one)), (one, other)), shape=(count + landmarks,) * 2)
+    label = connected_components(links, directed=False)[1]
+    return np.asarray(label[:count] == label[0], dtype=np.bool_)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +107,10 @@ class PlainEdges:
     """pose (p,), value (p, 3), information (p, 3, 3) in the chart e = Z^-1 X."""
     landmark_priors: tuple[Ints, Floats, Floats]
     """landmark (p,), value (p, 2), information (p, 2, 2)."""
+    pose_ranges: tuple[Ints, Ints, Floats, Floats]
+    """pose (r,), pose (r,), range (r,) m, sigma (r,) m."""
+    landmark_ranges: tuple[Ints, Ints, Floats, Floats]
+    """landmark (r,), landmark (r,), range (r,) m, sigma (r,) m."""
 
 
 def plain_edges(graph: Graph) -> PlainEdges:
@@ -87,6 +125,8 @@ def plain_edges(graph: Graph) -> PlainEdges:
     sightings: list[tuple[Ints, Ints, Floats, Floats]] = []
     ranges: list[tuple[Ints, Ints, Floats, Floats]] = []
     priors: dict[str, list[tuple[Ints, Floats, Floats]]] = {"poses": [], "anchors": []}
+    between_poses: list[tuple[Ints, Ints, Floats, Floats]] = []
+    between_landmarks: list[tuple[Ints, Ints, Floats, Floats]] = []
     for edges in graph.edges:
         weights = np.ones(len(edges)) if edges.weights is None else edges.weights
         on = weights > 0
@@ -97,6 +137,12 @@ def plain_edges(graph: Graph) -> PlainEdges:
             left = edges.residuals(graph)[on, 0] * edges.sigma[on]
             apart = np.hypot(*(graph.poses[edges.pose[on], :2] - graph.anchors[edges.anchor[on]]).T)
             ranges.append((edges.pose[on], edges.anchor[on], apart - left, edges.sigma[on] / scale))
+        elif isinstance(edges, PointDistanceEdges):
+            left = edges.residuals(graph)[on, 0] * edges.sigma[on]
+            apart = np.hypot(*(graph.poses[edges.i[on], :2] - graph.poses[edges.j[on], :2]).T)
+            between_poses.append((edges.i[on], edges.j[on], apart - left, edges.sigma[on] / scale))
+        elif isinstance(edges, AnchorDistanceEdges):
+            between_landmarks.append((edges.i[on], edges.j[on], edges.distance[on], edges.sigma[on] / scale))
         elif isinstance(edges, LandmarkEdges):
             L = edges.sqrt_information[on] * scale[:, None, None]
             sightings.append((edges.pose[on], edges.anchor[on], edges.position[on], _squared(L)))
@@ -120,6 +166,8 @@ def plain_edges(graph: Graph) -> PlainEdges:
         _stacked(ranges, (none, none, np.zeros(0), np.zeros(0))),
         _stacked(priors["poses"], (none, np.zeros((0, 3)), no_information)),
         _stacked(priors["anchors"], (none, np.zeros((0, 2)), np.zeros((0, 2, 2)))),
+        _stacked(between_poses, (none, none, np.zeros(0), np.zeros(0))),
+        _stacked(between_landmarks, (none, none, np.zeros(0), np.zeros(0))),
     )
 
 
@@ -239,6 +287,8 @@ def assembled(plain: PlainEdges, poses: Floats, anchors: Floats, fixed: Ints = _
         RelativePoseEdges(plain.i, plain.j, plain.T_i_j, root(plain.information)),
         LandmarkEdges(pose, anchor, position, root(seen)),
         _ranges_from_poses(*plain.ranges),
+        _ranges_between_poses(*plain.pose_ranges),
+        AnchorDistanceEdges(*plain.landmark_ranges),
         PriorEdges("poses", prior, value, root(strength) @ _turned(-value[:, 2])),
         PriorEdges("anchors", plain.landmark_priors[0], plain.landmark_priors[1], root(plain.landmark_priors[2])),
     )
@@ -258,6 +308,11 @@ def _ranges_from_poses(pose: Ints, anchor: Ints, ranges: Floats, sigma: Floats) 
     n, flat = len(pose), np.zeros((len(pose), 2))
     none = np.full((n, 6), -1, dtype=np.int64)
     return RangeEdges(pose, anchor, ranges, sigma, flat, np.zeros(n), flat, np.zeros(2), np.zeros(n), none)
+
+
+def _ranges_between_poses(i: Ints, j: Ints, ranges: Floats, sigma: Floats) -> PointDistanceEdges:
+    none = np.zeros((len(i), 2))
+    return PointDistanceEdges(i, j, none, none, ranges, sigma)
 
 
 def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:

@@ -47,7 +47,7 @@ and a direction that was not measured has none."""
 def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
     """Read a planar PyFG graph, plain or gzip; ``-`` = standard input.
 
-    Ranges between two poses or two landmarks are counted as skipped.
+    Chains of several robots may be tied by nothing but ranges, between their poses or to landmarks.
 
     Parameters
     ----------
@@ -70,13 +70,14 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     records = content.records
     steps, seen = records["EDGE_SE2"], records["EDGE_SE2_XY"]
     pinned, surveyed = records["VERTEX_SE2:PRIOR"], records["VERTEX_XY:PRIOR"]
-    ranged = _between_pose_and_landmark(records["EDGE_RANGE"], pose_of, landmark_of, content)
+    ranged, meetings, surveys = _kinds_of_ranges(records["EDGE_RANGE"], pose_of, landmark_of)
     ends = pose_of[steps.names]
     for of, wrong, problem in (
         (steps, (ends < 0).any(axis=1), "an edge between poses names a landmark"),
         (steps, ends[:, 0] == ends[:, 1], "an edge leads from a pose to itself"),
         (seen, (pose_of[seen.names[:, 0]] < 0) | (landmark_of[seen.names[:, 1]] < 0), "needs a pose and a landmark"),
-        (ranged, ~(ranged.numbers[:, 1] > 0), "the variance of a range must be positive"),
+        *((of, ~(of.numbers[:, 1] > 0), "the variance of a range must be positive") for of in (ranged, meetings, surveys)),
+        *((of, of.names[:, 0] == of.names[:, 1], "a range leads from a vertex to itself") for of in (meetings, surveys)),
         (pinned, pose_of[pinned.names[:, 0]] < 0, "a prior on a pose names a landmark"),
         (surveyed, landmark_of[surveyed.names[:, 0]] < 0, "a prior on a landmark names a pose"),
         (records["VERTEX_SE2"], pose_of[records["VERTEX_SE2"].names[:, 0]] < 0, "a pose is named like a landmark"),
@@ -88,20 +89,20 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     def matrices(of: Records, size: int, first: int) -> Floats:
         return _inverse(read_matrices(of.numbers[:, first:], size, of.lines, content.path, "covariance"), of, content)
 
+    def lengths(of: Records) -> tuple[Floats, Floats]:
+        return of.numbers[:, 0], np.sqrt(of.numbers[:, 1])
+
     plain = PlainEdges(
         ends[:, 0],
         ends[:, 1],
         steps.numbers[:, :3],
         matrices(steps, 3, 3),
         (pose_of[seen.names[:, 0]], landmark_of[seen.names[:, 1]], seen.numbers[:, :2], matrices(seen, 2, 2)),
-        (
-            pose_of[ranged.names[:, 0]],
-            landmark_of[ranged.names[:, 1]],
-            ranged.numbers[:, 0],
-            np.sqrt(ranged.numbers[:, 1]),
-        ),
+        (pose_of[ranged.names[:, 0]], landmark_of[ranged.names[:, 1]], *lengths(ranged)),
         (pose_of[pinned.names[:, 0]], pinned.numbers[:, :3], matrices(pinned, 3, 3)),
         (landmark_of[surveyed.names[:, 0]], surveyed.numbers[:, :2], matrices(surveyed, 2, 2)),
+        (*pose_of[meetings.names.T], *lengths(meetings)),
+        (*landmark_of[surveys.names.T], *lengths(surveys)),
     )
     poses = told_places(records["VERTEX_SE2"], pose_of, len(pose_ids), content, from_odometry)
     anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
@@ -171,6 +172,11 @@ def _lines(graph: Graph, stamps: Floats, poses: NDArray[np.str_], anchors: NDArr
     yield from _rows("EDGE_SE2_XY", stamps[pose], [poses[pose], anchors[anchor]], position, _covariances(information))
     pose, anchor, distance, sigma = plain.ranges
     yield from _rows("EDGE_RANGE", stamps[pose], [poses[pose], anchors[anchor]], np.stack([distance, sigma**2], axis=1))
+    i, j, distance, sigma = plain.pose_ranges
+    yield from _rows("EDGE_RANGE", stamps[i], [poses[i], poses[j]], np.stack([distance, sigma**2], axis=1))
+    i, j, distance, sigma = plain.landmark_ranges
+    when = np.full(len(i), stamps[first])
+    yield from _rows("EDGE_RANGE", when, [anchors[i], anchors[j]], np.stack([distance, sigma**2], axis=1))
 
 
 def _rows(tag: str, stamps: Floats | None, names: list[NDArray[np.str_]], *columns: Floats) -> Iterator[str]:
@@ -220,12 +226,14 @@ def _numbered(content: RecordFile) -> tuple[tuple[str, ...], Ints, tuple[str, ..
     return names[0], index[0], names[1], index[1]
 
 
-def _between_pose_and_landmark(ranged: Records, pose_of: Ints, landmark_of: Ints, content: RecordFile) -> Records:
-    """Return the ranges between a pose and a landmark, in this order; the others are counted as skipped."""
+def _kinds_of_ranges(ranged: Records, pose_of: Ints, landmark_of: Ints) -> tuple[Records, Records, Records]:
+    """Return the ranges between a pose and a landmark, in this order, between two poses, and between two landmarks."""
     names = ranged.names.copy()
     swapped = (landmark_of[names[:, 0]] >= 0) & (pose_of[names[:, 1]] >= 0)
     names[swapped] = names[swapped, ::-1]
-    used = (pose_of[names[:, 0]] >= 0) & (landmark_of[names[:, 1]] >= 0)
-    if not used.all():
-        content.skipped["EDGE_RANGE between two poses or two landmarks"] = int((~used).sum())
-    return Records(ranged.lines[used], ranged.stamps[used], names[used], ranged.numbers[used])
+    first, second = pose_of[names[:, 0]] >= 0, pose_of[names[:, 1]] >= 0
+    kinds = (first & ~second, first & second, ~first)
+    mixed, meetings, surveys = (
+        Records(ranged.lines[k], ranged.stamps[k], names[k], ranged.numbers[k]) for k in kinds
+    )
+    return mixed, meetings, surveys

@@ -1,0 +1,142 @@
+"""Starting places for the chains of several robots that nothing but ranges ties together.
+
+Each chain is taken as rigid, as its odometry has it. Chains are placed one after another, the best tied first: for every
+heading R on a circle of starts, a range d from its point b to a placed point a says |a - R b - t| = d, which is
+trilateration of t; squared, |p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t and |t|^2. Gauss-Newton steps in
+heading and place follow, with Cauchy weights, for odometry drifts and some ranges are wrong. Several hypotheses are kept
+from chain to chain; which is right is for the optimisation of the whole graph to say.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from ..graph.distance_edges import PointDistanceEdges
+from ..graph.graph import Graph
+from ..graph.range_edges import RangeEdges
+from .anchor_starts import place_anchors
+
+_HEADINGS = 24
+"""Starts of a chain's heading."""
+_STEPS = 15
+"""Gauss-Newton steps from each."""
+_MOST_RANGES = 300
+"""Ranges looked at for one chain; more say the same again."""
+_BEND = 0.5
+"""m; from this residual on a range counts less: what rigid chains are off after some minutes of odometry."""
+_KEPT = 4
+"""Hypotheses kept."""
+_LEAST_RANGES = 4
+"""Three unknowns and one range that contradicts."""
+
+
+def place_chains(graph: Graph, chains: Ints) -> list[Graph]:
+    """Return graphs with every chain placed, the likeliest first.
+
+    Parameters
+    ----------
+    graph : poses of each chain in a frame of its own; those of chain 0 are where they are.
+    chains : (n,) chain of each pose.
+    """
+    hypotheses = [(0.0, graph)]
+    waiting = set(range(1, int(chains.max(initial=0)) + 1))
+    placed = {0}
+    while waiting:
+        chain = max(sorted(waiting), key=lambda c: len(_ties(hypotheses[0][1], chains, c, placed)[2]))
+        found = [
+            (cost + more, replace(g, poses=_moved(g.poses, chains == chain, T)))
+            for cost, g in hypotheses
+            for more, T in _places(*_ties(g, chains, chain, placed))
+        ]
+        hypotheses = sorted(found, key=lambda h: h[0])[:_KEPT]
+        waiting.remove(chain)
+        placed.add(chain)
+    return [g for _, g in hypotheses]
+
+
+def _moved(poses: Floats, mine: Bools, T: Floats) -> Floats:
+    return np.where(mine[:, None], se2.compose(T, poses), poses)
+
+
+def _ties(graph: Graph, chains: Ints, chain: int, placed: set[int]) -> tuple[Floats, Floats, Floats]:
+    """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them."""
+    here = np.isin(chains, sorted(placed))
+    there, own, ranges = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0)]
+    anchors = _heard_by(graph, here).anchors
+    for e in graph.edges:
+        if isinstance(e, PointDistanceEdges):
+            for one, other in ((e.i, e.j), (e.j, e.i)):
+                tied = (chains[one] == chain) & here[other]
+                own.append(graph.poses[one[tied], :2])
+                there.append(graph.poses[other[tied], :2])
+                ranges.append(e.distance[tied])
+        elif isinstance(e, RangeEdges):
+            tied = (chains[e.pose] == chain) & np.isfinite(anchors[e.anchor]).all(axis=1)
+            own.append(graph.poses[e.pose[tied], :2])
+            there.append(anchors[e.anchor[tied]])
+            ranges.append(e.ranges[tied])
+    every = max(-(-sum(map(len, ranges)) // _MOST_RANGES), 1)
+    return tuple(np.concatenate(part)[::every] for part in (there, own, ranges))  # type: ignore[return-value]
+
+
+def _heard_by(graph: Graph, here: Bools) -> Graph:
+    """Return the graph with those landmarks placed that ranges from some of the poses place."""
+    ranges = tuple(e.rows(np.flatnonzero(here[e.pose])) for e in graph.edges if isinstance(e, RangeEdges))
+    found, lost = place_anchors(replace(graph, edges=ranges))
+    anchors = found.anchors.copy()
+    anchors[list(lost)] = np.nan
+    return replace(graph, anchors=anchors)
+
+
+def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Floats]]:
+    """Return (robust cost, T_map_chain) of the best places, apart from each other."""
+    if len(ranges) < _LEAST_RANGES:
+        return [(0.0, np.zeros(3))]
+    found = [_settled(start, there, own, ranges) for start in _starts(there, own, ranges)]
+    found.sort(key=lambda place: place[0])
+    best: list[tuple[float, Floats]] = []
+    for cost, T in found:
+        if all(np.abs(se2.between(T, other)).max() > _APART for _, other in best):
+            best.append((cost, T))
+    return best[:_KEPT]
+
+
+_APART = 0.1
+"""m and rad between two hypotheses."""
+
+
+def _starts(there: Floats, own: Floats, ranges: Floats) -> list[Floats]:
+    starts = []
+    for theta in np.arange(_HEADINGS) * 2.0 * np.pi / _HEADINGS:
+        p = there - se2.rotate(np.full(len(own), theta), own)
+        A = np.column_stack([-2.0 * p, np.ones(len(p))])
+        t = np.linalg.lstsq(A, ranges**2 - np.sum(p**2, axis=1), rcond=None)[0]
+        starts.append(np.array([t[0], t[1], theta]))
+    return starts
+
+
+def _settled(T: Floats, there: Floats, own: Floats, ranges: Floats) -> tuple[float, Floats]:
+    """Return cost and place after damped Gauss-Newton steps with Cauchy weights."""
+
+    def residuals(T: Floats) -> tuple[Floats, Floats, Floats, float]:
+        arm = se2.rotate(np.full(len(own), T[2]), own)
+        offset = T[:2] + arm - there
+        length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
+        left = length - ranges
+        return left, offset / length[:, None], arm, float(np.log1p((left / _BEND) ** 2).sum())
+
+    left, along, arm, cost = residuals(T)
+    damping = 1e-3
+    for _ in range(_STEPS):
+        J = np.column_stack([along, along[:, 1] * arm[:, 0] - along[:, 0] * arm[:, 1]])
+        W = 1.0 / (1.0 + (left / _BEND) ** 2)
+        H = J.T @ (W[:, None] * J)
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), -J.T @ (W * left))
+        tried = residuals(T + step)
+        if tried[3] < cost:
+            T, (left, along, arm, cost), damping = T + step, tried, damping / 3.0
+        else:
+            damping *= 5.0
+    return cost, np.array([T[0], T[1], float(se2.wrap_angle(np.asarray(T[2])))])
