@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from uwblite.config import field_docs, from_dict, leaves, merge, override, parse_toml, setting, to_dict, to_toml, toml_value
 from uwblite.errors import ConfigError
+from uwblite.mapping_config import MappingConfig
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -166,3 +167,9 @@ def test_leaves_name_every_setting():
 @given(st.text(st.characters(codec="utf-8")))
 def test_any_text_survives_toml(text):
     assert tomllib.loads(f"x = {toml_value(text)}")["x"] == text
+
+
+def test_a_message_that_quotes_a_broken_file_stays_short():
+    with pytest.raises(ConfigError, match=r"unknown setting 'AAA.* \.\.\. A*'; `uwblite config` lists all settings$") as caught:
+        merge(MappingConfig(), {"A" * 100_000: 1})
+    assert len(str(caught.value)) < 1000

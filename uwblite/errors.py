@@ -2,7 +2,19 @@
 
 
 class UwbliteError(Exception):
-    """Base of all errors of this package; the command line shows its text as one line and exits with 1."""
+    """Base of all errors of this package; the command line shows its text as one line and exits with 1.
+
+    Parameters
+    ----------
+    text : one line; the middle of a very long one, which quotes a broken file, is left out.
+    """
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 3 :]}")
+
+
+_LONGEST = 1000
+"""Characters of a message."""
 
 
 class ConfigError(UwbliteError):
