@@ -44,6 +44,15 @@ def floor_of(module: str) -> int:
     raise AssertionError(f"{module} has no floor; give {room_of(module)} one in tests/test_architecture.py")
 
 
+def test_contributing_draws_the_same_floors():
+    text = (PACKAGE.parent / "CONTRIBUTING.md").read_text()
+    drawn = [line.split("  the ")[0].split() for line in text.split("```\ncli ")[1].split("```")[0].splitlines()]
+    drawn[0] = ["cli"]
+    known = {room for floor in FLOORS for room in floor}
+    rooms = [{word for word in line if word in known} for line in drawn]
+    assert rooms == [set(floor) for floor in reversed(FLOORS) if floor != ("__main__",)]
+
+
 def tree_of(module: str) -> ast.Module:
     return ast.parse((PACKAGE / f"{module}.py").read_text())
 
