@@ -159,7 +159,7 @@ def _bags() -> Iterator[tuple[str, Case]]:
     for storage in ("mcap", "sqlite3"):
         for part in ("messages", "metadata.yaml"):
             name = f"bag/{part}"
-            yield f"{storage} {part}", Case(name, reader(storage), lambda folder, s=storage: whole(folder, s), 8)  # type: ignore[misc]
+            yield f"{storage} {part}", Case(name, reader(storage), lambda folder, s=storage: whole(folder, s), 4)  # type: ignore[misc]
     yield "ros1 bag", Case("one.bag", lambda path: read_bag(path), _ros1, 4)
 
 
