@@ -229,7 +229,7 @@ def noise_scans(case: Case, rng: Rng) -> Case:
 
 def late_half(case: Case, rng: Rng) -> Case:
     """Every other scan is stamped an hour late."""
-    return with_scans(case, lambda s: replace(s, stamps=s.stamps + 3600.0 * (np.arange(len(s.stamps)) % 2)))
+    return shifted(case, lambda t: 3600.0 * (np.arange(len(t)) % 2), "lidar")
 
 
 # ---------------------------------------------------------------- faults of the radio

@@ -48,6 +48,8 @@ class AnchorEstimate:
     """Why the status is not 'ok', in words."""
     alternative: Floats | None = None
     """(2,) the mirrored position, m, where the status is 'mirror-ambiguous'."""
+    since: float = float("nan")
+    """First range from this place, s, where the anchor was moved during the recording; else nan."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ from .constraints import Constraints
 from .map_result import MapResult
 from .mapping_config import MappingConfig
 from .pipeline import (
+    anchor_moves,
     closure_rounds,
     constraint_edges,
     final_stages,
@@ -63,20 +64,30 @@ def build_map(
     config, stages = config or MappingConfig(), Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
     logs = [scan_selection.prepared(log, config) for log in logs]
-    stages.note(logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
-
     estimate = radio_stages.first_optimisation(task)
     if np.any((factors := radio_stages.odometry_unit_factors(estimate, task)) != 1.0):
         logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
         task = replace(task, recordings=gather(logs, config.keyframes))
         estimate = radio_stages.first_optimisation(task)
-    for stage in _stages(task):
-        estimate = stage(estimate, task)
-        task = task.following(estimate)
+    said = stages.mark()
+    for _ in range(_MOST_MOVES):
+        stages.back_to(said)
+        if (renamed := anchor_moves.with_moves_apart(estimate, task)) is not None:
+            task = replace(task, recordings=gather(renamed, config.keyframes))
+            estimate = radio_stages.first_optimisation(task)
+        for stage in _stages(task):
+            estimate = stage(estimate, task)
+            task = task.following(estimate)
+        if not task.recordings.have_scans or anchor_moves.with_moves_apart(estimate, task) is None:
+            break
+    stages.note([recording.log for recording in task.recordings.each])
     grid = final_stages.occupancy_grid(estimate, task)
     return summary.summarise(estimate, grid, task)
 
+
+_MOST_MOVES = 3
+"""How often, at most, a map begins again because anchors were moved while it was recorded."""
 
 Stage = Callable[[Estimate, Task], Estimate]
 

@@ -167,6 +167,8 @@ class Screening:
 
     remarks: tuple[Remark, ...]
     breaks: OdometryBreaks
+    lidar_by_wheels: float = float("nan")
+    """Way by the lidar / way by the wheels; nan where nothing tells."""
 
 
 MOST_METRES, MOST_SECONDS = 1e7, 1e20
@@ -242,9 +244,13 @@ class SensorLog:
         return replace(self, ranges=None if uwb else self.ranges, scans=None if lidar else self.scans)
 
     def with_odometry_times(self, factor: float) -> "SensorLog":
-        """Return the recording with all lengths of its odometry multiplied by a factor."""
-        poses = self.odometry.poses * np.array([factor, factor, 1.0])
-        return self if factor == 1.0 else replace(self, odometry=replace(self.odometry, poses=poses))
+        """Return the same recording with the odometry's lengths multiplied by a factor."""
+        lengths = np.array([factor, factor, 1.0])
+        odometry, screening = replace(self.odometry, poses=self.odometry.poses * lengths), self.screening
+        if screening is not None:
+            breaks = replace(screening.breaks, sigma=screening.breaks.sigma * lengths)
+            screening = replace(screening, breaks=breaks, lidar_by_wheels=screening.lidar_by_wheels / factor)
+        return replace(self, odometry=odometry, screening=screening)
 
     def with_later_scans(self, delay: float) -> "SensorLog":
         """Return the same recording with every scan later by delay, s."""

@@ -66,7 +66,7 @@ def anchors_csv(result: MapResult) -> str:
     """Return the anchors as CSV; positions, sigmas and biases in metres, empty where unknown."""
     lines = [
         "id,x,y,sigma_x,sigma_y,ranges,used_share,bias,bias_sigma,residual_rms,status,"
-        "covariance_xy,alternative_x,alternative_y,reason"
+        "covariance_xy,alternative_x,alternative_y,reason,since"
     ]
     for a in result.anchors:
         other = np.full(2, np.nan) if a.alternative is None else a.alternative
@@ -80,6 +80,7 @@ def anchors_csv(result: MapResult) -> str:
             _decimal(a.covariance[0, 1], 9),
             *(_decimal(v) for v in other),
             a.reason,
+            _decimal(a.since),
         )
         lines.append(",".join(map(_quoted, values)))
     return "\n".join(lines) + "\n"

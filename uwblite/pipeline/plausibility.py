@@ -14,6 +14,7 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..keyframes import OUTSIDE
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from .estimate import Estimate, Task
+from .residual_tests import check_residuals
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate is worth a warning."""
@@ -42,6 +43,9 @@ def judge(
     check_range_stamps(task, OUTSIDE)
     if table:
         check_sustained_outliers(table, estimate.anchor_ids, task)
+        check_residuals(estimate, table["residual"], task)
+    else:
+        check_residuals(estimate, np.zeros(0), task)
     check_handedness(estimate, task)
     check_fit(task)
 

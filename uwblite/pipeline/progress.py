@@ -42,6 +42,14 @@ class Stages:
         """Add a reason not to trust the result."""
         self.doubts.append(Notice(kind, text, figures))
 
+    def mark(self) -> tuple[int, int]:
+        """Return how much was said so far."""
+        return len(self.warnings), len(self.doubts)
+
+    def back_to(self, mark: tuple[int, int]) -> None:
+        """Forget what was said since, because the stages that said it run again."""
+        del self.warnings[mark[0] :], self.doubts[mark[1] :]
+
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage."""
         now = self._clock() if self._clock else 0.0

@@ -1,5 +1,7 @@
 """From the optimised graph to the result: anchors, calibration, doubts, in the user's words."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..arrays import Floats
@@ -11,10 +13,13 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from . import plausibility
+from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
 from .radio_stages import heights_given
 from .recordings import Recording, Recordings
 
+_ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
+"""Doubts that do not speak against all anchors."""
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
 
@@ -30,6 +35,7 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     # By the scatter of ranges to a typical anchor; by its own scatter, no anchor would ever disagree.
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
+    anchors = _with_times(anchors, ranges)
     listed = {u.key: u for recording in recordings.each for u in _unknowns(recording, task.config.calibration)}
     calibrated = tuple(_calibration(k, listed[key], graph, covariance) for k, key in enumerate(graph.calibration.keys))
     table = {} if ranges is None else {
@@ -37,6 +43,8 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
         "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
     }
     plausibility.judge(estimate, anchors, calibrated, listed, table, grid, task)
+    if any(notice.kind not in _ABOUT_PARTS for notice in stages.doubts):
+        anchors = tuple(_distrusted(a) if a.status == "ok" else a for a in anchors)
     stages.end("summary")
     stamps = [recording.trajectory_stamps for recording in recordings.each]
     return MapResult(
@@ -100,6 +108,22 @@ def _anchor(
         status, reason = "distrusted", f"only {used:.0%} of its ranges agree with the map"
     return AnchorEstimate(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, _spread(own), status, reason, alternative
+    )
+
+
+def _distrusted(anchor: AnchorEstimate) -> AnchorEstimate:
+    return replace(anchor, status="distrusted", reason="the map is doubted")
+
+
+def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:
+    """Tell of anchors that were moved since when each place holds."""
+    bases = [name_and_number(a.id)[0] for a in anchors]
+    if ranges is None or len(set(bases)) == len(bases):
+        return anchors
+    first = [float(np.min(ranges.stamps[ranges.anchor == k], initial=np.inf)) for k in range(len(anchors))]
+    return tuple(
+        replace(a, since=t) if bases.count(base) > 1 and np.isfinite(t) else a
+        for a, base, t in zip(anchors, bases, first, strict=True)
     )
 
 

@@ -8,6 +8,7 @@ from .. import se2
 from ..arrays import Bools, Floats
 from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
 from . import cuts, directions, odometry_chain, range_motion, stuck_sensors, units, wheel_motion
+from .wheel_motion import Pairs
 
 _GAP = 2.0
 """Silence of the odometry that is a gap, s; or twenty periods, where that is longer."""
@@ -49,15 +50,24 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     for repair in repairs + [directions.laser_upright] * turn_laser:
         log, more = repair(log)
         remarks += more
-    breaks = [jumps]
-    for step in (_gaps, _lost_wheels):
-        log, own, more = step(log)
-        breaks.append(own)
-        remarks += more
-    own, more = _cuts(log, _sorted(breaks).stamps)
-    breaks.append(own)
-    remarks += more
-    return replace(log, screening=Screening(tuple(remarks), _sorted(breaks)))
+    log, gaps, more = _gaps(log)
+    log, pairs, turned = _looking_ahead(log)
+    log, pairs, lost, standing = _lost_wheels(log, pairs)
+    remarks += [*more, *turned, *standing]
+    cut, more = _cuts(log, _sorted([gaps, lost]).stamps)
+    if pairs is not None:
+        more += wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]))
+    ratio = float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
+    return replace(log, screening=Screening((*remarks, *more), _sorted([jumps, gaps, lost, cut]), ratio))
+
+
+def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Remark]]:
+    """Compare wheels and lidar, the laser turned to where the driving shows that it looks."""
+    pairs = wheel_motion.compare(log)
+    if pairs is None or not pairs.measured.any():
+        return log, None, []
+    log, remarks = directions.laser_ahead(log, pairs)
+    return log, wheel_motion.compare(log) if remarks else pairs, remarks
 
 
 def _clock_remarks(log: SensorLog) -> list[Remark]:
@@ -131,27 +141,23 @@ def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
     return replace(log, ranges=ranges, scans=scans)
 
 
-def _lost_wheels(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
+def _lost_wheels(
+    log: SensorLog, pairs: Pairs | None
+) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Remark]]:
     """Find stretches in which the wheels stand and other sensors move, and put something in their place."""
-    pairs = wheel_motion.compare(log)
     start = float(log.odometry.stamps[0])
-    if pairs is not None and pairs.measured.any():
-        log, turned = directions.laser_ahead(log, pairs)
-        if turned:
-            log, breaks, remarks = _lost_wheels(log)
-            return log, breaks, turned + remarks
-        stretches = wheel_motion.lost(log, pairs)
-        remarks = [_lost_remark(a - start, b - start, "the motion from scan to scan stands in for them") for a, b in stretches]
-        if stretches:
-            odometry, breaks = wheel_motion.replaced(log, stretches)
-            log = replace(log, odometry=odometry)
-            pairs = wheel_motion.compare(log) or pairs
-            return log, breaks, remarks + wheel_motion.disagreeing(pairs, start)
-        return log, OdometryBreaks.none(), wheel_motion.disagreeing(pairs, start)
-    stretches = [(a, b) for a, b in wheel_motion.standing(log.odometry, 5.0) if range_motion.excess(log, a, b) > 0.0]
-    text = "the trajectory there rests on ranges alone"
-    remarks = [replace(_lost_remark(a - start, b - start, text), doubt=True) for a, b in stretches]
-    return log, _unknown_steps(log.odometry, stretches), remarks
+    if pairs is None:
+        stretches = [(a, b) for a, b in wheel_motion.standing(log.odometry, 5.0) if range_motion.excess(log, a, b) > 0.0]
+        text = "the trajectory there rests on ranges alone"
+        remarks = [replace(_lost_remark(a - start, b - start, text), doubt=True) for a, b in stretches]
+        return log, None, _unknown_steps(log.odometry, stretches), remarks
+    stretches = wheel_motion.lost(log, pairs)
+    if not stretches:
+        return log, pairs, OdometryBreaks.none(), []
+    odometry, breaks = wheel_motion.replaced(log, stretches)
+    remarks = [_lost_remark(a - start, b - start, "the motion from scan to scan stands in for them") for a, b in stretches]
+    log = replace(log, odometry=odometry)
+    return log, wheel_motion.compare(log), breaks, remarks
 
 
 def _lost_remark(a: float, b: float, outcome: str) -> Remark:

@@ -163,6 +163,7 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
     smooth = np.convolve(bad, np.ones(_LEAST_PAIRS) / _LEAST_PAIRS, mode="same") > _MOST
     edges = np.flatnonzero(np.diff(np.concatenate([[False], smooth, [False]]).astype(np.int64))).reshape(-1, 2)
     runs = [(own.start[a], own.end[b - 1]) for a, b in edges if own.end[b - 1] - own.start[a] >= _LEAST_SECONDS]
+    runs = runs or _other_scale(own, start)
     if not runs:
         return []
     when = ", ".join(f"t = {a - start:.0f} to {b - start:.0f} s" for a, b in runs[:3])
@@ -172,6 +173,50 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
         "factor there than elsewhere"
     )
     return [Remark("wheels-against-lidar", text, doubt=True)]
+
+
+def way_ratio(pairs: Pairs) -> float:
+    """Return the way by the lidar / the way by the wheels; nan where there are too few clear motions."""
+    own = pairs.rows(pairs.measured)
+    ratio = _ratios(own.wheels[:, :2], own.lidar[:, :2], _CLEAR_WAY)[1]
+    return float(np.median(ratio)) if len(ratio) >= 2 * _LEAST_PAIRS else float("nan")
+
+
+def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
+    """Return the longest stretch in which ways or turns have another ratio than elsewhere."""
+    for columns, clear in ((slice(0, 2), _CLEAR_WAY), (slice(2, 3), _CLEAR_TURN)):
+        rows, ratio = _ratios(own.wheels[:, columns], own.lidar[:, columns], clear)
+        if len(rows) < 3 * _CHUNK:
+            continue
+        parts = np.array_split(np.arange(len(rows)), len(rows) // _CHUNK)
+        middle = np.array([np.median(ratio[p]) for p in parts])
+        sigma = np.array([1.2533 * 1.4826 * np.median(np.abs(ratio[p] - np.median(ratio[p]))) / np.sqrt(len(p)) for p in parts])
+        usual = float(np.median(middle))
+        spread = 1.4826 * float(np.median(np.abs(middle - usual)))
+        off = np.abs(middle - usual) > np.maximum(_OTHER_RATIO * usual, _RATIO_SIGMAS * np.hypot(sigma, spread))
+        # Half of the recording may be the other half's exception: then the parts scatter, each sharply.
+        halves = [np.median(middle[h]) for h in np.array_split(np.arange(len(middle)), 2)]
+        if abs(halves[0] - halves[1]) > max(_OTHER_RATIO * usual, _RATIO_SIGMAS * float(np.median(sigma))):
+            off = np.abs(middle - halves[0]) > np.abs(middle - halves[1])
+        if off.sum() >= 2:
+            inside = np.concatenate([rows[p] for p, o in zip(parts, off.tolist(), strict=True) if o])
+            return [(float(own.start[inside[0]]), float(own.end[inside[-1]]))]
+    return []
+
+
+def _ratios(wheels: Floats, lidar: Floats, clear: float) -> tuple[Ints, Floats]:
+    """Return the pairs with a clear motion by either, and the ratio of lidar to wheels along the larger of the two."""
+    size = np.sqrt(np.sum(wheels**2, axis=1))
+    rows = np.flatnonzero(size > clear)
+    return rows, np.sum(wheels * lidar, axis=1)[rows] / size[rows] ** 2
+
+
+_CLEAR_WAY, _CLEAR_TURN = 0.05, 0.1
+"""Ways, m, and turns, rad, whose ratio is no noise."""
+_CHUNK = 12
+"""Pairs whose median ratio is taken."""
+_OTHER_RATIO, _RATIO_SIGMAS = 0.15, 5.0
+"""Relative difference of ratios, and in their standard deviations, from which they are not the same."""
 
 
 def _factor(wheels: Floats, lidar: Floats, least: float) -> float:

@@ -1,0 +1,42 @@
+"""An anchor that is moved while it is heard is told from one that is not, and the moment is found."""
+
+import numpy as np
+import pytest
+
+from uwblite.radio.change_points import find_move
+from uwblite.radio.trilateration import TrilaterationConfig
+
+STAMPS = np.arange(0.0, 200.0, 1.0)
+PATH = np.column_stack([5.0 + 4.0 * np.cos(0.11 * STAMPS), 4.0 + 3.0 * np.sin(0.17 * STAMPS)])
+SIGMA = 0.06
+
+
+def heard(seed, before, after=None, moment=100, share=0.1):
+    """Return ranges with noise, a bias and a share of them too long, to one place and from a moment on to another."""
+    rng = np.random.default_rng(seed)
+    place = np.where((np.arange(len(STAMPS)) < moment)[:, None], before, before if after is None else after)
+    blocked = rng.random(len(STAMPS)) < share
+    return np.hypot(*(place - PATH).T) + 0.2 + rng.normal(0.0, SIGMA, len(STAMPS)) + blocked * rng.exponential(0.8, len(STAMPS))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("moment", [60, 100, 140])
+def test_a_move_is_found_with_its_places_and_its_moment(seed, moment):
+    before, after = np.array([-2.0, 1.0]), np.array([-0.5, 3.5])
+    move = find_move(PATH, heard(seed, before, after, moment), STAMPS, SIGMA, TrilaterationConfig())
+    assert move is not None
+    assert abs(move.stamp - moment) <= 5.0
+    assert np.hypot(*(move.before - before)) < 0.5
+    assert np.hypot(*(move.after - after)) < 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
+def test_an_anchor_that_stands_still_was_not_moved_however_often_its_sight_is_blocked(seed, share):
+    assert find_move(PATH, heard(seed, np.array([-2.0, 1.0]), share=share), STAMPS, SIGMA, TrilaterationConfig()) is None
+
+
+def test_a_few_ranges_show_no_move():
+    few = slice(0, 30)
+    ranges = heard(1, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), moment=15)[few]
+    assert find_move(PATH[few], ranges, STAMPS[few], SIGMA, TrilaterationConfig()) is None

@@ -1,0 +1,113 @@
+"""Tests of each kind of measurement against the joint estimate: what noise cannot explain is a doubt.
+
+Every test compares what the estimate leaves with what the sensor itself says of its noise, over stretches of time, and
+knows of no particular fault.
+"""
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from ..graph.calibration import RANGE_SCALE
+from ..radio.range_noise import short_term_sigma
+from .estimate import Estimate, Task
+
+_SCATTER, _TIMES_NOISE = 0.3, 3.0
+"""Typical scatter of ranges about the map, m, and in units of their scatter from one to the next, that multipath and blocked
+sight do not exceed."""
+_NO_DISTANCES = 1.5
+"""Ranges that scatter by more are no distances, m."""
+_SUDDEN = 5.0
+"""Standard deviations that a step of sound wheels hardly ever exceeds."""
+_WINDOW, _MOST = 10, 0.6
+"""Steps in a row, and the share of them that must be off."""
+_MEASURED_BREAK = 0.15
+"""Steps more uncertain than that, m, are no measurements."""
+_SCALE = 0.12
+"""Relative disagreement of two sensors on lengths beyond which one of them is at fault."""
+
+
+def check_residuals(estimate: Estimate, residuals: Floats, task: Task) -> None:
+    """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, speak against.
+
+    Parameters
+    ----------
+    estimate : final. residuals : what is left of its ranges (m,), m.
+    """
+    check_range_scatter(estimate, residuals, task)
+    check_odometry_steps(estimate, task)
+    check_scales(estimate, task)
+    check_support(estimate, task)
+
+
+def check_range_scatter(estimate: Estimate, residuals: Floats, task: Task) -> None:
+    """Compare how ranges scatter about the map with how they scatter from one to the next."""
+    ranges = estimate.ranges
+    if ranges is None or not (alive := np.asarray(ranges.weights) > 0).any():
+        return
+    short = short_term_sigma(ranges.stamps[alive], ranges.anchor[alive], ranges.ranges[alive], task.config.ranges)
+    typical = float(np.median(_spread_by_anchor(residuals[alive], ranges.anchor[alive])))
+    if typical <= min(max(_SCATTER, _TIMES_NOISE * short), _NO_DISTANCES):
+        return
+    text = f"the ranges scatter by {typical:.1f} m: they are no distances to anchors that stand still"
+    if typical > _TIMES_NOISE * short:
+        text = (
+            f"the ranges lie {typical:.2f} m (typically) off the map, and only {short:.2f} m from one to the next: clocks, ids "
+            "or the trajectory are wrong"
+        )
+    task.stages.doubt("range-scatter", text, typical=typical, short_term=short)
+
+
+def check_odometry_steps(estimate: Estimate, task: Task) -> None:
+    """Find stretches in which most steps of the odometry are off by more than their noise, whatever it was estimated to be."""
+    wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
+    if len(wheels) < _WINDOW:
+        return
+    measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
+    off = (np.abs(wheels.residuals(graph)).max(axis=1) > _SUDDEN) & measured
+    share = np.convolve(off, np.ones(_WINDOW) / _WINDOW, mode="valid")
+    if share.max() < _MOST:
+        return
+    first = int(np.argmax(share >= _MOST))
+    last = len(share) - 1 - int(np.argmax(share[::-1] >= _MOST)) + _WINDOW
+    a, b = (float(stamps[wheels.i[k]] - stamps[0]) for k in (first, min(last, len(wheels) - 1)))
+    text = f"between t = {a:.0f} and {b:.0f} s most steps of the odometry disagree with the map far beyond their noise"
+    task.stages.doubt("odometry-steps", text, start=a, end=b)
+
+
+def check_scales(estimate: Estimate, task: Task) -> None:
+    """Compare the lengths that odometry, lidar and radio measure."""
+    if not task.recordings.have_scans:
+        return
+    known = estimate.graph.calibration
+    place = known.index(RANGE_SCALE)
+    scale = 1.0 + (float(known.values[place]) if place >= 0 else 0.0)
+    if estimate.placed.any() and abs(scale - 1.0) > _SCALE:
+        text = f"the ranges are {scale:.2f} times what the lidar's map says: one of the two has a wrong unit or scale"
+        task.stages.doubt("scales", text, ranges_by_lidar=scale)
+    screenings = [recording.log.screening for recording in task.recordings.each]
+    ratios = np.array([s.lidar_by_wheels for s in screenings if s is not None])
+    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _SCALE)]
+    if len(off):
+        outcome = "the ranges agree with the wheels" if estimate.placed.any() else "nothing tells which of the two is right"
+        text = (
+            f"the lidar sees {off[0]:.2f} times the way that the wheels count, and {outcome}: the map has the lidar's scale; "
+            "check the units of both"
+        )
+        task.stages.doubt("scales", text, lidar_by_wheels=float(off[0]))
+
+
+def check_support(estimate: Estimate, task: Task) -> None:
+    """Doubt a map that nothing but the odometry holds."""
+    ranges = estimate.ranges
+    held = ranges is not None and bool(np.any(np.asarray(ranges.weights) > 0))
+    lidar = (estimate.steps, estimate.joint, estimate.closures.edges)
+    held |= any(edges is not None and len(edges) > 0 for edges in lidar)
+    if not held and len(estimate.graph.poses) > 2:
+        text = "neither ranges nor scans hold the trajectory: it is the odometry's alone, and drifts"
+        task.stages.doubt("odometry-alone", text)
+
+
+def _spread_by_anchor(residuals: Floats, anchor: Ints) -> Floats:
+    """Return the robust standard deviation of the residuals (m,) of each anchor that has any, m."""
+    own = [residuals[anchor == k] for k in np.unique(anchor)]
+    return np.array([1.4826 * float(np.median(np.abs(r - np.median(r)))) for r in own])
