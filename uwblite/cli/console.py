@@ -9,9 +9,12 @@ import os
 import sys
 import time
 import traceback
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from ..printable import encodable, printable
+
+if TYPE_CHECKING:
+    from .stage_shares import Overall
 
 _LOGGER = logging.getLogger("uwblite")
 
@@ -129,12 +132,16 @@ def _clear_bar() -> None:
 
 
 class Progress:
-    """A progress bar on stderr, with the time left in the present stage; silent where stderr is not a terminal.
+    """A progress bar on stderr, with the time left; silent where stderr is not a terminal.
 
-    Call it as ``progress(stage, done, total)``: the signature that ``build_map`` asks for.
+    Call it as ``progress(stage, done, total)``: the signature that ``build_map`` asks for. The time left is that of the
+    stage, or of all stages where `overall` knows their shares.
     """
 
-    def __init__(self, stream: TextIO | None = None, clock: Any = time.monotonic) -> None:
+    def __init__(
+        self, stream: TextIO | None = None, clock: Any = time.monotonic, overall: "Overall | None" = None
+    ) -> None:
+        self.overall, self.first = overall, 0.0 if overall is None else clock()
         self.stream = sys.stderr if stream is None else stream
         self.clock = clock
         self.active = self.stream.isatty() and not _CONSOLE.quiet
@@ -148,13 +155,18 @@ class Progress:
         if not self.active:
             return
         now = self.clock()
+        if self.overall is not None:
+            self.overall.take(stage, done, total)
         if stage != self.stage:
             self.clear()
             self.stage, self.began, self.shown = stage, now, -1.0
         if now - self.shown < 0.1 and done < total:
             return
         self.shown = now
-        self._draw(progress_line(stage, done, total, now - self.began))
+        if self.overall is None:
+            self._draw(progress_line(stage, done, total, now - self.began))
+        else:
+            self._draw(overall_line(stage, self.overall.share, now - self.first))
 
     def _draw(self, line: str) -> None:
         line = printable(line)[: self._columns() - 1]
@@ -190,6 +202,13 @@ def progress_line(stage: str, done: int, total: int, elapsed: float) -> str:
     bar = "#" * int(20 * share)
     left = f"  {duration(elapsed * (1.0 - share) / share)} left" if 0.0 < share < 1.0 and elapsed > 1.0 else ""
     return f"{stage:<16} [{bar:<20}] {100 * share:3.0f} %{left}"
+
+
+def overall_line(stage: str, share: float, elapsed: float) -> str:
+    """Return the text of a progress bar over all stages; elapsed is the time since the first began, s."""
+    known = 0.05 < share < 1.0 and elapsed > 2.0
+    left = f"  about {duration(elapsed * (1.0 - share) / share)} left" if known else ""
+    return f"[{'#' * int(20 * share):<20}] {100 * share:3.0f} %  {stage}{left}"
 
 
 def duration(seconds: float) -> str:

@@ -150,8 +150,9 @@ def _known(args: argparse.Namespace) -> "Constraints":
 def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Constraints", jobs: int) -> "MapResult":
     from ..mapping import build_map
     from . import console
+    from .stage_shares import Overall
 
-    progress = console.Progress()
+    progress = console.Progress(overall=Overall())
 
     def report(stage: str, done: int, total: int) -> None:
         if stage.startswith("occupancy grid of"):

@@ -1,0 +1,46 @@
+"""The time left over all stages: it knows every stage of a real map, never runs backwards, and ends near the end."""
+
+import itertools
+
+import pytest
+
+from uwblite.cli import console
+from uwblite.cli.stage_shares import _SHARES, Overall
+from uwblite.mapping import build_map
+
+
+@pytest.mark.parametrize("lidar", [True, False])
+def test_every_stage_of_a_map_is_known_and_the_share_only_rises(log, lidar):
+    overall, shares, strangers = Overall(), [0.0], set()
+    known = {name for name, _ in _SHARES}
+    first = log.odometry.stamps[0]
+
+    def progress(stage, done, total):
+        shares.append(overall.take(stage, done, total))
+        if stage.rstrip(" 0123456789") not in known and not stage.startswith("occupancy grid of"):
+            strangers.add(stage)
+
+    build_map(log.crop(first, first + 60.0).without(lidar=not lidar), progress=progress)
+    assert strangers == set()
+    assert shares == sorted(shares)
+    assert shares[-1] > 0.95
+    assert len(set(shares)) > 5
+
+
+def test_rounds_share_what_is_left_of_their_stage():
+    overall = Overall()
+    rounds = [overall.take(f"loop closure {k}", 1, 1) for k in range(1, 6)]
+    steps = [b - a for a, b in itertools.pairwise(rounds)]
+    assert all(b == pytest.approx(a / 2) for a, b in itertools.pairwise(steps))
+    assert Overall().take("joint refinement", 0, 10) > rounds[-1]
+
+
+def test_unknown_stages_and_empty_ones_change_nothing():
+    overall = Overall()
+    assert overall.take("clouds", 1, 2) == overall.take("something new", 1, 1) == overall.take("keyframes", 0, 0)
+
+
+def test_the_line_says_the_time_left_once_it_can_be_told():
+    assert "left" not in console.overall_line("clouds", 0.02, 60.0)
+    assert "left" not in console.overall_line("clouds", 0.5, 1.0)
+    assert console.overall_line("clouds", 0.25, 30.0) == "[#####               ]  25 %  clouds  about 1 min 30 s left"
