@@ -45,7 +45,7 @@ WORST = 1.6
 
 @dataclass(frozen=True)
 class Row:
-    """One kind of drive and what is asked of it."""
+    """One kind of recording and what is asked of it."""
 
     name: str
     settings: Settings
@@ -66,7 +66,7 @@ ROWS = {
     "slips": Row("hall, wheels twice as bad, 3 slips", Settings(world="hall", odometry_scale=2.0, slips=3), 0.05, 0.08),
     "warehouse": Row("warehouse, equal racks, 60 min", Settings(world="warehouse"), 0.15, 0.20),
     "heights": Row(
-        "hall, anchors at 2 m, tag at 0.3 m, not told", Settings(world="hall", anchor_height=2.0, tag_height=0.3), 0.04, 0.06
+        "hall, anchors at 2 m, tag at 0.3 m, not given", Settings(world="hall", anchor_height=2.0, tag_height=0.3), 0.04, 0.06
     ),
     "radio off": Row("hall, no UWB", Settings(world="hall"), 0.10, 0.15, ("use_uwb=false",)),
 }
@@ -95,12 +95,12 @@ INGREDIENTS: dict[str, tuple[str, ...]] = {
     "noise of ranges learnt": ("ranges.learn=false",),
     "correlation of ranges": ("ranges.learn=false", "ranges.slow_share=0"),
     "errors steady by direction": ("ranges.steady=0",),
-    "evidence for the radio's priors": ("calibration.range_scale_sound=0.15", "calibration.range_bias_sound=0.8"),
+    "marginal likelihood for the radio's priors": ("calibration.range_scale_sound=0.15", "calibration.range_bias_sound=0.8"),
     "robust kernels of wheels and ranges": ("odometry.kernel.name=none", "ranges.kernel.name=none"),
     "tracking": ("scan_to_scan.on=false",),
     "loop closures of sub-maps": ("loop_closure.rounds=0",),
     "joint refinement": ("refinement.rounds=0",),
-    "pairs chosen anew": ("refinement.selections=1",),
+    "pairs chosen again": ("refinement.selections=1",),
     "second scan per key pose": ("keyframes.scans=1",),
     "corners": ("clouds.linearity=0.85",),
     "deskewing": ("deskew",),
@@ -110,7 +110,7 @@ INGREDIENTS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Task:
-    """A drive, simulated and read once, and the settings to map it with."""
+    """A recording, simulated and read once, and the settings to map it with."""
 
     name: str
     settings: Settings
@@ -130,7 +130,7 @@ def flat(log: SensorLog) -> SensorLog:
 
 
 def work(task: Task) -> list[tuple[str, str, Figures]]:
-    """Make all maps of a drive and compare them with the truth."""
+    """Make all maps of a recording and compare them with the truth."""
     trial = made(task.settings)
     done = []
     for name, changes in task.runs:
@@ -175,7 +175,7 @@ def simulated(args: argparse.Namespace) -> str:
             row.name, float(np.mean(columns)), max(columns), f"{row.column:g}", float(np.mean(ates)), max(ates),
             f"{row.ate:g}", float(np.mean([f.anchors for f in figures])), doubts, "yes" if good else "**no**",
         ])
-    head = ["drive", "columns", "worst", "bar", "ATE", "worst", "bar", "anchors", "doubted", "kept"]
+    head = ["recording", "columns", "worst", "bar", "ATE", "worst", "bar", "anchors", "doubted", "kept"]
     text = table(head, lines)
     verdict = "All bars are kept." if not missed else f"Missed: {'; '.join(missed)}."
     return (
@@ -283,8 +283,10 @@ def ablation(args: argparse.Namespace) -> str:
         ]
         if run != base and not worse:
             useless.append(run)
-    verdict = f"Buys nothing on any of these drives (less than a twentieth in ATE and anchors): {', '.join(useless) or 'none'}."
-    length = ", drives of 6 min" if args.quick else ""
+    verdict = (
+        f"Buys nothing on any of these recordings (less than a twentieth in ATE and anchors): {', '.join(useless) or 'none'}."
+    )
+    length = ", recordings of 6 min" if args.quick else ""
     return f"## What each ingredient buys\n\nEach left out in turn, seed {args.seed}{length}.\n{text}\n{verdict}"
 
 
@@ -297,7 +299,7 @@ def injection(args: argparse.Namespace) -> str:
         rng = np.random.default_rng(seed)
         clean, spoilt = (solved(g, trial, result.keyframe_stamps) for g in (plain(result.graph), wronged(result.graph, rng)))
         rows.append([seed, clean, spoilt, spoilt / clean])
-    text = table(["seed", "clean", "with 30 % lies", "ratio"], rows)
+    text = table(["seed", "clean", "with 30 % false", "ratio"], rows)
     return (
         "## False measurements\n\nHall, 8 min: 30 % false closures, anywhere and of the true ones' weight, and 30 % of the "
         f"ranges replaced\nby nonsense, then graduated non-convexity (`uwblite.graph.gnc`); ATE of the key poses, m.\n\n{text}"
@@ -350,12 +352,12 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("parts", nargs="*", choices=[*PARTS, []], metavar="PART", help=f"some of {', '.join(PARTS)} (all)")
     p.add_argument("--out", type=Path, default=ROOT / "docs" / "accuracy.md", metavar="FILE", help="page to write into")
     p.add_argument("--print", action="store_true", help="print instead of writing")
-    p.add_argument("--seeds", type=int, default=3, metavar="N", help="drives per row (3)")
-    p.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the ablation's drives (1)")
-    p.add_argument("--only", default="", metavar="NAMES", help="drives or recordings, separated by commas")
+    p.add_argument("--seeds", type=int, default=3, metavar="N", help="recordings per row (3)")
+    p.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the ablation's recordings (1)")
+    p.add_argument("--only", default="", metavar="NAMES", help="recordings, separated by commas")
     p.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting; repeatable")
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
-    p.add_argument("--quick", action="store_true", help="drives of 6 min")
+    p.add_argument("--quick", action="store_true", help="recordings of 6 min")
     args = p.parse_args(argv)
     made_by = {"simulated": simulated, "real": real, "ablation": ablation, "injection": injection}
     if not args.print and not args.out.exists():

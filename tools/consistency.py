@@ -42,7 +42,7 @@ FIRST_SEED = 1000
 
 @dataclass(frozen=True)
 class Consistency:
-    """Normalised errors of one drive."""
+    """Normalised errors of one recording."""
 
     name: str
     poses: Floats
@@ -61,7 +61,7 @@ class Consistency:
 
 @dataclass(frozen=True)
 class Task:
-    """A drive and the settings to map it with."""
+    """A recording and the settings to map it with."""
 
     name: str
     settings: Settings
@@ -95,14 +95,14 @@ def compare(name: str, result: MapResult, trial: Trial) -> Consistency:
 
 
 def work(task: Task) -> Consistency:
-    """Simulate a drive, map it and compare; the grid does not matter and is drawn coarsely."""
+    """Simulate a recording, map it and compare; the grid does not matter and is drawn coarsely."""
     trial = made(task.settings)
     config = override(MappingConfig(), ("grid.resolution=0.5", *task.changes))
     return compare(task.name, build_map(trial.log, config), trial)
 
 
 def row(name: str, some: Sequence[Consistency]) -> list[object]:
-    """Return a row of the table: means over drives, and shares of all values below the quantile of 95 %."""
+    """Return a row of the table: means over recordings, and shares of all values below the quantile of 95 %."""
     def inside(values: list[Floats], dimensions: int) -> str:
         return f"{100.0 * float(np.mean(np.concatenate(values) < chi2.ppf(0.95, dimensions))):.0f} %"
 
@@ -118,7 +118,7 @@ def row(name: str, some: Sequence[Consistency]) -> list[object]:
 
 
 HEAD = (
-    "drive", "runs", "pose (3)", "x, y (2)", "heading (1)", "pose, median (2.4)", "pose, inside 95 %", "error", "stated",
+    "recording", "runs", "pose (3)", "x, y (2)", "heading (1)", "pose, median (2.4)", "pose, inside 95 %", "error", "stated",
     "anchor (2)", "anchor, median (1.4)", "anchor, inside 95 %",
 )
 
@@ -129,7 +129,7 @@ def document(found: Sequence[Consistency], minutes: float) -> str:
     rows = [row(n, [c for c in found if c.name == n]) for n in names]
     rows.append(row("all", found))
     return (
-        f"## Are the stated uncertainties true?\n\n{len(found)} simulated drives of {minutes:g} min. Normalised errors squared "
+        f"## Are the stated uncertainties true?\n\n{len(found)} simulated recordings of {minutes:g} min. Normalised errors squared "
         "(in brackets what is expected of true\ncovariances), in the frame of the first pose, relative to which the "
         "covariances are; the share of them inside the\nquantile of 95 %; rms error and rms stated standard deviation of the "
         "positions, m.\n\n" + table(HEAD, rows)
@@ -139,7 +139,7 @@ def document(found: Sequence[Consistency], minutes: float) -> str:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--runs", type=int, default=20, metavar="N", help="drives (20)")
+    p.add_argument("--runs", type=int, default=20, metavar="N", help="recordings (20)")
     p.add_argument("--minutes", type=float, default=7.0, metavar="N", help="length of each (7)")
     p.add_argument("--out", type=Path, default=ROOT / "docs" / "accuracy.md", metavar="FILE", help="page to write into")
     p.add_argument("--print", action="store_true", help="print instead of writing")

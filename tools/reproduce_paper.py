@@ -51,7 +51,7 @@ QUICK_WITHOUT_MAP = ("grid.resolution=0.5",)
 
 @dataclass(frozen=True)
 class Run:
-    """One map to make of a drive."""
+    """One map to make of a recording."""
 
     key: tuple[str, ...]
     """What it is for: table, then row and column."""
@@ -66,14 +66,14 @@ class Run:
 
 @dataclass(frozen=True)
 class Task:
-    """A drive and everything that is done with it; the drive is simulated and read once."""
+    """A recording and everything that is done with it; the recording is simulated and read once."""
 
     settings: Settings
     runs: tuple[Run, ...]
 
 
 def heard(trial: Trial, nodes: tuple[int, ...]) -> Trial:
-    """Return the drive as if only these anchors, counted from 1, had been there."""
+    """Return the recording as if only these anchors, counted from 1, had been there."""
     ranges = trial.log.ranges
     if not nodes or ranges is None:
         return trial
@@ -90,7 +90,7 @@ def heard(trial: Trial, nodes: tuple[int, ...]) -> Trial:
 
 
 def work(task: Task) -> list[tuple[tuple[str, ...], Figures]]:
-    """Simulate a drive, make all its maps and compare them with the truth."""
+    """Simulate a recording, make all its maps and compare them with the truth."""
     trial = made(task.settings)
     done = []
     for run in task.runs:
@@ -112,7 +112,7 @@ def draw(result: MapResult, path: str, caption: str) -> None:
 
 
 def planned(args: argparse.Namespace, pictures: Path) -> list[Task]:
-    """List the drives and what is done with each."""
+    """List the recordings and what is done with each."""
     minutes = 6.0 if args.quick else None
     seeds = range(1, 2 if args.quick else args.seeds + 1)
     tasks = []
@@ -197,7 +197,7 @@ def table_1(results: Results, seeds: Sequence[str]) -> str:
     for n, (a, b, _, _) in enumerate(first["odometry", "paper"].pairs):
         rows.append([f"{a} - {b}"] + [first[m, p].pairs[n][3] for p in PRESETS for m in METHODS])
     head = ["pair"] + [f"{p}: {m}" for p in PRESETS for m in METHODS]
-    return text + "\nThe ten pairs of the hall, first drive, as drawn:\n\n" + table(head, rows)
+    return text + "\nThe ten pairs of the hall, first recording, as drawn:\n\n" + table(head, rows)
 
 
 def by_row(results: Results, name: str, first: str, presets: Sequence[str] = PRESETS) -> str:
@@ -285,7 +285,7 @@ HEAD = """\
 Written by `tools/reproduce_paper.py`; do not edit. All figures in metres unless said otherwise; `-` = not known.
 
 Liu et al. drove a robot for 31 min through a hall and judged maps by ten distances between columns. Their recordings
-are not public. Here the drives are simulated: {drives}. *paper* is `--preset paper`: the plain choices of the paper;
+are not public. Here the recordings are simulated: {drives}. *paper* is `--preset paper`: the plain choices of the paper;
 *default* is uwblite without options. From the paper only the figures that everything is measured against are quoted.
 
 Errors of column distances are given twice: *in the map*, where the columns were found (so many of the pairs asked), and
@@ -310,7 +310,7 @@ def document(results: Results, args: argparse.Namespace) -> str:
     parts = [
         HEAD.format(drives=f"{len(seeds)} of the hall, one of a corridor loop and one of a cluttered lab, {minutes}"),
         "## What reproduces\n\n" + differences(results, seeds) + "\n" + NOTES,
-        "## Table I: methods\n\nHall: mean of the drives.\n\n" + table_1(results, seeds),
+        "## Table I: methods\n\nHall: mean of the recordings.\n\n" + table_1(results, seeds),
         "## Table II: which UWB nodes\n\nHall, heavy NLOS on nodes 3 and 4.\n\n" + by_row(results, "II", "nodes"),
         "## Table III: size of sub-maps\n\nSub-maps of 0 m are single key poses; the paper's preset then tries the best four "
         "partners of each only.\n\n" + by_row(results, "III", "epsilon, m"),
@@ -318,7 +318,7 @@ def document(results: Results, args: argparse.Namespace) -> str:
         + "\nOf the joint refinement, which has that place in the defaults:\n\n"
         + by_row(results, "IV", "rounds", ("default",)),
         "## Fitness threshold and outlier distance\n\nColumn error as drawn (accepted closures).\n" + grids(results),
-        "## Table V: time per stage\n\nFull method, first drive of the hall; this machine was not idle.\n\n"
+        "## Table V: time per stage\n\nFull method, first recording of the hall; this machine was not idle.\n\n"
         + table_5(results, seeds[0]),
         "## Maps\n\n" + gallery(),
     ]
@@ -339,8 +339,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--out", type=Path, default=ROOT / "docs", metavar="DIR", help="folder of paper.md (docs)")
-    p.add_argument("--quick", action="store_true", help="drives of 6 min, one seed, few values")
-    p.add_argument("--seeds", type=int, default=3, metavar="N", help="drives of the hall (3)")
+    p.add_argument("--quick", action="store_true", help="recordings of 6 min, one seed, few values")
+    p.add_argument("--seeds", type=int, default=3, metavar="N", help="recordings of the hall (3)")
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     args = p.parse_args(argv)
     pictures = args.out / "images"

@@ -1,4 +1,4 @@
-"""Simulated drives with their truth, and how far a map of one is from it; shared by the tools that measure accuracy."""
+"""Simulated recordings with their truth, and how far a map of one is from it; shared by the tools that measure accuracy."""
 
 import os
 import re
@@ -87,7 +87,7 @@ class Figures:
 
 
 def made(settings: Settings) -> Trial:
-    """Simulate a drive and read it back from a log in a temporary folder."""
+    """Simulate a recording and read it back from a log in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix="uwblite-") as folder:
         logfile.write(simulate(settings), Path(folder))
         return loaded(Path(folder))
