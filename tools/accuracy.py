@@ -3,7 +3,7 @@
 
     python tools/accuracy.py                                     everything, about an hour on two cores
     python tools/accuracy.py simulated --seeds 1 --only hall,lab a part of it
-    python tools/accuracy.py simulated --quick --print           drives of 6 min, nothing written
+    python tools/accuracy.py simulated --quick --print           recordings of 6 min, nothing written
     python tools/accuracy.py ablation --set keyframes.scans=3
 
 Parts: simulated (buildings x seeds against bars), real (recordings of others, where they are: UWBLITE_SHARED_DATA),

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Are the stated uncertainties true? Maps simulated drives and compares errors with the covariances that uwblite states.
+"""Are the stated uncertainties true? Maps simulated recordings and compares errors with the covariances that uwblite states.
 
-    python tools/consistency.py                              20 drives of 7 min; writes into docs/accuracy.md
+    python tools/consistency.py                              20 recordings of 7 min; writes into docs/accuracy.md
     python tools/consistency.py --runs 4 --minutes 4 --print a quick look
     python tools/consistency.py --set refinement.correlation=8 --print
 
@@ -129,8 +129,8 @@ def document(found: Sequence[Consistency], minutes: float) -> str:
     rows = [row(n, [c for c in found if c.name == n]) for n in names]
     rows.append(row("all", found))
     return (
-        f"## Are the stated uncertainties true?\n\n{len(found)} simulated recordings of {minutes:g} min. Normalised errors squared "
-        "(in brackets what is expected of true\ncovariances), in the frame of the first pose, relative to which the "
+        f"## Are the stated uncertainties true?\n\n{len(found)} simulated recordings of {minutes:g} min. Normalised errors "
+        "squared (in brackets what is expected of true\ncovariances), in the frame of the first pose, relative to which the "
         "covariances are; the share of them inside the\nquantile of 95 %; rms error and rms stated standard deviation of the "
         "positions, m.\n\n" + table(HEAD, rows)
     )

@@ -2,7 +2,7 @@
 """Repeat the experiments of the paper on simulated buildings, with its plain settings and with the defaults.
 
     python tools/reproduce_paper.py            docs/paper.md and docs/images/paper_*.png; ten minutes on two cores
-    python tools/reproduce_paper.py --quick --out paper-out    drives of 6 min, one seed, a few minutes
+    python tools/reproduce_paper.py --quick --out paper-out    recordings of 6 min, one seed, a few minutes
 
 Liu et al., Cost-effective Mapping of Mobile Robot Based on the Fusion of UWB and Short-range 2D LiDAR (CITATION.cff):
 table I (methods), II (UWB nodes), III (sub-map size), IV (iterations of ICP), the grid of fitness threshold and outlier
@@ -285,7 +285,7 @@ HEAD = """\
 Written by `tools/reproduce_paper.py`; do not edit. All figures in metres unless said otherwise; `-` = not known.
 
 Liu et al. drove a robot for 31 min through a hall and judged maps by ten distances between columns. Their recordings
-are not public. Here the recordings are simulated: {drives}. *paper* is `--preset paper`: the plain choices of the paper;
+are not public. Here the recordings are simulated: {recordings}. *paper* is `--preset paper`: the plain choices of the paper;
 *default* is uwblite without options. From the paper only the figures that everything is measured against are quoted.
 
 Errors of column distances are given twice: *in the map*, where the columns were found (so many of the pairs asked), and
@@ -308,7 +308,7 @@ def document(results: Results, args: argparse.Namespace) -> str:
     seeds = sorted({k[4] for k in results if k[0] == "I" and k[3] == "hall"})
     minutes = "of 6 min" if args.quick else "of 31 min (hall) and 20 min (corridor, lab)"
     parts = [
-        HEAD.format(drives=f"{len(seeds)} of the hall, one of a corridor loop and one of a cluttered lab, {minutes}"),
+        HEAD.format(recordings=f"{len(seeds)} of the hall, one of a corridor loop and one of a cluttered lab, {minutes}"),
         "## What reproduces\n\n" + differences(results, seeds) + "\n" + NOTES,
         "## Table I: methods\n\nHall: mean of the recordings.\n\n" + table_1(results, seeds),
         "## Table II: which UWB nodes\n\nHall, heavy NLOS on nodes 3 and 4.\n\n" + by_row(results, "II", "nodes"),
@@ -350,7 +350,7 @@ def main(argv: list[str] | None = None) -> int:
     tasks, began = planned(args, pictures), time.perf_counter()
     for n, done in enumerate(spread_out(work, tasks, args.jobs)):
         results.update(done)
-        print(f"{n + 1} of {len(tasks)} drives, {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+        print(f"{n + 1} of {len(tasks)} recordings, {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
     args.out.write_text(document(results, args))
     print(args.out)
     return 0
