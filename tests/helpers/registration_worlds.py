@@ -22,10 +22,13 @@ def wall_points(walls, rng, spacing=0.05, noise=NOISE):
     return points + rng.normal(0.0, noise, points.shape)
 
 
+def views(walls, truth, rng, spacing=0.05, noise=NOISE):
+    """Return target and source points (n, 2), two samples of the same walls, the source in the frame at the pose truth."""
+    target = wall_points(walls, rng, spacing, noise)
+    return target, se2.transform(se2.inverse(truth), wall_points(walls, rng, spacing, noise))
+
+
 def pair(walls, truth, rng, centre, spacing=0.05, noise=NOISE) -> tuple[PointCloud, PointCloud]:
-    """Return target and source, two samples of the same walls, the source in the frame at the pose truth; both seen
-    from the same place, the centre."""
-    target = make_cloud(wall_points(walls, rng, spacing, noise), np.asarray(centre))
-    source = wall_points(walls, rng, spacing, noise)
-    back = se2.inverse(truth)
-    return target, make_cloud(se2.transform(back, source), se2.transform(back, np.asarray(centre)))
+    """Return the clouds of two views, both seen from the same place, the centre."""
+    target, source = views(walls, truth, rng, spacing, noise)
+    return make_cloud(target, np.asarray(centre)), make_cloud(source, se2.transform(se2.inverse(truth), np.asarray(centre)))

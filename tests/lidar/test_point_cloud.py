@@ -1,7 +1,5 @@
 """Filters against brute force, normals against known walls."""
 
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,8 +13,7 @@ from uwblite.lidar.point_cloud import (
     make_tree,
     radius_outlier_filter,
     statistical_outlier_filter,
-    voxel_labels,
-    voxel_means,
+    two_sided,
 )
 
 clouds = hnp.arrays(
@@ -26,39 +23,6 @@ clouds = hnp.arrays(
 
 def _distances(points):
     return np.sqrt(((points[:, None] - points[None, :]) ** 2).sum(axis=-1))
-
-
-@settings(max_examples=60, deadline=None)
-@given(clouds, st.sampled_from([0.05, 0.3, 2.0]))
-def test_voxel_means_equal_brute_force(points, size):
-    cells = [tuple(c) for c in np.floor(points / size).astype(int)]
-    expected = [np.mean([p for p, c in zip(points, cells, strict=True) if c == cell], axis=0) for cell in sorted(set(cells))]
-    means, counts = voxel_means(points, size, points)
-    assert counts.tolist() == [cells.count(cell) for cell in sorted(set(cells))]
-    np.testing.assert_allclose(means, np.reshape(expected, (-1, 2)), atol=1e-12)
-
-
-@pytest.mark.parametrize("spread", [1.0, 1e4, 1e12], ids=["counted", "sorted", "beyond 64 bits"])
-def test_voxel_labels_agree_however_wide_the_cloud_is(spread):
-    rng = np.random.default_rng(0)
-    near = rng.uniform(0.0, 1.0, (200, 2))
-    labels, _ = voxel_labels(near, 0.1)
-    with_far, count = voxel_labels(np.vstack([near, [[-spread, -spread], [spread, spread]]]), 0.1)
-    assert count == labels.max() + 3
-    np.testing.assert_array_equal(with_far[:-2] - 1, labels)
-
-
-def test_voxel_means_carry_what_belongs_to_the_points():
-    points = np.array([[0.1, 0.1], [0.3, 0.1], [1.1, 0.2]])
-    means, counts = voxel_means(points, 1.0, np.array([[1.0, 0.0, 5.0], [3.0, 0.0, 7.0], [9.0, 1.0, 0.0]]))
-    np.testing.assert_allclose(means, [[2.0, 0.0, 6.0], [9.0, 1.0, 0.0]])
-    assert counts.tolist() == [2, 1]
-
-
-def test_centroids_of_voxels_stay_where_they_are():
-    points = np.random.default_rng(1).normal(size=(500, 2))
-    once = voxel_means(points, 0.2, points)[0]
-    np.testing.assert_allclose(voxel_means(once, 0.2, once)[0], once)
 
 
 @settings(max_examples=60, deadline=None)
@@ -150,24 +114,20 @@ def test_normals_point_to_the_viewpoint_in_any_frame():
         assert (se2.rotate(-pose[2], cloud.normals)[:, 1] * side > 0.9).all()
 
 
-def test_a_cloud_is_the_same_whatever_is_asked_of_it_first():
-    points = np.random.default_rng(4).uniform(0.0, 3.0, (300, 2))
-    one, two = make_cloud(points), make_cloud(points)
-    one.raster(0.3, 2)
-    np.testing.assert_array_equal(one.raster(0.2).table, two.raster(0.2).table)
-    assert one.raster(0.2) is one.raster(0.2)
-
-
-def test_a_cloud_goes_to_another_process_and_back():
+def test_a_two_sided_cloud_has_each_point_with_either_normal():
     cloud = make_cloud(np.random.default_rng(5).uniform(0.0, 3.0, (100, 2)), np.ones(2))
-    copy = pickle.loads(pickle.dumps(cloud))
-    np.testing.assert_array_equal(copy.surface, cloud.surface)
-    np.testing.assert_array_equal(copy.tree.query(cloud.points, k=3)[1], cloud.tree.query(cloud.points, k=3)[1])
+    both = two_sided(cloud)
+    assert len(both) == 200
+    assert not both.oriented
+    for half, sign in ((slice(0, 100), 1.0), (slice(100, 200), -1.0)):
+        np.testing.assert_array_equal(both.centers[half], cloud.centers)
+        np.testing.assert_array_equal(both.normals[half], sign * cloud.normals)
+        np.testing.assert_array_equal(both.normal_variance[half], cloud.normal_variance)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_tiny_clouds_have_no_lines(n):
     cloud = make_cloud(np.zeros((n, 2)))
     assert len(cloud) == n
-    assert (cloud.surface[:2] == 0.0).all()
-    assert (cloud.surface[6] == 0.0).all()
+    assert (cloud.normals == 0.0).all()
+    assert (cloud.normal_variance == 0.0).all()

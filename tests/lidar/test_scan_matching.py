@@ -11,7 +11,7 @@ from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.lidar.clouds import Clouds
-from uwblite.lidar.scan_matching import PairFactors, match, measured, pair_points, rasterize, trusted_step
+from uwblite.lidar.scan_matching import PairFactors, match, measured, nondegenerate_step, pair_points, rasterize
 
 
 def scattered(rng, counts) -> Clouds:
@@ -211,7 +211,7 @@ def test_what_scatter_feigns_is_taken_off_and_never_more(seed):
     rng = np.random.default_rng(seed)
     (hessian, gradient), (feigned, _) = quadratic_form(rng, 3), quadratic_form(rng, 3)
     feigned *= 10 ** rng.uniform(-3, 1)
-    step, root = trusted_step(factors_of(hessian, gradient, feigned))
+    step, root = nondegenerate_step(factors_of(hessian, gradient, feigned))
     information = root[0].T @ root[0]
     size = np.trace(hessian)
     assert np.linalg.eigvalsh(hessian - information).min() > -1e-6 * size

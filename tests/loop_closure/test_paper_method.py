@@ -14,7 +14,7 @@ from uwblite.lidar.submaps import SubmapConfig, build
 from uwblite.loop_closure.closures import LoopClosureConfig
 from uwblite.loop_closure.paper_method import candidates, find
 
-ICP = IcpConfig(method="point_to_point", max_correspondence_distance=0.3, max_iterations=300, fitness_sigma=0.1)
+ICP = IcpConfig(max_correspondence_distance=0.3, max_iterations=300, fitness_sigma=0.1)
 PLAIN = LoopClosureConfig(method="icp", partners=1000)
 
 

@@ -16,7 +16,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..config import setting
 from ..keyframes import ScanPoints
-from .point_cloud import Lines, estimate_normals, make_tree
+from .point_cloud import Lines, PointCloud, estimate_normals, make_tree
 
 _BLOCK = 32
 """Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
@@ -132,6 +132,18 @@ def joined(parts: Sequence[Clouds]) -> Clouds:
         whole.points[rows], whole.normals[rows], whole.normal_variance[rows] = part.points, part.normals, part.normal_variance
         whole.owner[rows] = part.owner + first
     return whole
+
+
+def stacked(parts: Sequence[PointCloud]) -> Clouds:
+    """Return single clouds, each in its own frame, as one array."""
+    counts = [len(p) for p in parts]
+    return Clouds(
+        np.cumsum([0, *counts]),
+        np.concatenate([p.centers for p in parts]),
+        np.concatenate([p.normals for p in parts]),
+        np.repeat(np.arange(len(parts), dtype=np.int32), counts),
+        np.concatenate([p.normal_variance for p in parts]),
+    )
 
 
 def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:

@@ -19,7 +19,9 @@ from scipy import fft
 from .. import se2
 from ..arrays import Floats, Ints
 from ..config import setting
+from .clouds import stacked
 from .point_cloud import PointCloud
+from .scan_matching import rasterize
 
 Singles = NDArray[np.float32]
 
@@ -54,9 +56,6 @@ class SearchResult:
     """(c, 3) T_target_source; m, m, rad; on the grid."""
     scores: Floats
     """(c,) at most 1; mean agreement of the source's points."""
-    ambiguity: float
-    """Score of the second candidate / score of the first, 0..1: near 1 the clouds do not tell the two apart (equal
-    rooms, or the length of a corridor)."""
 
 
 def search(
@@ -90,8 +89,7 @@ def search(
         ],
         axis=-1,
     )
-    best = scores[tuple(found.T)].astype(np.float64)
-    return SearchResult(poses, best, float(best[1] / best[0]) if len(best) > 1 else 0.0)
+    return SearchResult(poses, scores[tuple(found.T)].astype(np.float64))
 
 
 def score_grid(
@@ -114,14 +112,14 @@ def score_grid(
     headings = T_target_source[2] + np.arange(-turns, turns + 1) * config.angle_step
     shift_x, shift_y = (np.arange(-n, n + 1) for n in half)
     scores = np.zeros((len(headings), len(shift_y), len(shift_x)), np.float32)
-    if len(target) and len(source):
+    if target.normals.any() and source.normals.any():
         oriented = target.oriented and source.oriented
         field, origin = _target_field(target, config, oriented)
         # Points that no shift brings onto the field are left out; of the rest none may wrap around onto it.
         shape = tuple(fft.next_fast_len(field.shape[k] + 2 * half[1 - k]) for k in (0, 1))
         spectrum = fft.fft2(field, shape)
         normals = source.normals[:, 0] + 1j * source.normals[:, 1]
-        weight = normals if oriented else np.ones(len(source), complex)
+        weight = normals if oriented else (normals != 0.0).astype(complex)
         for k, heading in enumerate(headings):
             image = _source_image(source, weight, heading, T_target_source, origin, field.shape, half, shape, config)
             product = np.conj(fft.fft2(image)) * spectrum
@@ -135,14 +133,13 @@ def score_grid(
 
 def _target_field(target: PointCloud, config: CorrelativeConfig, oriented: bool) -> tuple[NDArray[np.complex64], Floats]:
     """Return the field (rows, columns) and the place of its lower left corner, m."""
-    raster = target.raster(_CELLS_PER_REACH * config.resolution)
-    index = raster.table.reshape(raster.height, raster.width)
-    x = raster.origin[0] + (np.arange(raster.width) + 0.5) * raster.cell
-    y = raster.origin[1] + (np.arange(raster.height) + 0.5) * raster.cell
-    normal_x, normal_y, _, near_x, near_y = target.surface[:5].take(index, axis=1)
-    square = (x - near_x) ** 2 + (y[:, None] - near_y) ** 2
-    field = np.exp(-0.5 * np.minimum(square / config.spread**2, 200.0)) * (index < len(target))
-    return (field * (normal_x + 1j * normal_y) if oriented else field).astype(np.complex64), raster.origin
+    raster = rasterize(stacked([target]), config.resolution, _CELLS_PER_REACH * config.resolution)
+    index, origin = raster.nearest.reshape(raster.shape[0]).T, raster.origin[0]
+    x, y = (origin[k] + (np.arange(raster.shape[0, k]) + 0.5) * config.resolution for k in (0, 1))
+    (near_x, near_y), (normal_x, normal_y) = target.centers[index].T, target.normals[index].T
+    square = (x[:, None] - near_x) ** 2 + (y - near_y) ** 2
+    field = np.exp(-0.5 * np.minimum(square / config.spread**2, 200.0)).T * (index >= 0)
+    return (field * (normal_x + 1j * normal_y).T if oriented else field).astype(np.complex64), origin
 
 
 def _source_image(

@@ -7,7 +7,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints
 from .clouds import Clouds
-from .scan_matching import CloudRasters, PairFactors, PairPoints, match, trusted_step
+from .scan_matching import CloudRasters, PairFactors, PairPoints, match, nondegenerate_step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +44,7 @@ def align_pairs(
     pose, gate = guess.copy(), first_gate
     for _ in range(iterations):
         factors = match(clouds, raster, i, pose, points, gate, gate / 2.0)
-        step = trusted_step(factors)[0]
+        step = nondegenerate_step(factors)[0]
         reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / 0.3, np.abs(step[:, 2]) / 0.15)
         pose += step / np.maximum(reach, 1.0)[:, None]
         pose[:, 2] = se2.wrap_angle(pose[:, 2])

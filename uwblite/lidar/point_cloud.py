@@ -1,77 +1,19 @@
-"""Planar point clouds (n, 2): filters, normals, and the cloud that registration works on.
+"""Planar point clouds (n, 2): filters, and the lines through the neighbourhoods of their points.
 
-Points are finite, in metres, in any one frame. The three filters run in the paper's order: voxel, statistical,
-radius. Every function is pure and keeps a fixed order of points.
+Points are finite, in metres, in any one frame, and keep their order.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ..arrays import Bools, Floats, Ints
-from .nearest import NearestRaster, make_raster
-
-_DENSE_CELLS_PER_POINT = 16
-"""A voxel grid of at most so many cells per point (plus a few thousand) is counted densely instead of sorted."""
-
-_NOWHERE = 1e9
-"""m; coordinate of the partner of a point that has none."""
 
 
 def make_tree(points: Floats) -> cKDTree:
     """Return a kd-tree of points (n, 2) with the quick build: sliding midpoint splits, loose boxes."""
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
-
-
-def voxel_labels(points: Floats, size: float) -> tuple[Ints, int]:
-    """Number the occupied square cells of a grid through the frame's origin.
-
-    Parameters
-    ----------
-    points : (n, 2), m.
-    size : edge of a cell, m.
-
-    Returns
-    -------
-    labels : (n,) number of each point's cell; cells are numbered by column (x), then row (y).
-    count : how many cells are occupied.
-    """
-    if len(points) == 0:
-        return np.zeros(0, np.int64), 0
-    cells = np.floor(points / size)
-    low = cells.min(axis=0)
-    extent = cells.max(axis=0) - low + 1.0
-    if extent[0] * extent[1] >= 2.0**62:
-        _, labels = np.unique(cells, axis=0, return_inverse=True)
-        labels = labels.reshape(-1).astype(np.int64)
-        return labels, int(labels.max()) + 1
-    keys = ((cells[:, 0] - low[0]) * extent[1] + (cells[:, 1] - low[1])).astype(np.int64)
-    if extent[0] * extent[1] > _DENSE_CELLS_PER_POINT * len(points) + 4096:
-        found, labels = np.unique(keys, return_inverse=True)
-        return labels.astype(np.int64), len(found)
-    number = np.cumsum(np.bincount(keys) > 0)
-    return number[keys] - 1, int(number[-1])
-
-
-def voxel_means(points: Floats, size: float, values: Floats) -> tuple[Floats, Ints]:
-    """Average values over the points of each occupied voxel.
-
-    Parameters
-    ----------
-    points : (n, 2), m.
-    size : edge of a voxel, m.
-    values : (n, k), anything that goes with the points: the points themselves, viewpoints, stamps.
-
-    Returns
-    -------
-    means : (m, k), ordered by voxel column (x), then row (y).
-    counts : (m,) how many points each voxel holds.
-    """
-    labels, count = voxel_labels(points, size)
-    counts = np.bincount(labels, minlength=count)
-    sums = [np.bincount(labels, weights=column, minlength=count) for column in values.T]
-    return np.stack(sums, axis=-1) / counts[:, None], counts
 
 
 def statistical_outlier_filter(
@@ -184,73 +126,49 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
-    """Points with everything registration derives from them, computed once and reused over all pairs."""
+    """Points with the lines through their neighbourhoods."""
 
-    points: Floats
-    """(n, 2) m, frame of the cloud."""
-    tree: cKDTree
-    """Of the points."""
     centers: Floats
-    """(n, 2) m, mean of each point's neighbourhood."""
+    """(n, 2) m, frame of the cloud; mean of each point's neighbourhood."""
     normals: Floats
     """(n, 2) unit vectors across the local line, towards the viewpoint where known; zero where there is no line."""
-    linearity: Floats
-    """(n,) see Lines."""
-    neighbours: Ints
+    normal_variance: Floats
     """(n,) see Lines."""
     oriented: bool
     """The normals point to the side the surface was seen from."""
-    surface: Floats
-    """(7, n + 1) normal x, y; distance of the line from the origin, m; center x, y, m; variance of the normal, rad^2;
-    1 where there is a line. Points without a line have a zero normal: they pull at nothing. Column n stands for no
-    point, far from everything."""
-    rasters: dict[tuple[float, int, int], NearestRaster] = field(default_factory=dict, repr=False)
-    """Tables of nearest centers by (reach, stride, cells); filled on first use by raster()."""
 
     def __len__(self) -> int:
-        return len(self.points)
-
-    def raster(self, reach: float, stride: int = 1, cells: int = 4) -> NearestRaster:
-        """Return the table of nearest centers within reach, m, see make_raster; made on first use."""
-        key = (reach, stride, cells)
-        if key not in self.rasters:
-            self.rasters[key] = make_raster(self.centers, reach, stride, cells)
-        return self.rasters[key]
+        return len(self.centers)
 
 
 def make_cloud(
     points: Floats, viewpoints: Floats | None = None, normal_radius: float = 0.25, min_linearity: float = 0.6
 ) -> PointCloud:
-    """Prepare points for registration: kd-tree, lines, normals towards the sensor.
+    """Fit a line to the surroundings of every point and turn its normal towards the sensor.
 
     Parameters
     ----------
-    points : (n, 2), m; thin them to an even density first (voxel_means).
+    points : (n, 2), m; of an even density.
     viewpoints : (n, 2) or (2,), where the sensor stood when it saw each point, m, same frame. None: not known;
         then walls match from both sides.
     normal_radius : neighbourhood of the lines, m; a few times the distance between points.
     min_linearity : a neighbourhood that is less straight gives no line.
     """
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
-    tree = make_tree(points)
-    lines = estimate_normals(points, tree, normal_radius)
+    lines = estimate_normals(points, make_tree(points), normal_radius)
     straight = lines.linearity >= min_linearity
     normals = np.where(straight[:, None], lines.normals, 0.0)
     if viewpoints is not None:
-        towards = _along(viewpoints - points, normals)
-        normals = np.where(towards[:, None] < 0.0, -normals, normals)
-    surface = np.zeros((7, len(points) + 1))
-    surface[:2, :-1] = normals.T
-    surface[2, :-1] = _along(lines.centers, normals)
-    surface[3:5, :-1] = lines.centers.T
-    surface[3:5, -1] = _NOWHERE
-    surface[5, :-1] = np.where(straight, lines.normal_variance, 0.0)
-    surface[6, :-1] = straight
+        away = np.einsum("ni,ni->n", viewpoints - points, normals) < 0.0
+        normals = np.where(away[:, None], -normals, normals)
+    return PointCloud(lines.centers, normals, np.where(straight, lines.normal_variance, 0.0), viewpoints is not None)
+
+
+def two_sided(cloud: PointCloud) -> PointCloud:
+    """Return a cloud with every point twice, once with either normal: of a source seen from an unknown side one matches."""
     return PointCloud(
-        points, tree, lines.centers, normals, lines.linearity, lines.neighbours, viewpoints is not None, surface
+        np.tile(cloud.centers, (2, 1)),
+        np.concatenate([cloud.normals, -cloud.normals]),
+        np.tile(cloud.normal_variance, 2),
+        oriented=False,
     )
-
-
-def _along(vectors: Floats, normals: Floats) -> Floats:
-    """Return the parts (n,) of vectors (n, 2) along normals (n, 2)."""
-    return vectors[:, 0] * normals[:, 0] + vectors[:, 1] * normals[:, 1]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Floats, Ints
 from .clouds import Clouds
-from .line_factor import relative_eigen
+from .degeneracy import relative_eigen
 
 _CLOUDS_AT_ONCE = 256
 """Clouds whose rasters are painted at once."""
@@ -48,7 +48,7 @@ class PairFactors:
     hessian: Floats
     """(e, 3, 3) sum of w J^T J of the point-to-line distances by T_i_j (x, y, theta), 1/m^2-like, unscaled by noise."""
     feigned: Floats
-    """(e, 3, 3) part of it that the scatter of the normals alone would feign, see line_factor."""
+    """(e, 3, 3) part of it that the scatter of the normals alone would feign, see degeneracy."""
     gradient: Floats
     """(e, 3) sum of w J^T r."""
     matched: Ints
@@ -254,12 +254,12 @@ _TRUSTED = 2.0
 """Multiple of the feigned information that a direction must exceed to have been measured."""
 
 
-def trusted_step(factors: PairFactors) -> tuple[Floats, Floats]:
+def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
     """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with
     L^T L the information in those directions (unscaled by noise).
 
     In the basis B that diagonalises both, feigned = B B^T and hessian = B V diag(l) V^T B^T; l must exceed a multiple
-    of 1, see line_factor.trusted_part.
+    of 1, see degeneracy.
     """
     basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.feigned)
     kept = np.maximum(values - _TRUSTED, 0.0)
@@ -281,7 +281,7 @@ def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Flo
     -------
     Z (e, 3) and sqrt_information (e, 3, 3) in the chart e = Z^-1 T; zero along what cannot be seen.
     """
-    step, root = trusted_step(factors)
+    step, root = nondegenerate_step(factors)
     z = T_i_j + step
     z[:, 2] = se2.wrap_angle(z[:, 2])
     c, s = se2.cos_sin(z[:, 2])

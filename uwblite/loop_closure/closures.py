@@ -18,7 +18,7 @@ class LoopClosureConfig:
 
     method: Literal["search", "icp"] = "search"
     """search: candidates by the graph's own uncertainty, judged by all that follows here. icp: the paper's plain way, by
-    the settings of [icp]; of those here only rounds, partners and correlation count (see plain_closures)."""
+    the settings of [icp]; of those here only rounds, partners and correlation count (see paper_method)."""
     partners: int = 4
     """Candidates per sub-map and round, best expected overlap first."""
     rounds: int = 4

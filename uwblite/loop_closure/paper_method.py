@@ -16,7 +16,7 @@ from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges
 from ..lidar.clouds import Clouds
-from ..lidar.point_cloud import make_cloud
+from ..lidar.point_cloud import make_tree
 from ..lidar.point_to_point import IcpConfig, Registration, align
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
@@ -41,7 +41,7 @@ def find(
     ----------
     graph : poses that place the sub-maps.
     session : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
-    config : its partners bound the candidates per sub-map. icp : method, outlier distance, iterations and fitness.
+    config : its partners bound the candidates per sub-map. icp : outlier distance, iterations and fitness.
     progress : called with (done, total).
     executor : any concurrent.futures executor; the result does not depend on it.
     """
@@ -128,9 +128,10 @@ def _batches(clouds: Clouds, target: Ints, source: Ints, guess: Floats, icp: Icp
 
 def _align(batch: _Batch) -> list[Registration]:
     """Align the pairs of a batch; runs in a worker."""
-    prepared = [make_cloud(batch.clouds.cloud(k)[0]) for k in range(len(batch.clouds))]
+    points = [batch.clouds.cloud(k)[0] for k in range(len(batch.clouds))]
+    trees = [make_tree(p) for p in points]
     pairs = zip(batch.target.tolist(), batch.source.tolist(), batch.guess, strict=True)
-    return [align(prepared[a], prepared[b], guess, batch.icp) for a, b, guess in pairs]
+    return [align(trees[a], points[b], guess, batch.icp) for a, b, guess in pairs]
 
 
 def _story(i: int, j: int, found: Registration, information: Floats) -> LoopClosure:

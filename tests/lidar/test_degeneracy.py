@@ -1,0 +1,61 @@
+"""Degenerate directions: rooms hold a pose, corridors do not along their length, whatever the frame."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers.registration_worlds import CORRIDOR, ROOM, pair
+
+from uwblite.lidar.clouds import stacked
+from uwblite.lidar.degeneracy import relative_eigen
+from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points, rasterize
+
+CENTRE = (3.0, 1.5)
+
+
+def matched(target, source, pose):
+    clouds, i, j = stacked([target, source]), np.array([0]), np.array([1])
+    points = pair_points(clouds, j, len(source))
+    return match(clouds, rasterize(clouds, 0.05, 0.3), i, np.asarray(pose)[None], points, 0.3, 0.15)
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.015, 0.03])
+def test_rooms_are_kept_and_the_length_of_corridors_is_dropped(noise):
+    along = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        for walls, centre in ((ROOM, CENTRE), (CORRIDOR, (0.0, 0.0))):
+            factors = matched(*pair(walls, np.zeros(3), rng, centre, noise=noise), np.zeros(3))
+            root = nondegenerate_step(factors)[1][0]
+            raw, kept = factors.hessian[0], root.T @ root
+            assert kept[1, 1] > 0.9 * raw[1, 1]
+            assert (np.linalg.eigvalsh(raw - kept) > -1e-6 * raw[1, 1]).all()
+            if walls is ROOM:
+                assert kept[0, 0] > 0.9 * raw[0, 0]
+            else:
+                # What is known of x when y and theta are free, too.
+                known = [1.0 / np.linalg.inv(h + 1e-9 * raw[1, 1] * np.eye(3))[0, 0] for h in (kept, raw)]
+                along.append(known[0] / known[1])
+    assert np.median(along) < 1e-3
+    assert np.max(along) < 0.5
+
+
+def test_eigenvalues_do_not_depend_on_units_or_frame():
+    rng = np.random.default_rng(7)
+    half, other, change = rng.normal(size=(3, 3, 3))
+    information, feigned = half @ half.T * [10.0], 0.3 * other @ other.T + np.eye(3)
+    basis, inverse, values, vectors = relative_eigen(information, feigned)
+    # The floor under N, 1e-9 of H, takes that share of l from an eigenvalue l of some tens.
+    np.testing.assert_allclose(values, scipy.linalg.eigh(information, feigned, eigvals_only=True), rtol=1e-6)
+    np.testing.assert_allclose(basis @ vectors @ np.diag(values) @ vectors.T @ basis.T, information, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(basis @ inverse, np.eye(3), atol=1e-12)
+    moved = relative_eigen(change @ information @ change.T, change @ feigned @ change.T)[2]
+    np.testing.assert_allclose(moved, values, rtol=1e-5)
+
+
+def test_lines_without_scatter_are_fully_measured():
+    values = relative_eigen(np.diag([4.0, 2.0, 1.0]), np.zeros((3, 3)))[2]
+    assert values.min() > 1e8
+
+
+def test_nothing_matched_has_no_measured_direction():
+    assert (relative_eigen(np.zeros((3, 3)), np.zeros((3, 3)))[2] == 0.0).all()

@@ -1,0 +1,29 @@
+"""Degenerate directions of a registration: those in which only the scatter of the normals seems to hold a pose.
+
+Normals scatter, and a wall whose normals scatter seems to resist being slid along. With the variance v of a normal's
+angle and the Jacobian J_t of the tangent, N = sum w v J_t^T J_t is the information that scatter alone would feign. In
+the basis B that diagonalises both, H = B V diag(l) V^T B^T and N = B B^T, a direction was measured where its l exceeds
+a multiple of 1. That depends neither on units nor on the frame.
+"""
+
+import numpy as np
+
+from ..arrays import Floats
+
+_FLOOR = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) * 1e-9
+"""N is at least this share of H's diagonal: without any scatter a direction is measured up to the inverse of it. Sums x
+and y, whatever the frame."""
+_TINY = 1e-30
+
+
+def relative_eigen(information: Floats, feigned: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return (..., 3, 3) B, its inverse, eigenvalues and eigenvectors of B^-1 H B^-T where N = B B^T, N kept from vanishing."""
+    basis = np.asarray(np.linalg.cholesky(feigned + _floor(information)[..., None] * np.eye(3)), dtype=np.float64)
+    inverse = np.asarray(np.linalg.inv(basis), dtype=np.float64)
+    values, vectors = np.linalg.eigh(inverse @ information @ np.swapaxes(inverse, -1, -2))
+    return basis, inverse, values, vectors
+
+
+def _floor(information: Floats) -> Floats:
+    """Return what keeps the diagonal (..., 3) of N from vanishing."""
+    return np.asarray(np.diagonal(information, axis1=-2, axis2=-1) @ _FLOOR + _TINY)
