@@ -20,7 +20,7 @@ FLOORS = (
     ("sensor_log", "graph", "drivers"),
     ("constraints", "keyframes", "grid"),
     ("wheels", "map_result", "radio"),
-    ("lidar", "report"),
+    ("gyro", "lidar", "report"),
     ("screening",),
     ("loop_closure", "checks", "evaluation", "io"),
     ("mapping_config",),

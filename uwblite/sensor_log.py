@@ -54,6 +54,16 @@ class UwbRanges:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Gyro:
+    """The heading of a gyro, from an arbitrary zero, with its bias."""
+
+    stamps: Floats
+    """(g,) s, non-decreasing."""
+    heading: Floats
+    """(g,) rad, counter-clockwise, unwrapped."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LaserScans:
     """2D scans with the field names of sensor_msgs/LaserScan; all scans share one geometry."""
 
@@ -208,12 +218,16 @@ class SensorLog:
     notes: LogNotes = field(default_factory=LogNotes)
     screening: Screening | None = None
     """What screening found; None before it."""
+    gyro: Gyro | None = None
 
     def __post_init__(self) -> None:
         _check(self.odometry.stamps, "odometry.stamps", (None,), ordered=True)
         _check(self.odometry.poses, "odometry.poses", (len(self.odometry.stamps), 3), most=MOST_METRES)
         if len(self.odometry.stamps) == 0:
             raise DataError("the log has no odometry; uwblite needs ODOM messages (or ROBOTLASER1 with robot poses)")
+        if self.gyro is not None:
+            _check(self.gyro.stamps, "gyro.stamps", (None,), ordered=True)
+            _check(self.gyro.heading, "gyro.heading", (len(self.gyro.stamps),))
         if self.ranges is not None:
             m = len(self.ranges.stamps)
             _check(self.ranges.stamps, "ranges.stamps", (None,), ordered=True)
@@ -273,7 +287,11 @@ class SensorLog:
         if scans is not None:
             cut = part(scans.stamps)
             scans = replace(scans, stamps=scans.stamps[cut], ranges=scans.ranges[cut])
-        return replace(self, odometry=odometry, ranges=ranges, scans=scans)
+        gyro = self.gyro
+        if gyro is not None:
+            cut = part(gyro.stamps)
+            gyro = Gyro(gyro.stamps[cut], gyro.heading[cut])
+        return replace(self, odometry=odometry, ranges=ranges, scans=scans, gyro=gyro)
 
 
 def _check(

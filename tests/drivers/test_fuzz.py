@@ -12,6 +12,7 @@ from uwblite.drivers.create2 import Create2Protocol
 from uwblite.drivers.devices import DEVICES, open_device
 from uwblite.drivers.dwm1001 import TlvProtocol
 from uwblite.drivers.dwm1001_shell import ShellProtocol
+from uwblite.drivers.gyro_line import gyro_format
 from uwblite.drivers.kobuki import KobukiProtocol
 from uwblite.drivers.ldlidar import LdLidarProtocol
 from uwblite.drivers.lds01 import Lds01Protocol
@@ -51,6 +52,7 @@ PROTOCOLS = {
     "kobuki": (KobukiProtocol, WORDS["kobuki"]),
     "line": (lambda: OdometryLineProtocol(LineFormat()), WORDS["line"]),
     "create2": (Create2Protocol, WORDS["create2"]),
+    "gyro-line": (lambda: OdometryLineProtocol(gyro_format("turn_rate", 1.0, 1.0, "")), WORDS["line"]),
     "uwb-line": (lambda: UwbLineProtocol(by_columns(parse_columns("id,range", 1.0, ""))), WORDS["uwb-line"]),
     **{name: (lambda parse=parse: UwbLineProtocol(parse), WORDS[name]) for name, parse in BOARDS.items()},
     "linktrack": (LinkTrackProtocol, WORDS["linktrack"]),

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from emulators.dwm_device import DwmDevice
-from emulators.kobuki_device import Create2Device, KobukiDevice, TickLineDevice
+from emulators.kobuki_device import Create2Device, GyroLineDevice, KobukiDevice, TickLineDevice
 from emulators.simulated_world import SimulatedWorld
 from emulators.spinning_device import LIDARS
 from emulators.uwb_boards import BOARDS, UwbBoard
@@ -49,6 +49,9 @@ def test_from_emulator_to_map(tmp_path, lidar, uwb, base):
         ("odometry", session("odometry", base), BASES[base](world.poses(), clock)),
         ("uwb", session("uwb", uwb), tag),
     ]
+    if base != "kobuki":  # which has a gyro of its own
+        lines = "line:port?columns=t,turn_rate&time_unit=0.001&angle_unit=0.017453292519943295"
+        devices.append(("gyro", open_device("gyro", lines)[0], GyroLineDevice(world.true_poses(), clock)))
     params = [("uwb_tag_offset_x", f"{settings.tag[0]}"), ("uwb_tag_offset_y", f"{settings.tag[1]}"),
               ("uwb_tag_height", "0.6"), ("uwb_anchor_height", "0.6")]  # fmt: skip
     recorder = record(

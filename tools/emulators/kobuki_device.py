@@ -158,6 +158,18 @@ class TickLineDevice(WheeledDevice):
         return f"{ms},{left},{right}\r\n".encode()
 
 
+class GyroLineDevice(WheeledDevice):
+    """A gyro that prints ``ms,rate`` a hundred times a second, rate in degrees per second, with a bias."""
+
+    PERIOD = 0.01
+    BIAS = 0.8
+    """degrees/s."""
+
+    def encode(self, ms: int, left: int, right: int, theta: float, turn_rate: float) -> bytes:
+        """Return a line."""
+        return f"{ms},{math.degrees(turn_rate) + self.BIAS:.3f}\r\n".encode()
+
+
 def encode_packet(subs: list[tuple[int, bytes]]) -> bytes:
     """Build a packet from sub-payloads (id, data), together at most 255 bytes with their headers."""
     payload = b"".join(bytes((kind, len(data))) + data for kind, data in subs)

@@ -37,6 +37,11 @@ class SimulatedWorld(RoomWorld):
         for time, (x, y, theta) in zip(self.recording.stamps.tolist(), self.recording.odometry.tolist(), strict=True):
             yield Pose(time, x, y, theta)
 
+    def true_poses(self) -> Iterator[Pose]:
+        """Yield where the robot really is, which a gyro feels."""
+        for time, (x, y, theta) in zip(self.recording.stamps.tolist(), self.recording.truth.tolist(), strict=True):
+            yield Pose(time, x, y, theta)
+
     def epochs(self) -> Iterator[Epoch]:
         """Yield the ranging rounds."""
         stamps, first = np.unique(self.recording.range_stamps, return_index=True)

@@ -39,7 +39,7 @@ computer's monotonic clock, s).
 """
 
 
-MOST = {"uwb": 9, "lidar": 5, "odometry": 1}
+MOST = {"uwb": 9, "lidar": 5, "gyro": 1, "odometry": 1}
 """How many of a kind a log keeps apart."""
 
 
@@ -49,6 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     devices.add_argument("--uwb", metavar="[NAME:]PORT", action="append", help="UWB tag (a DWM1001 without a name); repeatable")
     devices.add_argument("--lidar", metavar="[NAME:]PORT", action="append", help="lidar (a Hokuyo without a name); repeatable")
     devices.add_argument("--odometry", metavar="NAME:PORT", action="append", help="base: kobuki:PORT, line:PORT?columns=...")
+    gyro = "its heading takes the place of the wheels': line:PORT?columns=t,turn_rate"
+    devices.add_argument("--gyro", metavar="NAME:PORT", action="append", help=gyro)
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=place, metavar="FILE", required=True, help="the log; must not exist unless --append")
     output.add_argument("--append", action="store_true", help="go on with a log that broke off")
@@ -85,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
     from ..drivers.recorder import Recorder
     from ..drivers.transport import check_pyserial, check_url
 
-    if not (args.uwb or args.lidar or args.odometry):
-        note("uwblite: error: name at least one of --uwb, --lidar, --odometry; `uwblite devices` lists what is there")
+    if not any(getattr(args, sensor) for sensor in MOST):
+        note("uwblite: error: name at least one of --uwb, --lidar, --gyro, --odometry; `uwblite devices` lists what is there")
         return 2
     path = Path(args.out)
     if path.suffix in (".gz", ".bz2", ".xz", ".zip"):
@@ -201,7 +203,7 @@ def _mounting_params(args: argparse.Namespace, offset: float) -> list[tuple[str,
 def _head(args: argparse.Namespace, remark: str) -> list[str]:
     from .. import __version__
 
-    devices = ", ".join(f"{name} {spec}" for name in ("uwb", "lidar", "odometry") for spec in getattr(args, name) or [])
+    devices = ", ".join(f"{name} {spec}" for name in MOST for spec in getattr(args, name) or [])
     return [f"recorded by uwblite {__version__}: {devices}", *([remark] if remark else [])]
 
 

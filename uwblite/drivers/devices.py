@@ -13,6 +13,7 @@ from ..errors import ConfigError
 from .create2 import Create2Driver
 from .dwm1001_driver import Dwm1001Driver
 from .events import Pose
+from .gyro_line import GyroLineDriver, gyro_format
 from .kobuki import KobukiDriver
 from .ldlidar import LdLidarDriver
 from .lds01 import Lds01Driver
@@ -28,7 +29,7 @@ BAUD = 1200, 4_000_000
 """bit/s, least and most, that a serial port is opened with."""
 CP2102 = ("10c4:ea60",)
 """A USB-serial chip that the adapters of many lidars have."""
-SENSORS = ("uwb", "lidar", "odometry")
+SENSORS = ("uwb", "lidar", "gyro", "odometry")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +136,14 @@ def _uwb_line(options: Options, _setup: Setup) -> Driver:
     return _board(by_columns(form), "UWB tag that prints lines", options)
 
 
+def _gyro_line(options: Options, _setup: Setup) -> Driver:
+    form = gyro_format(
+        options.text("columns", "turn_rate"), options.number("time_unit", 1.0, 1e-12, 1e6),
+        options.number("angle_unit", 1.0, -1e3, 1e3), options.text("prefix"),
+    )  # fmt: skip
+    return GyroLineDriver(form, options.whole("baud", GyroLineDriver.baud, *BAUD))
+
+
 def _board(parse: Parse, title: str, options: Options) -> Driver:
     baud, unit = options.whole("baud", UwbLineDriver.baud, *BAUD), options.number("time_unit", 1.0, 1e-12, 1e6)
     return UwbLineDriver(parse, title, baud, unit, options.text("tag"))
@@ -168,6 +177,10 @@ DEVICES = {
             "line", "odometry", "base that prints text lines", _line, talks=True, probe=False,
             options="columns (t,x,y,theta | t,left,right | speed, turn_rate, - to skip), tick (m), wheel_base (m),"
             " tick_modulus, time_unit (s), length_unit (m), angle_unit (rad), prefix, baud",
+        ),
+        DeviceKind(
+            "gyro-line", "gyro", "gyro or IMU that prints its yaw rate or yaw (also line:PORT)", _gyro_line, talks=True,
+            probe=False, options="columns (turn_rate | theta, t, - to skip), angle_unit (rad), time_unit (s), prefix, baud",
         ),
         DeviceKind(
             "tlv", "uwb", "DWM1001 tag with PANS R2, 1 mm", lambda _o, setup: Dwm1001Driver(stream=setup.stream),
@@ -217,7 +230,7 @@ DEVICES = {
 }  # fmt: skip
 """By name. The first kind of a sensor that has no name of its own in what the user wrote is DEFAULT's."""
 DEFAULT = {"uwb": "tlv", "lidar": "scip"}
-ALIASES = {("uwb", "dwm1001"): "tlv", ("uwb", "line"): "uwb-line"}
+ALIASES = {("uwb", "dwm1001"): "tlv", ("uwb", "line"): "uwb-line", ("gyro", "line"): "gyro-line"}
 
 
 def open_device(sensor: str, spec: str, setup: Setup | None = None, more: dict[str, str] | None = None) -> tuple[Session, str]:

@@ -140,6 +140,18 @@ class OdometryPose:
 
 
 @dataclass(frozen=True, slots=True)
+class GyroHeading:
+    """Heading of a gyro from an arbitrary zero, with its bias."""
+
+    stamp: float
+    """s, host clock."""
+    heading: float
+    """rad, counter-clockwise, not wrapped."""
+    turn_rate: float
+    """rad/s."""
+
+
+@dataclass(frozen=True, slots=True)
 class Lost:
     """The device numbers or times its frames, and some are missing."""
 
@@ -152,4 +164,4 @@ class Lost:
 Pose = tuple[float, float, float]
 """x, y, theta of the base in the odom frame; m, m, rad."""
 
-Action = Corrupt | Send | SetBaud | SetDtr | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | Lost
+Action = Corrupt | Send | SetBaud | SetDtr | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | GyroHeading | Lost

@@ -14,7 +14,7 @@ import threading
 from pathlib import Path
 
 from ..errors import DataError
-from .events import LaserScan, OdometryPose, RangeEpoch
+from .events import GyroHeading, LaserScan, OdometryPose, RangeEpoch
 
 _MILLIMETRES = tuple(f"{mm / 1000:.3f}" for mm in range(8192))
 TAIL = 1 << 18
@@ -38,6 +38,11 @@ def pose_line(pose: OdometryPose, tail: str) -> str:
     """Write ODOM x y theta tv rv accel."""
     fields = (pose.x, pose.y, pose.theta, pose.speed, pose.turn_rate, 0.0)
     return f"ODOM {' '.join(number_text(field) for field in fields)} {tail}"
+
+
+def gyro_line(gyro: GyroHeading, tail: str) -> str:
+    """Write GYRO heading turn_rate."""
+    return f"GYRO {number_text(gyro.heading)} {number_text(gyro.turn_rate)} {tail}"
 
 
 def numbered(name: str, number: int) -> str:

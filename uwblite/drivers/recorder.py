@@ -10,9 +10,23 @@ import selectors
 from collections.abc import Callable
 
 from ..errors import DeviceError
-from .events import Action, Corrupt, LaserScan, Lost, Note, OdometryPose, Param, RangeEpoch, Reopen, Send, SetBaud, SetDtr
+from .events import (
+    Action,
+    Corrupt,
+    GyroHeading,
+    LaserScan,
+    Lost,
+    Note,
+    OdometryPose,
+    Param,
+    RangeEpoch,
+    Reopen,
+    Send,
+    SetBaud,
+    SetDtr,
+)
 from .link import Link, Mounting, doubts, summary_lines
-from .log_file import LogFile, number_text, pose_line, range_lines, scan_line
+from .log_file import LogFile, gyro_line, number_text, pose_line, range_lines, scan_line
 from .transport import Opening, Port, open_port
 
 SILENCE = 3.0
@@ -133,7 +147,7 @@ class Recorder:
     def _do(self, link: Link, actions: list[Action], now: float) -> None:
         counts = link.counts
         for action in actions:
-            if isinstance(action, LaserScan | RangeEpoch | OdometryPose):
+            if isinstance(action, LaserScan | RangeEpoch | OdometryPose | GyroHeading):
                 self._message(link, now)
                 self._write(action, link)
             elif isinstance(action, Send | SetBaud | SetDtr):
@@ -178,11 +192,13 @@ class Recorder:
             link.said.clear()
         link.last_message = now
 
-    def _write(self, measured: LaserScan | RangeEpoch | OdometryPose, link: Link) -> None:
+    def _write(self, measured: LaserScan | RangeEpoch | OdometryPose | GyroHeading, link: Link) -> None:
         tail, counts = self._tail(measured.stamp), link.counts
         if isinstance(measured, OdometryPose):
             self._pose = measured
             self._lines.append(pose_line(measured, tail))
+        elif isinstance(measured, GyroHeading):
+            self._lines.append(gyro_line(measured, tail))
         elif isinstance(measured, RangeEpoch):
             self._lines += range_lines(measured, tail, link.number)
             counts.spread, counts.widest = counts.spread + measured.spread, max(counts.widest, measured.spread)

@@ -9,9 +9,10 @@
 | ROBOTLASER1 | laser_type start_angle fov angular_resolution maximum_range accuracy remission_mode num_readings [readings] num_remissions [remissions] laser_x laser_y laser_theta robot_x robot_y robot_theta laser_tv laser_rv forward_safety side_safety turn_axis |
 | RAWLASER1 | as ROBOTLASER1 up to the remissions |
 | FLASER | num_readings [readings] x y theta odom_x odom_y odom_theta |
+| GYRO | heading turn_rate |
 | UWB | anchor_id range quality(0..100); UWB2 ... UWB9 = by the robot's second ... ninth tag |
 
-UWB is uwblite's own; other CARMEN readers skip it. ROBOTLASER1 exists with and without num_remissions and turn_axis,
+UWB and GYRO are uwblite's own; other CARMEN readers skip it. ROBOTLASER1 exists with and without num_remissions and turn_axis,
 and some published logs leave out ipc_timestamp: both are accepted, and then the logger's time counts.
 A reading at or above the maximum range saw nothing (+inf); a reading below range_min is an error code (nan).
 """  # noqa: E501
@@ -24,7 +25,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..errors import FormatError
-from ..sensor_log import LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id
+from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id
 from .carmen_laser import LaserMessages
 from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
 from .carmen_params import Params
@@ -94,6 +95,7 @@ class _Reader:
         self.odometry = array("d")
         self.uwb = array("d")
         self.tags = 1
+        self.gyro = array("d")
         self.uwb_ids: dict[bytes, int] = {}
         self.skipped: dict[str, int] = {}
         self.set_back: dict[str, float] = {}
@@ -105,6 +107,7 @@ class _Reader:
             b"ODOM": self._odom,
             b"UWB": self._uwb,
             **{f"UWB{k}".encode(): self._uwb for k in range(2, MOST_TAGS + 1)},
+            b"GYRO": self._gyro,
             b"PARAM": self.params.take,
         }
 
@@ -172,6 +175,10 @@ class _Reader:
             anchor = self.uwb_ids.setdefault(tokens[1], len(self.uwb_ids))
         self.uwb.extend((stamp, anchor, distance, quality, int(tokens[0][3:] or b"1") - 1))
 
+    def _gyro(self, tokens: list[bytes]) -> None:
+        heading, _ = numbers(tokens[1:3], "GYRO", 2)
+        self.gyro.extend((self._stamp(tokens, 3, "GYRO"), heading))
+
     def _stamp(self, tokens: list[bytes], fields: int, name: str) -> float:
         """Return ipc_timestamp behind the name and contents (`fields` tokens); logger_timestamp where it is left out."""
         # A log leaves ipc_timestamp out everywhere or nowhere: once it was seen, a short message lacks something else.
@@ -219,7 +226,8 @@ class _Reader:
             warnings=tuple(warnings),
             set_back=self.set_back,
         )
-        return SensorLog(odometry, ranges, scans, self.params.mounting(T_base_laser, self.tags), notes)
+        mounting = self.params.mounting(T_base_laser, self.tags)
+        return SensorLog(odometry, ranges, scans, mounting, notes, gyro=self._finish_gyro(warnings))
 
     def _finish_odometry(self, warnings: list[str]) -> Odometry:
         rows = np.array(self.odometry).reshape(-1, 4)
@@ -234,6 +242,13 @@ class _Reader:
             warnings.append("no ODOM messages: the robot poses of the laser messages serve as odometry")
         order = time_order(rows[:, 0], "odometry", warnings, self.set_back)
         return Odometry(rows[order, 0], rows[order, 1:])
+
+    def _finish_gyro(self, warnings: list[str]) -> Gyro | None:
+        if not self.gyro:
+            return None
+        rows = np.array(self.gyro).reshape(-1, 2)
+        order = time_order(rows[:, 0], "gyro", warnings, self.set_back)
+        return Gyro(rows[order, 0], np.unwrap(rows[order, 1]))
 
     def _finish_ranges(self, warnings: list[str]) -> UwbRanges | None:
         if not self.uwb:

@@ -37,10 +37,11 @@ def write_log(path: str | os.PathLike[str], log: SensorLog) -> None:
         stream.write(b"# CARMEN Logfile\n")
         for name, value in _params(log):
             stream.write(f"PARAM {name} {value} 0 {HOST} 0\n".encode())
-        sources = [_odometry_lines(log), _range_lines(log), scan_lines(log)]
+        sources = [_odometry_lines(log), _gyro_lines(log), _range_lines(log), scan_lines(log)]
         none = np.zeros(0)
-        stamps = [log.odometry.stamps, log.ranges.stamps if log.ranges else none, log.scans.stamps if log.scans else none]
-        kind = np.repeat(np.arange(3), [len(s) for s in stamps])
+        sensors = (log.odometry, log.gyro, log.ranges, log.scans)
+        stamps = [none if sensor is None else sensor.stamps for sensor in sensors]
+        kind = np.repeat(np.arange(4), [len(s) for s in stamps])
         order = np.argsort(np.concatenate(stamps), kind="stable")
         for source in kind[order].tolist():
             stream.write(next(sources[source]))
@@ -68,6 +69,13 @@ def _params(log: SensorLog) -> Iterator[tuple[str, str]]:
 def _odometry_lines(log: SensorLog) -> Iterator[bytes]:
     for stamp, (x, y, theta) in zip(log.odometry.stamps.tolist(), log.odometry.poses.tolist(), strict=True):
         yield f"ODOM {x:.6f} {y:.6f} {theta:.6f} 0 0 0 {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
+
+
+def _gyro_lines(log: SensorLog) -> Iterator[bytes]:
+    if log.gyro is None:
+        return
+    for stamp, heading in zip(log.gyro.stamps.tolist(), log.gyro.heading.tolist(), strict=True):
+        yield f"GYRO {heading:.6f} 0 {stamp:.6f} {HOST} {stamp:.6f}\n".encode()
 
 
 def _range_lines(log: SensorLog) -> Iterator[bytes]:

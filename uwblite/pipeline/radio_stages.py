@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import keyframes, se2
+from .. import gyro, keyframes, se2
 from ..arrays import Bools, Floats
 from ..graph import calibration
 from ..graph.calibration import BIAS, ODOMETRY, RADIO, RANGE_SCALE, with_free, with_nonnegative_heights
@@ -41,13 +41,14 @@ def first_optimisation(task: Task) -> Estimate:
 def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
     """Return a recording's graph by dead reckoning, with its calibration priors, odometry edges and range edges."""
     log, frames, ids = recording.log, recording.frames, recording.anchor_ids
-    listed = calibration.unknowns(config.calibration, ids, heights_given(recording))
+    priors, noise = gyro.settings(log, config.calibration, config.odometry)
+    listed = calibration.unknowns(priors, ids, heights_given(recording))
     block = calibration.block(listed)
     graph = Graph(frames.odometry.copy(), np.zeros((len(ids), 2)), (), block)
     graph = graph.with_edges(calibration.prior_edges(listed))
     graph = replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool))
     graph = with_free(graph, *ODOMETRY, BIAS, RANGE_SCALE)
-    odometry = wheel_edges(frames, 0, config.odometry, block)
+    odometry = wheel_edges(frames, 0, noise, block)
     if log.ranges is None:
         return Estimate(graph, odometry, None, ids)
     attached = keyframes.attach_ranges(log.ranges, log.odometry, frames, log.mounting)

@@ -6,6 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
+from ..gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
 from . import cuts, directions, odometry_chain, range_motion, stuck_sensors, units, wheel_motion
 from .wheel_motion import Pairs
@@ -44,8 +45,8 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     odometry, glitches = odometry_chain.without_glitches(odometry)
     units.refuse_degrees(odometry)
     odometry, jumps, broken = odometry_chain.rejoined(odometry)
-    log = replace(log, odometry=odometry)
-    remarks += [*_repeats(repeats), *glitches, *broken]
+    log, turned = heading_from_gyro(replace(log, odometry=odometry))
+    remarks += [*_repeats(repeats), *glitches, *broken, *turned]
     repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_repeated_ranges, directions.heading_with_the_path]
     for repair in repairs + [directions.laser_upright] * turn_laser:
         log, more = repair(log)

@@ -1,0 +1,107 @@
+"""A gyro's heading in place of the wheels'."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import planted
+
+from uwblite import se2
+from uwblite.gyro import LEFT_OF_BIAS, heading_from_gyro, settings
+from uwblite.io.carmen import read_log, write_log
+from uwblite.mapping import build_map
+from uwblite.mapping_config import MappingConfig
+from uwblite.sensor_log import Gyro, Odometry, SensorLog
+
+ANCHORS = np.array([[-6.0, -5.0], [6.0, -5.5], [6.5, 5.0], [-5.5, 6.0]])
+BIAS = 0.01
+
+
+def gyro_of(stamps, truth, rng=None, bias=BIAS, noise=0.0, rate=100.0) -> Gyro:
+    """Return what a gyro says of a true motion; noise: rad per square root of a second."""
+    when = np.arange(stamps[0], stamps[-1], 1.0 / rate)
+    heading = np.interp(when, stamps, np.unwrap(truth[:, 2])) + bias * (when - when[0])
+    if rng is not None:
+        heading = heading + noise * np.sqrt(1.0 / rate) * np.cumsum(rng.standard_normal(len(when)))
+    return Gyro(when, heading - heading[0] + 1.0)
+
+
+def rested(stamps, truth, seconds=6.0):
+    """Return the drive with a rest before it."""
+    rest = np.arange(0.0, seconds, stamps[1] - stamps[0])
+    return np.concatenate([rest, stamps + seconds]), np.concatenate([np.repeat(truth[:1], len(rest), axis=0), truth])
+
+
+def test_a_perfect_gyro_makes_wheels_that_turn_wrongly_perfect():
+    rng = np.random.default_rng(1)
+    stamps, truth = rested(*planted.wander(rng, 20.0))
+    motion = se2.between(truth[:-1], truth[1:])
+    wrong = 0.3 * motion[:, 2] + 0.05 * np.hypot(*motion[:, :2].T)
+    said = np.column_stack([se2.rotate(0.5 * wrong, motion[:, :2]), motion[:, 2] + wrong])
+    wheels = Odometry(stamps, planted.chain(np.zeros(3), said))
+    log, remarks = heading_from_gyro(SensorLog(wheels, gyro=gyro_of(stamps, truth)))
+    start = se2.compose(log.odometry.poses[0], se2.inverse(truth[0]))
+    expected = se2.compose(start, truth)
+    covered = stamps <= stamps[-1] - 0.01
+    assert np.abs(log.odometry.poses - expected)[covered, :2].max() < 0.01  # chords of 0.1 s
+    assert np.abs(se2.wrap_angle(log.odometry.poses[:, 2] - expected[:, 2]))[covered].max() < 2e-3
+    assert f"{BIAS:+.5f}" in remarks[0].text
+    assert "rests" in remarks[0].text
+
+
+def test_without_a_rest_the_bias_is_found_against_the_wheels():
+    rng = np.random.default_rng(2)
+    stamps, truth = planted.wander(rng, 60.0)
+    log, remarks = heading_from_gyro(SensorLog(planted.odometry(stamps, truth), gyro=gyro_of(stamps, truth)))
+    assert "against the wheels" in remarks[0].text
+    turn = se2.wrap_angle(log.odometry.poses[:, 2] - (truth[:, 2] - truth[0, 2]))
+    assert np.abs(turn).max() < 0.1 * BIAS * stamps[-1]
+
+
+def test_where_the_gyro_is_silent_the_wheels_turn():
+    rng = np.random.default_rng(3)
+    stamps, truth = rested(*planted.wander(rng, 20.0))
+    gyro = gyro_of(stamps, truth, bias=0.0)
+    heard = (gyro.stamps < 15.0) | (gyro.stamps > 25.0)
+    wheels = planted.odometry(stamps, truth)
+    log, _ = heading_from_gyro(SensorLog(wheels, gyro=Gyro(gyro.stamps[heard], gyro.heading[heard])))
+    assert np.abs(se2.wrap_angle(log.odometry.poses[:, 2] - wheels.poses[:, 2])).max() < 5e-3
+    silent = Gyro(np.array([1e6, 1e6 + 1.0]), np.zeros(2))
+    same, remarks = heading_from_gyro(SensorLog(wheels, gyro=silent))
+    assert same.odometry is wheels
+    assert "silent" in remarks[0].text
+
+
+def test_a_log_keeps_the_gyro(tmp_path):
+    rng = np.random.default_rng(4)
+    stamps, truth = planted.wander(rng, 5.0)
+    log = SensorLog(planted.odometry(stamps, truth), gyro=gyro_of(stamps, truth))
+    write_log(tmp_path / "run.log", log)
+    again = read_log(tmp_path / "run.log")
+    assert again.gyro.heading == pytest.approx(log.gyro.heading, abs=1e-6)
+    assert again.gyro.stamps == pytest.approx(log.gyro.stamps, abs=1e-6)
+    assert read_log(tmp_path / "run.log").crop(end=3.0).gyro.stamps.max() <= 3.0
+
+
+def test_priors_and_noise_are_a_gyros_and_what_is_off_stays_off():
+    config, log = MappingConfig(), SensorLog(Odometry(np.zeros(1), np.zeros((1, 3))))
+    assert settings(log, config.calibration, config.odometry) == (config.calibration, config.odometry)
+    log = replace(log, gyro=Gyro(np.zeros(1), np.zeros(1)))
+    calibration, noise = settings(log, config.calibration, config.odometry)
+    assert calibration.heading_rate == LEFT_OF_BIAS
+    assert noise.heading_per_turn < config.odometry.heading_per_turn
+    assert settings(log, replace(config.calibration, heading_rate=0.0), config.odometry)[0].heading_rate == 0.0
+
+
+def test_the_map_of_slipping_wheels_is_better_with_a_gyro():
+    rng = np.random.default_rng(5)
+    stamps, truth = rested(*planted.wander(rng, 100.0))
+    wheels = planted.odometry(stamps, truth, rng, turn_scale=1.1, noise=0.01, turn_noise=0.1)
+    ranges = planted.ranges(rng, stamps, truth, ANCHORS, sigma=0.05)
+    gyro = gyro_of(stamps, truth, rng, noise=0.0005)
+    errors = []
+    for recording in (SensorLog(wheels, ranges), SensorLog(wheels, ranges, gyro=gyro)):
+        result = build_map(recording, MappingConfig())
+        turn = se2.wrap_angle(result.trajectory[:, 2] - truth[:, 2])
+        errors.append(np.degrees(np.sqrt(np.mean(se2.wrap_angle(turn - np.median(turn)) ** 2))))
+    assert errors[1] < 0.5 * errors[0]
