@@ -251,8 +251,8 @@ def halves(config: MappingConfig) -> str:
             anchor.bias - float(np.median(ranges["residual"][own & half]))
             for half in (ranges["stamp"] < middle, ranges["stamp"] >= middle)
         )
-        told = [f"{alone[n][anchor.id][0]:.2f} +- {alone[n][anchor.id][1]:.2f}" for n in (0, 1)]
-        rows.append([anchor.id, f"{anchor.bias:.2f} +- {anchor.bias_sigma:.2f}", first, second, abs(first - second), *told])
+        told = [f"{alone[n][anchor.id][0]:.2f} ± {alone[n][anchor.id][1]:.2f}" for n in (0, 1)]
+        rows.append([anchor.id, f"{anchor.bias:.2f} ± {anchor.bias_sigma:.2f}", first, second, abs(first - second), *told])
     return (
         "Kasdorf, no truth: the anchors' biases, m; bar 0.15 on the difference between the halves of the recording. In 4 m of\n"
         "driving neither half alone parts an anchor's bias from its place, as the stated sigmas say, so they are compared\n"

@@ -79,11 +79,11 @@ def _check_screening(log: SensorLog, found: Findings) -> None:
     try:
         screening = screen(log).screening
     except DataError as error:
-        found.serious("log", str(error), "no map is made before that is mended")
+        found.serious("log", str(error), "no map is made before that is fixed")
         return
     for remark in screening.remarks if screening is not None else ():
         if remark.doubt:
-            found.serious("log", remark.text, "a map of this is doubted: mend the recording, or cut it there")
+            found.serious("log", remark.text, "the map will be doubted: repair the recording, or cut it there")
         else:
             found.warning("log", remark.text, "a map repairs it so; the files stay as they are")
 

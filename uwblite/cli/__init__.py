@@ -38,7 +38,7 @@ _OUT_OF_MEMORY = "out of memory; a coarser --resolution, --crop or a shorter rec
 _EXIT_CODES = """\
 exit codes:
   0    done
-  1    error; one line on stderr says what, where and how to mend it
+  1    error; one line on stderr says what, where and how to fix it
   2    wrong usage of the command line
   3    files are written, but the result should not be trusted; the reasons are named
   130  interrupted (Ctrl-C)

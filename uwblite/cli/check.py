@@ -113,7 +113,7 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], prob
     lines.append(f"expected cost here: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
     serious = len(diagnosis.serious)
     lines.append(
-        f"mend the {serious} serious finding{'s' if serious > 1 else ''} first"
+        f"fix the {serious} serious finding{'s' if serious > 1 else ''} first"
         if serious
         else f"next: uwblite map {name} --out map/"
     )

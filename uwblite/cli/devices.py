@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ..drivers.events import Action
     from ..drivers.transport import Port
 
-HELP = "list tag, lidar and base that are plugged in, and say how to mend what is not right"
+HELP = "list tag, lidar and base that are plugged in, and say how to fix what is not right"
 EPILOG = """
 examples:
   uwblite devices                              look at every port of a known kind

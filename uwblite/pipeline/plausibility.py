@@ -107,7 +107,7 @@ def check_calibration(
         unit = "" if value.unit == "1" else f" {value.unit}"
         task.stages.warn(
             "unusual-calibration",
-            f"{value.meaning} came out as {value.value:+.3g} +- {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
+            f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
             + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings"),
             name=value.name, value=value.value, sigma=value.sigma, usual=sigma,
         )  # fmt: skip
