@@ -152,3 +152,35 @@ def test_columns_that_cannot_be_are_refused(result, capsys, row):
     (root / "odd.csv").write_text(f"name,x,y,radius\n{row}\nC2,1,1,0.2\n")
     assert main([*words, "--landmarks", str(root / "odd.csv")]) == 1
     assert capsys.readouterr().err.startswith("uwblite: error: ")
+
+
+def test_relations_are_judged_at_the_lidars_clock(result, capsys):
+    """The lidar is found 0.5 s late, a relation lies outside, and neither truth nor map is needed."""
+    place, (verb, folder, *_) = result
+    stamps, truth = read_tum(place / "truth.tum")
+    (place / "map" / "report.json").write_text('{"calibration": [{"name": "laser_delay", "value": 0.5}]}')
+    pairs = np.array([[20, 30], [300, 40], [50, 390]])
+    seen = se2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])
+    lines = [
+        f"{stamps[i] - 0.5:.3f} {stamps[j] - 0.5:.3f} {x} {y} 0 0 0 {angle}"
+        for (i, j), (x, y, angle) in zip(pairs.tolist(), seen.tolist(), strict=True)
+    ]
+    relations = place / "truth.relations"
+    relations.write_text("\n".join([*lines, f"{stamps[0] - 60:.3f} {stamps[9]:.3f} 0 0 0 0 0 0"]) + "\n")
+    assert main([verb, folder, "--relations", str(relations), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["relations"]
+    assert told["count"] == 4
+    assert told["not_answered"] == 1
+    assert told["share_far"] == 0.25
+    assert told["translation"]["mean"] < 1e-4
+    assert told["rotation"]["mean"] < 1e-4
+    assert main([verb, folder, "--relations", str(relations), "--truth", str(place / "truth.tum")]) == 0
+    out = capsys.readouterr().out
+    assert "4 relations, 1 not answered; 25.0% beyond 0.5 m or not answered" in out
+    assert "position (ATE)" in out
+
+
+def test_something_to_judge_by_is_needed(result, capsys):
+    _, (verb, folder, *_) = result
+    assert main([verb, folder]) == 2
+    assert "give --truth, --relations, or both" in capsys.readouterr().err

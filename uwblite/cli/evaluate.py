@@ -25,6 +25,7 @@ examples:
   uwblite evaluate map/ --truth truth.tum
   uwblite evaluate map/ --truth truth.tum --anchors truth_anchors.csv --landmarks columns.csv
   uwblite evaluate map/ --truth truth.tum --json
+  uwblite evaluate map/ --relations truth.relations.gz
   uwblite evaluate both/ --truth monday.tum --truth tuesday.tum    a map of two recordings
   uwblite evaluate both/ --truth tuesday.tum --recording 2         only the second of them
 
@@ -37,6 +38,8 @@ files (lengths in metres):
   --anchors    id,x,y
   --landmarks  name,x,y,radius[,neighbours]   neighbours: names separated by blanks; only these distances are judged
   --walls      x1,y1,x2,y2
+  --relations  stamp1 stamp2 x y z roll pitch yaw: the scan of stamp2 as seen from that of stamp1. Poses are asked at the
+               lidar's clock, as the map found it; relations without an answer are counted and told
 """
 
 DEFAULT_RADIUS = 0.3
@@ -46,7 +49,8 @@ DEFAULT_RADIUS = 0.3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("dir", help="folder that uwblite map wrote: trajectory.tum, anchors.csv, map.yaml")
-    parser.add_argument("--truth", metavar="FILE.tum", required=True, action="append", help="true poses; one per recording")
+    parser.add_argument("--truth", metavar="FILE.tum", action="append", help="true poses; one per recording")
+    parser.add_argument("--relations", metavar="FILE", help="true relative poses of scans (Kuemmerle et al. 2009)")
     counted, length = number(above=0, whole=True), number(above=0)
     parser.add_argument("--recording", metavar="N", type=counted, help="the recording that a single truth is of (1)")
     parser.add_argument("--anchors", metavar="FILE.csv", help="true anchors")
@@ -61,10 +65,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..errors import ConfigError
+    from ..errors import ConfigError, UsageError
     from . import console
 
-    if args.recording and len(args.truth) > 1:
+    if not args.truth and not args.relations:
+        raise UsageError("give --truth, --relations, or both")
+    if not args.truth and (args.anchors or args.landmarks or args.walls):
+        raise UsageError("--anchors, --landmarks and --walls need --truth, which lays the map over them")
+    if args.recording and len(args.truth or ()) > 1:
         raise ConfigError("--recording is for a single --truth; several are of recording 1, 2, ...")
     summary, lines = evaluate(args)
     if args.json:
@@ -87,11 +95,14 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
 
     folder = Path(args.dir)
     mend_result(folder)
+    told, told_lines = _relations(folder, args.relations, args.recording or 1) if args.relations else ({}, [])
+    if not args.truth:
+        return told, told_lines
     recordings = [_recording(folder, truth, number) for number, truth in enumerate(args.truth, args.recording or 1)]
     stamps, poses, true_stamps, true_poses = _one_after_another(recordings)
     trajectory = evaluate_trajectory(stamps, poses, true_stamps, true_poses, max_gap=args.max_gap, rpe_delta=args.delta)
-    summary: dict[str, Any] = {"trajectory": _trajectory_summary(trajectory, len(true_stamps))}
-    lines = _trajectory_lines(trajectory, len(true_stamps), "together" if len(recordings) > 1 else "trajectory")
+    summary: dict[str, Any] = {**told, "trajectory": _trajectory_summary(trajectory, len(true_stamps))}
+    lines = told_lines + _trajectory_lines(trajectory, len(true_stamps), "together" if len(recordings) > 1 else "trajectory")
     if len(recordings) > 1:
         alone = [evaluate_trajectory(*recording, max_gap=args.max_gap, rpe_delta=args.delta) for recording in recordings]
         summary["recordings"] = [
@@ -128,6 +139,36 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     if occupied is None and (args.landmarks or args.walls):
         lines.append("no map.yaml in the folder: columns and walls are not judged")
     return summary, lines
+
+
+def _relations(folder: Path, path: str, number: int) -> tuple[dict[str, Any], list[str]]:
+    """Judge a recording of a result by relations; return the figures as JSON-ready summary and as lines of text."""
+    import math
+
+    from ..errors import ConfigError
+    from ..evaluation.relations import FAR, Relations, evaluate_relations
+    from ..io.relations_file import read_relations
+    from ..io.stored_result import read_result
+
+    result = read_result(folder)
+    if number > len(result.trajectories):
+        raise ConfigError(f"{folder} is a map of {len(result.trajectories)} recordings, not of {number}")
+    relations = Relations(*read_relations(path))
+    found = evaluate_relations(*in_order(*result.trajectories[number - 1]), relations, result.laser_delay)
+    missing = len(relations) - int(found.answered.sum())
+    t, r, degrees = found.translations, found.rotations, math.degrees(1.0)
+    lines = [
+        f"{'relations':<24}{'mean':>11}{'sd':>11}{'median':>11}{'max':>11}",
+        f"{'  translation':<24}{t.mean:11.4f}{t.std:11.4f}{t.median:11.4f}{t.max:11.4f}  m",
+        f"{'  rotation':<24}" + "".join(f"{degrees * v:11.4f}" for v in (r.mean, r.std, r.median, r.max)) + "  deg",
+        f"{len(relations)} relations, {missing} not answered; {found.far:.1%} beyond {FAR:g} m or not answered; "
+        f"asked at the lidar's clock {result.laser_delay:+.3f} s",
+    ]
+    summary = {
+        "count": len(relations), "not_answered": missing, "share_far": found.far, "laser_delay": result.laser_delay,
+        "translation": _plain(t), "rotation": _plain(r),
+    }  # fmt: skip
+    return {"relations": summary}, lines
 
 
 def _recording(folder: Path, truth: str, number: int) -> "Timed":

@@ -66,6 +66,14 @@ class StoredResult:
     report: dict[str, Any] = field(default_factory=dict)
     """report.json, as it stands there; empty where there is none."""
 
+    @property
+    def laser_delay(self) -> float:
+        """Offset of the lidar's clock, s: a scan stamped t was taken at t + laser_delay by the trajectory's clock; 0 where
+        the report says nothing of it."""
+        entries = self.report.get("calibration") or []
+        found = [e.get("value") for e in entries if isinstance(e, dict) and e.get("name") == "laser_delay"]
+        return float(found[0]) if found and isinstance(found[0], int | float) else 0.0
+
     def pose_at(self, recording: int, stamps: Floats) -> Floats:
         """Return the poses (..., 3) of a recording, counted from 1, at times of its clock, s."""
         return se2.interpolate_trajectory(*self.trajectories[recording - 1], stamps)

@@ -58,18 +58,7 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
     ------
     FormatError : a line has not eight finite numbers, or there is no pose.
     """
-    parts: list[Floats] = []
-    with open_source(path) as source:
-        number = 0
-        for block in source.blocks():
-            lines = block.split(b"\n")[:-1]
-            rows = [(number + i, line.split()) for i, line in enumerate(lines, 1) if not line.lstrip().startswith(b"#")]
-            rows = [(n, tokens) for n, tokens in rows if tokens]
-            parts.append(_numbers(rows, source.path))
-            number += len(lines)
-        table = np.concatenate(parts) if parts else np.zeros((0, 8))
-        if len(table) == 0:
-            raise FormatError("no poses in it", source.path)
+    table = read_rows(path, "timestamp tx ty tz qx qy qz qw", "poses")
     qx, qy, qz, qw = table[:, 4:].T
     norm = qx * qx + qy * qy + qz * qz + qw * qw
     # Files without orientation write four zeros: heading 0.
@@ -77,11 +66,37 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Floats]:
     return table[:, 0].copy(), np.stack([table[:, 1], table[:, 2], np.where(norm > 0, yaw, 0.0)], axis=1)
 
 
-def _numbers(rows: list[tuple[int, list[bytes]]], path: str) -> Floats:
+def read_rows(path: str | os.PathLike[str], columns: str, what: str) -> Floats:
+    """Return the rows (n, 8), n >= 1, of a table of eight finite numbers a line.
+
+    Parameters
+    ----------
+    columns : their names. what : the rows hold, for messages.
+
+    Raises
+    ------
+    FormatError : a line has not eight finite numbers, or there is none.
+    """
+    parts: list[Floats] = []
+    with open_source(path) as source:
+        number = 0
+        for block in source.blocks():
+            lines = block.split(b"\n")[:-1]
+            rows = [(number + i, line.split()) for i, line in enumerate(lines, 1) if not line.lstrip().startswith(b"#")]
+            rows = [(n, tokens) for n, tokens in rows if tokens]
+            parts.append(_numbers(rows, source.path, columns))
+            number += len(lines)
+        table = np.concatenate(parts) if parts else np.zeros((0, 8))
+        if len(table) == 0:
+            raise FormatError(f"no {what} in it", source.path)
+    return table
+
+
+def _numbers(rows: list[tuple[int, list[bytes]]], path: str, columns: str) -> Floats:
     """Return (n, 8) finite numbers."""
     for number, tokens in rows:
         if len(tokens) != 8:
-            raise FormatError(f"{len(tokens)} columns, expected 8: timestamp tx ty tz qx qy qz qw", path, number)
+            raise FormatError(f"{len(tokens)} columns, expected 8: {columns}", path, number)
     try:
         table = np.array([tokens for _, tokens in rows], dtype=np.float64).reshape(-1, 8)
     except ValueError:

@@ -138,10 +138,12 @@ def _searched(
         first = max(first, int(before[-1]) + 1 if len(before) else 0)
         guess = steps.guess[row]
         found = searching.find(k, first, chain, np.stack([guess, steps.pose[row], guess * [0.0, 0.0, 1.0]]))
-        lost[row], wrong[row] = not found.clear, not found.clear and found.contradicts
+        wrong[row] = not found.clear and found.contradicts
+        # Where no search is clear, descent near to the odometry's guess still measures what the surfaces fix.
+        lost[row] = not found.clear and (found.contradicts or steps.share[row] < _LEAST_SHARE)
         if found.clear:
             chain[k] = pose[row] = found.pose
-        else:
+        elif lost[row]:
             first = k + 1
     return pose, lost, wrong
 
@@ -153,6 +155,8 @@ def _loosened(wheels: OdometryEdges, wrong: Bools) -> OdometryEdges:
     return replace(wheels, sqrt_information=wheels.sqrt_information * (sigma / wide)[:, None, :])
 
 
+_LEAST_SHARE = 0.4
+"""Share of points that match from which descent from the odometry's guess measures a step."""
 _LOOSER = 10.0
 """Factor on the standard deviations of wheels that the clouds contradict."""
 _LOOSEST = np.array([0.3, 0.3, 0.2])
