@@ -39,7 +39,6 @@ REFUSED = {
     "no speed": ["--odometry", "line:/dev/null?columns=t,x,y,theta&baud=0"],
     "speed beyond all ports": ["--odometry", "line:/dev/null?columns=t,x,y,theta&baud=10000000000"],
     "modulus": ["--odometry", f"line:/dev/null?columns=t,left,right&tick=1e-4&wheel_base=0.3&tick_modulus=1{'0' * 400}"],
-    "two lidars": ["--lidar", "/dev/null", "--lidar", "/dev/zero"],
     "a tag as lidar": ["--lidar", "tlv:/dev/null"],
     "an option that it does not have": ["--lidar", "/dev/null?colour=3"],
     "no port": ["--uwb", "shell:"],
@@ -68,7 +67,7 @@ def test_an_earlier_log_is_not_touched(tmp_path, monkeypatch):
 
 def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path):
     out = tmp_path / "run.log"
-    assert main(["record", "--lidar", str(tmp_path / "ttyLATER"), "--out", str(out), "--duration", "0.2"]) == 3
+    assert main(["record", "--lidar", str(tmp_path / "ttyLATER"), "--out", str(out), "--duration", "2"]) == 3
     assert "no such port" in out.read_text()
 
 

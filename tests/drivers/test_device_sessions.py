@@ -347,6 +347,7 @@ def test_lidar_that_gives_no_time_is_late_by_no_more_than_a_turn_is_long():
     truth = {tuple(v): t for t, v in sent}
     for scan in of_kind(actions, LaserScan):
         assert scan.stamp == pytest.approx(truth[tuple(round(1000 * r) for r in scan.ranges)], abs=0.003)
+        assert scan.spread == pytest.approx(0.035)
 
 
 @pytest.mark.parametrize(
@@ -376,7 +377,8 @@ def test_lidar_on_a_slow_line_is_made_faster_or_asked_for_fewer_scans(rates, exp
     for scan in settled:
         key = tuple(5600 if math.isinf(r) else round(1000 * r) for r in scan.ranges)
         # An answer to TM1 takes 8 ms at 19200 bit/s: the clock is known to half of that.
-        assert min(abs(scan.stamp - t) for t in truth[key]) < (0.003 if rates[1:] else 0.0045)
+        assert min(abs(scan.stamp - t) for t in truth[key]) < scan.spread + 0.0025
+        assert scan.spread < (0.003 if rates[1:] else 0.006)
 
 
 def test_lidar_scans_that_a_restart_cost_are_counted():
@@ -440,3 +442,20 @@ def test_tag_on_a_link_whose_delay_comes_and_goes(seed):
     lost = sum(a.count for a in of_kind(actions, Lost))
     begun = sum(t >= epochs[0].stamp - 0.05 for t, _ in sent)
     assert len(epochs) + lost == pytest.approx(begun, abs=0.05 * begun)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lidar_on_a_busy_computer_is_tied_as_well_as_is_stated(seed):
+    """Answers take 0 to 25 ms: more readings of the clock are asked for, and what is left is stated."""
+    device, sent = lidar()
+    rng = random.Random(seed)
+    actions, _ = simulate(ScipDriver(), device, 40.0, jitter=lambda: rng.uniform(0, 0.025))
+    truth = {}
+    for true, values in sent:
+        truth.setdefault(tuple(values), []).append(true)
+    scans = of_kind(actions, LaserScan)[50:]
+    errors = [min(abs(scan.stamp - t) for t in truth[tuple(round(1000 * r) for r in scan.ranges)]) for scan in scans]
+    assert scans[-1].spread < 0.006
+    # Besides the tie there is the smallest of the thirty delays with which the latency is learnt: 3.5 ms at 99 %.
+    assert sorted(errors)[int(0.95 * len(errors))] < scans[-1].spread + 0.0035
+    assert max(errors) < 0.010

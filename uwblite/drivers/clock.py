@@ -167,14 +167,16 @@ class DeviceClock:
     modulus : the counter wraps at this number of counts; 0 = it does not wrap.
     period : s between frames; None = learned from them.
     latency : s from a frame's stamp to its first byte at the host, at least, as long as it was not measured (`tie`).
+    spread : s by which that may be wrong.
     proven : the unit of time is a fact of the protocol. Otherwise frames are stamped with their arrival until the clock
         has kept pace with the host's.
     """
 
     def __init__(
-        self, tick: float, modulus: int = 0, *, period: float | None = None, latency: float = 0.0, proven: bool = True
+        self, tick: float, modulus: int = 0, *, period: float | None = None, latency: float = 0.0, spread: float = 0.0,
+        proven: bool = True,
     ) -> None:  # fmt: skip
-        self.latency, self.period = latency, period
+        self.latency, self.spread, self.period = latency, spread, period
         self.proven, self._believed = proven, proven
         self.rate: float | None = None
         """Device seconds per host second where these disagree: frames are then stamped with their arrival."""
@@ -201,6 +203,7 @@ class DeviceClock:
         low, high = self._tie or (-math.inf, math.inf)
         # Counts are whole: the reading was made up to half a count before or after what it says.
         self._tie = max(low, sent - device - self._half), min(high, answered - device + self._half)
+        self.spread = max(self._half, (self._tie[1] - self._tie[0]) / 2)
         self._learn_until = None
 
     def read(self, count: float, arrival: float) -> Reading:

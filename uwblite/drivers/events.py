@@ -120,6 +120,8 @@ class LaserScan:
     range_max: float
     range_min: float = 0.02
     """m."""
+    spread: float = 0.0
+    """s; the stamp may be wrong by this much to either side; 0 = not known."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,7 +114,7 @@ def summary_lines(links: list[Link], start: float, end: float) -> list[str]:
             text += "; anchors " + ", ".join(f"{name} {count}" for name, count in sorted(counts.anchors.items()))
         if counts.widest:
             mean = counts.spread / counts.messages
-            text += f"; stamps within {1000 * mean:.1f} ms on average, {1000 * counts.widest:.0f} ms at worst"
+            text += f"; stamps within {1000 * mean:.1f} ms on average, {1000 * counts.widest:.1f} ms at worst"
         lines.append(text)
         lines += [f"{link.name}: corrupt {count} times: {why}" for why, count in counts.corrupt.most_common(8)]
     return lines

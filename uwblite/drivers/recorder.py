@@ -194,6 +194,8 @@ class Recorder:
 
     def _write(self, measured: LaserScan | RangeEpoch | OdometryPose | GyroHeading, link: Link) -> None:
         tail, counts = self._tail(measured.stamp), link.counts
+        spread = 0.0 if isinstance(measured, OdometryPose) else measured.spread
+        counts.spread, counts.widest = counts.spread + spread, max(counts.widest, spread)
         if isinstance(measured, OdometryPose):
             self._pose = measured
             self._lines.append(pose_line(measured, tail))
@@ -201,7 +203,6 @@ class Recorder:
             self._lines.append(gyro_line(measured, tail))
         elif isinstance(measured, RangeEpoch):
             self._lines += range_lines(measured, tail, link.number)
-            counts.spread, counts.widest = counts.spread + measured.spread, max(counts.widest, measured.spread)
             counts.anchors.update(reading.anchor_id for reading in measured.readings)
         else:
             self.param(link.param_name("laser_time_increment"), f"{measured.time_increment:.9f}")
@@ -346,6 +347,9 @@ class Recorder:
                 link.port = None
             if link.opening is not None:
                 link.opening.give_up()
+                why = link.opening.result() or "it was still being opened at the end"
+                if not link.counts.connects and isinstance(why, str | DeviceError):
+                    self._note(link, Note("error", f"{link.name}-cannot-open", f"{link.name}: {link.url}: {why}"))
         self._selector.close()
         self._report_damage()
         for line in self.summary():

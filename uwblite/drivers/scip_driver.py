@@ -28,7 +28,12 @@ PATIENCE = 0.4
 SETTLE = 0.1
 """s for a flush or another bit rate to take effect."""
 PARAMETER_READS = 4
-TIME_READS = 8
+TIME_READS = 8, 40
+"""Readings of the clock, at least and at most; a busy computer needs more of them."""
+GOOD_TIE = 0.002
+"""s to which the clocks should be tied to each other."""
+NOMINAL_SPREAD = 0.035
+"""s by which the nominal delay may be wrong: between the end of the sweep and that of the turn."""
 TRUNCATION = 0.5
 """ms; stamps are truncated to 1 ms, half of that makes them unbiased."""
 SCAN_PATIENCE = 1.0
@@ -76,7 +81,7 @@ class ScipDriver(Driver):
         self._start, self._end, self._cluster, self._skip, self._wide = start, end, max(1, cluster), skip, wide
         self._stream = stream
         self._protocol = ScipProtocol()
-        self._clock = DeviceClock(1e-3, TIME_MODULUS, latency=self.geometry.period)
+        self._clock = DeviceClock(1e-3, TIME_MODULUS, latency=self.geometry.period, spread=NOMINAL_SPREAD)
         self._rates_tried: set[int] = set()
         self._rounds = 0
 
@@ -204,8 +209,10 @@ class ScipDriver(Driver):
     def _tie_clock(self) -> Script[None]:
         """Read the clock a few times in the time-adjust mode; without it, what was measured before stays in force."""
         entered = yield from self._request("TM0")
-        for _ in range(TIME_READS if entered and status_meaning("TM0", entered.status)[0] == "ok" else 0):
+        for k in range(TIME_READS[1] if entered and status_meaning("TM0", entered.status)[0] == "ok" else 0):
             sent = self.now
+            if k >= TIME_READS[0] and self._clock.spread < GOOD_TIE:
+                break
             reply = yield from self._request("TM1", 1)
             if reply is None or not reply.lines:
                 break
@@ -331,6 +338,7 @@ class ScipDriver(Driver):
             unit.step_time * scan.cluster,
             min(unit.distance_max, limit or unit.distance_max) / 1000,
             unit.distance_min / 1000,
+            self._clock.spread,
         )
 
     # ---- for people
