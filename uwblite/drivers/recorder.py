@@ -194,7 +194,7 @@ class Recorder:
 
     def _write(self, measured: LaserScan | RangeEpoch | OdometryPose | GyroHeading, link: Link) -> None:
         tail, counts = self._tail(measured.stamp), link.counts
-        spread = 0.0 if isinstance(measured, OdometryPose) else measured.spread
+        spread = measured.spread if isinstance(measured, LaserScan | RangeEpoch) else 0.0
         counts.spread, counts.widest = counts.spread + spread, max(counts.widest, spread)
         if isinstance(measured, OdometryPose):
             self._pose = measured
