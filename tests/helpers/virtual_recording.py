@@ -34,14 +34,18 @@ class VirtualPort:
 
     def read(self):
         now, data = self._clock.now, b""
+        self._send(self.device.advance(now), now)
         while self._answers and self._answers[0][0] <= now:
             data += self._answers.pop(0)[1]
-        return data + self.device.advance(now)
+        return data
+
+    def _send(self, data, due):
+        """Let bytes arrive at a time, behind those that were sent before."""
+        if data:
+            self._answers.append((max(due, self._answers[-1][0]) if self._answers else due, data))
 
     def write(self, data):
-        answer = self.device.receive(data, self._clock.now)
-        if answer:
-            self._answers.append((self._clock.now + LATENCY, answer))
+        self._send(self.device.receive(data, self._clock.now), self._clock.now + LATENCY)
 
     def next_time(self):
         return min(self.device.next_time(self._clock.now), self._answers[0][0] if self._answers else float("inf"))
