@@ -10,7 +10,7 @@ from .config import setting
 from .graph.calibration import odometry_indices
 from .graph.graph import Calibration, Graph
 from .graph.pose_edges import OdometryEdges, RelativePoseEdges
-from .graph.robust import Kernel
+from .graph.robust import Kernel, spread
 from .keyframes import Keyframes
 
 _STEPS = Kernel("cauchy", 5.0)
@@ -78,7 +78,7 @@ def learn_wheels(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) 
     seen = np.einsum("eii->ei", onto) > 0.9
     factor = np.ones(3)
     for k in np.flatnonzero(seen.sum(axis=0) >= _ENOUGH_STEPS):
-        factor[k] = np.clip(1.4826 * np.median(off[seen[:, k], k]), 0.3, 10.0)
+        factor[k] = np.clip(spread(off[seen[:, k], k]), 0.3, 10.0)
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor)
 
 

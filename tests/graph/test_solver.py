@@ -395,7 +395,7 @@ def test_the_summary_tells_what_happened():
     assert summary.converged
     assert summary.reason == "chi2 no longer decreases"
     assert summary.chi2_initial == pytest.approx(graph.chi2())
-    assert summary.chi2_history.shape == summary.damping_history.shape == (summary.iterations,)
+    assert summary.chi2_history.shape == (summary.iterations,)
     assert summary.chi2 == min(summary.chi2_history)
     assert calls == [(k + 1, 100) for k in range(summary.iterations)]
 
@@ -425,7 +425,6 @@ def test_steps_that_fail_are_dropped():
         best = np.minimum.accumulate(np.append(summary.chi2_initial, summary.chi2_history))
         rejected = summary.chi2_history > best[:-1]
         failed += rejected.sum()
-        assert np.all(np.diff(summary.damping_history)[rejected[:-1]] >= 0)
         assert found.chi2() == pytest.approx(best[-1])
     assert failed > 0
 
@@ -437,7 +436,6 @@ def test_a_first_step_that_fails_is_no_sign_of_a_minimum():
     graph = Graph(poses, np.array([[3.0, 0.01]]), (ranges,), fixed_poses=np.ones(3, dtype=bool))
     found, summary = optimize(graph)
     assert summary.chi2_history[0] > summary.chi2_initial
-    assert summary.damping_history[0] == SolverConfig().initial_damping
     assert summary.converged
     assert summary.chi2 < 1e-9
     np.testing.assert_allclose(found.anchors[0], place, atol=1e-5)
@@ -457,7 +455,7 @@ def test_the_gradient_is_judged_in_standard_deviations(away, steps):
 def test_ill_posed_problems_are_named():
     graph, _, _ = loop(17)
     everything = replace(graph, fixed_poses=np.ones(60, dtype=bool), fixed_anchors=np.ones(3, dtype=bool))
-    with pytest.raises(SolverError, match="held fixed"):
+    with pytest.raises(SolverError, match="value is fixed"):
         optimize(everything)
     with pytest.raises(SolverError, match="no edges"):
         optimize(replace(graph, edges=()))
@@ -477,7 +475,7 @@ def test_ill_posed_problems_are_named():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"max_iterations": 0}, {"relative_decrease": 0.0}, {"gradient_tolerance": -1.0}, {"initial_damping": float("nan")}],
+    [{"max_iterations": 0}, {"relative_decrease": 0.0}, {"gradient_tolerance": -1.0}],
 )
 def test_settings_are_checked(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):

@@ -20,12 +20,18 @@ from uwblite.grid.occupancy_grid import (
     RayCounter,
     Sweeps,
     from_counts,
-    from_scans,
     from_sweeps,
 )
 from uwblite.grid.ray_counter import WEIGHT_UNIT
 from uwblite.grid.scan_rays import empty_reach, extent, in_runs, moved_scans, scan_rays, seen_reach
 from uwblite.sensor_log import LaserScans
+
+DEFAULT = GridConfig()
+
+
+def from_scans(first, scans, config=DEFAULT, *, last=None, **options):
+    """Make the map of one recording's scans."""
+    return from_sweeps([Sweeps(scans, first, last)], config, **options)
 
 
 def bresenham(row, col, row_end, col_end):

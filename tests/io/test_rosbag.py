@@ -11,7 +11,7 @@ from helpers.results import small_log
 
 from uwblite.errors import ConfigError, FormatError, UwbliteError
 from uwblite.io.carmen import read_log
-from uwblite.io.rosbag import BagTopics, list_topics, read_bag
+from uwblite.io.rosbag import BagTopics, plan_bag, read_bag
 from uwblite.io.rosbag_writer import write_bag
 from uwblite.io.uwb_mapping import UwbMapping, parse_mappings
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
@@ -62,7 +62,7 @@ def test_a_recording_survives_a_bag(tmp_path, storage, flipped):
 
 def test_topics_are_listed_and_wrong_ones_refused(tmp_path):
     write_bag(tmp_path / "bag", recording())
-    topics = {t.name: t for t in list_topics(tmp_path / "bag")}
+    topics = {t.name: t for t in plan_bag(tmp_path / "bag")[0]}
     assert topics["/odom"].count == 40
     assert topics["/uwb/anchor_9_1_A/range"].type == "sensor_msgs/msg/Range"
     with pytest.raises(ConfigError, match=r"no topic /odo; did you mean /odom\? it has .*/odom"):

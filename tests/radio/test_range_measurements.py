@@ -9,7 +9,7 @@ from helpers.planted import ranges, wander
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.keyframes import KeyframeConfig, attach_ranges, select
-from uwblite.radio.range_measurements import learn_noise, range_edges, relocate, tag_positions
+from uwblite.radio.range_measurements import learn_noise, range_edges, relocate
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
@@ -34,7 +34,7 @@ def test_range_edges_say_the_slant_distance_of_tag_and_anchor():
     stamps, truth, frames, places, radio, edges = world(1, sigma=0.0)
     height = MOUNTING.height_difference(radio.anchor_ids[0])
     tag = se2.transform(se2.interpolate_trajectory(stamps, truth, radio.stamps), MOUNTING.tag_position[:2])
-    np.testing.assert_allclose(tag_positions(edges, truth[frames.index]), tag, atol=1e-9)
+    np.testing.assert_allclose(edges.tag_positions(truth[frames.index]), tag, atol=1e-9)
     expected = np.hypot(np.hypot(*(tag - places[radio.anchor]).T), height)
     np.testing.assert_allclose(edges.distances(Graph(truth[frames.index], places)), expected, atol=1e-9)
     np.testing.assert_array_equal(edges.sigma, 0.3)
@@ -97,7 +97,7 @@ def test_a_range_is_an_outlier_by_what_one_range_scatters():
     frames = select(Odometry(stamps, truth), KeyframeConfig())
     attached = attach_ranges(radio, Odometry(stamps, truth), frames, SensorMounting())
     edges = range_edges(attached, 0, radio.anchor_ids, SensorMounting(), Calibration(), 0.3, TrilaterationConfig())
-    slow = 0.15 * np.sin(tag_positions(edges, truth[frames.index]).sum(axis=1))
+    slow = 0.15 * np.sin(edges.tag_positions(truth[frames.index]).sum(axis=1))
     edges = replace(edges, ranges=edges.ranges + slow + np.where(np.arange(len(edges)) == 40, 2.0, 0.0))
     graph = Graph(truth[frames.index], places)
     learnt, (noise,) = learn_noise(edges, graph, 1, RangeNoiseConfig())

@@ -6,6 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
+from ..graph.robust import spread
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.units import LONGEST
 from ..sensor_log import SensorLog, UwbRanges
@@ -103,9 +104,9 @@ def _spikes(values: Floats, travelled: Floats) -> tuple[int, float]:
     """
     if len(values) < 5:
         return 0, 0.0
-    change = np.abs(values[1:-1] - 0.5 * (values[:-2] + values[2:]))
+    change = values[1:-1] - 0.5 * (values[:-2] + values[2:])
     # Second differences of white noise have the variance 3/2 of it; a median ignores up to half of outliers.
-    noise = float(1.4826 * np.median(change) / np.sqrt(1.5))
+    noise = spread(change) / float(np.sqrt(1.5))
     windows = np.lib.stride_tricks.sliding_window_view(values, 5)
     around = np.median(windows[:, [0, 1, 3, 4]], axis=1)
     driven = travelled[4:] - travelled[:-4]

@@ -10,6 +10,9 @@ from ..arrays import Floats, Ints
 from .graph import Block, Graph, Linearization, pick_rows
 from .robust import SQUARED, Kernel
 
+_LEAST_SQUARE = 1e-4
+"""m^2; of a range shorter than the anchor's height, a centimetre is left in the plane."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeEdges:
@@ -53,6 +56,15 @@ class RangeEdges:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def tag_positions(self, poses: Floats) -> Floats:
+        """Return where the tag was at each range (e, 2), map frame, by its nominal position on the base."""
+        arm = self.lever_arm + se2.rotate(self.turn, np.broadcast_to(self.tag, (len(self), 2)))
+        return se2.transform(poses[self.pose], arm)
+
+    def planar_ranges(self) -> Floats:
+        """Return the measured distances (e,) in the plane, m."""
+        return np.sqrt(np.maximum(self.ranges**2 - self.height**2, _LEAST_SQUARE))
 
     def _geometry(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
         """Return R(theta) u (2, e), the vector anchor -> tag (2, e), P and sqrt(P^2 + |q|) (2, e), the calibration (6, e)."""

@@ -65,7 +65,7 @@ class SolverConfig:
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
             raise ConfigError(f"max_iterations must be at least 1, not {self.max_iterations}")
-        for name in ("relative_decrease", "gradient_tolerance", "initial_damping"):
+        for name in ("relative_decrease", "gradient_tolerance"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
 
@@ -86,12 +86,8 @@ class SolverSummary:
     """Robust, weighted cost at the end."""
     dof: int
     """Independent residuals of the edges in use minus free unknowns."""
-    damping: float
-    """Last lambda."""
     chi2_history: Floats = field(default_factory=lambda: np.zeros(0))
     """(iterations,) cost tried by each step."""
-    damping_history: Floats = field(default_factory=lambda: np.zeros(0))
-    """(iterations,) lambda of each step."""
     unobserved: dict[str, Ints] = field(default_factory=dict)
     """By block: indices of free unknowns that no edge measures; they stay where they were."""
 
@@ -147,7 +143,7 @@ def minimise(
     if not np.isfinite(chi2):
         raise SolverError(_what_is_not_finite(graph, linearized))
     damping, growth, last_decrease = config.initial_damping, 2.0, np.inf
-    history: list[tuple[float, float]] = []
+    history: list[float] = []
     to_come = _extrapolated if all(edges.kernel.name == "none" for edges in graph.edges) else _as_much_again
     reason, improved = "", True
     factor: Factor | None = None
@@ -171,7 +167,7 @@ def minimise(
         trial = _trial(graph, normal.unknowns, step, linked)
         trial_linearized = linearize(trial)
         trial_chi2 = _cost(trial, trial_linearized)
-        history.append((trial_chi2, damping))
+        history.append(trial_chi2)
         if progress is not None:
             progress(len(history), config.max_iterations)
         decrease = chi2 - trial_chi2
@@ -193,7 +189,6 @@ def minimise(
                 damping, growth = max(damping * growth, _FIRST_BRAKE), growth * 2.0
         if not reason and damping > _MOST_DAMPING:
             reason = STUCK
-    chi2_history, damping_history = np.array(history).reshape(-1, 2).T
     return graph, SolverSummary(
         converged=reason in (SETTLED, GRADIENT),
         reason=reason,
@@ -201,9 +196,7 @@ def minimise(
         chi2_initial=chi2_initial,
         chi2=chi2,
         dof=_independent_residuals(graph, linearized or linearize(graph)) - normal.unknowns.size,
-        damping=damping,
-        chi2_history=chi2_history,
-        damping_history=damping_history,
+        chi2_history=np.array(history),
         unobserved=_unobserved(normal.unknowns, normal.diagonal),
     )
 

@@ -31,7 +31,7 @@ from .geometry import GridGeometry, central_box
 from .ray_counter import WEIGHT_UNIT, Counts, RayCounter
 from .scan_rays import ScanRays, empty_reach, extent, moved_scans, scan_rays, seen_reach
 
-__all__ = ["GridConfig", "GridGeometry", "OccupancyGrid", "RayCounter", "Sweeps", "from_counts", "from_scans", "from_sweeps"]
+__all__ = ["GridConfig", "GridGeometry", "OccupancyGrid", "RayCounter", "Sweeps", "from_counts", "from_sweeps"]
 
 Progress = Callable[[int, int], None]
 """Called as progress(scans done, scans in all)."""
@@ -127,39 +127,6 @@ def from_counts(counter: RayCounter, config: GridConfig, scans_used: int = 0) ->
     return OccupancyGrid(counter.geometry, log_odds, scans_used)
 
 
-def from_scans(
-    first: Floats,
-    scans: LaserScans,
-    config: GridConfig = GridConfig(),
-    *,
-    last: Floats | None = None,
-    flipped: bool = False,
-    geometry: GridGeometry | None = None,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
-) -> OccupancyGrid:
-    """Make the map of scans whose poses are known.
-
-    Parameters
-    ----------
-    first : (k, 3) T_map_laser at the first ray of every scan.
-    scans : the k scans.
-    config : settings.
-    last : (k, 3) T_map_laser at the last ray of every scan; in between the laser moves evenly. None = no deskewing.
-    flipped : the laser is mounted upside down.
-    geometry : the grid to fill; None = the smallest around all rays.
-    executor : any concurrent.futures executor; the result does not depend on it.
-    progress : called after every batch of scans.
-
-    Raises
-    ------
-    ConfigError : the map would be larger than config.max_cells.
-    DataError : poses and scans do not belong together.
-    """
-    sweeps = Sweeps(scans, first, last, flipped)
-    return from_sweeps([sweeps], config, geometry=geometry, executor=executor, progress=progress)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweeps:
     """Scans of one recording and where the laser was."""
@@ -187,7 +154,22 @@ def from_sweeps(
     progress: Progress | None = None,
     announce: Callable[[GridGeometry], object] | None = None,
 ) -> OccupancyGrid:
-    """Make one map of the scans of all recordings; see from_scans. `announce` is called before it is allocated."""
+    """Make one map of the scans of all recordings.
+
+    Parameters
+    ----------
+    recordings : their scans with known poses.
+    config : settings.
+    geometry : the grid to fill; None = the smallest around all rays.
+    executor : any concurrent.futures executor; the result does not depend on it.
+    progress : called after every batch of scans.
+    announce : called with the geometry before the grid is allocated.
+
+    Raises
+    ------
+    ConfigError : the map would be larger than config.max_cells.
+    DataError : there are no scans.
+    """
     if not any(len(sweeps.first) for sweeps in recordings):
         raise DataError("there are no scans to make a map of")
     tasks = [_task(sweeps, config) for sweeps in recordings if len(sweeps.first)]

@@ -29,12 +29,6 @@ _SAMPLES = 20
 """Messages of a topic that are looked at to tell how they are made."""
 
 
-def list_topics(path: str | os.PathLike[str]) -> tuple[BagTopic, ...]:
-    """Return the topics of a bag, by name."""
-    with _opened(path) as reader:
-        return _topics(reader)
-
-
 def plan_bag(
     path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings: tuple[UwbMapping, ...] = ()
 ) -> tuple[tuple[BagTopic, ...], TopicPlan]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from ..graph.robust import sigma_of_median
 from ..sensor_log import LaserScans, SensorLog
 
 PAIRS = 1000
@@ -90,8 +91,7 @@ def _ratio(laser: Floats, wheels: Floats) -> tuple[float, float]:
     if clear.sum() < LEAST_PAIRS:
         return float("nan"), float("nan")
     ratio = laser[clear] / wheels[clear]
-    middle = float(np.median(ratio))
-    return middle, float(1.2533 * 1.4826 * np.median(np.abs(ratio - middle)) / np.sqrt(clear.sum()))
+    return float(np.median(ratio)), sigma_of_median(ratio)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

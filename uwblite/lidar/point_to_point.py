@@ -42,10 +42,8 @@ class Registration:
     reason: str
     """Why it stopped, in words."""
     iterations: int
-    num_inliers: int
-    """Source points that found a partner."""
     overlap: float
-    """num_inliers / number of source points, 0..1."""
+    """Share of the source points that found a partner, 0..1."""
     rmse: float
     """m, root mean square distance of inliers from their partner."""
     fitness: float
@@ -100,7 +98,7 @@ def fitness_score(target: cKDTree, points: Floats, T_target_source: Floats) -> f
 
 def _failure(pose: Floats, reason: str, source: Floats, iterations: int = 0, matches: int = 0) -> Registration:
     return Registration(
-        T_target_source=pose, converged=False, reason=reason, iterations=iterations, num_inliers=matches,
+        T_target_source=pose, converged=False, reason=reason, iterations=iterations,
         overlap=matches / max(len(source), 1), rmse=float("inf"), fitness=float("inf"), information=np.zeros((3, 3)),
     )
 
@@ -126,7 +124,7 @@ def _result(
     square = float(np.sum((se2.transform(pose, near) - far) ** 2))
     variance = max(square / max(2 * len(near) - 3, 1), config.min_sigma**2)
     return Registration(
-        T_target_source=pose, converged=converged, reason=reason, iterations=iterations, num_inliers=len(near),
+        T_target_source=pose, converged=converged, reason=reason, iterations=iterations,
         overlap=len(near) / len(source), rmse=float(np.sqrt(square / len(near))), fitness=fitness,
         information=_information(near) / variance,
     )

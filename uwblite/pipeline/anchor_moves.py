@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from ..radio.change_points import Move, find_move
-from ..radio.range_measurements import tag_positions
 from ..radio.range_noise import short_term_sigma
 from ..sensor_log import OdometryBreaks, Remark, Screening, SensorLog, UwbRanges
 from .estimate import Estimate, Task
@@ -30,7 +29,7 @@ def _renamed_log(recording: Recording, estimate: Estimate, task: Task) -> Sensor
         return log
     # The recording's ranges stand in the edges in their own order.
     heard = np.flatnonzero((edges.pose >= recording.rows.start) & (edges.pose < recording.rows.stop))
-    positions = tag_positions(edges, estimate.graph.poses)
+    positions = edges.tag_positions(estimate.graph.poses)
     usable = np.isfinite(edges.ranges) & (edges.ranges > _SHORTEST) & (edges.ranges < task.config.trilateration.max_range)
     sigma = short_term_sigma(edges.stamps[usable], edges.anchor[usable], edges.ranges[usable], task.config.ranges)
     remarks: list[Remark] = []

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..graph.calibration import RANGE_SCALE
+from ..graph.robust import spread_about_median
 from ..radio.range_noise import short_term_sigma
 from .estimate import Estimate, Task
 
@@ -110,4 +111,4 @@ def check_support(estimate: Estimate, task: Task) -> None:
 def _spread_by_anchor(residuals: Floats, anchor: Ints) -> Floats:
     """Return the robust standard deviation of the residuals (m,) of each anchor that has any, m."""
     own = [residuals[anchor == k] for k in np.unique(anchor)]
-    return np.array([1.4826 * float(np.median(np.abs(r - np.median(r)))) for r in own])
+    return np.array([spread_about_median(r) for r in own])

@@ -9,6 +9,7 @@ from ..graph.calibration import CalibrationConfig, Unknown, unknowns
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
 from ..graph.range_edges import RangeEdges
+from ..graph.robust import spread_about_median
 from ..grid.occupancy_grid import OccupancyGrid
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
@@ -31,7 +32,8 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
     if ranges is not None and estimate.placed.any():
-        typical = float(np.median([_spread(residuals[ranges.anchor == k]) for k in np.flatnonzero(estimate.placed)]))
+        own = (residuals[ranges.anchor == k] for k in np.flatnonzero(estimate.placed))
+        typical = float(np.median([spread_about_median(r) for r in own]))
     # By the scatter of ranges to a typical anchor; by its own scatter, no anchor would ever disagree.
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
@@ -79,11 +81,6 @@ def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, F
     return whitened * ranges.sigma, own * ranges.kernel.weight(whitened**2)
 
 
-def _spread(residuals: Floats) -> float:
-    """Return the robust standard deviation of residuals about their median."""
-    return 1.4826 * float(np.median(np.abs(residuals - np.median(residuals))))
-
-
 def _anchor(
     k: int, estimate: Estimate, recordings: Recordings, covariance: Marginals, residuals: Floats, limit: float
 ) -> AnchorEstimate:
@@ -107,7 +104,8 @@ def _anchor(
     elif used < 0.5:
         status, reason = "distrusted", f"only {used:.0%} of its ranges agree with the map"
     return AnchorEstimate(
-        name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, _spread(own), status, reason, alternative
+        name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, spread_about_median(own), status, reason,
+        alternative,
     )
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Floats
 from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
@@ -38,10 +37,9 @@ def _heard(graph: Graph, anchor: int) -> tuple[Floats, Floats]:
     positions, ranges = [np.zeros((0, 2))], [np.zeros(0)]
     for edges in graph.edges:
         if isinstance(edges, RangeEdges):
-            mine = edges.anchor == anchor
-            arm = edges.lever_arm[mine] + se2.rotate(edges.turn[mine], edges.tag)
-            positions.append(se2.transform(graph.poses[edges.pose[mine]], arm))
-            ranges.append(edges.ranges[mine])
+            own = edges.rows(edges.anchor == anchor)
+            positions.append(own.tag_positions(graph.poses))
+            ranges.append(own.ranges)
     return np.concatenate(positions), np.concatenate(ranges)
 
 

@@ -18,7 +18,7 @@ from ..config import setting
 from ..graph.graph import Calibration, Graph
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
-from ..graph.robust import Kernel
+from ..graph.robust import Kernel, spread
 from ..graph.solver import SolverConfig, optimize
 from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate
 
@@ -201,11 +201,8 @@ class _Growth:
         found = {}
         for anchor in np.unique(ranges.anchor[inside]):
             if not self.placed[anchor]:
-                which = inside & (ranges.anchor == anchor)
-                level = np.sqrt(np.maximum(ranges.ranges[which] ** 2 - ranges.height[which] ** 2, 1e-4))
-                arm = ranges.lever_arm[which] + se2.rotate(ranges.turn[which], ranges.tag)
-                tag = se2.transform(self.poses[ranges.pose[which]], arm)
-                found[int(anchor)] = trilaterate(tag, level, self.search, drift)
+                own = ranges.rows(inside & (ranges.anchor == anchor))
+                found[int(anchor)] = trilaterate(own.tag_positions(self.poses), own.planar_ranges(), self.search, drift)
         return found
 
     def _adopt(self, found: dict[int, list[AnchorHypothesis]]) -> bool:
@@ -267,10 +264,9 @@ class _Growth:
         self.anchors, self.calibration = solved.anchors.copy(), solved.calibration
         for edges in solved.edges:
             if isinstance(edges, RangeEdges):
-                error = np.abs(edges.residuals(solved)[:, 0] * edges.sigma)
+                error = edges.residuals(solved)[:, 0] * edges.sigma
                 for anchor in np.unique(edges.anchor):
-                    spread = 1.4826 * float(np.median(error[edges.anchor == anchor]))
-                    self.sigma[anchor] = max(spread, self.config.range_sigma)
+                    self.sigma[anchor] = max(spread(error[edges.anchor == anchor]), self.config.range_sigma)
 
     def _part(self, low: int, high: int) -> Graph:
         """Return the graph of poses [low, high) with their odometry and their ranges to placed anchors."""

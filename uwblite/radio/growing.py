@@ -278,9 +278,8 @@ class _Growth:
         """Return where the tag was (m, 2) at ranges, and the planar distances (m,) they measured."""
         places, distances = [np.zeros((0, 2))], [np.zeros(0)]
         for edges in heard:
-            tag = edges.lever_arm + se2.rotate(edges.turn, np.broadcast_to(edges.tag, (len(edges), 2)))
-            places.append(se2.transform(self.graph.poses[edges.pose], tag))
-            distances.append(np.sqrt(np.maximum(edges.ranges**2 - edges.height**2, 1e-4)))
+            places.append(edges.tag_positions(self.graph.poses))
+            distances.append(edges.planar_ranges())
         return np.concatenate(places), np.concatenate(distances)
 
 

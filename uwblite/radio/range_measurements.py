@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import se2
-from ..arrays import Bools, Floats
+from ..arrays import Bools
 from ..graph.calibration import range_indices
 from ..graph.graph import Calibration, Graph
 from ..graph.range_edges import RangeEdges
@@ -52,12 +51,6 @@ def range_edges(
     )
 
 
-def tag_positions(edges: RangeEdges, poses: Floats) -> Floats:
-    """Return where the tag was at each range (m, 2), map frame."""
-    arm = edges.lever_arm + se2.rotate(edges.turn, edges.tag)
-    return se2.transform(poses[edges.pose], arm)
-
-
 def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: TrilaterationConfig) -> Graph:
     """Return the graph with anchors moved to where clearly more of their ranges agree, its poses being trusted.
 
@@ -65,11 +58,11 @@ def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: Trilaterati
     ----------
     edges : ranges; those of weight 0 do not count. placed : (a,) anchors that may be moved.
     """
-    positions, anchors = tag_positions(edges, graph.poses), graph.anchors.copy()
+    positions, anchors = edges.tag_positions(graph.poses), graph.anchors.copy()
     alive = np.ones(len(edges), dtype=bool) if edges.weights is None else edges.weights > 0
     for anchor in np.flatnonzero(placed):
         own = np.flatnonzero(alive & (edges.anchor == anchor))
-        level = np.sqrt(np.maximum(edges.ranges[own] ** 2 - edges.height[own] ** 2, 1e-4))
+        level = edges.rows(own).planar_ranges()
         found = trilaterate(positions[own], level, search, _TRUSTED)
         if not found:
             continue
@@ -103,7 +96,7 @@ def learn_noise(
         where the lidar holds the poses. Without it such errors hardly matter for the poses, since the anchors' places
         absorb them; what matters then is that all ranges together hold the trajectory.
     """
-    positions, sigma, weights = tag_positions(edges, graph.poses), edges.sigma.copy(), np.zeros(len(edges))
+    positions, sigma, weights = edges.tag_positions(graph.poses), edges.sigma.copy(), np.zeros(len(edges))
     errors = edges.residuals(graph)[:, 0] * edges.sigma
     alive = np.ones(len(edges), dtype=bool) if edges.weights is None else edges.weights > 0
     noises = []

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ..arrays import Floats, Ints
 from ..config import setting
-from ..graph.robust import Kernel
+from ..graph.robust import Kernel, spread
 
 _ROBUST = Kernel("cauchy", 2.5)
 
@@ -83,7 +83,7 @@ def short_term_sigma(stamps: Floats, anchor: Ints, ranges: Floats, config: Range
     same &= span < 4.0 * np.median(span[same]) if same.any() else same
     if same.sum() < 20:
         return config.sigma
-    return max(1.4826 * float(np.median(np.abs(off[same]))), config.min_sigma)
+    return max(spread(off[same]), config.min_sigma)
 
 
 def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNoiseConfig) -> RangeNoise:
@@ -101,8 +101,8 @@ def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNo
     if not config.learn or kept.sum() < 30:
         return prior
     p, e = positions[kept], residuals[kept] - np.median(residuals[kept])
-    spread = max(1.4826 * float(np.median(np.abs(e))), config.min_sigma)
-    e = np.clip(e, -3.0 * spread, 3.0 * spread)
+    sigma = max(spread(e), config.min_sigma)
+    e = np.clip(e, -3.0 * sigma, 3.0 * sigma)
     variance = max(float(e @ e) / len(e), config.min_sigma**2)
     edges = np.array([0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.0])
     covariance, pairs = _covariance_by_distance(p, e, edges)

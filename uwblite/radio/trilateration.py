@@ -12,6 +12,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..config import setting
+from ..graph.robust import MAD_TO_SIGMA
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +155,7 @@ def _refine(
         jacobian = np.stack([dx / distance, dy / distance, np.ones_like(dx)], axis=1)
         equations = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
         gradient = np.einsum("skm,sm->sk", jacobian, weight * error)
-        robust[on] = 1.4826 * np.median(np.abs(error), axis=1)
+        robust[on] = MAD_TO_SIGMA * np.median(np.abs(error), axis=1)
         prior = (np.clip(robust[on], drift, scale[on]) / config.bias_sigma) ** 2
         equations[:, 2, 2] += prior
         gradient[:, 2] -= prior * state[on, 2]

@@ -7,6 +7,7 @@ count, apart from noise and blocked sight. Where several anchors exceed that tog
 import numpy as np
 
 from ..arrays import Floats
+from ..graph.robust import spread
 from ..sensor_log import SensorLog
 
 _WINDOW = 3
@@ -112,7 +113,7 @@ def _noise(ranges: Floats) -> float:
     """Return the standard deviation of one reading by second differences, m."""
     if len(ranges) < 5:
         return 0.1
-    return max(float(1.4826 * np.median(np.abs(ranges[1:-1] - 0.5 * (ranges[:-2] + ranges[2:]))) / np.sqrt(1.5)), 0.03)
+    return max(spread(ranges[1:-1] - 0.5 * (ranges[:-2] + ranges[2:])) / float(np.sqrt(1.5)), 0.03)
 
 
 def _travelled(log: SensorLog, stamps: Floats) -> Floats:

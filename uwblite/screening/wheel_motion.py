@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
+from ..graph.robust import sigma_of_median, spread_about_median
 from ..lidar.scan_odometry import scan_steps
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, Remark, SensorLog
 from .odometry_chain import chained
@@ -190,10 +191,10 @@ def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
             continue
         parts = np.array_split(np.arange(len(rows)), len(rows) // _CHUNK)
         middle = np.array([np.median(ratio[p]) for p in parts])
-        sigma = np.array([1.2533 * 1.4826 * np.median(np.abs(ratio[p] - np.median(ratio[p]))) / np.sqrt(len(p)) for p in parts])
+        sigma = np.array([sigma_of_median(ratio[p]) for p in parts])
         usual = float(np.median(middle))
-        spread = 1.4826 * float(np.median(np.abs(middle - usual)))
-        off = np.abs(middle - usual) > np.maximum(_OTHER_RATIO * usual, _RATIO_SIGMAS * np.hypot(sigma, spread))
+        sigma = np.hypot(sigma, spread_about_median(middle))
+        off = np.abs(middle - usual) > np.maximum(_OTHER_RATIO * usual, _RATIO_SIGMAS * sigma)
         # Half of the recording may be the other half's exception: then the parts scatter, each sharply.
         halves = [np.median(middle[h]) for h in np.array_split(np.arange(len(middle)), 2)]
         if abs(halves[0] - halves[1]) > max(_OTHER_RATIO * usual, _RATIO_SIGMAS * float(np.median(sigma))):
