@@ -68,7 +68,8 @@ def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:
     if not any(log.ranges is not None and len(log.ranges.ranges) for log in logs):
         task.stages.warn("no-ranges", "no UWB ranges in use: the map rests on odometry and lidar")
     if grid is None:
-        task.stages.warn("no-lidar", "no lidar in use: trajectory and anchors only, no map")
+        text = "no lidar in use: trajectory and anchors only, no map; left and right rest on the odometry's turns"
+        task.stages.warn("no-lidar", text)
     elif not any(log.scans is not None and np.isfinite(log.scans.ranges).any() for log in logs):
         task.stages.warn("empty-scans", "the lidar saw nothing in any scan: the map is empty")
 

@@ -23,6 +23,8 @@ _WINDOW, _MOST = 10, 0.6
 """Steps in a row, and the share of them that must be off."""
 _MEASURED_BREAK = 0.15
 """Steps more uncertain than that, m, are no measurements."""
+_WAYS = 0.15
+"""Relative disagreement of lidar and wheels on ways from one scan to the next, which single scans show to some per cent."""
 _SCALE = 0.12
 """Relative disagreement of two sensors on lengths beyond which one of them is at fault."""
 
@@ -87,7 +89,7 @@ def check_scales(estimate: Estimate, task: Task) -> None:
         task.stages.doubt("scales", text, ranges_by_lidar=scale)
     screenings = [recording.log.screening for recording in task.recordings.each]
     ratios = np.array([s.lidar_by_wheels for s in screenings if s is not None])
-    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _SCALE)]
+    off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _WAYS)]
     if len(off):
         outcome = "the ranges agree with the wheels" if estimate.placed.any() else "nothing tells which of the two is right"
         text = (

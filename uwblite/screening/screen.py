@@ -15,6 +15,8 @@ _GAP = 2.0
 """Silence of the odometry that is a gap, s; or twenty periods, where that is longer."""
 _STANDS = (0.05, 0.05)
 """Way, m, and turn, rad, below which the wheels say that the robot stood meanwhile."""
+_SHORTEST_PATH = 2.0
+"""A shorter drive shows little of anything, m."""
 _ANYWHERE = (20.0, 20.0, 3.0)
 """Standard deviation of a step that nothing measured, m, m, rad."""
 _STEP = 2.0
@@ -58,6 +60,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     cut, more = _cuts(log, _sorted([gaps, lost]).stamps)
     if pairs is not None:
         more += wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]))
+    more += _hardly_moving(log.odometry)
     ratio = float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
     return replace(log, screening=Screening((*remarks, *more), _sorted([jumps, gaps, lost, cut]), ratio))
 
@@ -69,6 +72,19 @@ def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Remark
         return log, None, []
     log, remarks = directions.laser_ahead(log, pairs)
     return log, wheel_motion.compare(log) if remarks else pairs, remarks
+
+
+def _hardly_moving(odometry: Odometry) -> list[Remark]:
+    """Doubt a recording of a robot that stands: nothing can be placed from one spot."""
+    path = float(np.sum(np.hypot(*np.diff(odometry.poses[:, :2], axis=0).T)))
+    if path >= _SHORTEST_PATH:
+        return []
+    turned = float(np.ptp(np.unwrap(odometry.poses[:, 2])))
+    text = (
+        f"the robot hardly moves: {path:.2f} m in {np.ptp(odometry.stamps):.0f} s (turning {turned:.1f} rad); does the base "
+        "report its wheels, in metres? Drive through the place"
+    )
+    return [Remark("hardly-moving", text, doubt=True)]
 
 
 def _clock_remarks(log: SensorLog) -> list[Remark]:
