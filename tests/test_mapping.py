@@ -336,3 +336,12 @@ def test_wheels_in_another_unit_are_told_by_the_radio(shared_data):
     off = se2.transform(se2.align(found, there), found) - there
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.35
     assert [w for w in result.warnings if w.kind == "odometry-unit"]
+
+
+@pytest.mark.slow
+def test_a_lidar_that_sees_little_does_no_harm_to_the_radio(tmp_path):
+    """A nearly empty hall: with lidar no worse than without, up to a twentieth."""
+    logfile.write(simulate(Settings(world="arena", seed=2, minutes=12.0, speed=0.4)), tmp_path)
+    log, truth = read_log(tmp_path / "run.log"), read_tum(tmp_path / "truth.tum")
+    alone = ate(build_map(log, replace(MappingConfig(), use_lidar=False)), truth)
+    assert ate(build_map(log), truth) < 1.05 * alone

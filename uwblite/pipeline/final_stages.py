@@ -5,14 +5,16 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..graph.calibration import with_nonnegative_heights
+from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_nonnegative_heights
 from ..graph.graph import Graph
 from ..graph.solver import optimize
+from ..graph.unknowns import free_unknowns
 from ..grid import occupancy_grid as grids
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid, Sweeps
 from .estimate import Estimate, Task
 from .map_frame import cropped
+from .radio_stages import with_range_noise
 from .recordings import Recording
 
 _LARGE_GRID = 5_000_000
@@ -20,14 +22,46 @@ _LARGE_GRID = 5_000_000
 
 
 def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
-    """Put every measurement into the graph, and optimise once more where range noise was re-estimated at the end."""
-    graph, reestimated = estimate.problem, estimate.joint is not None and estimate.ranges is not None
+    """Put every measurement into the graph; where the lidar has refined it, poses and anchors get the weights that suit each.
+
+    What all ranges from one direction are wrong by alike moves an anchor, and no number of them averages it out; but it
+    tells a pose nothing false, since the anchor's place absorbs it. So the ranges weigh by their own errors while poses are
+    estimated, and by the common ones as well where anchors are: without feedback from anchors to poses (M. Plummer, Cuts in
+    Bayesian graphical models, 2015). The outliers stay those that were found while all ranges weighed little.
+    """
+    if estimate.joint is not None and estimate.ranges is not None:
+        for _ in range(_LAPS):
+            estimate = _solved(with_range_noise(estimate, task.config), task)
+        estimate = _anchors_alone(estimate, task)
     # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
     scans = estimate.scans if task.config.align == "walls" else None
-    estimate = replace(estimate, graph=graph, scans=scans, steps=None, joint=None)
-    if not reestimated:
+    return replace(estimate, graph=estimate.problem, scans=scans, steps=None, joint=None)
+
+
+_LAPS = 2
+"""Range noise learnt and everything solved so often: the second time on poses that the first has moved."""
+
+
+def _solved(estimate: Estimate, task: Task) -> Estimate:
+    """Return the estimate at the optimum of all of its measurements."""
+    solved = with_nonnegative_heights(optimize(estimate.problem, task.config.solver)[0])
+    graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
+    return replace(estimate, graph=graph.with_estimates_of(solved))
+
+
+def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
+    """Estimate anchors and their calibration once more at the poses found, errors steady by direction counted as well."""
+    if task.config.ranges.steady == 0.0:
         return estimate
-    return replace(estimate, graph=with_nonnegative_heights(optimize(graph, task.config.solver)[0]))
+    estimate = with_range_noise(estimate, task.config, steady=True)
+    graph, own = estimate.graph, estimate.graph.calibration.of_kinds(BIAS, HEIGHT, RANGE_SCALE)
+    fixed = np.asarray(graph.fixed_calibration)
+    held = replace(graph, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=fixed | ~own)
+    if not any(free.any() for free in free_unknowns(held).values()):
+        return estimate
+    done = _solved(replace(estimate, graph=held), task).graph
+    fixed = fixed | (np.asarray(done.fixed_calibration) & own)
+    return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))
 
 
 def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:

@@ -176,7 +176,22 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
         )  # fmt: skip
         if shift < config.refinement.same_pairs:
             break
-    return estimate
+    return estimate if estimate.ranges is None or estimate.joint is None else _matched_once_more(estimate, scans, task)
+
+
+def _matched_once_more(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimate:
+    """Match again where ranges that weigh by their own errors alone move poses: there the lidar hardly holds them."""
+    config, settings = task.config, replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
+    free = with_range_noise(estimate, config)
+    moved = free.with_estimates_of(optimize(free.problem, config.solver)[0])
+    shift = float(np.sqrt(np.mean(np.sum((moved.graph.poses - estimate.graph.poses)[:, :2] ** 2, axis=1))))
+    if shift < settings.same_pairs:
+        return estimate
+    i, j = _pairs(moved.graph, scans, settings, task)
+    refined = _refine(moved.graph, free.odometry_and_ranges, scans, i, j, settings, task, "joint refinement")
+    task.stages.end("matched once more", pairs=len(i), used=int(refined.used.sum()), shift=round(shift, 5))
+    graph = with_nonnegative_heights(moved.graph.with_estimates_of(refined.graph))
+    return replace(moved, graph=graph, joint=refined.edges)
 
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:

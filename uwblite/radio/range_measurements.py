@@ -92,9 +92,9 @@ def learn_noise(
     ----------
     graph : estimates the residuals are taken at.
     anchors : how many there are.
-    steady : count errors that depend on direction and distance alone once as well, see range_noise.steady_sigma: right
-        where the lidar holds the poses. Without it such errors hardly matter for the poses, since the anchors' places
-        absorb them; what matters then is that all ranges together hold the trajectory.
+    steady : count errors that depend on direction and distance alone once as well, see range_noise.steady_sigma: right for
+        anchors at given poses, and against anchors that lie for long. Poses do not feel such errors, since the anchors'
+        places absorb them; what matters for poses is that all ranges together hold the trajectory.
     """
     positions, sigma, weights = edges.tag_positions(graph.poses), edges.sigma.copy(), np.zeros(len(edges))
     errors = edges.residuals(graph)[:, 0] * edges.sigma
