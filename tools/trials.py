@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT))
 import numpy as np
 from numpy.typing import NDArray
 from simulation import logfile
-from simulation.recording import Settings, simulate
+from simulation.recording import Recording, Settings, simulate
 
 from uwblite import se2
 from uwblite.cli.evaluate import read_landmarks
@@ -88,8 +88,13 @@ class Figures:
 
 def made(settings: Settings) -> Trial:
     """Simulate a recording and read it back from a log in a temporary folder."""
+    return as_read(simulate(settings))
+
+
+def as_read(recording: Recording) -> Trial:
+    """Return a simulated recording as it reads from its log, and what is true of it."""
     with tempfile.TemporaryDirectory(prefix="uwblite-") as folder:
-        logfile.write(simulate(settings), Path(folder))
+        logfile.write(recording, Path(folder))
         return loaded(Path(folder))
 
 

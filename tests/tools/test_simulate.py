@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import oracle
 import pytest
 from simulate import parser, settings_from
 from simulation import drive, floorplans, laser, logfile, radio, recording, wheels
 from simulation.fields import smooth_field
 from simulation.plans import PLANS
 from simulation.recording import Lie, Settings, simulate
+from trials import as_read
 
 from uwblite import se2
 from uwblite.io.carmen import read_log
@@ -308,3 +310,15 @@ def test_few_anchors_are_heard_at_a_time_in_large_places(world, least, most):
     made = simulate(Settings(world=world, seed=1, minutes=10.0, speed=0.5, without=("laser",)))
     heard = [np.unique(made.range_anchors[np.abs(made.range_stamps - t) < 10.0]).size for t in range(10, 590, 20)]
     assert least <= np.mean(heard) <= most
+
+
+def test_the_oracle_is_near_the_truth_and_its_bound_says_how_near():
+    """Errors agree with the Cramer-Rao bound, with lidar and without, and the lidar helps."""
+    made = simulate(Settings(world="room", seed=1, minutes=3.0, scan_rate=2.0, uwb_rate=2.0))
+    log = as_read(made).log
+    without, with_lidar = (oracle.solve(made, log, lidar=lidar) for lidar in (False, True))
+    assert with_lidar.ate < without.ate
+    # One drive has a handful of independent patches of multipath: a factor of two either way.
+    assert 0.4 * without.bound_ate < without.ate < 2.0 * without.bound_ate
+    assert 0.3 * without.bound_anchors < without.anchors < 2.0 * without.bound_anchors
+    assert with_lidar.bound_ate < 0.5 * without.bound_ate
