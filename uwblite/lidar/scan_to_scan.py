@@ -2,10 +2,10 @@
 
 Neighbouring clouds are aligned from the odometry's guess, all at once. A pair that then shares few points got a bad guess
 (slip, a fast turn between sparse scans, wheels that count backwards as forwards): it is searched for in the local sub-map
-of the keyframes before. Where that finds nothing, or two places alike, the step is left to an odometry of little weight.
+of the keyframes before. Where that finds nothing, or two places alike, the step is left to the odometry.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -109,24 +109,24 @@ def follow(
     good = steps.enough & (steps.share >= config.good_share)
     learnt = learn_wheels(wheels, _edges(clouds, raster, i[good], steps.pose[good], tight, config), graph)
     miss = _miss(clouds, learnt)
-    pose, lost, wrong = _searched(clouds, i, steps, steps.enough & ~good, config)
+    pose, lost = _searched(clouds, i, steps, steps.enough & ~good, config)
     kept = steps.enough & ~lost
     measured_steps = _edges(clouds, raster, i[kept], pose[kept], tight, config)
-    learnt = _loosened(learn_wheels(wheels, measured_steps, graph), wrong)
+    learnt = learn_wheels(wheels, measured_steps, graph)
     searched = int((steps.enough & ~good).sum())
     return ScanOdometry(measured_steps, learnt, float(np.median(miss)) if len(miss) else 0.0, searched)
 
 
 def _searched(
     clouds: Clouds, i: Ints, steps: _Steps, doubtful: Bools, config: TrackingConfig
-) -> tuple[Floats, Bools, Bools]:
+) -> tuple[Floats, Bools]:
     """Search for doubtful steps (e,), each against the sub-map of those before it.
 
     Returns
     -------
-    Poses of all steps (e, 3), which were not found (e,), and where the odometry is wrong all the same (e,).
+    Poses of all steps (e, 3), and which were not found (e,).
     """
-    pose, lost, wrong = steps.pose.copy(), np.zeros(len(i), dtype=bool), np.zeros(len(i), dtype=bool)
+    pose, lost = steps.pose.copy(), np.zeros(len(i), dtype=bool)
     searching = StepSearch(clouds, config.distance, config.angle)
     chain = np.zeros((len(clouds), 3))
     chain[i] = pose
@@ -138,29 +138,17 @@ def _searched(
         first = max(first, int(before[-1]) + 1 if len(before) else 0)
         guess = steps.guess[row]
         found = searching.find(k, first, chain, np.stack([guess, steps.pose[row], guess * [0.0, 0.0, 1.0]]))
-        wrong[row] = not found.clear and found.contradicts
         # Where no search is clear, descent near to the odometry's guess still measures what the surfaces fix.
         lost[row] = not found.clear and (found.contradicts or steps.share[row] < _LEAST_SHARE)
         if found.clear:
             chain[k] = pose[row] = found.pose
         elif lost[row]:
             first = k + 1
-    return pose, lost, wrong
-
-
-def _loosened(wheels: OdometryEdges, wrong: Bools) -> OdometryEdges:
-    """Return the wheels' edges with less weight where the clouds contradict them and do not tell what is right."""
-    sigma = 1.0 / np.einsum("eii->ei", wheels.sqrt_information)
-    wide = np.where(wrong[:, None], np.clip(_LOOSER * sigma, sigma, np.maximum(sigma, _LOOSEST)), sigma)
-    return replace(wheels, sqrt_information=wheels.sqrt_information * (sigma / wide)[:, None, :])
+    return pose, lost
 
 
 _LEAST_SHARE = 0.4
 """Share of points that match from which descent from the odometry's guess measures a step."""
-_LOOSER = 10.0
-"""Factor on the standard deviations of wheels that the clouds contradict."""
-_LOOSEST = np.array([0.3, 0.3, 0.2])
-"""What these become at most along, across, m, and in heading, rad."""
 
 
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:

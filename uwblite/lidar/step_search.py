@@ -55,10 +55,8 @@ class FoundStep:
     """Share of points that match less the share that stands in free space."""
     second: float
     """Score of the best distinct place; -1 = there is none."""
-    expected: float
-    """Score where descent from the odometry's guess ends, if it ends near to it; -1 = it does not."""
     through: float
-    """Share that would stand in free space at the odometry's guess."""
+    """Share that stands in free space where matching near to the odometry's guess ends, or at the guess if it goes away."""
 
     @property
     def clear(self) -> bool:
@@ -67,8 +65,8 @@ class FoundStep:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the odometry's guess is clearly worse than what was found, or stands in free space."""
-        return self.expected < self.score - _MARGIN or self.through > _THROUGH
+        """Whether the odometry's guess is wrong whatever is right: surfaces would stand in free space there."""
+        return self.through > _THROUGH
 
 
 class StepSearch:
@@ -99,11 +97,13 @@ class StepSearch:
         target = np.zeros(len(starts), dtype=np.int64)
         points = pair_points(pair, target + 1, _POINTS)
         tried = align_pairs(pair, raster, target, target + 1, starts, points, _FIRST_GATE, _LAST_GATE, _ITERATIONS)
-        score = tried.share - self._through(k, tried.pose)
+        through = self._through(k, tried.pose)
+        score = tried.share - through
         best = int(np.argmax(score))
         second = float(score[_apart(tried.pose[best], tried.pose)].max(initial=-1.0))
-        expected = float(score[~_apart(motion, tried.pose)].max(initial=-1.0))
-        return FoundStep(tried.pose[best], float(score[best]), second, expected, float(self._through(k, motion[None])[0]))
+        near = np.flatnonzero(~_apart(motion, tried.pose))
+        there = through[near[np.argmax(score[near])]] if len(near) else self._through(k, motion[None])[0]
+        return FoundStep(tried.pose[best], float(score[best]), second, float(there))
 
     def _through(self, k: int, poses: Floats) -> Floats:
         """Return the shares (c,) of either scan that would stand in free space for poses (c, 3) of keyframe k + 1 in k."""
