@@ -6,7 +6,7 @@
     python tools/bench.py icp                               registration, against small_gicp and Open3D
     python tools/bench.py map --log hall=recordings/hall/run.log  whole runs of `uwblite map`; --log may be repeated
     python tools/bench.py start                             import and --help above bare python
-    python tools/bench.py hundred                           75,000 poses grown from their odometry: minutes
+    python tools/bench.py hundred                           75,000 poses, incrementally from their odometry: minutes
 
 Processor time on one core and one BLAS thread; runs of a library and of its peers alternate, so that a busy machine
 slows both. Start is wall time, whole runs are both. Recordings are made by tools/simulate.py (hall, 31 min: --minutes 31;
@@ -155,13 +155,14 @@ def bench_hundred() -> None:
     from bench_graphs import ate, paper_graph, trilaterated
 
     from uwblite.graph.solver import optimize
-    from uwblite.radio.growing import optimize_growing
+    from uwblite.radio.incremental import optimize_incrementally
 
     head("Hundred times the paper", "from", "s", "iterations at the end", "chi2 / dof", "ATE, m")
     graph, truth = paper_graph(100)
     show("(the odometry)", 0, 0, "", ate(graph.poses, truth))
     near = graph.updated(truth, trilaterated(truth, graph.edges[2], len(graph.anchors)), graph.calibration.values)
-    for name, run in (("truth, plain", lambda: optimize(near)), ("odometry, growing", lambda: optimize_growing(graph))):
+    runs = {"truth, plain": lambda: optimize(near), "odometry, incremental": lambda: optimize_incrementally(graph)}
+    for name, run in runs.items():
         began = time.process_time()
         found, summary = run()
         show(name, time.process_time() - began, summary.iterations, summary.chi2_per_dof, ate(found.poses, truth))

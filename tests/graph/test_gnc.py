@@ -116,6 +116,6 @@ def test_settings_are_checked():
     for wrong in ({3: 4.0}, {-1: 4.0}, {0: 0.0}):
         with pytest.raises(ConfigError, match="threshold"):
             optimize_gnc(graph, wrong)
-    for name, value in (("growth", 1.0), ("steps_per_mu", 0), ("reach", 0.5)):
+    for name, value in (("mu_factor", 1.0), ("steps_per_mu", 0), ("reach", 0.5)):
         with pytest.raises(ConfigError, match=name):
             GncConfig(**{name: value})

@@ -124,3 +124,28 @@ def dense_system(graph):
             H[np.ix_(touched, touched)] += weight * J.T @ J
             g[touched] += weight * J.T @ linear.residuals[e]
     return H[:-1, :-1], g[:-1], number
+
+
+def lawn(seed, n=1500, side=60.0, drift=0.02):
+    """Return a long drive between random goals with 16 anchors, guessed by dead reckoning; the truth; the anchors."""
+    rng = np.random.default_rng(seed)
+    truth = np.zeros((n, 3))
+    truth[0, :2] = goal = np.array([side / 2, side / 2])
+    for k in range(1, n):
+        while np.hypot(*(goal - truth[k - 1, :2])) < 2.0:
+            goal = np.clip(truth[k - 1, :2] + rng.uniform(-25.0, 25.0, 2), 2.0, side - 2.0)
+        want = np.arctan2(*(goal - truth[k - 1, :2])[::-1])
+        turn = np.clip(se2.wrap_angle(want - truth[k - 1, 2]), -0.35, 0.35)
+        truth[k] = se2.compose(truth[k - 1], [0.5, 0.0, turn])
+    axis = (np.arange(4) + 0.5) * side / 4
+    anchors = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + rng.normal(scale=2.0, size=(16, 2))
+    each = np.arange(n - 1)
+    odometry = relative_edges(truth, each, each + 1, [0.02, 0.01, drift], rng)
+    distance = np.hypot(*(truth[:, None, :2] - anchors).transpose(2, 0, 1))
+    pose = np.repeat(np.arange(n), 3)
+    anchor = np.argsort(distance, axis=1)[:, :3].ravel()
+    ranges = plain_ranges(pose, anchor, distance[pose, anchor] + rng.normal(scale=0.1, size=len(pose)), 0.1)
+    guess = [truth[0]]
+    for motion in odometry.T_i_j:
+        guess.append(se2.compose(guess[-1], motion))
+    return Graph(np.array(guess), np.zeros((16, 2)), (odometry, ranges)), truth, anchors

@@ -7,7 +7,7 @@ from .options import number, place
 
 if TYPE_CHECKING:
     from ..graph.graph import Graph
-    from ..graph.solver import SolverSummary
+    from ..graph.solver import Progress, SolverConfig, SolverSummary
     from ..io.graph_file import GraphFile
 
 HELP = "optimise a pose graph: g2o, TORO or PyFG in, optimised graph and trajectory out"
@@ -16,6 +16,8 @@ examples:
   uwblite optimize graph.g2o --out optimised.g2o
   uwblite optimize graph.pyfg --out optimised.pyfg --trajectory path.tum --from-odometry
   uwblite optimize loops.g2o --out straight.g2o --kernel huber --kernel-scale 2
+  uwblite optimize graph.pyfg --incremental --out optimised.pyfg   the odometry bends so far that all at once fails
+  uwblite optimize loops.g2o --robust --out straight.g2o           some loop closures or ranges are false
   uwblite optimize graph.g2o --json                chi2 and iterations only, nothing is written
 
 exit code 3: the search did not converge
@@ -28,6 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=place, metavar="FILE", help="optimised graph; .g2o or .pyfg by its name, .gz compresses")
     parser.add_argument("--trajectory", type=place, metavar="FILE", help="poses as a TUM trajectory, as evo reads it")
     parser.add_argument("--from-odometry", action="store_true", help="forget the file's estimates, start from the odometry")
+    way = parser.add_mutually_exclusive_group()
+    adding = "start from the odometry and add poses in the order of time, anchors when their ranges place them"
+    way.add_argument("--incremental", action="store_true", help=adding)
+    deciding = "decide which loop closures and ranges are outliers, by graduated non-convexity, and leave them out"
+    way.add_argument("--robust", action="store_true", help=deciding)
     parser.add_argument("--kernel", metavar="NAME", default="none", help="robust kernel on edges that close loops, and ranges")
     bend = "standard deviations where it bends (2)"
     parser.add_argument("--kernel-scale", metavar="K", type=number(above=0), default=2.0, help=bend)
@@ -42,7 +49,8 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
 
     from ..config import override
-    from ..graph.solver import SolverConfig, optimize
+    from ..errors import ConfigError
+    from ..graph.solver import SolverConfig
     from ..radio.anchor_starts import place_anchors
     from ..radio.chain_starts import place_chains
     from . import console
@@ -52,7 +60,10 @@ def run(args: argparse.Namespace) -> int:
         graph_format(args.out)
     refuse_existing(args.force, args.out, args.trajectory)
     config = override(SolverConfig(), args.set)
-    file = read_graph(args.graph, from_odometry=args.from_odometry)
+    file = read_graph(args.graph, from_odometry=args.from_odometry or args.incremental)
+    if args.incremental and file.chains.any():
+        count = int(file.chains.max()) + 1
+        raise ConfigError(f"--incremental adds the poses of one robot; {args.graph} has {count} chains of odometry")
     for warning in file.warnings:
         console.note(f"uwblite: {args.graph}: {warning}")
     starts = place_chains(_with_kernel(file.graph, args.kernel, args.kernel_scale), file.chains)
@@ -61,10 +72,10 @@ def run(args: argparse.Namespace) -> int:
         solutions = []
         for start in starts:
             graph, lost = place_anchors(start)
-            solutions.append((*optimize(graph, config, lambda done, most: progress("optimising", done, most)), lost))
+            solutions.append((*_solve(args, graph, config, lambda done, most: progress("optimising", done, most)), lost))
     finally:
         progress.close()
-    solved, summary, lost = min(solutions, key=lambda solution: solution[1].chi2)
+    solved, summary, outliers, lost = min(solutions, key=lambda solution: (sum(solution[2].values()), solution[1].chi2))
     solved_file = dataclasses.replace(file, graph=solved)
     if args.out:
         write_graph(args.out, solved_file)
@@ -73,12 +84,58 @@ def run(args: argparse.Namespace) -> int:
 
         write_tum(args.trajectory, file.stamps, solved.poses)
     figures = _figures(solved_file, summary, [file.anchor_ids[k] for k in lost])
+    if args.robust:
+        figures["outliers"] = outliers
     if args.json:
         console.say_json(figures)
     else:
         for line in _lines(args, figures):
             console.say(line)
     return 0 if summary.converged else 3
+
+
+def _solve(
+    args: argparse.Namespace, graph: "Graph", config: "SolverConfig", progress: "Progress"
+) -> tuple["Graph", "SolverSummary", dict[str, int]]:
+    """Optimise in the way the options ask for; with --robust also count the outliers by kind of edge."""
+    import dataclasses
+
+    if args.incremental:
+        from ..radio.incremental import IncrementalConfig, optimize_incrementally
+
+        return *optimize_incrementally(graph, IncrementalConfig(solver=config), progress), {}
+    if not args.robust:
+        from ..graph.solver import optimize
+
+        return *optimize(graph, config, progress), {}
+    from ..graph.gnc import GncConfig, optimize_gnc
+
+    solved, summary, weights = optimize_gnc(graph, _thresholds(graph), GncConfig(solver=config), progress)
+    outliers: dict[str, int] = {}
+    for k, weight in weights.items():
+        name = type(graph.edges[k]).__name__
+        outliers[name] = outliers.get(name, 0) + int((weight == 0.0).sum())
+    # The file keeps every edge; which ones were left out is not a property of the measurements.
+    return dataclasses.replace(solved, edges=graph.edges), summary, outliers
+
+
+_THRESHOLDS = {1: 3.3, 2: 3.7, 3: 4.0}
+"""Whitened norm beyond which an edge of so many dimensions is an outlier: one good edge in a thousand lies there."""
+
+
+def _thresholds(graph: "Graph") -> dict[int, float]:
+    """Return by position the threshold of each kind of edges that may hold outliers: all but priors and successive poses."""
+    import numpy as np
+
+    from ..graph.graph import PriorEdges
+    from ..graph.pose_edges import RelativePoseEdges
+
+    chosen = {}
+    for k, e in enumerate(graph.edges):
+        chain = isinstance(e, RelativePoseEdges) and bool(np.all(np.abs(e.j - e.i) == 1))
+        if len(e) and not chain and not isinstance(e, PriorEdges):
+            chosen[k] = _THRESHOLDS[e.residuals(graph).shape[1]]
+    return chosen
 
 
 def _with_kernel(graph: "Graph", name: str, scale: float) -> "Graph":
@@ -136,10 +193,13 @@ def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
         f" in {figures['iterations']} iterations: {figures['reason']}"
     )
     if not figures["converged"]:
-        lines.append("DOUBT: not converged; try --set max_iterations=1000, --from-odometry or a robust --kernel")
+        lines.append("DOUBT: not converged; try --set max_iterations=1000, --from-odometry --incremental or --robust")
     lines.append("no certificate: whether a lower minimum exists is not known")
     if figures["chains"] > 1:
         lines[0] += f"; {figures['chains']} chains that nothing but ranges ties together"
+    if "outliers" in figures:
+        counted = ", ".join(f"{count} {name}" for name, count in figures["outliers"].items())
+        lines.append(f"outliers left out: {counted or 'there is no edge that may be one'}")
     if figures["unplaced_anchors"]:
         lines.append(f"warning: no position for anchors {', '.join(figures['unplaced_anchors'])}: too few ranges")
     written = [name for name in (args.out, args.trajectory) if name]

@@ -1,6 +1,6 @@
 """Graduated non-convexity: decide which edges of chosen kinds are outliers while optimising.
 
-The truncated square min(r^2, c^2) is approached from a nearly convex surrogate as mu grows from about 0; each edge's
+The truncated square min(r^2, c^2) is approached from a nearly convex surrogate as mu rises from about 0; each edge's
 weight follows in closed form from its residual (H. Yang, P. Antonante, V. Tzoumas, L. Carlone, Graduated Non-Convexity
 for Robust Spatial Perception, RA-L 2020, equation 14)::
 
@@ -29,7 +29,7 @@ from .solver import Progress, SolverConfig, SolverSummary, check, linearize, min
 class GncConfig:
     """How fast to become strict."""
 
-    growth: float = 2.0
+    mu_factor: float = 2.0
     """Factor on mu from step to step."""
     steps_per_mu: int = 1
     """Linear systems solved per mu."""
@@ -39,8 +39,8 @@ class GncConfig:
     """Of the last optimisation, with the weights decided."""
 
     def __post_init__(self) -> None:
-        if not self.growth > 1.0:
-            raise ConfigError(f"growth must be above 1, not {self.growth}")
+        if not self.mu_factor > 1.0:
+            raise ConfigError(f"mu_factor must be above 1, not {self.mu_factor}")
         if self.steps_per_mu < 1:
             raise ConfigError(f"steps_per_mu must be at least 1, not {self.steps_per_mu}")
         if not self.reach > 1.0:
@@ -79,14 +79,14 @@ def optimize_gnc(
     worst = max((float(np.max(s)) for s in _squared(plain, thresholds).values() if len(s)), default=0.0)
     mu = 1.0 / max(2.0 * min(worst, config.reach**2) - 1.0, 1e-3)
     few = replace(config.solver, max_iterations=config.steps_per_mu)
-    most = max(1, int(np.ceil(np.log(_STRICT / mu) / np.log(config.growth))))
+    most = max(1, int(np.ceil(np.log(_STRICT / mu) / np.log(config.mu_factor))))
     current = plain
     for step in range(most):
         weights = {k: truncated_weight(s, mu) for k, s in _squared(current, thresholds).items()}
         current, _ = minimise(*_weighted(current, plain, weights), normal, few)
         if progress is not None:
             progress(step + 1, most + 1)
-        mu *= config.growth
+        mu *= config.mu_factor
         if all(np.all((w == 0.0) | (w == 1.0)) for w in weights.values()):
             break
     weights = {k: (s < 1.0).astype(np.float64) for k, s in _squared(current, thresholds).items()}

@@ -1,9 +1,9 @@
-"""Optimising a graph whose guess is only locally right, by growing it in time.
+"""Incremental optimisation of a graph whose initial values are only locally right: poses are added in time.
 
 Dead reckoning over kilometres bends so far that no descent from it finds the minimum: with anchors trilaterated on a
 bent path, the basin is lost after a few thousand poses. But the guess of the next hundred poses, laid onto what is
 known already, is always near. So poses are added in pieces. Each time the last few hundred are optimised while older
-ones hold them; the whole is optimised again when it has grown by half, or when the last part does not fit.
+ones hold them; the whole is optimised again when it is longer by half, or when the last part does not fit.
 
 An anchor joins when the ranges heard so far place it, and leaves again when later ranges contradict it: the mirror
 image of an anchor passed on one side is often found, and is recognised only after a turn.
@@ -31,8 +31,8 @@ from .trilateration import TrilaterationConfig, ambiguous, trilaterate
 
 
 @dataclass(frozen=True, slots=True)
-class GrowingConfig:
-    """How a graph grows."""
+class IncrementalConfig:
+    """How poses are added."""
 
     piece: int = 100
     """Poses added at once; over so many the guess may not bend by more than about a radian."""
@@ -40,8 +40,8 @@ class GrowingConfig:
     """Poses optimised after each piece, older ones held."""
     widening: int = 4
     """Factor on the window where it does not fit."""
-    resolve_growth: float = 1.5
-    """Everything is optimised again when the number of poses has grown by this factor."""
+    resolve_factor: float = 1.5
+    """Everything is optimised again when there are so many times the poses."""
     significance: float = 5.0
     """Standard deviations by which chi2 may exceed the usual."""
     probation: int = 400
@@ -67,12 +67,12 @@ class GrowingConfig:
         for name, least in (("piece", 1), ("window", 1), ("widening", 2), ("min_ranges", 1)):
             if getattr(self, name) < least:
                 raise ConfigError(f"{name} must be at least {least}, not {getattr(self, name)}")
-        if not self.resolve_growth > 1.0:
-            raise ConfigError(f"resolve_growth must be above 1, not {self.resolve_growth}")
+        if not self.resolve_factor > 1.0:
+            raise ConfigError(f"resolve_factor must be above 1, not {self.resolve_factor}")
 
 
-def optimize_growing(
-    graph: Graph, config: GrowingConfig = GrowingConfig(), progress: Progress | None = None
+def optimize_incrementally(
+    graph: Graph, config: IncrementalConfig = IncrementalConfig(), progress: Progress | None = None
 ) -> tuple[Graph, SolverSummary]:
     """Optimise a graph whose poses stand in the order of time and are guessed by dead reckoning.
 
@@ -87,11 +87,11 @@ def optimize_growing(
     SolverError : nothing is free, nothing is measured, or a starting value is not finite.
     """
     check(graph)
-    growth = _Growth(graph, config)
-    for done in growth.run():
+    state = _Incremental(graph, config)
+    for done in state.run():
         if progress is not None:
             progress(done, len(graph.poses))
-    return optimize(growth.graph, config.solver)
+    return optimize(state.graph, config.solver)
 
 
 class _Kind(NamedTuple):
@@ -119,10 +119,10 @@ class _Part(NamedTuple):
     chi2_per_dof: float
 
 
-class _Growth:
+class _Incremental:
     """What is known so far: `graph` with the poses done, and which anchors have joined."""
 
-    def __init__(self, graph: Graph, config: GrowingConfig) -> None:
+    def __init__(self, graph: Graph, config: IncrementalConfig) -> None:
         self.graph, self.guess, self.config = graph, graph.poses, config
         self.kinds = [_by_time(edges, graph) for edges in graph.edges]
         self.free = free_unknowns(graph)
@@ -152,12 +152,12 @@ class _Growth:
         return np.where(known | self.ranged, -1, first)
 
     def run(self) -> Iterator[int]:
-        """Grow to the whole path, yielding the number of poses done."""
+        """Add poses up to the whole path, yielding the number done."""
         done, whole = 0, 0
         while done < len(self.guess):
             now = min(done + self.config.piece, len(self.guess))
             self._lay_on(done, now)
-            everything = now == len(self.guess) or now >= self.config.resolve_growth * whole
+            everything = now == len(self.guess) or now >= self.config.resolve_factor * whole
             part = self._fit(now, everything)
             self.graph = replace(
                 self.graph,

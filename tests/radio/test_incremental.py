@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import plain_ranges, relative_edges
+from helpers.planted_graphs import lawn, relative_edges
 
 from uwblite import se2
 from uwblite.errors import ConfigError
@@ -10,32 +10,7 @@ from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
-from uwblite.radio.growing import GrowingConfig, optimize_growing
-
-
-def lawn(seed, n=1500, side=60.0, drift=0.02):
-    """Return a long drive between random goals with 16 anchors, guessed by dead reckoning; the truth; the anchors."""
-    rng = np.random.default_rng(seed)
-    truth = np.zeros((n, 3))
-    truth[0, :2] = goal = np.array([side / 2, side / 2])
-    for k in range(1, n):
-        while np.hypot(*(goal - truth[k - 1, :2])) < 2.0:
-            goal = np.clip(truth[k - 1, :2] + rng.uniform(-25.0, 25.0, 2), 2.0, side - 2.0)
-        want = np.arctan2(*(goal - truth[k - 1, :2])[::-1])
-        turn = np.clip(se2.wrap_angle(want - truth[k - 1, 2]), -0.35, 0.35)
-        truth[k] = se2.compose(truth[k - 1], [0.5, 0.0, turn])
-    axis = (np.arange(4) + 0.5) * side / 4
-    anchors = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + rng.normal(scale=2.0, size=(16, 2))
-    each = np.arange(n - 1)
-    odometry = relative_edges(truth, each, each + 1, [0.02, 0.01, drift], rng)
-    distance = np.hypot(*(truth[:, None, :2] - anchors).transpose(2, 0, 1))
-    pose = np.repeat(np.arange(n), 3)
-    anchor = np.argsort(distance, axis=1)[:, :3].ravel()
-    ranges = plain_ranges(pose, anchor, distance[pose, anchor] + rng.normal(scale=0.1, size=len(pose)), 0.1)
-    guess = [truth[0]]
-    for motion in odometry.T_i_j:
-        guess.append(se2.compose(guess[-1], motion))
-    return Graph(np.array(guess), np.zeros((16, 2)), (odometry, ranges)), truth, anchors
+from uwblite.radio.incremental import IncrementalConfig, optimize_incrementally
 
 
 def rms(a, b):
@@ -43,10 +18,10 @@ def rms(a, b):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_bent_guess_grows_to_the_minimum(seed):
+def test_a_bent_guess_ends_at_the_minimum(seed):
     graph, truth, anchors = lawn(seed)
     best, _ = optimize(replace(graph, poses=truth, anchors=anchors))
-    found, summary = optimize_growing(graph)
+    found, summary = optimize_incrementally(graph)
     assert rms(graph.poses, truth) > 5.0
     np.testing.assert_allclose(found.poses[:, :2], best.poses[:, :2], atol=0.02)
     often = np.bincount(graph.edges[1].anchor, minlength=16) > 20
@@ -57,19 +32,19 @@ def test_a_bent_guess_grows_to_the_minimum(seed):
     assert summary.chi2_per_dof == pytest.approx(1.0, abs=0.1)
 
 
-def test_without_growing_the_same_guess_is_lost():
+def test_all_at_once_the_same_guess_is_lost():
     graph, _, anchors = lawn(0)
     assert optimize(replace(graph, anchors=anchors))[1].chi2_per_dof > 2.0
 
 
-def test_pose_graphs_grow_too():
+def test_pose_graphs_need_no_ranges():
     graph, truth, _ = lawn(2, n=600)
     close = np.array([(i, j) for i in range(600) for j in range(i + 50, 600) if np.hypot(*(truth[i] - truth[j])[:2]) < 1.0])[
         ::10
     ]
     closures = relative_edges(truth, close[:, 0], close[:, 1], [0.03, 0.03, 0.01], np.random.default_rng(0))
     graph = Graph(graph.poses, edges=(graph.edges[0], closures))
-    found, summary = optimize_growing(graph)
+    found, summary = optimize_incrementally(graph)
     assert summary.chi2 == pytest.approx(optimize(replace(graph, poses=truth))[1].chi2, rel=1e-6)
     assert found.anchors.shape == (0, 2)
 
@@ -77,11 +52,11 @@ def test_pose_graphs_grow_too():
 def test_surveyed_anchors_hold_the_path_from_the_start():
     graph, truth, anchors = lawn(3, n=400)
     held = replace(graph, anchors=anchors, fixed_anchors=np.ones(16, dtype=bool))
-    found, _ = optimize_growing(held)
+    found, _ = optimize_incrementally(held)
     np.testing.assert_array_equal(found.anchors, anchors)
     assert rms(found.poses, truth) < 0.15
     prior = PriorEdges("anchors", np.arange(16), anchors, np.tile(np.eye(2) / 0.05, (16, 1, 1)))
-    found, _ = optimize_growing(replace(graph, anchors=anchors).with_edges(prior))
+    found, _ = optimize_incrementally(replace(graph, anchors=anchors).with_edges(prior))
     assert rms(found.poses, truth) < 0.15
 
 
@@ -95,7 +70,7 @@ def test_landmarks_without_ranges_are_carried_along():
     first = np.array([pose[mark == m].min() if np.any(mark == m) else 0 for m in range(30)])
     guess = se2.transform(graph.poses[first], se2.transform(se2.inverse(truth[first]), marks))
     graph = Graph(graph.poses, guess, (graph.edges[0], edges))
-    _, summary = optimize_growing(graph)
+    _, summary = optimize_incrementally(graph)
     assert summary.chi2 == pytest.approx(optimize(replace(graph, poses=truth, anchors=marks))[1].chi2, rel=1e-5)
 
 
@@ -107,7 +82,7 @@ def test_calibration_is_found_on_the_way():
     graph = replace(
         graph, edges=(odometry, ranges, prior), calibration=Calibration((UnknownKey("scale"), UnknownKey("bias")), np.zeros(2))
     )
-    found, summary = optimize_growing(graph)
+    found, summary = optimize_incrementally(graph)
     # Hundreds of ranges per anchor: the scale is known to about 0.1 %, the bias to about 1 cm.
     np.testing.assert_array_less(np.abs(found.calibration.values - [0.05, 0.2]), [4e-3, 4e-2])
     best, at_best = optimize(replace(graph, poses=truth, anchors=anchors))
@@ -115,10 +90,10 @@ def test_calibration_is_found_on_the_way():
     assert summary.chi2 == pytest.approx(at_best.chi2, rel=1e-5)
 
 
-def test_short_and_trivial_graphs_are_grown_in_one_piece():
+def test_short_and_trivial_graphs_are_one_piece():
     truth = np.cumsum(np.full((5, 3), 0.3), axis=0)
     edges = relative_edges(truth, range(4), range(1, 5), [0.1, 0.1, 0.1], np.random.default_rng(0))
-    found, summary = optimize_growing(Graph(truth, edges=(edges,)))
+    found, summary = optimize_incrementally(Graph(truth, edges=(edges,)))
     np.testing.assert_allclose(RelativePoseEdges.residuals(edges, found), 0.0, atol=1e-6)
     assert summary.chi2 == pytest.approx(0.0, abs=1e-9)
 
@@ -126,17 +101,17 @@ def test_short_and_trivial_graphs_are_grown_in_one_piece():
 def test_progress_is_told_in_poses():
     graph, _, _ = lawn(6, n=350)
     calls = []
-    optimize_growing(graph, progress=lambda done, most: calls.append((done, most)))
+    optimize_incrementally(graph, progress=lambda done, most: calls.append((done, most)))
     assert calls == [(100, 350), (200, 350), (300, 350), (350, 350)]
 
 
 def test_results_are_the_same_every_time():
     graph, _, _ = lawn(7, n=300)
-    first, second = (optimize_growing(graph)[0] for _ in range(2))
+    first, second = (optimize_incrementally(graph)[0] for _ in range(2))
     assert first.poses.tobytes() == second.poses.tobytes()
 
 
-@pytest.mark.parametrize("wrong", [{"piece": 0}, {"window": 0}, {"widening": 1}, {"min_ranges": 0}, {"resolve_growth": 1.0}])
+@pytest.mark.parametrize("wrong", [{"piece": 0}, {"window": 0}, {"widening": 1}, {"min_ranges": 0}, {"resolve_factor": 1.0}])
 def test_settings_are_checked(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        GrowingConfig(**wrong)
+        IncrementalConfig(**wrong)
