@@ -69,7 +69,7 @@ def test_closures_and_rays_do_not_depend_on_the_executor(minutes, method):
     log = read_log(minutes[0])
     config = MappingConfig()
     if method == "icp":
-        config = replace(config, loops=replace(config.loop_closure, method="icp", rounds=1))
+        config = replace(config, loop_closure=replace(config.loop_closure, method="icp", rounds=1))
     alone = build_map(log, config)
     with ProcessPoolExecutor(2) as executor:
         assert same_map(alone, build_map(log, config, executor=executor))

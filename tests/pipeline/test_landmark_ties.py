@@ -115,7 +115,7 @@ def test_a_measured_distance_gives_the_map_its_true_length(carpet):
     after = build_map(log, constraints=known(2.0 + LONG * before))
     # The tape's sigma, and a centimetre or two of each column's place.
     assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=3 * np.hypot(0.02, 0.02) / LONG)
-    told = next(s for s in after.stages if s.name == "measured distances").figures["distances"]
+    told = next(s for s in after.stages if s.name == "landmark distances").figures["distances"]
     assert told[0]["map"] == pytest.approx(LONG, abs=0.06)
     assert not [w for w in after.warnings if "measured" in w.text]
 
@@ -123,12 +123,12 @@ def test_a_measured_distance_gives_the_map_its_true_length(carpet):
 def test_a_measured_distance_calibrates_the_wheels(wrong_wheels):
     """Scans are not matched with each other here: wheels and tape are all there is."""
     log, stamps, truth = wrong_wheels
-    blind = MappingConfig(use_loops=False, tracking=TrackingConfig(on=False))
+    blind = MappingConfig(use_loops=False, scan_to_scan=TrackingConfig(on=False))
     assert stretch(build_map(log, blind), stamps, truth) == pytest.approx(SCALE, abs=0.003)
     names = zip(("near", "far"), (2.0, 2.0 + LONG), strict=True)
     shrunk = replace(known(0.0), landmarks=tuple(KnownLandmark(name, (SCALE * x, 0.9), 0.3) for name, x in names))
     after = build_map(log, blind, constraints=shrunk)
-    told = next(s for s in after.stages if s.name == "measured distances").figures["distances"]
+    told = next(s for s in after.stages if s.name == "landmark distances").figures["distances"]
     assert told[0]["map"] == pytest.approx(LONG, abs=0.06)
     # The way there alone may bend a little: the tape holds both ways together.
     assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=0.015)

@@ -103,7 +103,7 @@ def test_wheels_and_biases_are_each_recording_s_own(merged):
 def test_names_of_a_further_recording_are_its_own():
     config, told = MappingConfig().calibration, np.zeros(1, dtype=bool)
     first, second = (unknowns(config, ("A",), told, n) for n in (0, 1))
-    assert not {u.name for u in first} & {u.name for u in second}
+    assert not {u.key for u in first} & {u.key for u in second}
     assert len(first) - len(second) == 5
 
 

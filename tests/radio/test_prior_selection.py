@@ -54,7 +54,7 @@ def solved(seed, bias=(0.0,) * 4, scale=1.0):
     listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
     attached = attach_ranges(radio, wheels, frames, LEVEL)
     edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
-    held = np.array([u.name.split(":")[0] not in ("range_scale", "bias") for u in listed])
+    held = np.array([u.key.kind not in ("range_scale", "bias") for u in listed])
     fixed = np.ones(len(frames), dtype=bool)
     graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, None, held)
     done = optimize(graph.with_edges(edges))[0]
@@ -114,7 +114,7 @@ def driven(seed, scale=1.0, unit=1.0):
     attached = attach_ranges(radio, wheels, frames, LEVEL)
     edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
     steps = wheel_edges(frames, 0, OdometryNoiseConfig(), block(listed))
-    held = np.array([u.name.split(":")[0] not in ("range_scale", "bias", "odometry_scale") for u in listed])
+    held = np.array([u.key.kind not in ("range_scale", "bias", "odometry_scale") for u in listed])
     graph = Graph(frames.odometry, PLACES / unit, (prior_edges(listed),), block(listed), None, None, held)
     done = optimize(graph.with_edges(edges, steps))[0]
     return graph.updated(done.poses, done.anchors, done.calibration.values), (edges, steps)

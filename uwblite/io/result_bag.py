@@ -3,10 +3,12 @@
 import heapq
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from .. import se2
+from ..arrays import Floats
 from ..errors import ConfigError
 from ..report import palette
 from ..report.palette import share
@@ -43,7 +45,14 @@ def write_result_bag(
     ConfigError : there are recordings, but not as many as the map was made of, or one of another time.
     """
     _check(result, logs)
+    trajectories = tuple((_from_zero(stamps), poses) for stamps, poses in result.trajectories)
+    result = replace(result, trajectories=trajectories, keyframe_stamps=_from_zero(result.keyframe_stamps))
     write_messages(path, lambda make: _messages(result, logs, make), storage=storage)
+
+
+def _from_zero(stamps: Floats) -> Floats:
+    """Return stamps (n,), s, with those less than a second before 0 put to 0: a late lidar clock moves keyframes there."""
+    return np.where((stamps > -1.0) & (stamps < 0.0), 0.0, stamps)
 
 
 def _check(result: StoredResult, logs: Sequence[SensorLog]) -> None:

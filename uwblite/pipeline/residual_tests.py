@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..graph.calibration import RANGE_SCALE
+from ..graph.pose_edges import RelativePoseEdges, ScanEdges
 from ..graph.robust import spread_about_median
 from ..radio.range_noise import short_term_sigma
 from .estimate import Estimate, Task
@@ -103,8 +104,7 @@ def check_support(estimate: Estimate, task: Task) -> None:
     """Doubt a map that nothing but the odometry holds."""
     ranges = estimate.ranges
     held = ranges is not None and bool(np.any(np.asarray(ranges.weights) > 0))
-    lidar = (estimate.steps, estimate.joint, estimate.closures.edges)
-    held |= any(edges is not None and len(edges) > 0 for edges in lidar)
+    held |= any(isinstance(edges, ScanEdges | RelativePoseEdges) for edges in estimate.graph.edges)
     if not held and len(estimate.graph.poses) > 2:
         text = "neither ranges nor scans hold the trajectory: it is the odometry's alone, and drifts"
         task.stages.doubt("odometry-alone", text)
