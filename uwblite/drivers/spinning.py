@@ -133,8 +133,12 @@ def _span(samples: Samples) -> float:
 
 
 def _turn(samples: Samples) -> float:
-    """Return the duration of a turn, s."""
-    return samples.period * len(samples.turned) / max(_span(samples), 1e-6)
+    """Return the duration of a turn, s; a frame that states no time counts as the fastest turn."""
+    return max(samples.period * len(samples.turned) / max(_span(samples), 1e-6), _SHORTEST_TURN)
+
+
+_SHORTEST_TURN = 1e-3
+"""No spinning lidar turns faster, s."""
 
 
 def _elapsed(before: Samples, samples: Samples) -> tuple[float, bool]:

@@ -72,7 +72,10 @@ def _each(pattern: str, unit: float) -> Parse:
     return parse
 
 
-_AT_RANGE = re.compile(r"AT\+RANGE=tid:(\d+),mask:[0-9A-Fa-f]+,seq:\d+,range:\(([-\d,]+)\)(?:.*?ancid:\(([-\d,]+)\))?")
+_NUMBERS = r"((?:-?\d+)?(?:,(?:-?\d+)?)*)"
+_AT_RANGE = re.compile(
+    rf"AT\+RANGE=tid:(\d+),mask:[0-9A-Fa-f]+,seq:\d+,range:\({_NUMBERS}\)(?:.*?ancid:\({_NUMBERS}\))?"
+)
 
 
 def _at_range(line: str) -> Ranges | str | None:
@@ -86,7 +89,7 @@ def _at_range(line: str) -> Ranges | str | None:
     names = match[3].split(",") if match[3] else [str(i) for i in range(len(centimetres))]
     if len(names) != len(centimetres):
         return "as many ranges as anchors were expected"
-    pairs = [(name, int(text)) for name, text in zip(names, centimetres, strict=True) if text.lstrip("-")]
+    pairs = [(name, int(text)) for name, text in zip(names, centimetres, strict=True) if name and text]
     return Ranges(tuple(reading(name, cm / 100) for name, cm in pairs if cm > 0 and int(name) >= 0), tag=match[1])
 
 
