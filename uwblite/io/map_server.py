@@ -252,7 +252,10 @@ def _take_words(words: list[bytes], pixels: Image, done: int, path: str) -> int:
     """Write numbers behind those that are there already; return how many there are then."""
     words = words[: len(pixels) - done]
     try:
-        pixels[done : done + len(words)] = np.array(words, dtype=np.uint8)
+        values = np.array(words, dtype=np.int64)  # not uint8: numpy 1 wraps what is above 255
     except (ValueError, OverflowError):
-        raise FormatError("the PGM's pixels are damaged", path) from None
+        values = np.array([-1])
+    if len(values) and not 0 <= values.min() <= values.max() <= 255:
+        raise FormatError("the PGM's pixels are damaged", path)
+    pixels[done : done + len(words)] = values
     return done + len(words)
