@@ -15,15 +15,14 @@ PACKAGE = Path(uwblite.__file__).parent
 MODULES = sorted(p.relative_to(PACKAGE).with_suffix("").as_posix() for p in PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    ("errors", "printable", "arrays", "parallel"),
+    ("errors", "arrays"),
     ("se2", "config"),
     ("sensor_log", "graph", "drivers"),
-    ("constraints", "keyframes", "grid"),
-    ("wheels", "map_result", "radio"),
-    ("gyro", "lidar", "report"),
+    ("constraints", "odometry", "grid"),
+    ("map_result", "radio"),
+    ("lidar", "report"),
     ("screening",),
     ("loop_closure", "checks", "evaluation", "io"),
-    ("mapping_config",),
     ("pipeline",),
     ("mapping",),
     ("localize", "server"),
@@ -210,7 +209,7 @@ USE = """
 from acme._x import uwblite
 from acme._x.uwblite.cli import main
 from acme._x.uwblite.config import field_docs
-from acme._x.uwblite.keyframes import KeyframeConfig
+from acme._x.uwblite.odometry.keyframes import KeyframeConfig
 assert field_docs(KeyframeConfig)["distance"]
 assert not [m for m in sys.modules if m.split(".")[0] == "uwblite"]
 log = uwblite.read_log({log!r})

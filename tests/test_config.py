@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from uwblite.config import field_docs, from_dict, leaves, merge, override, parse_toml, setting, to_dict, to_toml, toml_value
 from uwblite.errors import ConfigError
-from uwblite.mapping_config import MappingConfig
+from uwblite.pipeline.mapping_config import MappingConfig
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

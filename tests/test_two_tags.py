@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 from helpers import planted
 
-from uwblite import keyframes, se2
+from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.graph.calibration import CalibrationConfig, block, unknowns
 from uwblite.graph.graph import Graph
 from uwblite.io.carmen import read_log, write_log
-from uwblite.keyframes import KeyframeConfig
 from uwblite.mapping import build_map
-from uwblite.mapping_config import MappingConfig
+from uwblite.odometry import keyframes
+from uwblite.odometry.attached import attach_ranges
+from uwblite.odometry.keyframes import KeyframeConfig
+from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import SensorLog, SensorMounting, UwbRanges
@@ -43,7 +45,7 @@ def test_at_the_truth_every_range_of_either_tag_fits():
     stamps, truth = planted.wander(rng, 30.0)
     ranges, odometry = both(stamps, truth, rng), planted.odometry(stamps, truth)
     frames = keyframes.select(odometry, KeyframeConfig())
-    attached = keyframes.attach_ranges(ranges, odometry, frames, MOUNTING)
+    attached = attach_ranges(ranges, odometry, frames, MOUNTING)
     listed = unknowns(CalibrationConfig(), ranges.anchor_ids, np.ones(4, dtype=bool))
     edges = range_edges(attached, 0, ranges.anchor_ids, MOUNTING, block(listed), 1.0, TrilaterationConfig())
     # The anchors in the frame of the odometry, which begins at 0.
@@ -52,7 +54,7 @@ def test_at_the_truth_every_range_of_either_tag_fits():
     assert np.abs(edges.residuals(graph)).max() < 2e-3  # interpolation between samples of 0.1 s
     blind = replace(ranges, tag=None)
     wrong = range_edges(
-        keyframes.attach_ranges(blind, odometry, frames, MOUNTING), 0, ranges.anchor_ids, MOUNTING, block(listed), 1.0,
+        attach_ranges(blind, odometry, frames, MOUNTING), 0, ranges.anchor_ids, MOUNTING, block(listed), 1.0,
         TrilaterationConfig(),
     )  # fmt: skip
     assert np.abs(wrong.residuals(graph)).max() > 0.5
@@ -63,7 +65,7 @@ def test_velocities_are_those_of_the_tag_that_measured():
     stamps, truth = planted.drive([(0.0, 0.0, 0.8)], [10.0])
     ranges, odometry = both(stamps, truth, rng), planted.odometry(stamps, truth)
     frames = keyframes.select(odometry, KeyframeConfig())
-    attached = keyframes.attach_ranges(ranges, odometry, frames, MOUNTING)
+    attached = attach_ranges(ranges, odometry, frames, MOUNTING)
     inner = (ranges.stamps > 0.2) & (ranges.stamps < 9.8)
     speed = np.hypot(*attached.velocity.T)
     for tag, place in enumerate((FRONT, REAR)):

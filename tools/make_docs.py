@@ -11,7 +11,7 @@ sys.path.insert(0, str(ROOT))
 
 from uwblite.config import field_docs, permitted, shown_fields, toml_value
 from uwblite.mapping import MappingConfig
-from uwblite.mapping_config import preset
+from uwblite.pipeline.mapping_config import preset
 
 TARGET = ROOT / "docs" / "tuning.md"
 

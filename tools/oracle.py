@@ -20,9 +20,11 @@ from scipy.linalg import cho_factor, cho_solve
 from simulation import radio
 from simulation.recording import Recording
 
-from uwblite import keyframes, se2
+from uwblite import se2
 from uwblite.evaluation.trajectory import align
-from uwblite.keyframes import KeyframeConfig
+from uwblite.odometry import keyframes
+from uwblite.odometry.attached import attach_ranges, choose_scans, scan_points
+from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.sensor_log import SensorLog
 
 Floats = NDArray[np.float64]
@@ -115,8 +117,8 @@ class Oracle:
         """Return the rays of the scans at the keyframes, moved to these by the odometry as the estimator does."""
         log, model = self.log, self.recording.settings.laser
         assert log.scans is not None
-        owner, chosen = keyframes.choose_scans(log.scans, self.frames, KeyframeConfig())
-        found = keyframes.scan_points(log, self.frames, owner, chosen)
+        owner, chosen = choose_scans(log.scans, self.frames, KeyframeConfig())
+        found = scan_points(log, self.frames, owner, chosen)
         surface = self.recording.surfaces[found.scan, found.ray].astype(np.int64)
         kept = surface >= 0
         way = found.points[kept] - found.origins[kept]
@@ -270,7 +272,7 @@ class Oracle:
     def _add_ranges(self, matrix: Floats, gradient: Floats) -> None:
         r, log, layout, model = self.recording, self.log, self.layout, self.recording.settings.radio
         assert log.ranges is not None
-        attached = keyframes.attach_ranges(log.ranges, log.odometry, self.frames, log.mounting)
+        attached = attach_ranges(log.ranges, log.odometry, self.frames, log.mounting)
         known = {name: k for k, name in enumerate(r.plan.anchor_ids[: self.anchors])}
         number = np.array([known[i] for i in log.ranges.anchor_ids])[attached.anchor]
         poses, tag_arm = self.poses(), np.asarray(r.settings.tag)

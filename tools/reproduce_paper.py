@@ -26,7 +26,7 @@ from uwblite.config import override
 from uwblite.io.png import write_png
 from uwblite.map_result import MapResult
 from uwblite.mapping import build_map
-from uwblite.mapping_config import preset
+from uwblite.pipeline.mapping_config import preset
 from uwblite.report.picture import PictureAnchor, draw_map
 
 PRESETS = ("paper", "default")

@@ -14,7 +14,6 @@ import numpy as np
 
 from .constraints import Constraints
 from .map_result import MapResult
-from .mapping_config import MappingConfig
 from .pipeline import (
     anchor_moves,
     closure_rounds,
@@ -29,6 +28,7 @@ from .pipeline import (
     summary,
 )
 from .pipeline.estimate import Estimate, Task
+from .pipeline.mapping_config import MappingConfig
 from .pipeline.progress import Progress, Stages
 from .pipeline.recordings import gather
 from .sensor_log import SensorLog

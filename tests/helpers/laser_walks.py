@@ -6,8 +6,8 @@ from uwblite import se2
 from uwblite.graph.calibration import odometry_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import OdometryEdges
-from uwblite.keyframes import ScanPoints
 from uwblite.lidar.clouds import CloudConfig, Clouds, build
+from uwblite.odometry.attached import ScanPoints
 
 from .planted import box, cast, chain, wander
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.keyframes import ScanPoints
 from uwblite.lidar.clouds import CloudConfig, build, in_map
+from uwblite.odometry.attached import ScanPoints
 
 EVERYTHING = CloudConfig(voxel=0.1, normal_radius=0.3, min_neighbours=0)
 SINGLE = 2.0**-23

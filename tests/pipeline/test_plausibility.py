@@ -10,8 +10,8 @@ from helpers.planted import aligned_error, box, odometry, ranges, recording, sca
 from uwblite import se2
 from uwblite.constraints import Constraints, KnownAnchor
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
-from uwblite.keyframes import OUTSIDE
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.attached import OUTSIDE
 from uwblite.pipeline.plausibility import check_handedness, outlier_stretches
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import SensorMounting

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.grid.occupancy_grid import GridConfig
-from uwblite.keyframes import KeyframeConfig, choose_scans, of
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.attached import choose_scans
+from uwblite.odometry.keyframes import KeyframeConfig, of
 from uwblite.pipeline.scan_selection import thinned
 
 FRAMES, GRID = KeyframeConfig(), GridConfig()

@@ -10,7 +10,7 @@ from uwblite import se2
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.calibration import CalibrationConfig
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.mapping_config import preset
+from uwblite.pipeline.mapping_config import preset
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])

@@ -9,12 +9,13 @@ from helpers.planted import aligned_error, odometry, ranges, wander
 from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
 from uwblite.graph.graph import Graph
-from uwblite.keyframes import KeyframeConfig, attach_ranges, select
+from uwblite.odometry.attached import attach_ranges
+from uwblite.odometry.keyframes import KeyframeConfig, select
+from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio.bootstrap import BootstrapConfig, BootstrapResult, bootstrap_graph
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
-from uwblite.wheels import OdometryNoiseConfig, wheel_edges
 
 SIGMA = 0.05
 WELL = 0.3

@@ -10,12 +10,13 @@ from scipy.stats import multivariate_normal
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
 from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.solver import optimize
-from uwblite.keyframes import KeyframeConfig, attach_ranges, select
+from uwblite.odometry.attached import attach_ranges
+from uwblite.odometry.keyframes import KeyframeConfig, select
+from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio.prior_selection import log_marginal_likelihood, select_priors
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
-from uwblite.wheels import OdometryNoiseConfig, wheel_edges
 
 LEVEL = SensorMounting(anchor_height=0.0)
 CONFIG = CalibrationConfig()

@@ -8,7 +8,8 @@ from helpers.planted import ranges, wander
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph
-from uwblite.keyframes import KeyframeConfig, attach_ranges, select
+from uwblite.odometry.attached import attach_ranges
+from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.radio.range_measurements import learn_noise, range_edges, relocate
 from uwblite.radio.range_noise import RangeNoiseConfig
 from uwblite.radio.trilateration import TrilaterationConfig

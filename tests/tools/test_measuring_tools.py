@@ -14,7 +14,7 @@ from simulation.recording import Settings
 from uwblite.config import override
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.mapping_config import preset
+from uwblite.pipeline.mapping_config import preset
 
 SHORT = Settings(world="room", seed=3, minutes=1.0, scan_rate=5.0)
 COARSE = ("grid.resolution=0.2",)

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
-from ..graph.robust import spread
+from ..arrays import Floats, spread
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.units import LONGEST
 from ..sensor_log import SensorLog, UwbRanges

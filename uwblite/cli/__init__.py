@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from .. import __version__
 from ..errors import UsageError, UwbliteError
-from ..printable import printable
+from ..report.printable import printable
 
 VERBS = ("map", "view", "localize", "check", "record", "devices", "plan-anchors", "convert", "evaluate", "optimize", "config")
 """In the order in which a user meets them; `uwblite VERB` is the module of the same name, with _ for -."""

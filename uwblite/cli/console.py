@@ -11,7 +11,7 @@ import time
 import traceback
 from typing import TYPE_CHECKING, Any, TextIO
 
-from ..printable import encodable, printable
+from ..report.printable import encodable, printable
 
 if TYPE_CHECKING:
     from .stage_shares import Overall

@@ -89,7 +89,6 @@ def _map(args: argparse.Namespace) -> int:
     from ..config import to_toml
     from ..io.result_text import RunRecord
     from ..io.results import write_result
-    from ..parallel import in_order
     from ..pipeline.scan_selection import prepared
     from . import console
     from .formats import read_recording
@@ -99,7 +98,7 @@ def _map(args: argparse.Namespace) -> int:
     began = time.perf_counter()
     with _workers(args.jobs if len(args.logs) > 1 else 1) as executor:
         read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
-        logs = [apply_mounting(log, args) for log in in_order(read, args.logs, executor)]
+        logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
     reading = time.perf_counter() - began
     _tell_reader_warnings(logs)
     if args.dry_run:

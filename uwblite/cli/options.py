@@ -30,7 +30,7 @@ def effective_config(args: argparse.Namespace) -> "MappingConfig":
     """
     from ..config import merge, override, parse_toml
     from ..errors import ConfigError, UsageError
-    from ..mapping_config import MappingConfig, preset
+    from ..pipeline.mapping_config import MappingConfig, preset
 
     # A user who says how the laser is mounted is believed.
     given = ["detect_laser_flip=false"] if getattr(args, "laser_flipped", False) else []

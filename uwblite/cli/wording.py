@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from ..printable import spread
+from ..report.printable import sigma_text
 
 if TYPE_CHECKING:
     from ..map_result import AnchorEstimate, CalibrationEstimate
@@ -18,10 +18,10 @@ def anchor_line(anchor: "AnchorEstimate") -> str:
         place = "no position"
     else:
         sigma_x, sigma_y = (max(float(anchor.covariance[k, k]), 0.0) ** 0.5 for k in (0, 1))
-        place = f"x {signed(x)} \u00b1{spread(sigma_x, 2)} m, y {signed(y)} \u00b1{spread(sigma_y, 2)} m"
+        place = f"x {signed(x)} \u00b1{sigma_text(sigma_x, 2)} m, y {signed(y)} \u00b1{sigma_text(sigma_y, 2)} m"
     parts = [f"anchor {anchor.id}: {place}"]
     if anchor.bias_sigma > 0:
-        parts.append(f"bias {signed(anchor.bias, plus=True)} \u00b1{spread(anchor.bias_sigma, 2)} m")
+        parts.append(f"bias {signed(anchor.bias, plus=True)} \u00b1{sigma_text(anchor.bias_sigma, 2)} m")
     parts.append(f"{anchor.ranges} ranges")
     lost = 100 * (1 - anchor.used_share) if anchor.used_share == anchor.used_share else 0.0
     if lost >= 0.5:
@@ -36,10 +36,11 @@ def anchor_line(anchor: "AnchorEstimate") -> str:
 def calibration_line(value: "CalibrationEstimate") -> str:
     """Return one line about a calibration value; ratios in per cent."""
     if value.unit == "1":
-        return f"{value.meaning}: {signed(100 * value.value, plus=True)} \u00b1{spread(100 * value.sigma, 2)} % ({value.name})"
+        percent, sigma = signed(100 * value.value, plus=True), sigma_text(100 * value.sigma, 2)
+        return f"{value.meaning}: {percent} \u00b1{sigma} % ({value.name})"
     digits = 4 if value.unit.startswith("rad") else 3
     number = signed(value.value, digits, plus=True)
-    return f"{value.meaning}: {number} \u00b1{spread(value.sigma, digits)} {value.unit} ({value.name})"
+    return f"{value.meaning}: {number} \u00b1{sigma_text(value.sigma, digits)} {value.unit} ({value.name})"
 
 
 def signed(value: float, digits: int = 2, *, plus: bool = False) -> str:

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from ..printable import encodable
+from ..report.printable import encodable
 
 WAITING = ".uwblite-partial-"
 """In the name of a folder whose files are forced to the disk all at once, before it takes its place; see folders.py."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..map_result import MapResult, Notice
-from ..printable import encodable
+from ..report.printable import encodable
 from ..sensor_log import LogNotes, SensorLog
 
 SCHEMA = 2

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..config import setting
-from ..keyframes import ScanPoints
+from ..odometry.attached import ScanPoints
 from .point_cloud import Lines, PointCloud, estimate_normals, make_tree
 
 _BLOCK = 32

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
-from ..graph.robust import sigma_of_median
+from ..arrays import Floats, Ints, sigma_of_median
 from ..sensor_log import LaserScans, SensorLog
 
 PAIRS = 1000

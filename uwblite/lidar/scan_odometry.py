@@ -8,7 +8,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..keyframes import ScanPoints
+from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
 from . import clouds, scan_matching
 from .clouds import CloudConfig, Clouds

@@ -14,7 +14,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..wheels import learn_wheels
+from ..odometry.wheels import learn_wheels
 from .clouds import Clouds
 from .pair_alignment import align_pairs
 from .scan_matching import CloudRasters, match, measured, pair_points

@@ -19,9 +19,9 @@ from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.point_cloud import PointCloud, make_cloud
 from ..lidar.scan_matching import PairFactors, match, pair_points, rasterize
 from ..lidar.visibility import violates_free_space
-from ..parallel import in_order
 from .candidates import Candidates
 from .closures import LoopClosureConfig
+from .parallel import in_order
 
 _AT_ONCE = 32
 """Candidates of a batch."""

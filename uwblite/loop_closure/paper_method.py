@@ -20,8 +20,8 @@ from ..lidar.point_cloud import make_tree
 from ..lidar.point_to_point import IcpConfig, Registration, align
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
-from ..parallel import in_order
 from .closures import Closures, LoopClosureConfig, no_closures
+from .parallel import in_order
 
 _CELL = 0.5
 """m; two sub-maps overlap by the share of such squares of the smaller one that both have points in."""

@@ -14,8 +14,8 @@ from ..graph.range_edges import RangeEdges
 from ..lidar.clouds import Clouds
 from ..lidar.scan_matching import CloudRasters
 from ..loop_closure.closures import Closures, no_closures
-from ..mapping_config import MappingConfig
 from ..radio.bootstrap import BootstrapResult
+from .mapping_config import MappingConfig
 from .progress import Stages
 from .recordings import Recordings
 

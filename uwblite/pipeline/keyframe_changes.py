@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import keyframes, se2
+from .. import se2
 from ..arrays import Ints
 from ..graph.graph import Edges, PriorEdges
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..graph.range_edges import RangeEdges
-from ..wheels import drift_time
+from ..odometry.attached import attach_ranges
+from ..odometry.wheels import drift_time
 from .estimate import Estimate
 from .recordings import Recordings
 
@@ -77,7 +78,7 @@ def _attached(ranges: RangeEdges, before: Recordings, after: Recordings) -> Rang
         own = np.flatnonzero((ranges.pose >= old.rows.start) & (ranges.pose < old.rows.stop))
         if log.ranges is None or not len(own):
             continue
-        again = keyframes.attach_ranges(log.ranges, log.odometry, recording.frames, log.mounting)
+        again = attach_ranges(log.ranges, log.odometry, recording.frames, log.mounting)
         tag = np.asarray(log.mounting.tag_position[:2], dtype=np.float64)
         pose[own], turn[own], velocity[own] = again.keyframe + recording.first, again.turn, again.velocity
         arm[own] = again.lever_arm + se2.rotate(again.turn, tag - ranges.tag)

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import keyframes
 from ..arrays import Ints
 from ..graph.calibration import LASER, RADIO, with_free, with_nonnegative_heights
 from ..graph.graph import Edges, Graph
@@ -17,9 +16,10 @@ from ..graph.solver import optimize
 from ..lidar import clouds, joint_refinement, scan_matching, scan_to_scan, visibility
 from ..lidar.clouds import Clouds
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult
-from ..mapping_config import MappingConfig
+from ..odometry.attached import choose_scans, scan_points
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
+from .mapping_config import MappingConfig
 from .progress import solver_figures
 from .radio_stages import with_range_noise
 from .recordings import Recording, denser, later
@@ -49,12 +49,12 @@ def _blocks(recording: Recording, config: MappingConfig, delay: float) -> list[C
     if log.scans is None:
         none = np.zeros(0, dtype=np.int64)
         return [Clouds(np.zeros(len(frames) + 1, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))]
-    owner, chosen = keyframes.choose_scans(log.scans, frames, config.keyframes)
+    owner, chosen = choose_scans(log.scans, frames, config.keyframes)
     blocks = []
     for block in range(0, len(frames), _BLOCK):
         size = min(_BLOCK, len(frames) - block)
         own = slice(*np.searchsorted(owner, [block, block + size]).tolist())
-        rays = keyframes.scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
+        rays = scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
         blocks.append(clouds.build(replace(rays, keyframe=rays.keyframe - block), size, config.clouds))
     return blocks
 

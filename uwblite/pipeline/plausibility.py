@@ -11,8 +11,8 @@ from ..arrays import Bools, Floats
 from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
-from ..keyframes import OUTSIDE
 from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..odometry.attached import OUTSIDE
 from .estimate import Estimate, Task
 from .residual_tests import check_residuals
 

@@ -8,19 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import gyro, keyframes, se2
+from .. import se2
 from ..arrays import Bools, Floats
 from ..graph import calibration
 from ..graph.calibration import BIAS, ODOMETRY, RADIO, RANGE_SCALE, with_free, with_nonnegative_heights
 from ..graph.graph import Graph
 from ..graph.solver import optimize
-from ..mapping_config import MappingConfig
+from ..odometry import gyro
+from ..odometry.attached import attach_ranges
+from ..odometry.wheels import wheel_edges
 from ..radio import bootstrap, prior_selection
 from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
-from ..wheels import wheel_edges
 from . import joining, map_frame
 from .estimate import Estimate, Task
+from .mapping_config import MappingConfig
 from .progress import solver_figures
 from .recordings import Recording
 
@@ -51,7 +53,7 @@ def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
     odometry = wheel_edges(frames, 0, noise, block)
     if log.ranges is None:
         return Estimate(graph, odometry, None, ids)
-    attached = keyframes.attach_ranges(log.ranges, log.odometry, frames, log.mounting)
+    attached = attach_ranges(log.ranges, log.odometry, frames, log.mounting)
     ranges = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.trilateration, config.ranges.kernel)
     return Estimate(graph, odometry, ranges if np.any(ranges.weights) else None, ids)
 

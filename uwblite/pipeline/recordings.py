@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .. import keyframes
 from ..arrays import Floats, Ints
 from ..constraints import Clock
 from ..errors import DataError
-from ..keyframes import KeyframeConfig, Keyframes
+from ..odometry import keyframes
+from ..odometry.keyframes import KeyframeConfig, Keyframes
 from ..sensor_log import SensorLog
 
 _APART = 1000.0

@@ -6,10 +6,9 @@ knows of no particular fault.
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, spread_about_median
 from ..graph.calibration import RANGE_SCALE
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
-from ..graph.robust import spread_about_median
 from ..radio.range_noise import short_term_sigma
 from .estimate import Estimate, Task
 

@@ -8,13 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import keyframes, se2
+from .. import se2
 from ..grid.occupancy_grid import GridConfig
 from ..grid.scan_rays import moved_scans
-from ..keyframes import KeyframeConfig
-from ..mapping_config import MappingConfig
+from ..odometry import keyframes
+from ..odometry.attached import choose_scans
+from ..odometry.keyframes import KeyframeConfig
 from ..screening.screen import screen
 from ..sensor_log import SensorLog
+from .mapping_config import MappingConfig
 
 _STEPS = 2
 """Scans kept within the distance after which the grid traces the next one: odometry does not know that distance exactly."""
@@ -39,7 +41,7 @@ def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorL
     scans = log.scans
     if scans is None or not len(scans.stamps) or grid.move_distance <= 0.0:
         return log
-    _, near = keyframes.choose_scans(scans, keyframes.of(log, frames), frames)
+    _, near = choose_scans(scans, keyframes.of(log, frames), frames)
     base = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps)
     laser = se2.compose(base, log.mounting.T_base_laser)
     traced = moved_scans(laser, grid.move_distance / _STEPS, grid.move_angle / _STEPS)

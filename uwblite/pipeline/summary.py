@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, spread_about_median
 from ..graph.calibration import CalibrationConfig, Unknown, unknowns
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
 from ..graph.range_edges import RangeEdges
-from ..graph.robust import spread_about_median
 from ..grid.occupancy_grid import OccupancyGrid
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult

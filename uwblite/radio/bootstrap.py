@@ -13,12 +13,12 @@ from typing import ClassVar
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, spread
 from ..config import setting
 from ..graph.graph import Calibration, Graph
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
-from ..graph.robust import Kernel, spread
+from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, optimize
 from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate
 

@@ -9,7 +9,7 @@ from ..graph.calibration import range_indices
 from ..graph.graph import Calibration, Graph
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
-from ..keyframes import AttachedRanges
+from ..odometry.attached import AttachedRanges
 from ..sensor_log import SensorMounting
 from . import nlos_mixture
 from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, steady_sigma

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, spread
 from ..config import setting
-from ..graph.robust import Kernel, spread
+from ..graph.robust import Kernel
 
 _ROBUST = Kernel("cauchy", 2.5)
 

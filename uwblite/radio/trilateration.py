@@ -10,9 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import MAD_TO_SIGMA, Bools, Floats
 from ..config import setting
-from ..graph.robust import MAD_TO_SIGMA
 
 
 @dataclass(frozen=True, slots=True)

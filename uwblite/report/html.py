@@ -13,8 +13,8 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..map_result import OUTCOMES, AnchorEstimate, CalibrationEstimate, MapResult
-from ..printable import printable, spread
 from .page import PAGE, SCRIPT, STYLE
+from .printable import printable, sigma_text
 from .svg_map import draw, number, shown_closures, sigma, thin
 
 MOST_RESIDUALS = 1500
@@ -111,11 +111,11 @@ def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
         (
             a.id,
             number(a.position[0]),
-            spread(sigma(a, 0), 3),
+            sigma_text(sigma(a, 0), 3),
             number(a.position[1]),
-            spread(sigma(a, 1), 3),
+            sigma_text(sigma(a, 1), 3),
             number(a.bias, sign=True),
-            spread(a.bias_sigma, 3),
+            sigma_text(a.bias_sigma, 3),
             str(a.ranges),
             f"{100 * (1 - a.used_share):.0f} %" if np.isfinite(a.used_share) else "\u2013",
             number(a.residual_rms),
@@ -140,7 +140,7 @@ def _calibration_table(result: MapResult) -> str:
 def _calibration_row(value: CalibrationEstimate) -> tuple[str, ...]:
     """Return name, value, sigma, unit and meaning; ratios in per cent."""
     scale, digits, unit = (100.0, 2, "%") if value.unit == "1" else (1.0, 4, value.unit)
-    return (value.name, number(scale * value.value, digits, True), spread(scale * value.sigma, digits), unit, value.meaning)
+    return (value.name, number(scale * value.value, digits, True), sigma_text(scale * value.sigma, digits), unit, value.meaning)
 
 
 def _closure_table(result: MapResult) -> str:

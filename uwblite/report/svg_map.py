@@ -7,7 +7,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
-from ..printable import spread
+from .printable import sigma_text
 
 MOST_POINTS = 4000
 """Points of one line drawn at most."""
@@ -116,8 +116,8 @@ def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:
         return ""
     cx, cy = float(anchor.position[0]), -float(anchor.position[1])
     label = (
-        f"anchor {anchor.id}: x {number(anchor.position[0], 2)} \u00b1{spread(sigma(anchor, 0), 2)} m, "
-        f"y {number(anchor.position[1], 2)} \u00b1{spread(sigma(anchor, 1), 2)} m, {anchor.status} {anchor.reason}"
+        f"anchor {anchor.id}: x {number(anchor.position[0], 2)} \u00b1{sigma_text(sigma(anchor, 0), 2)} m, "
+        f"y {number(anchor.position[1], 2)} \u00b1{sigma_text(sigma(anchor, 1), 2)} m, {anchor.status} {anchor.reason}"
     )
     r = size / 110
     state = "ok" if anchor.status == "ok" else "doubt"

@@ -6,8 +6,7 @@ count, apart from noise and blocked sight. Where several anchors exceed that tog
 
 import numpy as np
 
-from ..arrays import Floats
-from ..graph.robust import spread
+from ..arrays import Floats, spread
 from ..sensor_log import SensorLog
 
 _WINDOW = 3

@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..gyro import heading_from_gyro
+from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
 from . import cuts, directions, odometry_chain, range_motion, stuck_sensors, units, wheel_motion
 from .wheel_motion import Pairs

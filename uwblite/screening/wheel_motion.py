@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
-from ..graph.robust import sigma_of_median, spread_about_median
+from ..arrays import Bools, Floats, Ints, sigma_of_median, spread_about_median
 from ..lidar.scan_odometry import scan_steps
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, Remark, SensorLog
 from .odometry_chain import chained

@@ -14,9 +14,9 @@ from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.graph.solver import optimize
-from uwblite.keyframes import KeyframeConfig, select
+from uwblite.odometry.keyframes import KeyframeConfig, select
+from uwblite.odometry.wheels import OdometryNoiseConfig, learn_wheels, wheel_edges
 from uwblite.sensor_log import Odometry
-from uwblite.wheels import OdometryNoiseConfig, learn_wheels, wheel_edges
 
 NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
 

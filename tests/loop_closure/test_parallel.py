@@ -10,8 +10,8 @@ import pytest
 
 from uwblite.cli import main
 from uwblite.io.carmen import read_log, write_log
+from uwblite.loop_closure.parallel import in_order
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.parallel import in_order
 
 
 def late_first(task):

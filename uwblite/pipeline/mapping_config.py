@@ -3,23 +3,23 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from .errors import ConfigError
-from .graph.calibration import CalibrationConfig
-from .graph.robust import SQUARED
-from .graph.solver import SolverConfig
-from .grid.occupancy_grid import GridConfig
-from .keyframes import KeyframeConfig
-from .lidar.clouds import CloudConfig
-from .lidar.correlative_matching import CorrelativeConfig
-from .lidar.joint_refinement import RefinementConfig
-from .lidar.point_to_point import IcpConfig
-from .lidar.scan_to_scan import TrackingConfig
-from .lidar.submaps import SubmapConfig
-from .loop_closure.closures import LoopClosureConfig
-from .radio.bootstrap import BootstrapConfig
-from .radio.range_noise import RangeNoiseConfig
-from .radio.trilateration import TrilaterationConfig
-from .wheels import OdometryNoiseConfig
+from ..errors import ConfigError
+from ..graph.calibration import CalibrationConfig
+from ..graph.robust import SQUARED
+from ..graph.solver import SolverConfig
+from ..grid.occupancy_grid import GridConfig
+from ..lidar.clouds import CloudConfig
+from ..lidar.correlative_matching import CorrelativeConfig
+from ..lidar.joint_refinement import RefinementConfig
+from ..lidar.point_to_point import IcpConfig
+from ..lidar.scan_to_scan import TrackingConfig
+from ..lidar.submaps import SubmapConfig
+from ..loop_closure.closures import LoopClosureConfig
+from ..odometry.keyframes import KeyframeConfig
+from ..odometry.wheels import OdometryNoiseConfig
+from ..radio.bootstrap import BootstrapConfig
+from ..radio.range_noise import RangeNoiseConfig
+from ..radio.trilateration import TrilaterationConfig
 
 
 @dataclass(frozen=True, slots=True)

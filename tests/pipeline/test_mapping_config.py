@@ -12,7 +12,7 @@ from uwblite.graph.pose_edges import OdometryEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.mapping_config import PRESETS, preset
+from uwblite.pipeline.mapping_config import PRESETS, preset
 
 
 @pytest.mark.parametrize("name", PRESETS)

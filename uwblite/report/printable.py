@@ -24,7 +24,7 @@ def _escape(character: str) -> str:
     return character.encode("unicode_escape", "surrogatepass").decode()
 
 
-def spread(sigma: float, digits: int) -> str:
+def sigma_text(sigma: float, digits: int) -> str:
     """Return a standard deviation with so many decimals, or more where it would show less than two digits of itself.
 
     What is not finite is a dash, and 0 is "0": it was given, not estimated.

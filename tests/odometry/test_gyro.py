@@ -7,10 +7,10 @@ import pytest
 from helpers import planted
 
 from uwblite import se2
-from uwblite.gyro import LEFT_OF_BIAS, heading_from_gyro, settings
 from uwblite.io.carmen import read_log, write_log
 from uwblite.mapping import build_map
-from uwblite.mapping_config import MappingConfig
+from uwblite.odometry.gyro import LEFT_OF_BIAS, heading_from_gyro, settings
+from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.sensor_log import Gyro, Odometry, SensorLog
 
 ANCHORS = np.array([[-6.0, -5.0], [6.0, -5.5], [6.5, 5.0], [-5.5, 6.0]])

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from . import se2
-from .arrays import Bools, Floats
-from .graph.calibration import CalibrationConfig
-from .sensor_log import Gyro, Odometry, Remark, SensorLog
+from .. import se2
+from ..arrays import Bools, Floats
+from ..graph.calibration import CalibrationConfig
+from ..sensor_log import Gyro, Odometry, Remark, SensorLog
 from .wheels import OdometryNoiseConfig
 
 GAP = 0.25

@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import se2
-from .arrays import Floats
-from .config import setting
-from .graph.calibration import odometry_indices
-from .graph.graph import Calibration, Graph
-from .graph.pose_edges import OdometryEdges, RelativePoseEdges
-from .graph.robust import Kernel, spread
+from .. import se2
+from ..arrays import Floats, spread
+from ..config import setting
+from ..graph.calibration import odometry_indices
+from ..graph.graph import Calibration, Graph
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
+from ..graph.robust import Kernel
 from .keyframes import Keyframes
 
 _STEPS = Kernel("cauchy", 5.0)

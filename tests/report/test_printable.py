@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from uwblite.printable import spread
+from uwblite.report.printable import sigma_text
 
 
 @pytest.mark.parametrize(
@@ -15,4 +15,4 @@ from uwblite.printable import spread
     ],
 )  # fmt: skip
 def test_a_sigma_shows_at_least_two_digits_of_itself(sigma, digits, text):
-    assert spread(sigma, digits) == text
+    assert sigma_text(sigma, digits) == text

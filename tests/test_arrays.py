@@ -1,0 +1,32 @@
+"""Robust spreads: laws of the median absolute deviation, and normal errors with outliers."""
+
+import numpy as np
+import pytest
+
+from uwblite.arrays import MAD_TO_SIGMA, sigma_of_median, spread, spread_about_median
+
+
+def test_the_factor_is_that_of_normal_errors():
+    # 1 / (0.75 quantile of the standard normal distribution).
+    assert pytest.approx(1.0 / 0.6744897501960817, abs=5e-5) == MAD_TO_SIGMA
+
+
+def test_spreads_by_hand():
+    assert spread(np.array([-1.0, 2.0, 4.0])) == pytest.approx(2.0 * 1.4826)
+    assert spread_about_median(np.array([9.0, 10.0, 13.0])) == pytest.approx(1.4826)
+    # sqrt(pi / 2) = 1.2533 times the standard deviation of a mean of four values.
+    assert sigma_of_median(np.array([-1.0, -1.0, 1.0, 1.0])) == pytest.approx(1.4826 * np.sqrt(np.pi / 2.0) / 2.0, rel=1e-4)
+
+
+def test_half_of_the_errors_may_be_outliers():
+    errors = np.random.default_rng(1).normal(0.0, 0.2, 20_000)
+    assert spread(errors) == pytest.approx(0.2, rel=0.03)
+    errors[:4000] = 1e6
+    # The median size is then the 0.5 / 0.8 = 0.625 quantile of the sizes, 0.887 standard deviations.
+    assert spread(errors) == pytest.approx(0.2 * 0.887 * 1.4826, rel=0.03)
+
+
+def test_the_median_of_many_samples_scatters_as_stated():
+    samples = np.random.default_rng(2).normal(3.0, 0.5, (2000, 101))
+    medians = np.median(samples, axis=1)
+    assert np.mean([sigma_of_median(row) for row in samples]) == pytest.approx(medians.std(), rel=0.06)
