@@ -71,15 +71,16 @@ def build_map(
         task = replace(task, recordings=gather(logs, config.keyframes))
         estimate = radio_stages.first_optimisation(task)
     said = stages.mark()
+    renamed = anchor_moves.first_with_moves_apart(estimate, task, logs)
     for _ in range(_MOST_MOVES):
-        stages.back_to(said)
-        if (renamed := anchor_moves.with_moves_apart(estimate, task)) is not None:
+        if renamed is not None:
+            stages.back_to(said)
             task = replace(task, recordings=gather(renamed, config.keyframes))
             estimate = radio_stages.first_optimisation(task)
         for stage in _stages(task):
             estimate = stage(estimate, task)
             task = task.following(estimate)
-        if not task.recordings.have_scans or anchor_moves.with_moves_apart(estimate, task) is None:
+        if (renamed := anchor_moves.with_moves_apart(estimate, task, logs)) is None:
             break
     stages.note([recording.log for recording in task.recordings.each])
     grid = final_stages.occupancy_grid(estimate, task)

@@ -36,3 +36,17 @@ def test_a_moved_anchor_has_a_row_for_each_place(lidar):
     assert by_id["B2"].since < 101.0
     assert abs(by_id["B2@2"].since - 180.0) < 5.0
     assert np.isnan(by_id["A1"].since)
+
+
+@pytest.mark.slow
+def test_anchors_that_change_names_at_once_are_told_apart():
+    log = recording(two_rounds())
+    ranges, following = log.ranges, np.array([1, 2, 0])
+    renamed = np.where(ranges.stamps > 180.0, following[ranges.anchor], ranges.anchor)
+    result = build_map(replace(log, ranges=replace(ranges, anchor=renamed)))
+    by_id = {a.id: a for a in result.anchors}
+    names = ranges.anchor_ids
+    assert set(by_id) == {*names, *(f"{name}@2" for name in names)}
+    for k, name in enumerate(names):
+        assert np.hypot(*(by_id[name].position - ANCHORS[name])) < 0.3
+        assert np.hypot(*(by_id[f"{names[following[k]]}@2"].position - ANCHORS[name])) < 0.3

@@ -1,9 +1,11 @@
 """An anchor that is moved while it is heard is told from one that is not, and the moment is found."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from uwblite.radio.change_points import find_move
+from uwblite.radio.change_points import find_move, find_moves
 from uwblite.radio.trilateration import TrilaterationConfig
 
 STAMPS = np.arange(0.0, 200.0, 1.0)
@@ -40,3 +42,21 @@ def test_a_few_ranges_show_no_move():
     few = slice(0, 30)
     ranges = heard(1, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), moment=15)[few]
     assert find_move(PATH[few], ranges, STAMPS[few], SIGMA, TrilaterationConfig()) is None
+
+
+@pytest.mark.parametrize("moment", [21, 179])
+def test_a_move_near_an_end_is_found_from_any_first_moment(moment):
+    before, after = np.array([-2.0, 1.0]), np.array([11.0, 6.0])
+    move = find_move(PATH, heard(3, before, after, moment, share=0.0), STAMPS, SIGMA, TrilaterationConfig())
+    # Fewer unexplained ranges than the least share show no move; where one is found, its moment is right.
+    assert move is None or abs(move.stamp - moment) <= 2.0
+
+
+def test_two_moves_are_found_in_the_order_of_time():
+    places = [np.array([-2.0, 1.0]), np.array([11.0, 6.0]), np.array([4.0, -5.0])]
+    ranges = heard(5, places[0], places[1], 60)
+    ranges[110:] = heard(5, places[2])[110:]
+    moves = find_moves(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig())
+    np.testing.assert_allclose([m.stamp for m in moves], [60.0, 110.0], atol=4.0)
+    for move, (before, after) in zip(moves, pairwise(places), strict=True):
+        np.testing.assert_allclose([move.before, move.after], [before, after], atol=0.5)

@@ -1,58 +1,130 @@
 """Anchors that were moved while they were heard: from that moment on they have a second name.
 
 The detection needs a trajectory, not a map: it is made once odometry and ranges are optimised, and where the lidar has
-straightened the trajectory once more. The recording's ranges are then renamed, and its map begins again.
+straightened the trajectory once more, always from the names as recorded. Ranges to places that are wrong bend a trajectory
+that odometry alone holds, and the bent one hides moves. So where one anchor was moved, the trajectory is estimated anew with
+all anchors apart before and after, which presumes nothing of any, and the moves are found on that one.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ..radio.change_points import Move, find_move
+from ..radio.change_points import Move, find_moves
 from ..radio.range_noise import short_term_sigma
 from ..sensor_log import OdometryBreaks, Remark, Screening, SensorLog, UwbRanges
 from .estimate import Estimate, Task
-from .recordings import Recording
+from .radio_stages import first_optimisation
+from .recordings import Recording, gather
+
+Moves = dict[str, list[Move]]
+"""By the anchor's name as recorded."""
 
 
-def with_moves_apart(estimate: Estimate, task: Task) -> list[SensorLog] | None:
-    """Return the recordings with anchors that were moved under a second name from then on; None where none was moved."""
-    logs = [_renamed_log(recording, estimate, task) for recording in task.recordings.each]
-    same = all(log is recording.log for log, recording in zip(logs, task.recordings.each, strict=True))
-    return None if same else logs
+def with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) -> list[SensorLog] | None:
+    """Return the recordings with anchors that were moved under another name from then on; None where the names stay.
+
+    Parameters
+    ----------
+    logs : the recordings with the names as they were recorded.
+    """
+    moves = _moves_of_all(estimate, task, logs)
+    renamed = [_renamed(log, found) for log, found in zip(logs, moves, strict=True)]
+    now = [recording.log.ranges for recording in task.recordings.each]
+    same = all(_alike(log.ranges, ranges, found) for log, ranges, found in zip(renamed, now, moves, strict=True))
+    return None if same else renamed
 
 
-def _renamed_log(recording: Recording, estimate: Estimate, task: Task) -> SensorLog:
-    log, edges = recording.log, estimate.ranges
-    ranges = heard_by = log.ranges
-    if ranges is None or heard_by is None or edges is None or estimate.bootstrap is None:
-        return log
+def first_with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) -> list[SensorLog] | None:
+    """Return the same after a first optimisation, whose trajectory is bent where anchors were moved."""
+    moves = _moves_of_all(estimate, task, logs)
+    if not any(moves):
+        return None
+    apart = [_renamed(log, _of_all(log, found)) for log, found in zip(logs, moves, strict=True)]
+    said = task.stages.mark()
+    task = replace(task, recordings=gather(apart, task.config.keyframes))
+    estimate = first_optimisation(task)
+    task.stages.back_to(said)
+    moves = _moves_of_all(estimate, task, logs)
+    return [_renamed(log, found) for log, found in zip(logs, moves, strict=True)] if any(moves) else None
+
+
+def _of_all(log: SensorLog, moves: Moves) -> Moves:
+    """Return all moves as moves of all anchors; one of several at about the same time stands for them."""
+    every = sorted((move for found in moves.values() for move in found), key=lambda move: move.stamp)
+    apart = [m for k, m in enumerate(every) if k == 0 or m.stamp - every[k - 1].stamp > _TOGETHER]
+    return {} if log.ranges is None else dict.fromkeys(log.ranges.anchor_ids, apart)
+
+
+_TOGETHER = 30.0
+"""Moves within so much of each other are taken for one, s."""
+
+
+def _alike(a: UwbRanges | None, b: UwbRanges | None, moves: Moves) -> bool:
+    """Tell whether ranges are called the same, but for a few at each move."""
+    if a is None or b is None:
+        return True
+    differ = np.asarray(a.anchor_ids)[a.anchor] != np.asarray(b.anchor_ids)[b.anchor]
+    return int(differ.sum()) <= _FEW * sum(map(len, moves.values()))
+
+
+_FEW = 2
+"""Ranges by which a moment may be off."""
+
+
+def _moves_of_all(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) -> list[Moves]:
+    return [_moves(recording, log, estimate, task) for recording, log in zip(task.recordings.each, logs, strict=True)]
+
+
+def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task) -> Moves:
+    """Return the moves of the anchors of a recording, by their names as recorded (log)."""
+    edges, ranges = estimate.ranges, log.ranges
+    if ranges is None or edges is None or estimate.bootstrap is None:
+        return {}
     # The recording's ranges stand in the edges in their own order.
     heard = np.flatnonzero((edges.pose >= recording.rows.start) & (edges.pose < recording.rows.stop))
     positions = edges.tag_positions(estimate.graph.poses)
     usable = np.isfinite(edges.ranges) & (edges.ranges > _SHORTEST) & (edges.ranges < task.config.trilateration.max_range)
     sigma = short_term_sigma(edges.stamps[usable], edges.anchor[usable], edges.ranges[usable], task.config.ranges)
-    remarks: list[Remark] = []
-    start = float(log.odometry.stamps[0])
-    for k, name in enumerate(recording.anchor_ids):
-        own = heard[(heard_by.anchor == k) & usable[heard]]
+    moves = {}
+    for k, name in enumerate(ranges.anchor_ids):
+        own = heard[(ranges.anchor == k) & usable[heard]]
         level = np.sqrt(np.maximum(edges.ranges[own] ** 2 - edges.height[own] ** 2, 1e-4))
-        move = find_move(positions[own], level, edges.stamps[own], sigma, task.config.trilateration)
-        if move is not None:
-            ranges, other = _renamed(ranges, name, move)
-            text = (
-                f"anchor {name} was moved by {move.distance:.1f} m at about t = {move.stamp - start:.0f} s; from then on it is "
-                f"called {other}"
-            )
-            remarks.append(Remark("moved-anchor", text))
-    if not remarks:
+        found = find_moves(positions[own], level, edges.stamps[own], sigma, task.config.trilateration)
+        if found:
+            moves[name] = found
+    return moves
+
+
+def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
+    """Return a recording with the ranges of moved anchors under another name from each move on, and remarks that say so."""
+    ranges = log.ranges
+    if ranges is None or not moves:
         return log
-    told_heights = log.mounting.anchor_heights
-    known = {name: name_and_number(name)[0] for name in ranges.anchor_ids if name_and_number(name)[0] in told_heights}
-    heights = {**{name: told_heights[base] for name, base in known.items()}, **told_heights}
+    names = np.asarray(ranges.anchor_ids)[ranges.anchor].astype(object)
+    heights = dict(log.mounting.anchor_heights)
+    remarks: list[Remark] = []
+    for name, found in moves.items():
+        base, number = name_and_number(name)
+        own = names == name
+        for move in found:
+            number += 1
+            other = f"{base}@{number}"
+            names[own & (ranges.stamps >= move.stamp)] = other
+            if name in heights:
+                heights[other] = heights[name]
+            when = f"t = {move.stamp - log.odometry.stamps[0]:.0f} s"
+            text = f"anchor {name} was moved by {move.distance:.1f} m at about {when}; from then on it is called {other}"
+            remarks.append(Remark("moved-anchor", text))
+    ids, anchor = np.unique(names.astype(str), return_inverse=True)
     before = log.screening or Screening((), OdometryBreaks.none())
-    screening = replace(before, remarks=(*before.remarks, *remarks))
-    return replace(log, ranges=ranges, mounting=replace(log.mounting, anchor_heights=heights), screening=screening)
+    return replace(
+        log,
+        ranges=replace(ranges, anchor=anchor.astype(np.int64), anchor_ids=tuple(ids.tolist())),
+        mounting=replace(log.mounting, anchor_heights=heights),
+        screening=replace(before, remarks=(*before.remarks, *remarks)),
+    )
 
 
 _SHORTEST = 0.02
@@ -63,14 +135,3 @@ def name_and_number(name: str) -> tuple[str, int]:
     """Return the radio's name of an anchor and which of its places is meant: ``ID`` is the first, ``ID@2`` the second ..."""
     base, mark, number = name.rpartition("@")
     return (base, int(number)) if mark and number.isdigit() else (name, 1)
-
-
-def _renamed(ranges: UwbRanges, name: str, move: Move) -> tuple[UwbRanges, str]:
-    """Return the ranges with those of an anchor from a moment on under a new name, and that name."""
-    base = name_and_number(name)[0]
-    number = 1 + max(n for b, n in map(name_and_number, ranges.anchor_ids) if b == base)
-    other = f"{base}@{number}"
-    names = np.array([*ranges.anchor_ids, other])[ranges.anchor].astype(object)
-    names[(names == name) & (ranges.stamps >= move.stamp)] = other
-    ids, anchor = np.unique(names.astype(str), return_inverse=True)
-    return replace(ranges, anchor=anchor.astype(np.int64), anchor_ids=tuple(ids.tolist())), other

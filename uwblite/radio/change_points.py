@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats
-from .trilateration import TrilaterationConfig, trilaterate
+from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate
 
 _SPLITS = 7
 """Moments tried first, evenly spread over the ranges."""
-_FINER = 3
-"""Times the neighbourhood of the best moment is looked at more closely."""
+_ROUNDS = 6
+"""Times, at most, that places and moment are found in turn; two or three are usual."""
 _LEAST_RANGES = 20
 """Ranges on either side of a moment."""
 _LEAST_MOVE = 0.8
@@ -47,6 +47,30 @@ class Move:
         return float(np.hypot(*(self.after - self.before)))
 
 
+def find_moves(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig) -> list[Move]:
+    """Find all moves of an anchor, in the order of time; parameters as for find_move.
+
+    Binary segmentation; of three places, the first split may fall into the second one's time, so every moment is found
+    again between its neighbours.
+    """
+    moves = _parted(path, ranges, stamps, sigma, config)
+    for k in range(len(moves)) if len(moves) > 1 else ():
+        since = moves[k - 1].stamp if k else -np.inf
+        until = moves[k + 1].stamp if k + 1 < len(moves) else np.inf
+        own = (stamps >= since) & (stamps < until)
+        moves[k] = find_move(path[own], ranges[own], stamps[own], sigma, config) or moves[k]
+    return moves
+
+
+def _parted(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig) -> list[Move]:
+    move = find_move(path, ranges, stamps, sigma, config)
+    if move is None:
+        return []
+    parts = (stamps < move.stamp, stamps >= move.stamp)
+    before, after = (_parted(path[own], ranges[own], stamps[own], sigma, config) for own in parts)
+    return [*before, move, *after]
+
+
 def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig) -> Move | None:
     """Find whether and when an anchor was moved; None where one place explains its ranges, or two do not explain more.
 
@@ -58,38 +82,44 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     if len(ranges) < 2 * _LEAST_RANGES:
         return None
     width = _WIDTH * max(sigma, 0.05)
-    alone = _unexplained(path, ranges, width, config)[0]
+    alone = float(_misfit(path, ranges, _fitted(path, ranges, width, config), width).sum())
     if alone < _WORSE * len(ranges):
         return None
-    best, split = np.inf, 0
-    low, high = _LEAST_RANGES, len(ranges) - _LEAST_RANGES
-    for _ in range(1 + _FINER):
-        tried = np.unique(np.linspace(low, high, _SPLITS).astype(np.int64))
-        costs = [
-            _unexplained(path[:k], ranges[:k], width, config)[0] + _unexplained(path[k:], ranges[k:], width, config)[0]
-            for k in tried.tolist()
-        ]
-        if min(costs) < best:
-            best, split = min(costs), int(tried[int(np.argmin(costs))])
-        step = max(int((high - low) / (_SPLITS - 1)), 1)
-        low, high = max(split - step, _LEAST_RANGES), min(split + step, len(ranges) - _LEAST_RANGES)
+    starts = np.unique(np.linspace(_LEAST_RANGES, len(ranges) - _LEAST_RANGES, _SPLITS).astype(np.int64)).tolist()
+    best, split, before, after = min((_settled(path, ranges, k, width, config) for k in starts), key=lambda found: found[0])
     if best > (1.0 - _EXPLAINED) * alone:
         return None
-    (_, before, own), (_, after, other) = (
-        _unexplained(path[part], ranges[part], width, config) for part in (slice(0, split), slice(split, None))
-    )
-    move = Move(float(stamps[split]), before, after)
-    return move if move.distance > max(_LEAST_MOVE, _SIGMAS * np.hypot(own, other)) else None
+    move = Move(float(stamps[split]), before.position, after.position)
+    return move if move.distance > max(_LEAST_MOVE, _SIGMAS * np.hypot(before.position_sigma, after.position_sigma)) else None
 
 
-def _unexplained(path: Floats, ranges: Floats, width: float, config: TrilaterationConfig) -> tuple[float, Floats, float]:
-    """Return how many ranges the best place leaves unexplained, that place (2,), and its standard deviation, m."""
-    found = trilaterate(path, ranges, config)
-    if not found:
-        return float(len(ranges)), np.full(2, np.nan), np.inf
-    left = [
-        float(np.sum(np.minimum(np.abs(ranges - np.hypot(*(h.position - path).T) - h.bias) / width, 1.0) ** 2))
-        for h in found[:3]
-    ]
-    best = int(np.argmin(left))
-    return left[best], found[best].position, found[best].position_sigma
+def _settled(
+    path: Floats, ranges: Floats, split: int, width: float, config: TrilaterationConfig
+) -> tuple[float, int, AnchorHypothesis, AnchorHypothesis]:
+    """Return how many ranges two places leave unexplained, the first range of the second one, and both places.
+
+    From a first moment on, the places that suit the ranges before and after it and the moment that suits the two places
+    are found in turn: the cost of every moment follows from running sums (k-means with two clusters in a row).
+    """
+    low, high = _LEAST_RANGES, len(ranges) - _LEAST_RANGES
+    for _ in range(_ROUNDS):
+        before, after = (_fitted(path[part], ranges[part], width, config) for part in (slice(0, split), slice(split, None)))
+        by_one, by_other = (_misfit(path, ranges, place, width) for place in (before, after))
+        cost = np.concatenate([[0.0], np.cumsum(by_one - by_other)])[low : high + 1] + by_other.sum()
+        best = low + int(np.argmin(cost))
+        if best == split:
+            break
+        split = best
+    return float(cost[best - low]), best, before, after
+
+
+def _fitted(path: Floats, ranges: Floats, width: float, config: TrilaterationConfig) -> AnchorHypothesis:
+    """Return the place that leaves the fewest ranges unexplained."""
+    found = trilaterate(path, ranges, config)[:3]
+    return min(found, key=lambda place: float(_misfit(path, ranges, place, width).sum()))
+
+
+def _misfit(path: Floats, ranges: Floats, place: AnchorHypothesis, width: float) -> Floats:
+    """Return how far each range (m,) is from being explained by a place: 0 wholly, 1 not at all."""
+    off = np.abs(ranges - np.hypot(*(place.position - path).T) - place.bias) / width
+    return np.minimum(off, 1.0) ** 2
