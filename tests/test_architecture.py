@@ -19,7 +19,7 @@ FLOORS = (
     ("se2", "config"),
     ("sensor_log", "graph", "drivers"),
     ("constraints", "odometry", "grid"),
-    ("map_result", "radio"),
+    ("map_result", "radio", "navigation"),
     ("lidar", "report"),
     ("screening",),
     ("loop_closure", "checks", "evaluation", "io"),

@@ -21,7 +21,10 @@ from .. import __version__
 from ..errors import UsageError, UwbliteError
 from ..report.printable import printable
 
-VERBS = ("map", "view", "localize", "check", "record", "devices", "plan-anchors", "convert", "evaluate", "optimize", "config")
+VERBS = (
+    "map", "view", "localize", "plan", "check", "record", "devices", "plan-anchors", "convert", "evaluate", "optimize",
+    "config",
+)  # fmt: skip
 """In the order in which a user meets them; `uwblite VERB` is the module of the same name, with _ for -."""
 
 _DESCRIPTION = """\

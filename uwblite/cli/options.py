@@ -115,16 +115,17 @@ def place(text: str) -> str:
     return text
 
 
-def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
-    """Return a reader of so many numbers separated by commas."""
+def numbers(count: int, most: int = 0) -> Callable[[str], tuple[float, ...]]:
+    """Return a reader of so many numbers, or up to `most`, separated by commas."""
+    wanted = f"{count} or {most}" if most else f"{count}"
 
     def parse(text: str) -> tuple[float, ...]:
         try:
             values = tuple(float(part) for part in text.split(","))
         except ValueError:
             values = ()
-        if len(values) != count or not all(map(math.isfinite, values)):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {count} numbers separated by commas")
+        if not count <= len(values) <= max(most, count) or not all(map(math.isfinite, values)):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted} numbers separated by commas")
         return values
 
     return parse

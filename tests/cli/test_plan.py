@@ -1,0 +1,74 @@
+"""`uwblite plan` as a user calls it."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from helpers.planning_worlds import grid_of
+from helpers.results import small_log, small_result
+
+from uwblite.cli import main
+from uwblite.io.map_server import write_map
+from uwblite.io.png import decode_png
+from uwblite.io.result_text import RunRecord
+from uwblite.io.results import write_result
+
+
+@pytest.fixture
+def rooms(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    wall = "#" * 8 + "." * 6 + "#" * 26
+    write_map(tmp_path, grid_of("\n".join(["." * 40] * 20 + [wall] + ["." * 40] * 20)), name="rooms")
+    return ["plan", "--map", "rooms.yaml", "--radius", "0.2"]
+
+
+def test_a_path_goes_to_a_table_and_a_picture(rooms, tmp_path, capsys):
+    words = [*rooms, "--from", "3,1,1.5", "--to", "3,3", "--via", "2,1", "--step", "0.2"]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert said.splitlines()[-1] == "files: plan.csv plan.png"
+    rows = list(csv.DictReader((tmp_path / "plan.csv").read_text().splitlines()))
+    assert list(rows[0]) == ["x", "y", "theta", "distance", "clearance"]
+    table = np.array([[float(v) for v in row.values()] for row in rows])
+    assert table[0, :3] == pytest.approx([3.0, 1.0, 1.5])
+    assert table[-1, :2] == pytest.approx([3.0, 3.0])
+    assert table[:, 4].min() >= 0.2
+    assert 2.0 in table[:, 0]
+    assert len(np.unique(decode_png((tmp_path / "plan.png").read_bytes()).reshape(-1, 3), axis=0)) > 10
+    assert main(words) == 1
+    assert "exists" in capsys.readouterr().err
+    assert main([*words, "--force", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert np.array(told["poses"]) == pytest.approx(table[:, :3], abs=1e-4)
+    assert told["length"] == pytest.approx(table[-1, 3], abs=1e-4)
+
+
+def test_no_way_names_the_nearest_reachable_point_and_writes_nothing(rooms, tmp_path, capsys):
+    words = [*rooms[:-1], "0.35", "--from", "3,1", "--to", "3,3", "--json"]
+    assert main(words) == 1
+    said = capsys.readouterr()
+    assert "no way to (3.00, 3.00); the nearest reachable point is (" in said.err
+    told = json.loads(said.out)
+    assert told["exit_code"] == 1
+    assert told["nearest"][1] < 2.0
+    assert not (tmp_path / "plan.csv").exists()
+    assert main([*rooms, "--from", "3,2.05", "--to", "3,3"]) == 1
+    assert "cannot stand at the start (3.00, 2.05)" in capsys.readouterr().err
+
+
+def test_a_result_of_map_is_planned_in_with_its_anchors(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    words = ["plan", "--map", "map", "--radius", "0", "--from", "0,0", "--to", "1,-3.2", "--unknown", "price"]
+    assert main(words) in (0, 1)
+    assert "internal" not in capsys.readouterr().err
+    (tmp_path / "map" / "map.yaml").unlink()
+    assert main(words) == 1
+    assert "no map.yaml" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("bad", ["--from 1", "--from 1,2,3,4", "--to nan,1", "--radius -1", "--step 0"])
+def test_wrong_words_are_usage_errors(rooms, capsys, bad):
+    assert main([*rooms, "--from", "3,1", "--to", "3,3", *bad.split()]) == 2
+    assert "error" in capsys.readouterr().err

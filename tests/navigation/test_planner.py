@@ -1,0 +1,157 @@
+"""Paths against a plain Dijkstra of the test's own, and the laws that hold for every path."""
+
+import heapq
+
+import numpy as np
+import pytest
+from helpers.planning_worlds import distance_to_squares, grid_of, random_grid
+from scipy.sparse.csgraph import dijkstra
+
+from uwblite.grid.occupancy_grid import OCCUPIED
+from uwblite.navigation.planner import STEPS, NoPathError, make_planner
+
+RADIUS = 0.15
+
+
+def reference_costs(planner, first):
+    """Return the cost from one cell to every other (rows, cols) by a heap and loops."""
+    passable, cost = planner.clearance.passable(), planner.clearance.cell_cost().astype(np.float64)
+    found = np.full(passable.shape, np.inf)
+    queue = [(0.0, first)]
+    while queue:
+        here, (row, col) = heapq.heappop(queue)
+        if here >= found[row, col]:
+            continue
+        found[row, col] = here
+        for dr, dc in STEPS:
+            r, c = row + dr, col + dc
+            if 0 <= r < passable.shape[0] and 0 <= c < passable.shape[1] and passable[r, c]:
+                step = planner.clearance.geometry.resolution * np.hypot(dr, dc) * 0.5 * (cost[row, col] + cost[r, c])
+                heapq.heappush(queue, (here + step, (r, c)))
+    return found
+
+
+def free_places(planner, count, seed):
+    """Return places (count, 2) where the robot may stand."""
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(planner.nodes), count)
+    return planner.clearance.geometry.centre_of(*np.divmod(planner.nodes[chosen], planner.clearance.geometry.cols))
+
+
+@pytest.mark.parametrize("unknown", ["refuse", "price"])
+@pytest.mark.parametrize("seed", range(3))
+def test_costs_of_the_steps_are_those_of_a_plain_dijkstra(seed, unknown):
+    grid = random_grid(seed)
+    grid.log_odds[20:30, 20:26] = 0.0
+    planner = make_planner(grid, RADIUS, unknown=unknown)
+    costs = dijkstra(planner.graph, indices=0)
+    first = np.divmod(int(planner.nodes[0]), grid.geometry.cols)
+    reference = reference_costs(planner, first).ravel()
+    assert costs == pytest.approx(reference[planner.nodes], rel=1e-6)
+    assert abs(planner.graph - planner.graph.T).max() < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_laws_of_a_path(seed):
+    grid = random_grid(seed)
+    planner = make_planner(grid, RADIUS)
+    places = free_places(planner, 8, seed).reshape(-1, 2, 2)
+    for start, goal in places:
+        try:
+            path = planner.plan(start, [goal], step=0.07)
+        except NoPathError:
+            node = planner._beside(start)
+            assert not np.isfinite(dijkstra(planner.graph, indices=node)[planner._beside(goal)])
+            continue
+        straight = np.hypot(*(goal - start))
+        assert np.array_equal(path.poses[[0, -1], :2], [start, goal])
+        assert path.length >= straight - 1e-9
+        assert path.cost >= path.length - 1e-9
+        gaps = np.hypot(*np.diff(path.poses[:, :2], axis=0).T)
+        assert gaps.max(initial=0.0) <= 0.07 + 1e-9
+        assert path.distances == pytest.approx(np.concatenate([[0.0], np.cumsum(gaps)]))
+        share = np.linspace(0.0, 1.0, 20)[:, None, None]
+        dense = (path.poses[:-1, :2] + share * np.diff(path.poses[:, :2], axis=0)).reshape(-1, 2)
+        obstacles = grid.states() == OCCUPIED
+        assert distance_to_squares(grid, obstacles, np.concatenate([dense, start[None]])).min() >= RADIUS - 1e-6
+        assert np.all(path.clearances <= distance_to_squares(grid, obstacles, path.poses[:, :2]) + 1e-6)
+        # Smoothing gains; the bounds between the cells, and a corner's worth, make a straight way of steps a little dearer.
+        steps = dijkstra(planner.graph, indices=planner._beside(start))[planner._beside(goal)]
+        assert path.cost <= steps * 1.005 + 1e-3
+        assert planner.plan(goal, [start]).cost == pytest.approx(path.cost, rel=0.02, abs=1e-3)
+
+
+def test_open_space_is_crossed_in_a_straight_line():
+    planner = make_planner(grid_of("\n".join(["." * 60] * 60), resolution=0.05), 0.1)
+    start, goal = np.array([0.91, 0.93]), np.array([2.02, 1.37])
+    path = planner.plan(np.array([*start, 2.0]), [goal], step=0.1)
+    assert path.length == pytest.approx(np.hypot(*(goal - start)), rel=1e-9)
+    assert path.poses[0, 2] == pytest.approx(2.0)
+    assert path.poses[1:, 2] == pytest.approx(np.arctan2(*(goal - start)[::-1]))
+
+
+def test_around_the_end_of_a_wall_the_path_is_the_shortest_there_is(monkeypatch):
+    # Where nearness costs nothing: two tangents, two arcs around the corners of the wall's end, and its width between them.
+    monkeypatch.setattr("uwblite.navigation.clearance.NEAR_COST", 0.0)
+    wide = "\n".join(["." * 81] * 60 + ["." * 40 + "#" + "." * 40] * 40)
+    planner = make_planner(grid_of(wide, resolution=0.05), 0.2)
+    path = planner.plan(np.array([0.8, 1.0]), [np.array([3.25, 1.0])])
+    far = np.hypot(2.0 - 0.8, 2.0 - 1.0)
+    arc = np.arctan2(1.0, 1.2) + np.arcsin(0.2 / far)
+    shortest = 2 * (np.sqrt(far**2 - 0.2**2) + 0.2 * arc) + 0.05
+    assert shortest < path.length < 1.015 * shortest
+    assert path.cost == pytest.approx(path.length)
+
+
+def test_a_narrow_door_is_passed_in_the_middle_and_too_narrow_a_one_not():
+    text = "\n".join(["." * 40] * 20 + ["#" * 18 + "." * 5 + "#" * 17] + ["." * 40] * 20)
+    grid = grid_of(text)
+    start, goal = np.array([2.05, 0.8]), np.array([2.05, 3.4])
+    path = make_planner(grid, 0.15).plan(start, [goal])
+    assert np.abs(path.poses[:, 0] - 2.05).max() < 0.06
+    with pytest.raises(NoPathError, match=r"no way to .* nearest reachable point") as caught:
+        make_planner(grid, 0.25).plan(start, [goal])
+    assert caught.value.nearest[1] < 2.0
+    assert np.hypot(*(caught.value.nearest - goal)) < 1.8
+
+
+def test_unknown_space_is_crossed_only_where_the_way_around_is_dearer():
+    text = "\n".join(["." * 40] * 4 + ["." * 15 + "?" * 10 + "." * 15] * 30 + ["#" * 40])
+    start, goal = np.array([1.0, 0.6]), np.array([3.0, 0.6])
+    around = make_planner(grid_of(text), 0.1).plan(start, [goal])
+    assert around.poses[:, 1].max() > 3.0
+    through = make_planner(grid_of(text), 0.1, unknown="price").plan(start, [goal])
+    assert through.poses[:, 1].max() < 1.0
+    assert 1.0 + 4.0 + 1.0 - 0.4 < through.cost < 1.0 + 5.0 + 1.0 + 0.4
+
+
+def test_places_on_the_way_are_passed_in_order():
+    planner = make_planner(grid_of("\n".join(["." * 40] * 40)), 0.1)
+    via = [np.array([3.0, 1.0]), np.array([3.0, 3.0])]
+    path = planner.plan(np.array([1.0, 1.0]), [*via, np.array([1.0, 3.0])])
+    where = [int(np.argmin(np.hypot(*(path.poses[:, :2] - v).T))) for v in via]
+    assert np.hypot(*(path.poses[where, :2] - via).T).max() < 1e-9
+    assert where == sorted(where)
+    assert path.length == pytest.approx(6.0, rel=1e-6)
+
+
+def test_a_robot_too_near_to_a_wall_may_leave_and_one_inside_of_it_not():
+    planner = make_planner(grid_of("#" * 20 + "\n" + "\n".join(["." * 20] * 19)), 0.3)
+    path = planner.plan(np.array([1.0, 1.75]), [np.array([1.0, 0.7])])
+    assert path.clearances[0] < 0.3
+    assert np.all(np.diff(path.clearances[:3]) > 0.0)
+    with pytest.raises(NoPathError, match="cannot stand at the start"):
+        planner.plan(np.array([1.0, 1.95]), [np.array([1.0, 0.7])])
+    with pytest.raises(NoPathError, match="cannot stand at the start"):
+        planner.plan(np.array([50.0, 1.0]), [np.array([1.0, 0.7])])
+
+
+def test_standing_still_is_a_path():
+    path = make_planner(grid_of("\n".join(["." * 20] * 20)), 0.1).plan(np.array([1.0, 1.0, 0.5]), [np.array([1.0, 1.0])])
+    assert path.length == path.cost == 0.0
+    assert path.poses == pytest.approx(np.array([[1.0, 1.0, 0.5]]))
+
+
+def test_a_robot_larger_than_the_map_stands_nowhere():
+    with pytest.raises(NoPathError, match="nowhere"):
+        make_planner(grid_of("....\n....\n....\n...."), 1.0)

@@ -1,0 +1,1 @@
+"""Planning on a map: clearance from obstacles, the cheapest path over the grid, and its smoothing."""

@@ -1,0 +1,154 @@
+"""Straight pieces instead of the staircase that a search over cells leaves, and poses along them.
+
+Candidates of shortcuts join corners that are 1, 2, 4, 8 ... apart; those that keep the clearance are steps of a graph
+whose cheapest path is the new line. It is cut into short pieces and shortened again until that gains nothing. A shortcut is
+weighed by its cost and not by its length, so that the line stays as far from obstacles as the search wanted.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from .clearance import ClearanceMap
+
+_SAMPLES_PER_CELL = 2
+"""Where clearance and cost of a line are looked up."""
+_SAMPLES_AT_A_TIME = 200_000
+_STARTS_PER_SHORTCUT = 4
+"""Shortcuts of the same reach that overlap."""
+_CORNER_COST = 1e-3
+"""m; a corner is worth as much, so that of equal lines the one with the fewest pieces is taken."""
+_GAIN = 1e-3
+"""Relative; a round that gains less is the last."""
+_MOST_ROUNDS = 6
+
+
+class Lines(NamedTuple):
+    """What was found along straight lines."""
+
+    costs: Floats
+    """(n,) in metres of open space."""
+    clear: Bools
+    """(n,) whether every point of the line keeps the robot's radius from all obstacles."""
+    crossing: Bools
+    """(n,) whether the line leads through an obstacle's cell."""
+
+
+def along_lines(clearance: ClearanceMap, begin: Floats, end: Floats) -> Lines:
+    """Look up clearance and cost along straight lines.
+
+    Parameters
+    ----------
+    clearance : the map.
+    begin, end : (n, 2) m, map frame.
+    """
+    lengths = np.hypot(*(end - begin).T)
+    pieces = np.ceil(lengths * (_SAMPLES_PER_CELL / clearance.geometry.resolution)).astype(np.int64) + 1
+    ends = np.flatnonzero(np.diff(np.cumsum(pieces + 1) // _SAMPLES_AT_A_TIME)) + 1
+    found = [
+        _along(clearance, b, e, length, count)
+        for b, e, length, count in zip(*(np.split(a, ends) for a in (begin, end, lengths, pieces)), strict=True)
+    ]
+    return Lines(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _along(clearance: ClearanceMap, begin: Floats, end: Floats, lengths: Floats, pieces: Ints) -> Lines:
+    """Look up lines (n,) at the ends of so many equal pieces (n,) of each."""
+    first = np.cumsum(pieces + 1) - (pieces + 1)
+    owner = np.repeat(np.arange(len(pieces)), pieces + 1)
+    share = (np.arange(len(owner)) - first[owner]) / pieces[owner]
+    squared, cost = clearance.at(begin[owner] + share[:, None] * (end - begin)[owner])
+    step = lengths / pieces
+    clear = np.minimum.reduceat(squared, first) - 0.25 * step**2 >= clearance.radius**2
+    last = first + pieces
+    costs = step * (np.add.reduceat(cost, first) - 0.5 * (cost[first] + cost[last]))
+    return Lines(costs, clear, np.minimum.reduceat(squared, first) <= 0.0)
+
+
+def smoothed(clearance: ClearanceMap, line: Floats) -> Floats:
+    """Return the corners (k, 2) of a cheaper line with the same ends, m.
+
+    Parameters
+    ----------
+    clearance : the map.
+    line : (n, 2) corners, m, map frame; its pieces are clear.
+    """
+    cost = np.inf
+    for _ in range(_MOST_ROUNDS):
+        line, now = _shortened(clearance, _divided(line, clearance.geometry.resolution))
+        if not now < cost * (1.0 - _GAIN):
+            break
+        cost = now
+    return line
+
+
+def _shortened(clearance: ClearanceMap, line: Floats) -> tuple[Floats, float]:
+    """Return the cheapest line (k, 2) by shortcuts between corners (n, 2), and its cost."""
+    begin, end = _shortcuts(len(line))
+    along = along_lines(clearance, line[begin], line[end])
+    kept = along.clear | (end - begin == 1)
+    costs = along.costs[kept] + _CORNER_COST
+    graph = csr_matrix((costs, (begin[kept], end[kept])), shape=(len(line), len(line)))
+    totals, before = dijkstra(graph, indices=0, return_predecessors=True)
+    return line[walk_back(before, 0, len(line) - 1)], float(totals[-1])
+
+
+def _shortcuts(corners: int) -> tuple[Ints, Ints]:
+    """Return first and last corner (m,) of every candidate."""
+    begins, ends, reach = [], [], 1
+    while reach < corners:
+        stride = max(reach // _STARTS_PER_SHORTCUT, 1)
+        begin = np.arange(0, corners - reach, stride)
+        begins.append(begin)
+        ends.append(begin + reach)
+        reach *= 2
+    # From both ends to everywhere near, and the whole in one.
+    begins.append(np.array([0]))
+    ends.append(np.array([corners - 1]))
+    pairs = np.unique(np.stack([np.concatenate(begins), np.concatenate(ends)]), axis=1)
+    return pairs[0], pairs[1]
+
+
+def walk_back(before: Ints, first: int, last: int) -> Ints:
+    """Return the nodes (k,) from the first to the last along a tree of predecessors (n,)."""
+    chain = [last]
+    while chain[-1] != first:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])
+
+
+def _divided(line: Floats, step: float) -> Floats:
+    """Return the corners (n, 2) of a line whose pieces are cut into equal ones no longer than the step, m."""
+    ways = np.diff(line, axis=0)
+    pieces = np.maximum(np.ceil(np.hypot(*ways.T) / step - 1e-9), 1).astype(np.int64)
+    owner = np.repeat(np.arange(len(ways)), pieces)
+    share = (np.arange(len(owner)) - (np.cumsum(pieces) - pieces)[owner]) / pieces[owner]
+    return np.concatenate([line[owner] + share[:, None] * ways[owner], line[-1:]])
+
+
+def sampled(line: Floats, step: float, heading: float | None = None) -> tuple[Floats, Floats]:
+    """Return poses along a line, and how far from its start they are.
+
+    Parameters
+    ----------
+    line : (n, 2) corners, m.
+    step : largest distance between poses, m; all corners are among them.
+    heading : of the first pose, rad; None = along the line.
+
+    Returns
+    -------
+    poses : (k, 3) with the heading of the piece that begins there, at the end of the one that ends; m, m, rad.
+    distances : (k,) m.
+    """
+    points = _divided(line, step)
+    ways = np.diff(points, axis=0)
+    lengths = np.hypot(*ways.T)
+    headings = np.arctan2(ways[:, 1], ways[:, 0])
+    headings = np.concatenate([headings, headings[-1:]]) if len(headings) else np.zeros(1)
+    if heading is not None:
+        headings[0] = se2.wrap_angle(heading)
+    return np.column_stack([points, headings]), np.concatenate([[0.0], np.cumsum(lengths)])
