@@ -148,3 +148,23 @@ def test_json_is_one_object(tmp_path, room_log, target, capsys):
     assert said["exit_code"] == 0
     assert said["counts"]["odometry readings"] == 401
     assert said["out"].startswith(str(tmp_path))
+
+
+def test_a_map_becomes_a_bundle_for_nav2(tmp_path, capsys):
+    from helpers.results import small_log, small_result
+
+    from uwblite.io.nav2_bundle import FILES
+    from uwblite.io.result_text import RunRecord
+    from uwblite.io.results import write_result
+
+    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("uwblite map x", ""))
+    words = ["convert", str(tmp_path / "map"), str(tmp_path / "nav2"), "--to", "nav2"]
+    assert main(words) == 0
+    assert {p.name for p in (tmp_path / "nav2").iterdir()} == set(FILES)
+    assert main(words) == 1
+    assert "exists" in capsys.readouterr().err
+    assert main([*words, "--force"]) == 0
+    assert main(["convert", str(tmp_path / "map"), str(tmp_path / "map"), "--to", "nav2", "--force"]) == 1
+    assert "is the map itself" in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "map"), str(tmp_path / "map" / "map.pgm"), "--to", "nav2", "--force"]) == 1
+    assert "is a file" in capsys.readouterr().err

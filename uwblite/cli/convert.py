@@ -1,6 +1,7 @@
 """`uwblite convert`: recordings and pose graphs between formats."""
 
 import argparse
+import os
 from typing import TYPE_CHECKING
 
 from ..errors import ConfigError
@@ -25,12 +26,13 @@ examples:
   uwblite convert graph.g2o graph.pyfg
   uwblite convert map/ map.mcap --recording run.log    a map for Foxglove and RViz: /map, tf, path, anchors, closures
   uwblite convert map/ scans.g2o --recording run.log   its pose graph with the scans (ROBOTLASER1)
+  uwblite convert map/ nav2/ --to nav2                 a bundle for nav2: map, keep-out mask, parameters, initial pose
   uwblite convert map/ path.kitti                      trajectories: .tum and .kitti, as evo reads them; run.log too
 
 bags need the package rosbags, in the environment of uwblite (without it the error gives the command)
 """
 _RECORDINGS = ("log", "csv", "mcap", "sqlite3", "tum", "kitti")
-_TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg", "tum", "kitti")
+_TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg", "tum", "kitti", "nav2")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -129,8 +131,10 @@ def _convert_map(args: argparse.Namespace, to: str) -> int:
     from .formats import read_recording, refuse_existing
     from .options import apply_mounting, bag_choices
 
-    if to not in ("mcap", "sqlite3", "g2o", "tum", "kitti"):
-        raise ConfigError(f"{args.target}: not a format for a map; use --to mcap, sqlite3, g2o, tum or kitti")
+    if to not in ("mcap", "sqlite3", "g2o", "tum", "kitti", "nav2"):
+        raise ConfigError(f"{args.target}: not a format for a map; use --to nav2, mcap, sqlite3, g2o, tum or kitti")
+    if to == "nav2":
+        return _convert_to_nav2(args)
     refuse_existing(args.force, args.target)
     result = read_result(args.source)
     if to in ("tum", "kitti"):
@@ -144,6 +148,22 @@ def _convert_map(args: argparse.Namespace, to: str) -> int:
     write_result_bag(args.target, result, logs, storage=to)
     without = "" if logs else "without scans and odometry, which --recording adds"
     return _say(args, {"anchors": len(result.anchors), "closures": len(result.closures)}, note=without)
+
+
+def _convert_to_nav2(args: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    from ..io.nav2_bundle import FILES, write_nav2_bundle
+    from ..io.stored_result import read_result
+    from .formats import refuse_existing
+
+    if os.path.exists(args.target) and not os.path.isdir(args.target):
+        raise ConfigError(f"{args.target} is a file; --to nav2 makes a folder")
+    if os.path.isdir(args.target) and os.path.samefile(args.source, args.target):
+        raise ConfigError(f"{args.target} is the map itself; choose another folder for the bundle")
+    refuse_existing(args.force, *(str(Path(args.target) / name) for name in FILES))
+    result = read_result(args.source)
+    return _say(args, {"files": len(write_nav2_bundle(args.target, result)), "anchors": len(result.anchors)})
 
 
 def _convert_trajectory(args: argparse.Namespace, to: str) -> int:
@@ -182,7 +202,7 @@ def _convert_recording(args: argparse.Namespace, to: str) -> int:
     from .formats import read_recording, refuse_existing
     from .options import apply_mounting, bag_choices
 
-    if to in ("", "bag", "g2o", "pyfg", "map"):
+    if to in ("", "bag", "g2o", "pyfg", "map", "nav2"):
         hint = "a ROS 1 bag cannot be written; use --to mcap" if to == "bag" else f"use --to {', '.join(_RECORDINGS)}"
         raise ConfigError(f"{args.target}: not a format for a recording; {hint}")
     refuse_existing(args.force, args.target)
