@@ -102,6 +102,19 @@ def test_a_reset_keeps_the_latency_that_was_measured():
     assert max(map(abs, errors[100:])) < 0.003
 
 
+@pytest.mark.parametrize("uptime", [1.2, 2.0, 30.0])
+def test_a_clock_that_is_read_after_a_replug_is_tied_anew_however_short_it_ran(uptime):
+    """The unit counts from 0 again after a second without power, so that its clock steps back by little or much."""
+    clock = DeviceClock(1e-3, 1 << 24, period=0.1, latency=0.066)
+    for zero in (100.0, 101.0 + uptime):
+        for k in range(8):
+            sent = zero + 0.6 + 0.01 * k
+            clock.tie(1000 * (sent + 0.001 - zero), sent, sent + 0.002)
+        for k in range(10, round(10 * uptime)):
+            true = zero + 0.1 * k
+            assert clock.read(100 * k, true + 0.101).stamp == pytest.approx(true, abs=0.002)
+
+
 def test_frames_that_are_missing_are_counted_across_a_reset_and_with_a_learned_period():
     for period in (0.05, None):
         clock = DeviceClock(1e-3, 1 << 16, period=period)

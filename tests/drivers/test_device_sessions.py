@@ -347,7 +347,7 @@ def test_lidar_that_gives_no_time_is_late_by_no_more_than_a_turn_is_long():
     truth = {tuple(v): t for t, v in sent}
     for scan in of_kind(actions, LaserScan):
         assert scan.stamp == pytest.approx(truth[tuple(round(1000 * r) for r in scan.ranges)], abs=0.003)
-        assert scan.spread == pytest.approx(0.035)
+        assert 0.035 < scan.spread < 0.040
 
 
 @pytest.mark.parametrize(
@@ -377,8 +377,8 @@ def test_lidar_on_a_slow_line_is_made_faster_or_asked_for_fewer_scans(rates, exp
     for scan in settled:
         key = tuple(5600 if math.isinf(r) else round(1000 * r) for r in scan.ranges)
         # An answer to TM1 takes 8 ms at 19200 bit/s: the clock is known to half of that.
-        assert min(abs(scan.stamp - t) for t in truth[key]) < scan.spread + 0.0025
-        assert scan.spread < (0.003 if rates[1:] else 0.006)
+        assert min(abs(scan.stamp - t) for t in truth[key]) < scan.spread
+        assert scan.spread < (0.006 if rates[1:] else 0.009)
 
 
 def test_lidar_scans_that_a_restart_cost_are_counted():
@@ -446,16 +446,16 @@ def test_tag_on_a_link_whose_delay_comes_and_goes(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_lidar_on_a_busy_computer_is_tied_as_well_as_is_stated(seed):
-    """Answers take 0 to 25 ms: more readings of the clock are asked for, and what is left is stated."""
+    """Answers and scans take 0 to 25 ms: more readings of the clock are asked for, and what is left is stated."""
     device, sent = lidar()
     rng = random.Random(seed)
     actions, _ = simulate(ScipDriver(), device, 40.0, jitter=lambda: rng.uniform(0, 0.025))
     truth = {}
     for true, values in sent:
         truth.setdefault(tuple(values), []).append(true)
-    scans = of_kind(actions, LaserScan)[50:]
+    scans = of_kind(actions, LaserScan)
     errors = [min(abs(scan.stamp - t) for t in truth[tuple(round(1000 * r) for r in scan.ranges)]) for scan in scans]
-    assert scans[-1].spread < 0.006
-    # Besides the tie there is the smallest of the thirty delays with which the latency is learnt: 3.5 ms at 99 %.
-    assert sorted(errors)[int(0.95 * len(errors))] < scans[-1].spread + 0.0035
-    assert max(errors) < 0.010
+    assert all(error < scan.spread for error, scan in zip(errors, scans, strict=True))
+    # The smallest of ten delays, and so each point of the envelope, is 2.3 ms late on average.
+    assert sorted(scan.spread for scan in scans)[len(scans) // 2] < 0.010
+    assert sorted(errors)[int(0.95 * len(errors))] < 0.005

@@ -2,7 +2,7 @@
 
 from unittest import mock
 
-from uwblite.drivers import recorder as recorder_module
+from uwblite.drivers import link as link_module
 from uwblite.drivers.link import Link, Mounting
 from uwblite.drivers.log_file import LogFile
 from uwblite.drivers.recorder import Recorder
@@ -129,7 +129,7 @@ def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), par
         begin(clock.now)
     try:
         recorder.begin(["recorded in simulated time"])
-        with mock.patch.object(recorder_module, "Opening", OpenedAtOnce):
+        with mock.patch.object(link_module, "Opening", OpenedAtOnce):
             recorder.run(duration=seconds, stopping=lambda: False)
     finally:
         log.close()

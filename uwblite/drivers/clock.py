@@ -20,10 +20,12 @@ MAX_SKEW = 1e-3
 """Largest believable relative error of a crystal; anything above is a broken estimate."""
 BACKWARD = 1.0
 """s; a scan may have begun before the last reading of the clock, more than that is another power-up."""
-FIT_BUCKETS = 8
-"""Fewer buckets than this: offset only, no skew."""
-LEARNING = 3.0
-"""s of frames in which their delay is measured against `DeviceClock.tie`; clocks drift less than 1 ms in it."""
+LEAST_EXCESS = 1e-4
+"""s; the smallest delays of two buckets are not alike to less than that."""
+LEAP = 0.1
+"""s by which a reading of the clock may differ from what its frames say; more is another power-up."""
+TOGETHER = 5.0
+"""s; readings of the clock that are further apart do not narrow each other down, since crystals drift."""
 RATE_WINDOW = 1.0
 """s of arrivals whose smallest delay is compared with that of the window before."""
 WRONG_RATE = 0.05
@@ -79,23 +81,30 @@ class Unwrapper:
 class ClockMap:
     """Map device seconds to host seconds by the lower envelope of arrivals.
 
+    Delays above the envelope are taken for exponential, and the skew of a crystal for normal about 0; the line is the
+    most probable one. Without that prior the slope of a short or noisy window would be extrapolated to its end.
+
     Parameters
     ----------
     window : s of device time that the envelope looks back.
     bucket : s; one minimum is kept per bucket, so memory is bounded by window / bucket.
-    max_skew : share by which the rate of the device's clock may be wrong.
+    max_skew : share by which the rate of the device's clock may be wrong; a tenth of it is usual.
     """
 
     def __init__(self, window: float = 120.0, bucket: float = 1.0, max_skew: float = MAX_SKEW) -> None:
         self._bucket, self._max_skew = bucket, max_skew
         self._minima: deque[tuple[float, float]] = deque(maxlen=max(2, round(window / bucket)))
         self._index: int | None = None
-        self._slope, self._origin, self._offset = 0.0, 0.0, 0.0
+        self._offset = 0.0
+        self.skew = 0.0
+        """Relative rate of the host clock against the device clock, minus one."""
+        self.excess = 0.0
+        """s, mean of the smallest delays of the buckets above the envelope: it is known to twice that, at its ends too."""
 
     @property
-    def skew(self) -> float:
-        """Relative rate of the host clock against the device clock, minus one."""
-        return self._slope
+    def full(self) -> bool:
+        """The envelope begins to forget."""
+        return len(self._minima) == self._minima.maxlen
 
     def add(self, device: float, host: float) -> None:
         """Take one frame: stamped at `device` s by the device, arrived at `host` s."""
@@ -114,18 +123,25 @@ class ClockMap:
 
     def host(self, device: float) -> float:
         """Return the host time of device time `device`, s, late by the smallest delay that occurs."""
-        return device + self._offset + self._slope * (device - self._origin)
+        return device + self._offset + self.skew * device
 
     def _fit(self) -> None:
-        points = self._minima
-        self._slope, self._origin = 0.0, points[0][0]
-        if len(points) >= FIT_BUCKETS:
-            hull = _lower_hull(points)
-            middle = (points[0][0] + points[-1][0]) / 2
-            for (x0, y0), (x1, y1) in pairwise(hull):
-                if x0 <= middle <= x1:
-                    self._slope = max(-self._max_skew, min(self._max_skew, (y1 - y0) / (x1 - x0)))
-        self._offset = min(y - self._slope * (x - self._origin) for x, y in points)
+        points, hull = self._minima, _lower_hull(self._minima)
+        count, middle = len(points), sum(x for x, _ in points) / len(points)
+        # The line through a corner of the hull has the log probability count * excess(slope) / mean + (slope / usual)^2 / 2:
+        # its slope grows until that pays no more, or until the line lies on the next edge.
+        usual = (0.1 * self._max_skew) ** 2 * count / max(self.excess, LEAST_EXCESS) if count > 2 else 0.0
+        slopes = [(y1 - y0) / (x1 - x0) for (x0, y0), (x1, y1) in pairwise(hull)]
+        before, slope = -math.inf, 0.0
+        for (x, _), following in zip(hull, [*slopes, math.inf], strict=True):
+            slope = max(before, usual * (middle - x))
+            if slope <= following:
+                break
+            before = following
+        self.skew = max(-self._max_skew, min(self._max_skew, slope))
+        over = [y - self.skew * x for x, y in points]
+        self._offset = min(over)
+        self.excess = (sum(over) - count * self._offset) / max(count - 2, 1)  # a line has two parameters
 
 
 def _lower_hull(points: deque[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -153,6 +169,8 @@ class Reading:
     """Frames that did not arrive in between."""
     reset: bool
     """The device counted anew: it was powered up again."""
+    spread: float
+    """s by which the stamp may be wrong to either side."""
 
 
 class DeviceClock:
@@ -176,7 +194,8 @@ class DeviceClock:
         self, tick: float, modulus: int = 0, *, period: float | None = None, latency: float = 0.0, spread: float = 0.0,
         proven: bool = True,
     ) -> None:  # fmt: skip
-        self.latency, self.spread, self.period = latency, spread, period
+        self.latency, self.tied, self.period = latency, spread, period
+        """s; `tied` is by how much the delay may be wrong."""
         self.proven, self._believed = proven, proven
         self.rate: float | None = None
         """Device seconds per host second where these disagree: frames are then stamped with their arrival."""
@@ -186,8 +205,9 @@ class DeviceClock:
         self._steps: deque[float] = deque(maxlen=25)
         self._half = tick / 2
         self._tie: tuple[float, float] | None = None
-        """s, between which host time minus device time lies."""
-        self._learn_until: float | None = None
+        """s, between which host time minus device time lay."""
+        self._tied_at = 0.0
+        """s, device time of the last reading that says so."""
         self._windows: list[tuple[float, float]] = []
         self._witnesses = 0
 
@@ -198,13 +218,13 @@ class DeviceClock:
         with it.
         """
         device, reset = self._unwrapper.unwrap(count, answered)
-        if reset:
+        believed = self._map.host(device) - self.latency
+        if reset or (self._last is not None and not sent - LEAP < believed < answered + LEAP):
             self._begin_anew()
-        low, high = self._tie or (-math.inf, math.inf)
+        low, high = self._tie if self._tie and device - self._tied_at < TOGETHER else (-math.inf, math.inf)
         # Counts are whole: the reading was made up to half a count before or after what it says.
         self._tie = max(low, sent - device - self._half), min(high, answered - device + self._half)
-        self.spread = max(self._half, (self._tie[1] - self._tie[0]) / 2)
-        self._learn_until = None
+        self.tied, self._tied_at = max(self._half, (self._tie[1] - self._tie[0]) / 2), device
 
     def read(self, count: float, arrival: float) -> Reading:
         """Take a frame.
@@ -227,9 +247,11 @@ class DeviceClock:
         self._map.add(device, arrival)
         if not self._believed:
             self._check_rate(device, arrival, reset=reset)
-        self._learn_latency(device, arrival)
-        known = self.proven and self.rate is None
-        return Reading(self._map.host(device) - self.latency if known else arrival, elapsed, missing, reset)
+        self._learn_latency()
+        stamp, spread = self._map.host(device) - self.latency, self.tied + self._half + 2 * self._map.excess
+        if not self.proven or self.rate is not None:
+            stamp = arrival
+        return Reading(stamp, elapsed, missing, reset, spread)
 
     def _begin_anew(self) -> None:
         self._map, self._last, self._tie = ClockMap(), None, None
@@ -242,16 +264,12 @@ class DeviceClock:
         gap = arrival - self._arrival if self._arrival and elapsed is None else elapsed or 0.0
         return round(gap / period) - 1 if gap > GAP * period else 0
 
-    def _learn_latency(self, device: float, arrival: float) -> None:
-        if self._tie is None:
-            return
-        delay = arrival - device - sum(self._tie) / 2
-        if self._learn_until is None:
-            self._learn_until, self.latency = device + LEARNING, math.inf
-        if device <= self._learn_until:
-            self.latency = max(0.0, min(self.latency, delay))
-        else:
-            self._tie = None
+    def _learn_latency(self) -> None:
+        """Measure the delay of frames: by how much the envelope of their arrivals lies behind the tie, at the tie's time."""
+        if self._tie is not None:
+            self.latency = max(0.0, self._map.host(self._tied_at) - self._tied_at - sum(self._tie) / 2)
+            if self._map.full:
+                self._tie = None
 
     def _check_rate(self, device: float, arrival: float, *, reset: bool) -> None:
         """Compare the pace of both clocks: the smallest delay of a window must be that of the one before."""

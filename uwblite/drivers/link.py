@@ -1,13 +1,20 @@
 """One device of a recording: its port, its session, and what it did."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
+from ..errors import DeviceError
+from .events import Note, Send, SetBaud, SetDtr
 from .session import Session
+from .transport import Opening, Port
 
-if TYPE_CHECKING:
-    from .transport import Opening, Port
+SILENCE = 3.0
+"""s without a measurement before it is said."""
+HANG = 10.0
+"""s without a measurement before the port is opened anew."""
+BACK_OFF = (0.1, 0.2, 0.4, 0.7, 1.0)
+"""s between attempts to open a port that is gone; the last one repeats."""
 
 
 @dataclass(slots=True)
@@ -70,6 +77,111 @@ class Link:
         self.new_lost = self.new_corrupt = 0
         self.rate = 0.0
         self._rate_base = (0.0, 0)
+
+    # ---- its port
+
+    def connect(self, now: float, open_port: Callable[[str, int], Port]) -> Port | DeviceError | None:
+        """Open the port in the background, or take it when it is open.
+
+        Parameters
+        ----------
+        now : s.
+        open_port : (url, baud) -> Port.
+
+        Returns
+        -------
+        Port that is open now, DeviceError where it cannot be, None as long as that is not known.
+        """
+        if self.opening is None:
+            self.opening = Opening(open_port, self.url, self.session.baud)
+        port = self.opening.result()
+        if port is None:
+            return None
+        self.opening = None
+        if not isinstance(port, DeviceError):
+            try:
+                port.read()  # what waited came nobody knows when
+            except DeviceError as error:
+                port.close()
+                port = error
+        if isinstance(port, DeviceError):
+            self._retry_later(now)
+            return port
+        self.port, self.attempt = port, 0
+        self.counts.connects += 1
+        self.opened = self.last_data = now
+        return port
+
+    def disconnect(self, now: float) -> None:
+        """Close the port, to be opened again after a pause."""
+        if self.port is not None:
+            self.port.close()
+            self.port = None
+            self._retry_later(now)
+            self._fall_silent()
+
+    def _retry_later(self, now: float) -> None:
+        self.retry_at = now + BACK_OFF[min(self.attempt, len(BACK_OFF) - 1)]
+        self.attempt += 1
+
+    def send(self, action: Send | SetBaud | SetDtr) -> None:
+        """Do to the port what the session wants.
+
+        Raises
+        ------
+        DeviceError : the device is gone.
+        """
+        if self.port is None:
+            return
+        if isinstance(action, Send):
+            self.port.write(action.data)
+        elif isinstance(action, SetBaud):
+            self.port.set_baud(action.rate)
+        else:
+            self.port.set_dtr(action.on)
+
+    def finish(self) -> str:
+        """Let the device fall quiet and close the port; return why it was never open, "" where it was."""
+        try:
+            for action in self.session.stop() if self.port is not None else ():
+                if isinstance(action, Send | SetDtr):
+                    self.send(action)
+        except DeviceError:
+            pass  # it was pulled at the very end
+        if self.port is not None:
+            self.port.close()
+            self.port = None
+        if self.opening is None or self.counts.connects:
+            return ""
+        self.opening.give_up()
+        why = self.opening.result() or "it was still being opened at the end"
+        return f"{self.name}: {self.url}: {why}" if isinstance(why, str | DeviceError) else ""
+
+    # ---- its data
+
+    def heard(self, now: float) -> float:
+        """Count a measurement; return the length of the silence that it ends, s, 0 = there was none."""
+        self.counts.messages += 1
+        pause = now - self.last_message if self.quiet else 0.0
+        self.quiet, self.last_message = False, now
+        self.counts.silent_time += pause
+        return pause
+
+    def watch(self, now: float) -> tuple[Note | None, bool]:
+        """Return what is to be said of a device that falls silent, and whether its port should be opened anew."""
+        silent, note = now - max(self.last_message, self.opened), None
+        if silent > SILENCE and not self.quiet:
+            self._fall_silent()
+            if now - self.last_data < SILENCE:
+                why = "bytes come, but no good frame: wrong bit rate, wrong device or a bad cable"
+            else:
+                why = "check power and cable; unplug it and plug it in again"
+            note = Note("warning", f"{self.name}-no-data", f"{self.name}: no data for {silent:.0f} s; {why}")
+        return note, silent > HANG and now - self.last_data > HANG
+
+    def _fall_silent(self) -> None:
+        if not self.quiet:
+            self.quiet, self.last_message = True, max(self.last_message, self.opened)
 
     def param_name(self, name: str) -> str:
         """Return what a fact about this device is called in the log: ``laser_serial``, ``laser2_serial`` ..."""

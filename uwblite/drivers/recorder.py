@@ -27,14 +27,8 @@ from .events import (
 )
 from .link import Link, Mounting, doubts, summary_lines
 from .log_file import LogFile, gyro_line, number_text, pose_line, range_lines, scan_line
-from .transport import Opening, Port, open_port
+from .transport import Port, open_port
 
-SILENCE = 3.0
-"""s without a measurement before it is said."""
-HANG = 10.0
-"""s without a measurement before the port is opened anew."""
-BACK_OFF = (0.1, 0.2, 0.4, 0.7, 1.0)
-"""s between attempts to open a port that is gone; the last one repeats."""
 HOUSEKEEPING = 0.25
 """s between looks at silent devices and the status line."""
 OPENING = 0.02
@@ -100,9 +94,9 @@ class Recorder:
                 if until is not None and now >= until:
                     break
                 if now >= next_look:
+                    self._housekeeping(now)
                     opening = any(link.opening for link in self.links)
                     next_look = now + (OPENING if opening else HOUSEKEEPING)
-                    self._housekeeping(now)
                     if on_status:
                         on_status()
                 self._wait(next_look if until is None else min(next_look, until))
@@ -168,29 +162,17 @@ class Recorder:
                 return
 
     def _send(self, link: Link, action: Send | SetBaud | SetDtr) -> bool:
-        if link.port is None:
-            return False
         try:
-            if isinstance(action, Send):
-                link.port.write(action.data)
-            elif isinstance(action, SetBaud):
-                link.port.set_baud(action.rate)
-            else:
-                link.port.set_dtr(action.on)
+            link.send(action)
         except DeviceError as error:
             self._down(link, str(error))
-            return False
-        return True
+        return link.port is not None
 
     def _message(self, link: Link, now: float) -> None:
-        link.counts.messages += 1
-        if link.quiet:
-            link.quiet = False
-            pause = now - link.last_message
-            link.counts.silent_time += pause
+        pause = link.heard(now)
+        if pause:
             self._note(link, Note("info", f"{link.name}-data-again", f"{link.name}: data again after {pause:.1f} s"))
             link.said.clear()
-        link.last_message = now
 
     def _write(self, measured: LaserScan | RangeEpoch | OdometryPose | GyroHeading, link: Link) -> None:
         tail, counts = self._tail(measured.stamp), link.counts
@@ -276,39 +258,22 @@ class Recorder:
             link.new_lost = link.new_corrupt = 0
 
     def _watch(self, link: Link, now: float) -> None:
-        silent = now - max(link.last_message, link.opened)
-        if silent > SILENCE and not link.quiet:
-            link.quiet = True
-            link.last_message = max(link.last_message, link.opened)
-            if now - link.last_data < SILENCE:
-                why = "bytes come, but no good frame: wrong bit rate, wrong device or a bad cable"
-            else:
-                why = "check power and cable; unplug it and plug it in again"
-            self._note(link, Note("warning", f"{link.name}-no-data", f"{link.name}: no data for {silent:.0f} s; {why}"))
-        if silent > HANG and now - link.last_data > HANG:
+        note, hangs = link.watch(now)
+        if note:
+            self._note(link, note)
+        if hangs:
             self._down(link, "silent")
 
     def _up(self, link: Link, now: float) -> None:
-        """Open the port in the background, or take it when it is open."""
-        if link.opening is None:
-            link.opening = Opening(self._open_port, link.url, link.session.baud)
-        port = link.opening.result()
-        if port is None:
-            return
-        link.opening = None
+        port = link.connect(now, self._open_port)
         if isinstance(port, DeviceError):
             self._note(link, Note("error", f"{link.name}-cannot-open", f"{link.name}: {port}; trying again"))
-            link.retry_at = now + BACK_OFF[min(link.attempt, len(BACK_OFF) - 1)]
-            link.attempt += 1
-            return
-        link.port, link.attempt = port, 0
-        link.counts.connects += 1
-        link.opened = link.last_data = now
-        fileno = port.fileno()
-        if fileno is not None:
-            self._selector.register(fileno, selectors.EVENT_READ, link)
-        self._note(link, Note("info", f"{link.name}-connected", f"{link.name}: {link.url} open"))
-        self._do(link, link.session.start(now), now)
+        elif port is not None:
+            fileno = port.fileno()
+            if fileno is not None:
+                self._selector.register(fileno, selectors.EVENT_READ, link)
+            self._note(link, Note("info", f"{link.name}-connected", f"{link.name}: {link.url} open"))
+            self._do(link, link.session.start(now), now)
 
     def _down(self, link: Link, why: str) -> None:
         if link.port is None:
@@ -316,13 +281,7 @@ class Recorder:
         fileno = link.port.fileno()
         if fileno is not None:
             self._selector.unregister(fileno)
-        link.port.close()
-        link.port = None
-        link.retry_at = self._now() + BACK_OFF[min(link.attempt, len(BACK_OFF) - 1)]
-        link.attempt += 1
-        if not link.quiet:
-            link.quiet = True
-            link.last_message = max(link.last_message, link.opened)
+        link.disconnect(self._now())
         self._note(link, Note("warning", f"{link.name}-gone", f"{link.name}: {why}; opening it again"))
 
     # ---- the end
@@ -338,18 +297,9 @@ class Recorder:
 
     def _finish(self) -> None:
         for link in self.links:
-            if link.port is not None:
-                for action in link.session.stop():
-                    if isinstance(action, Send | SetDtr):
-                        self._send(link, action)
-            if link.port is not None:
-                link.port.close()
-                link.port = None
-            if link.opening is not None:
-                link.opening.give_up()
-                why = link.opening.result() or "it was still being opened at the end"
-                if not link.counts.connects and isinstance(why, str | DeviceError):
-                    self._note(link, Note("error", f"{link.name}-cannot-open", f"{link.name}: {link.url}: {why}"))
+            never = link.finish()
+            if never:
+                self._note(link, Note("error", f"{link.name}-cannot-open", never))
         self._selector.close()
         self._report_damage()
         for line in self.summary():

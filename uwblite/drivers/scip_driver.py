@@ -14,7 +14,7 @@ import math
 from typing import Any
 
 from ..errors import ProtocolError
-from .clock import DeviceClock
+from .clock import DeviceClock, Reading
 from .events import Action, Corrupt, LaserScan, Lost, Note, Param, Reopen, Send, SetBaud
 from .scip import TIME_MODULUS, WITH_LINES, Distances, Reply, ScipProtocol
 from .scip_codes import status_meaning
@@ -211,7 +211,7 @@ class ScipDriver(Driver):
         entered = yield from self._request("TM0")
         for k in range(TIME_READS[1] if entered and status_meaning("TM0", entered.status)[0] == "ok" else 0):
             sent = self.now
-            if k >= TIME_READS[0] and self._clock.spread < GOOD_TIE:
+            if k >= TIME_READS[0] and self._clock.tied < GOOD_TIE:
                 break
             reply = yield from self._request("TM1", 1)
             if reply is None or not reply.lines:
@@ -324,21 +324,21 @@ class ScipDriver(Driver):
             return
         if reading.missing:
             yield Lost(reading.stamp, reading.missing)
-        yield self._laser_scan(scan, reading.stamp)
+        yield self._laser_scan(scan, reading)
 
-    def _laser_scan(self, scan: Distances, stamp: float) -> LaserScan:
+    def _laser_scan(self, scan: Distances, reading: Reading) -> LaserScan:
         unit = self.geometry
         limit = None if scan.command[1] == "D" else NARROW
         merge = (scan.cluster - 1) / 2
         return LaserScan(
-            stamp + (scan.start - unit.first) * unit.step_time,
+            reading.stamp + (scan.start - unit.first) * unit.step_time,
             to_ranges(scan.values, unit, limit),
             (scan.start + merge - unit.front) * unit.step_angle,
             unit.step_angle * scan.cluster,
             unit.step_time * scan.cluster,
             min(unit.distance_max, limit or unit.distance_max) / 1000,
             unit.distance_min / 1000,
-            self._clock.spread,
+            reading.spread,
         )
 
     # ---- for people
