@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.constraints import Clock, Constraints, ForbiddenClosure, KnownAnchor, KnownClosure, KnownDistance, KnownPose
+from uwblite.constraints import Clock, Constraints, ForbiddenClosure, GivenAnchor, GivenClosure, GivenDistance, GivenPose
 from uwblite.errors import ConfigError, FormatError
 from uwblite.graph.distance_edges import AnchorDistanceEdges
 from uwblite.graph.graph import Graph
@@ -45,7 +45,7 @@ def first_estimate(T=(2.0, -3.0, 1.2), anchors=TRUE):
 
 
 def surveyed(*ids, movable=False, shift=(0.0, 0.0)):
-    return tuple(KnownAnchor(i, tuple(TRUE[IDS.index(i)] + shift), 0.02, movable) for i in ids)
+    return tuple(GivenAnchor(i, tuple(TRUE[IDS.index(i)] + shift), 0.02, movable) for i in ids)
 
 
 angle = st.floats(-np.pi, np.pi)
@@ -61,7 +61,7 @@ def test_the_users_frame_is_found_from_anchors(T, ids):
 
 @given(st.tuples(st.floats(-50, 50), st.floats(-50, 50), angle))
 def test_the_users_frame_is_found_from_a_pose(T):
-    known = Constraints(poses=(KnownPose(float(STAMPS[7]), tuple(drive()[7].tolist())),))
+    known = Constraints(poses=(GivenPose(float(STAMPS[7]), tuple(drive()[7].tolist())),))
     done = apply(known, first_estimate(T), IDS, ALL, CLOCK)
     np.testing.assert_allclose(se2.between(drive(), done.graph.poses), 0, atol=1e-9)
 
@@ -98,7 +98,7 @@ def test_an_anchor_moved_since_the_earlier_map_is_named_and_does_not_bend_the_ma
 
 
 def test_a_tape_between_anchors_is_heard():
-    known = Constraints(distances=(KnownDistance(("A", "B"), 9.0, 0.001),))
+    known = Constraints(distances=(GivenDistance(("A", "B"), 9.0, 0.001),))
     done = apply(known, first_estimate(), IDS, ALL, CLOCK)
     assert done.graph.fixed_poses is None
     solved, _ = optimize(done.graph)
@@ -119,7 +119,7 @@ def test_the_jacobian_of_a_distance_is_right():
 
 
 def test_a_known_closure_ties_two_times_together():
-    known = Constraints(closures=(KnownClosure((float(STAMPS[3]), float(STAMPS[30]))),))
+    known = Constraints(closures=(GivenClosure((float(STAMPS[3]), float(STAMPS[30]))),))
     edges = apply(known, first_estimate(), IDS, ALL, CLOCK).graph.edges[-1]
     assert (edges.i.tolist(), edges.j.tolist()) == ([3], [30])
     np.testing.assert_allclose(edges.sqrt_information[0], np.eye(3) * 10)
@@ -137,16 +137,16 @@ def test_stamps_of_several_recordings_are_told_apart():
     clock = Clock(np.concatenate([STAMPS[:20], STAMPS[:20]]), np.repeat([0, 1], 20))
     stamp = float(STAMPS[7])
     assert (clock.nearest(stamp, 1), clock.nearest(stamp, 2)) == (7, 27)
-    known = Constraints(closures=(KnownClosure((stamp, stamp), recordings=(2, 1)),))
+    known = Constraints(closures=(GivenClosure((stamp, stamp), recordings=(2, 1)),))
     edges = apply(known, first_estimate(), IDS, ALL, clock).graph.edges[-1]
     assert (edges.i.tolist(), edges.j.tolist()) == ([27], [7])
     banned = Constraints(forbidden=(ForbiddenClosure((stamp, stamp), within=0.1, recordings=(1, 2)),))
     i, j = np.array([7, 27, 6, 7]), np.array([27, 7, 27, 7])
     assert banned.allowed(clock, i, j).tolist() == [False, False, True, True]
     with pytest.raises(ConfigError, match="there is no recording 3; there are 2"):
-        apply(Constraints(poses=(KnownPose(stamp, (0, 0, 0), recording=3),)), first_estimate(), IDS, ALL, clock)
+        apply(Constraints(poses=(GivenPose(stamp, (0, 0, 0), recording=3),)), first_estimate(), IDS, ALL, clock)
     with pytest.raises(ConfigError, match=r"outside recording 2 \(100 to 109.5 s\)"):
-        apply(Constraints(poses=(KnownPose(300.0, (0, 0, 0), recording=2),)), first_estimate(), IDS, ALL, clock)
+        apply(Constraints(poses=(GivenPose(300.0, (0, 0, 0), recording=2),)), first_estimate(), IDS, ALL, clock)
 
 
 def test_of_a_moved_anchor_the_last_place_counts(tmp_path):
@@ -163,16 +163,16 @@ def test_sums_take_the_later_place_of_an_anchor():
 @pytest.mark.parametrize(
     ("known", "message"),
     [
-        (Constraints(anchors=(KnownAnchor("X", (0, 0)),)), "no ranges to anchor X; the recording has A, B, C, D"),
-        (Constraints(distances=(KnownDistance(("A", "Y"), 1.0),)), "anchor Y"),
-        (Constraints(poses=(KnownPose(7.0, (0, 0, 0)),)), "stamp 7 lies outside"),
-        (Constraints(closures=(KnownClosure((101.0, 900.0)),)), "stamp 900 lies outside"),
+        (Constraints(anchors=(GivenAnchor("X", (0, 0)),)), "no ranges to anchor X; the recording has A, B, C, D"),
+        (Constraints(distances=(GivenDistance(("A", "Y"), 1.0),)), "anchor Y"),
+        (Constraints(poses=(GivenPose(7.0, (0, 0, 0)),)), "stamp 7 lies outside"),
+        (Constraints(closures=(GivenClosure((101.0, 900.0)),)), "stamp 900 lies outside"),
     ],
 )
 def test_what_does_not_belong_to_the_recording_is_refused(known, message):
     with pytest.raises(ConfigError, match=message):
         apply(known, first_estimate(), IDS, ALL, CLOCK)
-    gone = Constraints(anchors=(KnownAnchor("X", (0, 0), movable=True), *surveyed("A", "B", movable=True)))
+    gone = Constraints(anchors=(GivenAnchor("X", (0, 0), movable=True), *surveyed("A", "B", movable=True)))
     np.testing.assert_allclose(apply(gone, first_estimate(), IDS, ALL, CLOCK).graph.anchors, TRUE, atol=1e-6)
 
 
@@ -201,7 +201,7 @@ within = 20
 
 def test_a_file_says_it_all():
     known = parse_constraints(FILE)
-    assert known.anchors == (KnownAnchor("5C0B", (1.0, 2.0), 0.02),)
+    assert known.anchors == (GivenAnchor("5C0B", (1.0, 2.0), 0.02),)
     assert known.poses[0].pose == (0.0, 0.0, 1.5)
     assert known.distances[0].anchors == ("5C0B", "91A3")
     assert known.closures[0].stamps == (10.0, 200.0)
@@ -230,7 +230,7 @@ def test_the_anchors_of_an_earlier_map(tmp_path):
     file = tmp_path / "anchors.csv"
     file.write_text("id,x,y,sigma_x,sigma_y,status\nA,1,2,0.01,0.3,ok\nB,3,4,,,ok\nC,,,,,unplaced\nD,1,1,1,1,distrusted\n")
     known = read_anchors(file)
-    assert known.anchors == (KnownAnchor("A", (1.0, 2.0), 0.3, True), KnownAnchor("B", (3.0, 4.0), 0.02, True))
+    assert known.anchors == (GivenAnchor("A", (1.0, 2.0), 0.3, True), GivenAnchor("B", (3.0, 4.0), 0.02, True))
     file.write_text("id,x,y\nC,,\n")
     with pytest.raises(FormatError, match="no anchor in it has a place"):
         read_anchors(file)

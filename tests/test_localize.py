@@ -8,7 +8,7 @@ import pytest
 from conftest import ROOT
 
 from uwblite import se2
-from uwblite.constraints import Constraints, KnownAnchor
+from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.errors import DataError
 from uwblite.io.carmen import read_log
 from uwblite.localize import localize
@@ -19,14 +19,14 @@ from uwblite.mapping import MappingConfig, build_map
 def earlier(log):
     """A map of the room in a frame of its own."""
     start = float(log.odometry.stamps[0])
-    from uwblite.constraints import KnownPose
+    from uwblite.constraints import GivenPose
 
-    return build_map(log, constraints=Constraints(poses=(KnownPose(start, (5.0, -3.0, 2.0), (1e-3, 1e-3, 1e-3)),)))
+    return build_map(log, constraints=Constraints(poses=(GivenPose(start, (5.0, -3.0, 2.0), (1e-3, 1e-3, 1e-3)),)))
 
 
 def anchors_of(result, **moved):
     known = (
-        KnownAnchor(a.id, tuple(np.add(a.position, moved.get(f"a{a.id}", (0, 0))).tolist()), 0.1, movable=True)
+        GivenAnchor(a.id, tuple(np.add(a.position, moved.get(f"a{a.id}", (0, 0))).tolist()), 0.1, movable=True)
         for a in result.anchors
     )
     return Constraints(anchors=tuple(known))
@@ -75,7 +75,7 @@ def test_a_changed_place_is_doubted(log, earlier):
 
 
 def test_a_recording_with_neither_an_anchor_of_the_map_nor_walls_is_refused(log, earlier):
-    strangers = Constraints(anchors=(KnownAnchor("X", (0, 0)), KnownAnchor("Y", (1, 1))))
+    strangers = Constraints(anchors=(GivenAnchor("X", (0, 0)), GivenAnchor("Y", (1, 1))))
     blind, bare = log.without(lidar=True), log.without(uwb=True, lidar=True)
     for alone, grid in ((blind, earlier.grid), (log, None), (bare, earlier.grid)):
         with pytest.raises(DataError, match="hears 0 of the map's anchors"):
@@ -118,9 +118,9 @@ def test_another_drive_through_the_same_room(tmp_path):
 
     first = read_log(tmp_path / "5" / "run.log")
     stamps, poses = read_tum(tmp_path / "5" / "truth.tum")
-    from uwblite.constraints import KnownPose
+    from uwblite.constraints import GivenPose
 
-    start = KnownPose(float(first.odometry.stamps[0]), tuple(poses[0].tolist()), (1e-4, 1e-4, 1e-4))
+    start = GivenPose(float(first.odometry.stamps[0]), tuple(poses[0].tolist()), (1e-4, 1e-4, 1e-4))
     known = build_map(first, constraints=Constraints(poses=(start,)))
     # The map's own frame, found from its trajectory, is what the other drive is judged in.
     truth = se2.interpolate_trajectory(stamps, poses, known.stamps)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.planted import box, odometry, ranges, recording, scans, wander
 from simulation import logfile
-from simulation.recording import Lie, Settings, simulate
+from simulation.recording import FalseRanges, Settings, simulate
 
 from uwblite import se2
 from uwblite.errors import Cancelled
@@ -166,10 +166,10 @@ def test_hardly_any_recording_at_all():
 
 
 def test_progress_is_told_in_order(minute):
-    told = []
-    result = build_map(minute, progress=lambda *a: told.append(a))
-    assert all(0 <= done <= total and total >= 1 for _, done, total in told)
-    ended = [stage for stage, done, total in told if (done, total) == (1, 1)]
+    reported = []
+    result = build_map(minute, progress=lambda *a: reported.append(a))
+    assert all(0 <= done <= total and total >= 1 for _, done, total in reported)
+    ended = [stage for stage, done, total in reported if (done, total) == (1, 1)]
     names = [s.name for s in result.stages]
     assert [s for s in dict.fromkeys(ended) if s in names] == names
     assert names[0] == "keyframes"
@@ -204,7 +204,7 @@ def simulated(tmp_path, **settings):
     return read_log(tmp_path / "run.log"), read_tum(tmp_path / "truth.tum")
 
 
-LIES = (Lie(anchor=2, start=60.0, seconds=120.0, metres=3.0),)
+FALSE_RANGES = (FalseRanges(anchor=2, start=60.0, seconds=120.0, metres=3.0),)
 
 
 @pytest.mark.slow
@@ -216,7 +216,7 @@ LIES = (Lie(anchor=2, start=60.0, seconds=120.0, metres=3.0),)
         (0.10, {"world": "corridor", "minutes": 8.0, "seed": 13}),
         (0.06, {"world": "hall", "minutes": 8.0, "seed": 14, "nlos": "heavy", "nlos_anchors": (3, 4)}),
         (0.08, {"world": "hall", "minutes": 8.0, "seed": 15, "odometry_scale": 2.0, "slips": 3}),
-        (0.06, {"world": "hall", "minutes": 8.0, "seed": 16, "outliers": 0.1, "zeros": 0.05, "lies": LIES}),
+        (0.06, {"world": "hall", "minutes": 8.0, "seed": 16, "outliers": 0.1, "zeros": 0.05, "lies": FALSE_RANGES}),
         (0.06, {"world": "hall", "minutes": 8.0, "seed": 17, "anchor_height": 2.0, "tag_height": 0.3}),
         (0.15, {"world": "hall", "minutes": 8.0, "seed": 18, "without": ("uwb",)}),
         (0.06, {"world": "hall", "minutes": 8.0, "seed": 19, "people": 4}),
@@ -314,15 +314,15 @@ def test_a_lidar_whose_clock_is_late_is_found_out(log, truth, result):
 
 def test_a_large_grid_is_announced_and_may_be_declined(minute, monkeypatch):
     monkeypatch.setattr("uwblite.pipeline.final_stages._LARGE_GRID", 100)
-    told = []
+    reported = []
 
     def decline(stage, done, total):
-        told.append(stage)
+        reported.append(stage)
         return "million cells" not in stage
 
     with pytest.raises(Cancelled, match="MB"):
         build_map(minute, progress=decline)
-    assert told.count("occupancy grid") == 0
+    assert reported.count("occupancy grid") == 0
 
 
 @pytest.mark.slow

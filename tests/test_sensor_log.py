@@ -14,7 +14,7 @@ from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, 
 def log() -> SensorLog:
     rng = np.random.default_rng(0)
     stamps, truth = wander(rng, 10.0, half_width=2.0)
-    radio = ranges(rng, stamps, truth, np.array([[4.0, 0.0], [-4.0, 1.0], [0.0, 5.0]]), heard=[[0, 99], [0, 8], [12, 99]])
+    radio = ranges(rng, stamps, truth, np.array([[4.0, 0.0], [-4.0, 1.0], [0.0, 5.0]]), in_reach=[[0, 99], [0, 8], [12, 99]])
     return recording(odometry(stamps, truth), radio, scans(stamps, truth, box(8, 8), beams=30))
 
 

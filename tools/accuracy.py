@@ -76,7 +76,7 @@ ROWS = {
 
 MOUNTING = Settings(world="lab", laser_error=(0.03, -0.02, 0.03), laser_delay=0.03, uwb_delay=0.08)
 POOR_RADIO = Settings(world="hall", radio=RadioModel(bias_sd=0.8, scale=1.05))
-ABLATION_DRIVES = {
+ABLATION_RECORDINGS = {
     **{k: ROWS[k].settings for k in ("hall", "corridor", "lab", "nlos", "slips", "heights")},
     "mounting": MOUNTING,
     "poor radio": POOR_RADIO,
@@ -279,10 +279,10 @@ def halves(config: MappingConfig) -> str:
 
 def ablation(args: argparse.Namespace) -> str:
     """Leave each ingredient out in turn; return the tables and what buys nothing."""
-    names = asked(args, list(ABLATION_DRIVES))
+    names = asked(args, list(ABLATION_RECORDINGS))
     runs = tuple(INGREDIENTS.items())
     tasks = [
-        Task(n, replace(ABLATION_DRIVES[n], seed=args.seed, minutes=6.0 if args.quick else None), runs, tuple(args.set))
+        Task(n, replace(ABLATION_RECORDINGS[n], seed=args.seed, minutes=6.0 if args.quick else None), runs, tuple(args.set))
         for n in names
     ]
     found = {(drive, run): f for rows in follow(tasks, args) for drive, run, f in rows}
@@ -337,9 +337,9 @@ def wronged(graph: Graph, rng: np.random.Generator) -> Graph:
         if isinstance(e, RelativePoseEdges):
             count, n = round(0.3 * len(e)), len(graph.poses)
             i, j = rng.integers(n, size=(2, count))
-            lie = np.column_stack([rng.uniform(-3.0, 3.0, (count, 2)), rng.uniform(-np.pi, np.pi, count)])
+            false = np.column_stack([rng.uniform(-3.0, 3.0, (count, 2)), rng.uniform(-np.pi, np.pi, count)])
             pick = rng.integers(len(e), size=count)
-            both = ((e.i, i), (e.j, j), (e.T_i_j, lie), (e.sqrt_information, e.sqrt_information[pick]))
+            both = ((e.i, i), (e.j, j), (e.T_i_j, false), (e.sqrt_information, e.sqrt_information[pick]))
             e = RelativePoseEdges(*(np.concatenate(p) for p in both))
         edges.append(e)
     return replace(graph, edges=tuple(edges))

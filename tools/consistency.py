@@ -31,7 +31,7 @@ from uwblite.mapping import MappingConfig, build_map
 
 Floats = NDArray[np.float64]
 
-DRIVES = {
+RECORDINGS = {
     "hall": Settings(world="hall"),
     "lab": Settings(world="lab"),
     "corridor": Settings(world="corridor"),
@@ -147,8 +147,8 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     args = p.parse_args(argv)
     tasks = [
-        Task(name, replace(DRIVES[name], seed=FIRST_SEED + k, minutes=args.minutes, scan_rate=5.0), tuple(args.set))
-        for k, name in zip(range(args.runs), list(DRIVES) * args.runs, strict=False)
+        Task(name, replace(RECORDINGS[name], seed=FIRST_SEED + k, minutes=args.minutes, scan_rate=5.0), tuple(args.set))
+        for k, name in zip(range(args.runs), list(RECORDINGS) * args.runs, strict=False)
     ]
     found = []
     for c in spread_out(work, tasks, args.jobs):

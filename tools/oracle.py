@@ -102,10 +102,10 @@ class Oracle:
         self.truth = self._at(self.frames.stamps)
         self.rays = self._rays() if lidar and len(recording.scans) else None
         self.walls = recording.plan.walls
-        self.heard = log.ranges is not None
+        self.has_ranges = log.ranges is not None
         seen = np.unique(self.rays.surface) if self.rays is not None else np.zeros(0, dtype=np.int64)
         self.seen = seen
-        self.anchors = len(recording.anchors) if self.heard else 0
+        self.anchors = len(recording.anchors) if self.has_ranges else 0
         self.layout = _Layout(len(self.frames), self.anchors, len(seen))
         self.x = self._start()
 
@@ -168,7 +168,7 @@ class Oracle:
         matrix = sparse_part.toarray()
         if self.rays is not None:
             self._add_rays(matrix, gradient)
-        if self.heard:
+        if self.has_ranges:
             self._add_ranges(matrix, gradient)
         return matrix, gradient
 

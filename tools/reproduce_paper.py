@@ -72,7 +72,7 @@ class Task:
     runs: tuple[Run, ...]
 
 
-def heard(trial: Trial, nodes: tuple[int, ...]) -> Trial:
+def with_anchors(trial: Trial, nodes: tuple[int, ...]) -> Trial:
     """Return the recording as if only these anchors, counted from 1, had been there."""
     ranges = trial.log.ranges
     if not nodes or ranges is None:
@@ -95,7 +95,7 @@ def work(task: Task) -> list[tuple[tuple[str, ...], Figures]]:
     done = []
     for run in task.runs:
         config = override(preset(run.preset), run.changes)
-        some = heard(trial, run.nodes)
+        some = with_anchors(trial, run.nodes)
         result = build_map(some.log, config, clock=time.perf_counter)
         if run.picture:
             draw(result, run.picture, f"{run.preset}: {run.key[1]}")

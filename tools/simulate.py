@@ -19,7 +19,7 @@ from pathlib import Path
 from simulation.logfile import write
 from simulation.plans import PLANS
 from simulation.radio import NLOS_LEVELS, RadioModel
-from simulation.recording import Lie, Settings, simulate, with_overrides
+from simulation.recording import FalseRanges, Settings, simulate, with_overrides
 
 
 def numbers(text: str) -> tuple[float, ...]:
@@ -32,10 +32,10 @@ def whole_numbers(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in text.split(","))
 
 
-def lie(text: str) -> Lie:
+def false(text: str) -> FalseRanges:
     """Read ANCHOR:START:SECONDS:METRES."""
     anchor, start, seconds, metres = text.split(":")
-    return Lie(int(anchor), float(start), float(seconds), float(metres))
+    return FalseRanges(int(anchor), float(start), float(seconds), float(metres))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     add("--zeros", type=float, help="share of ranges that are zero (0)")
     add(
         "--lie",
-        type=lie,
+        type=false,
         action="append",
         metavar="ANCHOR:START:SECONDS:METRES",
         help="anchor is wrong for a while; repeatable",
@@ -99,9 +99,11 @@ def settings_from(args: argparse.Namespace) -> Settings:
     told = vars(args)
     radio = {name[6:]: told.pop(name) for name in list(told) if name.startswith("range_")}
     radio_model = replace(RadioModel(), **{k: v for k, v in radio.items() if v is not None})
-    lies, without = told.pop("lie"), told.pop("without")
+    false_ranges, without = told.pop("lie"), told.pop("without")
     values = {k: v for k, v in told.items() if k not in ("out", "gzip")}
-    return with_overrides(Settings(), radio=radio_model, lies=tuple(lies or ()), without=tuple(without or ()), **values)
+    return with_overrides(
+        Settings(), radio=radio_model, false_ranges=tuple(false_ranges or ()), without=tuple(without or ()), **values
+    )
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -13,7 +13,7 @@ from .errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)
-class KnownAnchor:
+class GivenAnchor:
     """An anchor whose place is known."""
 
     id: str = ""
@@ -27,7 +27,7 @@ class KnownAnchor:
 
 
 @dataclass(frozen=True, slots=True)
-class KnownPose:
+class GivenPose:
     """Where the robot was at a time."""
 
     stamp: float = 0.0
@@ -41,7 +41,7 @@ class KnownPose:
 
 
 @dataclass(frozen=True, slots=True)
-class KnownDistance:
+class GivenDistance:
     """The distance between two anchors."""
 
     anchors: tuple[str, str] = ("", "")
@@ -53,7 +53,7 @@ class KnownDistance:
 
 
 @dataclass(frozen=True, slots=True)
-class KnownLandmark:
+class GivenLandmark:
     """Something that the lidar sees, by its place in the map as it comes out without distances to it."""
 
     name: str = ""
@@ -65,7 +65,7 @@ class KnownLandmark:
 
 
 @dataclass(frozen=True, slots=True)
-class KnownLandmarkDistance:
+class GivenLandmarkDistance:
     """The true distance between two landmarks; of columns, between their centres."""
 
     landmarks: tuple[str, str] = ("", "")
@@ -77,7 +77,7 @@ class KnownLandmarkDistance:
 
 
 @dataclass(frozen=True, slots=True)
-class KnownClosure:
+class GivenClosure:
     """Two times at which the robot was at the same place, or places at a known pose to each other."""
 
     stamps: tuple[float, float] = (0.0, 0.0)
@@ -106,13 +106,13 @@ class ForbiddenClosure:
 class Constraints:
     """Everything that is known beforehand."""
 
-    anchors: tuple[KnownAnchor, ...] = ()
-    poses: tuple[KnownPose, ...] = ()
-    distances: tuple[KnownDistance, ...] = ()
-    closures: tuple[KnownClosure, ...] = ()
+    anchors: tuple[GivenAnchor, ...] = ()
+    poses: tuple[GivenPose, ...] = ()
+    distances: tuple[GivenDistance, ...] = ()
+    closures: tuple[GivenClosure, ...] = ()
     forbidden: tuple[ForbiddenClosure, ...] = ()
-    landmarks: tuple[KnownLandmark, ...] = ()
-    landmark_distances: tuple[KnownLandmarkDistance, ...] = ()
+    landmarks: tuple[GivenLandmark, ...] = ()
+    landmark_distances: tuple[GivenLandmarkDistance, ...] = ()
 
     def __add__(self, other: "Constraints") -> "Constraints":
         """Return both together; of one anchor's places the other's counts."""

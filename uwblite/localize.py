@@ -70,8 +70,8 @@ def localize(
     ------
     DataError : the recording does not hear two of the map's anchors, and there are no walls to compare.
     """
-    heard = set(log.ranges.anchor_ids) if log.ranges is not None else set()
-    shared = [a.id for a in anchors.anchors if a.id in heard]
+    measured = set(log.ranges.anchor_ids) if log.ranges is not None else set()
+    shared = [a.id for a in anchors.anchors if a.id in measured]
     alone = len(shared) < 2
     if alone and (grid is None or log.scans is None):
         raise DataError(
@@ -121,7 +121,7 @@ def _laid_over(result: MapResult, grid: OccupancyGrid, *, anywhere: bool) -> Loc
 
 _GATE = 0.15
 """m; walls farther apart do not lie on one another."""
-_SETTLED = 0.005
+_CONVERGED = 0.005
 """m and rad; the last step of an alignment that has converged, a tenth of a cell."""
 _LEAST_MATCHES = 10
 _ITERATIONS = 40
@@ -166,7 +166,7 @@ def _fit(pose: Floats, overlap: float, rmse: float, matches: int, step: float) -
     reason = "step below tolerance"
     if matches < _LEAST_MATCHES:
         reason = f"no overlap: {matches} wall points have a partner"
-    elif step > _SETTLED:
+    elif step > _CONVERGED:
         reason = f"stopped after {_ITERATIONS} iterations, still moving"
     return _Fit(pose, float(overlap), float(rmse), reason == "step below tolerance", reason)
 

@@ -70,11 +70,11 @@ def build_map(
         logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
         task = replace(task, recordings=gather(logs, config.keyframes))
         estimate = radio_stages.first_optimisation(task)
-    said = stages.mark()
+    before = stages.mark()
     renamed = anchor_moves.first_with_moves_apart(estimate, task, logs)
     for _ in range(_MOST_MOVES):
         if renamed is not None:
-            stages.back_to(said)
+            stages.back_to(before)
             task = replace(task, recordings=gather(renamed, config.keyframes))
             estimate = radio_stages.first_optimisation(task)
         for stage in _stages(task):

@@ -97,15 +97,15 @@ def test_a_robot_that_fell_asleep_is_woken_and_its_gap_told():
             yield Pose(1e6, 0.0, 0.0, 0.0)
 
     device, _ = emulated(Still())
-    receive, heard = device.receive, []
+    receive, received = device.receive, []
 
     def sleepy(data, now):
-        heard.append((now, data))
+        received.append((now, data))
         return receive(data, now) if not 1005.0 < now < 1012.0 else b""
 
     device.receive = sleepy
     session_actions, _ = simulate(Create2Driver(), _Asleep(device), 20.0)
-    assert sum(data == b"\x80" for _, data in heard) > 3
+    assert sum(data == b"\x80" for _, data in received) > 3
     assert sum(event.count for event in of_kind(session_actions, Lost)) == pytest.approx(7 / 0.015, rel=0.2)
     assert not of_kind(session_actions, Note)  # shorter than an encoder may take to turn by half its range
 

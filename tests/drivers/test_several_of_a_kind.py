@@ -30,9 +30,9 @@ def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever
     lines = [line.split() for line in (tmp_path / "run.log").read_text().splitlines()]
     beams = {name: {int(line[8]) for line in lines if line[0] == name} for name in ("ROBOTLASER1", "ROBOTLASER2")}
     assert beams == {"ROBOTLASER1": {450}, "ROBOTLASER2": {360}}
-    told = {line[1]: line[2] for line in lines if line[0] == "PARAM"}
-    assert float(told["laser_range_min"]) == 0.02
-    assert float(told["laser2_range_min"]) == 0.12
+    stated = {line[1]: line[2] for line in lines if line[0] == "PARAM"}
+    assert float(stated["laser_range_min"]) == 0.02
+    assert float(stated["laser2_range_min"]) == 0.12
     log = read_log(tmp_path / "run.log")
     assert log.scans.ranges.shape[1] == 450
     assert log.notes.skipped["ROBOTLASER2"] > 15

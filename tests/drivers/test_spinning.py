@@ -139,9 +139,9 @@ def test_model_and_health_are_told(name):
     device, turns = emulator(name, health=b"\x02\x01\x00")
     session = open_device("lidar", SPECS[name])[0]
     actions, _, _ = run(name, 3.0, device=(device, turns), session=session)
-    told = {param.name: param.value for param in of_kind(actions, Param)}
-    assert told["laser_serial"] == bytes(range(16)).hex().upper()
-    assert told["laser_firmware"] == "1.29"
+    stated = {param.name: param.value for param in of_kind(actions, Param)}
+    assert stated["laser_serial"] == bytes(range(16)).hex().upper()
+    assert stated["laser_firmware"] == "1.29"
     assert [(note.level, note.name) for note in of_kind(actions, Note)] == [("error", "lidar-health")]
     assert session.driver.identity().findings
 

@@ -95,11 +95,11 @@ def test_distances_as_a_trajectory_draws_them():
 def test_walls_of_a_perfect_map():
     posts = np.column_stack([COLUMNS.positions, COLUMNS.radii])
     path = np.array([[4.0, 3.5], [1.0, 1.0], [7.0, 6.0], [1.0, 6.0], [7.0, 1.0]])
-    good = wall_errors(drawn(noise=0.0), ROOM, posts, path, sight=6.0)
+    good = wall_errors(drawn(noise=0.0), ROOM, posts, path, reach=6.0)
     assert good.precision == 1.0
     assert good.recall > 0.99
     assert good.distance_rms < CELL
-    away = wall_errors(drawn(noise=0.0) + 0.3, ROOM, posts, path, sight=6.0)
+    away = wall_errors(drawn(noise=0.0) + 0.3, ROOM, posts, path, reach=6.0)
     assert away.precision < 0.3
     assert away.recall < 0.3
     empty = wall_errors(np.empty((0, 2)), ROOM, posts, path)

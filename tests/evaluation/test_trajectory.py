@@ -9,7 +9,7 @@ from uwblite.errors import DataError
 from uwblite.evaluation.trajectory import evaluate_anchors, evaluate_trajectory, statistics, stretches
 
 
-def a_drive(n=400, seed=0):
+def a_recording(n=400, seed=0):
     rng = np.random.default_rng(seed)
     step = np.stack([rng.uniform(0.0, 0.1, n), np.zeros(n), rng.normal(0, 0.1, n)], axis=1)
     poses = [np.array([3.0, -2.0, 0.7])]
@@ -28,7 +28,7 @@ def test_statistics_of_known_errors():
 
 
 def test_no_error_in_another_frame_and_at_other_stamps():
-    stamps, poses = a_drive()
+    stamps, poses = a_recording()
     moved = se2.compose(np.array([5.0, 1.0, 2.5]), poses)
     between = 0.5 * (stamps[:-1] + stamps[1:])
     truth = se2.interpolate_trajectory(stamps, poses, between)
@@ -40,7 +40,7 @@ def test_no_error_in_another_frame_and_at_other_stamps():
 
 
 def test_noise_is_measured_at_its_size():
-    stamps, poses = a_drive(4000)
+    stamps, poses = a_recording(4000)
     noise = np.random.default_rng(2).normal(0, (0.05, 0.05, 0.02), poses.shape)
     found = evaluate_trajectory(stamps, poses + noise, stamps, poses)
     assert found.ate.rmse == pytest.approx(0.05 * np.sqrt(2), rel=4 / np.sqrt(2 * 4000))
@@ -48,13 +48,13 @@ def test_noise_is_measured_at_its_size():
 
 
 def test_scale_error_stays_in_the_figure():
-    stamps, poses = a_drive()
+    stamps, poses = a_recording()
     longer = poses * [1.1, 1.1, 1.0]
     assert evaluate_trajectory(stamps, longer, stamps, poses).ate.rmse > 0.05 * np.std(poses[:, :2])
 
 
 def test_truth_without_heading_is_judged_by_position_only():
-    stamps, poses = a_drive()
+    stamps, poses = a_recording()
     truth = poses * [1.0, 1.0, 0.0]
     found = evaluate_trajectory(stamps, poses, stamps, truth)
     assert found.heading is None
@@ -63,7 +63,7 @@ def test_truth_without_heading_is_judged_by_position_only():
 
 
 def test_gaps_and_ends_of_the_estimate_are_left_out():
-    stamps, poses = a_drive()
+    stamps, poses = a_recording()
     keep = (stamps < 5.0) | (stamps > 8.0)
     found = evaluate_trajectory(stamps[keep], poses[keep], np.append(stamps, 100.0), np.vstack([poses, poses[-1:]]))
     left = np.append(stamps, 100.0)[found.matched]
@@ -72,14 +72,14 @@ def test_gaps_and_ends_of_the_estimate_are_left_out():
 
 
 def test_other_clock_is_an_error_that_says_so():
-    stamps, poses = a_drive()
+    stamps, poses = a_recording()
     with pytest.raises(DataError, match=r"only 0 of 400 .*same recording and clock"):
         evaluate_trajectory(stamps, poses, stamps + 1e6, poses)
 
 
 @pytest.mark.parametrize("length", [0, 1])
 def test_an_estimate_of_one_pose_or_none_cannot_be_compared(length):
-    stamps, poses = a_drive(5)
+    stamps, poses = a_recording(5)
     with pytest.raises(DataError, match=r"only 0 of 5 true stamps \(0.000 .. 0.200 s\) lie within the trajectory"):
         evaluate_trajectory(stamps[:length], poses[:length], stamps, poses)
     with pytest.raises(DataError, match=rf"only {length} of {length} true stamps"):
@@ -112,7 +112,7 @@ def test_agrees_with_evo(tmp_path, delta):
     from evo.core import metrics, sync, trajectory
     from evo.tools import file_interface
 
-    stamps, poses = a_drive(2000, seed=3)
+    stamps, poses = a_recording(2000, seed=3)
     noisy = poses + np.cumsum(np.random.default_rng(4).normal(0, 2e-3, poses.shape), axis=0)
     moved = se2.compose(np.array([8.0, -3.0, 1.9]), noisy)
     for name, rows in (("truth.tum", poses), ("estimate.tum", moved)):

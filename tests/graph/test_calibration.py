@@ -17,18 +17,18 @@ from uwblite.graph.calibration import (
 from uwblite.graph.graph import Calibration, Graph
 
 IDS = ("1E05", "5C0B", "91A3")
-TOLD = np.array([False, True, False])
+GIVEN = np.array([False, True, False])
 
 
 def test_every_unknown_has_a_name_of_its_own_a_unit_and_a_meaning():
-    listed = unknowns(CalibrationConfig(), IDS, TOLD)
+    listed = unknowns(CalibrationConfig(), IDS, GIVEN)
     assert len({u.key.label for u in listed}) == len(listed)
     assert all(u.unit and u.meaning and u.sigma > 0 for u in listed)
     assert {f"bias:{a}" for a in IDS} <= {u.key.label for u in listed}
 
 
 def test_height_is_unknown_only_where_nobody_told():
-    names = {u.key.label for u in unknowns(CalibrationConfig(), IDS, TOLD)}
+    names = {u.key.label for u in unknowns(CalibrationConfig(), IDS, GIVEN)}
     assert {n for n in names if n.startswith("height2:")} == {"height2:1E05", "height2:91A3"}
 
 
@@ -43,14 +43,14 @@ def test_height_is_unknown_only_where_nobody_told():
     ],
 )
 def test_a_prior_of_zero_switches_its_unknowns_off_and_no_others(field, names):
-    every = {u.key.label for u in unknowns(CalibrationConfig(), IDS, TOLD)}
-    left = {u.key.label for u in unknowns(CalibrationConfig(**{field: 0.0}), IDS, TOLD)}
+    every = {u.key.label for u in unknowns(CalibrationConfig(), IDS, GIVEN)}
+    left = {u.key.label for u in unknowns(CalibrationConfig(**{field: 0.0}), IDS, GIVEN)}
     assert every - left == names
     assert left <= every
 
 
 def test_priors_weigh_one_standard_deviation_as_one():
-    listed = unknowns(CalibrationConfig(), IDS, TOLD)
+    listed = unknowns(CalibrationConfig(), IDS, GIVEN)
     sigma = np.array([u.sigma for u in listed])
     graph = Graph(np.zeros((1, 3)), calibration=Calibration(block(listed).keys, 2.0 * sigma))
     residuals = prior_edges(listed).residuals(graph)
@@ -60,31 +60,31 @@ def test_priors_weigh_one_standard_deviation_as_one():
 
 def test_a_height_of_so_much_is_a_prior_on_its_square():
     with_heights, without = (
-        sorted(u.sigma for u in unknowns(CalibrationConfig(anchor_height=3.0), IDS, given)) for given in (TOLD, ~TOLD | TOLD)
+        sorted(u.sigma for u in unknowns(CalibrationConfig(anchor_height=3.0), IDS, given)) for given in (GIVEN, ~GIVEN | GIVEN)
     )
     assert [s for s in with_heights if s > 1.0] == [9.0, 9.0]
     assert not [s for s in without if s > 1.0]
 
 
 def test_what_is_freed_joins_what_was_free():
-    listed = unknowns(CalibrationConfig(), IDS, TOLD)
+    listed = unknowns(CalibrationConfig(), IDS, GIVEN)
     fixed = np.ones(len(listed), dtype=bool)
     fixed[0] = False
     graph = Graph(np.zeros((1, 3)), calibration=block(listed), fixed_calibration=fixed)
-    freed = with_free(graph, "bias", "laser_delay").fixed_calibration
-    free = {u.key.label for u, held in zip(listed, freed, strict=True) if not held}
+    released = with_free(graph, "bias", "laser_delay").fixed_calibration
+    free = {u.key.label for u, is_fixed in zip(listed, released, strict=True) if not is_fixed}
     assert free == {listed[0].key.label, "laser_delay", *(f"bias:{a}" for a in IDS)}
     assert fixed.sum() == len(listed) - 1
 
 
 def test_tables_name_the_right_scalar_in_the_right_column():
-    calibration = block(unknowns(CalibrationConfig(), IDS, TOLD))
+    calibration = block(unknowns(CalibrationConfig(), IDS, GIVEN))
     anchor = np.array([2, 0, 1, 1])
     table = range_indices(calibration, anchor, IDS)
     assert table.shape == (4, 6)
     for row, a in zip(table, anchor, strict=True):
         said = [calibration.keys[k].label if k >= 0 else None for k in row]
-        height = None if TOLD[a] else f"height2:{IDS[a]}"
+        height = None if GIVEN[a] else f"height2:{IDS[a]}"
         assert said == ["range_scale", f"bias:{IDS[a]}", height, "tag_x", "tag_y", "range_delay"]
     wheels = odometry_indices(calibration, 3)
     assert wheels.shape == (3, 4)
@@ -105,9 +105,9 @@ def test_tables_name_the_right_scalar_in_the_right_column():
 
 def test_what_is_switched_off_has_index_minus_one():
     nothing = CalibrationConfig(**dict.fromkeys(CalibrationConfig.__dataclass_fields__, 0.0))
-    calibration = block(unknowns(nothing, IDS, TOLD))
+    calibration = block(unknowns(nothing, IDS, GIVEN))
     assert calibration.keys == ()
-    assert len(prior_edges(unknowns(nothing, IDS, TOLD))) == 0
+    assert len(prior_edges(unknowns(nothing, IDS, GIVEN))) == 0
     assert np.all(range_indices(calibration, np.array([0, 1]), IDS) == -1)
     assert np.all(odometry_indices(calibration, 2) == -1)
     assert np.all(scan_indices(calibration) == -1)

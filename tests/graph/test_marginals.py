@@ -56,8 +56,8 @@ def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(fixed):
 
 def test_held_unknowns_have_no_covariance():
     graph, _ = calibrated()
-    held = replace(graph, fixed_poses=np.arange(60) % 7 == 0, fixed_anchors=np.array([False, True, False]))
-    covariance, found = dense_covariance(held), marginals(held)
+    is_fixed = replace(graph, fixed_poses=np.arange(60) % 7 == 0, fixed_anchors=np.array([False, True, False]))
+    covariance, found = dense_covariance(is_fixed), marginals(is_fixed)
     assert not found.poses[7].any()
     assert not found.anchors[1].any()
     np.testing.assert_allclose(found.poses[8], covariance("poses", 8, "poses", 8), rtol=1e-6)

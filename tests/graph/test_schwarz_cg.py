@@ -12,7 +12,7 @@ from uwblite.graph.schwarz_cg import TwoLevelFactor
 from uwblite.graph.solver import linearize, optimize
 
 
-def tied(n, each=5, seed=0, held=()):
+def tied(n, each=5, seed=0, is_fixed=()):
     """Return a graph of n poses wandering in a room, each tied to others near by, started 2 cm and 10 mrad off."""
     rng = np.random.default_rng(seed)
     truth = np.column_stack([4.0 * np.cos(0.37 * np.arange(n)), 4.0 * np.sin(0.23 * np.arange(n)), rng.uniform(-3, 3, n)])
@@ -22,7 +22,7 @@ def tied(n, each=5, seed=0, held=()):
     ties = relative_edges(truth, i[near], j[near], [0.02, 0.02, 0.01], rng)
     start = se2.compose(truth, rng.normal(0, 1, (n, 3)) * [0.02, 0.02, 0.01])
     start[0] = truth[0]
-    fixed = np.isin(np.arange(n), [0, *held])
+    fixed = np.isin(np.arange(n), [0, *is_fixed])
     return Graph(start, edges=(steps, ties), fixed_poses=fixed), truth
 
 
@@ -34,9 +34,9 @@ def system(graph):
     return normal
 
 
-@pytest.mark.parametrize("held", [(), (5, 17, 40), (599,)])
-def test_solutions_are_those_of_the_dense_matrix(held):
-    graph, _ = tied(600, 20, held=held)
+@pytest.mark.parametrize("is_fixed", [(), (5, 17, 40), (599,)])
+def test_solutions_are_those_of_the_dense_matrix(is_fixed):
+    graph, _ = tied(600, 20, is_fixed=is_fixed)
     normal = system(graph)
     factor = normal.factor(np.zeros(normal.unknowns.size))
     assert isinstance(factor, TwoLevelFactor)

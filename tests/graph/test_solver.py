@@ -42,7 +42,7 @@ def in_solver_order(normal, number):
     return order
 
 
-def mixed(seed, **held):
+def mixed(seed, **is_fixed):
     """Return a graph with every kind of edges, robust kernels and weights, and a prior that makes it definite."""
     graph, kinds = every_kind(seed)
     rng = np.random.default_rng(seed)
@@ -54,10 +54,10 @@ def mixed(seed, **held):
     for name, count, width in (("poses", 6, 3), ("anchors", 3, 2), ("calibration", 14, 1)):
         prior = rng.normal(size=(count, width)), np.tile(0.5 * np.eye(width), (count, 1, 1))
         edges.append(PriorEdges(name, np.arange(count), *prior))
-    return replace(graph.with_edges(*edges), **held)
+    return replace(graph.with_edges(*edges), **is_fixed)
 
 
-HELD = [
+FIXED = [
     {},
     {"fixed_poses": np.zeros(6, dtype=bool)},
     {"fixed_poses": np.array([False, True, True, False, False, False]), "fixed_anchors": np.array([True, False, True])},
@@ -68,9 +68,9 @@ HELD = [
 ]
 
 
-@pytest.mark.parametrize("held", HELD, ids=lambda h: "+".join(h) or "default")
-def test_normal_equations_equal_a_dense_assembly(held):
-    graph = mixed(1, **held)
+@pytest.mark.parametrize("is_fixed", FIXED, ids=lambda h: "+".join(h) or "default")
+def test_normal_equations_equal_a_dense_assembly(is_fixed):
+    graph = mixed(1, **is_fixed)
     normal = filled(graph)
     H, g, number = dense_system(graph)
     order = in_solver_order(normal, number)
@@ -213,12 +213,12 @@ def test_an_outlier_bends_the_robust_minimum_less():
 def test_held_unknowns_stay_where_they_are():
     rng = np.random.default_rng(5)
     graph, _, _ = loop(5)
-    held_poses, held_anchors = rng.random(len(graph.poses)) < 0.2, np.array([True, False, False])
-    held = replace(graph, fixed_poses=held_poses, fixed_anchors=held_anchors)
-    found, summary = optimize(held)
-    np.testing.assert_array_equal(found.poses[held_poses], graph.poses[held_poses])
+    some_poses, some_anchors = rng.random(len(graph.poses)) < 0.2, np.array([True, False, False])
+    is_fixed = replace(graph, fixed_poses=some_poses, fixed_anchors=some_anchors)
+    found, summary = optimize(is_fixed)
+    np.testing.assert_array_equal(found.poses[some_poses], graph.poses[some_poses])
     np.testing.assert_array_equal(found.anchors[0], graph.anchors[0])
-    assert np.all(np.any(found.poses[~held_poses] != graph.poses[~held_poses], axis=1))
+    assert np.all(np.any(found.poses[~some_poses] != graph.poses[~some_poses], axis=1))
     assert summary.chi2 < summary.chi2_initial
 
 
@@ -327,9 +327,9 @@ def test_poses_move_along_arcs_and_headings_stay_wrapped():
     assert np.all(np.abs(there.poses[:, 2]) <= np.pi)
 
 
-@pytest.mark.parametrize("held", HELD[:4], ids=lambda h: "+".join(h) or "default")
-def test_link_by_link_is_the_same_step_to_first_order(held):
-    graph = mixed(3, **held)
+@pytest.mark.parametrize("is_fixed", FIXED[:4], ids=lambda h: "+".join(h) or "default")
+def test_link_by_link_is_the_same_step_to_first_order(is_fixed):
+    graph = mixed(3, **is_fixed)
     normal = filled(graph)
     step = np.random.default_rng(0).normal(size=normal.unknowns.size)
     linked = np.array([True, True, False, True, True])

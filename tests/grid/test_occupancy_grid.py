@@ -418,8 +418,8 @@ def test_a_grid_too_large_is_refused_before_it_is_allocated():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 50e6
-    told = []
+    reported = []
     sweeps = Sweeps(room_scans(drive(3)), drive(3))
-    grid = from_sweeps([sweeps], announce=told.append)
-    assert told[0].cells >= grid.geometry.cells
-    assert told[0].megabytes == pytest.approx(told[0].cells * 12e-6)
+    grid = from_sweeps([sweeps], announce=reported.append)
+    assert reported[0].cells >= grid.geometry.cells
+    assert reported[0].megabytes == pytest.approx(reported[0].cells * 12e-6)

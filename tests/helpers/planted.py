@@ -52,7 +52,9 @@ def odometry(stamps, truth, rng=None, scale=1.0, turn_scale=1.0, drift=0.0, nois
     return Odometry(stamps, chain(np.zeros(3), said))
 
 
-def ranges(rng, stamps, truth, anchors, rate=2.0, sigma=0.05, bias=None, outliers=0.0, tag=(0.0, 0.0), heard=None) -> UwbRanges:
+def ranges(
+    rng, stamps, truth, anchors, rate=2.0, sigma=0.05, bias=None, outliers=0.0, tag=(0.0, 0.0), in_reach=None
+) -> UwbRanges:
     """Return ranges to anchors (a, 2), one at a time round robin, stamped between the poses.
 
     bias : (a,) m. outliers : share of the ranges that are 0.5 to 5 m long or short. heard : (a, 2) s, first and last time.
@@ -60,14 +62,14 @@ def ranges(rng, stamps, truth, anchors, rate=2.0, sigma=0.05, bias=None, outlier
     count = int((stamps[-1] - stamps[0]) * rate * len(anchors))
     times = np.sort(rng.uniform(stamps[0], stamps[-1], count))
     which = np.arange(count) % len(anchors)
-    if heard is not None:
-        audible = (times >= np.asarray(heard)[which, 0]) & (times <= np.asarray(heard)[which, 1])
+    if in_reach is not None:
+        audible = (times >= np.asarray(in_reach)[which, 0]) & (times <= np.asarray(in_reach)[which, 1])
         times, which = times[audible], which[audible]
     place = se2.transform(se2.interpolate_trajectory(stamps, truth, times), np.asarray(tag))
     distance = np.hypot(*(place - anchors[which]).T) + sigma * rng.standard_normal(len(times))
     distance += 0.0 if bias is None else np.asarray(bias)[which]
-    lying = rng.random(len(times)) < outliers
-    distance[lying] += (rng.uniform(0.5, 5.0, len(times)) * np.where(rng.random(len(times)) < 0.8, 1.0, -1.0))[lying]
+    outlying = rng.random(len(times)) < outliers
+    distance[outlying] += (rng.uniform(0.5, 5.0, len(times)) * np.where(rng.random(len(times)) < 0.8, 1.0, -1.0))[outlying]
     used, index = np.unique(which, return_inverse=True)
     ids = tuple(f"A{k:02d}" for k in used)
     return UwbRanges(times, index.astype(np.int64), np.maximum(distance, 0.0), np.full(len(times), 100.0), ids)

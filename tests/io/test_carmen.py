@@ -44,8 +44,8 @@ def random_log(seed=0, beams=31, scans=23, range_max=12.0):
     ranges = np.round(rng.uniform(0.05, range_max - 0.1, (scans, beams)), 3).astype(np.float32)
     ranges[rng.random(ranges.shape) < 0.2] = np.inf
     ranges[rng.random(ranges.shape) < 0.1] = np.nan
-    heard, said = np.sort(rng.uniform(1e9, 1e9 + 10, 30)), rng.uniform(0, 20, 30)
-    uwb = UwbRanges(heard, np.arange(30) % 3, said, rng.integers(0, 101, 30).astype(float), ("1151", "5C0B", "A-1"))
+    range_stamps, distances = np.sort(rng.uniform(1e9, 1e9 + 10, 30)), rng.uniform(0, 20, 30)
+    uwb = UwbRanges(range_stamps, np.arange(30) % 3, distances, rng.integers(0, 101, 30).astype(float), ("1151", "5C0B", "A-1"))
     laser = LaserScans(np.sort(rng.uniform(1e9, 1e9 + 10, scans)), ranges, -2.0, 0.13, 1e-4, 0.03, range_max)
     heights = {"5C0B": 2.25, "A-1": 0.75}
     mounting = SensorMounting(np.array([0.1, -0.02, 3.0]), True, np.array([0.05, 0.01, 0.3]), 1.5, heights)
@@ -342,11 +342,11 @@ def test_a_broken_line_is_skipped_counted_and_named(tmp_path, line, why):
     good = "".join(ODOM.format(x=k, t=k) for k in range(500))
     log = read(tmp_path, (good + line + "\n" + good).encode("latin1"))
     assert log.notes.broken == 1
-    ((number, said),) = log.notes.broken_lines
+    ((number, distances),) = log.notes.broken_lines
     assert number == 501
-    assert why in said
-    assert said.isprintable()
-    assert len(said) <= 100
+    assert why in distances
+    assert distances.isprintable()
+    assert len(distances) <= 100
     assert len(log.odometry.stamps) == 1000
 
 

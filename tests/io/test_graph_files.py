@@ -180,8 +180,8 @@ def test_vertices_that_are_missing_are_reached_along_edges(tmp_path):
     back = read_g2o(tmp_path / "a")
     np.testing.assert_allclose(se2.between(back.graph.poses[0], back.graph.poses), se2.between(X[0], X), atol=1e-9)
     assert back.pose_ids == ("0", "10", "20", "30", "40", "50")
-    told = f"VERTEX_SE2 30 {float(X[3, 0])} {float(X[3, 1])} {float(X[3, 2])}\n"
-    (tmp_path / "a").write_text(told + "".join(lines))
+    vertex = f"VERTEX_SE2 30 {float(X[3, 0])} {float(X[3, 1])} {float(X[3, 2])}\n"
+    (tmp_path / "a").write_text(vertex + "".join(lines))
     moved = read_g2o(tmp_path / "a").graph.poses
     np.testing.assert_allclose(moved[:, :2], X[:, :2], atol=1e-9)
     np.testing.assert_allclose(se2.wrap_angle(moved[:, 2] - X[:, 2]), 0.0, atol=1e-9)

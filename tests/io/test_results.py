@@ -18,7 +18,7 @@ from helpers.results import EVIL, FILES, contents, small_log, small_result
 from uwblite.errors import ConfigError
 from uwblite.io import folders, results
 from uwblite.io.result_text import RunRecord, anchors_csv, covariance_csv
-from uwblite.io.results import check_target, is_of_result, mend_result, write_result
+from uwblite.io.results import check_target, is_of_result, repair_result, write_result
 from uwblite.io.tum import read_tum
 
 RECORD = RunRecord("uwblite map run.log --out map_again", "use_uwb = true\n", {"uwblite": "0.1.0"})
@@ -184,7 +184,7 @@ def test_a_kill_at_any_step_leaves_one_result_whole(tmp_path, monkeypatch, forei
             (folder / "mine").mkdir()
             (folder / "mine" / "notes.txt").write_text("mine")
         ended = killed_at(step, folder)
-        mend_result(folder)
+        repair_result(folder)
         found = {name: data for name, data in files_of(folder).items() if is_of_result(name)}
         assert found in (old, new), step
         assert not foreign or (folder / "mine" / "notes.txt").read_text() == "mine"

@@ -42,13 +42,13 @@ def test_rooms_are_kept_and_the_length_of_corridors_is_dropped(noise):
 def test_eigenvalues_do_not_depend_on_units_or_frame():
     rng = np.random.default_rng(7)
     half, other, change = rng.normal(size=(3, 3, 3))
-    information, feigned = half @ half.T * [10.0], 0.3 * other @ other.T + np.eye(3)
-    basis, inverse, values, vectors = relative_eigen(information, feigned)
+    information, spurious = half @ half.T * [10.0], 0.3 * other @ other.T + np.eye(3)
+    basis, inverse, values, vectors = relative_eigen(information, spurious)
     # The floor under N, 1e-9 of H, takes that share of l from an eigenvalue l of some tens.
-    np.testing.assert_allclose(values, scipy.linalg.eigh(information, feigned, eigvals_only=True), rtol=1e-6)
+    np.testing.assert_allclose(values, scipy.linalg.eigh(information, spurious, eigvals_only=True), rtol=1e-6)
     np.testing.assert_allclose(basis @ vectors @ np.diag(values) @ vectors.T @ basis.T, information, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(basis @ inverse, np.eye(3), atol=1e-12)
-    moved = relative_eigen(change @ information @ change.T, change @ feigned @ change.T)[2]
+    moved = relative_eigen(change @ information @ change.T, change @ spurious @ change.T)[2]
     np.testing.assert_allclose(moved, values, rtol=1e-5)
 
 

@@ -43,7 +43,7 @@ def test_a_noise_free_room_is_found_to_a_millimetre():
     start = drifted(np.random.default_rng(2), truth, NOISE)
     before = aligned_error(start.poses[:, :2], truth[:, :2])
     exact = Graph(start.poses).with_edges(chained(truth, NOISE * 10))
-    result = refined(exact, clouds, path, replace(CONFIG, rounds=40, settled=1e-5))
+    result = refined(exact, clouds, path, replace(CONFIG, rounds=40, convergence=1e-5))
     after = aligned_error(result.graph.poses[:, :2], truth[:, :2])
     assert before > 0.03
     assert after < 1e-3
@@ -150,13 +150,15 @@ def test_keyframes_without_any_return_are_held_by_the_wheels():
 def test_rounds_are_told_and_bounded():
     truth, path, clouds = room(7, 0.01, 8.0)
     graph = drifted(np.random.default_rng(1), truth, NOISE)
-    recording, told = np.zeros(len(truth), dtype=np.int64), []
+    recording, reported = np.zeros(len(truth), dtype=np.int64), []
     i, j = choose_pairs(clouds, graph.poses, path, recording, CONFIG)
     config = replace(CONFIG, rounds=3)
     raster = rasterize(clouds, 0.1, 0.5)
-    result = refine(graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig(), lambda *a: told.append(a))
+    result = refine(
+        graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig(), lambda *a: reported.append(a)
+    )
     assert result.rounds == 3
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert reported == [(1, 3), (2, 3), (3, 3)]
     assert len(result.edges) == result.used.sum()
     again = refine(graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig())
     assert again.graph.poses.tobytes() == result.graph.poses.tobytes()

@@ -89,8 +89,8 @@ def test_a_laser_upside_down_is_mapped_and_said():
     result = build_map(log)
     assert [d for d in result.doubts if d.kind == "laser-turned-over"]
     assert evaluate_trajectory(stamps, result.trajectory, stamps, truth).ate.rmse < 0.03
-    told = build_map(replace(log, mounting=DOWN))
-    assert not [d for d in told.doubts if d.kind == "laser-turned-over"]
-    np.testing.assert_array_equal(told.trajectory, result.trajectory)
+    reported = build_map(replace(log, mounting=DOWN))
+    assert not [d for d in reported.doubts if d.kind == "laser-turned-over"]
+    np.testing.assert_array_equal(reported.trajectory, result.trajectory)
     believed = build_map(log, MappingConfig(detect_laser_flip=False))
     assert not [d for d in believed.doubts if d.kind == "laser-turned-over"]

@@ -117,8 +117,8 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
         slide = np.column_stack([
             (residual(pose[e] + d, normal=along) - residual(pose[e] - d, normal=along)) / (2 * step) for d in step * np.eye(3)
         ])
-        feigned = (slide * (w * scatter)[:, None]).T @ slide
-        np.testing.assert_allclose(factors.feigned[e], feigned, rtol=1e-4, atol=1e-4 * np.abs(feigned).max())
+        spurious = (slide * (w * scatter)[:, None]).T @ slide
+        np.testing.assert_allclose(factors.spurious[e], spurious, rtol=1e-4, atol=1e-4 * np.abs(spurious).max())
 
         def cost(x, residual=residual):
             s = residual(x) ** 2
@@ -128,7 +128,7 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
         np.testing.assert_allclose(factors.gradient[e], slope, rtol=1e-4, atol=1e-6)
 
 
-def settled(clouds, raster, i, j, guess, gates=(0.4, 0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1)):
+def converged(clouds, raster, i, j, guess, gates=(0.4, 0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1)):
     """Return the poses after rounds of matching and stepping, and the last factors and measurement."""
     points, pose = pair_points(clouds, j, 200), guess.copy()
     for gate in gates:
@@ -146,7 +146,7 @@ def test_known_motions_are_recovered(noise):
     i, j = np.triu_indices(8, 1)
     exact = se2.between(truth[i], truth[j])
     guess = exact + np.column_stack([rng.uniform(-0.15, 0.15, (len(i), 2)), rng.uniform(-0.08, 0.08, len(i))])
-    _, factors, pose, root = settled(clouds, rasterize(clouds, 0.04, 0.4), i, j, guess)
+    _, factors, pose, root = converged(clouds, rasterize(clouds, 0.04, 0.4), i, j, guess)
     error = se2.between(exact, pose)
     # Noise-free: what is left comes from averaging in cells of 0.02 m on slanting walls and at corners.
     variance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
@@ -163,7 +163,7 @@ def test_a_corridor_constrains_across_and_not_along():
     exact = se2.between(truth[0], truth[1])
     along = se2.rotate(-truth[0, 2], np.array([1.0, 0.0]))
     guess = exact + np.array([*(0.1 * along), 0.0])
-    _, _, pose, root = settled(clouds, rasterize(clouds, 0.04, 0.4), i, j, guess[None])
+    _, _, pose, root = converged(clouds, rasterize(clouds, 0.04, 0.4), i, j, guess[None])
     information = root[0].T @ root[0]
     shift = se2.rotate(-pose[0, 2], along)
     assert np.array([*shift, 0.0]) @ information @ np.array([*shift, 0.0]) < 1e-9 * np.trace(information)
@@ -174,11 +174,11 @@ def test_a_corridor_constrains_across_and_not_along():
     assert abs(pose[0, 2] - exact[2]) < 0.002
 
 
-def factors_of(hessian, gradient, feigned=None) -> PairFactors:
+def factors_of(hessian, gradient, spurious=None) -> PairFactors:
     """Return the factors of one pair with this quadratic form."""
     one = np.ones(1)
-    feigned = np.zeros((3, 3)) if feigned is None else feigned
-    return PairFactors(hessian[None], feigned[None], gradient[None], one.astype(int), one.astype(int), one, one)
+    spurious = np.zeros((3, 3)) if spurious is None else spurious
+    return PairFactors(hessian[None], spurious[None], gradient[None], one.astype(int), one.astype(int), one, one)
 
 
 def quadratic_form(rng, rank):
@@ -209,13 +209,13 @@ def test_a_measurement_has_the_cost_of_its_factors(seed, rank):
 def test_what_scatter_feigns_is_taken_off_and_never_more(seed):
     """0 <= information <= H, and a direction in which H is less than what scatter feigns twice says nothing."""
     rng = np.random.default_rng(seed)
-    (hessian, gradient), (feigned, _) = quadratic_form(rng, 3), quadratic_form(rng, 3)
-    feigned *= 10 ** rng.uniform(-3, 1)
-    step, root = nondegenerate_step(factors_of(hessian, gradient, feigned))
+    (hessian, gradient), (spurious, _) = quadratic_form(rng, 3), quadratic_form(rng, 3)
+    spurious *= 10 ** rng.uniform(-3, 1)
+    step, root = nondegenerate_step(factors_of(hessian, gradient, spurious))
     information = root[0].T @ root[0]
     size = np.trace(hessian)
     assert np.linalg.eigvalsh(hessian - information).min() > -1e-6 * size
-    lost = np.linalg.eigvals(np.linalg.solve(feigned, hessian)).real < 2.0
+    lost = np.linalg.eigvals(np.linalg.solve(spurious, hessian)).real < 2.0
     assert np.linalg.matrix_rank(information, tol=1e-9 * size) == 3 - lost.sum()
     if not lost.any():
         np.testing.assert_allclose(step[0], -np.linalg.solve(hessian, gradient), rtol=1e-5, atol=1e-8)

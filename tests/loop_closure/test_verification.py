@@ -243,9 +243,9 @@ def test_a_wide_uncertainty_is_searched(hall, closures):
     exact = true_poses(hall, one)
     off = np.column_stack([rng.uniform(-0.8, 0.8, (len(pairs), 2)), rng.uniform(-0.3, 0.3, len(pairs))])
     one = replace(one, guess=exact + off)
-    told = []
-    found = find(one, hall[3], CONFIG, SEARCH, lambda done, total: told.append((done, total)))
-    assert told == [(len(pairs), len(pairs))]
+    reported = []
+    found = find(one, hall[3], CONFIG, SEARCH, lambda done, total: reported.append((done, total)))
+    assert reported == [(len(pairs), len(pairs))]
     assert len(found.edges) >= len(pairs) // 2
     good = [k for k, c in enumerate(found.candidates) if c.accepted]
     error = se2.between(exact[good], found.edges.T_i_j)
@@ -279,11 +279,11 @@ def planted_closures(rng, truth, count, false_share) -> tuple[Closures, np.ndarr
     pose[false] += rng.uniform(0.5, 2.0, (false.sum(), 3)) * [1.0, 1.0, 0.2]
     root = np.tile(np.diag([100.0, 100.0, 250.0]), (count, 1, 1))
     information = root @ root
-    story = tuple(
+    records = tuple(
         LoopClosure(int(a), int(b), z, h, 0.01, 0.9, "accepted", "planted")
         for a, b, z, h in zip(i, j, pose, information, strict=True)
     )
-    return Closures(RelativePoseEdges(i, j, pose, root), story), false
+    return Closures(RelativePoseEdges(i, j, pose, root), records), false
 
 
 @pytest.mark.parametrize("seed", range(3))

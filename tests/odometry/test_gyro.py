@@ -62,9 +62,9 @@ def test_where_the_gyro_is_silent_the_wheels_turn():
     rng = np.random.default_rng(3)
     stamps, truth = rested(*planted.wander(rng, 20.0))
     gyro = gyro_of(stamps, truth, bias=0.0)
-    heard = (gyro.stamps < 15.0) | (gyro.stamps > 25.0)
+    read = (gyro.stamps < 15.0) | (gyro.stamps > 25.0)
     wheels = planted.odometry(stamps, truth)
-    log, _ = heading_from_gyro(SensorLog(wheels, gyro=Gyro(gyro.stamps[heard], gyro.heading[heard])))
+    log, _ = heading_from_gyro(SensorLog(wheels, gyro=Gyro(gyro.stamps[read], gyro.heading[read])))
     assert np.abs(se2.wrap_angle(log.odometry.poses[:, 2] - wheels.poses[:, 2])).max() < 5e-3
     silent = Gyro(np.array([1e6, 1e6 + 1.0]), np.zeros(2))
     same, remarks = heading_from_gyro(SensorLog(wheels, gyro=silent))

@@ -15,7 +15,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.graph.solver import optimize
 from uwblite.odometry.keyframes import KeyframeConfig, select
-from uwblite.odometry.wheels import OdometryNoiseConfig, learn_wheels, wheel_edges
+from uwblite.odometry.wheels import OdometryNoiseConfig, reestimate_wheel_noise, wheel_edges
 from uwblite.sensor_log import Odometry
 
 NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
@@ -75,13 +75,13 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
     some = np.sort(rng.permutation(len(exact))[: len(exact) // 2])
     said = exact.motion[some] + (rng.random(len(some)) < 0.1)[:, None] * np.array([0.5, 0.5, 0.3])
     steps = RelativePoseEdges(some, some + 1, said, np.tile(np.eye(3), (len(some), 1, 1)))
-    learnt = learn_wheels(wheels, steps, graph)
+    learnt = reestimate_wheel_noise(wheels, steps, graph)
     factor = np.einsum("eii->ei", exact.sqrt_information / learnt.sqrt_information.clip(1e-12))
     # Medians of 500 steps are known to 5 %; a tenth of lies moves them by 12 %.
     assert np.median(factor[:, 0]) == pytest.approx(np.clip(position, 0.5, 10.0), rel=0.3)
     assert np.median(factor[:, 2]) == pytest.approx(np.clip(heading, 0.5, 10.0), rel=0.3)
     few = RelativePoseEdges(some[:5], some[:5] + 1, said[:5], steps.sqrt_information[:5])
-    assert learn_wheels(wheels, few, graph) is wheels
+    assert reestimate_wheel_noise(wheels, few, graph) is wheels
 
 
 def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
@@ -95,7 +95,7 @@ def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
     wheels = replace(exact, motion=se2.compose(exact.motion, off))
     said = se2.compose(wheels.motion, np.column_stack([np.zeros(len(off)), se2.inverse(off)[:, 1:]]))
     blind = np.tile(np.diag([0.0, 100.0, 100.0]), (len(exact), 1, 1))
-    learnt = learn_wheels(wheels, RelativePoseEdges(exact.i, exact.j, said, blind), Graph(frames.odometry))
+    learnt = reestimate_wheel_noise(wheels, RelativePoseEdges(exact.i, exact.j, said, blind), Graph(frames.odometry))
     factor = np.einsum("eii->ei", exact.sqrt_information)[0] / np.einsum("eii->ei", learnt.sqrt_information)[0]
     assert factor == pytest.approx([1.0, 4.0, 4.0], rel=0.2)
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite import build_map, se2
-from uwblite.constraints import Constraints, KnownLandmark, KnownLandmarkDistance
+from uwblite.constraints import Constraints, GivenLandmark, GivenLandmarkDistance
 from uwblite.errors import ConfigError
 from uwblite.graph.distance_edges import PointDistanceEdges
 from uwblite.graph.graph import Graph
@@ -96,8 +96,8 @@ def wrong_wheels():
 def known(far, distance=LONG, sigma=0.02, radius=0.3):
     places = {"near": (2.0, 0.9), "far": (far, 0.9)}
     return Constraints(
-        landmarks=tuple(KnownLandmark(name, place, radius) for name, place in places.items()),
-        landmark_distances=(KnownLandmarkDistance(("near", "far"), distance, sigma),),
+        landmarks=tuple(GivenLandmark(name, place, radius) for name, place in places.items()),
+        landmark_distances=(GivenLandmarkDistance(("near", "far"), distance, sigma),),
     )
 
 
@@ -115,8 +115,8 @@ def test_a_measured_distance_gives_the_map_its_true_length(carpet):
     after = build_map(log, constraints=known(2.0 + LONG * before))
     # The tape's sigma, and a centimetre or two of each column's place.
     assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=3 * np.hypot(0.02, 0.02) / LONG)
-    told = next(s for s in after.stages if s.name == "landmark distances").figures["distances"]
-    assert told[0]["map"] == pytest.approx(LONG, abs=0.06)
+    reported = next(s for s in after.stages if s.name == "landmark distances").figures["distances"]
+    assert reported[0]["map"] == pytest.approx(LONG, abs=0.06)
     assert not [w for w in after.warnings if "measured" in w.text]
 
 
@@ -126,10 +126,10 @@ def test_a_measured_distance_calibrates_the_wheels(wrong_wheels):
     blind = MappingConfig(use_loops=False, scan_to_scan=TrackingConfig(on=False))
     assert stretch(build_map(log, blind), stamps, truth) == pytest.approx(SCALE, abs=0.003)
     names = zip(("near", "far"), (2.0, 2.0 + LONG), strict=True)
-    shrunk = replace(known(0.0), landmarks=tuple(KnownLandmark(name, (SCALE * x, 0.9), 0.3) for name, x in names))
+    shrunk = replace(known(0.0), landmarks=tuple(GivenLandmark(name, (SCALE * x, 0.9), 0.3) for name, x in names))
     after = build_map(log, blind, constraints=shrunk)
-    told = next(s for s in after.stages if s.name == "landmark distances").figures["distances"]
-    assert told[0]["map"] == pytest.approx(LONG, abs=0.06)
+    reported = next(s for s in after.stages if s.name == "landmark distances").figures["distances"]
+    assert reported[0]["map"] == pytest.approx(LONG, abs=0.06)
     # The way there alone may bend a little: the tape holds both ways together.
     assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=0.015)
     scale = next(c for c in after.calibration if c.name == "odometry_scale")
@@ -144,8 +144,8 @@ def test_places_are_those_of_the_map_as_it_is_turned(carpet):
     turn = se2.compose(walls.graph.poses[0], se2.inverse(plain.graph.poses[0]))
     places = se2.transform(turn, np.array([[2.0, 0.9], [2.0 + LONG * stretch(plain, stamps, truth), 0.9]])).tolist()
     names = zip(("near", "far"), places, strict=True)
-    told = replace(known(0.0), landmarks=tuple(KnownLandmark(name, tuple(place), 0.3) for name, place in names))
-    after = build_map(log, MappingConfig(align="walls"), constraints=told)
+    given = replace(known(0.0), landmarks=tuple(GivenLandmark(name, tuple(place), 0.3) for name, place in names))
+    after = build_map(log, MappingConfig(align="walls"), constraints=given)
     assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=3 * np.hypot(0.02, 0.02) / LONG)
 
 
@@ -156,8 +156,8 @@ def test_a_distance_that_all_else_contradicts_is_named():
     log = planted.recording(planted.odometry(stamps, truth, rng, noise=0.002, turn_noise=0.002), lidar=lidar)
     here = se2.transform(se2.inverse(truth[0]), np.array([[3.0, 2.0], [-3.0, 2.0]])).tolist()
     wrong = Constraints(
-        landmarks=(KnownLandmark("a", tuple(here[0]), 0.3), KnownLandmark("b", tuple(here[1]), 0.3)),
-        landmark_distances=(KnownLandmarkDistance(("a", "b"), 7.0, 0.05),),
+        landmarks=(GivenLandmark("a", tuple(here[0]), 0.3), GivenLandmark("b", tuple(here[1]), 0.3)),
+        landmark_distances=(GivenLandmarkDistance(("a", "b"), 7.0, 0.05),),
     )
     result = build_map(log, MappingConfig(), constraints=wrong)
     assert [w for w in result.warnings if "a - b" in w.text and "7.000 m" in w.text]
@@ -165,7 +165,7 @@ def test_a_distance_that_all_else_contradicts_is_named():
 
 def test_what_is_not_there_is_said(carpet):
     log, _, _ = carpet
-    nowhere, alone = KnownLandmark("x", (12.0, 9.0)), KnownLandmarkDistance(("x", "x"), 1.0)
+    nowhere, alone = GivenLandmark("x", (12.0, 9.0)), GivenLandmarkDistance(("x", "x"), 1.0)
     lost = Constraints(landmarks=(nowhere,), landmark_distances=(alone,))
     with pytest.raises(ConfigError, match="saw nothing within"):
         build_map(log, MappingConfig(use_loops=False), constraints=lost)
@@ -183,13 +183,13 @@ def test_a_column_is_found_beside_its_told_place():
     angle = np.linspace(0, 2 * np.pi, 60)
     ring = np.column_stack([4.0 + 0.3 * np.cos(angle), 1.0 + 0.3 * np.sin(angle)])
     pose = np.array([[1.0, 2.0, 0.7]])
-    told = tuple(se2.transform(pose[0], np.array([4.15, 0.9])).tolist())
-    found = sightings(KnownLandmark("c", told, 0.3), one_cloud(ring), pose, np.zeros(1))
+    given = tuple(se2.transform(pose[0], np.array([4.15, 0.9])).tolist())
+    found = sightings(GivenLandmark("c", given, 0.3), one_cloud(ring), pose, np.zeros(1))
     np.testing.assert_allclose(found.position, [[4.0, 1.0]], atol=0.01)
-    plain = sightings(KnownLandmark("c", told), one_cloud(ring), pose, np.zeros(1))
+    plain = sightings(GivenLandmark("c", given), one_cloud(ring), pose, np.zeros(1))
     np.testing.assert_allclose(plain.position, [[4.15, 0.9]], atol=1e-12)
     with pytest.raises(ConfigError, match=r"no column of radius 0\.6"):
-        sightings(KnownLandmark("c", told, 0.6), one_cloud(ring), pose, np.zeros(1))
+        sightings(GivenLandmark("c", given, 0.6), one_cloud(ring), pose, np.zeros(1))
 
 
 def test_all_ties_of_a_distance_weigh_as_much_as_it_does():
@@ -198,11 +198,11 @@ def test_all_ties_of_a_distance_weigh_as_much_as_it_does():
     many = clouds.Clouds(
         np.arange(n + 1) * 5, np.tile(cloud.points, (n, 1)), np.zeros((5 * n, 2)), np.repeat(np.arange(n), 5), np.zeros(5 * n)
     )
-    told = Constraints(
-        landmarks=(KnownLandmark("a", (1.0, 0.0)), KnownLandmark("b", (1.1, 0.0))),
-        landmark_distances=(KnownLandmarkDistance(("a", "b"), 3.0, 0.1), KnownLandmarkDistance(("b", "a"), 3.0, 0.2)),
+    given = Constraints(
+        landmarks=(GivenLandmark("a", (1.0, 0.0)), GivenLandmark("b", (1.1, 0.0))),
+        landmark_distances=(GivenLandmarkDistance(("a", "b"), 3.0, 0.1), GivenLandmarkDistance(("b", "a"), 3.0, 0.2)),
     )
-    tied = ties(told, many, np.zeros((n, 3)), 10.0 * np.arange(n))
+    tied = ties(given, many, np.zeros((n, 3)), 10.0 * np.arange(n))
     for number, sigma in enumerate((0.1, 0.2)):
         own = tied.edges.sigma[tied.measured == number]
         assert np.sum(own**-2.0) == pytest.approx(sigma**-2.0)

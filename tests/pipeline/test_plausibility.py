@@ -8,7 +8,7 @@ import pytest
 from helpers.planted import aligned_error, box, odometry, ranges, recording, scans, wander
 
 from uwblite import se2
-from uwblite.constraints import Constraints, KnownAnchor
+from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import OUTSIDE
@@ -69,7 +69,7 @@ def test_wheels_that_turn_against_the_laser_are_doubted(error, doubted):
 def test_known_anchors_vouch_for_the_sign():
     log = run(turn_scale=2.0)[2]
     known = Constraints(
-        anchors=tuple(KnownAnchor(name, tuple(place), 0.05) for name, place in zip(log.ranges.anchor_ids, PLACES, strict=True))
+        anchors=tuple(GivenAnchor(name, tuple(place), 0.05) for name, place in zip(log.ranges.anchor_ids, PLACES, strict=True))
     )
     result = build_map(log, constraints=known)
     assert not said(result.doubts, "mirrored")
@@ -137,10 +137,10 @@ def test_anchors_that_lie_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed)
     """Two of four anchors say 2 m too little for 40 % of the time each: wheels alone are soft enough to believe them."""
     stamps, truth, log = run(seed, walls=np.concatenate([box(13, 13), box(3, 2) + 0.5]), metres=100.0)
     radio, part = log.ranges, (log.ranges.stamps - stamps[0]) / np.ptp(stamps)
-    lie = (radio.anchor == 0) & (part > 0.1) & (part < 0.5) | (radio.anchor == 1) & (part > 0.5) & (part < 0.9)
+    outlying = (radio.anchor == 0) & (part > 0.1) & (part < 0.5) | (radio.anchor == 1) & (part > 0.5) & (part < 0.9)
     honest, lied = (
         aligned_error(build_map(replace(log, ranges=replace(radio, ranges=said))).trajectory[:, :2], truth[:, :2])
-        for said in (radio.ranges, np.maximum(radio.ranges - 2.0 * lie, 0.1))
+        for said in (radio.ranges, np.maximum(radio.ranges - 2.0 * outlying, 0.1))
     )
     assert honest < 0.03
     assert lied < 0.05
@@ -149,6 +149,6 @@ def test_anchors_that_lie_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed)
 @pytest.mark.parametrize("radio_scale", [1.0, 1.08])
 def test_ranges_or_wheels_of_another_scale_are_told(radio_scale):
     """Without a lidar nothing says which of the two is wrong, but that they differ is plain."""
-    told = said(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
-    assert len(told) == (radio_scale != 1.0)
-    assert all("scale of the wheels" in text for text in told)
+    reported = said(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
+    assert len(reported) == (radio_scale != 1.0)
+    assert all("scale of the wheels" in text for text in reported)

@@ -101,16 +101,16 @@ def test_wheels_and_biases_are_each_recording_s_own(merged):
 
 
 def test_names_of_a_further_recording_are_its_own():
-    config, told = MappingConfig().calibration, np.zeros(1, dtype=bool)
-    first, second = (unknowns(config, ("A",), told, n) for n in (0, 1))
+    config, given_heights = MappingConfig().calibration, np.zeros(1, dtype=bool)
+    first, second = (unknowns(config, ("A",), given_heights, n) for n in (0, 1))
     assert not {u.key for u in first} & {u.key for u in second}
     assert len(first) - len(second) == 5
 
 
 def test_ranges_of_all_are_counted_and_listed(two, merged):
     for k, anchor in enumerate(merged.anchors):
-        heard = sum(int(np.sum(log.ranges.anchor == k)) for log, _ in two)
-        assert anchor.ranges == heard
+        measured = sum(int(np.sum(log.ranges.anchor == k)) for log, _ in two)
+        assert anchor.ranges == measured
     assert len(merged.range_table["stamp"]) == sum(len(log.ranges.stamps) for log, _ in two)
 
 
@@ -120,9 +120,9 @@ def test_a_moved_anchor_is_named_and_stands_at_both_places(two, shift):
     logs = [two[0][0], drive(2, there, start=500.0, turn=2.0)[0]]
     result = build_map(logs)
     name = logs[0].ranges.anchor_ids[1]
-    told = [w for w in result.warnings if "was moved" in w.text]
-    assert len(told) == 1
-    assert f"anchor {name} was moved: in recording 2" in told[0].text
+    reported = [w for w in result.warnings if "was moved" in w.text]
+    assert len(reported) == 1
+    assert f"anchor {name} was moved: in recording 2" in reported[0].text
     places = {a.id: a.position for a in result.anchors}
     stamps, first = logs[0].odometry.stamps, result.trajectory[result.recording == 0]
     laid = evaluate_trajectory(stamps, first, stamps, two[0][1]).T_truth_map

@@ -109,8 +109,8 @@ def test_an_anchor_that_lies_is_named_and_bends_nothing(run):
     stamps, truth, log, good = run
     rng = np.random.default_rng(3)
     wild = (log.ranges.anchor == 2) & (rng.random(len(log.ranges.ranges)) < 0.67)
-    lying = log.ranges.ranges + np.where(wild, rng.uniform(1.0, 9.0, len(wild)), 0.0)
-    result = build_map(replace(log, ranges=replace(log.ranges, ranges=lying)))
+    with_outliers = log.ranges.ranges + np.where(wild, rng.uniform(1.0, 9.0, len(wild)), 0.0)
+    result = build_map(replace(log, ranges=replace(log.ranges, ranges=with_outliers)))
     statuses = [a.status for a in result.anchors]
     assert statuses[:2] + statuses[3:] == ["ok"] * 3
     assert statuses[2] in ("distrusted", "unplaced")

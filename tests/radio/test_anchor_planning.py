@@ -7,10 +7,10 @@ from uwblite.errors import ConfigError
 from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
 from uwblite.radio.anchor_planning import (
     SIGMA_BEHIND_WALLS,
-    SIGMA_IN_SIGHT,
+    SIGMA_LINE_OF_SIGHT,
     _coarse,
-    _in_sight,
     _information,
+    _line_of_sight,
     plan_anchors,
     position_errors,
 )
@@ -29,20 +29,20 @@ def hall(rows=60, cols=100, wall_at=None, door=range(0)):
 def test_the_error_is_that_of_least_squares():
     rng = np.random.default_rng(2)
     point, anchors = rng.uniform(0, 10, 2), rng.uniform(0, 10, (4, 2))
-    told = _information(point[None], anchors, np.ones((4, 1), dtype=bool), 100.0).sum(axis=0)[0]
+    information = _information(point[None], anchors, np.ones((4, 1), dtype=bool), 100.0).sum(axis=0)[0]
     u = (point - anchors) / np.linalg.norm(point - anchors, axis=1)[:, None]
-    covariance = np.linalg.inv(u.T @ u / SIGMA_IN_SIGHT**2 + np.eye(2) / 9.0)
-    assert position_errors(told) == pytest.approx(np.sqrt(np.trace(covariance)), rel=1e-12)
+    covariance = np.linalg.inv(u.T @ u / SIGMA_LINE_OF_SIGHT**2 + np.eye(2) / 9.0)
+    assert position_errors(information) == pytest.approx(np.sqrt(np.trace(covariance)), rel=1e-12)
     # Drawn positions scatter as it says: ranges with that noise, linearised least squares.
-    step = np.linalg.lstsq(u, SIGMA_IN_SIGHT * rng.normal(size=(4, 20_000)), rcond=None)[0]
-    assert np.sqrt(np.mean(np.sum(step**2, axis=0))) == pytest.approx(position_errors(told), rel=0.03)
+    step = np.linalg.lstsq(u, SIGMA_LINE_OF_SIGHT * rng.normal(size=(4, 20_000)), rcond=None)[0]
+    assert np.sqrt(np.mean(np.sum(step**2, axis=0))) == pytest.approx(position_errors(information), rel=0.03)
 
 
 def test_out_of_reach_tells_nothing_and_walls_tell_less():
     point, anchor = np.zeros((1, 2)), np.array([[5.0, 0.0]])
     cases = ((True, 9.0), (False, 9.0), (True, 4.0))
     near, behind, far = (_information(point, anchor, np.array([[sight]]), reach)[0, 0] for sight, reach in cases)
-    assert near[0] / behind[0] == pytest.approx((SIGMA_BEHIND_WALLS / SIGMA_IN_SIGHT) ** 2)
+    assert near[0] / behind[0] == pytest.approx((SIGMA_BEHIND_WALLS / SIGMA_LINE_OF_SIGHT) ** 2)
     assert not far.any()
 
 
@@ -63,9 +63,9 @@ def test_the_first_place_is_the_best_of_all_and_more_never_harm():
         points = np.floor((one.points - low) / cell).astype(int)[:, ::-1]
         both = np.vstack([anchors, place])
         here = np.floor((both - low) / cell).astype(int)[:, ::-1]
-        told = _information(one.points, both, _in_sight(blocked, here, points), 25.0).sum(axis=0)
+        information = _information(one.points, both, _line_of_sight(blocked, here, points), 25.0).sum(axis=0)
         # The candidates are thinned to every other cell or so: a neighbour may be better by a little.
-        assert position_errors(told).mean() > one.errors[1].mean() * 0.99
+        assert position_errors(information).mean() > one.errors[1].mean() * 0.99
 
 
 def test_anchors_go_where_none_are_in_sight():
@@ -83,7 +83,7 @@ def test_sight_ends_at_walls_and_passes_doors():
     blocked[4, 10] = False
     source = np.array([[4, 2]])
     targets = np.array([[4, 18], [1, 18], [1, 6], [4, 2]])
-    assert _in_sight(blocked, source, targets)[0].tolist() == [True, False, True, True]
+    assert _line_of_sight(blocked, source, targets)[0].tolist() == [True, False, True, True]
 
 
 def test_what_cannot_be_planned_is_said():

@@ -37,20 +37,20 @@ def start(wheels: Odometry, radio: UwbRanges) -> tuple[BootstrapResult, np.ndarr
     edges = range_edges(attached, 0, ids, mounting, calibration, 0.1, TrilaterationConfig())
     path = np.concatenate([[0.0], np.cumsum(frames.path)])
     config = BootstrapConfig(range_sigma=1.5 * SIGMA)
-    grown = bootstrap_graph(
+    bootstrapped = bootstrap_graph(
         graph, wheel_edges(frames, 0, OdometryNoiseConfig(), calibration), edges, path, config, TrilaterationConfig()
     )
-    return grown, frames.stamps
+    return bootstrapped, frames.stamps
 
 
-def judged(grown, keyframe_stamps, stamps, truth, places) -> tuple[float, float]:
+def judged(bootstrapped, keyframe_stamps, stamps, truth, places) -> tuple[float, float]:
     """Return the error of poses and of placed anchors, m, after one rigid motion that fits the poses."""
     at = se2.interpolate_trajectory(stamps, truth, keyframe_stamps)[:, :2]
-    poses, anchors = grown.graph.poses[:, :2], grown.graph.anchors[grown.placed]
+    poses, anchors = bootstrapped.graph.poses[:, :2], bootstrapped.graph.anchors[bootstrapped.placed]
     p, q = poses - poses.mean(axis=0), at - at.mean(axis=0)
     angle = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
     moved = se2.rotate(angle, anchors - poses.mean(axis=0)) + at.mean(axis=0)
-    return aligned_error(poses, at), float(np.hypot(*(moved - places[grown.placed]).T).max(initial=0.0))
+    return aligned_error(poses, at), float(np.hypot(*(moved - places[bootstrapped.placed]).T).max(initial=0.0))
 
 
 def places_around(rng, count) -> np.ndarray:
@@ -81,10 +81,10 @@ def test_a_bent_trajectory_and_unknown_anchors_are_recovered(fault, seed):
     wheels = odometry(stamps, truth, rng, **WHEELS[fault])
     bent = aligned_error(wheels.poses[:, :2], truth[:, :2])
     bias = rng.uniform(-0.2, 0.5, 4)
-    grown, at = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, bias=bias, outliers=0.1))
-    error, anchor_error = judged(grown, at, stamps, truth, places)
-    assert grown.placed.all()
-    assert not grown.ambiguous.any()
+    bootstrapped, at = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, bias=bias, outliers=0.1))
+    error, anchor_error = judged(bootstrapped, at, stamps, truth, places)
+    assert bootstrapped.placed.all()
+    assert not bootstrapped.ambiguous.any()
     assert error < WELL, f"odometry alone {bent:.2f} m"
     assert anchor_error < 2 * WELL
     assert bent > 3 * error
@@ -98,10 +98,10 @@ def test_any_number_of_anchors_serves(count):
     places = places_around(rng, count)
     wheels = odometry(stamps, truth, rng, scale=0.99, turn_scale=1.02, drift=0.004, noise=0.01, turn_noise=0.01)
     radio = ranges(rng, stamps, truth, places, rate=max(0.5, 2.0 / count), sigma=SIGMA, outliers=0.1)
-    grown, at = start(wheels, radio)
-    error, anchor_error = judged(grown, at, stamps, truth, places)
+    bootstrapped, at = start(wheels, radio)
+    error, anchor_error = judged(bootstrapped, at, stamps, truth, places)
     bent = aligned_error(wheels.poses[:, :2], truth[:, :2])
-    assert grown.placed.all()
+    assert bootstrapped.placed.all()
     assert error < (WELL if count >= 3 else max(2 * WELL, bent / 2))
     assert anchor_error < (2 * WELL if count >= 3 else 4 * WELL)
 
@@ -110,12 +110,12 @@ def test_anchors_that_are_heard_part_of_the_time_are_placed_when_they_come():
     rng = np.random.default_rng(21)
     stamps, truth = wander(rng, 200.0)
     end = stamps[-1]
-    heard = np.array([[0, 0.45], [0, 0.45], [0.05, 0.5], [0.35, 1.0], [0.4, 1.0], [0.55, 1.0]]) * end
+    in_reach = np.array([[0, 0.45], [0, 0.45], [0.05, 0.5], [0.35, 1.0], [0.4, 1.0], [0.55, 1.0]]) * end
     places = places_around(rng, 6)
     wheels = odometry(stamps, truth, rng, drift=0.008, noise=0.01, turn_noise=0.02)
-    grown, at = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, outliers=0.1, heard=heard))
-    error, anchor_error = judged(grown, at, stamps, truth, places)
-    assert grown.placed.all()
+    bootstrapped, at = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, outliers=0.1, in_reach=in_reach))
+    error, anchor_error = judged(bootstrapped, at, stamps, truth, places)
+    assert bootstrapped.placed.all()
     assert error < WELL
     assert anchor_error < 2 * WELL
 
@@ -138,16 +138,18 @@ def test_the_result_does_not_depend_on_where_the_run_starts(seed):
     wheels = odometry(stamps, truth, rng, drift=0.012, noise=0.01, turn_noise=0.02)
     radio = ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA, outliers=0.1)
     cut = stamps[-1] / 3
-    late, heard = wheels.stamps >= cut, radio.stamps >= cut
+    late, in_reach = wheels.stamps >= cut, radio.stamps >= cut
     shorter = Odometry(wheels.stamps[late], wheels.poses[late])
-    fewer = UwbRanges(radio.stamps[heard], radio.anchor[heard], radio.ranges[heard], radio.quality[heard], radio.anchor_ids)
+    fewer = UwbRanges(
+        radio.stamps[in_reach], radio.anchor[in_reach], radio.ranges[in_reach], radio.quality[in_reach], radio.anchor_ids
+    )
     back = reversed_in_time(wheels, radio)
     for (one, other), said, true in (
         ((wheels, radio), stamps, truth), (back, stamps, truth[::-1]), ((shorter, fewer), stamps, truth),
     ):
-        grown, at = start(one, other)
-        error, anchor_error = judged(grown, at, said, true, places)
-        assert grown.placed.all()
+        bootstrapped, at = start(one, other)
+        error, anchor_error = judged(bootstrapped, at, said, true, places)
+        assert bootstrapped.placed.all()
         assert error < WELL
         assert anchor_error < 2 * WELL
 
@@ -158,11 +160,11 @@ def test_a_straight_run_says_that_its_anchors_are_ambiguous():
     truth = np.column_stack([0.3 * stamps, 0.003 * np.sin(stamps), np.zeros(800)])
     places = np.array([[5.0, 3.0], [15.0, -4.0], [22.0, 2.0]])
     wheels = odometry(stamps, truth, rng, noise=0.005, turn_noise=0.001)
-    grown, _ = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA))
-    assert grown.ambiguous.all()
-    assert all(len(h) >= 2 for h in grown.hypotheses)
+    bootstrapped, _ = start(wheels, ranges(rng, stamps, truth, places, rate=1.0, sigma=SIGMA))
+    assert bootstrapped.ambiguous.all()
+    assert all(len(h) >= 2 for h in bootstrapped.hypotheses)
     for k, place in enumerate(places):
-        found = np.array([h.position for h in grown.hypotheses[k][:2]])
+        found = np.array([h.position for h in bootstrapped.hypotheses[k][:2]])
         # Ranges fix how far along and how far aside; on which side is a guess, and both guesses are told.
         sides = np.array([[place[0], abs(place[1])], [place[0], -abs(place[1])]])
         gap = np.hypot(*(found[:, None] - sides[None]).transpose(2, 0, 1))
@@ -175,17 +177,17 @@ def test_ranges_of_no_weight_and_none_at_all_leave_the_odometry():
     wheels = odometry(stamps, truth, rng, noise=0.01)
     radio = ranges(rng, stamps, truth, np.zeros((2, 2)))
     nothing = replace(radio, ranges=np.zeros(len(radio.ranges)))
-    grown, at = start(wheels, nothing)
-    assert not grown.placed.any()
-    np.testing.assert_allclose(grown.graph.poses, se2.interpolate_trajectory(stamps, wheels.poses, at), atol=1e-9)
+    bootstrapped, at = start(wheels, nothing)
+    assert not bootstrapped.placed.any()
+    np.testing.assert_allclose(bootstrapped.graph.poses, se2.interpolate_trajectory(stamps, wheels.poses, at), atol=1e-9)
 
 
 def test_a_robot_that_stands_places_nothing_for_sure():
     rng = np.random.default_rng(61)
     stamps, truth = np.arange(300) * 0.1, np.zeros((300, 3))
-    grown, _ = start(Odometry(stamps, truth), ranges(rng, stamps, truth, np.array([[3.0, 1.0], [-2.0, 4.0]]), rate=2.0))
-    assert grown.ambiguous.all() or not grown.placed.any()
-    assert np.isfinite(grown.graph.poses).all()
+    bootstrapped, _ = start(Odometry(stamps, truth), ranges(rng, stamps, truth, np.array([[3.0, 1.0], [-2.0, 4.0]]), rate=2.0))
+    assert bootstrapped.ambiguous.all() or not bootstrapped.placed.any()
+    assert np.isfinite(bootstrapped.graph.poses).all()
 
 
 def test_equal_inputs_give_equal_bytes():

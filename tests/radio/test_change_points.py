@@ -13,7 +13,7 @@ PATH = np.column_stack([5.0 + 4.0 * np.cos(0.11 * STAMPS), 4.0 + 3.0 * np.sin(0.
 SIGMA = 0.06
 
 
-def heard(seed, before, after=None, moment=100, share=0.1):
+def measured(seed, before, after=None, moment=100, share=0.1):
     """Return ranges with noise, a bias and a share of them too long, to one place and from a moment on to another."""
     rng = np.random.default_rng(seed)
     place = np.where((np.arange(len(STAMPS)) < moment)[:, None], before, before if after is None else after)
@@ -25,7 +25,7 @@ def heard(seed, before, after=None, moment=100, share=0.1):
 @pytest.mark.parametrize("moment", [60, 100, 140])
 def test_a_move_is_found_with_its_places_and_its_moment(seed, moment):
     before, after = np.array([-2.0, 1.0]), np.array([-0.5, 3.5])
-    move = find_move(PATH, heard(seed, before, after, moment), STAMPS, SIGMA, TrilaterationConfig())
+    move = find_move(PATH, measured(seed, before, after, moment), STAMPS, SIGMA, TrilaterationConfig())
     assert move is not None
     assert abs(move.stamp - moment) <= 5.0
     assert np.hypot(*(move.before - before)) < 0.5
@@ -35,27 +35,27 @@ def test_a_move_is_found_with_its_places_and_its_moment(seed, moment):
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
 def test_an_anchor_that_stands_still_was_not_moved_however_often_its_sight_is_blocked(seed, share):
-    assert find_move(PATH, heard(seed, np.array([-2.0, 1.0]), share=share), STAMPS, SIGMA, TrilaterationConfig()) is None
+    assert find_move(PATH, measured(seed, np.array([-2.0, 1.0]), share=share), STAMPS, SIGMA, TrilaterationConfig()) is None
 
 
 def test_a_few_ranges_show_no_move():
     few = slice(0, 30)
-    ranges = heard(1, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), moment=15)[few]
+    ranges = measured(1, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), moment=15)[few]
     assert find_move(PATH[few], ranges, STAMPS[few], SIGMA, TrilaterationConfig()) is None
 
 
 @pytest.mark.parametrize("moment", [21, 179])
 def test_a_move_near_an_end_is_found_from_any_first_moment(moment):
     before, after = np.array([-2.0, 1.0]), np.array([11.0, 6.0])
-    move = find_move(PATH, heard(3, before, after, moment, share=0.0), STAMPS, SIGMA, TrilaterationConfig())
+    move = find_move(PATH, measured(3, before, after, moment, share=0.0), STAMPS, SIGMA, TrilaterationConfig())
     # Fewer unexplained ranges than the least share show no move; where one is found, its moment is right.
     assert move is None or abs(move.stamp - moment) <= 2.0
 
 
 def test_two_moves_are_found_in_the_order_of_time():
     places = [np.array([-2.0, 1.0]), np.array([11.0, 6.0]), np.array([4.0, -5.0])]
-    ranges = heard(5, places[0], places[1], 60)
-    ranges[110:] = heard(5, places[2])[110:]
+    ranges = measured(5, places[0], places[1], 60)
+    ranges[110:] = measured(5, places[2])[110:]
     moves = find_moves(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig())
     np.testing.assert_allclose([m.stamp for m in moves], [60.0, 110.0], atol=4.0)
     for move, (before, after) in zip(moves, pairwise(places), strict=True):

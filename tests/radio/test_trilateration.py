@@ -157,11 +157,11 @@ def test_usable_readings_are_positive_finite_and_not_absurd():
 
 @pytest.mark.parametrize("lies", [0.0, 0.3])
 @pytest.mark.parametrize("bias", [0.0, 1.2])
-def test_agreement_is_the_share_of_ranges_that_fit_a_place_whatever_the_bias(lies, bias):
+def test_agreement_is_the_share_of_ranges_that_fit_a_place_whatever_the_bias(false_ranges, bias):
     rng = np.random.default_rng(7)
     path, place = loop_path(rng, metres=30.0), np.array([4.0, -3.0])
     said = np.hypot(*(place - path).T) + bias + 0.02 * rng.standard_normal(len(path))
-    wrong = np.arange(len(path)) < lies * len(path)
+    wrong = np.arange(len(path)) < false_ranges * len(path)
     said = said + 3.0 * wrong
     assert agreement(path, said, place) == pytest.approx(1.0 - wrong.mean(), abs=0.02)
     assert agreement(path, said, np.array([8.0, 2.0])) < 0.6

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.room_drive import recording, two_rounds
+from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.errors import DataError

@@ -59,7 +59,7 @@ def test_a_trial_is_judged_by_all_figures(trial, result):
 
 
 def test_fewer_anchors_are_as_if_the_others_had_not_been_there(trial):
-    some = reproduce_paper.heard(trial, (2, 4))
+    some = reproduce_paper.with_anchors(trial, (2, 4))
     ids = list(trial.anchors)
     assert set(some.anchors) == set(some.log.ranges.anchor_ids) == {ids[1], ids[3]}
     for name in some.anchors:
@@ -67,7 +67,7 @@ def test_fewer_anchors_are_as_if_the_others_had_not_been_there(trial):
             t.log.ranges.ranges[t.log.ranges.anchor == t.log.ranges.anchor_ids.index(name)] for t in (some, trial)
         )
         np.testing.assert_array_equal(kept, all_of_them)
-    assert reproduce_paper.heard(trial, ()) is trial
+    assert reproduce_paper.with_anchors(trial, ()) is trial
 
 
 def test_rays_can_be_told_as_of_one_time(trial):

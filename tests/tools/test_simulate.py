@@ -9,7 +9,7 @@ from simulate import parser, settings_from
 from simulation import drive, floorplans, laser, logfile, radio, recording, wheels
 from simulation.fields import smooth_field
 from simulation.plans import PLANS
-from simulation.recording import Lie, Settings, simulate
+from simulation.recording import FalseRanges, Settings, simulate
 from trials import as_read
 
 from uwblite import se2
@@ -203,7 +203,7 @@ def test_occlusion_only_lengthens():
 
 def test_a_lying_anchor_lies_for_its_stretch_only():
     honest = simulate(replace(SHORT, without=("laser",)))
-    lying = simulate(replace(SHORT, without=("laser",), lies=(Lie(2, 5.0, 10.0, 3.0),)))
+    lying = simulate(replace(SHORT, without=("laser",), false_ranges=(FalseRanges(2, 5.0, 10.0, 3.0),)))
     wrong = lying.ranges - honest.ranges
     during = (honest.range_anchors == 1) & (honest.range_stamps >= 5.0) & (honest.range_stamps < 15.0)
     np.testing.assert_allclose(wrong[during], 3.0)
@@ -280,7 +280,7 @@ def test_command_line_reaches_every_setting():
     )
     settings = settings_from(parser().parse_args(words.split()))
     assert settings.nlos_anchors == (3, 4)
-    assert settings.lies == (Lie(1, 10.0, 60.0, 2.5),)
+    assert settings.false_ranges == (FalseRanges(1, 10.0, 60.0, 2.5),)
     assert (settings.radio.bias_sd, settings.radio.scale, settings.radio.noise_sd) == (1.5, 1.07, 0.03)
     assert settings.without == ("uwb",)
     assert (settings.slips, settings.people, settings.minutes, settings.laser_flipped) == (3, 2, 2.0, True)
@@ -308,8 +308,8 @@ def test_overnight_one_anchor_of_the_site_moved_and_one_is_new():
 @pytest.mark.parametrize(("world", "least", "most"), [("arena", 3.0, 5.0), ("tunnel", 3.0, 5.0), ("site", 3.0, 5.0)])
 def test_few_anchors_are_heard_at_a_time_in_large_places(world, least, most):
     made = simulate(Settings(world=world, seed=1, minutes=10.0, speed=0.5, without=("laser",)))
-    heard = [np.unique(made.range_anchors[np.abs(made.range_stamps - t) < 10.0]).size for t in range(10, 590, 20)]
-    assert least <= np.mean(heard) <= most
+    in_reach = [np.unique(made.range_anchors[np.abs(made.range_stamps - t) < 10.0]).size for t in range(10, 590, 20)]
+    assert least <= np.mean(in_reach) <= most
 
 
 def test_the_oracle_is_near_the_truth_and_its_bound_says_how_near():

@@ -20,7 +20,7 @@ _CHUNK = 8
 
 
 @dataclass(frozen=True)
-class Lie:
+class FalseRanges:
     """A stretch in which one anchor is wrong by the same amount."""
 
     anchor: int
@@ -58,7 +58,7 @@ class Settings:
     """Share of ranges that are nonsense of either sign."""
     zeros: float = 0.0
     """Share of ranges that are 0."""
-    lies: tuple[Lie, ...] = ()
+    false_ranges: tuple[FalseRanges, ...] = ()
     anchor_height: float = 0.6
     tag_height: float = 0.6
     tell_heights: bool = False
@@ -260,7 +260,7 @@ def _range(
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     tag = pose[:, :2] + np.stack([c * settings.tag[0] - s * settings.tag[1], s * settings.tag[0] + c * settings.tag[1]], axis=1)
     bodies = _bodies(crowd, times, pose)
-    ranges, heard, effort = (np.empty((len(times), count)) for _ in range(3))
+    ranges, received, effort = (np.empty((len(times), count)) for _ in range(3))
     pattern = _lasting(settings.robot, 7, _rng(settings, 7)).integers(2**31)
     for a, place in enumerate(anchors):
         rng = _rng(settings, 200 + a)
@@ -279,11 +279,11 @@ def _range(
         noise = model.noise_sd * rng.standard_normal(len(times))
         smooth = bias[a] + model.multipath_sd * field_ + model.antenna_sd * antenna
         ranges[:, a] = model.scale * distance + smooth + extra + noise
-        heard[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < min(model.max_range, plan.radio_range))
+        received[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < min(model.max_range, plan.radio_range))
         effort[:, a] = distance + 6.0 * shadow
     rng = _rng(settings, 8)
     rank = np.argsort(np.argsort(effort + rng.uniform(0, 3, effort.shape), axis=1), axis=1)
-    epoch, anchor = np.nonzero((heard > 0) & (rank < model.per_epoch))
+    epoch, anchor = np.nonzero((received > 0) & (rank < model.per_epoch))
     stamps, values = times[epoch], np.maximum(ranges[epoch, anchor], 0.0)
     values = _spoil(settings, stamps, anchor, values, rng, max(plan.size))
     return stamps + settings.uwb_delay, anchor, np.round(values, 3), truth
@@ -292,9 +292,9 @@ def _range(
 def _spoil(
     settings: Settings, stamps: Floats, anchor: NDArray[np.int64], values: Floats, rng: np.random.Generator, size: float
 ) -> Floats:
-    for lie in settings.lies:
-        during = (anchor == lie.anchor - 1) & (stamps >= lie.start) & (stamps < lie.start + lie.seconds)
-        values = np.where(during, np.maximum(values + lie.metres, 0.0), values)
+    for false in settings.false_ranges:
+        during = (anchor == false.anchor - 1) & (stamps >= false.start) & (stamps < false.start + false.seconds)
+        values = np.where(during, np.maximum(values + false.metres, 0.0), values)
     kind, wild = rng.random(len(values)), rng.uniform(0.0, 1.5 * size, len(values))
     values = np.where(kind < settings.outliers, wild, values)
     return np.where(kind > 1.0 - settings.zeros, 0.0, values)

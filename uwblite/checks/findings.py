@@ -70,7 +70,7 @@ def timing(
     gap = max(expected_gap, 5.0 * period)
     gaps = np.flatnonzero(steps > gap)
     equal = float(np.mean(steps == 0)) if len(steps) else 0.0
-    suspect = equal if repeats is None else repeats
+    repeated = equal if repeats is None else repeats
     if len(gaps):
         worst = gaps[np.argmax(steps[gaps])]
         found.add(
@@ -80,11 +80,11 @@ def timing(
             f" at t = {stamps[worst] - stamps[0]:.1f} s",
             "check cable, power and processor load at these times",
         )
-    if suspect > 0.02:
+    if repeated > 0.02:
         found.add(
             "warning" if topic != "radio" else "note",
             topic,
-            f"{100 * suspect:.0f} % of the stamps equal the one before",
+            f"{100 * repeated:.0f} % of the stamps equal the one before",
             "stamps of low resolution, or readings that arrived in one piece: stamp each reading when it is made",
         )
     return {

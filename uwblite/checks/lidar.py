@@ -72,7 +72,7 @@ def _check_turning(log: SensorLog, found: Findings) -> dict[str, float]:
         return {}
     figures = {
         "pairs": turning.pairs,
-        "misfit rad": round(turning.told, 4),
+        "misfit rad": round(turning.as_given, 4),
         "misfit if mounted the other way up rad": round(turning.other, 4),
         "clock offset s": round(turning.clock_offset, 3),
     }

@@ -128,8 +128,8 @@ def _check_coverage(log: SensorLog, found: Findings, window: float = 2.0) -> dic
     # Windows without ranges are only counted, however long the recording claims to be.
     windows = max(1.0, np.ceil((end - start) / window))
     slot = np.floor((ranges.stamps[usable] - start) / window)
-    heard = np.unique(np.stack([slot, ranges.anchor[usable].astype(np.float64)]), axis=1)
-    count = np.unique(heard[0], return_counts=True)[1]
+    measured = np.unique(np.stack([slot, ranges.anchor[usable].astype(np.float64)]), axis=1)
+    count = np.unique(measured[0], return_counts=True)[1]
     shares = {f"at least {n}": round(min(float(np.sum(count >= n)) / float(windows), 1.0), 3) for n in (1, 2, 3)}
     if len(ranges.anchor_ids) > 1 and shares["at least 2"] < 0.5:
         found.warning(

@@ -31,7 +31,7 @@ LISTEN, ASK = 0.6, 5.0
 
 
 @dataclass
-class Sight:
+class PortReport:
     """What was seen on one port."""
 
     path: str
@@ -60,26 +60,26 @@ def run(args: argparse.Namespace) -> int:
 
     if args.kinds:
         return _list_kinds()
-    sights = []
+    reports = []
     if args.ports:
         for path in args.ports:
             check_url(path)
-        sights = [Sight(path) if args.list else look(path, [], args.pan_id) for path in args.ports]
+        reports = [PortReport(path) if args.list else look(path, [], args.pan_id) for path in args.ports]
     else:
         for port in plugged_in():
             kinds = kinds_on_usb(port.usb_id, port.description)
-            sight = look(port.path, kinds, args.pan_id) if kinds and not args.list else Sight(port.path)
-            sight.details = {"usb": f"{port.usb_id} {port.description}".strip(), **sight.details}
-            sights.append(sight)
+            port_report = look(port.path, kinds, args.pan_id) if kinds and not args.list else PortReport(port.path)
+            port_report.details = {"usb": f"{port.usb_id} {port.description}".strip(), **port_report.details}
+            reports.append(port_report)
             if not kinds:
-                sight.findings.append(("info", f"kind not known; `uwblite devices {port.path}` looks at it"))
-    if not sights:
+                port_report.findings.append(("info", f"kind not known; `uwblite devices {port.path}` looks at it"))
+    if not reports:
         raise DeviceError("no serial device is plugged in; check cables and power, then `dmesg | tail` (see firmware_notes)")
-    _compare_networks(sights)
-    _report(sights, args.json)
-    if any(level != "info" for sight in sights for level, _ in sight.findings):
+    _compare_networks(reports)
+    _report(reports, args.json)
+    if any(level != "info" for port_report in reports for level, _ in port_report.findings):
         return 3
-    return 0 if args.list or any(sight.found for sight in sights) else 1
+    return 0 if args.list or any(port_report.found for port_report in reports) else 1
 
 
 def _list_kinds() -> int:
@@ -94,32 +94,32 @@ def _list_kinds() -> int:
     return 0
 
 
-def _report(sights: list[Sight], as_json: bool) -> None:
+def _report(reports: list[PortReport], as_json: bool) -> None:
     if as_json:
         rows = [
             {
-                "port": sight.path,
-                "kind": sight.kind,
-                **sight.details,
-                "findings": [{"level": level, "text": text} for level, text in sight.findings],
+                "port": port_report.path,
+                "kind": port_report.kind,
+                **port_report.details,
+                "findings": [{"level": level, "text": text} for level, text in port_report.findings],
             }
-            for sight in sights
+            for port_report in reports
         ]
         say_json({"devices": rows})
         return
-    for sight in sights:
-        say(f"{sight.path}: {sight.kind}")
-        for name, value in sight.details.items():
+    for port_report in reports:
+        say(f"{port_report.path}: {port_report.kind}")
+        for name, value in port_report.details.items():
             say(f"    {name}: {value}")
-        for level, text in sight.findings:
+        for level, text in port_report.findings:
             say(f"    {level}: {text}")
-    if sights and all(sight.found for sight in sights) and not any(
-        level != "info" for sight in sights for level, _ in sight.findings
+    if reports and all(port_report.found for port_report in reports) and not any(
+        level != "info" for port_report in reports for level, _ in port_report.findings
     ):  # fmt: skip
         note("all is well")
 
 
-def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> Sight:
+def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> PortReport:
     """Open a port, find out who is there, and judge its settings.
 
     Parameters
@@ -136,30 +136,30 @@ def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> Sight:
     from ..drivers.transport import open_port
     from ..errors import DeviceError
 
-    sight = Sight(path)
+    port_report = PortReport(path)
     tried = kinds or [kind for kind in DEVICES.values() if kind.probe]
     try:
         port = open_port(path, tried[0].baud)
     except DeviceError as error:
-        sight.findings.append(("error", str(error)))
-        return sight
+        port_report.findings.append(("error", str(error)))
+        return port_report
     try:
         for kind in sorted(tried, key=lambda kind: not kind.talks):
             port.set_baud(kind.baud)
-            if _ask(port, kind, sight):
-                _judge_network(sight, pan_id)
-                return sight
+            if _ask(port, kind, port_report):
+                _judge_network(port_report, pan_id)
+                return port_report
         known = ", ".join(kind.title for kind in tried)
         silent = f"nobody known answers: is the device powered, and is it one of these: {known}?"
-        sight.findings.append(("error", kinds[0].silent if kinds else silent))
+        port_report.findings.append(("error", kinds[0].silent if kinds else silent))
     except DeviceError as error:
-        sight.findings.append(("error", str(error)))
+        port_report.findings.append(("error", str(error)))
     finally:
         port.close()
-    return sight
+    return port_report
 
 
-def _ask(port: "Port", kind: "DeviceKind", sight: Sight) -> bool:
+def _ask(port: "Port", kind: "DeviceKind", port_report: PortReport) -> bool:
     """Let a device's session find it; True when it did."""
     from ..drivers.devices import Options, Setup
     from ..drivers.events import Note, Reopen, Send, SetBaud, SetDtr
@@ -189,31 +189,31 @@ def _ask(port: "Port", kind: "DeviceKind", sight: Sight) -> bool:
         going = going and do(session.tick(now))
         time.sleep(0.003)
     if not driver.ready:
-        sight.findings += [(note.level, note.text) for note in notes if note.name == "lidar-scip1-only"]
+        port_report.findings += [(note.level, note.text) for note in notes if note.name == "lidar-scip1-only"]
         return False
     do(session.stop())
     identity = driver.identity()
-    sight.found, sight.kind, sight.details = True, identity.title, dict(identity.details)
+    port_report.found, port_report.kind, port_report.details = True, identity.title, dict(identity.details)
     said = {note.name for note in identity.findings}
     shown = [*identity.findings, *(note for note in notes if note.name not in said)]
-    sight.findings += [(note.level, note.text) for note in shown]
+    port_report.findings += [(note.level, note.text) for note in shown]
     return True
 
 
-def _judge_network(sight: Sight, pan_id: int | None) -> None:
-    network = sight.details.get("network")
+def _judge_network(port_report: PortReport, pan_id: int | None) -> None:
+    network = port_report.details.get("network")
     if pan_id is not None and network not in (None, "0x0000", f"0x{pan_id:04X}"):
         text = f"the network id is {network}: in the shell type `nis 0x{pan_id:04X}`, then `reset`"
-        sight.findings.append(("error", text))
+        port_report.findings.append(("error", text))
 
 
-def _compare_networks(sights: list[Sight]) -> None:
+def _compare_networks(reports: list[PortReport]) -> None:
     """Nodes on one computer that are in different networks never hear each other."""
-    networks = {sight.details["network"] for sight in sights if "network" in sight.details}
+    networks = {port_report.details["network"] for port_report in reports if "network" in port_report.details}
     if len(networks) > 1:
-        for sight in sights:
-            if "network" in sight.details:
-                sight.findings.append(("warning", f"nodes differ in network id ({', '.join(sorted(networks))})"))
+        for port_report in reports:
+            if "network" in port_report.details:
+                port_report.findings.append(("warning", f"nodes differ in network id ({', '.join(sorted(networks))})"))
 
 
 def _pan_id(text: str) -> Any:

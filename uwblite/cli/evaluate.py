@@ -90,19 +90,21 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     from .. import se2
     from ..evaluation.map import landmark_errors, landmark_errors_along
     from ..evaluation.trajectory import evaluate_trajectory
-    from ..io.results import mend_result
+    from ..io.results import repair_result
     from ..lidar.columns import find_columns
 
     folder = Path(args.dir)
-    mend_result(folder)
-    told, told_lines = _relations(folder, args.relations, args.recording or 1) if args.relations else ({}, [])
+    repair_result(folder)
+    relation_figures, relation_lines = _relations(folder, args.relations, args.recording or 1) if args.relations else ({}, [])
     if not args.truth:
-        return told, told_lines
+        return relation_figures, relation_lines
     recordings = [_recording(folder, truth, number) for number, truth in enumerate(args.truth, args.recording or 1)]
     stamps, poses, true_stamps, true_poses = _one_after_another(recordings)
     trajectory = evaluate_trajectory(stamps, poses, true_stamps, true_poses, max_gap=args.max_gap, rpe_delta=args.delta)
-    summary: dict[str, Any] = {**told, "trajectory": _trajectory_summary(trajectory, len(true_stamps))}
-    lines = told_lines + _trajectory_lines(trajectory, len(true_stamps), "together" if len(recordings) > 1 else "trajectory")
+    summary: dict[str, Any] = {**relation_figures, "trajectory": _trajectory_summary(trajectory, len(true_stamps))}
+    lines = relation_lines + _trajectory_lines(
+        trajectory, len(true_stamps), "together" if len(recordings) > 1 else "trajectory"
+    )
     if len(recordings) > 1:
         alone = [evaluate_trajectory(*recording, max_gap=args.max_gap, rpe_delta=args.delta) for recording in recordings]
         summary["recordings"] = [

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from ..io.constraints_file import read_anchors
     from ..io.map_server import read_map
     from ..io.result_text import json_lines
-    from ..io.results import mend_result
+    from ..io.results import repair_result
     from ..localize import localize
     from . import console
     from .formats import read_recording, refuse_existing
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     files = _files(args)
     refuse_existing(args.force, *files.values())
     config = effective_config(args)
-    mend_result(args.map)
+    repair_result(args.map)
     yaml = os.path.join(args.map, "map.yaml")
     grid = read_map(yaml) if os.path.exists(yaml) else None
     anchors = read_anchors(os.path.join(args.map, "anchors.csv"), least=1 if grid is None else 0)

@@ -60,7 +60,7 @@ def landmark_errors_along(
     poses: Floats,
     pairs: tuple[tuple[str, str], ...] | None = None,
     *,
-    sight: float = 4.0,
+    reach: float = 4.0,
     most: int = 200,
 ) -> LandmarkErrors:
     """Compare distances between columns as a trajectory would draw them with the true ones.
@@ -79,7 +79,7 @@ def landmark_errors_along(
     sightings = {}
     for name, place in zip(truth.names, truth.positions, strict=True):
         from_base = se2.transform(se2.inverse(true_poses), place)
-        seen = np.flatnonzero(np.hypot(*from_base.T) <= sight)
+        seen = np.flatnonzero(np.hypot(*from_base.T) <= reach)
         seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(most, len(seen))).astype(np.int64))]
         if len(seen):
             sightings[name] = se2.transform(poses[seen], from_base[seen])
@@ -97,9 +97,9 @@ def _distance_errors(
     judged = tuple((a, b) for a, b in pairs if a in sightings and b in sightings)
     true_place = dict(zip(truth.names, truth.positions, strict=True))
     true_distances = np.array([np.hypot(*(true_place[a] - true_place[b])) for a, b in judged])
-    said = [np.hypot(*(sightings[a][:, None] - sightings[b][None]).transpose(2, 0, 1)) for a, b in judged]
-    errors = np.array([np.mean(np.abs(d - t)) for d, t in zip(said, true_distances, strict=True)])
-    distances = np.array([np.mean(d) for d in said])
+    measured = [np.hypot(*(sightings[a][:, None] - sightings[b][None]).transpose(2, 0, 1)) for a, b in judged]
+    errors = np.array([np.mean(np.abs(d - t)) for d, t in zip(measured, true_distances, strict=True)])
+    distances = np.array([np.mean(d) for d in measured])
     mean = float(np.mean(errors)) if judged else float("nan")
     return LandmarkErrors(judged, true_distances, distances, errors, mean, missing)
 
@@ -111,7 +111,7 @@ def wall_errors(
     viewpoints: Floats,
     *,
     tolerance: float = 0.10,
-    sight: float = 4.0,
+    reach: float = 4.0,
     step: float = 0.05,
 ) -> WallErrors:
     """Compare occupied cells with the true surfaces.
@@ -129,7 +129,7 @@ def wall_errors(
     if not len(occupied) or not len(surface):
         return WallErrors(tolerance, 0.0, 0.0, float("nan"))
     distance = cKDTree(surface).query(occupied)[0]
-    visible = surface[visible_from(surface, walls, columns, viewpoints, sight)]
+    visible = surface[visible_from(surface, walls, columns, viewpoints, reach)]
     covered = cKDTree(occupied).query(visible)[0] <= tolerance if len(visible) else np.zeros(1, dtype=bool)
     near = distance[distance <= 5.0 * tolerance]
     rms = float(np.sqrt(np.mean(near**2))) if len(near) else float("nan")
@@ -154,14 +154,14 @@ _VIEWS = 24
 """Nearest viewpoints tried for each point of a surface."""
 
 
-def visible_from(points: Floats, walls: Floats, columns: Floats, viewpoints: Floats, sight: float) -> Bools:
+def visible_from(points: Floats, walls: Floats, columns: Floats, viewpoints: Floats, reach: float) -> Bools:
     """Return which points (n,) on surfaces one of the nearest viewpoints (v, 2) sees, m; surfaces hide one another."""
     if not len(viewpoints):
         return np.zeros(len(points), dtype=bool)
     # Viewpoints half a metre apart: the nearest ones then differ in direction, not only in time.
     coarse = viewpoints[np.unique(np.round(viewpoints / 0.5).astype(np.int64), axis=0, return_index=True)[1]]
     count = min(_VIEWS, len(coarse))
-    distance, view = cKDTree(coarse).query(points, k=count, distance_upper_bound=sight)
+    distance, view = cKDTree(coarse).query(points, k=count, distance_upper_bound=reach)
     point, rank = np.nonzero(np.isfinite(np.atleast_2d(distance.reshape(len(points), count))))
     start = coarse[view.reshape(len(points), count)[point, rank]]
     # The ray stops short of the surface, which otherwise would hide itself.

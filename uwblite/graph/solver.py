@@ -175,14 +175,14 @@ def minimise(
         negligible = config.relative_decrease * chi2 + _NOTHING
         if improved:
             if to_come(decrease, last_decrease, promised) <= negligible and damping <= _FREE:
-                reason = SETTLED
+                reason = NO_DECREASE
             near = not reused and decrease <= _NEAR * chi2 and damping <= _NEARLY_FREE
             factor = factor if near else None
             graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3), _LEAST_DAMPING)
             growth = 2.0
         elif 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * chi2) and damping <= _FREE:
-            reason = SETTLED
+            reason = NO_DECREASE
         else:
             factor = None
             if not reused:
@@ -190,7 +190,7 @@ def minimise(
         if not reason and damping > _MOST_DAMPING:
             reason = STUCK
     return graph, SolverSummary(
-        converged=reason in (SETTLED, GRADIENT),
+        converged=reason in (NO_DECREASE, GRADIENT),
         reason=reason,
         iterations=len(history),
         chi2_initial=chi2_initial,
@@ -201,7 +201,7 @@ def minimise(
     )
 
 
-SETTLED = "chi2 no longer decreases"
+NO_DECREASE = "chi2 no longer decreases"
 GRADIENT = "gradient negligible"
 STUCK = "no step decreases chi2"
 USED_UP = "iterations used up"

@@ -276,13 +276,13 @@ class _Task:
 
 
 def _trace(
-    task: _Task, counter: RayCounter, walls: Bools | None, executor: Executor | None, tell: Callable[[int], None]
+    task: _Task, counter: RayCounter, walls: Bools | None, executor: Executor | None, report: Callable[[int], None]
 ) -> None:
     """Trace the beams that saw something, or, where walls are given, those that saw nothing."""
     if executor is None:
         for done, rays in task.batches(empty=walls is not None):
             _insert(counter, rays, walls)
-            tell(done)
+            report(done)
         return
     parts = task.split(_TASKS)
     done = 0
@@ -290,7 +290,7 @@ def _trace(
     for part, counts in zip(parts, executor.map(_count, parts, *same), strict=True):
         counter.add(*counts)
         done += len(part.chosen)
-        tell(done)
+        report(done)
 
 
 def _count(task: _Task, geometry: GridGeometry, walls: Bools | None) -> tuple[Counts, Counts]:

@@ -10,24 +10,24 @@ from ..config import from_dict, parse_toml
 from ..constraints import (
     Constraints,
     ForbiddenClosure,
-    KnownAnchor,
-    KnownClosure,
-    KnownDistance,
-    KnownLandmark,
-    KnownLandmarkDistance,
-    KnownPose,
+    GivenAnchor,
+    GivenClosure,
+    GivenDistance,
+    GivenLandmark,
+    GivenLandmarkDistance,
+    GivenPose,
 )
 from ..errors import ConfigError, FormatError
 from ..sensor_log import MOST_METRES, MOST_SECONDS
 from .csv_table import read_csv
 
 _TABLES: Mapping[str, tuple[type, str]] = {
-    "anchor": (KnownAnchor, "anchors"),
-    "pose": (KnownPose, "poses"),
-    "anchor_distance": (KnownDistance, "distances"),
-    "landmark": (KnownLandmark, "landmarks"),
-    "landmark_distance": (KnownLandmarkDistance, "landmark_distances"),
-    "closure": (KnownClosure, "closures"),
+    "anchor": (GivenAnchor, "anchors"),
+    "pose": (GivenPose, "poses"),
+    "anchor_distance": (GivenDistance, "distances"),
+    "landmark": (GivenLandmark, "landmarks"),
+    "landmark_distance": (GivenLandmarkDistance, "landmark_distances"),
+    "closure": (GivenClosure, "closures"),
     "forbidden_closure": (ForbiddenClosure, "forbidden"),
 }
 
@@ -71,12 +71,12 @@ def _entry(kind: type, table: Any, where: str) -> Any:
 
 
 _REQUIRED: Mapping[type, tuple[str, ...]] = {
-    KnownAnchor: ("id", "position"),
-    KnownPose: ("stamp", "pose"),
-    KnownDistance: ("anchors", "distance"),
-    KnownLandmark: ("name", "position"),
-    KnownLandmarkDistance: ("landmarks", "distance"),
-    KnownClosure: ("stamps",),
+    GivenAnchor: ("id", "position"),
+    GivenPose: ("stamp", "pose"),
+    GivenDistance: ("anchors", "distance"),
+    GivenLandmark: ("name", "position"),
+    GivenLandmarkDistance: ("landmarks", "distance"),
+    GivenClosure: ("stamps",),
     ForbiddenClosure: ("stamps",),
 }
 
@@ -97,13 +97,13 @@ def read_anchors(path: str | os.PathLike[str], *, least: int = 1) -> Constraints
         table.texts(column)
     values = table.numbers("x", "y", "sigma_x", "sigma_y", default=np.nan)
     status = table.texts("status", default="ok")
-    anchors: dict[str, KnownAnchor] = {}
+    anchors: dict[str, GivenAnchor] = {}
     for name, (x, y, sigma_x, sigma_y), state in zip(names, values.tolist(), status, strict=True):
         if np.isfinite(x) and np.isfinite(y) and state == "ok":
             sigma = float(np.nanmax([sigma_x, sigma_y, 0.02]))
             anchor, mark, number = name.rpartition("#")
             name = anchor if mark and number.isdigit() and anchor in names else name
-            anchors[name] = KnownAnchor(name, (x, y), sigma, movable=True)
+            anchors[name] = GivenAnchor(name, (x, y), sigma, movable=True)
     if len(anchors) < least:
         raise FormatError("no anchor in it has a place; it must be the anchors.csv of a map", os.fspath(path))
     return Constraints(anchors=tuple(anchors.values()))

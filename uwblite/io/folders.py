@@ -44,7 +44,7 @@ def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Pat
 
 
 def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:
-    _mend(folder, owned)
+    _repair(folder, owned)
     beside = not folder.exists() or _may_change_places(folder, owned)
     home, prefix = (folder.parent, f".{shortened(folder.name)}{WAITING}") if beside else (folder, WAITING)
     _clear(home, prefix)
@@ -61,7 +61,7 @@ def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:
             shutil.rmtree(folder / _READY, ignore_errors=True)
             os.replace(waiting, folder / _READY)
             sync_folder(folder)
-            _mend(folder, owned)
+            _repair(folder, owned)
     finally:
         shutil.rmtree(waiting, ignore_errors=True)
 
@@ -72,10 +72,10 @@ def mend(path: str | os.PathLike[str], owned: Owned) -> bool:
     if not (folder / _READY / _LIST).is_file():
         return False
     with one_at_a_time(folder):
-        return _mend(folder, owned)
+        return _repair(folder, owned)
 
 
-def _mend(folder: Path, owned: Owned) -> bool:
+def _repair(folder: Path, owned: Owned) -> bool:
     ready = folder / _READY
     if ready.is_symlink() or not (ready / _LIST).is_file():
         return False

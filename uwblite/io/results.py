@@ -52,7 +52,7 @@ def is_of_result(name: str) -> bool:
     return _CONTRACT.fullmatch(name) is not None
 
 
-def mend_result(folder: str | os.PathLike[str]) -> None:
+def repair_result(folder: str | os.PathLike[str]) -> None:
     """Finish a replacement of a result that a crash has interrupted, where there is one and it may be finished."""
     with suppress(OSError):
         mend(folder, is_of_result)
@@ -69,9 +69,9 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{path} is not a folder; choose another --out")
-    held = sorted(p.name for p in path.iterdir() if is_of_result(p.name)) if path.is_dir() else []
-    if held and not force:
-        raise ConfigError(f"{path} already holds a result ({held[0]}, ...); use --force to replace it, or another --out")
+    present = sorted(p.name for p in path.iterdir() if is_of_result(p.name)) if path.is_dir() else []
+    if present and not force:
+        raise ConfigError(f"{path} already holds a result ({present[0]}, ...); use --force to replace it, or another --out")
     nearest = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise PermissionError(13, os.strerror(13), str(nearest))

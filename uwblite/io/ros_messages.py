@@ -129,8 +129,8 @@ class Messages:
         full = np.zeros((6, 6))
         planar = [0, 1, 5]
         full[np.ix_(planar, planar)] = covariance
-        held = self.make("geometry_msgs/PoseWithCovariance", pose=self.pose(pose), covariance=full.reshape(-1))
-        return self.make("geometry_msgs/PoseWithCovarianceStamped", header=self.header(stamp, MAP), pose=held)
+        estimate = self.make("geometry_msgs/PoseWithCovariance", pose=self.pose(pose), covariance=full.reshape(-1))
+        return self.make("geometry_msgs/PoseWithCovarianceStamped", header=self.header(stamp, MAP), pose=estimate)
 
     def marker(self, stamp: float, group: str, number: int, kind: int, colour: Sequence[float], **values: Any) -> Any:
         """Return a visualization_msgs/Marker in the map frame; colour is red, green, blue, alpha, 0..1."""

@@ -14,7 +14,7 @@ from ..errors import FormatError
 from ..grid.occupancy_grid import OccupancyGrid
 from .csv_table import read_csv
 from .map_server import read_map
-from .results import mend_result
+from .results import repair_result
 from .tum import read_tum
 
 
@@ -87,7 +87,7 @@ def read_result(folder: str | os.PathLike[str]) -> StoredResult:
     FormatError : the folder holds none, or a file in it is not what it should be.
     """
     path = Path(folder)
-    mend_result(path)
+    repair_result(path)
     if not (path / "trajectory.tum").is_file():
         raise FormatError("holds no result of uwblite map (no trajectory.tum)", os.fspath(path))
     later = (path / f"trajectory_{k}.tum" for k in range(2, 1 + len(list(path.glob("trajectory*.tum")))))

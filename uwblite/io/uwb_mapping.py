@@ -69,8 +69,8 @@ class UwbMapping:
             value = _field(reading, self.range, self)
             quality = float(_field(reading, self.quality, self)) if self.quality else 100.0
             if self.anchor == "index":
-                heard = [(k, float(v)) for k, v in enumerate(value) if self._wanted(reading, k)]
-                found += [(self._name(k), v * self.unit, quality) for k, v in heard if math.isfinite(v) and v != 0.0]
+                measured = [(k, float(v)) for k, v in enumerate(value) if self._wanted(reading, k)]
+                found += [(self._name(k), v * self.unit, quality) for k, v in measured if math.isfinite(v) and v != 0.0]
             elif self._wanted(reading):
                 found.append((self._anchor(reading, topic), float(value) * self.unit, quality))
         return found

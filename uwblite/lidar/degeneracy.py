@@ -16,9 +16,9 @@ and y, whatever the frame."""
 _TINY = 1e-30
 
 
-def relative_eigen(information: Floats, feigned: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Return (..., 3, 3) B, its inverse, eigenvalues and eigenvectors of B^-1 H B^-T where N = B B^T, N kept from vanishing."""
-    basis = np.asarray(np.linalg.cholesky(feigned + _floor(information)[..., None] * np.eye(3)), dtype=np.float64)
+    basis = np.asarray(np.linalg.cholesky(spurious + _floor(information)[..., None] * np.eye(3)), dtype=np.float64)
     inverse = np.asarray(np.linalg.inv(basis), dtype=np.float64)
     values, vectors = np.linalg.eigh(inverse @ information @ np.swapaxes(inverse, -1, -2))
     return basis, inverse, values, vectors

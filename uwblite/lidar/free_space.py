@@ -42,15 +42,15 @@ def free_space(
         edge must not contradict it.
     """
     ranges = np.asarray(ranges, dtype=np.float64)
-    known = np.where(np.isposinf(ranges), beyond, np.where(np.isfinite(ranges), ranges, 0.0))
-    free = known.copy()
+    reach = np.where(np.isposinf(ranges), beyond, np.where(np.isfinite(ranges), ranges, 0.0))
+    free = reach.copy()
     for k in range(1, blur + 1):
-        free[:, k:] = np.minimum(free[:, k:], known[:, :-k])
-        free[:, :-k] = np.minimum(free[:, :-k], known[:, k:])
+        free[:, k:] = np.minimum(free[:, k:], reach[:, :-k])
+        free[:, :-k] = np.minimum(free[:, :-k], reach[:, k:])
     return FreeSpace(np.asarray(poses, dtype=np.float64).reshape(-1, 3), free, angle_min, angle_increment)
 
 
-def looked_through(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, Ints]:
+def seen_beyond(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, Ints]:
     """Count for each point the scans that looked through it, and those to which it was in view.
 
     Parameters
@@ -70,8 +70,8 @@ def looked_through(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints
     scan = np.arange(len(free.poses))[:, None]
     width = free.ranges.shape[1]
     until = np.where(bins < width, free.ranges[scan, np.minimum(bins, width - 1)], 0.0)
-    known = until > 0.0
-    through, in_view = known & (distance < until - margin), known & (distance < until + margin)
+    reach = until > 0.0
+    through, in_view = reach & (distance < until - margin), reach & (distance < until + margin)
     return through.sum(axis=0), in_view.sum(axis=0)
 
 
@@ -90,6 +90,6 @@ def contradiction(free: FreeSpace, points: Floats, margin: float, least: int = 1
     """
     if len(points) == 0 or len(free.poses) == 0:
         return 0.0, 0.0
-    through, in_view = looked_through(free, points, margin)
+    through, in_view = seen_beyond(free, points, margin)
     seen = in_view > 0
     return float(np.sum((through >= least) & seen) / max(int(seen.sum()), 1)), float(seen.mean())

@@ -70,7 +70,7 @@ class RefinementConfig:
     """Standard deviation of a point-to-line distance before it is learnt, m."""
     correlation: float = setting(4.0, advanced=True)
     """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
-    settled: float = setting(0.0002, advanced=True)
+    convergence: float = setting(0.0002, advanced=True)
     """Rounds end early when the places of clouds in the frames of their partners change by less than this (root mean
     square) at the last gate, m."""
 
@@ -217,7 +217,7 @@ def refine(
         if on_round is not None:
             on_round(rounds, config.rounds)
         last = gate <= config.last_gate * 1.001
-        if rounds >= config.rounds or (last and moved < config.settled):
+        if rounds >= config.rounds or (last and moved < config.convergence):
             return RefinementResult(graph, _only(edges, used), i, j, factors, used, sigma, rounds, summary)
         gate = max(gate * config.shrink, config.last_gate)
 

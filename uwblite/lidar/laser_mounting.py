@@ -29,7 +29,7 @@ class Turning:
     """Scan pairs that were matched."""
     typical: float
     """Median turn between them by the wheels, rad."""
-    told: float
+    as_given: float
     """Mean difference of turns, laser mounted as told, at the best clock offset, rad."""
     other: float
     """The same with the laser mounted the other way up."""
@@ -51,7 +51,7 @@ class Turning:
     @property
     def turned_over(self) -> bool:
         """Whether the laser is mounted the other way up than told."""
-        return self.other < 0.5 * self.told
+        return self.other < 0.5 * self.as_given
 
 
 def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
@@ -72,13 +72,13 @@ def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
     middle = 0.5 * scans.time_increment * scans.ranges.shape[1]
     wheels = np.stack([_wheel_turn(log, scans, first, second, middle + lag) for lag in _LAGS])
     sign = -1.0 if log.mounting.laser_flipped else 1.0
-    told, other = (_Agreement.of(log, scans, first, second, wheels, s * sign) for s in (1.0, -1.0))
-    right = other if other.misfit.min() < 0.5 * told.misfit.min() else told
+    as_given, other = (_Agreement.of(log, scans, first, second, wheels, s * sign) for s in (1.0, -1.0))
+    right = other if other.misfit.min() < 0.5 * as_given.misfit.min() else as_given
     best, centre = int(np.argmin(right.misfit)), len(_LAGS) // 2
     gain = right.errors[centre] - right.errors[best]
     clear = right.misfit[best] < 0.7 * right.misfit[centre] and gain.mean() > 2.0 * gain.std() / np.sqrt(gain.size)
     return Turning(
-        len(first), float(np.median(np.abs(wheels[centre]))), float(told.misfit.min()), float(other.misfit.min()),
+        len(first), float(np.median(np.abs(wheels[centre]))), float(as_given.misfit.min()), float(other.misfit.min()),
         float(right.misfit[best]), float(-_LAGS[best]), bool(clear),
         *_ratio(right.turn, wheels[best]),
     )
@@ -113,9 +113,9 @@ class _Agreement:
         some = sharp > 0.0
         clear = some & (sharp >= np.quantile(sharp[some], 0.5)) if some.any() else ~some
         # A wrong track width makes all turns wrong by one factor; that is no disagreement on which way they go.
-        said, seen = wheels[len(wheels) // 2], sign * turn
-        large = clear & (np.abs(said) > 0.05)
-        factor = float(np.clip(np.median(seen[large] / said[large]), 1.0 / _WIDEST, _WIDEST)) if large.any() else 1.0
+        by_wheels, seen = wheels[len(wheels) // 2], sign * turn
+        large = clear & (np.abs(by_wheels) > 0.05)
+        factor = float(np.clip(np.median(seen[large] / by_wheels[large]), 1.0 / _WIDEST, _WIDEST)) if large.any() else 1.0
         return _Agreement(seen, np.minimum(np.abs(factor * wheels[:, clear] - seen[clear]), 0.3))
 
 
@@ -135,13 +135,13 @@ def _turning_pairs(log: SensorLog, scans: LaserScans, pairs: int) -> tuple[Ints,
     near = scans.stamps[second] - scans.stamps[first] < 2.0
     start, end = (se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps[k]) for k in (first, second))
     motion = se2.between(start, end)
-    turn, drive = np.abs(motion[:, 2]), np.hypot(motion[:, 0], motion[:, 1])
+    turn, travel = np.abs(motion[:, 2]), np.hypot(motion[:, 0], motion[:, 1])
     view = abs(scans.angle_increment) * scans.ranges.shape[1]
     clear = near & (turn > 0.05) & (turn < 0.4 * view)
-    chosen = np.flatnonzero(clear & (drive < 0.15 + 0.3 * turn))
+    chosen = np.flatnonzero(clear & (travel < 0.15 + 0.3 * turn))
     if len(chosen) < LEAST_PAIRS:
-        driving = np.flatnonzero(clear & (drive < 1.0))
-        chosen = np.sort(driving[np.argsort(drive[driving] - 0.3 * turn[driving], kind="stable")[: 2 * LEAST_PAIRS]])
+        driving = np.flatnonzero(clear & (travel < 1.0))
+        chosen = np.sort(driving[np.argsort(travel[driving] - 0.3 * turn[driving], kind="stable")[: 2 * LEAST_PAIRS]])
     chosen = chosen[:: max(1, len(chosen) // pairs)]
     return first[chosen], second[chosen]
 

@@ -47,7 +47,7 @@ class PairFactors:
 
     hessian: Floats
     """(e, 3, 3) sum of w J^T J of the point-to-line distances by T_i_j (x, y, theta), 1/m^2-like, unscaled by noise."""
-    feigned: Floats
+    spurious: Floats
     """(e, 3, 3) part of it that the scatter of the normals alone would feign, see degeneracy."""
     gradient: Floats
     """(e, 3) sum of w J^T r."""
@@ -222,10 +222,10 @@ def _match(
     # The tangent (-ny, nx) stands where the normal stood; its variance weighs it once more.
     tangent = np.stack([-wy, wx, weighted[:, 2]], axis=1)
     scatter = surface.variance.take(target) + surface.variance.take(row)
-    feigned = (tangent * scatter[:, None]) @ tangent.transpose(0, 2, 1)
+    spurious = (tangent * scatter[:, None]) @ tangent.transpose(0, 2, 1)
     return PairFactors(
         hessian=summed[:, :3, :3],
-        feigned=feigned,
+        spurious=spurious,
         gradient=summed[:, :3, 3],
         matched=good.sum(axis=1),
         asked=(row >= 0).sum(axis=1),
@@ -250,7 +250,7 @@ def _look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> Ints:
     return np.where(inside, raster.nearest.take(cell), _NOBODY).astype(np.int64)
 
 
-_TRUSTED = 2.0
+_MEASURED = 2.0
 """Multiple of the feigned information that a direction must exceed to have been measured."""
 
 
@@ -261,8 +261,8 @@ def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
     In the basis B that diagonalises both, feigned = B B^T and hessian = B V diag(l) V^T B^T; l must exceed a multiple
     of 1, see degeneracy.
     """
-    basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.feigned)
-    kept = np.maximum(values - _TRUSTED, 0.0)
+    basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.spurious)
+    kept = np.maximum(values - _MEASURED, 0.0)
     divisor = np.where(kept > 0.0, values, np.inf)
     within = np.swapaxes(vectors, 1, 2) @ inverse
     step = -np.einsum("eji,ej->ei", within, np.einsum("eij,ej->ei", within, factors.gradient) / divisor)

@@ -14,7 +14,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..odometry.wheels import learn_wheels
+from ..odometry.wheels import reestimate_wheel_noise
 from .clouds import Clouds
 from .pair_alignment import align_pairs
 from .scan_matching import CloudRasters, match, measured, pair_points
@@ -107,12 +107,12 @@ def follow(
     i, tight = wheels.i, min(config.gate, gate)
     steps = _Steps.of(clouds, raster, wheels, graph, gate, config)
     good = steps.enough & (steps.share >= config.good_share)
-    learnt = learn_wheels(wheels, _edges(clouds, raster, i[good], steps.pose[good], tight, config), graph)
+    learnt = reestimate_wheel_noise(wheels, _edges(clouds, raster, i[good], steps.pose[good], tight, config), graph)
     miss = _miss(clouds, learnt)
     pose, lost = _searched(clouds, i, steps, steps.enough & ~good, config)
     kept = steps.enough & ~lost
     measured_steps = _edges(clouds, raster, i[kept], pose[kept], tight, config)
-    learnt = learn_wheels(wheels, measured_steps, graph)
+    learnt = reestimate_wheel_noise(wheels, measured_steps, graph)
     searched = int((steps.enough & ~good).sum())
     return ScanOdometry(measured_steps, learnt, float(np.median(miss)) if len(miss) else 0.0, searched)
 

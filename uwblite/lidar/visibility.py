@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from .. import se2
 from ..arrays import Floats, Ints
 from .clouds import Clouds
-from .free_space import FreeSpace, contradiction, free_space, looked_through
+from .free_space import FreeSpace, contradiction, free_space, seen_beyond
 from .submaps import Submaps
 
 _BEARINGS = 120
@@ -71,7 +71,7 @@ def static_points(submaps: Submaps, free: Sequence[FreeSpace]) -> Submaps:
     kept = np.ones(len(submaps.clouds.points), dtype=bool)
     for k, own in enumerate(free):
         rows = slice(submaps.clouds.offsets[k], submaps.clouds.offsets[k + 1])
-        through, in_view = looked_through(own, submaps.clouds.cloud(k)[0], _MARGIN)
+        through, in_view = seen_beyond(own, submaps.clouds.cloud(k)[0], _MARGIN)
         kept[rows] = 2 * through <= in_view
     return replace(submaps, clouds=submaps.clouds.only(kept))
 

@@ -31,7 +31,7 @@ class Candidates:
     """(c, 3, 3) of the guess."""
     spread: Floats
     """(c,) 3 sigma of its position, m."""
-    held: bool = True
+    constrained: bool = True
     """Radio or known anchors hold the trajectory, so that its covariance is to be believed."""
 
     def rows(self, chosen: slice) -> "Candidates":
@@ -53,7 +53,7 @@ class Candidates:
 
 def propose(
     graph: Graph, marginals: JointCovariance, submaps: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
-    missed: set[tuple[int, int]], held: bool, config: LoopClosureConfig,
+    missed: set[tuple[int, int]], constrained: bool, config: LoopClosureConfig,
 ) -> Candidates:
     """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
 
@@ -75,7 +75,7 @@ def propose(
     near = distance < config.reach + config.search_limit
     a, b, distance = a[near], b[near], distance[near]
     if not len(a):
-        return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), held)
+        return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), constrained)
     covariance = marginals.relative(reference[a], reference[b])
     slack = np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
     astray = np.array([(int(x), int(y)) in missed for x, y in zip(a, b, strict=True)])
@@ -91,7 +91,7 @@ def propose(
     fresh = np.array([(int(x), int(y), bool(d)) not in tried for x, y, d in zip(a, b, doubtful, strict=True)])
     kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
     a, b = a[kept], b[kept]
-    return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept], held)
+    return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept], constrained)
 
 
 def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:
@@ -109,6 +109,6 @@ def missed(candidates: Candidates, found: Closures, config: LoopClosureConfig) -
     direct = candidates.spread <= config.direct
     return {
         (int(a), int(b))
-        for a, b, d, story in zip(candidates.target, candidates.source, direct, found.candidates, strict=True)
-        if d and story.overlap < config.overlap
+        for a, b, d, records in zip(candidates.target, candidates.source, direct, found.candidates, strict=True)
+        if d and records.overlap < config.overlap
     }

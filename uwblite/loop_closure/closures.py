@@ -80,10 +80,10 @@ class Closures:
         ----------
         keep : (e,) of the edges. outcome : of each other one. reasons : (e,) its outcome in words.
         """
-        story, standing = list(self.candidates), [k for k, c in enumerate(self.candidates) if c.accepted]
+        records, standing = list(self.candidates), [k for k, c in enumerate(self.candidates) if c.accepted]
         for k in np.flatnonzero(~keep).tolist():
-            story[standing[k]] = replace(story[standing[k]], outcome=outcome, reason=reasons[k])
-        return Closures(self.edges.rows(np.flatnonzero(keep)), tuple(story))
+            records[standing[k]] = replace(records[standing[k]], outcome=outcome, reason=reasons[k])
+        return Closures(self.edges.rows(np.flatnonzero(keep)), tuple(records))
 
 
 def no_closures() -> Closures:

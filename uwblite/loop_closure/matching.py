@@ -104,7 +104,7 @@ def _fit(batch: _Batch) -> ClosureMatches:
     points = pair_points(clouds, candidates.source, config.points)
     factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
     best = Aligned(pose, factors)
-    return ClosureMatches(best, found, second, _see_through(batch, best))
+    return ClosureMatches(best, found, second, _free_space_violations(batch, best))
 
 
 def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
@@ -146,7 +146,7 @@ def _prepare(clouds: Clouds, k: int, prepared: dict[int, PointCloud]) -> PointCl
     return prepared[k]
 
 
-def _see_through(batch: _Batch, best: Aligned) -> Floats:
+def _free_space_violations(batch: _Batch, best: Aligned) -> Floats:
     """Return the larger share of points (c,) of either sub-map that would stand in what the other saw to be free."""
     candidates, config, free = batch.candidates, batch.config, batch.free
     through = np.zeros(len(candidates.target))

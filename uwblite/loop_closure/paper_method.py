@@ -56,9 +56,9 @@ def find(
         if progress is not None:
             progress(len(results), len(target))
     information = [found.information / config.correlation for found in results]
-    story = [_story(int(i[k]), int(j[k]), found, information[k]) for k, found in enumerate(results)]
-    good = np.flatnonzero([c.accepted for c in story])
-    kept = [story[k] for k in good]
+    records = [_record(int(i[k]), int(j[k]), found, information[k]) for k, found in enumerate(results)]
+    good = np.flatnonzero([c.accepted for c in records])
+    kept = [records[k] for k in good]
     return Closures(
         RelativePoseEdges(
             np.array([c.i for c in kept], dtype=np.int64),
@@ -66,7 +66,7 @@ def find(
             np.array([c.T_i_j for c in kept]).reshape(-1, 3),
             _root(np.array([information[k] for k in good]).reshape(-1, 3, 3)),
         ),
-        tuple(story),
+        tuple(records),
     )
 
 
@@ -134,7 +134,7 @@ def _align(batch: _Batch) -> list[Registration]:
     return [align(trees[a], points[b], guess, batch.icp) for a, b, guess in pairs]
 
 
-def _story(i: int, j: int, found: Registration, information: Floats) -> LoopClosure:
+def _record(i: int, j: int, found: Registration, information: Floats) -> LoopClosure:
     outcome = "accepted" if found.converged else "not-converged"
     why = f"fitness score {found.fitness:.3g} m2 after {found.iterations} iterations" if found.converged else found.reason
     return LoopClosure(i, j, found.T_target_source, information, found.rmse, found.overlap, outcome, why)

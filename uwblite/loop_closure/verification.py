@@ -68,7 +68,7 @@ def _judge(
     joint = onto @ candidates.covariance @ np.swapaxes(onto, 1, 2) + seen
     distance = np.einsum("ei,eij,ej->e", visible, np.linalg.pinv(joint, rcond=1e-9, hermitian=True), visible)
     strength = np.linalg.eigvalsh(information)[:, 1]
-    most = config.consistency if candidates.held else np.inf
+    most = config.consistency if candidates.constrained else np.inf
     verdicts: list[tuple[str, str]] = []
     for k in range(len(z)):
         least = config.overlap_after_search if searched[k] else config.overlap
@@ -101,14 +101,14 @@ def _collect(
     """Return every candidate with its outcome, and the accepted ones as edges between the sub-maps' keyframes."""
     i, j = submaps.reference[candidates.target], submaps.reference[candidates.source]
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
-    story = tuple(
+    records = tuple(
         LoopClosure(
             int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), outcome, reason
         )
         for k, (outcome, reason) in enumerate(verdicts)
     )
-    good = np.array([closure.accepted for closure in story], dtype=bool)
-    return Closures(RelativePoseEdges(i[good], j[good], z[good], sqrt_information[good]), story)
+    good = np.array([closure.accepted for closure in records], dtype=bool)
+    return Closures(RelativePoseEdges(i[good], j[good], z[good], sqrt_information[good]), records)
 
 
 def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:

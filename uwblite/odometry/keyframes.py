@@ -160,11 +160,11 @@ def _moments(odometry: Odometry, scans: LaserScans | None) -> tuple[Floats, Ints
     if scans is None:
         return stamps, np.arange(len(stamps)), np.ones(len(stamps), dtype=bool)
     middle = scans.middles
-    looks = np.unique(middle[(middle > stamps[0]) & (middle < stamps[-1])])
-    looks = np.setdiff1d(looks, stamps, assume_unique=False)
-    moments = np.concatenate([stamps, looks])
+    at_scans = np.unique(middle[(middle > stamps[0]) & (middle < stamps[-1])])
+    at_scans = np.setdiff1d(at_scans, stamps, assume_unique=False)
+    moments = np.concatenate([stamps, at_scans])
     order = np.argsort(moments, kind="stable")
-    sample = np.concatenate([np.arange(len(stamps)), _sample(odometry, looks)])
+    sample = np.concatenate([np.arange(len(stamps)), _sample(odometry, at_scans)])
     return moments[order], sample[order], np.isin(moments[order], middle)
 
 

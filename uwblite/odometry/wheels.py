@@ -58,7 +58,7 @@ def drift_time(keyframes: Keyframes) -> Floats:
     return np.where(keyframes.slack[:, 2] > 0.0, np.minimum(keyframes.duration, 1.0), keyframes.duration)
 
 
-def learn_wheels(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
+def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
     """Scale the wheels' noise along, across and in heading so that it explains how far they lie from measured steps.
 
     Parameters

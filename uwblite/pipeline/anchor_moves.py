@@ -83,13 +83,13 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task)
     if ranges is None or edges is None or estimate.bootstrap is None:
         return {}
     # The recording's ranges stand in the edges in their own order.
-    heard = np.flatnonzero((edges.pose >= recording.rows.start) & (edges.pose < recording.rows.stop))
+    of_recording = np.flatnonzero((edges.pose >= recording.rows.start) & (edges.pose < recording.rows.stop))
     positions = edges.tag_positions(estimate.graph.poses)
     usable = np.isfinite(edges.ranges) & (edges.ranges > _SHORTEST) & (edges.ranges < task.config.trilateration.max_range)
     sigma = short_term_sigma(edges.stamps[usable], edges.anchor[usable], edges.ranges[usable], task.config.ranges)
     moves = {}
     for k, name in enumerate(ranges.anchor_ids):
-        own = heard[(ranges.anchor == k) & usable[heard]]
+        own = of_recording[(ranges.anchor == k) & usable[of_recording]]
         level = np.sqrt(np.maximum(edges.ranges[own] ** 2 - edges.height[own] ** 2, 1e-4))
         found = find_moves(positions[own], level, edges.stamps[own], sigma, task.config.trilateration)
         if found:

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..constraints import Clock, Constraints, KnownAnchor
+from ..constraints import Clock, Constraints, GivenAnchor
 from ..errors import ConfigError
 from ..graph.distance_edges import AnchorDistanceEdges
 from ..graph.graph import Edges, Graph, PriorEdges
@@ -57,7 +57,7 @@ class Applied:
     """Anchors that are not where they were said to be, by id: how far off they are, m."""
 
 
-def apply(known: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
+def apply(given: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
     """Bring a first estimate into the user's frame and add what is known to its edges.
 
     Parameters
@@ -72,46 +72,46 @@ def apply(known: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed:
     ------
     ConfigError : an anchor is not in the recording, or a stamp lies outside it.
     """
-    known = _present(known, anchor_ids)
+    given = _present(given, anchor_ids)
     index = {name: k for k, name in enumerate(anchor_ids)}
-    motion, moved = _fit(known, graph, index, placed, clock)
+    motion, moved = _fit(given, graph, index, placed, clock)
     graph = replace(graph, poses=se2.compose(motion, graph.poses), anchors=se2.transform(motion, graph.anchors))
-    edges = [*_anchor_priors(known, index, moved), *_pose_priors(known, clock)]
-    edges += [*_distances(known, index), *_closures(known, clock)]
-    if known.places:
+    edges = [*_anchor_priors(given, index, moved), *_pose_priors(given, clock)]
+    edges += [*_distances(given, index), *_closures(given, clock)]
+    if given.places:
         graph = replace(graph, fixed_poses=np.zeros(len(graph.poses), dtype=bool))
-        edges += _gauge(known, graph, moved)
+        edges += _gauge(given, graph, moved)
     return Applied(graph.with_edges(*edges), motion, moved)
 
 
-def _present(known: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
+def _present(given: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
     """Return what concerns this recording; anchors of an earlier map that are not heard any more are left out."""
-    wanted = {a.id for a in known.anchors if not a.movable} | {name for d in known.distances for name in d.anchors}
+    wanted = {a.id for a in given.anchors if not a.movable} | {name for d in given.distances for name in d.anchors}
     missing = sorted(wanted - set(anchor_ids))
     if missing:
         raise ConfigError(f"constraints: no ranges to anchor {missing[0]}; the recording has {', '.join(anchor_ids) or 'none'}")
-    return replace(known, anchors=tuple(a for a in known.anchors if a.id in anchor_ids))
+    return replace(given, anchors=tuple(a for a in given.anchors if a.id in anchor_ids))
 
 
 def _fit(
-    known: Constraints, graph: Graph, index: dict[str, int], placed: Bools, clock: Clock
+    given: Constraints, graph: Graph, index: dict[str, int], placed: Bools, clock: Clock
 ) -> tuple[Floats, dict[str, float]]:
     """Return the rigid motion (3,) that brings most known places together, and anchors that do not join in."""
-    if known.poses:
-        first = min(known.poses, key=lambda p: p.sigma)
+    if given.poses:
+        first = min(given.poses, key=lambda p: p.sigma)
         motion = se2.compose(np.array(first.pose), se2.inverse(graph.poses[clock.nearest(first.stamp, first.recording)]))
-        return motion, _strayed(known, graph, index, placed, motion)
-    anchors = [a for a in known.anchors if placed[index[a.id]]]
+        return motion, _strayed(given, graph, index, placed, motion)
+    anchors = [a for a in given.anchors if placed[index[a.id]]]
     here = np.array([graph.anchors[index[a.id]] for a in anchors]).reshape(-1, 2)
     there = np.array([a.position for a in anchors]).reshape(-1, 2)
     if len(anchors) < 2:
         shift = (there - here)[0] if len(anchors) else np.zeros(2)
         return np.array([*shift, 0.0]), {}
     motion = consensus(here, there, np.array([_tolerance(a) for a in anchors]))
-    return motion, _strayed(known, graph, index, placed, motion)
+    return motion, _strayed(given, graph, index, placed, motion)
 
 
-def _tolerance(anchor: KnownAnchor) -> float:
+def _tolerance(anchor: GivenAnchor) -> float:
     """Return how far a first estimate may lie from a known place, m; biases are not yet known well then."""
     return 3.0 * anchor.sigma + 0.6
 
@@ -129,9 +129,9 @@ def consensus(here: Floats, there: Floats, tolerance: Floats) -> Floats:
     return align(here[agree], there[agree])
 
 
-def _strayed(known: Constraints, graph: Graph, index: dict[str, int], placed: Bools, motion: Floats) -> dict[str, float]:
+def _strayed(given: Constraints, graph: Graph, index: dict[str, int], placed: Bools, motion: Floats) -> dict[str, float]:
     strayed = {}
-    for a in known.anchors:
+    for a in given.anchors:
         if a.movable and placed[index[a.id]]:
             off = float(np.hypot(*(se2.transform(motion, graph.anchors[index[a.id]]) - np.array(a.position))))
             if off > _tolerance(a):
@@ -139,11 +139,11 @@ def _strayed(known: Constraints, graph: Graph, index: dict[str, int], placed: Bo
     return strayed
 
 
-def _anchor_priors(known: Constraints, index: dict[str, int], moved: dict[str, float]) -> list[Edges]:
+def _anchor_priors(given: Constraints, index: dict[str, int], moved: dict[str, float]) -> list[Edges]:
     """Surveyed anchors are taken as they are; those of an earlier map get a kernel that gives up a moved one."""
     edges: list[Edges] = []
     for movable, kernel in ((False, Kernel()), (True, Kernel("geman-mcclure", 4.0))):
-        anchors = [a for a in known.anchors if a.movable == movable and a.id not in moved]
+        anchors = [a for a in given.anchors if a.movable == movable and a.id not in moved]
         if anchors:
             place = np.array([index[a.id] for a in anchors], dtype=np.int64)
             value = np.array([a.position for a in anchors])
@@ -152,34 +152,34 @@ def _anchor_priors(known: Constraints, index: dict[str, int], moved: dict[str, f
     return edges
 
 
-def _pose_priors(known: Constraints, clock: Clock) -> list[Edges]:
-    if not known.poses:
+def _pose_priors(given: Constraints, clock: Clock) -> list[Edges]:
+    if not given.poses:
         return []
-    place = np.array([clock.nearest(p.stamp, p.recording) for p in known.poses], dtype=np.int64)
-    root = np.array([np.diag(1.0 / np.array(p.sigma)) for p in known.poses])
-    return [PriorEdges("poses", place, np.array([p.pose for p in known.poses]), root)]
+    place = np.array([clock.nearest(p.stamp, p.recording) for p in given.poses], dtype=np.int64)
+    root = np.array([np.diag(1.0 / np.array(p.sigma)) for p in given.poses])
+    return [PriorEdges("poses", place, np.array([p.pose for p in given.poses]), root)]
 
 
-def _distances(known: Constraints, index: dict[str, int]) -> list[Edges]:
-    if not known.distances:
+def _distances(given: Constraints, index: dict[str, int]) -> list[Edges]:
+    if not given.distances:
         return []
-    ends = np.array([[index[name] for name in d.anchors] for d in known.distances], dtype=np.int64)
-    values = np.array([[d.distance, d.sigma] for d in known.distances])
+    ends = np.array([[index[name] for name in d.anchors] for d in given.distances], dtype=np.int64)
+    values = np.array([[d.distance, d.sigma] for d in given.distances])
     return [AnchorDistanceEdges(ends[:, 0], ends[:, 1], values[:, 0], values[:, 1])]
 
 
-def _closures(known: Constraints, clock: Clock) -> list[Edges]:
-    if not known.closures:
+def _closures(given: Constraints, clock: Clock) -> list[Edges]:
+    if not given.closures:
         return []
-    ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in known.closures]
+    ends = [[clock.nearest(s, r) for s, r in zip(c.stamps, c.recordings, strict=True)] for c in given.closures]
     i, j = np.array(ends, dtype=np.int64).T
-    root = np.array([np.diag(1.0 / np.array(c.sigma)) for c in known.closures])
-    return [RelativePoseEdges(i, j, np.array([c.pose for c in known.closures]), root)]
+    root = np.array([np.diag(1.0 / np.array(c.sigma)) for c in given.closures])
+    return [RelativePoseEdges(i, j, np.array([c.pose for c in given.closures]), root)]
 
 
-def _gauge(known: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:
+def _gauge(given: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:
     """Hold the heading of the first pose where one known place alone leaves it open."""
-    if known.poses or sum(a.id not in moved for a in known.anchors) > 1:
+    if given.poses or sum(a.id not in moved for a in given.anchors) > 1:
         return []
     root = np.diag([0.0, 0.0, 1e4])[None]
     return [PriorEdges("poses", np.zeros(1, dtype=np.int64), graph.poses[:1].copy(), root)]

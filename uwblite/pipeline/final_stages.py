@@ -56,10 +56,10 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     estimate = with_range_noise(estimate, task.config, steady=True)
     graph, own = estimate.graph, estimate.graph.calibration.of_kinds(BIAS, HEIGHT, RANGE_SCALE)
     fixed = np.asarray(graph.fixed_calibration)
-    held = replace(graph, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=fixed | ~own)
-    if not any(free.any() for free in free_unknowns(held).values()):
+    with_fixed_poses = replace(graph, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=fixed | ~own)
+    if not any(free.any() for free in free_unknowns(with_fixed_poses).values()):
         return estimate
-    done = _solved(replace(estimate, graph=held), task).graph
+    done = _solved(replace(estimate, graph=with_fixed_poses), task).graph
     fixed = fixed | (np.asarray(done.fixed_calibration) & own)
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))
 

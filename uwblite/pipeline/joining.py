@@ -45,14 +45,14 @@ def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
     DataError : a recording shares fewer than two placed anchors with the others.
     """
     recordings = task.recordings
-    known = _places(estimates[0])
+    placed = _places(estimates[0])
     motions = [np.zeros(3) for _ in estimates]
     names = [list(estimate.anchor_ids) for estimate in estimates]
     waiting = list(range(1, len(estimates)))
     while waiting:
         found = {n: _places(estimates[n]) for n in waiting}
-        number = max(waiting, key=lambda n: (len(found[n].keys() & known.keys()), -n))
-        motions[number], moved = _laid_on(found[number], known, recordings.each[number])
+        number = max(waiting, key=lambda n: (len(found[n].keys() & placed.keys()), -n))
+        motions[number], moved = _laid_on(found[number], placed, recordings.each[number])
         waiting.remove(number)
         for k, name in enumerate(names[number]):
             here, spread = found[number].get(name, (None, 0.0))
@@ -60,9 +60,9 @@ def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
                 continue
             here = se2.transform(motions[number], here)
             if name in moved:
-                names[number][k] = _other_name(name, here, spread, number, known)
+                names[number][k] = _other_name(name, here, spread, number, placed)
                 warn_of_moved_anchor(task, name, moved[name], number, names[number][k])
-            known.setdefault(names[number][k], (here, spread))
+            placed.setdefault(names[number][k], (here, spread))
     return _one_graph(estimates, motions, names, recordings)
 
 
@@ -80,11 +80,13 @@ def numbered(anchor: str, recording: int) -> str:
     return f"{anchor}#{recording + 1}"
 
 
-def _other_name(name: str, here: Floats, spread: float, number: int, known: dict[str, tuple[Floats, float]]) -> str:
+def _other_name(name: str, here: Floats, spread: float, number: int, placed: dict[str, tuple[Floats, float]]) -> str:
     """Return what to call an anchor that does not stand at its first place: as a recording that found it here does."""
     for earlier in range(1, number):
         other = numbered(name, earlier)
-        if other in known and np.hypot(*(known[other][0] - here)) < _FIRST_TOLERANCE + 2.0 * np.hypot(spread, known[other][1]):
+        if other in placed and np.hypot(*(placed[other][0] - here)) < _FIRST_TOLERANCE + 2.0 * np.hypot(
+            spread, placed[other][1]
+        ):
             return other
     return numbered(name, number)
 
@@ -104,17 +106,17 @@ def _places(estimate: Estimate) -> dict[str, tuple[Floats, float]]:
 
 
 def _laid_on(
-    found: dict[str, tuple[Floats, float]], known: dict[str, tuple[Floats, float]], recording: Recording
+    found: dict[str, tuple[Floats, float]], placed: dict[str, tuple[Floats, float]], recording: Recording
 ) -> tuple[Floats, dict[str, float]]:
     """Return the motion (3,) of a recording into the common frame, and the anchors that do not join in, with how far off."""
-    common = sorted(found.keys() & known.keys())
+    common = sorted(found.keys() & placed.keys())
     if len(common) < 2:
         raise DataError(
             f"{recording.name} shares {len(common)} placed anchors with the others ({', '.join(common) or 'none'}); two "
             "or more are needed to bring it into their frame: map it alone, or record where common anchors are heard"
         )
-    here, there = (np.array([side[name][0] for name in common]) for side in (found, known))
-    spread = np.array([np.hypot(found[name][1], known[name][1]) for name in common])
+    here, there = (np.array([side[name][0] for name in common]) for side in (found, placed))
+    spread = np.array([np.hypot(found[name][1], placed[name][1]) for name in common])
     tolerance = _FIRST_TOLERANCE + 2.0 * spread
     motion = consensus(here, there, tolerance)
     off = np.hypot(*(se2.transform(motion, here) - there).T)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..constraints import Constraints, KnownLandmark
+from ..constraints import Constraints, GivenLandmark
 from ..errors import ConfigError
 from ..graph.distance_edges import PointDistanceEdges
 from ..graph.graph import Graph
@@ -45,7 +45,7 @@ class Sightings:
     """(v, 2) m, in the frame of that keyframe."""
 
 
-def sightings(landmark: KnownLandmark, clouds: Clouds, poses: Floats, path: Floats) -> Sightings:
+def sightings(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: Floats) -> Sightings:
     """Find the keyframes that see a landmark.
 
     Parameters
@@ -120,7 +120,7 @@ class Ties:
     """(e,) which distance each is of."""
 
 
-def ties(known: Constraints, clouds: Clouds, poses: Floats, path: Floats) -> Ties:
+def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) -> Ties:
     """Find the landmarks and tie the poses that see them at the measured distances.
 
     Parameters
@@ -132,14 +132,14 @@ def ties(known: Constraints, clouds: Clouds, poses: Floats, path: Floats) -> Tie
     ------
     ConfigError : a landmark is not given of, or is not there.
     """
-    listed = {landmark.name: landmark for landmark in known.landmarks}
-    wanted = [name for d in known.landmark_distances for name in d.landmarks]
+    listed = {landmark.name: landmark for landmark in constraints.landmarks}
+    wanted = [name for d in constraints.landmark_distances for name in d.landmarks]
     missing = sorted(set(wanted) - set(listed))
     if missing:
         raise ConfigError(f"constraints: [[landmark_distance]] names {missing[0]!r}, of which there is no [[landmark]]")
     found = {name: sightings(listed[name], clouds, poses, path) for name in dict.fromkeys(wanted)}
     rows: list[tuple[NDArray[Any], ...]] = []
-    for number, given in enumerate(known.landmark_distances):
+    for number, given in enumerate(constraints.landmark_distances):
         one, other = (found[name] for name in given.landmarks)
         a, b = np.indices((len(one.keyframe), len(other.keyframe))).reshape(2, -1)
         flat = np.ones(len(a))

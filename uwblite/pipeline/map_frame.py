@@ -94,10 +94,10 @@ def alignment(how: str, graph: Graph, placed: Bools, normals: Floats) -> Floats:
         turned = wall_direction(se2.rotate(to_first[2], normals))
         return se2.compose(np.array([0.0, 0.0, -turned]), to_first)
     if how == "anchors":
-        known = np.flatnonzero(placed)
-        if len(known) < 2:
+        indices = np.flatnonzero(placed)
+        if len(indices) < 2:
             raise DataError("two placed anchors are needed to align the map with; choose another --align")
-        first, last = graph.anchors[known[0]], graph.anchors[known[-1]]
+        first, last = graph.anchors[indices[0]], graph.anchors[indices[-1]]
         return se2.inverse(np.array([*first, np.arctan2(*(last - first)[::-1])]))
     raise ConfigError(f"unknown alignment {how!r}; choose one of {', '.join(ALIGNMENTS)}")
 

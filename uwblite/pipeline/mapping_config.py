@@ -28,7 +28,8 @@ class MappingConfig:
 
     RENAMED: ClassVar[dict[str, str]] = {
         "growth": "bootstrap", "anchors": "trilateration", "loops": "loop_closure", "tracking": "scan_to_scan",
-        "search": "correlative", "turn_laser": "detect_laser_flip",
+        "search": "correlative",
+        "turn_laser": "detect_laser_flip", "refinement.settled": "refinement.convergence",
     }
     """Earlier names, for error messages."""
     use_uwb: bool = True

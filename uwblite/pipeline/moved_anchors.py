@@ -31,27 +31,27 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
     """
     if len(task.recordings) == 1 or estimate.ranges is None or estimate.bootstrap is None:
         return estimate
-    heard = task.recordings.of_keyframe[estimate.ranges.pose]
-    place, covariance, pairs = _places_by_recording(estimate, heard, task.config.solver, task.config.ranges)
+    recording_of = task.recordings.of_keyframe[estimate.ranges.pose]
+    place, covariance, pairs = _places_by_recording(estimate, recording_of, task.config.solver, task.config.ranges)
     ids, anchors, anchor = list(estimate.anchor_ids), estimate.graph.anchors.copy(), estimate.ranges.anchor.copy()
     source = list(range(len(ids)))
     moved = False
     for k, name in enumerate(estimate.anchor_ids):
         rows = np.flatnonzero(pairs[:, 0] == k).tolist()
-        known = dict.fromkeys(rows[:1], k)
+        number_of = dict.fromkeys(rows[:1], k)
         for row in rows[1:]:
             recording = int(pairs[row, 1])
-            same = [n for r, n in known.items() if not _differ(place[row] - place[r], covariance[row] + covariance[r])]
+            same = [n for r, n in number_of.items() if not _differ(place[row] - place[r], covariance[row] + covariance[r])]
             if not same:
                 ids.append(numbered(name, recording))
                 source.append(k)
                 anchors = np.vstack([anchors, place[row]])
-            known[row] = same[0] if same else len(ids) - 1
-            if known[row] != k:
+            number_of[row] = same[0] if same else len(ids) - 1
+            if number_of[row] != k:
                 moved = True
-                anchor[(estimate.ranges.anchor == k) & (heard == recording)] = known[row]
+                anchor[(estimate.ranges.anchor == k) & (recording_of == recording)] = number_of[row]
                 off = float(np.hypot(*(place[row] - place[rows[0]])))
-                warn_of_moved_anchor(task, name, off, recording, ids[known[row]])
+                warn_of_moved_anchor(task, name, off, recording, ids[number_of[row]])
     if not moved:
         return estimate
     found = estimate.bootstrap
@@ -69,14 +69,14 @@ def _differ(off: Floats, covariance: Floats) -> bool:
 
 
 def _places_by_recording(
-    estimate: Estimate, heard: Ints, solver: SolverConfig, noise: RangeNoiseConfig
+    estimate: Estimate, recording_of: Ints, solver: SolverConfig, noise: RangeNoiseConfig
 ) -> tuple[Floats, Floats, Ints]:
     """Return place (p, 2), covariance (p, 2, 2) and (anchor, recording) of each anchor as each recording heard it."""
     ranges, graph = estimate.ranges, estimate.graph
     assert ranges is not None
     assert graph.fixed_calibration is not None
     alive = np.flatnonzero((np.asarray(ranges.weights) > 0) & estimate.placed[ranges.anchor])
-    pairs, which = np.unique(np.stack([ranges.anchor[alive], heard[alive]], axis=1), axis=0, return_inverse=True)
+    pairs, which = np.unique(np.stack([ranges.anchor[alive], recording_of[alive]], axis=1), axis=0, return_inverse=True)
     own = graph.calibration.of_kinds(BIAS)
     priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration")
     all_poses, fixed = np.ones(len(graph.poses), dtype=bool), graph.fixed_calibration | ~own

@@ -110,9 +110,9 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
 
     It is 1 where the unit is right up to what a calibration of the wheels' radius may take up.
     """
-    known, recordings = estimate.graph.calibration, task.recordings
-    places = [known.index("odometry_scale", recording=n) for n in range(len(recordings))]
-    factors = np.array([1.0 if place < 0 else 1.0 + float(known.values[place]) for place in places])
+    calibration, recordings = estimate.graph.calibration, task.recordings
+    places = [calibration.index("odometry_scale", recording=n) for n in range(len(recordings))]
+    factors = np.array([1.0 if place < 0 else 1.0 + float(calibration.values[place]) for place in places])
     factors = np.where(np.abs(factors - 1.0) > _OTHER_UNIT, factors, 1.0)
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:

@@ -81,9 +81,9 @@ def check_scales(estimate: Estimate, task: Task) -> None:
     """Compare the lengths that odometry, lidar and radio measure."""
     if not task.recordings.have_scans:
         return
-    known = estimate.graph.calibration
-    place = known.index(RANGE_SCALE)
-    scale = 1.0 + (float(known.values[place]) if place >= 0 else 0.0)
+    calibration = estimate.graph.calibration
+    place = calibration.index(RANGE_SCALE)
+    scale = 1.0 + (float(calibration.values[place]) if place >= 0 else 0.0)
     if estimate.placed.any() and abs(scale - 1.0) > _SCALE:
         text = f"the ranges are {scale:.2f} times what the lidar's map says: one of the two has a wrong unit or scale"
         task.stages.doubt("scales", text, ranges_by_lidar=scale)
@@ -102,9 +102,9 @@ def check_scales(estimate: Estimate, task: Task) -> None:
 def check_support(estimate: Estimate, task: Task) -> None:
     """Doubt a map that nothing but the odometry holds."""
     ranges = estimate.ranges
-    held = ranges is not None and bool(np.any(np.asarray(ranges.weights) > 0))
-    held |= any(isinstance(edges, ScanEdges | RelativePoseEdges) for edges in estimate.graph.edges)
-    if not held and len(estimate.graph.poses) > 2:
+    constrained = ranges is not None and bool(np.any(np.asarray(ranges.weights) > 0))
+    constrained |= any(isinstance(edges, ScanEdges | RelativePoseEdges) for edges in estimate.graph.edges)
+    if not constrained and len(estimate.graph.poses) > 2:
         text = "neither ranges nor scans hold the trajectory: it is the odometry's alone, and drifts"
         task.stages.doubt("odometry-alone", text)
 

@@ -126,8 +126,8 @@ def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) 
 
 def _count(name: str, recordings: Recordings) -> int:
     """Return how many ranges to an anchor the recordings hold."""
-    heard = [(r.log.ranges, r.anchor_ids.index(name)) for r in recordings.each if name in r.anchor_ids]
-    return sum(int(np.sum(ranges.anchor == k)) for ranges, k in heard if ranges is not None)
+    measured = [(r.log.ranges, r.anchor_ids.index(name)) for r in recordings.each if name in r.anchor_ids]
+    return sum(int(np.sum(ranges.anchor == k)) for ranges, k in measured if ranges is not None)
 
 
 def _calibration(k: int, unknown: Unknown, graph: Graph, covariance: Marginals) -> CalibrationEstimate:

@@ -18,7 +18,7 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 
-SIGMA_IN_SIGHT, SIGMA_BEHIND_WALLS = 0.1, 0.5
+SIGMA_LINE_OF_SIGHT, SIGMA_BEHIND_WALLS = 0.1, 0.5
 """m; of a range in line of sight, and of one through walls, whose delay is not known."""
 _PRIOR = 3.0
 """m; how well the position is known without ranges: it bounds the error where no anchor is heard."""
@@ -68,8 +68,8 @@ def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: flo
 
     at, offered = metres(points), metres(candidates)
     here = np.floor((anchors - low) / cell).astype(np.int64)[:, ::-1] if len(anchors) else np.zeros((0, 2), dtype=np.int64)
-    today = _information(at, anchors, _in_sight(blocked, here, points), reach).sum(axis=0)
-    gains = _information(at, offered, _in_sight(blocked, candidates, points), reach)
+    today = _information(at, anchors, _line_of_sight(blocked, here, points), reach).sum(axis=0)
+    gains = _information(at, offered, _line_of_sight(blocked, candidates, points), reach)
     offered_too_near = _near(offered, anchors)
     chosen = _choose(today, gains, offered, offered_too_near, count)
     errors = [position_errors(today)]
@@ -84,11 +84,11 @@ def position_errors(information: Floats) -> Floats:
     return np.asarray(np.sqrt((xx + yy) / (xx * yy - xy**2)))
 
 
-def _information(points: Floats, anchors: Floats, in_sight: Bools, reach: float) -> Floats:
+def _information(points: Floats, anchors: Floats, line_of_sight: Bools, reach: float) -> Floats:
     """Return what a range to each anchor tells at each point (a, m, 3): xx, xy, yy, 1/m^2."""
     away = points[None] - anchors[:, None]
     distance = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-3)
-    weight = np.where(in_sight, SIGMA_IN_SIGHT, SIGMA_BEHIND_WALLS) ** -2.0 * (distance <= reach)
+    weight = np.where(line_of_sight, SIGMA_LINE_OF_SIGHT, SIGMA_BEHIND_WALLS) ** -2.0 * (distance <= reach)
     x, y = np.moveaxis(away / distance[..., None], -1, 0)
     return np.stack([x * x, x * y, y * y], axis=-1) * weight[..., None]
 
@@ -161,12 +161,12 @@ def _wall_cells(blocked: Bools, free: Bools) -> Ints:
     return _places(free & beside, _MOST_CANDIDATES)
 
 
-def _in_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
+def _line_of_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
     """Tell from which sources (a, 2) which targets (m, 2) are in sight (a, m).
 
     The first cell on the way is no obstacle: an anchor whose place is known to a decimetre may lie in its own wall.
     """
-    sight = np.zeros((len(sources), len(targets)), dtype=np.bool_)
+    line_of_sight = np.zeros((len(sources), len(targets)), dtype=np.bool_)
     for k, source in enumerate(sources):
         step = targets - source
         length = np.abs(step).max(axis=1)
@@ -174,5 +174,5 @@ def _in_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
         share = along[None] / np.maximum(length, 1)[:, None]
         cells = np.rint(source + step[:, None] * share[..., None]).astype(np.int64)
         cells = np.clip(cells, 0, np.array(blocked.shape) - 1)
-        sight[k] = ~(blocked[cells[..., 0], cells[..., 1]] & (share < 1.0)).any(axis=1)
-    return sight
+        line_of_sight[k] = ~(blocked[cells[..., 0], cells[..., 1]] & (share < 1.0)).any(axis=1)
+    return line_of_sight

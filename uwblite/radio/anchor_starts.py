@@ -21,7 +21,7 @@ def place_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> tu
         return graph, ()
     anchors, lost = graph.anchors.copy(), []
     for anchor in missing.tolist():
-        positions, ranges = _heard(graph, anchor)
+        positions, ranges = _distances_to(graph, anchor)
         found = trilaterate(positions, ranges, config or TrilaterationConfig())
         anchors[anchor] = found[0].position if found else 0.0
         if not found:
@@ -32,7 +32,7 @@ def place_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> tu
     return replace(graph, anchors=anchors, fixed_anchors=fixed, edges=edges), tuple(lost)
 
 
-def _heard(graph: Graph, anchor: int) -> tuple[Floats, Floats]:
+def _distances_to(graph: Graph, anchor: int) -> tuple[Floats, Floats]:
     """Return positions (m, 2) of the tag and ranges (m,) of one anchor, m."""
     positions, ranges = [np.zeros((0, 2))], [np.zeros(0)]
     for edges in graph.edges:

@@ -31,7 +31,7 @@ class BootstrapConfig:
     """Travelled distances of the first stretch, m, tried in this order until the anchors in it are clear; then all of it."""
     piece: ClassVar[float] = 0.3
     """Distance laid on at once, as a share of the first stretch; more where the prediction holds."""
-    resolve_growth: ClassVar[float] = 1.35
+    resolve_factor: ClassVar[float] = 1.35
     """All poses so far are solved again when their number has grown by this factor."""
     range_sigma: float = setting(0.15, advanced=True)
     """Assumed standard deviation of ranges until it is learnt, m."""
@@ -86,17 +86,17 @@ def bootstrap_graph(
     path : (k,) travelled distance at each pose, m.
     config, search : settings.
     """
-    best: _Growth | None = None
+    best: _Bootstrap | None = None
     least = np.inf
     for heading_scale in config.heading_scales:
         calibration = _with(graph.calibration, "heading_scale", heading_scale)
         if calibration is None:
             continue
-        growth = _Growth(replace(graph, calibration=calibration), odometry, ranges, path, config, search)
-        growth.run()
-        misfit = growth.misfit()
+        attempt = _Bootstrap(replace(graph, calibration=calibration), odometry, ranges, path, config, search)
+        attempt.run()
+        misfit = attempt.misfit()
         if best is None or misfit < 0.8 * least:
-            best, least = growth, misfit
+            best, least = attempt, misfit
         if misfit < config.agreement:
             break
     assert best is not None
@@ -113,7 +113,7 @@ def _with(calibration: Calibration, name: str, value: float) -> Calibration | No
     return replace(calibration, values=values)
 
 
-class _Growth:
+class _Bootstrap:
     """One growth: the poses in [low, high) are known, the anchors in `placed` have a position."""
 
     def __init__(
@@ -140,7 +140,7 @@ class _Growth:
             while not self._complete():
                 held = self._extend(piece)
                 piece = 1.5 * piece if held else max(0.8 * piece, smallest)
-                if self.high - self.low >= self.config.resolve_growth * solved or self._complete():
+                if self.high - self.low >= self.config.resolve_factor * solved or self._complete():
                     self._solve((6.0, 3.0))
                     solved = self.high - self.low
                     if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
@@ -177,7 +177,7 @@ class _Growth:
     def _seed(self) -> float:
         """Choose the stretch whose anchors are clearest and place them; return its length, m."""
         best, most = None, -1.0
-        total, heard = float(self.path[-1]), min(len(np.unique(self.ranges.anchor[self.live])), 3)
+        total, count = float(self.path[-1]), min(len(np.unique(self.ranges.anchor[self.live])), 3)
         for length in [d for d in self.config.seed_distances if d < total] + [total]:
             places = 1 + max(0, min(5, int(2 * total / max(length, 1e-9)) - 2))
             for start in np.linspace(0.0, total - length, places):
@@ -188,7 +188,7 @@ class _Growth:
                 worth = sum(1.0 / (1.0 + h.sigma / self.config.range_sigma + h.position_sigma) for h in clear)
                 if worth > most + 1e-9:
                     best, most = (found, low, high), worth
-            if most > self.config.clear_enough * heard:
+            if most > self.config.clear_enough * count:
                 break
         assert best is not None
         found, self.low, self.high = best
@@ -229,16 +229,16 @@ class _Growth:
             old, new = self.high, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
             self.high = max(min(new, len(self.path)), old + 1)
             self.poses[old - 1 : self.high] = _dead_reckon(self.poses[old - 1], motion[old - 1 : self.high - 1])
-            held &= self._settle(old - 1, self.high, old - 1)
+            held &= self._optimise_piece(old - 1, self.high, old - 1)
         if self.low > 0:
             old, new = self.low, int(np.searchsorted(self.path, self.path[self.low] - piece))
             self.low = min(new, old - 1)
             back = se2.inverse(motion[self.low : old])[::-1]
             self.poses[self.low : old + 1] = _dead_reckon(self.poses[old], back)[::-1]
-            held &= self._settle(self.low, old + 1, old)
+            held &= self._optimise_piece(self.low, old + 1, old)
         return held
 
-    def _settle(self, low: int, high: int, held: int) -> bool:
+    def _optimise_piece(self, low: int, high: int, held: int) -> bool:
         """Optimise the poses of [low, high) with one of them, the anchors and the calibration held.
 
         Returns True where the ranges agreed with the prediction; then nothing is moved.

@@ -64,7 +64,7 @@ def _ties(graph: Graph, chains: Ints, chain: int, placed: set[int]) -> tuple[Flo
     """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them."""
     here = np.isin(chains, sorted(placed))
     there, own, ranges = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0)]
-    anchors = _heard_by(graph, here).anchors
+    anchors = _measured_from(graph, here).anchors
     for e in graph.edges:
         if isinstance(e, PointDistanceEdges):
             for one, other in ((e.i, e.j), (e.j, e.i)):
@@ -81,7 +81,7 @@ def _ties(graph: Graph, chains: Ints, chain: int, placed: set[int]) -> tuple[Flo
     return tuple(np.concatenate(part)[::every] for part in (there, own, ranges))  # type: ignore[return-value]
 
 
-def _heard_by(graph: Graph, here: Bools) -> Graph:
+def _measured_from(graph: Graph, here: Bools) -> Graph:
     """Return the graph with those landmarks placed that ranges from some of the poses place."""
     ranges = tuple(e.rows(np.flatnonzero(here[e.pose])) for e in graph.edges if isinstance(e, RangeEdges))
     found, lost = place_anchors(replace(graph, edges=ranges))
@@ -94,7 +94,7 @@ def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Flo
     """Return (robust cost, T_map_chain) of the best places, apart from each other."""
     if len(ranges) < _LEAST_RANGES:
         return [(0.0, np.zeros(3))]
-    found = [_settled(start, there, own, ranges) for start in _starts(there, own, ranges)]
+    found = [_converged(start, there, own, ranges) for start in _starts(there, own, ranges)]
     found.sort(key=lambda place: place[0])
     best: list[tuple[float, Floats]] = []
     for cost, T in found:
@@ -117,7 +117,7 @@ def _starts(there: Floats, own: Floats, ranges: Floats) -> list[Floats]:
     return starts
 
 
-def _settled(T: Floats, there: Floats, own: Floats, ranges: Floats) -> tuple[float, Floats]:
+def _converged(T: Floats, there: Floats, own: Floats, ranges: Floats) -> tuple[float, Floats]:
     """Return cost and place after damped Gauss-Newton steps with Cauchy weights."""
 
     def residuals(T: Floats) -> tuple[Floats, Floats, Floats, float]:

@@ -86,14 +86,14 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     if alone < _WORSE * len(ranges):
         return None
     starts = np.unique(np.linspace(_LEAST_RANGES, len(ranges) - _LEAST_RANGES, _SPLITS).astype(np.int64)).tolist()
-    best, split, before, after = min((_settled(path, ranges, k, width, config) for k in starts), key=lambda found: found[0])
+    best, split, before, after = min((_converged(path, ranges, k, width, config) for k in starts), key=lambda found: found[0])
     if best > (1.0 - _EXPLAINED) * alone:
         return None
     move = Move(float(stamps[split]), before.position, after.position)
     return move if move.distance > max(_LEAST_MOVE, _SIGMAS * np.hypot(before.position_sigma, after.position_sigma)) else None
 
 
-def _settled(
+def _converged(
     path: Floats, ranges: Floats, split: int, width: float, config: TrilaterationConfig
 ) -> tuple[float, int, AnchorHypothesis, AnchorHypothesis]:
     """Return how many ranges two places leave unexplained, the first range of the second one, and both places.

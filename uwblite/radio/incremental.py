@@ -132,24 +132,24 @@ class _Incremental:
         self.ranged = np.zeros(count, dtype=bool)
         for edges, _ in self.ranges:
             self.ranged[edges.anchor] = True
-        known = ~self.free["anchors"]
+        given = ~self.free["anchors"]
         for prior in graph.edges:
             if isinstance(prior, PriorEdges) and prior.block == "anchors":
-                known[prior.index] = True
-        self.ranged &= ~known
+                given[prior.index] = True
+        self.ranged &= ~given
         self.joined = ~self.ranged
         self.joined_at = np.where(self.joined, -1, len(graph.poses))
         self.tried = np.zeros(count, dtype=np.int64)
-        self.first_seen = self._first_seen(known)
+        self.first_seen = self._first_seen(given)
         self.usual = 1.0
 
-    def _first_seen(self, known: Bools) -> Ints:
+    def _first_seen(self, given: Bools) -> Ints:
         """Return when each anchor that is neither ranged nor known appears: then it is carried along with the path."""
-        first = np.full(len(known), len(self.guess))
+        first = np.full(len(given), len(self.guess))
         for kind in self.kinds:
             for anchors in kind.anchors:
                 np.minimum.at(first, anchors, kind.latest)
-        return np.where(known | self.ranged, -1, first)
+        return np.where(given | self.ranged, -1, first)
 
     def run(self) -> Iterator[int]:
         """Add poses up to the whole path, yielding the number done."""
@@ -190,12 +190,12 @@ class _Incremental:
             low = max(0, now - window)
             part = self._solve(low, now)
             if not part.fits:
-                part = self._without_suspects(part, low, now)
+                part = self._without_outliers(part, low, now)
             if part.fits or low == 0:
                 return part
             window *= self.config.widening
 
-    def _without_suspects(self, part: _Part, low: int, now: int) -> _Part:
+    def _without_outliers(self, part: _Part, low: int, now: int) -> _Part:
         """Return the part as it fits without some anchors, which then leave; or as it is."""
         fresh = self.joined & self.ranged & (self.joined_at >= now - self.config.probation)
         for accused in (fresh, None):
@@ -212,25 +212,25 @@ class _Incremental:
     def _outlying(self, low: int, now: int) -> Bools:
         """Return the anchors most of whose ranges disagree with the rest, by a robust optimisation."""
         robust = self._solve(low, now, kernel=Kernel("geman-mcclure", self.config.outlier + 1.0)).graph
-        heard, outliers = np.zeros(len(self.joined)), np.zeros(len(self.joined))
+        measured, outliers = np.zeros(len(self.joined)), np.zeros(len(self.joined))
         for edges in robust.edges:
             if isinstance(edges, RangeEdges):
                 off = np.abs(edges.residuals(robust)[:, 0]) > self.config.outlier
-                heard += np.bincount(edges.anchor, minlength=len(heard))
-                outliers += np.bincount(edges.anchor, off, len(heard))
-        return self.ranged & (outliers > self.config.outlier_share * np.maximum(heard, 1.0))
+                measured += np.bincount(edges.anchor, minlength=len(measured))
+                outliers += np.bincount(edges.anchor, off, len(measured))
+        return self.ranged & (outliers > self.config.outlier_share * np.maximum(measured, 1.0))
 
     def _solve(self, low: int, now: int, without: Bools | None = None, kernel: Kernel | None = None) -> _Part:
         """Optimise poses low..now - 1 and the anchors that joined since; older ones hold them."""
         use = self.joined if without is None else self.joined & ~without
-        held = {name: ~mask for name, mask in self.free.items()}
+        fixed = {name: ~mask for name, mask in self.free.items()}
         part = replace(
             self.graph,
             poses=self.graph.poses[:now],
             edges=tuple(self._edges(low, now, use, kernel)),
-            fixed_poses=held["poses"][:now] | (np.arange(now) < low),
-            fixed_anchors=held["anchors"] | ~use | (self.joined_at < low) & (low > 0),
-            fixed_calibration=self.graph.fixed_calibration if low == 0 else np.ones_like(held["calibration"]),
+            fixed_poses=fixed["poses"][:now] | (np.arange(now) < low),
+            fixed_anchors=fixed["anchors"] | ~use | (self.joined_at < low) & (low > 0),
+            fixed_calibration=self.graph.fixed_calibration if low == 0 else np.ones_like(fixed["calibration"]),
         )
         if not part.edges or not any(mask.any() for mask in free_unknowns(part).values()):
             return _Part(part, True, float("nan"))
@@ -254,30 +254,30 @@ class _Incremental:
         last, config = now == len(self.guess), self.config
         anchors = self.graph.anchors.copy()
         for anchor in np.nonzero(~self.joined)[0]:
-            heard = self._heard(int(anchor), now)
-            count = sum(len(edges) for edges in heard)
+            measured = self._measured(int(anchor), now)
+            count = sum(len(edges) for edges in measured)
             if not last and (count < config.min_ranges or count < 1.2 * self.tried[anchor]):
                 continue
             self.tried[anchor] = count
-            found = trilaterate(*self._distances(heard), config.search, config.drift)
+            found = trilaterate(*self._distances(measured), config.search, config.drift)
             clear = bool(found) and not ambiguous(found, config.search)
             if found and (last or (clear and found[0].position_sigma < config.max_position_sigma)):
                 anchors[anchor] = found[0].position
                 self.joined[anchor], self.joined_at[anchor] = True, now
         self.graph = replace(self.graph, anchors=anchors)
 
-    def _heard(self, anchor: int, now: int) -> list[RangeEdges]:
+    def _measured(self, anchor: int, now: int) -> list[RangeEdges]:
         """Return the ranges to an anchor so far."""
-        heard = []
+        measured = []
         for (edges, latest), groups in zip(self.ranges, self.of_anchor, strict=True):
             which = groups[anchor]
-            heard.append(edges.rows(which[: np.searchsorted(latest[which], now)]))
-        return heard
+            measured.append(edges.rows(which[: np.searchsorted(latest[which], now)]))
+        return measured
 
-    def _distances(self, heard: list[RangeEdges]) -> tuple[Floats, Floats]:
+    def _distances(self, measured: list[RangeEdges]) -> tuple[Floats, Floats]:
         """Return where the tag was (m, 2) at ranges, and the planar distances (m,) they measured."""
         places, distances = [np.zeros((0, 2))], [np.zeros(0)]
-        for edges in heard:
+        for edges in measured:
             places.append(edges.tag_positions(self.graph.poses))
             distances.append(edges.planar_ranges())
         return np.concatenate(places), np.concatenate(distances)

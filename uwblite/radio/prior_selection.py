@@ -108,8 +108,8 @@ def log_marginal_likelihood(mean: Floats, covariance: Floats, before: Floats, af
     if sign <= 0:
         return -np.inf
     gain = pulled @ np.linalg.solve(other, pulled) - mean @ pulled
-    known = np.linalg.slogdet(covariance)[1]
-    return float(0.5 * (gain - spread - known) - np.sum(np.log(after / before)))
+    determinant = np.linalg.slogdet(covariance)[1]
+    return float(0.5 * (gain - spread - determinant) - np.sum(np.log(after / before)))
 
 
 def _between(low: float, high: float, steps: int) -> Sequence[float]:
@@ -117,9 +117,9 @@ def _between(low: float, high: float, steps: int) -> Sequence[float]:
 
 
 def _free(graph: Graph, name: str) -> Ints:
-    held = graph.fixed_calibration
+    fixed = graph.fixed_calibration
     named = graph.calibration.of_kinds(name)
-    return np.flatnonzero(named if held is None else named & ~held)
+    return np.flatnonzero(named if fixed is None else named & ~fixed)
 
 
 def _prior_sigma(graph: Graph) -> Floats:

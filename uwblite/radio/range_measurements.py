@@ -32,8 +32,8 @@ def range_edges(
     search : says which readings can be distances. kernel : robust kernel of all ranges.
     """
     above = [mounting.height_difference(a) for a in anchor_ids]
-    told = np.array([height or 0.0 for height in above])
-    is_told = np.array([height is not None for height in above], dtype=bool)
+    given = np.array([height or 0.0 for height in above])
+    is_given = np.array([height is not None for height in above], dtype=bool)
     return RangeEdges(
         attached.keyframe + first,
         attached.anchor,
@@ -43,7 +43,7 @@ def range_edges(
         attached.turn,
         attached.velocity,
         np.asarray(mounting.tag_position[:2], dtype=np.float64),
-        told[attached.anchor] - np.where(is_told[attached.anchor], attached.rise, 0.0),
+        given[attached.anchor] - np.where(is_given[attached.anchor], attached.rise, 0.0),
         range_indices(calibration, attached.anchor, anchor_ids),
         kernel,
         (usable(attached.ranges, search) & attached.inside).astype(np.float64),
@@ -63,7 +63,7 @@ def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: Trilaterati
     for anchor in np.flatnonzero(placed):
         own = np.flatnonzero(alive & (edges.anchor == anchor))
         level = edges.rows(own).planar_ranges()
-        found = trilaterate(positions[own], level, search, _TRUSTED)
+        found = trilaterate(positions[own], level, search, _LEVEL_SIGMA)
         if not found:
             continue
         here, there = (
@@ -75,7 +75,7 @@ def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: Trilaterati
     return replace(graph, anchors=anchors)
 
 
-_TRUSTED = 0.15
+_LEVEL_SIGMA = 0.15
 """Error of a path that the lidar holds, m."""
 _CLEARLY = 0.1
 """Share of its ranges that must agree more with another place before an anchor is moved there."""

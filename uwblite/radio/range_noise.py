@@ -106,11 +106,11 @@ def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNo
     variance = max(float(e @ e) / len(e), config.min_sigma**2)
     edges = np.array([0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.0])
     covariance, pairs = _covariance_by_distance(p, e, edges)
-    known = pairs >= 20
-    if known.sum() < 3 or not known[:2].any():
+    enough = pairs >= 20
+    if enough.sum() < 3 or not enough[:2].any():
         return prior
     middle = 0.5 * (edges[1:] + edges[:-1])
-    return _fit(middle[known], covariance[known], pairs[known], variance, prior, config)
+    return _fit(middle[enough], covariance[enough], pairs[enough], variance, prior, config)
 
 
 def _covariance_by_distance(p: Floats, e: Floats, edges: Floats) -> tuple[Floats, Floats]:

@@ -127,8 +127,8 @@ def _extent(grid: OccupancyGrid | None, path: Floats, anchors: list[PictureAncho
         reach = max(float((high - low).max()), _ANCHOR_REACH)
         boxes = [np.clip(boxes[0], low, high), np.clip(boxes[1], low - reach, high + reach)]
     if grid is not None:
-        known = grid.log_odds != 0.0
-        rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        observed = grid.log_odds != 0.0
+        rows, cols = np.flatnonzero(observed.any(axis=1)), np.flatnonzero(observed.any(axis=0))
         if len(rows):
             corners = grid.geometry.centre_of(rows[[0, -1]], cols[[0, -1]])
             boxes.append(corners)
@@ -155,12 +155,12 @@ def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
 def shaded(grid: OccupancyGrid) -> Image:
     """Return the colours (rows, cols, 3) of the cells: the surer a cell, the clearer its white or black."""
     p = grid.probability()
-    known = (grid.log_odds != 0.0)[:, :, None]
+    observed = (grid.log_odds != 0.0)[:, :, None]
     free = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, :, None]
     wall = np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, :, None]
     paper, floor, ink = (np.array(c, dtype=np.float32) for c in (PAPER, FLOOR, WALL))
     colours = paper + free * (floor - paper) + wall * (ink - paper)
-    return np.rint(np.where(known, colours, paper)).astype(np.uint8)
+    return np.rint(np.where(observed, colours, paper)).astype(np.uint8)
 
 
 def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, scale: float) -> None:

@@ -59,17 +59,17 @@ def _by_lidar(log: SensorLog) -> Floats:
     windows[:, _NEIGHBOURS] = 0.0
     span = np.diff(scans.stamps)
     change = np.where(span > _SILENCE * max(float(np.median(span)), 1e-3), 0.0, change)
-    suspect = np.flatnonzero((change > _LEAST_CHANGE) & (change > _TIMES_USUAL * np.quantile(windows, 0.9, axis=1)))
-    suspect = np.sort(suspect[np.argsort(-change[suspect], kind="stable")[:_MOST]])
-    if not len(suspect):
+    jumps = np.flatnonzero((change > _LEAST_CHANGE) & (change > _TIMES_USUAL * np.quantile(windows, 0.9, axis=1)))
+    jumps = np.sort(jumps[np.argsort(-change[jumps], kind="stable")[:_MOST]])
+    if not len(jumps):
         return np.zeros(0)
-    share = _shares(log, suspect, suspect + 1)
+    share = _shares(log, jumps, jumps + 1)
     # The scan itself may be at fault: those on either side of both must not match either.
-    low, high = np.maximum(suspect - 1, 0), np.minimum(suspect + 2, len(scans.stamps) - 1)
+    low, high = np.maximum(jumps - 1, 0), np.minimum(jumps + 2, len(scans.stamps) - 1)
     apart = (share < _SAME_PLACE) & (share > 0.0)
     apart[apart] &= _shares(log, low[apart], high[apart]) < _SAME_PLACE
     middle = middle_stamps(scans)
-    return 0.5 * (middle[suspect[apart]] + middle[suspect[apart] + 1])
+    return 0.5 * (middle[jumps[apart]] + middle[jumps[apart] + 1])
 
 
 def _changes(log: SensorLog) -> Floats:

@@ -31,9 +31,9 @@ def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     tried = {what: replace(log, odometry=_scaled(log.odometry, sign)) for what, sign in mirrors.items()}
     fits = {what: _fits_laser(other) for what, other in tried.items()}
     best = max(fits, key=lambda what: fits[what])
-    known = fits[best] > 0.0
+    one_fits = fits[best] > 0.0
     text = f"the odometry's heading turns against its path: {best} was changed"
-    if not known:
+    if not one_fits:
         text += ", and nothing tells whether the map is the place or its mirror image"
     return tried[best], [Remark("heading-against-path", text)]
 
@@ -78,8 +78,8 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
     angle = float(np.angle(turn))
     if abs(angle) < _LEAST_TURNED or abs(turn) < _CONCENTRATED:
         return log, []
-    told = log.mounting.T_base_laser
-    mount = np.array([told[0], told[1], float(se2.wrap_angle(told[2] + angle))])
+    mount_given = log.mounting.T_base_laser
+    mount = np.array([mount_given[0], mount_given[1], float(se2.wrap_angle(mount_given[2] + angle))])
     text = (
         f"the laser looks {np.degrees(angle):+.0f} degrees away from what was told, or the wheels drive that way; it was taken "
         f"so: --laser-pose {mount[0]:g},{mount[1]:g},{mount[2]:.3f}"

@@ -50,8 +50,8 @@ def excess(log: SensorLog, start: float, end: float) -> float:
 def cuts(log: SensorLog) -> list[float]:
     """Return the times, s, at which the ranges to several anchors jump together, and for good, by more than the robot drove."""
     votes: list[tuple[float, float, float]] = []
-    heard = _by_anchor(log)
-    for stamps, ranges in heard:
+    by_anchor = _by_anchor(log)
+    for stamps, ranges in by_anchor:
         if len(ranges) < 4 * _LONG:
             continue
         way, margin = _travelled(log, stamps), _MARGIN + _TIMES_NOISE * _noise(ranges)
@@ -59,7 +59,7 @@ def cuts(log: SensorLog) -> list[float]:
         over = np.minimum(short, long) - margin
         over[:-1][np.diff(stamps) > _SILENCE * np.median(np.diff(stamps))] = 0.0
         votes += [(float(stamps[k]), float(stamps[k + 1]), float(over[k])) for k in np.flatnonzero(over > 0.0)]
-    return _together(votes, len(heard))
+    return _together(votes, len(by_anchor))
 
 
 def _jumps(ranges: Floats, way: Floats, window: int) -> Floats:

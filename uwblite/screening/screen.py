@@ -21,7 +21,7 @@ _ANYWHERE = (20.0, 20.0, 3.0)
 """Standard deviation of a step that nothing measured, m, m, rad."""
 _STEP = 2.0
 """Time between the steps of lost wheels, where no lidar stands in for them, s."""
-_KNOWN = 3.0
+_APART = 3.0
 """A cut so near in time to another break is the same, s."""
 UNKNOWN = 3.0
 """Steps uncertain by so much, m, are no guess of where the robot is."""
@@ -192,10 +192,10 @@ def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> 
     return OdometryBreaks(odometry.stamps[before], sigma)
 
 
-def _cuts(log: SensorLog, known: Floats) -> tuple[OdometryBreaks, list[Remark]]:
+def _cuts(log: SensorLog, others: Floats) -> tuple[OdometryBreaks, list[Remark]]:
     """Find moments at which the robot is suddenly elsewhere, away from breaks (b,) that are known, s."""
     times = cuts.found(log)
-    times = times[[not np.any(np.abs(known - t) < _KNOWN) for t in times]] if len(times) else times
+    times = times[[not np.any(np.abs(others - t) < _APART) for t in times]] if len(times) else times
     if not len(times):
         return OdometryBreaks.none(), []
     stamps, start = log.odometry.stamps, log.odometry.stamps[0]

@@ -6,7 +6,7 @@ The file may hold constraints of the user's own. They stay as they are, above a 
 import json
 from dataclasses import replace
 
-from ..constraints import Constraints, ForbiddenClosure, KnownAnchor, KnownClosure
+from ..constraints import Constraints, ForbiddenClosure, GivenAnchor, GivenClosure
 from ..errors import ConfigError
 from ..io.constraints_file import parse_constraints
 from ..io.stored_result import StoredClosure
@@ -64,14 +64,14 @@ def with_closure(edits: Constraints, closure: StoredClosure, wish: str) -> Const
     if closure.pose is None:
         raise ConfigError("the report does not tell the pose of this closure, so it cannot be forced")
     x, y, theta = closure.pose.tolist()
-    forced = KnownClosure(closure.stamps, (x, y, theta), _FORCED_SIGMA, closure.recordings)
+    forced = GivenClosure(closure.stamps, (x, y, theta), _FORCED_SIGMA, closure.recordings)
     return replace(left, closures=(*left.closures, forced))
 
 
 def with_anchor(edits: Constraints, name: str, position: tuple[float, float] | None, sigma: float = 0.05) -> Constraints:
     """Return the edits with an anchor pinned at a place, m, or with None no longer pinned."""
     others = tuple(a for a in edits.anchors if a.id != name)
-    return replace(edits, anchors=others if position is None else (*others, KnownAnchor(name, position, sigma)))
+    return replace(edits, anchors=others if position is None else (*others, GivenAnchor(name, position, sigma)))
 
 
 def wish_for(edits: Constraints, closure: StoredClosure) -> str:
@@ -81,12 +81,12 @@ def wish_for(edits: Constraints, closure: StoredClosure) -> str:
     return "force" if any(_same(c, closure) for c in edits.closures) else "leave"
 
 
-def _same(one: KnownClosure | ForbiddenClosure, closure: StoredClosure) -> bool:
+def _same(one: GivenClosure | ForbiddenClosure, closure: StoredClosure) -> bool:
     near = all(abs(a - b) < 1e-4 for a, b in zip(one.stamps, closure.stamps, strict=True))
     return near and tuple(one.recordings) == closure.recordings
 
 
-def _ends(c: KnownClosure | ForbiddenClosure) -> str:
+def _ends(c: GivenClosure | ForbiddenClosure) -> str:
     return f"stamps = {_numbers(c.stamps)}\nrecordings = [{c.recordings[0]}, {c.recordings[1]}]\n"
 
 
