@@ -114,3 +114,15 @@ def test_a_corridor_constrains_across_and_not_along(heading):
         assert abs(angle) < 0.003
         # Along, nothing was seen: the guess stands.
         assert abs(along - 0.3) < 0.1
+
+
+def test_a_pair_ends_where_it_ends_alone(world):
+    """Pairs that have come to rest are left alone; the others do not notice."""
+    clouds, raster, _, exact = world
+    guess = exact + np.array([[0.0, 0.0, 0.0], [0.2, -0.2, 0.1], [-0.02, 0.01, 0.0]])
+    points = pair_points(clouds, J, 200)
+    together = align_pairs(clouds, raster, I, J, guess, points, 0.5, 0.15)
+    for k in range(3):
+        row = slice(k, k + 1)
+        alone = align_pairs(clouds, raster, I[row], J[row], guess[row], pair_points(clouds, J[row], 200), 0.5, 0.15)
+        np.testing.assert_allclose(alone.pose[0], together.pose[k], atol=1e-9)

@@ -10,7 +10,7 @@ from helpers.planted import box
 from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.lidar.scan_matching import rasterize
-from uwblite.lidar.scan_to_scan import TrackingConfig, follow
+from uwblite.lidar.scan_to_scan import Steps, TrackingConfig, descend, follow
 
 NOISE = np.array([0.01, 0.005, 0.006])
 GATE = 0.5
@@ -23,7 +23,8 @@ def followed(truth, clouds, said):
     for step in said:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
-    result = follow(clouds, raster, wheels, Graph(np.array(poses)), GATE, TrackingConfig())
+    steps = descend(clouds, raster, wheels.i, said, GATE, TrackingConfig())
+    result = follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig())
     return result.steps, result.wheels, result.searched
 
 
@@ -79,3 +80,24 @@ def test_a_corridor_is_not_measured_along():
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
     assert len(steps) > 20
     assert np.median(information[:, 0, 0]) < 0.02 * np.median(information[:, 1, 1])
+
+
+def test_a_step_measured_elsewhere_or_by_few_points_is_contradicted():
+    guess = np.zeros((4, 3))
+    pose = np.array([[0.01, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.0, 0.2], [0.3, 0.0, 0.0]])
+    steps = Steps(np.array([0, 1, 2, 4]), guess, pose, np.full(4, 0.9), np.array([True, True, True, False]))
+    assert steps.contradicted(TrackingConfig()).tolist() == [1, 2]
+    few = Steps(steps.i, guess, guess, np.array([0.9, 0.5, 0.9, 0.5]), steps.enough)
+    assert few.contradicted(TrackingConfig()).tolist() == [1]
+
+
+def test_steps_taken_over_stand_among_new_ones_in_order():
+    def steps(i, value):
+        i = np.array(i)
+        pose = np.full((len(i), 3), value) + i[:, None]
+        return Steps(i, pose, pose, np.full(len(i), value), np.ones(len(i), dtype=bool))
+
+    both = steps([0, 1, 2], 0.5).with_others(np.array([0, 4]), np.array([0, 2]), steps([1, 2, 3], 0.25))
+    assert both.i.tolist() == [0, 1, 2, 3, 4]
+    assert both.share.tolist() == [0.5, 0.25, 0.25, 0.25, 0.5]
+    np.testing.assert_array_equal(both.pose[:, 0], [0.5, 1.25, 2.25, 3.25, 2.5])

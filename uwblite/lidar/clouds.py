@@ -77,7 +77,8 @@ class Clouds:
         rows = np.repeat(self.offsets[which] - first, counts) + np.arange(int(counts.sum()))
         owner = np.repeat(np.arange(len(which), dtype=np.int32), counts)
         offsets = np.append(first, counts.sum()).astype(np.int64)
-        return Clouds(offsets, self.points[rows], self.normals[rows], owner, self.normal_variance[rows])
+        points, normals = (np.asfortranarray(column[rows]) for column in (self.points, self.normals))
+        return Clouds(offsets, points, normals, owner, self.normal_variance[rows])
 
     def only(self, kept: Bools) -> "Clouds":
         """Return the clouds with some of their points (p,) alone."""

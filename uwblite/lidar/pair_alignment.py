@@ -9,6 +9,11 @@ from ..arrays import Floats, Ints
 from .clouds import Clouds
 from .scan_matching import CloudRasters, PairFactors, PairPoints, match, nondegenerate_step
 
+_FARTHEST, _WIDEST = 0.3, 0.15
+"""Longest step of one iteration, m and rad."""
+_SETTLED = 1e-4
+"""Steps below this end the descent, m or rad."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aligned:
@@ -36,19 +41,23 @@ def align_pairs(
 ) -> Aligned:
     """Align many pairs of clouds at once, each on its own: point-to-line ICP with a shrinking gate.
 
+    A pair that no longer moves at the last gate is left alone.
+
     Parameters
     ----------
     i, j : (e,) target and source clouds. guess : (e, 3) start poses.
     points : see pair_points. first_gate, last_gate : farthest match in the first and last iteration, m.
     """
-    pose, gate = guess.copy(), first_gate
+    pose, gate, moving = guess.copy(), first_gate, np.arange(len(guess))
     for _ in range(iterations):
-        factors = match(clouds, raster, i, pose, points, gate, gate / 2.0)
-        step = nondegenerate_step(factors)[0]
-        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / 0.3, np.abs(step[:, 2]) / 0.15)
-        pose += step / np.maximum(reach, 1.0)[:, None]
-        pose[:, 2] = se2.wrap_angle(pose[:, 2])
-        if gate <= last_gate and np.abs(step).max(initial=0.0) < 1e-4:
-            break
+        some = PairPoints(points.row[moving])
+        step = nondegenerate_step(match(clouds, raster, i[moving], pose[moving], some, gate, gate / 2.0))[0]
+        reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / _FARTHEST, np.abs(step[:, 2]) / _WIDEST)
+        pose[moving] += step / np.maximum(reach, 1.0)[:, None]
+        if gate <= last_gate:
+            moving = moving[np.abs(step).max(axis=1) >= _SETTLED]
+            if not len(moving):
+                break
         gate = max(0.8 * gate, last_gate)
+    pose[:, 2] = se2.wrap_angle(pose[:, 2])
     return Aligned(pose, match(clouds, raster, i, pose, points, last_gate, last_gate / 2.0))

@@ -85,6 +85,14 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     return raster
 
 
+def chosen_rasters(one: CloudRasters, other: CloudRasters, which: Ints) -> CloudRasters:
+    """Return the rasters of some clouds (w,), those of the other numbered on behind those of the one."""
+    nearest = np.concatenate([one.nearest, other.nearest])
+    origin, shape = np.concatenate([one.origin, other.origin]), np.concatenate([one.shape, other.shape])
+    start = np.concatenate([one.start, other.start + len(one.nearest)])
+    return CloudRasters(one.cell, origin[which], shape[which], start[which], nearest)
+
+
 def _blocks(clouds: Clouds) -> Iterator[slice]:
     """Yield the clouds a bounded number at a time."""
     for first in range(0, len(clouds), _CLOUDS_AT_ONCE):

@@ -59,53 +59,69 @@ class ScanOdometry:
     """Steps that were searched for."""
 
 
-def contradicted(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig
-) -> Ints:
-    """Return the keyframes (s,) whose step to the next the clouds contradict: they share little there, or fit elsewhere."""
-    first = _Steps.of(clouds, raster, wheels, graph, gate, config)
-    off = se2.between(first.guess, first.pose)
-    elsewhere = (np.hypot(off[:, 0], off[:, 1]) > _ELSEWHERE) | (np.abs(off[:, 2]) > _ELSEWHERE)
-    return wheels.i[first.enough & ((first.share < config.good_share) | elsewhere)]
-
-
 _ELSEWHERE = 0.12
 """m or rad; what a step of sound wheels is never wrong by."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Steps:
-    """Steps as descent from the wheels' guess leaves them."""
+class Steps:
+    """Steps between neighbouring keyframes as descent from a guess leaves them."""
 
+    i: Ints
+    """(e,) keyframes at which they begin, increasing."""
     guess: Floats
+    """(e, 3)."""
     pose: Floats
+    """(e, 3) where descent ended."""
     share: Floats
+    """(e,) of the points looked up that match there."""
     enough: Bools
+    """(e,) whether the clouds have points enough to measure anything."""
 
-    @classmethod
-    def of(
-        cls, clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig
-    ) -> "_Steps":
-        i, tight = wheels.i, min(config.gate, gate)
-        guess = se2.between(graph.poses[i], graph.poses[i + 1])
-        aligned = align_pairs(clouds, raster, i, i + 1, guess, pair_points(clouds, i + 1, config.points), gate, tight)
-        return cls(guess, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
+    def contradicted(self, config: TrackingConfig) -> Ints:
+        """Return the keyframes (s,) whose step the clouds contradict: they share little there, or fit elsewhere."""
+        off = se2.between(self.guess, self.pose)
+        elsewhere = (np.hypot(off[:, 0], off[:, 1]) > _ELSEWHERE) | (np.abs(off[:, 2]) > _ELSEWHERE)
+        return self.i[self.enough & ((self.share < config.good_share) | elsewhere)]
+
+    def with_others(self, i: Ints, rows: Ints, others: "Steps") -> "Steps":
+        """Return some rows (r,) of these steps, now beginning at keyframes i (r,), among others."""
+        begins = np.concatenate([i, others.i])
+        order = np.argsort(begins)
+        columns = [
+            np.concatenate([getattr(self, name)[rows], getattr(others, name)])[order]
+            for name in ("guess", "pose", "share", "enough")
+        ]
+        return Steps(begins[order], *columns)
+
+
+def descend(
+    clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: float, config: TrackingConfig
+) -> Steps:
+    """Measure the steps from keyframes i (e,) to the next by their clouds, each from its guess (e, 3).
+
+    Parameters
+    ----------
+    clouds, raster : see clouds.build and scan_matching.rasterize. gate : reach of the raster, m.
+    """
+    points = pair_points(clouds, i + 1, config.points)
+    aligned = align_pairs(clouds, raster, i, i + 1, guess, points, gate, min(config.gate, gate))
+    return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
 
 
 def follow(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, gate: float, config: TrackingConfig
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float,
+    config: TrackingConfig,
 ) -> ScanOdometry:
-    """Measure every step between neighbouring keyframes by their clouds, searching where the guess may have been bad.
+    """Turn steps between neighbouring keyframes into edges, searching where the guess may have been bad.
 
     Parameters
     ----------
     clouds, raster : see clouds.build and scan_matching.rasterize.
-    wheels : edges between neighbouring keyframes. graph : poses by wheels and radio, the guess.
-    gate : reach of the raster, m.
-
+    wheels : edges between neighbouring keyframes. graph : holds their calibration.
+    steps : the same steps as descent leaves them, see descend. gate : reach of the raster, m.
     """
     i, tight = wheels.i, min(config.gate, gate)
-    steps = _Steps.of(clouds, raster, wheels, graph, gate, config)
     good = steps.enough & (steps.share >= config.good_share)
     learnt = reestimate_wheel_noise(wheels, _edges(clouds, raster, i[good], steps.pose[good], tight, config), graph)
     miss = _miss(clouds, learnt)
@@ -118,7 +134,7 @@ def follow(
 
 
 def _searched(
-    clouds: Clouds, i: Ints, steps: _Steps, doubtful: Bools, config: TrackingConfig
+    clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig
 ) -> tuple[Floats, Bools]:
     """Search for doubtful steps (e,), each against the sub-map of those before it.
 

@@ -8,89 +8,87 @@ from dataclasses import replace
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Ints
 from ..graph.calibration import LASER, RADIO, with_free, with_nonnegative_heights
 from ..graph.graph import Edges, Graph
 from ..graph.robust import SQUARED
 from ..graph.solver import optimize
-from ..lidar import clouds, joint_refinement, scan_matching, scan_to_scan, visibility
-from ..lidar.clouds import Clouds
+from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult
-from ..odometry.attached import choose_scans, scan_points
+from ..lidar.scan_to_scan import Steps
+from . import scan_clouds
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
-from .mapping_config import MappingConfig
 from .progress import solver_figures
 from .radio_stages import with_range_noise
-from .recordings import Recording, denser, later
-
-_BLOCK = 32
-"""Keyframes whose rays are held in memory at once."""
+from .recordings import denser, later
 
 
 def make_clouds(estimate: Estimate, task: Task) -> Estimate:
     """Make a cloud for each keyframe, and free the laser's mounting and clock."""
-    scans = _scan_clouds(task, 0.0)
+    scans = scan_clouds.make(task.recordings, task.config, 0.0)
     task.stages.end("clouds", points=len(scans.clouds.points))
     return replace(estimate, graph=with_free(estimate.graph, *LASER), scans=scans)
 
 
-def _scan_clouds(task: Task, delay: float) -> ScanClouds:
-    """Return the clouds of all recordings, the lidar's clock taken as late by `delay` s."""
-    config = task.config
-    built = clouds.joined([block for recording in task.recordings.each for block in _blocks(recording, config, delay)])
-    raster = scan_matching.rasterize(built, config.clouds.raster, max(config.refinement.first_gate, 0.2))
-    return ScanClouds(built, raster, delay)
-
-
-def _blocks(recording: Recording, config: MappingConfig, delay: float) -> list[Clouds]:
-    """Return the clouds of a recording's keyframes, a block at a time; empty ones without lidar."""
-    log, frames = recording.log.with_later_scans(delay), recording.frames
-    if log.scans is None:
-        none = np.zeros(0, dtype=np.int64)
-        return [Clouds(np.zeros(len(frames) + 1, dtype=np.int64), np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0))]
-    owner, chosen = choose_scans(log.scans, frames, config.keyframes)
-    blocks = []
-    for block in range(0, len(frames), _BLOCK):
-        size = min(_BLOCK, len(frames) - block)
-        own = slice(*np.searchsorted(owner, [block, block + size]).tolist())
-        rays = scan_points(log, frames, owner[own], chosen[own], config.clouds.range_max)
-        blocks.append(clouds.build(replace(rays, keyframe=rays.keyframe - block), size, config.clouds))
-    return blocks
-
-
 def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     """Match neighbouring clouds; where the lidar's clock is off by much, move keyframes and clouds with it, and repeat."""
-    estimate = _cut_contradicted(estimate, task)
-    estimate = _match_neighbours(estimate, task.following(estimate))
+    estimate, steps = _without_contradicted(*_descended(estimate, task), task)
+    estimate = _match_neighbours(estimate, steps, task.following(estimate))
     for _ in range(_RETIMINGS):
         delay = estimate.graph.calibration.get("laser_delay")
         if estimate.scans is None or abs(delay - estimate.scans.delay) < _CLOCK_TOLERANCE:
             break
         before = task.following(estimate).recordings
         estimate = with_keyframes(estimate, before, later(before, delay - estimate.scans.delay))
-        estimate = replace(estimate, scans=_scan_clouds(task.following(estimate), delay))
+        now = task.following(estimate)
+        estimate = replace(estimate, scans=scan_clouds.make(now.recordings, task.config, delay))
         task.stages.end("clouds made again", laser_delay=round(delay, 4))
-        estimate = _match_neighbours(estimate, task.following(estimate))
+        estimate = _match_neighbours(*_descended(estimate, now), now)
     return estimate
 
 
-def _cut_contradicted(estimate: Estimate, task: Task) -> Estimate:
-    """Cut the steps of the odometry that the clouds contradict at the scans within them.
+def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
+    """Return the estimate by odometry and a weak hold of the ranges, and the steps that the clouds measure from there.
+
+    False ranges would tear neighbours apart; with a weak hold, neighbours follow the odometry until clouds correct it.
+    """
+    weak, config = _with_inflated_ranges(estimate), task.config
+    whole = replace(weak, odometry=replace(weak.odometry, kernel=SQUARED)).odometry_and_ranges
+    estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*whole), config.solver)[0])
+    return estimate, _steps(estimate, np.arange(len(estimate.odometry)), task)
+
+
+def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
+    """Return some steps of the odometry (r,) as the clouds measure them from the estimate's poses."""
+    scans, poses, i = estimate.scans, estimate.graph.poses, estimate.odometry.i[rows]
+    assert scans is not None
+    guess = se2.between(poses[i], poses[i + 1])
+    return scan_to_scan.descend(
+        scans.clouds, scans.raster, i, guess, task.config.refinement.first_gate, task.config.scan_to_scan
+    )
+
+
+def _without_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Steps]:
+    """Cut the steps of the odometry that the clouds contradict at the scans within them, and measure those anew.
 
     Where little happens between two scans, the second is found whatever the odometry says.
     """
-    scans, config = estimate.scans, task.config
+    scans, before = estimate.scans, task.recordings
     assert scans is not None
-    steps = scan_to_scan.contradicted(
-        scans.clouds, scans.raster, estimate.odometry, estimate.graph, config.refinement.first_gate, config.scan_to_scan
-    )
-    after = denser(task.recordings, steps, _CUTS)
-    if len(after.stamps) == len(task.recordings.stamps):
-        return estimate
-    estimate = with_keyframes(estimate, task.recordings, after)
-    task.stages.end("keyframes added", steps=len(steps), keyframes=len(after.stamps))
-    return replace(estimate, scans=_scan_clouds(task.following(estimate), scans.delay))
+    doubtful = steps.contradicted(task.config.scan_to_scan)
+    after = denser(before, doubtful, _CUTS)
+    if len(after.stamps) == len(before.stamps):
+        return estimate, steps
+    scans, former = scan_clouds.remake(scans, before, after, task.config)
+    estimate = replace(with_keyframes(estimate, before, after), scans=scans)
+    i = estimate.odometry.i
+    kept = (former[i] >= 0) & (former[i + 1] == former[i] + 1)
+    rows = np.searchsorted(steps.i, former[i[kept]])
+    steps = steps.with_others(i[kept], rows, _steps(estimate, np.flatnonzero(~kept), task))
+    task.stages.end("keyframes added", steps=len(doubtful), keyframes=len(after.stamps))
+    return estimate, steps
 
 
 _CUTS = 4
@@ -101,17 +99,16 @@ _RETIMINGS = 3
 """Most times that clouds are made again; each time a quarter of the error is left."""
 
 
-def _match_neighbours(estimate: Estimate, task: Task) -> Estimate:
+def _match_neighbours(estimate: Estimate, steps: Steps, task: Task) -> Estimate:
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
-    config, scans, odometry = task.config, estimate.scans, estimate.odometry
+    config, scans, graph = task.config, estimate.scans, estimate.graph
     assert scans is not None
-    # False ranges would tear neighbours apart; with a weak hold, neighbours follow the odometry until clouds correct it.
-    weak = _with_inflated_ranges(estimate)
-    whole = replace(weak, odometry=replace(odometry, kernel=SQUARED)).odometry_and_ranges
-    graph = estimate.graph.with_estimates_of(optimize(estimate.graph.with_edges(*whole), config.solver)[0])
     rules = config.refinement
-    found = scan_to_scan.follow(scans.clouds, scans.raster, odometry, graph, rules.first_gate, config.scan_to_scan)
-    estimate, weak = replace(estimate, odometry=found.wheels), replace(weak, odometry=found.wheels)
+    found = scan_to_scan.follow(
+        scans.clouds, scans.raster, estimate.odometry, graph, steps, rules.first_gate, config.scan_to_scan
+    )
+    estimate = replace(estimate, odometry=found.wheels)
+    weak = _with_inflated_ranges(estimate)
     problem = graph.with_edges(*weak.odometry_and_ranges, found.steps)
     graph = graph.with_estimates_of(optimize(problem, config.solver)[0])
     gate = float(np.clip(found.miss, rules.later_gate, rules.first_gate))

@@ -1,0 +1,45 @@
+"""Clouds of keyframes: after keyframes were added, those taken over and those made anew are what all made anew would be."""
+
+import numpy as np
+import pytest
+from helpers.planted import box, odometry, recording, scans, wander
+
+from uwblite.lidar import scan_matching
+from uwblite.pipeline import scan_clouds
+from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.pipeline.recordings import denser, gather
+
+CONFIG = MappingConfig()
+
+
+def drive(seed, length=6.0, lidar=True):
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, length)
+    seen = scans(stamps, truth, box(9, 7), beams=120, rng=rng, noise=0.01) if lidar else None
+    return recording(odometry(stamps, truth, rng, noise=0.003, turn_noise=0.002), None, seen)
+
+
+@pytest.mark.parametrize("steps", [[], [3], [0, 4, 5, 19]])
+def test_clouds_taken_over_are_those_made_anew(steps):
+    logs = [drive(1), drive(2, lidar=False), drive(3)]
+    before = gather(logs, CONFIG.keyframes)
+    last = before.each[2]
+    after = denser(before, np.array([*steps, last.first + np.argmax(last.frames.duration)]), 4)
+    assert len(after.stamps) > len(before.stamps)
+    old = scan_clouds.make(before, CONFIG, 0.02)
+    mixed, former = scan_clouds.remake(old, before, after, CONFIG)
+    anew = scan_clouds.make(after, CONFIG, 0.02)
+    for name in ("offsets", "points", "normals", "owner", "normal_variance"):
+        np.testing.assert_array_equal(getattr(mixed.clouds, name), getattr(anew.clouds, name))
+    for k in range(len(anew.clouds)):
+        np.testing.assert_array_equal(cells(mixed.raster, k), cells(anew.raster, k))
+    assert mixed.delay == anew.delay == 0.02
+    # Steps that were cut and their neighbours alone are made anew.
+    assert 0 < np.sum(former < 0) < len(former) / 2
+    np.testing.assert_array_equal(before.stamps[former[former >= 0]], after.stamps[former >= 0])
+
+
+def cells(raster: scan_matching.CloudRasters, k: int) -> np.ndarray:
+    """The cells of one cloud's raster."""
+    start = int(raster.start[k])
+    return raster.nearest[start : start + int(raster.shape[k].prod())]
