@@ -22,8 +22,8 @@ from ..errors import UsageError, UwbliteError
 from ..report.printable import printable
 
 VERBS = (
-    "map", "view", "localize", "plan", "check", "record", "devices", "plan-anchors", "convert", "evaluate", "optimize",
-    "config",
+    "map", "batch", "view", "localize", "plan", "check", "record", "devices", "plan-anchors", "convert", "evaluate",
+    "optimize", "config",
 )  # fmt: skip
 """In the order in which a user meets them; `uwblite VERB` is the module of the same name, with _ for -."""
 
@@ -214,17 +214,24 @@ def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) ->
             return int(module.run(args))
     except KeyboardInterrupt:
         return console.fail("interrupted", 130)
-    except UwbliteError as error:
-        return console.fail(str(error), 2 if isinstance(error, UsageError) else 1, trace=args.debug)
-    except MemoryError:
-        return console.fail(_OUT_OF_MEMORY, 1, trace=args.debug)
-    except OSError as error:
-        return console.fail(console.os_error_text(error), 1, trace=args.debug)
     except Exception as error:
-        if interrupted:
+        if interrupted and not isinstance(error, UwbliteError | MemoryError | OSError):
             return console.fail("interrupted", 130)
-        text = f"internal error: {type(error).__name__}: {error} (please report it; --debug shows where)"
-        return console.fail(text, 1, trace=args.debug)
+        code, text = failure(error)
+        return console.fail(text, code, trace=args.debug)
+
+
+def failure(error: BaseException) -> tuple[int, str]:
+    """Return the exit code that an error means, and what is said of it."""
+    from . import console
+
+    if isinstance(error, UwbliteError):
+        return 2 if isinstance(error, UsageError) else 1, str(error)
+    if isinstance(error, MemoryError):
+        return 1, _OUT_OF_MEMORY
+    if isinstance(error, OSError):
+        return 1, console.os_error_text(error)
+    return 1, f"internal error: {type(error).__name__}: {error} (please report it; --debug shows where)"
 
 
 def _usage_error(text: str) -> int:

@@ -4,19 +4,18 @@ import argparse
 import shlex
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments, number, numbers, place
+from .workers import add_worker_arguments, versions, workers
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..constraints import Constraints
     from ..map_result import MapResult
-    from ..mapping import MappingConfig
+    from ..mapping import MappingConfig, Progress
     from ..sensor_log import SensorLog
 
 HELP = "map a recording: trajectory, anchors, occupancy grid, report"
@@ -31,6 +30,7 @@ examples:
   uwblite map monday.log tuesday.log --out both/       one map of several recordings: anchors tie them together
   uwblite map monday.log --out monday/ --anchors-from sunday/anchors.csv    in the frame of Sunday's map
   uwblite map drive.bag --out map/ --uwb-mapping uwb.toml    a ROS bag with ranges of one's own kind
+  uwblite map run.log --out map/ --scheduler tcp://head:8786    the heavy stages on a cluster of dask.distributed
   uwblite map run.log --out map/ --dry-run             read, check and estimate only
 
 files in --out: map.png (picture), report.html, map.yaml + map.pgm (map_server, nav2), trajectory.tum (evo),
@@ -47,12 +47,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace a result that is already there")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
     parser.add_argument("--dry-run", action="store_true", help="read, check and estimate time and memory; write nothing")
+    add_worker_arguments(parser, "processes for the heavy stages (1)")
+    add_map_arguments(parser)
+
+
+def add_map_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what a map is made of and how, whether of one recording or of many."""
     without = parser.add_argument("--without", action="append", default=[], choices=("uwb", "loops", "lidar"))
     without.help = "leave out a sensor or the loop closures, to see what they give; repeatable"
     text = "read every n-th laser scan only; the others take neither time nor memory (1)"
     counted = number(above=0, whole=True)
     parser.add_argument("--every-nth-scan", metavar="N", type=counted, default=1, help=text)
-    parser.add_argument("--jobs", metavar="N", type=counted, default=1, help="processes for the heavy stages (1)")
     output = parser.add_argument_group("map")
     edge = "edge of a cell, m: short for --set grid.resolution=M"
     output.add_argument("--resolution", metavar="M", type=number(above=0), help=edge)
@@ -86,47 +91,109 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _map(args: argparse.Namespace) -> int:
-    from ..config import to_toml
-    from ..io.result_text import RunRecord
-    from ..io.results import write_result
-    from ..pipeline.scan_selection import prepared
     from . import console
-    from .formats import read_recording
-    from .options import apply_mounting, bag_choices
 
-    config, constraints = _settings(args), _known(args)
     began = time.perf_counter()
-    with _workers(args.jobs if len(args.logs) > 1 else 1) as executor:
-        read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
-        logs = [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
+    with workers(args.jobs if len(args.logs) > 1 else 1) as executor:
+        logs = read_logs(args, executor)
     reading = time.perf_counter() - began
     _tell_reader_warnings(logs)
     if args.dry_run:
         return max(_dry_run(args, log) for log in logs)
-    # The scans that no map looks at are most of the memory.
-    logs = [prepared(log, config) for log in logs]
-    result = _build(logs, config, constraints, args.jobs)
+    made = _make_shown(args, logs, reading)
+    if args.json:
+        console.say_json(summary_json(args, made))
+    else:
+        for line in summary_lines(args, made):
+            console.say(line)
+    return 3 if made.result.doubts else 0
+
+
+class Made(NamedTuple):
+    """A map that is written."""
+
+    logs: "list[SensorLog]"
+    result: "MapResult"
+    names: list[str]
+    """Of the files in --out, in the order in which a user wants to see them."""
+    seconds: float
+    """From the first recording's first byte to the last file."""
+
+
+def read_logs(args: argparse.Namespace, executor: "Executor | None" = None) -> "list[SensorLog]":
+    """Return the recordings of the command line, with its mounting."""
+    from .formats import read_recording
+    from .options import apply_mounting, bag_choices
+
+    read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
+    return [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
+
+
+def make(
+    args: argparse.Namespace,
+    logs: "list[SensorLog]",
+    reading: float,
+    progress: "Progress | None" = None,
+    executor: "Executor | None" = None,
+) -> Made:
+    """Map recordings and write the result; say nothing.
+
+    Parameters
+    ----------
+    args : the command line: settings, constraints, --out.
+    logs : as `read_logs` returns them; the list is emptied, for scans that no map looks at are most of the memory.
+    reading : time that it took to read them, s.
+    progress, executor : see `build_map`.
+    """
+    from ..io.result_text import RunRecord
+    from ..io.results import write_result
+    from ..mapping import build_map
+    from ..pipeline.scan_selection import prepared
+
+    config, constraints = settings(args), known(args)
+    began = time.perf_counter()
+    kept = [prepared(logs.pop(0), config) for _ in range(len(logs))]
+    log = kept[0] if len(kept) == 1 else kept
+    result = build_map(
+        log, config, constraints=constraints, progress=progress, executor=executor, clock=time.perf_counter
+    )
     record = RunRecord(
         command=repeat_command(args),
-        config=to_toml(config, header="settings in force; `uwblite config` explains them"),
-        versions=_versions(),
+        config=config_text(config),
+        versions=versions(),
+        given=given_files(args),
         preset=args.preset or "",
-        seconds=0.0 if args.no_timings else time.perf_counter() - began,
+        seconds=0.0 if args.no_timings else reading + time.perf_counter() - began,
         reading_seconds=reading,
         peak_rss_bytes=_peak_memory(),
         timings_in_report=args.report_timings,
         scale_map=args.scale_map,
     )
-    names = write_result(args.out, logs, result, record)
-    if args.json:
-        console.say_json(summary_json(args, result, names, time.perf_counter() - began))
-    else:
-        for line in summary_lines(args, logs, result, names, time.perf_counter() - began):
-            console.say(line)
-    return 3 if result.doubts else 0
+    names = write_result(args.out, kept, result, record)
+    return Made(kept, result, names, reading + time.perf_counter() - began)
 
 
-def _settings(args: argparse.Namespace) -> "MappingConfig":
+def config_text(config: "MappingConfig") -> str:
+    """Return the config.toml of a result."""
+    from ..config import to_toml
+
+    return to_toml(config, header="settings in force; `uwblite config` explains them")
+
+
+def given_files(args: argparse.Namespace) -> dict[str, str]:
+    """Return the SHA-256 of the files that the command line names beside recordings and settings, by option.
+
+    What can be read once only, such as a pipe, has none.
+    """
+    import os
+
+    from ..io.files import sha256_of
+
+    named = {"constraints": args.constraints, "anchors-from": args.anchors_from, "uwb-mapping": args.uwb_mapping}
+    return {option: sha256_of(file) for option, file in named.items() if file and os.path.isfile(file)}
+
+
+def settings(args: argparse.Namespace) -> "MappingConfig":
     from ..config import override
     from .options import effective_config
 
@@ -135,7 +202,7 @@ def _settings(args: argparse.Namespace) -> "MappingConfig":
     return override(config, [f"{name}={value}" for name, value in short.items() if value is not None])
 
 
-def _known(args: argparse.Namespace) -> "Constraints":
+def known(args: argparse.Namespace) -> "Constraints":
     from ..constraints import Constraints
     from ..io.constraints_file import parse_constraints, read_anchors
     from .options import read_text
@@ -146,8 +213,8 @@ def _known(args: argparse.Namespace) -> "Constraints":
     return earlier + parse_constraints(read_text(args.constraints), args.constraints)
 
 
-def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Constraints", jobs: int) -> "MapResult":
-    from ..mapping import build_map
+def _make_shown(args: argparse.Namespace, logs: "list[SensorLog]", reading: float) -> Made:
+    """Map recordings with a progress bar, on the processes or the cluster that the command line asks for."""
     from . import console
     from .stage_shares import Overall
 
@@ -158,28 +225,11 @@ def _build(logs: list["SensorLog"], config: "MappingConfig", constraints: "Const
             console.note(f"uwblite: {stage}")
         progress(stage, done, total)
 
-    log = logs[0] if len(logs) == 1 else logs
     try:
-        with _workers(jobs) as executor:
-            clock = time.perf_counter
-            return build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=clock)
+        with workers(args.jobs, args.scheduler) as executor:
+            return make(args, logs, reading, report, executor)
     finally:
         progress.close()
-
-
-@contextmanager
-def _workers(jobs: int) -> Iterator["Executor | None"]:
-    """Start so many processes; for one job, none."""
-    if jobs == 1:
-        yield None
-        return
-    from concurrent.futures import ProcessPoolExecutor
-
-    executor = ProcessPoolExecutor(jobs)
-    try:
-        yield executor
-    finally:
-        executor.shutdown(cancel_futures=True)
 
 
 def _tell_reader_warnings(logs: list["SensorLog"]) -> None:
@@ -234,17 +284,6 @@ def repeat_command(args: argparse.Namespace) -> str:
     return shlex.join([*words, "--out", "map_again"])
 
 
-def _versions() -> dict[str, str]:
-    import platform
-
-    import numpy
-    import scipy
-
-    from .. import __version__
-
-    return {"uwblite": __version__, "Python": platform.python_version(), "numpy": numpy.__version__, "scipy": scipy.__version__}
-
-
 def _peak_memory() -> int:
     """Return the peak resident memory of this process and the largest of its children, bytes; 0 where it is not known."""
     try:
@@ -255,17 +294,16 @@ def _peak_memory() -> int:
     return unit * max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
 
 
-def summary_json(
-    args: argparse.Namespace, result: "MapResult", names: list[str], seconds: float
-) -> dict[str, Any]:
+def summary_json(args: argparse.Namespace, made: Made) -> dict[str, Any]:
     """Return the summary for programs; report.json has everything."""
     import os
 
     from ..io.result_text import notices
 
+    result = made.result
     return {
         "out": args.out,
-        "files": [os.path.join(args.out, name) for name in names],
+        "files": [os.path.join(args.out, name) for name in made.names],
         "trusted": not result.doubts,
         "doubts": notices(result.doubts),
         "warnings": notices(result.warnings),
@@ -275,22 +313,21 @@ def summary_json(
         },
         "closures": {"accepted": sum(c.accepted for c in result.closures), "candidates": len(result.closures)},
         "calibration": {c.name: c.value for c in result.calibration if c.state == "estimated"},
-        "seconds": round(seconds, 3),
+        "seconds": round(made.seconds, 3),
         "peak_rss_bytes": _peak_memory(),
         "exit_code": 3 if result.doubts else 0,
     }
 
 
-def summary_lines(
-    args: argparse.Namespace, logs: list["SensorLog"], result: "MapResult", names: list[str], seconds: float
-) -> list[str]:
+def summary_lines(args: argparse.Namespace, made: Made) -> list[str]:
     """Return the summary for people."""
     import os
 
     from .console import duration
     from .wording import anchor_line, calibration_line
 
-    span = sum(float(log.odometry.stamps[-1] - log.odometry.stamps[0]) for log in logs)
+    result, seconds = made.result, made.seconds
+    span = sum(float(log.odometry.stamps[-1] - log.odometry.stamps[0]) for log in made.logs)
     lines = [f"mapped {duration(span)} of driving in {duration(seconds)} ({span / max(seconds, 1e-9):.0f} times real time)"]
     kept = sum(c.accepted for c in result.closures)
     if result.grid is not None:
@@ -302,7 +339,7 @@ def summary_lines(
     lines += [calibration_line(c) for c in shown]
     lines += [f"warning: {text}" for text in result.warnings]
     lines += [f"DOUBT: {text}" for text in result.doubts]
-    lines.append("files: " + " ".join(os.path.join(args.out, name) for name in names))
+    lines.append("files: " + " ".join(os.path.join(args.out, name) for name in made.names))
     page = shlex.quote(os.path.join(args.out, "report.html"))
     lines.append(f"next: open {page} in a browser, or: uwblite evaluate {shlex.quote(args.out)} --truth truth.tum")
     return lines

@@ -30,6 +30,8 @@ class RunRecord:
     """Effective settings as TOML."""
     versions: dict[str, str] = field(default_factory=dict)
     """Of uwblite, Python and the libraries."""
+    given: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the files that are named beside recordings and settings, by the name of their option."""
     preset: str = ""
     seconds: float = 0.0
     """Wall time of the whole run; 0 = not to be recorded."""
@@ -104,6 +106,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "command": record.command,
         "preset": record.preset,
         "config_sha256": hashlib.sha256(record.config.encode()).hexdigest(),
+        "given": record.given,
         "inputs": [_input_entry(log.notes) for log in logs],
         "recording": recording_figures(logs, result),
         "trusted": not result.doubts,

@@ -19,4 +19,4 @@ def in_order(work: Callable[[Task], Answer], tasks: Iterable[Task], executor: Ex
     work : a function of a module, so that it can be sent to another process.
     executor : any concurrent.futures executor; None = here and now, a task at a time.
     """
-    yield from map(work, tasks) if executor is None else executor.map(work, tasks)
+    yield from map(work, tasks) if executor is None else executor.map(work, list(tasks))

@@ -1,0 +1,67 @@
+"""Who does the work: this process, some processes, or a scheduler that may be absent."""
+
+import argparse
+
+import pytest
+
+from uwblite.cli import main, workers
+from uwblite.errors import ConfigError
+
+
+def parsed(words):
+    parser = argparse.ArgumentParser()
+    workers.add_worker_arguments(parser, "so many")
+    return parser.parse_args(words)
+
+
+def test_processes_and_a_scheduler_exclude_each_other(capsys):
+    assert parsed(["--jobs", "3"]).jobs == 3
+    assert parsed(["--scheduler", "tcp://head:8786"]).scheduler == "tcp://head:8786"
+    with pytest.raises(SystemExit):
+        parsed(["--jobs", "2", "--scheduler", "tcp://head:8786"])
+
+
+def test_one_job_needs_no_executor_and_two_answer_in_order():
+    with workers.workers(1) as executor:
+        assert executor is None
+    with workers.workers(2) as executor:
+        assert list(executor.map(abs, range(-3, 3))) == [3, 2, 1, 0, 1, 2]
+
+
+def test_without_the_package_the_command_that_installs_it_is_said(monkeypatch, room_log, tmp_path, capsys):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--scheduler", "tcp://127.0.0.1:1"]) == 1
+    said = capsys.readouterr().err
+    assert "distributed" in said
+    assert "pip" in said
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(monkeypatch):
+    pytest.importorskip("distributed", reason="dask.distributed is not installed (extra: cluster)")
+    monkeypatch.setattr(workers, "_SECONDS_TO_CONNECT", 0.2)
+    with pytest.raises(ConfigError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1 "), workers.cluster("tcp://127.0.0.1:1"):
+        pass
+
+
+def test_workers_with_another_uwblite_are_refused_and_other_libraries_named(monkeypatch, capsys):
+    from uwblite.cli.workers import versions
+
+    class Client:
+        def __init__(self, theirs):
+            self.theirs = theirs
+
+        def run(self, function, on_error):
+            assert on_error == "return"
+            return self.theirs
+
+    workers._compare_versions(Client({"a": versions()}))
+    with pytest.raises(ConfigError, match=r"worker a has uwblite 0\.0, this is .*; install the same"):
+        workers._compare_versions(Client({"a": {**versions(), "uwblite": "0.0"}}))
+    with pytest.raises(ConfigError, match="worker b cannot import this uwblite"):
+        workers._compare_versions(Client({"b": ModuleNotFoundError("No module named 'uwblite'")}))
+    assert capsys.readouterr().err == ""
+    workers._compare_versions(Client({"a": {**versions(), "numpy": "1.0"}}))
+    assert "worker a has numpy 1.0 for" in capsys.readouterr().err
+    workers._compare_versions(Client({}))
+    assert "no worker yet" in capsys.readouterr().err

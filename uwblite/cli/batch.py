@@ -1,0 +1,264 @@
+"""`uwblite batch`: many recordings, each mapped on its own, and a table of what became of them."""
+
+import argparse
+import os
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .map import add_map_arguments
+from .options import place
+from .workers import add_worker_arguments, cluster, processes, versions
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from ..report.batch import BatchRow
+
+HELP = "map many recordings, each on its own: a folder for each, and a table"
+EPILOG = """\
+examples:
+  uwblite batch *.log --out maps/                        maps/NAME/ for each recording, maps/batch.html, maps/batch.csv
+  uwblite batch *.log --out maps/ --jobs 4               four recordings at a time
+  uwblite batch *.log --out maps/ --scheduler tcp://head:8786    on the workers of a dask.distributed scheduler
+  uwblite batch *.log --out maps/ --anchors-from site/anchors.csv    all of them in one frame
+
+What is finished is kept: the same command again, after a crash or with further recordings, maps only what is missing.
+A recording that fails does not stop the others. Workers of a scheduler read and write the files themselves, so they must
+see them under the same names.
+
+exit code 1: a recording failed; 3: a result should not be trusted; the table names them
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the verb."""
+    parser.add_argument("logs", metavar="LOG", nargs="+", help="CARMEN log, plain or .gz, ROS bag or CSV folder")
+    text = "folder for the results, a folder for each, and the table"
+    parser.add_argument("--out", type=place, metavar="DIR", required=True, help=text)
+    text = "replace results that were made of other recordings or with other settings"
+    parser.add_argument("--force", action="store_true", help=text)
+    parser.add_argument("--json", action="store_true", help="print the table as one JSON object instead of text")
+    add_worker_arguments(parser, "recordings that are mapped at a time, each in a process (1)")
+    add_map_arguments(parser)
+
+
+class Outcome(NamedTuple):
+    """What a worker says of a recording; its figures stand in report.json."""
+
+    code: int
+    """Exit code as of `uwblite map`."""
+    error: str = ""
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the verb."""
+    from ..io.locks import sole_writer
+    from . import console
+
+    tasks = tasks_of(args)
+    with sole_writer(args.out):
+        os.makedirs(args.out, exist_ok=True)
+        rows = _rows(args, tasks)
+    if args.json:
+        console.say_json({"out": args.out, "recordings": [_fields(row) for row in rows], "exit_code": _exit_code(rows)})
+    else:
+        console.say(f"the table: {os.path.join(args.out, 'batch.html')} and {os.path.join(args.out, 'batch.csv')}")
+    return _exit_code(rows)
+
+
+def tasks_of(args: argparse.Namespace) -> list[argparse.Namespace]:
+    """Return the command line of each recording's map, with absolute paths: workers may stand in another folder.
+
+    Raises
+    ------
+    UsageError, ConfigError : settings or files that no map could be made with, or two folders of the same name.
+    """
+    from .map import known, settings
+    from .options import bag_choices
+
+    settings(args), known(args), bag_choices(args)
+    absolute = {name: os.path.abspath(value) for name in _FILES if (value := getattr(args, name))}
+    return [
+        argparse.Namespace(**{**vars(args), **absolute, "logs": [os.path.abspath(log)], "out": os.path.abspath(folder)})
+        for log, folder in zip(args.logs, (os.path.join(args.out, name) for name in folder_names(args.logs)), strict=True)
+    ]
+
+
+_FILES = ("constraints", "anchors_from", "uwb_mapping", "config")
+
+
+def folder_names(logs: Sequence[str]) -> list[str]:
+    """Return the name of each recording's folder: its own without ending, behind its folder's where names are alike.
+
+    Raises
+    ------
+    ConfigError : two recordings are alike in both.
+    """
+    from ..errors import ConfigError
+
+    short = [_stem(log) for log in logs]
+    parents = [os.path.basename(os.path.dirname(os.path.abspath(log))) for log in logs]
+    names = [f"{parent}_{name}" if short.count(name) > 1 else name for name, parent in zip(short, parents, strict=True)]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise ConfigError(f"{logs[names.index(name)]} and {logs[k]} would both go to the folder {name}; rename one of them")
+    return names
+
+
+def _stem(log: str) -> str:
+    """Return the name of a recording without .gz and what tells its format."""
+    name = os.path.basename(os.path.abspath(log)).removesuffix(".gz")
+    return os.path.splitext(name)[0] or name
+
+
+def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> "list[BatchRow]":
+    """Map what is not there yet; write the table after every recording."""
+    from . import console
+
+    finished = {k for k, task in enumerate(tasks) if is_finished(task)}
+    rows = {k: _row(args.logs[k], tasks[k], Outcome(0)) for k in sorted(finished)}
+    if finished:
+        console.note(f"uwblite: {len(finished)} of {len(tasks)} recordings are mapped already")
+    _write_table(args.out, rows)
+    for k, outcome in _outcomes({k: task for k, task in enumerate(tasks) if k not in finished}, args):
+        rows[k] = _row(args.logs[k], tasks[k], outcome)
+        _write_table(args.out, rows)
+        if not args.json:
+            console.say(f"{len(rows)} of {len(tasks)}: {_line(rows[k])}")
+    return [rows[k] for k in range(len(tasks))]
+
+
+def is_finished(task: argparse.Namespace) -> bool:
+    """Tell whether a folder holds the map of this recording, made with these settings by this version."""
+    from ..io.files import sha256_of
+    from .map import given_files, repeat_command, settings
+
+    report = _report(task.out)
+    if not report or not os.path.exists(task.logs[0]):
+        return False
+    return (
+        report.get("command") == repeat_command(task)
+        and report.get("config_sha256") == _hash_of_settings(settings(task))
+        and report.get("given") == given_files(task)
+        and report.get("versions") == versions()
+        and [entry.get("sha256") for entry in report.get("inputs", ())] == [sha256_of(task.logs[0])]
+    )
+
+
+def _hash_of_settings(config: Any) -> str:
+    import hashlib
+
+    from .map import config_text
+
+    return hashlib.sha256(config_text(config).encode()).hexdigest()
+
+
+def _report(folder: str) -> dict[str, Any]:
+    import json
+
+    try:
+        with open(os.path.join(folder, "report.json"), encoding="utf-8") as stream:
+            report = json.load(stream)
+    except (OSError, ValueError):
+        return {}
+    return report if isinstance(report, dict) else {}
+
+
+def map_one(task: argparse.Namespace) -> Outcome:
+    """Map one recording; what goes wrong is the outcome, for it shall not stop the others."""
+    import time
+    import warnings
+
+    from ..io.locks import sole_writer
+    from ..io.results import check_target
+    from . import failure
+    from .map import make, read_logs
+
+    try:
+        with warnings.catch_warnings(), sole_writer(task.out):
+            warnings.simplefilter("ignore", RuntimeWarning)
+            check_target(task.out, force=task.force)
+            began = time.perf_counter()
+            logs = read_logs(task)
+            made = make(task, logs, time.perf_counter() - began)
+    except Exception as error:
+        code, text = failure(error)
+        return Outcome(code, text)
+    return Outcome(3 if made.result.doubts else 0)
+
+
+def _outcomes(tasks: dict[int, argparse.Namespace], args: argparse.Namespace) -> Iterator[tuple[int, Outcome]]:
+    """Yield number and outcome of every task as they come.
+
+    Where a process is killed, for instance for want of memory, all that it shared a pool with have no outcome: each of
+    them gets a process of its own, one at a time, and who then falls has failed.
+    """
+    broken = []
+    if tasks:
+        with cluster(args.scheduler) if args.scheduler else processes(args.jobs) as executor:
+            for k, outcome in _as_they_come(tasks, executor):
+                if outcome is None:
+                    broken.append(k)
+                else:
+                    yield k, outcome
+    for k in sorted(broken):
+        with processes(1) as executor:
+            for _, outcome in _as_they_come({k: tasks[k]}, executor):
+                yield k, outcome or Outcome(1, "its process was killed; too little memory? see the system's log")
+
+
+def _as_they_come(tasks: dict[int, argparse.Namespace], executor: "Executor") -> Iterator[tuple[int, Outcome | None]]:
+    """Yield number and outcome of every task; None where the pool broke."""
+    from concurrent.futures import BrokenExecutor, as_completed
+
+    from . import failure
+
+    futures = {executor.submit(map_one, task): k for k, task in tasks.items()}
+    for future in as_completed(futures):
+        error = future.exception()
+        if isinstance(error, BrokenExecutor):
+            yield futures[future], None
+        elif error is not None:
+            yield futures[future], Outcome(*failure(error))
+        else:
+            yield futures[future], future.result()
+
+
+def _row(recording: str, task: argparse.Namespace, outcome: Outcome) -> "BatchRow":
+    from ..report.batch import BatchRow, row_of
+
+    folder = os.path.basename(task.out)
+    if outcome.error:
+        return BatchRow(recording, folder, "failed", outcome.error.replace(task.logs[0], recording))
+    return row_of(recording, folder, _report(task.out))
+
+
+def _line(row: "BatchRow") -> str:
+    text = f"{row.recording}: {row.outcome}"
+    if row.outcome == "failed":
+        return f"{text}: {row.reason}"
+    size = "" if row.width is None else f", {row.width:.1f} x {row.height:.1f} m"
+    figures = f"{row.anchors} anchors, {row.closures} loop closures"
+    return f"{text}{f' ({row.reason})' if row.reason else ''}{size}, {figures}"
+
+
+def _write_table(out: str, rows: "dict[int, BatchRow]") -> None:
+    from pathlib import Path
+
+    from ..io.files import write_text
+    from ..report.batch import table_csv, table_html
+
+    ordered = [rows[k] for k in sorted(rows)]
+    write_text(Path(out) / "batch.csv", table_csv(ordered))
+    write_text(Path(out) / "batch.html", table_html(ordered, os.path.basename(os.path.abspath(out))))
+
+
+def _fields(row: "BatchRow") -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(row)
+
+
+def _exit_code(rows: "Sequence[BatchRow]") -> int:
+    outcomes = {row.outcome for row in rows}
+    return 1 if "failed" in outcomes else 3 if "doubted" in outcomes else 0

@@ -1,0 +1,106 @@
+"""Who does the heavy work: this process, several of this computer, or a cluster of dask.distributed."""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from .options import number
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+_SECONDS_TO_CONNECT = 10
+"""A scheduler that runs answers within milliseconds."""
+
+
+def add_worker_arguments(parser: argparse.ArgumentParser, jobs: str) -> None:
+    """Declare --jobs, with its help, and --scheduler."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--jobs", metavar="N", type=number(above=0, whole=True), default=1, help=jobs)
+    text = "hand the work to the workers of a dask.distributed scheduler, such as tcp://head:8786"
+    where.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
+
+
+@contextmanager
+def workers(jobs: int, scheduler: str = "") -> "Iterator[Executor | None]":
+    """Give an executor: the scheduler's workers, so many processes, or, for one job, none."""
+    if scheduler:
+        with cluster(scheduler) as executor:
+            yield executor
+    elif jobs == 1:
+        yield None
+    else:
+        with processes(jobs) as executor:
+            yield executor
+
+
+@contextmanager
+def processes(jobs: int) -> "Iterator[Executor]":
+    """Start so many processes; what waits is dropped at the end."""
+    from concurrent.futures import ProcessPoolExecutor
+
+    executor = ProcessPoolExecutor(jobs)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def cluster(address: str) -> "Iterator[Executor]":
+    """Connect to a scheduler, whose workers must have this uwblite.
+
+    Raises
+    ------
+    ConfigError : dask.distributed is missing, no scheduler answers, or a worker has no uwblite or another one.
+    """
+    from ..errors import ConfigError
+    from ..io.optional_packages import missing_package
+
+    try:
+        from distributed import Client
+    except ImportError:
+        raise missing_package("distributed", "--scheduler") from None
+    try:
+        client = Client(address, timeout=_SECONDS_TO_CONNECT)
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = str(error) or type(error).__name__
+        raise ConfigError(f"no scheduler answers at {address} ({reason}); `dask scheduler` starts one") from None
+    try:
+        _compare_versions(client)
+        with client.get_executor(pure=False) as executor:
+            yield executor
+    finally:
+        client.close()
+
+
+def _compare_versions(client: Any) -> None:
+    """Refuse workers whose uwblite is another one; other libraries may change the last digits, which is said."""
+    from ..errors import ConfigError
+    from . import console
+
+    ours = versions()
+    found = client.run(versions, on_error="return")
+    if not found:
+        console.note("uwblite: the scheduler has no worker yet; waiting for one (`dask worker ADDRESS`)")
+    for worker, theirs in found.items():
+        if isinstance(theirs, BaseException):
+            raise ConfigError(f"worker {worker} cannot import this uwblite ({theirs}); install it there")
+        if theirs["uwblite"] != ours["uwblite"]:
+            raise ConfigError(f"worker {worker} has uwblite {theirs['uwblite']}, this is {ours['uwblite']}; install the same")
+        if theirs != ours:
+            differ = ", ".join(f"{name} {theirs[name]} for {ours[name]}" for name in ours if theirs[name] != ours[name])
+            console.note(f"uwblite: worker {worker} has {differ}: last digits may differ")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of uwblite, Python and the libraries that results depend on."""
+    import platform
+
+    import numpy
+    import scipy
+
+    from .. import __version__
+
+    return {"uwblite": __version__, "Python": platform.python_version(), "numpy": numpy.__version__, "scipy": scipy.__version__}
