@@ -17,10 +17,11 @@ from uwblite.drivers.kobuki import KobukiProtocol
 from uwblite.drivers.ldlidar import LdLidarProtocol
 from uwblite.drivers.lds01 import Lds01Protocol
 from uwblite.drivers.linktrack import Bu03Protocol, LinkTrackProtocol
-from uwblite.drivers.odometry_line import LineFormat, OdometryLineProtocol
+from uwblite.drivers.odometry_line import LineFormat, values_by
 from uwblite.drivers.rplidar import RpLidarProtocol
 from uwblite.drivers.scip import ScipProtocol
-from uwblite.drivers.uwb_line import BOARDS, UwbLineProtocol, by_columns, parse_columns
+from uwblite.drivers.text_lines import LineProtocol
+from uwblite.drivers.uwb_line import BOARDS, by_columns, parse_columns
 from uwblite.drivers.ydlidar import YdLidarProtocol
 
 WORDS = {
@@ -50,11 +51,11 @@ PROTOCOLS = {
     "tlv": (TlvProtocol, WORDS["tlv"]),
     "shell": (ShellProtocol, WORDS["shell"]),
     "kobuki": (KobukiProtocol, WORDS["kobuki"]),
-    "line": (lambda: OdometryLineProtocol(LineFormat()), WORDS["line"]),
+    "line": (lambda: LineProtocol(values_by(LineFormat())), WORDS["line"]),
     "create2": (Create2Protocol, WORDS["create2"]),
-    "gyro-line": (lambda: OdometryLineProtocol(gyro_format("turn_rate", 1.0, 1.0, "")), WORDS["line"]),
-    "uwb-line": (lambda: UwbLineProtocol(by_columns(parse_columns("id,range", 1.0, ""))), WORDS["uwb-line"]),
-    **{name: (lambda parse=parse: UwbLineProtocol(parse), WORDS[name]) for name, parse in BOARDS.items()},
+    "gyro-line": (lambda: LineProtocol(values_by(gyro_format("turn_rate", 1.0, 1.0, ""))), WORDS["line"]),
+    "uwb-line": (lambda: LineProtocol(by_columns(parse_columns("id,range", 1.0, ""))), WORDS["uwb-line"]),
+    **{name: (lambda parse=parse: LineProtocol(parse), WORDS[name]) for name, parse in BOARDS.items()},
     "linktrack": (LinkTrackProtocol, WORDS["linktrack"]),
     "bu03": (Bu03Protocol, WORDS["bu03"]),
     "ld06": (LdLidarProtocol, WORDS["ld06"]),

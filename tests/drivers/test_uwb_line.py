@@ -9,8 +9,9 @@ from helpers.driver_harness import check_transcript, good, of_kind, simulate
 
 from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, Lost, Note, RangeEpoch
+from uwblite.drivers.text_lines import LineProtocol
 from uwblite.drivers.uwb_line import BOARDS as FORMS
-from uwblite.drivers.uwb_line import UwbLineProtocol, by_columns, parse_columns
+from uwblite.drivers.uwb_line import by_columns, parse_columns
 from uwblite.errors import ConfigError
 
 SPECS = {name: f"{name}:port" for name in BOARDS} | {
@@ -40,13 +41,13 @@ REAL_LINES = {
 @pytest.mark.parametrize("name", REAL_LINES)
 def test_lines_that_users_show(name):
     text, expected = REAL_LINES[name]
-    (line,) = UwbLineProtocol(FORMS[name]).feed(text.encode() + b"\r\n", 1.0)
+    (line,) = LineProtocol(FORMS[name]).feed(text.encode() + b"\r\n", 1.0)
     assert [(r.anchor_id, pytest.approx(r.range)) for r in line.content.readings] == expected
 
 
 def test_older_at_firmware_says_rssi_and_no_ids():
     text = "AT+RANGE=tid:1,mask:04,seq:63,range:(0,0,30,0,0,0,0,0),rssi:(0.00,0.00,-77.93,0.00,0.00,0.00,0.00,0.00)"
-    (line,) = UwbLineProtocol(FORMS["makerfabs-at"]).feed(text.encode() + b"\n", 1.0)
+    (line,) = LineProtocol(FORMS["makerfabs-at"]).feed(text.encode() + b"\n", 1.0)
     assert [(r.anchor_id, r.range) for r in line.content.readings] == [("2", 0.3)]
     assert line.content.tag == "1"
 
@@ -55,10 +56,10 @@ def test_older_at_firmware_says_rssi_and_no_ids():
 def test_transcript_in_every_split_and_among_noise(name):
     epochs = RoomWorld().epochs()
     lines = [line + b"\n" for k in range(12) for line in BOARDS[name](next(epochs), k, 100 * k).split(b"\n") if line.strip()]
-    expected = good(UwbLineProtocol(FORMS[name]).feed(b"".join(lines), 1.0))
+    expected = good(LineProtocol(FORMS[name]).feed(b"".join(lines), 1.0))
     assert len(expected) >= 12
     noises = [b"", b"\n", b"\xff\xfe\n", b"from: 12\n", b"an1\n", b"boot: ok\r\n", random.Random(3).randbytes(40) + b"\n"]
-    check_transcript(lambda: UwbLineProtocol(FORMS[name]), lines, expected, noises, splits=60)
+    check_transcript(lambda: LineProtocol(FORMS[name]), lines, expected, noises, splits=60)
 
 
 def board(name):
@@ -111,7 +112,7 @@ def test_columns(options, line, expected):
 
 @pytest.mark.parametrize("line", ["A1", "A1 x", "A1 2.5 9", "A/1 2.5", "A1 nan", "A1 1e999"])
 def test_lines_that_do_not_fit_are_damage(line):
-    protocol = UwbLineProtocol(by_columns(parse_columns("id,range", 1.0, "")))
+    protocol = LineProtocol(by_columns(parse_columns("id,range", 1.0, "")))
     (event,) = protocol.feed(line.encode() + b"\n", 1.0)
     assert isinstance(event, Corrupt)
 

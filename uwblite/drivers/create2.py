@@ -13,11 +13,11 @@ specification; users (packets 19 and 20).
 import math
 import struct
 from dataclasses import dataclass
-from typing import Any
 
 from .clock import ClockMap
 from .events import Action, Corrupt, Lost, Note, OdometryPose, Pose, Send
 from .framing import PacketReader, to_next
+from .odometer import WheelOdometer
 from .session import Driver, Identity, Script, Wait
 
 BAUD = 115200
@@ -64,6 +64,8 @@ class Encoders:
 class Create2Protocol(PacketReader):
     """Bytes of the robot in, Encoders and Corrupt out."""
 
+    smallest = LAYOUT.size
+
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[at] != HEAD:
@@ -82,42 +84,6 @@ class Create2Protocol(PacketReader):
         return Encoders(stamp, left, right, bumps >> 2 & 3, millivolts / 1000)
 
 
-class WheelOdometer:
-    """Integrate two wheels to a pose: each step a chord along the mean of both headings.
-
-    Parameters
-    ----------
-    tick : m per tick. base : m between the wheels. modulus : the counters wrap there.
-    start : x, y, theta; m, m, rad.
-    """
-
-    def __init__(self, tick: float, base: float, modulus: int, start: Pose) -> None:
-        self.pose = start
-        self._tick, self._base, self._modulus = tick, base, modulus
-        self._last: tuple[int, int] | None = None
-
-    def update(self, left: int, right: int) -> tuple[float, float]:
-        """Take both counters; return travel, m, and turn, rad, since the last time."""
-        last, self._last = self._last, (left, right)
-        if last is None:
-            return 0.0, 0.0
-        a, b = (self._wrapped(now - then) * self._tick for now, then in zip((left, right), last, strict=True))
-        travel, turn = (a + b) / 2, (b - a) / self._base
-        x, y, theta = self.pose
-        middle = theta + turn / 2
-        theta = math.remainder(theta + turn, 2 * math.pi)
-        self.pose = (x + travel * math.cos(middle), y + travel * math.sin(middle), theta)
-        return travel, turn
-
-    def forget(self) -> None:
-        """Hold the pose over a gap: what the counters did meanwhile is unknown."""
-        self._last = None
-
-    def _wrapped(self, difference: int) -> int:
-        half = self._modulus // 2
-        return (difference + half) % self._modulus - half
-
-
 class Create2Driver(Driver):
     """A Create 2 or Roomba. It is only listened to: the stream is asked for, no motor is ever moved.
 
@@ -129,8 +95,7 @@ class Create2Driver(Driver):
     baud = BAUD
 
     def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        super().__init__()
-        self._protocol = Create2Protocol()
+        super().__init__(Create2Protocol(), "iRobot Create 2")
         self._odometer = WheelOdometer(TICK, WHEEL_BASE, MODULUS, start)
         self._last: Encoders | None = None
         self._new_clock()
@@ -140,12 +105,8 @@ class Create2Driver(Driver):
 
     def begin(self) -> None:
         """Forget half a frame; the encoders counted on."""
-        self._protocol.reset()
+        super().begin()
         self._new_clock()
-
-    def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return Encoders and Corrupt."""
-        return self._protocol.feed(data, now)
 
     def script(self) -> Script[None]:
         """Ask for the stream, again whenever it stops: the robot falls asleep after five minutes, or was switched off."""
@@ -192,11 +153,11 @@ class Create2Driver(Driver):
     def identity(self) -> Identity:
         """Say who answered."""
         if self._last is None:
-            return Identity("iRobot Create 2")
+            return Identity(self.title)
         findings = []
         if self._last.wheel_drop:
             findings.append(Note("warning", "wheel-drop", "a wheel hangs in the air: travel will be wrong"))
         if 0 < self._last.voltage < LOW_VOLTAGE:
             text = f"the battery is low ({self._last.voltage:.1f} V): charge it before a run"
             findings.append(Note("warning", "low-battery", text))
-        return Identity("iRobot Create 2", (("battery", f"{self._last.voltage:.1f} V"),), tuple(findings))
+        return Identity(self.title, (("battery", f"{self._last.voltage:.1f} V"),), tuple(findings))

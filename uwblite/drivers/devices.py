@@ -18,7 +18,7 @@ from .kobuki import KobukiDriver
 from .ldlidar import LdLidarDriver
 from .lds01 import Lds01Driver
 from .linktrack import BU03_BAUD, LINKTRACK_BAUD, Bu03Protocol, LinkTrackProtocol, TagFrameDriver
-from .odometry_line import LineDriver, parse_format
+from .odometry_line import OdometryLineDriver, parse_format
 from .rplidar import RpLidarDriver
 from .scip_driver import ScipDriver
 from .session import Driver, Session
@@ -124,9 +124,9 @@ def _kobuki(_options: Options, setup: Setup) -> Driver:
 
 
 def _line(options: Options, setup: Setup) -> Driver:
-    baud = options.whole("baud", LineDriver.baud, *BAUD)
+    baud = options.whole("baud", OdometryLineDriver.baud, *BAUD)
     options.known += options.values
-    return LineDriver(parse_format({k: v for k, v in options.values.items() if k != "baud"}), baud, setup.start)
+    return OdometryLineDriver(parse_format({k: v for k, v in options.values.items() if k != "baud"}), baud, setup.start)
 
 
 def _uwb_line(options: Options, _setup: Setup) -> Driver:

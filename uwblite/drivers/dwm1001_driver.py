@@ -52,7 +52,7 @@ class Dwm1001Driver(Driver):
     baud = BAUD
 
     def __init__(self, *, shell: bool = False, stream: bool = True) -> None:
-        super().__init__()
+        super().__init__(TlvProtocol(), "DWM1001 tag")
         self.config: NodeConfig | None = None
         self.rate: UpdateRate | None = None
         self.values: dict[str, int] = {}
@@ -268,7 +268,7 @@ class Dwm1001Driver(Driver):
         if network == 0:
             text = "the network id is 0: in the shell type `nis 0xC0DE` (with 0x), then `reset`"
             findings.append(Note("error", "no-network-id", text))
-        title = "DWM1001 anchor" if self.config and self.config.anchor else "DWM1001 tag"
+        title = "DWM1001 anchor" if self.config and self.config.anchor else self.title
         return Identity(title, tuple(details.items()), tuple(findings))
 
 

@@ -171,6 +171,9 @@ class PacketReader(FrameReader):
     head was noise.
     """
 
+    smallest = 1
+    """Bytes of the smallest frame, before which nobody looks for one."""
+
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the good frame that begins at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
         raise NotImplementedError
@@ -179,7 +182,7 @@ class PacketReader(FrameReader):
         """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
         buffer = self.held.data
         size, behind = self.size_at(buffer, at), at + 1
-        while size == 0 and behind < len(buffer):
+        while size == 0 and behind + self.smallest <= len(buffer):
             found = self.size_at(buffer, behind)
             if found > 0:
                 return at - behind

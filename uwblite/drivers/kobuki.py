@@ -14,11 +14,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
-from typing import Any
 
 from .clock import DeviceClock
 from .events import Action, Corrupt, Lost, Note, OdometryPose, Pose, corrupt
 from .framing import FrameReader
+from .odometer import WheelOdometer
 from .session import Driver, Identity
 
 PERIOD = 0.020
@@ -104,55 +104,6 @@ def _sub_payloads(payload: bytes) -> Iterator[tuple[int | None, bytes]]:
         yield None, b""
 
 
-class KobukiOdometer:
-    """Integrate Feedback to a pose in the odom frame: travel from the encoders, heading from the gyro.
-
-    Between two packets the base moves straight along the mean of both headings (Borenstein's chord rule). The gyro's
-    angle is absolute, so the heading holds over any gap; the travel is ambiguous after one longer than MAX_BLIND.
-
-    Parameters
-    ----------
-    start : x, y, theta at the first packet; m, m, rad.
-    """
-
-    def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        self.pose = start
-        self._last: Feedback | None = None
-
-    def update(self, feedback: Feedback, elapsed: float | None) -> float:
-        """Take one packet and move the pose.
-
-        Parameters
-        ----------
-        feedback : from KobukiProtocol.
-        elapsed : s since the one before by the base's clock; None = the base was switched on anew.
-
-        Returns
-        -------
-        float, m/s, forward.
-        """
-        last, self._last = self._last, feedback
-        if last is None or elapsed is None:
-            return 0.0
-        left, right = (_wrapped(b - a) * TICK for a, b in ((last.left, feedback.left), (last.right, feedback.right)))
-        travel, turn = (left + right) / 2, (right - left) / WHEEL_BASE
-        if elapsed > MAX_GUESS:
-            travel = turn = 0.0
-        if last.heading is not None and feedback.heading is not None:
-            turn = math.remainder(feedback.heading - last.heading, 2 * math.pi)
-        x, y, theta = self.pose
-        middle = theta + turn / 2
-        self.pose = (
-            x + travel * math.cos(middle), y + travel * math.sin(middle), math.remainder(theta + turn, 2 * math.pi)
-        )  # fmt: skip
-        return travel / elapsed
-
-
-def _wrapped(difference: int) -> int:
-    """Return an encoder difference as a signed 16-bit number."""
-    return (difference + ENCODER_MODULUS // 2) % ENCODER_MODULUS - ENCODER_MODULUS // 2
-
-
 class KobukiDriver(Driver):
     """A Kobuki base. Nothing is ever sent.
 
@@ -162,20 +113,12 @@ class KobukiDriver(Driver):
     """
 
     def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        super().__init__()
-        self._protocol, self._odometer = KobukiProtocol(), KobukiOdometer(start)
+        super().__init__(KobukiProtocol(), "Kobuki base")
+        self._odometer = WheelOdometer(TICK, WHEEL_BASE, ENCODER_MODULUS, start)
         self._clock = DeviceClock(1e-3, STAMP_MODULUS, period=PERIOD)
         self._packets = 0
         self._battery = 0.0
         self._wheel_drop = 0
-
-    def begin(self) -> None:
-        """Forget half a packet; the base stayed on, and its clock and encoders counted on."""
-        self._protocol.reset()
-
-    def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return Feedback and Corrupt."""
-        return self._protocol.feed(data, now)
 
     def take(self, event: Feedback) -> list[Action]:
         """Turn a packet into a pose."""
@@ -184,7 +127,11 @@ class KobukiDriver(Driver):
         reading = self._clock.read(event.time, event.stamp)
         if reading.elapsed is not None and reading.elapsed <= 0:
             return [Corrupt(b"", "packet sent twice")]
-        speed = self._odometer.update(event, reading.elapsed)
+        if reading.elapsed is None:
+            self._odometer.forget()  # the base was switched on anew
+        # The gyro's angle is absolute, so the heading holds over any gap; the travel is ambiguous after a long one.
+        elapsed = reading.elapsed or math.inf
+        travel, _ = self._odometer.update(event.left, event.right, event.heading, still=elapsed > MAX_GUESS)
         actions: list[Action] = [Lost(reading.stamp, reading.missing)] if reading.missing else []
         if reading.reset or (reading.elapsed or 0.0) > MAX_BLIND:
             text = "odometry: the base restarted: its motion meanwhile is unknown, pose held"
@@ -194,7 +141,7 @@ class KobukiDriver(Driver):
         if event.wheel_drop and not self._wheel_drop:
             actions.append(Note("warning", "wheel-drop", "odometry: a wheel hangs in the air; travel is not to be trusted"))
         self._wheel_drop = event.wheel_drop
-        return [*actions, OdometryPose(reading.stamp, *self._odometer.pose, speed, event.turn_rate)]
+        return [*actions, OdometryPose(reading.stamp, *self._odometer.pose, travel / elapsed, event.turn_rate)]
 
     def identity(self) -> Identity:
         """Say who answered."""
@@ -204,4 +151,4 @@ class KobukiDriver(Driver):
         if 0 < self._battery < LOW_BATTERY:
             text = f"the battery is low ({self._battery:.1f} V): charge it before a run"
             findings.append(Note("warning", "low-battery", text))
-        return Identity("Kobuki base", (("battery", f"{self._battery:.1f} V"),), tuple(findings))
+        return Identity(self.title, (("battery", f"{self._battery:.1f} V"),), tuple(findings))

@@ -51,6 +51,8 @@ def crc8(data: bytes | bytearray) -> int:
 class LdLidarProtocol(PacketReader):
     """Bytes of the lidar in, Samples and Corrupt out."""
 
+    smallest = SIZE
+
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the packet at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[at] != HEAD[0]:

@@ -33,6 +33,8 @@ TRUST = 2 * PACKETS
 class Lds01Protocol(PacketReader):
     """Bytes of the lidar in, Samples and Corrupt out."""
 
+    smallest = SIZE
+
     def __init__(self) -> None:
         super().__init__()
         self._other_sums = 0

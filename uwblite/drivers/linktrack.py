@@ -15,7 +15,7 @@ from typing import Any
 from .clock import DeviceClock
 from .events import Action, Lost, Note, RangeEpoch, RangeReading
 from .framing import PacketReader, to_next
-from .session import Driver, Identity
+from .session import Driver
 
 ANCHORS = 8
 LINKTRACK_BAUD, LINKTRACK_SIZE = 921600, 128
@@ -39,7 +39,7 @@ class TagFrame:
 class LinkTrackProtocol(PacketReader):
     """Bytes of the tag in, TagFrame and Corrupt out."""
 
-    noise = "no tag frame"
+    noise, smallest = "no tag frame", LINKTRACK_SIZE
 
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
@@ -62,7 +62,7 @@ class LinkTrackProtocol(PacketReader):
 class Bu03Protocol(PacketReader):
     """Bytes of the tag in, TagFrame and Corrupt out."""
 
-    noise = "no range frame"
+    noise, smallest = "no range frame", BU03_SIZE
 
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
@@ -92,18 +92,10 @@ class TagFrameDriver(Driver):
     """
 
     def __init__(self, protocol: LinkTrackProtocol | Bu03Protocol, title: str, baud: int) -> None:
-        super().__init__()
-        self.baud, self._protocol, self._title = baud, protocol, title
+        super().__init__(protocol, title)
+        self.baud = baud
         self._clock = DeviceClock(1e-3, 1 << 32)
         self._empty = 0
-
-    def begin(self) -> None:
-        """Forget half a frame."""
-        self._protocol.reset()
-
-    def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return TagFrame and Corrupt."""
-        return self._protocol.feed(data, now)
 
     def take(self, event: TagFrame) -> list[Action]:
         """Turn a frame into ranges."""
@@ -120,7 +112,3 @@ class TagFrameDriver(Driver):
             text = "uwb: frames come, but without ranges: set tag and anchors to two-way ranging, not to time differences"
             actions += self.say_once(Note("warning", "uwb-no-ranges", text))
         return [*actions, RangeEpoch(stamp, event.readings)] if event.readings else actions
-
-    def identity(self) -> Identity:
-        """Say who answered."""
-        return Identity(self._title)

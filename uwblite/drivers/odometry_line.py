@@ -5,20 +5,15 @@ There is no standard for what hobby controllers print, so the columns are told: 
 """
 
 import math
-import re
-import sys
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 from ..errors import ConfigError
-from .clock import DeviceClock
-from .events import Action, Corrupt, Lost, Note, OdometryPose, Pose, corrupt
-from .framing import LineReader
-from .session import Driver, Identity, Script, Wait
+from .events import Action, Corrupt, Note, OdometryPose, Pose
+from .odometer import WheelOdometer, wrapped
+from .text_lines import Line, LineDriver, columns_of, number_of
 
-_Number = TypeVar("_Number", int, float)
-
-MAX_LINE = 256
 LEAP_SPEED, LEAP_TURN = 3.0, 10.0
 """m/s and rad/s that no base of this kind reaches: a line that asks for more is damaged, or the base began anew."""
 LEAST_STEP = 0.1
@@ -50,16 +45,6 @@ class LineFormat:
     """Text at the start of the lines to read; others are ignored."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One good line."""
-
-    stamp: float
-    """s, arrival of its first byte."""
-    values: tuple[tuple[str, float], ...]
-    """(column, number) in the order printed, units as printed."""
-
-
 def parse_format(options: dict[str, str]) -> LineFormat:
     """Build a LineFormat from text options.
 
@@ -77,24 +62,10 @@ def parse_format(options: dict[str, str]) -> LineFormat:
     """
     values: dict[str, object] = {}
     for name, text in options.items():
+        if name not in _OPTIONS:
+            raise ConfigError(f"odometry line: unknown option {name!r}; known are {', '.join(_OPTIONS)}")
         try:
-            if name == "columns":
-                values[name] = tuple(column.strip() for column in text.split(","))
-            elif name == "prefix":
-                values[name] = text
-            elif name == "tick_modulus":
-                values[name] = _sensible(int(text), 0, 1 << 64)
-            elif name in ("tick", "wheel_base"):
-                values[name] = _sensible(float(text), 0.0)
-            elif name == "time_unit":
-                values[name] = _sensible(float(text), _TINY)
-            elif name in ("length_unit", "angle_unit"):
-                # Below 0 for an axis or a heading that counts the other way.
-                _sensible(abs(float(text)), _TINY)
-                values[name] = float(text)
-            else:
-                known = "columns, prefix, time_unit, length_unit, angle_unit, tick, wheel_base, tick_modulus"
-                raise ConfigError(f"odometry line: unknown option {name!r}; known are {known}")
+            values[name] = _OPTIONS[name](text)
         except ValueError:
             raise ConfigError(f"odometry line: {name}={text!r} is not a number that makes sense here") from None
     spec = LineFormat(**values)  # type: ignore[arg-type]
@@ -110,116 +81,45 @@ def parse_format(options: dict[str, str]) -> LineFormat:
     return spec
 
 
-def _sensible(value: _Number, least: float, most: float = sys.float_info.max) -> _Number:
-    """Return a number within bounds, else raise ValueError."""
-    if not least <= value <= most:
-        raise ValueError
-    return value
+def _at_least(least: float, kind: type = float) -> Callable[[str], Any]:
+    def convert(text: str) -> Any:
+        value = kind(text)
+        if not least <= value <= _MOST:
+            raise ValueError
+        return value
+
+    return convert
 
 
-_TINY = 1e-12
+def _unit(text: str) -> float:
+    """Convert a factor, which is below 0 for an axis or a heading that counts the other way."""
+    _at_least(_TINY)(text.strip().lstrip("-"))
+    return float(text)
 
 
-class OdometryLineProtocol:
-    """Bytes in, Sample and Corrupt out. Holds at most one line of MAX_LINE bytes.
-
-    Parameters
-    ----------
-    line_format : columns and units.
-    """
-
-    def __init__(self, line_format: LineFormat) -> None:
-        self._format = line_format
-        self._lines = LineReader(MAX_LINE)
-
-    def feed(self, data: bytes, stamp: float) -> list[Sample | Corrupt]:
-        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
-        events: list[Sample | Corrupt] = []
-        for line in self._lines.feed(data, stamp):
-            if isinstance(line, Corrupt):
-                events.append(line)
-            elif line.data.strip() and not line.cut:
-                events += self._take_line(line.data.strip(), line.marks[0][1])
-        return events
-
-    def _take_line(self, line: bytes, stamp: float) -> list[Sample | Corrupt]:
-        text = line.decode("ascii", "replace")
-        prefix = self._format.prefix
-        if prefix:
-            at = text.rfind(prefix)
-            if at < 0:
-                return []
-            text = text[at + len(prefix) :]
-        fields = re.split(r"[,;\s]+", text.strip(" ,;\t"))
-        if len(fields) != len(self._format.columns):
-            return [corrupt(line, f"{len(fields)} columns instead of {len(self._format.columns)}")]
-        values = []
-        for name, field in zip(self._format.columns, fields, strict=True):
-            if name == "-":
-                continue
-            if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", field) or not math.isfinite(float(field)):
-                return [corrupt(line, f"column {name} is not a number")]
-            values.append((name, float(field)))
-        return [Sample(stamp, tuple(values))]
+_TINY, _MOST = 1e-12, 1e18
+_OPTIONS: dict[str, Callable[[str], Any]] = {
+    "columns": lambda text: tuple(column.strip() for column in text.split(",")), "prefix": str,
+    "time_unit": _at_least(_TINY), "length_unit": _unit, "angle_unit": _unit, "tick": _at_least(0.0),
+    "wheel_base": _at_least(0.0), "tick_modulus": _at_least(0, int),
+}  # fmt: skip
 
 
-class LineOdometer:
-    """Turn Samples into poses.
+def values_by(line_format: LineFormat) -> Callable[[str], dict[str, float] | str | None]:
+    """Return what reads a line as numbers by column, units as printed; a str says why the line is damaged."""
 
-    Parameters
-    ----------
-    line_format : columns and units.
-    start : pose at the first sample when it is made from ticks; m, m, rad.
-    """
+    def parse(line: str) -> dict[str, float] | str | None:
+        values = columns_of(line, line_format.columns, line_format.prefix)
+        if values is None or isinstance(values, str):
+            return values
+        numbers = {name: number for name, text in values.items() if (number := number_of(text)) is not None}
+        wrong = next((name for name in values if name not in numbers), None)
+        return f"column {wrong} is not a number" if wrong else numbers
 
-    def __init__(self, line_format: LineFormat, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        self._format = line_format
-        self._x, self._y, self._theta = start
-        self._last: dict[str, float] | None = None
-
-    def update(self, sample: Sample) -> OdometryPose:
-        """Take one sample; its stamp is the arrival.
-
-        Parameters
-        ----------
-        sample : from OdometryLineProtocol.
-
-        Returns
-        -------
-        OdometryPose
-        """
-        spec, values = self._format, dict(sample.values)
-        theta = values["theta"] * spec.angle_unit if "theta" in values else None
-        if "left" in values:
-            self._from_ticks(values, theta)
-        else:
-            assert theta is not None
-            self._x, self._y = values["x"] * spec.length_unit, values["y"] * spec.length_unit
-            self._theta = math.remainder(theta, 2 * math.pi)
-        self._last = values
-        speed = values.get("speed", 0.0) * spec.length_unit
-        return OdometryPose(sample.stamp, self._x, self._y, self._theta, speed, values.get("turn_rate", 0.0) * spec.angle_unit)
-
-    def _from_ticks(self, values: dict[str, float], theta: float | None) -> None:
-        spec, last = self._format, self._last
-        if last is None:
-            self._theta = self._theta if theta is None else theta
-            return
-        left, right = (_difference(spec, values[name] - last[name]) * spec.tick for name in ("left", "right"))
-        turn = (right - left) / spec.wheel_base if theta is None else math.remainder(theta - self._theta, 2 * math.pi)
-        middle = self._theta + turn / 2
-        self._x += (left + right) / 2 * math.cos(middle)
-        self._y += (left + right) / 2 * math.sin(middle)
-        self._theta = math.remainder(self._theta + turn, 2 * math.pi)
+    return parse
 
 
-def _difference(spec: LineFormat, ticks: float) -> float:
-    """Return a difference of tick counters that may have wrapped in between."""
-    wrap = spec.tick_modulus
-    return (ticks + wrap / 2) % wrap - wrap / 2 if wrap else ticks
-
-
-class LineDriver(Driver):
+class OdometryLineDriver(LineDriver):
     """A base that prints text lines.
 
     Parameters
@@ -230,30 +130,18 @@ class LineDriver(Driver):
     """
 
     def __init__(self, line_format: LineFormat, baud: int = 115200, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        super().__init__()
-        self.baud = baud
+        super().__init__(values_by(line_format), "base that prints lines", baud, line_format.time_unit)
         self._format = line_format
-        self._protocol = OdometryLineProtocol(line_format)
-        self._odometer = LineOdometer(line_format, start)
-        self._clock = DeviceClock(line_format.time_unit, proven=False)
-        self._last: Sample | None = None
-        self._doubtful: Sample | None = None
+        self._odometer = WheelOdometer(line_format.tick, line_format.wheel_base, line_format.tick_modulus, start)
+        self._last: Line | None = None
+        self._doubtful: Line | None = None
 
     def begin(self) -> None:
         """Forget half a line."""
-        self._protocol = OdometryLineProtocol(self._format)
+        super().begin()
         self._doubtful = None
 
-    def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return Sample and Corrupt."""
-        return self._protocol.feed(data, now)
-
-    def script(self) -> Script[None]:
-        """Pass over the first line, of which the port may have shown only the end; then listen."""
-        yield Wait(None)
-        yield from super().script()
-
-    def take(self, event: Sample) -> list[Action]:
+    def take(self, event: Line) -> list[Action]:
         """Turn a line into a pose. Lines have no sum: one that leaps counts only if the next one goes on from it."""
         self.ready = True
         doubtful, self._doubtful = self._doubtful, None
@@ -265,40 +153,39 @@ class LineDriver(Driver):
         self._doubtful = event
         return [Corrupt(b"", "line that leaps away and back")] if doubtful else []
 
-    def _follows(self, before: Sample, after: Sample) -> bool:
+    def _follows(self, before: Line, after: Line) -> bool:
         """Tell whether a base can have moved so, and its clock have gone on so."""
-        spec, old, new = self._format, dict(before.values), dict(after.values)
+        spec, clock, old, new = self._format, self.clock, before.content, after.content
         waited = max(after.stamp - before.stamp, 0.0)
         elapsed = (new["t"] - old["t"]) * spec.time_unit if "t" in new else waited
-        if self._clock.proven and self._clock.rate is None and not -1e-9 <= elapsed <= waited + LEAP_TIME:
+        if clock.proven and clock.rate is None and not -1e-9 <= elapsed <= waited + LEAP_TIME:
             return False
-        seconds = max(elapsed if self._clock.proven else waited, LEAST_STEP)
-        ways = [abs(_difference(spec, new[name] - old[name])) * spec.tick for name in ("left", "right") if name in new]
-        ways += [abs(new[name] - old[name]) * abs(spec.length_unit) for name in ("x", "y") if name in new]
-        turn = abs(math.remainder((new["theta"] - old["theta"]) * spec.angle_unit, 2 * math.pi)) if "theta" in new else 0.0
+        seconds = max(elapsed if clock.proven else waited, LEAST_STEP)
+        step = {name: new[name] - old[name] for name in new}
+        ways = [abs(wrapped(step[name], spec.tick_modulus)) * spec.tick for name in ("left", "right") if name in new]
+        ways += [abs(step[name] * spec.length_unit) for name in ("x", "y") if name in new]
+        turn = abs(math.remainder(step.get("theta", 0.0) * spec.angle_unit, 2 * math.pi))
         return max(ways) <= LEAP_SPEED * seconds and turn <= LEAP_TURN * seconds
 
-    def _pose(self, event: Sample) -> list[Action]:
-        self._last = event
-        time = dict(event.values).get("t")
-        if time is None:
-            return [self._odometer.update(event)]
-        reading = self._clock.read(time, event.stamp)
-        if reading.elapsed == 0:
+    def _pose(self, event: Line) -> list[Action]:
+        self._last, values, unit = event, event.content, self._format
+        stamp, elapsed, actions = self.timed(values.get("t"), event.stamp)
+        if elapsed == 0:
             return [Corrupt(b"", "line sent twice")]
-        actions: list[Action] = [Lost(reading.stamp, reading.missing)] if reading.missing else []
-        if self._clock.rate is not None:
-            actions += self.say_once(self._wrong_unit(self._clock.rate))
-        elif reading.reset:
+        if self.clock.rate is not None:
+            actions += self.say_once(self._wrong_unit(self.clock.rate))
+        elif elapsed is None and "t" in values and self._odometer.started:
             actions.append(Note("warning", "odometry-clock", "odometry: its clock leapt; time mapping starts anew"))
-        return [*actions, replace(self._odometer.update(event), stamp=reading.stamp)]
+        theta = values["theta"] * unit.angle_unit if "theta" in values else None
+        if "left" in values:
+            self._odometer.update(values["left"], values["right"], theta)
+        else:
+            self._odometer.place(values["x"] * unit.length_unit, values["y"] * unit.length_unit, theta or 0.0)
+        speed, rate = values.get("speed", 0.0) * unit.length_unit, values.get("turn_rate", 0.0) * unit.angle_unit
+        return [*actions, OdometryPose(stamp, *self._odometer.pose, speed, rate)]
 
     def _wrong_unit(self, rate: float) -> Note:
         text = "odometry: column t does not count seconds as time_unit says"
         if math.isfinite(rate) and rate > 0:
             text += f", it runs {rate:.4g} times too fast: say time_unit={self._format.time_unit / rate:.1g}"
         return Note("error", "odometry-time-unit", text + "; until then lines are stamped with their arrival")
-
-    def identity(self) -> Identity:
-        """Say who answered."""
-        return Identity("base that prints lines")

@@ -20,7 +20,18 @@ from operator import xor
 from .events import Action, Corrupt, Send, SetBaud
 from .framing import PacketReader, to_next
 from .session import Script
-from .slamtec import HEALTH_REPLY, INFO_REPLY, SYNC, Reply, SlamtecDriver, answers, decode_reply, reply_size, request
+from .slamtec import (
+    DESCRIPTOR,
+    HEALTH_REPLY,
+    INFO_REPLY,
+    SYNC,
+    Reply,
+    SlamtecDriver,
+    answers,
+    decode_reply,
+    reply_size,
+    request,
+)
 from .sweep import Fan, Samples
 
 BAUDS = (115200, 256000)
@@ -73,6 +84,7 @@ class RpLidarProtocol(PacketReader):
         """Forget what is half received, and the stream."""
         super().reset()
         self._stream, self._waiting, self._span = 0, None, 0
+        self.smallest = DESCRIPTOR
 
     def feed(self, data: bytes, stamp: float) -> list[Samples | Reply | Corrupt]:
         """Take bytes that arrived at `stamp` s and return the events they complete."""
@@ -98,6 +110,7 @@ class RpLidarProtocol(PacketReader):
             self.periods = (standard * 1e-6, express * 1e-6) if standard and express else self.periods
         elif reply.kind in (STANDARD_REPLY, EXPRESS_REPLY):
             self._stream, self._waiting = reply.kind, None
+            self.smallest = CAPSULE if reply.kind == EXPRESS_REPLY else NODE * TOGETHER
         return reply
 
     def _capsule(self, frame: bytes, stamp: float) -> Samples | None:
@@ -178,8 +191,7 @@ class RpLidarDriver(SlamtecDriver):
     title, dtr = "Slamtec RPLIDAR", False
 
     def __init__(self, express: bool = True, baud: int = BAUDS[0]) -> None:
-        self._protocol = RpLidarProtocol()
-        super().__init__(self._protocol, FAN)
+        super().__init__(RpLidarProtocol(), FAN)
         self.baud, self._express = baud, express
 
     def start_up(self) -> Script[bool]:

@@ -119,6 +119,10 @@ class ScipProtocol:
     """
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget half a reply."""
         self._lines = LineReader(MAX_LINE, keep=LONGEST_ECHO, ends=(b"\n",))
         self._frame: list[tuple[float, bytes]] = []
         self._text_owner = ""

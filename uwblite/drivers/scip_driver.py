@@ -73,25 +73,20 @@ class ScipDriver(Driver):
         self, start: int | None = None, end: int | None = None, *, cluster: int = 1, skip: int = 0, wide: bool = True,
         baud: int = BAUD_RATES[0], stream: bool = True,
     ) -> None:  # fmt: skip
-        super().__init__()
+        super().__init__(ScipProtocol(), "laser scanner")
         self.baud = baud
         self.geometry = Geometry()
         self.facts: dict[str, str] = {}
         """KEY: value of VV, PP and II."""
         self._start, self._end, self._cluster, self._skip, self._wide = start, end, max(1, cluster), skip, wide
         self._stream = stream
-        self._protocol = ScipProtocol()
         self._clock = DeviceClock(1e-3, TIME_MODULUS, latency=self.geometry.period, spread=NOMINAL_SPREAD)
         self._rates_tried: set[int] = set()
         self._rounds = 0
 
-    def begin(self) -> None:
-        """Forget half a reply."""
-        self._protocol = ScipProtocol()
-
     def parse(self, data: bytes, now: float) -> list[Any]:
         """Return Reply, Distances and Corrupt; remember what the unit says of itself."""
-        events = self._protocol.feed(data, now)
+        events = super().parse(data, now)
         for event in events:
             if isinstance(event, Reply) and event.command in WITH_LINES and event.status == "00":
                 self.facts.update(event.fields())
@@ -359,4 +354,4 @@ class ScipDriver(Driver):
         elif "works well" not in state and "stable" not in state.lower():
             text = f"it reports {state!r}: power it down and up; if that stays, it needs service"
             findings.append(Note("error", "lidar-state", text))
-        return Identity(f"laser scanner {facts.get('MODL', unit.model).partition('(')[0]}", tuple(details), tuple(findings))
+        return Identity(f"{self.title} {facts.get('MODL', unit.model).partition('(')[0]}", tuple(details), tuple(findings))

@@ -14,7 +14,7 @@ brings `now`, seconds of a monotonic clock.
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from .events import Action, Corrupt, Note, Send
 
@@ -43,16 +43,32 @@ class Identity:
     """What about it needs mending."""
 
 
+class ByteProtocol(Protocol):
+    """Bytes to events, sans-I/O."""
+
+    def feed(self, data: bytes, stamp: float) -> list[Any]:
+        """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes."""
+
+    def reset(self) -> None:
+        """Forget what is half received."""
+
+
 class Driver:
     """What one kind of device needs; kinds derive from this.
 
     A driver lives as long as the recording: what it learned (a clock, a pose, known anchors) stays after a reconnect.
+
+    Parameters
+    ----------
+    protocol : bytes to events.
+    title : of the device, for people.
     """
 
     baud = 115200
     """bit/s to open the port with."""
 
-    def __init__(self) -> None:
+    def __init__(self, protocol: ByteProtocol, title: str) -> None:
+        self.protocol, self.title = protocol, title
         self.now = 0.0
         """s, host clock: the time of what is being handled."""
         self.ready = False
@@ -61,10 +77,11 @@ class Driver:
 
     def begin(self) -> None:
         """Forget what was half received: the port was just opened."""
+        self.protocol.reset()
 
     def parse(self, data: bytes, now: float) -> list[Any]:
         """Return the events that bytes complete; Corrupt is counted, and shown to the script as well."""
-        raise NotImplementedError
+        return self.protocol.feed(data, now)
 
     def script(self) -> Script[None]:
         """Hold the conversation; by default, listen."""
@@ -83,7 +100,7 @@ class Driver:
 
     def identity(self) -> Identity:
         """Say who answered, once `ready`."""
-        raise NotImplementedError
+        return Identity(self.title)
 
     # ---- words of a script
 

@@ -1,7 +1,6 @@
 """What the drivers of spinning lidars share: the time of each reading, turns into scans, silence."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from .clock import ClockMap, DeviceClock
 from .events import Action, LaserScan, Lost, Reopen, SetDtr
@@ -37,8 +36,8 @@ class SpinningDriver(Driver):
     """State of the line DTR with which the motor turns; None = not used."""
 
     def __init__(self, protocol: FrameReader, fan: Fan, clock: DeviceClock | None = None) -> None:
-        super().__init__()
-        self.protocol, self.facts = protocol, dict[str, str]()
+        super().__init__(protocol, self.title)
+        self.facts = dict[str, str]()
         self._clock, self._map = clock, ClockMap(WINDOW, BUCKET, MOST_SKEW)
         self._assembler = SweepAssembler(fan)
         self._last: Samples | None = None
@@ -46,16 +45,12 @@ class SpinningDriver(Driver):
 
     def begin(self) -> None:
         """Forget half a packet and half a turn."""
-        self.protocol.reset()
+        super().begin()
         self._forget()
 
     def _forget(self) -> None:
         self._assembler.clear()
         self._last, self._time, self._map = None, 0.0, ClockMap(WINDOW, BUCKET, MOST_SKEW)
-
-    def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return Samples, replies and Corrupt."""
-        return self.protocol.feed(data, now)
 
     def script(self) -> Script[None]:
         """Start the lidar and listen, again and again."""

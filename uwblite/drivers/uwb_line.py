@@ -8,19 +8,15 @@ Makerfabs (DW1000 library, AT firmware), users' programs for the BU01, Qorvo's C
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from ..errors import ConfigError
-from .clock import DeviceClock
-from .events import Action, Corrupt, Lost, Note, RangeEpoch, RangeReading, corrupt
-from .framing import LineReader
-from .session import Driver, Identity, Script, Wait
+from .events import Action, Note, RangeEpoch, RangeReading
+from .session import Identity
+from .text_lines import Line, LineDriver, columns_of, number_of
 
-MAX_LINE = 1024
 MOST_RANGE = 1000.0
 """m; no UWB radio hears further."""
 NAME = re.compile(r"[A-Za-z0-9_.:-]{1,32}")
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,15 +36,6 @@ class Refused:
 
     what: str
     """Clause for people."""
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A line that was understood."""
-
-    stamp: float
-    """s, arrival of its first byte."""
-    content: Ranges | Refused
 
 
 Parse = Callable[[str], Ranges | Refused | str | None]
@@ -110,6 +97,17 @@ def reading(anchor: str, metres: float, quality: float = 100.0) -> RangeReading:
     return RangeReading(anchor.upper(), metres, round(min(max(quality, 0.0), 100.0)))
 
 
+def within_reach(parse: Parse) -> Parse:
+    """Return what reads lines as `parse` does and calls those damaged whose ranges no radio has."""
+
+    def checked(line: str) -> Ranges | Refused | str | None:
+        content = parse(line)
+        far = isinstance(content, Ranges) and any(abs(r.range) > MOST_RANGE for r in content.readings)
+        return f"a range beyond {MOST_RANGE:.0f} m" if far else content
+
+    return checked
+
+
 # ---- boards by columns
 
 
@@ -149,73 +147,23 @@ def by_columns(form: LineColumns) -> Parse:
     """Return what reads lines by columns, parted by commas, semicolons or blanks."""
 
     def parse(line: str) -> Ranges | str | None:
-        at = line.rfind(form.prefix) if form.prefix else 0
-        if at < 0:
-            return None
-        fields = re.split(r"[,;\s]+", line[at + len(form.prefix) :].strip(" ,;\t"))
-        if len(fields) != len(form.columns):
-            return f"{len(fields)} columns instead of {len(form.columns)}"
-        values = dict(zip(form.columns, fields, strict=True))
-        named = {k: v for k, v in values.items() if k.startswith("range") or k in ("t", "quality")}
-        wrong = next((k for k, v in named.items() if not NUMBER.fullmatch(v)), None)
-        if wrong or not NAME.fullmatch(values.get("id", "x")):
-            return f"column {wrong} is not a number" if wrong else "column id is no name"
-        quality = float(values.get("quality", 100.0))
-        found = [(k[6:], float(v)) for k, v in values.items() if k.startswith("range:")]
-        if "range" in values:
-            found.append((values["id"], float(values["range"])))
-        readings = tuple(reading(name, value * form.unit, quality) for name, value in found)
-        return Ranges(readings, float(values["t"]) if "t" in values else None, values.get("tag", ""))
+        values = columns_of(line, form.columns, form.prefix)
+        if values is None or isinstance(values, str):
+            return values
+        if not NAME.fullmatch(values.get("id", "x")):
+            return "column id is no name"
+        numbers = {k: number_of(v) for k, v in values.items() if k not in ("id", "tag")}
+        wrong = next((k for k, v in numbers.items() if v is None), None)
+        if wrong:
+            return f"column {wrong} is not a number"
+        quality = numbers.get("quality") or 0.0 if "quality" in numbers else 100.0
+        found = [(k[6:] or values["id"], v) for k, v in numbers.items() if k.startswith("range") and v is not None]
+        return Ranges(tuple(reading(k, v * form.unit, quality) for k, v in found), numbers.get("t"), values.get("tag", ""))
 
     return parse
 
 
-# ---- bytes to events
-
-
-class UwbLineProtocol:
-    """Bytes in, Line and Corrupt out. Holds at most one line of MAX_LINE bytes.
-
-    Parameters
-    ----------
-    parse : what a line says.
-    """
-
-    def __init__(self, parse: Parse) -> None:
-        self._parse = parse
-        self._lines = LineReader(MAX_LINE)
-
-    def feed(self, data: bytes, stamp: float) -> list[Line | Corrupt]:
-        """Take bytes that arrived at `stamp` s and return the events they complete.
-
-        Parameters
-        ----------
-        data : bytes from the port.
-        stamp : arrival, s, clock of the host.
-
-        Returns
-        -------
-        list of Line or Corrupt.
-        """
-        events: list[Line | Corrupt] = []
-        for line in self._lines.feed(data, stamp):
-            if isinstance(line, Corrupt):
-                events.append(line)
-            elif line.data.strip() and not line.cut:
-                events += self._take(line.data.strip(), line.stamp_at(0))
-        return events
-
-    def _take(self, data: bytes, stamp: float) -> list[Line | Corrupt]:
-        content = self._parse(data.decode("ascii", "replace"))
-        if content is None:
-            return []
-        if isinstance(content, str):
-            return [corrupt(data, content)]
-        far = isinstance(content, Ranges) and any(abs(r.range) > MOST_RANGE for r in content.readings)
-        return [corrupt(data, f"a range beyond {MOST_RANGE:.0f} m")] if far else [Line(stamp, content)]
-
-
-class UwbLineDriver(Driver):
+class UwbLineDriver(LineDriver):
     """A UWB tag that prints lines. Nothing is ever sent.
 
     Parameters
@@ -228,23 +176,8 @@ class UwbLineDriver(Driver):
     """
 
     def __init__(self, parse: Parse, title: str, baud: int = 115200, time_unit: float = 1.0, tag: str = "") -> None:
-        super().__init__()
-        self.baud, self._parse, self._title, self._tag = baud, parse, title, tag
-        self._protocol = UwbLineProtocol(parse)
-        self._clock = DeviceClock(time_unit, proven=False)
-
-    def begin(self) -> None:
-        """Forget half a line."""
-        self._protocol = UwbLineProtocol(self._parse)
-
-    def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return Line and Corrupt."""
-        return self._protocol.feed(data, now)
-
-    def script(self) -> Script[None]:
-        """Pass over the first line, of which the port may have shown only the end; then listen."""
-        yield Wait(None)
-        yield from super().script()
+        super().__init__(within_reach(parse), title, baud, time_unit)
+        self._tag = tag
 
     def take(self, event: Line) -> list[Action]:
         """Turn a line into ranges."""
@@ -258,12 +191,9 @@ class UwbLineDriver(Driver):
         self._tag, self.ready = content.tag or self._tag, True
         if not content.readings:
             return []
-        if content.time is None:
-            return [RangeEpoch(event.stamp, content.readings)]
-        clock = self._clock.read(content.time, event.stamp)
-        lost: list[Action] = [Lost(clock.stamp, clock.missing)] if clock.missing else []
-        return [*lost, RangeEpoch(clock.stamp, content.readings)]
+        stamp, _, lost = self.timed(content.time, event.stamp)
+        return [*lost, RangeEpoch(stamp, content.readings)]
 
     def identity(self) -> Identity:
         """Say who answered."""
-        return Identity(self._title, (("tag", self._tag),) if self._tag else ())
+        return Identity(self.title, (("tag", self._tag),) if self._tag else ())

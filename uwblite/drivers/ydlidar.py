@@ -48,6 +48,8 @@ class YdLidarProtocol(PacketReader):
     rate : readings per second.
     """
 
+    smallest = HEADER
+
     def __init__(self, rate: float) -> None:
         super().__init__()
         self._period = 1.0 / rate

@@ -1,0 +1,60 @@
+"""Two wheels to a pose: encoder counts, with the heading of a gyro where there is one."""
+
+import math
+
+from .events import Pose
+
+
+def wrapped(difference: float, modulus: int) -> float:
+    """Return a difference of counters that wrap at a modulus (0 = they do not)."""
+    return (difference + modulus // 2) % modulus - modulus // 2 if modulus else difference
+
+
+class WheelOdometer:
+    """Integrate two wheels: each step a chord along the mean of both headings (Borenstein).
+
+    Parameters
+    ----------
+    tick : m per tick. base : m between the wheels. modulus : the counters wrap there, 0 = they do not.
+    start : x, y, theta; m, m, rad.
+    """
+
+    def __init__(self, tick: float, base: float, modulus: int, start: Pose) -> None:
+        self.pose = start
+        self._tick, self._base, self._modulus = tick, base, modulus
+        self._last: tuple[float, float, float | None] | None = None
+
+    def update(self, left: float, right: float, heading: float | None = None, *, still: bool = False) -> tuple[float, float]:
+        """Take both counters; return travel, m, and turn, rad, since the last time.
+
+        Parameters
+        ----------
+        left, right : ticks.
+        heading : rad, of a gyro, from any zero; None = the wheels tell the turn.
+        still : what the counters did is unknown: the wheels count as still, a gyro does not.
+        """
+        last, self._last = self._last, (left, right, heading)
+        if last is None:
+            return 0.0, 0.0
+        a, b = (wrapped(now - then, self._modulus) * self._tick for now, then in ((left, last[0]), (right, last[1])))
+        travel, turn = (0.0, 0.0) if still else ((a + b) / 2, (b - a) / self._base if self._base else 0.0)
+        if heading is not None and last[2] is not None:
+            turn = math.remainder(heading - last[2], 2 * math.pi)
+        x, y, theta = self.pose
+        middle = theta + turn / 2
+        theta = math.remainder(theta + turn, 2 * math.pi)
+        self.pose = (x + travel * math.cos(middle), y + travel * math.sin(middle), theta)
+        return travel, turn
+
+    @property
+    def started(self) -> bool:
+        """The counters were read, or the pose was told."""
+        return self._last is not None
+
+    def place(self, x: float, y: float, theta: float) -> None:
+        """Take a pose that the base tells itself; m, m, rad."""
+        self.pose, self._last = (x, y, math.remainder(theta, 2 * math.pi)), (0.0, 0.0, None)
+
+    def forget(self) -> None:
+        """Hold the pose over a gap: what wheels and gyro did meanwhile is unknown."""
+        self._last = None
