@@ -25,7 +25,7 @@ from simulation.recording import Settings
 from trials import ROOT, SHARED, made, table, write_section
 
 from uwblite import se2
-from uwblite.checks.recording import diagnose
+from uwblite.cli.check import examined
 from uwblite.errors import UwbliteError
 from uwblite.io.carmen import read_log
 from uwblite.io.carmen_messages import time_order
@@ -478,7 +478,7 @@ class Outcome:
     said: tuple[str, ...]
     """Doubts, or the error."""
     check: int
-    """Exit code of `uwblite check --quick`."""
+    """Exit code of `uwblite check`."""
     seconds: float
     warnings: tuple[str, ...] = ()
 
@@ -561,8 +561,8 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
 
 
 def checked(log: SensorLog) -> bool:
-    """Tell whether `uwblite check --quick` finds anything serious."""
-    return bool(diagnose(log).serious)
+    """Tell whether `uwblite check` finds anything serious."""
+    return bool(examined(log)[0].serious)
 
 
 def clean_cases(worlds: Sequence[str], minutes: float, seed: int) -> dict[str, Case]:

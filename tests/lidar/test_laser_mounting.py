@@ -40,11 +40,11 @@ def test_who_told_the_way_up_rightly_is_not_contradicted():
 
 
 @pytest.mark.parametrize("lag", [0.3, -0.2])
-def test_the_clock_offset_is_found(lag):
+def test_the_delay_is_found(lag):
     """Turns are measured to about a beam's tenth; with 0.5 rad/s that is 0.01 s, and offsets are tried every 0.02 s."""
     seen = compare(turner(lag=lag)[0])
-    assert seen.clock_offset == pytest.approx(lag, abs=0.041)
-    assert seen.clock_clear
+    assert seen.delay == pytest.approx(-lag, abs=0.041)
+    assert seen.delay_clear
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])

@@ -74,7 +74,7 @@ def _check_turning(log: SensorLog, found: Findings) -> dict[str, float]:
         "pairs": turning.pairs,
         "misfit rad": round(turning.as_given, 4),
         "misfit if mounted the other way up rad": round(turning.other, 4),
-        "clock offset s": round(turning.clock_offset, 3),
+        "laser_delay s": round(turning.delay, 3),
     }
     if not turning.agree:
         found.warning(
@@ -83,10 +83,11 @@ def _check_turning(log: SensorLog, found: Findings) -> dict[str, float]:
             "check the stamps, the beam order and the wheels' heading",
         )
         return figures
-    if abs(turning.clock_offset) > 0.06 and turning.clock_clear:
+    if abs(turning.delay) > 0.06 and turning.delay_clear:
         found.warning(
             "lidar",
-            f"the laser's clock is {turning.clock_offset:+.2f} s off the odometry's",
+            f"the laser's stamps are {abs(turning.delay):.2f} s too {'early' if turning.delay > 0.0 else 'late'} for the "
+            f"odometry's clock (laser_delay {turning.delay:+.2f} s, to be added to them)",
             "uwblite corrects small offsets; stamp both with one clock, each when its reading begins",
         )
     if np.isfinite(turning.ratio):

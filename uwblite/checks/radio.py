@@ -155,7 +155,7 @@ def check_calibration(
         ),
         "heading_scale": (0.05, "the wheels' turns are off by {:+.1%}", "set the track width; uwblite corrects it"),
         "range_scale": (0.03, "all ranges are off by {:+.1%}", "calibrate the radio; uwblite corrects it"),
-        "range_delay": (0.1, "the radio's clock is {:+.2f} s off the odometry's", "uwblite corrects it; stamp on arrival"),
+        "range_delay": (0.1, "the ranges' stamps need {:+.2f} s to suit the odometry", "uwblite corrects it; stamp on arrival"),
     }
     for value in calibration:
         if value.state != "estimated":

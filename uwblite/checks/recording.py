@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
-from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..map_result import AnchorEstimate, CalibrationEstimate, Notice
 from ..screening.screen import screen
 from ..sensor_log import SensorLog
 from .findings import Finding, Findings
@@ -38,7 +38,11 @@ class Diagnosis:
 
 
 def diagnose(
-    log: SensorLog, *, anchors: tuple[AnchorEstimate, ...] = (), calibration: tuple[CalibrationEstimate, ...] = ()
+    log: SensorLog,
+    *,
+    anchors: tuple[AnchorEstimate, ...] = (),
+    calibration: tuple[CalibrationEstimate, ...] = (),
+    doubts: tuple[Notice, ...] = (),
 ) -> Diagnosis:
     """Examine a recording.
 
@@ -46,7 +50,8 @@ def diagnose(
     ----------
     log : the recording.
     anchors, calibration : what a map from wheels and radio alone says, where there is one: it tells the wheels' scale,
-        the clock offset of the radio and the bias of each anchor.
+        the delay of the radio and the bias of each anchor.
+    doubts : of that map; where there is a lidar, those of the ranges themselves.
     """
     found = Findings()
     _check_notes(log, found)
@@ -60,9 +65,11 @@ def diagnose(
         figures["radio calibration"] = check_calibration(anchors, calibration, found)
     if log.scans is None or len(log.scans.stamps) == 0:
         found.note("lidar", "there are no laser scans", "there will be a trajectory and anchors, but no map")
+        _check_doubts(doubts, found)
     else:
         figures["lidar"] = check_scans(log, found)
         _check_overlap(log, "lidar", log.scans.stamps, found)
+        _check_doubts(tuple(doubt for doubt in doubts if doubt.kind == "range-scatter"), found)
     if log.ranges is not None and len(log.ranges.stamps):
         _check_overlap(log, "radio", log.ranges.stamps, found)
     return Diagnosis(found.ranked(), figures)
@@ -77,15 +84,27 @@ def _advice_without_ranges(log: SensorLog) -> str:
 def _check_screening(log: SensorLog, found: Findings) -> None:
     """What a map would repair is a warning, what it would doubt or refuse is serious."""
     try:
-        screening = screen(log).screening
+        repaired = screen(log)
     except DataError as error:
         found.serious("log", str(error), "no map is made before that is fixed")
         return
+    screening = repaired.screening
+    sensors = [s for s in (repaired.ranges, repaired.scans) if s is not None and len(s.stamps) > 1]
+    if not sensors:
+        found.serious("log", "neither ranges nor scans are left to hold the trajectory", "odometry alone drifts")
     for remark in screening.remarks if screening is not None else ():
         if remark.doubt:
             found.serious("log", remark.text, "the map will be doubted: repair the recording, or cut it there")
         else:
             found.warning("log", remark.text, "a map repairs it so; the files stay as they are")
+
+
+def _check_doubts(doubts: tuple[Notice, ...], found: Findings) -> None:
+    """What a map from wheels and radio doubts, but for what the screening said."""
+    said = {finding.what for finding in found.ranked()}
+    for doubt in doubts:
+        if doubt.text not in said:
+            found.serious("radio", doubt.text, "a map from wheels and radio alone is doubted for it")
 
 
 def _check_notes(log: SensorLog, found: Findings) -> None:

@@ -36,8 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from .options import apply_mounting, bag_choices
 
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
-    anchors, calibration, problem = ((), (), "") if args.quick else _trial_map(log)
-    diagnosis = diagnose(log, anchors=anchors, calibration=calibration)
+    diagnosis, problem = (diagnose(log), "") if args.quick else examined(log)
     cost = expected_cost(log)
     if args.json:
         console.say_json(summary_json(args.log, diagnosis, cost, problem))
@@ -47,26 +46,42 @@ def run(args: argparse.Namespace) -> int:
     return 3 if diagnosis.serious else 0
 
 
-def _trial_map(log: "SensorLog") -> tuple[Any, Any, str]:
-    """Map from wheels and radio alone: it tells scales, clocks and biases. Returns also why it could not be made."""
+def examined(log: "SensorLog") -> tuple["Diagnosis", str]:
+    """Diagnose a recording with a map from wheels and radio alone: it tells scales, clocks, biases and ranges that are none.
+
+    Returns
+    -------
+    The diagnosis, and why that map could not be made; empty where it was, or where there are no ranges.
+    """
+    from ..checks.recording import diagnose
     from ..errors import UwbliteError
     from ..mapping import build_map
 
     if log.ranges is None or len(log.ranges.stamps) == 0:
-        return (), (), ""
+        return diagnose(log), ""
     try:
-        result = build_map(log.without(lidar=True))
+        trial = build_map(log.without(lidar=True))
     except UwbliteError as error:
-        return (), (), str(error)
-    return result.anchors, result.calibration, ""
+        return diagnose(log), str(error)
+    return diagnose(log, anchors=trial.anchors, calibration=trial.calibration, doubts=trial.doubts), ""
 
 
 def expected_cost(log: "SensorLog") -> dict[str, float]:
-    """Return the time and memory that `uwblite map` is expected to need on this computer, and the size of the map."""
+    """Return the time and memory that `uwblite map` is expected to need on this computer, and the size of the map.
+
+    They are those of the recording as a map repairs it; empty where it refuses the recording.
+    """
     import numpy as np
 
+    from ..errors import DataError
     from ..mapping import MappingConfig
+    from ..screening.screen import screen
     from .cost import expected_megabytes, expected_seconds
+
+    try:
+        log = screen(log)
+    except DataError:
+        return {}
 
     resolution = MappingConfig().grid.resolution
     reach = 0.0 if log.scans is None else min(log.scans.range_max, 30.0)
@@ -94,7 +109,7 @@ def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float], prob
         "figures": diagnosis.figures,
         "trial map": problem or "ok",
         "expected cost of map": cost,
-        "exit code": 3 if diagnosis.serious else 0,
+        "exit_code": 3 if diagnosis.serious else 0,
     }
 
 
@@ -109,8 +124,9 @@ def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], prob
     if not diagnosis.findings:
         lines.append("nothing to complain about")
     lines += ["", *_anchor_lines(diagnosis.figures), *_calibration_lines(diagnosis.figures)]
-    grid = f", a map of {cost['map width m']:.0f} x {cost['map height m']:.0f} m" if cost["map cells"] else ""
-    lines.append(f"expected cost here: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
+    if cost:
+        grid = f", a map of {cost['map width m']:.0f} x {cost['map height m']:.0f} m" if cost["map cells"] else ""
+        lines.append(f"expected cost here: about {cost['seconds']:.0f} s, {cost['megabytes']:.0f} MB{grid}")
     serious = len(diagnosis.serious)
     lines.append(
         f"fix the {serious} serious finding{'s' if serious > 1 else ''} first"

@@ -40,7 +40,7 @@ def processes(jobs: int) -> "Iterator[Executor]":
     """Start so many processes; what waits is dropped at the end."""
     from concurrent.futures import ProcessPoolExecutor
 
-    executor = ProcessPoolExecutor(jobs)
+    executor = ProcessPoolExecutor(jobs, initializer=_leave_interrupts)
     try:
         yield executor
     finally:
@@ -104,3 +104,10 @@ def versions() -> dict[str, str]:
     from .. import __version__
 
     return {"uwblite": __version__, "Python": platform.python_version(), "numpy": numpy.__version__, "scipy": scipy.__version__}
+
+
+def _leave_interrupts() -> None:
+    """Let Ctrl-C reach the main process alone, which stops the workers."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -35,10 +35,10 @@ class Turning:
     """The same with the laser mounted the other way up."""
     misfit: float
     """The same the way that is right."""
-    clock_offset: float
-    """Stamp of the laser minus that of the odometry for the same moment, s, where both agree best."""
-    clock_clear: bool
-    """Without the offset the turns agree clearly less."""
+    delay: float
+    """To be added to the laser's stamps, s: where both agree best; the sign is that of the calibration's ``laser_delay``."""
+    delay_clear: bool
+    """Without it the turns agree clearly less."""
     ratio: float
     """Turn by the laser / turn by the wheels; nan where there are too few clear turns."""
     ratio_sigma: float
@@ -79,7 +79,7 @@ def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
     clear = right.misfit[best] < 0.7 * right.misfit[centre] and gain.mean() > 2.0 * gain.std() / np.sqrt(gain.size)
     return Turning(
         len(first), float(np.median(np.abs(wheels[centre]))), float(as_given.misfit.min()), float(other.misfit.min()),
-        float(right.misfit[best]), float(-_LAGS[best]), bool(clear),
+        float(right.misfit[best]), float(_LAGS[best]), bool(clear),
         *_ratio(right.turn, wheels[best]),
     )
 

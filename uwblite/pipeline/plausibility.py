@@ -51,10 +51,11 @@ def judge(
 
 
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
-    """Name anchors that are not ok; a mirror ambiguity is a doubt."""
+    """Name anchors that are not ok; where none of those heard has one place alone, their mirror ambiguity is a doubt."""
+    unclear = not any(anchor.status == "ok" for anchor in anchors)
     for anchor in anchors:
         if anchor.status != "ok":
-            add = task.stages.doubt if anchor.status == "mirror-ambiguous" else task.stages.warn
+            add = task.stages.doubt if anchor.status == "mirror-ambiguous" and unclear else task.stages.warn
             text = f"anchor {anchor.id} is {anchor.status}: {anchor.reason}"
             add(f"anchor-{anchor.status}", text, anchor=anchor.id)
     if anchors and all(a.status == "unplaced" for a in anchors):

@@ -52,7 +52,10 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     try:
         covariance = calibration_covariance(graph.with_edges(*edges))[np.ix_(which, which)]
         np.linalg.cholesky(covariance)
+        determined = np.all(np.isfinite(np.linalg.inv(covariance)))
     except (SolverError, np.linalg.LinAlgError):
+        return graph
+    if not determined:
         return graph
     mean, before = graph.calibration.values[which], sigma[which]
     units, odds = _units(len(groups[0]), len(groups[1]), config)

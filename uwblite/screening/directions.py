@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Bools, Floats
 from ..lidar import laser_mounting
 from ..sensor_log import Odometry, Remark, SensorLog
 from .units import heading_agreement
@@ -78,10 +78,26 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
     angle = float(np.angle(turn))
     if abs(angle) < _LEAST_TURNED or abs(turn) < _CONCENTRATED:
         return log, []
-    mount_given = log.mounting.T_base_laser
-    mount = np.array([mount_given[0], mount_given[1], float(se2.wrap_angle(mount_given[2] + angle))])
+    given = log.mounting.T_base_laser
+    turned = np.array([given[0], given[1], float(se2.wrap_angle(given[2] + angle))])
+    around = se2.compose(np.array([0.0, 0.0, angle]), given)
+    mount, tags = turned, log.mounting.tags
+    if _lever_error(pairs, clear, given, around) < _lever_error(pairs, clear, given, turned):
+        mount, tags = around, np.column_stack([se2.rotate(np.full(len(tags), angle), tags[:, :2]), tags[:, 2]])
     text = (
         f"the laser looks {np.degrees(angle):+.0f} degrees away from what was told, or the wheels drive that way; it was taken "
-        f"so: --laser-pose {mount[0]:g},{mount[1]:g},{mount[2]:.3f}"
+        f"so: --laser-pose={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}"
     )
-    return replace(log, mounting=replace(log.mounting, T_base_laser=mount)), [Remark("laser-turned-away", text)]
+    mounting = replace(log.mounting, T_base_laser=mount, tag_position=tags[0], more_tags=tags[1:])
+    return replace(log, mounting=mounting), [Remark("laser-turned-away", text)]
+
+
+def _lever_error(pairs: Pairs, clear: Bools, given: Floats, mount: Floats) -> float:
+    """Return how far ways by lidar and wheels differ with the laser mounted so, m, mean over turning pairs.
+
+    A laser that was mounted another way round stands where it was given; where the wheels drive another way instead, it
+    stands elsewhere on their base, and its tag as well. Turns swing the laser about the base: that tells the two apart.
+    """
+    laser = se2.compose(se2.compose(se2.inverse(given), pairs.lidar[clear]), given)
+    base = se2.compose(se2.compose(mount, laser), se2.inverse(mount))
+    return float(np.mean(np.hypot(*(base - pairs.wheels[clear])[:, :2].T)))

@@ -94,13 +94,15 @@ def _agreed(over: list[float]) -> float:
 
 
 def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:
-    """Return stamps and usable ranges of each anchor while there is odometry."""
+    """Return stamps and usable ranges of each pair of tag and anchor while there is odometry."""
     ranges = log.ranges
     if ranges is None:
         return []
     usable = (ranges.ranges > _USABLE[0]) & (ranges.ranges < _USABLE[1])
     usable &= (ranges.stamps >= log.odometry.stamps[0]) & (ranges.stamps <= log.odometry.stamps[-1])
-    own = [usable & (ranges.anchor == k) for k in range(len(ranges.anchor_ids))]
+    tag = np.zeros_like(ranges.anchor) if ranges.tag is None else ranges.tag
+    pairs = np.unique(np.stack([ranges.anchor, tag]), axis=1).T.tolist()
+    own = [usable & (ranges.anchor == anchor) & (tag == which) for anchor, which in pairs]
     return [(ranges.stamps[o], ranges.ranges[o]) for o in own if o.sum() >= _WINDOW]
 
 

@@ -59,7 +59,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     remarks += [*more, *turned, *standing]
     cut, more = _cuts(log, _sorted([gaps, lost]).stamps)
     if pairs is not None:
-        more += wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]))
+        more += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]))
     more += _hardly_moving(log.odometry)
     ratio = float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
     return replace(log, screening=Screening((*remarks, *more), _sorted([jumps, gaps, lost, cut]), ratio))
@@ -68,8 +68,10 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
 def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Remark]]:
     """Compare wheels and lidar, the laser turned to where the driving shows that it looks."""
     pairs = wheel_motion.compare(log)
-    if pairs is None or not pairs.measured.any():
+    if pairs is None:
         return log, None, []
+    if not pairs.measured.any():
+        return log, None, wheel_motion.unmatched(pairs)
     log, remarks = directions.laser_ahead(log, pairs)
     return log, wheel_motion.compare(log) if remarks else pairs, remarks
 

@@ -175,6 +175,22 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
     return [Remark("wheels-against-lidar", text, doubt=True)]
 
 
+def unmatched(pairs: Pairs) -> list[Remark]:
+    """Return a doubt where scans a moment apart hardly ever show the same things; pairs that saw too little do not count."""
+    seen = pairs.share[pairs.share > 0.0]
+    if len(seen) < 4 * _LEAST_PAIRS or (most := float(np.quantile(seen, 0.9))) >= _NOISE_SHARE:
+        return []
+    text = (
+        f"scans a moment apart do not show the same things (nine of ten pairs share less than {100 * most:.0f} % of their "
+        "points): the readings are noise, or the order of the beams or their angles are not as told"
+    )
+    return [Remark("scans-do-not-match", text, doubt=True)]
+
+
+_NOISE_SHARE = 0.4
+"""Share of matching points that one pair of scans in ten exceeds in any place; noise gives 0.1 to 0.2."""
+
+
 def way_ratio(pairs: Pairs) -> float:
     """Return the way by the lidar / the way by the wheels; nan where there are too few clear motions."""
     own = pairs.rows(pairs.measured)
