@@ -37,7 +37,7 @@ def commands(text):
 
 
 def parses(words):
-    """Tell whether the command line understands these words, without running them."""
+    """Return whether the command line understands these words, without running them."""
     if words in (["--version"], ["--help"]):
         return True
     module = module_of(words[0])

@@ -78,7 +78,7 @@ def test_a_recording_with_neither_an_anchor_of_the_map_nor_walls_is_refused(log,
     strangers = Constraints(anchors=(GivenAnchor("X", (0, 0)), GivenAnchor("Y", (1, 1))))
     blind, bare = log.without(lidar=True), log.without(uwb=True, lidar=True)
     for alone, grid in ((blind, earlier.grid), (log, None), (bare, earlier.grid)):
-        with pytest.raises(DataError, match="hears 0 of the map's anchors"):
+        with pytest.raises(DataError, match="has ranges to 0 of the map's anchors"):
             localize(alone, strangers, grid)
 
 

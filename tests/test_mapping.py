@@ -110,8 +110,8 @@ def test_the_recording_is_not_changed(minute):
 )
 def test_a_missing_sensor_is_borne_and_said(minute, truth, off, words):
     result = build_map(minute, MappingConfig(**off))
-    said = " ".join(w.text for w in result.warnings)
-    assert words is None or words in said
+    stated = " ".join(w.text for w in result.warnings)
+    assert words is None or words in stated
     assert result.doubts == ()
     assert (result.grid is None) == ("use_lidar" in off)
     assert (len(result.anchors) == 0) == ("use_uwb" in off)
@@ -131,8 +131,8 @@ def test_a_sensor_that_never_was_is_as_one_switched_off(minute):
 
 def test_wheels_alone_give_the_odometry_back(minute):
     result = build_map(minute, MappingConfig(use_uwb=False, use_lidar=False))
-    said = se2.between(minute.odometry.poses[0], minute.odometry.poses)
-    np.testing.assert_allclose(se2.between(se2.compose(result.trajectory[0], said), result.trajectory), 0.0, atol=1e-6)
+    stated = se2.between(minute.odometry.poses[0], minute.odometry.poses)
+    np.testing.assert_allclose(se2.between(se2.compose(result.trajectory[0], stated), result.trajectory), 0.0, atol=1e-6)
     assert len(result.warnings) == 2
 
 
@@ -216,13 +216,13 @@ FALSE_RANGES = (FalseRanges(anchor=2, start=60.0, seconds=120.0, metres=3.0),)
         (0.10, {"world": "corridor", "minutes": 8.0, "seed": 13}),
         (0.06, {"world": "hall", "minutes": 8.0, "seed": 14, "nlos": "heavy", "nlos_anchors": (3, 4)}),
         (0.08, {"world": "hall", "minutes": 8.0, "seed": 15, "odometry_scale": 2.0, "slips": 3}),
-        (0.06, {"world": "hall", "minutes": 8.0, "seed": 16, "outliers": 0.1, "zeros": 0.05, "lies": FALSE_RANGES}),
+        (0.06, {"world": "hall", "minutes": 8.0, "seed": 16, "outliers": 0.1, "zeros": 0.05, "false_ranges": FALSE_RANGES}),
         (0.06, {"world": "hall", "minutes": 8.0, "seed": 17, "anchor_height": 2.0, "tag_height": 0.3}),
         (0.15, {"world": "hall", "minutes": 8.0, "seed": 18, "without": ("uwb",)}),
         (0.06, {"world": "hall", "minutes": 8.0, "seed": 19, "people": 4}),
         (0.06, {"world": "lab", "minutes": 6.0, "seed": 20, "laser_error": (0.03, -0.02, 0.03), "laser_delay": 0.03}),
     ],
-    ids=["hall", "lab", "corridor", "nlos", "slips", "lies", "heights", "no uwb", "people", "mounting"],
+    ids=["hall", "lab", "corridor", "nlos", "slips", "false ranges", "heights", "no uwb", "people", "mounting"],
 )
 def test_simulated_worlds(tmp_path, limit, settings):
     """Odometry alone drifts by decimetres to metres within these minutes; the bars are those of drives four times as long."""

@@ -25,8 +25,8 @@ def test_a_part_holds_what_lies_within_its_ends(log):
         assert stamps[-1] <= 11.0
     inside = (log.ranges.stamps >= 9.0) & (log.ranges.stamps <= 11.0)
     np.testing.assert_array_equal(part.ranges.ranges, log.ranges.ranges[inside])
-    said = [part.ranges.anchor_ids[k] for k in part.ranges.anchor]
-    assert said == [log.ranges.anchor_ids[k] for k in log.ranges.anchor[inside]]
+    stated = [part.ranges.anchor_ids[k] for k in part.ranges.anchor]
+    assert stated == [log.ranges.anchor_ids[k] for k in log.ranges.anchor[inside]]
     assert part.ranges.anchor_ids == ("A00",)
     assert len(log.crop().odometry.stamps) == len(log.odometry.stamps)
 

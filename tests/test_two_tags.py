@@ -30,13 +30,13 @@ def both(stamps, truth, rng, sigma=0.0, heights=True) -> UwbRanges:
     parts = [planted.ranges(rng, stamps, truth, ANCHORS, sigma=0.0, tag=tag) for tag in (FRONT, REAR)]
     rise = [1.4 - 0.6, 1.4 - 0.9] if heights else [0.0, 0.0]
     slant = [np.hypot(part.ranges, h) for part, h in zip(parts, rise, strict=True)]
-    said = np.concatenate(slant) + sigma * rng.standard_normal(sum(map(len, slant)))
+    stated = np.concatenate(slant) + sigma * rng.standard_normal(sum(map(len, slant)))
     when = np.concatenate([part.stamps for part in parts])
     order = np.argsort(when, kind="stable")
     tag = np.repeat([0, 1], [len(part.stamps) for part in parts])
     anchor = np.concatenate([part.anchor for part in parts])
     return UwbRanges(
-        when[order], anchor[order], said[order], np.full(len(when), 100.0), parts[0].anchor_ids, tag[order]
+        when[order], anchor[order], stated[order], np.full(len(when), 100.0), parts[0].anchor_ids, tag[order]
     )  # fmt: skip
 
 

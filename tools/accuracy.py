@@ -206,9 +206,9 @@ def follow(tasks: list[Task], args: argparse.Namespace) -> list[list[tuple[str, 
     began, done = time.perf_counter(), []
     for rows in spread_out(work, tasks, args.jobs):
         done.append(rows)
-        told = ", ".join(f"{n}: {f.ate:.4f}/{f.column:.4f}" for _, n, f in rows)
+        figures_text = ", ".join(f"{n}: {f.ate:.4f}/{f.column:.4f}" for _, n, f in rows)
         spent = time.perf_counter() - began
-        print(f"{len(done)} of {len(tasks)}, {spent:.0f} s, {rows[0][0]}: {told}", file=sys.stderr, flush=True)
+        print(f"{len(done)} of {len(tasks)}, {spent:.0f} s, {rows[0][0]}: {figures_text}", file=sys.stderr, flush=True)
     return done
 
 
@@ -267,8 +267,10 @@ def halves(config: MappingConfig) -> str:
             anchor.bias - float(np.median(ranges["residual"][own & half]))
             for half in (ranges["stamp"] < middle, ranges["stamp"] >= middle)
         )
-        told = [f"{alone[n][anchor.id][0]:.2f} ± {alone[n][anchor.id][1]:.2f}" for n in (0, 1)]
-        rows.append([anchor.id, f"{anchor.bias:.2f} ± {anchor.bias_sigma:.2f}", first, second, abs(first - second), *told])
+        figures_text = [f"{alone[n][anchor.id][0]:.2f} ± {alone[n][anchor.id][1]:.2f}" for n in (0, 1)]
+        rows.append(
+            [anchor.id, f"{anchor.bias:.2f} ± {anchor.bias_sigma:.2f}", first, second, abs(first - second), *figures_text]
+        )
     return (
         "Kasdorf, no truth: the anchors' biases, m; bar 0.15 on the difference between the halves of the recording. In 4 m of\n"
         "driving neither half alone parts an anchor's bias from its place, as the stated sigmas say, so they are compared\n"

@@ -153,9 +153,9 @@ def main(argv: list[str] | None = None) -> int:
     found = []
     for c in spread_out(work, tasks, args.jobs):
         found.append(c)
-        told = f"poses {c.poses.mean():.2f}, anchors {c.anchors.mean() if len(c.anchors) else float('nan'):.2f}"
-        told += f", {c.error:.4f} m of {c.stated:.4f} m stated"
-        print(f"{len(found)} of {len(tasks)}, {c.name}: {told}", file=sys.stderr, flush=True)
+        found_text = f"poses {c.poses.mean():.2f}, anchors {c.anchors.mean() if len(c.anchors) else float('nan'):.2f}"
+        found_text += f", {c.error:.4f} m of {c.stated:.4f} m stated"
+        print(f"{len(found)} of {len(tasks)}, {c.name}: {found_text}", file=sys.stderr, flush=True)
     text = document(found, args.minutes)
     if args.print:
         print(text)

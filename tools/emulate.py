@@ -77,7 +77,7 @@ class Plug:
             self.wire.write(data)
 
     def being_read(self) -> bool:
-        """Tell whether a host has begun to read measurements."""
+        """Return whether a host has begun to read measurements."""
         if isinstance(self.device, ScipDevice):
             return self.device.is_streaming
         if isinstance(self.device, DwmDevice):

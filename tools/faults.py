@@ -440,9 +440,9 @@ def sorted_log(case: Case) -> tuple[SensorLog, Floats]:
     log, warnings, set_back = case.log, list[str](), dict[str, float]()
 
     def ordered(sensor: str, stamps: Floats) -> tuple[Floats, Ints]:
-        said = stamps + case.clocks.get(sensor, 0.0)
-        order = time_order(said, sensor, warnings, set_back)
-        return said[order], order
+        stated = stamps + case.clocks.get(sensor, 0.0)
+        order = time_order(stated, sensor, warnings, set_back)
+        return stated[order], order
 
     stamps, order = ordered("odometry", log.odometry.stamps)
     truth = case.truth[order]
@@ -475,7 +475,7 @@ class Outcome:
     beyond: float
     """By how much the worst of them exceeds 1 m and three standard deviations, m."""
     exit_code: int
-    said: tuple[str, ...]
+    stated: tuple[str, ...]
     """Doubts, or the error."""
     check: int
     """Exit code of `uwblite check`."""
@@ -487,7 +487,7 @@ class Outcome:
         """'right', 'said', or what is wrong with the answer."""
         wrong = self.ate > ATE_BAR or self.beyond > 0.0
         if self.exit_code == 4:
-            return "TOO LONG" if "stopped after" in self.said[0] else "INTERNAL ERROR"
+            return "TOO LONG" if "stopped after" in self.stated[0] else "INTERNAL ERROR"
         if self.exit_code == 0:
             return "SILENTLY WRONG" if wrong else "right"
         return "false alarm" if self.name == "none" else "said, wrong" if wrong or self.exit_code == 1 else "said, right"
@@ -534,7 +534,7 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
     case = replace(case, log=case.log.without(lidar=sensors == "no-lidar", uwb=sensors == "no-uwb"))
     case = fault(case, np.random.default_rng(7))
     figures = (float("nan"), float("nan"), -np.inf)
-    said: tuple[str, ...] = ()
+    stated: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     check = -1
     began = time.process_time()
@@ -546,22 +546,22 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
         began = time.process_time()
         result = build_map(log)
         figures = judged(result, log.odometry.stamps, truth, case.anchors, sensors == "no-lidar")
-        said, warnings = tuple(map(str, result.doubts)), tuple(map(str, result.warnings))
+        stated, warnings = tuple(map(str, result.doubts)), tuple(map(str, result.warnings))
         code = 3 if result.doubts else 0
     except TimeoutError as error:
-        said, code = (str(error),), 4
+        stated, code = (str(error),), 4
     except UwbliteError as error:
-        said, code = (str(error),), 1
+        stated, code = (str(error),), 1
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
-        said, code = (f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})",), 4
+        stated, code = (f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})",), 4
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
-    return Outcome(world, name, sensors, *figures, code, said, check, time.process_time() - began, warnings)
+    return Outcome(world, name, sensors, *figures, code, stated, check, time.process_time() - began, warnings)
 
 
 def checked(log: SensorLog) -> bool:
-    """Tell whether `uwblite check` finds anything serious."""
+    """Return whether `uwblite check` finds anything serious."""
     return bool(examined(log)[0].serious)
 
 
@@ -591,10 +591,10 @@ def real_case(path: Path) -> Case:
 
 def shown(outcome: Outcome) -> list[object]:
     """Return the row of an outcome."""
-    said = "; ".join(outcome.said)
+    stated = "; ".join(outcome.stated)
     return [
         outcome.world, outcome.name, outcome.sensors, outcome.ate, outcome.anchor, outcome.exit_code, outcome.check,
-        outcome.verdict, said if len(said) < 300 else said[:297] + "...", f"{outcome.seconds:.0f}",
+        outcome.verdict, stated if len(stated) < 300 else stated[:297] + "...", f"{outcome.seconds:.0f}",
     ]  # fmt: skip
 
 

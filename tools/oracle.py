@@ -319,7 +319,7 @@ class Oracle:
         squared = ((tag[:, None] - tag[None]) ** 2).sum(axis=2)
         return np.asarray(model.multipath_sd**2 * np.exp(-0.5 * squared / model.multipath_length**2))
 
-    def _excess(self, stamps: Floats, number: Ints, said: Floats) -> tuple[Floats, Floats, Bools]:
+    def _excess(self, stamps: Floats, number: Ints, stated: Floats) -> tuple[Floats, Floats, Bools]:
         """Return the mean and the spread of what obstacles add to each range, and which ranges are sound at all."""
         r, model = self.recording, self.recording.settings.radio
         pose = self._at(stamps - r.settings.uwb_delay)
@@ -334,7 +334,7 @@ class Oracle:
         height = r.settings.anchor_height - r.settings.tag_height
         true = model.scale * np.hypot(np.hypot(*(r.anchors[number] - tag).T), height) + mean
         usual = np.hypot(np.hypot(model.noise_sd, model.multipath_sd), np.hypot(model.antenna_sd, model.bias_sd))
-        return mean, 0.8 * mean, np.abs(said - true) < 4.0 * usual + 4.0 * mean
+        return mean, 0.8 * mean, np.abs(stated - true) < 4.0 * usual + 4.0 * mean
 
     def _figures(self, factor: tuple[Floats, bool]) -> OracleFigures:
         layout, poses = self.layout, self.poses()

@@ -56,14 +56,14 @@ def parser() -> argparse.ArgumentParser:
     add("--anchors", type=int, help="so many anchors at random places")
     add("--anchor-height", type=float, help="m (0.6)")
     add("--tag-height", type=float, help="m (0.6)")
-    add("--tell-heights", action="store_true", help="write the heights into the log")
+    add("--write-heights", action="store_true", help="write the heights into the log")
     add("--tag", type=numbers, metavar="X,Y", help="place of the tag on the base (-0.05,0)")
     add("--nlos", choices=NLOS_LEVELS, help="how bad occlusion is (normal)")
     add("--nlos-anchors", type=whole_numbers, metavar="I,J", help="anchors, from 1, that --nlos is meant for; default all")
     add("--outliers", type=float, help="share of nonsense ranges (0)")
     add("--zeros", type=float, help="share of ranges that are zero (0)")
     add(
-        "--lie",
+        "--false-range",
         type=false,
         action="append",
         metavar="ANCHOR:START:SECONDS:METRES",
@@ -96,11 +96,11 @@ def parser() -> argparse.ArgumentParser:
 
 def settings_from(args: argparse.Namespace) -> Settings:
     """Return the settings the command line asks for."""
-    told = vars(args)
-    radio = {name[6:]: told.pop(name) for name in list(told) if name.startswith("range_")}
+    options = vars(args)
+    radio = {name[6:]: options.pop(name) for name in list(options) if name.startswith("range_")}
     radio_model = replace(RadioModel(), **{k: v for k, v in radio.items() if v is not None})
-    false_ranges, without = told.pop("lie"), told.pop("without")
-    values = {k: v for k, v in told.items() if k not in ("out", "gzip")}
+    false_ranges, without = options.pop("false_range"), options.pop("without")
+    values = {k: v for k, v in options.items() if k not in ("out", "gzip")}
     return with_overrides(
         Settings(), radio=radio_model, false_ranges=tuple(false_ranges or ()), without=tuple(without or ()), **values
     )

@@ -1,4 +1,4 @@
-"""Settings: nested frozen dataclasses to and from dicts and TOML, checked strictly. Knows nothing of mapping.
+"""Settings: nested frozen dataclasses to and from dicts and TOML, checked strictly; independent of mapping.
 
 A settings class is a frozen dataclass whose fields have a type, a default and, on the line below, a docstring (unit,
 meaning, when to change it). Fields are bool, int, float, str, a Literal of strings, a tuple or dict of these, one of
@@ -304,7 +304,7 @@ def _write_table(lines: list[str], config: Any, path: tuple[str, ...], comments:
 
 
 def permitted(field: "dataclasses.Field[Any]", hint: Any) -> str:
-    """Return what values a field takes beyond its type, in brackets; empty where nothing is to be said."""
+    """Return what values a field takes beyond its type, in brackets; empty where there is none."""
     parts = []
     literal = next((h for h in (hint, *get_args(hint)) if get_origin(h) is Literal), None)
     if literal is not None:

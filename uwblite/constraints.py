@@ -17,7 +17,7 @@ class GivenAnchor:
     """An anchor whose place is known."""
 
     id: str = ""
-    """As the radio says it."""
+    """As in the recording."""
     position: tuple[float, float] = (0.0, 0.0)
     """m, the user's frame."""
     sigma: float = setting(0.05, above=0.0)
@@ -35,7 +35,7 @@ class GivenPose:
     pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """x, y, theta in the user's frame; m, m, rad."""
     sigma: tuple[float, float, float] = setting((0.05, 0.05, 0.05), above=0.0)
-    """Standard deviations; m, m, rad. A large one (100) says that this one is not known."""
+    """Standard deviations; m, m, rad. A large one (100) leaves this one free."""
     recording: int = setting(1, minimum=1)
     """Which of several recordings the stamp belongs to: 1, 2, ... as they are named to `map`."""
 
@@ -133,7 +133,7 @@ class Constraints:
         return bool(self.anchors or self.poses)
 
     def allowed(self, clock: "Clock", i: Ints, j: Ints) -> Bools:
-        """Tell which pairs (n,) of the clock's poses may be matched with each other."""
+        """Return which pairs (n,) of the clock's poses may be matched with each other."""
         allowed = np.ones(len(i), dtype=bool)
         for ban in self.forbidden:
             near = [clock.off(s, r) <= ban.within for s, r in zip(ban.stamps, ban.recordings, strict=True)]

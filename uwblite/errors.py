@@ -1,4 +1,4 @@
-"""Every exception that uwblite raises on purpose. The message says what is wrong, where, and how to mend it."""
+"""Every exception that uwblite raises on purpose. The message says what is wrong, where, and how to fix it."""
 
 
 class UwbliteError(Exception):
@@ -30,7 +30,7 @@ class FormatError(UwbliteError):
 
     Parameters
     ----------
-    problem : what is wrong and how to mend it.
+    problem : what is wrong and how to fix it.
     path : name of the file, as the user gave it.
     line : 1-based line number, where there is one.
     """
@@ -42,7 +42,7 @@ class FormatError(UwbliteError):
 
 
 class DataError(UwbliteError):
-    """Measurements are well-formed but cannot be used: wrong shapes, no motion, a sensor that never spoke."""
+    """Measurements are well-formed but cannot be used: wrong shapes, no motion, a sensor without a reading."""
 
 
 class ProtocolError(UwbliteError):

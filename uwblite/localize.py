@@ -2,7 +2,7 @@
 
 The new recording is mapped on its own, with the earlier map's anchors as known places, so that it needs no start pose
 and has the accuracy of a whole map within itself; then its walls are laid over the earlier ones as one piece. Both maps
-widen a wall alike, so that their difference is free of it. Where fewer than two of the map's anchors are heard, the
+widen a wall alike, so that their difference is free of it. Where fewer than two of the map's anchors are in reach, the
 walls are sought in the whole map, whatever way they lie. The earlier map is not changed.
 """
 
@@ -30,7 +30,7 @@ from .sensor_log import SensorLog
 LEAST_OVERLAP = 0.4
 """Share of the new walls that must lie on earlier ones; the rest may be new, or not seen before."""
 REACH = 1.5
-"""The anchors alone are trusted to this, m."""
+"""Standard deviation of a position by anchors alone, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,14 +68,14 @@ def localize(
 
     Raises
     ------
-    DataError : the recording does not hear two of the map's anchors, and there are no walls to compare.
+    DataError : the recording has ranges to fewer than two of the map's anchors, and there are no walls to compare.
     """
     measured = set(log.ranges.anchor_ids) if log.ranges is not None else set()
     shared = [a.id for a in anchors.anchors if a.id in measured]
     alone = len(shared) < 2
     if alone and (grid is None or log.scans is None):
         raise DataError(
-            f"the recording hears {len(shared)} of the map's anchors ({', '.join(a.id for a in anchors.anchors)}); "
+            f"the recording has ranges to {len(shared)} of the map's anchors ({', '.join(a.id for a in anchors.anchors)}); "
             "two or more are needed to find it in the map, or lidar in both"
         )
     config = replace(config or MappingConfig(), align="odometry", crop=None)
@@ -84,7 +84,7 @@ def localize(
     if grid is None or result.grid is None:
         return Localization(result, np.zeros(3), float("nan"))
     if alone:
-        text = f"it hears {len(shared)} of the map's anchors: the walls alone say where it was"
+        text = f"it has ranges to {len(shared)} of the map's anchors: its place is from the walls alone"
         notice = Notice("few-common-anchors", text, {"anchors": len(shared)})
         result = replace(result, warnings=(*result.warnings, notice))
     return _laid_over(result, grid, anywhere=alone)
@@ -150,7 +150,7 @@ class _Fit:
 def _fits(earlier: PointCloud, new: PointCloud, guesses: Floats) -> list[_Fit]:
     """Align the new walls with the earlier ones from several guesses (g, 3); the best fit comes first.
 
-    A grid does not tell from which side a wall was seen: the new walls enter with either normal, of which one matches.
+    A grid does not contain from which side a wall was seen: the new walls enter with either normal, of which one matches.
     """
     sides, target = two_sided(new), np.zeros(len(guesses), dtype=np.int64)
     clouds, raster = stacked([earlier, sides]), rasterize(stacked([earlier]), _RASTER, REACH)

@@ -1,4 +1,4 @@
-"""What a run of the mapper gives back: estimates, how sure they are, and the story of how they came about."""
+"""Result of mapping: estimates, their covariances, and the stages by which they came about."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +15,7 @@ class Notice:
     kind: str
     """Fixed name for scripts and tests, such as ``mirror-ambiguity``; docs/formats.md lists them."""
     text: str
-    """For people: what, where, and how to mend it."""
+    """For people: what, where, and how to fix it."""
     figures: dict[str, Any] = field(default_factory=dict)
     """Named figures behind the text (JSON-ready)."""
 

@@ -49,7 +49,7 @@ def build_map(
 
     Parameters
     ----------
-    logs : the recording, ranges or scans may be missing; or several that hear the same anchors, by whatever robots on
+    logs : the recording, ranges or scans may be missing; or several with ranges to the same anchors, by whatever robots on
         whatever days: they become one map in the frame of the first.
     config : settings; None = defaults.
     constraints : what is known beforehand: surveyed anchors, pinned poses, an earlier map's anchors ...

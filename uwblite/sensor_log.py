@@ -32,9 +32,9 @@ class UwbRanges:
     anchor: Ints
     """(m,) index into anchor_ids."""
     ranges: Floats
-    """(m,) m, as the radio said them: zeros, spikes and biases included."""
+    """(m,) m, as the radio reported them: zeros, spikes and biases included."""
     quality: Floats
-    """(m,) 0..100 as the radio said it; 100 where it says nothing."""
+    """(m,) 0..100 as the radio reported it; 100 where it reports none."""
     anchor_ids: tuple[str, ...]
     """Names of the anchors, sorted; each has at least one range."""
     tag: Ints | None = None
@@ -146,12 +146,12 @@ class LogNotes:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """One thing that a recording says against itself."""
+    """One contradiction within a recording."""
 
     kind: str
     """A name for programs."""
     text: str
-    """What, where and how to mend it, for people."""
+    """What, where and how to fix it, for people."""
     doubt: bool = False
     """Whether a map of the recording should not be trusted; otherwise it was repaired, or costs accuracy only."""
 
@@ -178,7 +178,7 @@ class Screening:
     remarks: tuple[Remark, ...]
     breaks: OdometryBreaks
     lidar_by_wheels: float = float("nan")
-    """Way by the lidar / way by the wheels; nan where nothing tells."""
+    """Way by the lidar / way by the wheels; nan where nothing shows it."""
 
 
 MOST_METRES, MOST_SECONDS = 1e7, 1e20

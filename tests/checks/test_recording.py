@@ -76,7 +76,7 @@ def test_wheels_that_turn_too_much(sound):
     wrong = [poses[0]]
     for step in steps:
         wrong.append(se2.compose(wrong[-1], step))
-    assert_named(with_poses(sound, np.array(wrong)), "warning", "times the turns that the laser sees")
+    assert_named(with_poses(sound, np.array(wrong)), "warning", "times the turns of the laser")
 
 
 def test_jumps_gaps_and_equal_stamps(sound):
@@ -91,8 +91,8 @@ def test_jumps_gaps_and_equal_stamps(sound):
 
 
 def test_the_ranges_of_one_round_share_its_stamp_and_that_is_right(sound):
-    said = [f.what for f in diagnose(sound).findings if "equal the one before" in f.what]
-    assert said == []
+    stated = [f.what for f in diagnose(sound).findings if "equal the one before" in f.what]
+    assert stated == []
     coarse = replace(sound.ranges, stamps=np.floor(sound.ranges.stamps))
     assert_named(replace(sound, ranges=coarse), "note", "stamps equal the one before")
 

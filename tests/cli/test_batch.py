@@ -124,8 +124,8 @@ def test_wrong_settings_are_one_error_before_anything_is_done(recordings, tmp_pa
 
 def test_json_is_one_object(made, recordings, capsys):
     assert main(["batch", *recordings, "--out", str(made[0]), "--no-timings", "--json", "-q"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert [row["outcome"] for row in told["recordings"]] == ["mapped", "failed", "doubted"]
+    answer = json.loads(capsys.readouterr().out)
+    assert [row["outcome"] for row in answer["recordings"]] == ["mapped", "failed", "doubted"]
 
 
 @pytest.mark.slow

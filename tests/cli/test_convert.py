@@ -144,10 +144,10 @@ def test_plaza_from_odometry(shared_data, tmp_path, capsys):
 @pytest.mark.parametrize("target", ["a.log", "tables/", "a.tum"])
 def test_json_is_one_object(tmp_path, room_log, target, capsys):
     assert main(["convert", str(room_log), str(tmp_path / target) + "/" * target.endswith("/"), "--json", "--end", "20"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["exit_code"] == 0
-    assert said["counts"]["odometry readings"] == 401
-    assert said["out"].startswith(str(tmp_path))
+    output = json.loads(capsys.readouterr().out)
+    assert output["exit_code"] == 0
+    assert output["counts"]["odometry readings"] == 401
+    assert output["out"].startswith(str(tmp_path))
 
 
 def test_a_map_becomes_a_bundle_for_nav2(tmp_path, capsys):

@@ -168,12 +168,12 @@ def test_relations_are_judged_at_the_lidars_clock(result, capsys):
     relations = place / "truth.relations"
     relations.write_text("\n".join([*lines, f"{stamps[0] - 60:.3f} {stamps[9]:.3f} 0 0 0 0 0 0"]) + "\n")
     assert main([verb, folder, "--relations", str(relations), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)["relations"]
-    assert told["count"] == 4
-    assert told["not_answered"] == 1
-    assert told["share_far"] == 0.25
-    assert told["translation"]["mean"] < 1e-4
-    assert told["rotation"]["mean"] < 1e-4
+    answer = json.loads(capsys.readouterr().out)["relations"]
+    assert answer["count"] == 4
+    assert answer["not_answered"] == 1
+    assert answer["share_far"] == 0.25
+    assert answer["translation"]["mean"] < 1e-4
+    assert answer["rotation"]["mean"] < 1e-4
     assert main([verb, folder, "--relations", str(relations), "--truth", str(place / "truth.tum")]) == 0
     out = capsys.readouterr().out
     assert "4 relations, 1 not answered; 25.0% beyond 0.5 m or not answered" in out

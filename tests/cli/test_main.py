@@ -176,9 +176,9 @@ def test_names_of_settings_that_are_gone_say_what_became_of_them(setting, words,
     file = tmp_path / "old.toml"
     file.write_text(f"{name} = {value}\n")
     assert main(["config", "--config", str(file)]) == 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert words in output
+    assert output.count("\n") == 1
 
 
 def test_advanced_settings_are_listed_on_request_and_where_they_were_changed(capsys):
@@ -201,7 +201,7 @@ def test_numbers_that_begin_with_a_minus_need_no_equals_sign(verb, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output"),
     [
         (["map", "x.log", "--out", "y", "--resolutoin", "1"], "unknown option --resolutoin; did you mean --resolution?"),
         (["map", "x.log", "--out", "y", "--resolutoin=1"], "unknown option --resolutoin; did you mean --resolution?"),
@@ -209,8 +209,8 @@ def test_numbers_that_begin_with_a_minus_need_no_equals_sign(verb, capsys):
         (["map", "x.log"], "the following arguments are required: --out"),
     ],
 )
-def test_a_usage_error_is_short_and_says_what_was_meant(words, said, capsys):
+def test_a_usage_error_is_short_and_says_what_was_meant(words, output, capsys):
     assert main(words) == 2
     first, second = capsys.readouterr().err.splitlines()
-    assert first == f"uwblite {words[0]}: error: {said}"
+    assert first == f"uwblite {words[0]}: error: {output}"
     assert second == f"`uwblite {words[0]} --help` shows the options, examples first"

@@ -23,10 +23,10 @@ def mapped(tmp_path_factory, room_log):
     import io
 
     folder = tmp_path_factory.mktemp("room") / "map"
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
         code = main(["map", str(room_log), "--out", str(folder)])
-    return folder, code, said.getvalue()
+    return folder, code, output.getvalue()
 
 
 def test_the_sample_is_mapped_with_every_file(mapped):
@@ -36,11 +36,11 @@ def test_the_sample_is_mapped_with_every_file(mapped):
 
 
 def test_what_is_said_has_units_sigmas_paths_and_the_next_step(mapped):
-    folder, _, said = mapped
+    folder, _, output = mapped
     number = r"[\u2212+]?\d+\.\d+"
-    assert re.search(rf"anchor 5C0B: x {number} \u00b1\d\.\d\d m, y {number} \u00b1\d\.\d\d m, bias .* m, 190 ranges", said)
-    assert str(folder / "map.png") in said
-    assert "next: open" in said
+    assert re.search(rf"anchor 5C0B: x {number} \u00b1\d\.\d\d m, y {number} \u00b1\d\.\d\d m, bias .* m, 190 ranges", output)
+    assert str(folder / "map.png") in output
+    assert "next: open" in output
 
 
 def test_the_trajectory_follows_the_truth(mapped, room_log):
@@ -50,11 +50,11 @@ def test_the_trajectory_follows_the_truth(mapped, room_log):
     import contextlib
     import io
 
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
         assert run(["evaluate", str(mapped[0]), "--truth", str(truth), "--json"]) == 0
     # Lidar noise is 0.01 m, a cell 0.05 m: three centimetres over 46 m of driving in one room.
-    assert json.loads(said.getvalue())["trajectory"]["ate"]["rmse"] < 0.03
+    assert json.loads(output.getvalue())["trajectory"]["ate"]["rmse"] < 0.03
 
 
 def test_every_odometry_stamp_has_a_pose(mapped):
@@ -197,16 +197,16 @@ def test_a_result_to_trust_exits_with_0_and_one_in_doubt_with_3(radio_only, tmp_
     for name, code in (("around", 0), ("straight", 3)):
         out = tmp_path / name
         assert main(["map", str(radio_only / f"{name}.log"), "--out", str(out), *words]) == code
-        said = capsys.readouterr().out
+        output = capsys.readouterr().out
         report = json.loads((out / "report.json").read_text())
         assert bool(report["doubts"]) == (code == 3)
         assert (out / "trajectory.tum").exists()
         if as_json:
-            summary = json.loads(said)
+            summary = json.loads(output)
             assert (summary["trusted"], summary["exit_code"]) == (code == 0, code)
             assert summary["doubts"] == report["doubts"]
         else:
-            doubts = [line.removeprefix("DOUBT: ") for line in said.splitlines() if line.startswith("DOUBT: ")]
+            doubts = [line.removeprefix("DOUBT: ") for line in output.splitlines() if line.startswith("DOUBT: ")]
             assert doubts == [doubt["text"] for doubt in report["doubts"]]
             assert all("mirror-ambiguous" in doubt for doubt in doubts)
 
@@ -217,8 +217,8 @@ def test_broken_lines_are_told_counted_and_skipped(radio_only, tmp_path, capsys)
     lines[90:90] = ["UWB A00 far 100 1 r 1\n"]
     (tmp_path / "broken.log").write_text("".join(lines))
     assert main(["map", str(tmp_path / "broken.log"), "--out", str(tmp_path / "map")]) == 0
-    said = capsys.readouterr().err
-    assert "uwblite: 2 broken lines skipped; the first is line 41: ODOM has too few fields" in said
+    output = capsys.readouterr().err
+    assert "uwblite: 2 broken lines skipped; the first is line 41: ODOM has too few fields" in output
     report = json.loads((tmp_path / "map" / "report.json").read_text())
     assert report["inputs"][0]["broken_lines"] == 2
     assert main(["map", str(radio_only / "around.log"), "--out", str(tmp_path / "whole")]) == 0
@@ -230,9 +230,9 @@ def test_too_many_broken_lines_are_refused_and_nothing_is_written(radio_only, tm
     lines = (radio_only / "around.log").read_text().splitlines(keepends=True)
     (tmp_path / "broken.log").write_text("".join(line + "ODOM 1 2\n" * (k % 10 == 0) for k, line in enumerate(lines)))
     assert main(["map", str(tmp_path / "broken.log"), "--out", str(tmp_path / "map")]) == 1
-    said = capsys.readouterr().err
-    assert "messages are broken (allowed: 5%)" in said
-    assert f"{tmp_path / 'broken.log'}:2:" in said
+    output = capsys.readouterr().err
+    assert "messages are broken (allowed: 5%)" in output
+    assert f"{tmp_path / 'broken.log'}:2:" in output
     assert not (tmp_path / "map").exists()
 
 
@@ -282,8 +282,8 @@ def test_localize_finds_a_part_in_the_map(mapped, room_log, tmp_path, capsys):
     words = ["--map", str(mapped[0]), "--out", str(tmp_path / "p.tum"), "--picture", str(tmp_path / "p.png")]
     before = contents(mapped[0])
     assert main(["localize", str(part), *words, "--covariance", str(tmp_path / "p.csv")]) == 0
-    said = capsys.readouterr().out
-    assert "% of the walls lie on those of the map" in said
+    output = capsys.readouterr().out
+    assert "% of the walls lie on those of the map" in output
     stamps, poses = read_tum(tmp_path / "p.tum")
     there, whole = read_tum(mapped[0] / "trajectory.tum")
     from uwblite.se2 import interpolate_trajectory

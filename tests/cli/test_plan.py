@@ -26,8 +26,8 @@ def rooms(tmp_path, monkeypatch):
 def test_a_path_goes_to_a_table_and_a_picture(rooms, tmp_path, capsys):
     words = [*rooms, "--from", "3,1,1.5", "--to", "3,3", "--via", "2,1", "--step", "0.2"]
     assert main(words) == 0
-    said = capsys.readouterr().out
-    assert said.splitlines()[-1] == "files: plan.csv plan.png"
+    output = capsys.readouterr().out
+    assert output.splitlines()[-1] == "files: plan.csv plan.png"
     rows = list(csv.DictReader((tmp_path / "plan.csv").read_text().splitlines()))
     assert list(rows[0]) == ["x", "y", "theta", "distance", "clearance"]
     table = np.array([[float(v) for v in row.values()] for row in rows])
@@ -39,19 +39,19 @@ def test_a_path_goes_to_a_table_and_a_picture(rooms, tmp_path, capsys):
     assert main(words) == 1
     assert "exists" in capsys.readouterr().err
     assert main([*words, "--force", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert np.array(told["poses"]) == pytest.approx(table[:, :3], abs=1e-4)
-    assert told["length"] == pytest.approx(table[-1, 3], abs=1e-4)
+    answer = json.loads(capsys.readouterr().out)
+    assert np.array(answer["poses"]) == pytest.approx(table[:, :3], abs=1e-4)
+    assert answer["length"] == pytest.approx(table[-1, 3], abs=1e-4)
 
 
 def test_no_way_names_the_nearest_reachable_point_and_writes_nothing(rooms, tmp_path, capsys):
     words = [*rooms[:-1], "0.35", "--from", "3,1", "--to", "3,3", "--json"]
     assert main(words) == 1
-    said = capsys.readouterr()
-    assert "no way to (3.00, 3.00); the nearest reachable point is (" in said.err
-    told = json.loads(said.out)
-    assert told["exit_code"] == 1
-    assert told["nearest"][1] < 2.0
+    output = capsys.readouterr()
+    assert "no way to (3.00, 3.00); the nearest reachable point is (" in output.err
+    answer = json.loads(output.out)
+    assert answer["exit_code"] == 1
+    assert answer["nearest"][1] < 2.0
     assert not (tmp_path / "plan.csv").exists()
     assert main([*rooms, "--from", "3,2.05", "--to", "3,3"]) == 1
     assert "cannot stand at the start (3.00, 2.05)" in capsys.readouterr().err

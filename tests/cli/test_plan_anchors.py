@@ -21,8 +21,8 @@ def mapped(tmp_path):
 def test_places_go_to_a_table_and_a_picture(mapped, capsys):
     words = ["plan-anchors", "--map", str(mapped / "map"), "--count", "2", "--out", str(mapped / "plan")]
     assert main(words) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("2 anchors today: expected error of a position")
+    output = capsys.readouterr().out
+    assert output.startswith("2 anchors today: expected error of a position")
     rows = (mapped / "plan.csv").read_text().splitlines()
     assert rows[0] == "id,x,y,mean_error,error_95"
     assert [row.split(",")[0] for row in rows[1:]] == ["new1", "new2"]

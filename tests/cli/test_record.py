@@ -52,9 +52,9 @@ def test_a_mistake_is_told_before_anything_is_written(mistake, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken.log").write_text("not a port")
     assert main(["record", "--out", "new.log", *REFUSED[mistake]]) in (1, 2)
-    said = capfd.readouterr().err
-    assert "error: " in said
-    assert "Traceback" not in said
+    output = capfd.readouterr().err
+    assert "error: " in output
+    assert "Traceback" not in output
     assert [p.name for p in tmp_path.iterdir()] == ["taken.log"]
 
 
@@ -111,9 +111,9 @@ def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
     """A Raspberry Pi's header has a UART, whether something hangs on it or not."""
     monkeypatch.setattr(transport, "plugged_in", lambda: [transport.PluggedIn("/dev/ttyS0", "ttyS0", "")])
     assert main(["devices"]) == 1
-    said = capfd.readouterr()
-    assert "all is well" not in said.err + said.out
-    assert "devices /dev/ttyS0" in said.out
+    output = capfd.readouterr()
+    assert "all is well" not in output.err + output.out
+    assert "devices /dev/ttyS0" in output.out
 
 
 def test_every_kind_of_device_is_listed_with_its_options(capfd):

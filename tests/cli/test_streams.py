@@ -42,9 +42,9 @@ def folder(tmp_path_factory, room_log):
     "words", ["--help", "--version", "map --help", "config", "check small.log --quick", "check small.log --quick --json"]
 )
 def test_a_full_stdout_is_one_line(folder, words):
-    code, _, said = shell(f"$UWBLITE {words} >/dev/full", folder)
-    assert (code, said.count(b"\n")) == (1, 1)
-    assert said.startswith(b"uwblite: error: stdout: No space left on device")
+    code, _, output = shell(f"$UWBLITE {words} >/dev/full", folder)
+    assert (code, output.count(b"\n")) == (1, 1)
+    assert output.startswith(b"uwblite: error: stdout: No space left on device")
 
 
 @pytest.mark.parametrize(
@@ -52,9 +52,9 @@ def test_a_full_stdout_is_one_line(folder, words):
 )
 @pytest.mark.parametrize("streams", [">&-", "2>&-", ">&- 2>&-", "2>/dev/full", ">&- 2>/dev/full <&-"])
 def test_the_work_is_done_without_anybody_who_listens(folder, words, code, streams):
-    got, _, said = shell(f"$UWBLITE {words} {streams}", folder)
+    got, _, output = shell(f"$UWBLITE {words} {streams}", folder)
     assert got == code
-    assert b"Traceback" not in said
+    assert b"Traceback" not in output
 
 
 def test_a_result_is_whole_though_nobody_listens(folder):
@@ -64,18 +64,18 @@ def test_a_result_is_whole_though_nobody_listens(folder):
 
 
 def test_closed_standard_input_is_one_line(folder):
-    code, _, said = shell("$UWBLITE check - <&-", folder)
-    assert (code, said.count(b"\n")) == (1, 1)
-    assert b"standard input is closed" in said
+    code, _, output = shell("$UWBLITE check - <&-", folder)
+    assert (code, output.count(b"\n")) == (1, 1)
+    assert b"standard input is closed" in output
 
 
 def test_names_that_are_no_text_reach_no_terminal_and_spoil_no_result(folder):
     name = os.fsdecode(HOSTILE)
     for command in ('$UWBLITE check "$NAME" --quick', '$UWBLITE map "$NAME" --out "$OUT" --force', '$UWBLITE check "$NAME.x"'):
-        code, out, said = shell(command, folder, NAME=name, OUT=os.fsdecode(b"o\xff\x1bc"))
-        assert code in (0, 1, 3), said
-        assert (out + said).decode().replace("\n", "").isprintable()
-        assert b"internal" not in said
+        code, out, output = shell(command, folder, NAME=name, OUT=os.fsdecode(b"o\xff\x1bc"))
+        assert code in (0, 1, 3), output
+        assert (out + output).decode().replace("\n", "").isprintable()
+        assert b"internal" not in output
     [made] = [p for p in folder.iterdir() if p.name.startswith("o")]
     report = json.loads((made / "report.json").read_text())
     assert report["inputs"][0]["source"].encode()
@@ -88,9 +88,9 @@ def test_a_line_holds_nothing_that_a_terminal_obeys(capsys):
     console.note("\x9b1m\r")
     console.fail("x\x07\ny", 1)
     console.Progress()("stage\x1b", 1, 2)
-    out, said = capsys.readouterr()
+    out, output = capsys.readouterr()
     assert out == "a\\x1b[2Jb\\nc\\u202ed\\xff\n"
-    assert said == "\\x9b1m\\r\nuwblite: error: x\\x07 y\n"
+    assert output == "\\x9b1m\\r\nuwblite: error: x\\x07 y\n"
     main(["map", "\x1b[31mx.log", "y\x1b", "--out", "z", "--frob\x1b"])
     assert "\x1b" not in capsys.readouterr().err
 

@@ -31,8 +31,8 @@ class Served:
             command, cwd=cwd, env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        said = self.process.stdout.readline()
-        self.address = re.search(r"http://127\.0\.0\.1:\d+/", said).group()
+        output = self.process.stdout.readline()
+        self.address = re.search(r"http://127\.0\.0\.1:\d+/", output).group()
 
     def __enter__(self):
         return self

@@ -31,9 +31,9 @@ def test_one_job_needs_no_executor_and_two_answer_in_order():
 def test_without_the_package_the_command_that_installs_it_is_said(monkeypatch, room_log, tmp_path, capsys):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--scheduler", "tcp://127.0.0.1:1"]) == 1
-    said = capsys.readouterr().err
-    assert "distributed" in said
-    assert "pip" in said
+    output = capsys.readouterr().err
+    assert "distributed" in output
+    assert "pip" in output
     assert not (tmp_path / "map").exists()
 
 

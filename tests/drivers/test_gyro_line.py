@@ -29,23 +29,23 @@ def test_rates_are_integrated_by_the_gyros_own_time():
     device = GyroLineDevice(RoomWorld().poses(), clock, on_packet=lambda *pose: sent.append(pose))
     session = open_device("gyro", f"line:x?columns=t,turn_rate&time_unit=0.001&{DEGREES}")[0]
     actions, _ = simulate(session, device, 60.0, jitter=lambda: rng.expovariate(300.0))
-    said = of_kind(actions, GyroHeading)
-    assert len(said) > 5900
+    stated = of_kind(actions, GyroHeading)
+    assert len(stated) > 5900
     assert not of_kind(actions, Corrupt)
     assert not of_kind(actions, Lost)
-    turned, seconds = said[-1].heading - said[200].heading, said[-1].stamp - said[200].stamp
+    turned, seconds = stated[-1].heading - stated[200].heading, stated[-1].stamp - stated[200].stamp
     # The circle of the emulated room, 0.2 m/s on 1.5 m, and the bias of the gyro.
     assert turned / seconds == pytest.approx(0.2 / 1.5 + math.radians(0.8), abs=2e-4)
 
 
 def test_headings_are_unwrapped_and_may_count_clockwise():
-    said, _ = headings(f"line:x?columns=theta&angle_unit={-math.radians(1)}", ["0", "170", "179", "-179", "-90", "10"])
-    assert [round(-math.degrees(h.heading)) for h in said] == [170, 179, 181, 270, 370]
+    stated, _ = headings(f"line:x?columns=theta&angle_unit={-math.radians(1)}", ["0", "170", "179", "-179", "-90", "10"])
+    assert [round(-math.degrees(h.heading)) for h in stated] == [170, 179, 181, 270, 370]
 
 
 def test_what_happens_in_a_gap_is_not_guessed():
-    said, _ = headings("line:x?columns=t,turn_rate", [f"{t},1.0" for t in (0.0, 0.1, 0.2, 5.0, 5.1)], period=0.1)
-    assert said[-1].heading - said[0].heading == pytest.approx(0.2, abs=1e-9)
+    stated, _ = headings("line:x?columns=t,turn_rate", [f"{t},1.0" for t in (0.0, 0.1, 0.2, 5.0, 5.1)], period=0.1)
+    assert stated[-1].heading - stated[0].heading == pytest.approx(0.2, abs=1e-9)
 
 
 @pytest.mark.parametrize("columns", ["t", "x,y,theta", "turn_rate,turn_rate", "-"])

@@ -39,7 +39,7 @@ def session(sensor, name):
 @pytest.mark.slow
 @pytest.mark.parametrize(("lidar", "uwb", "base"), TOGETHER)
 def test_from_emulator_to_map(tmp_path, lidar, uwb, base):
-    settings = Settings(world="room", seed=3, minutes=MINUTES, uwb_rate=5.0, without=("laser",), tell_heights=True)
+    settings = Settings(world="room", seed=3, minutes=MINUTES, uwb_rate=5.0, without=("laser",), write_heights=True)
     recording = simulate(settings)
     world, clock = SimulatedWorld(recording), WorldClock()
     write = BOARDS.get({"uwb-line": "line"}.get(uwb, uwb))
@@ -71,9 +71,9 @@ def absolute_error(path, recording, zero):
     """Return the RMS distance of a trajectory to the truth after the best rigid alignment, m."""
     rows = np.loadtxt(path)
     inside = (rows[:, 0] > zero + 0.1) & (rows[:, 0] < zero + recording.stamps[-1] - 0.1)
-    said = rows[inside, 1:3]
+    stated = rows[inside, 1:3]
     true = np.stack([np.interp(rows[inside, 0] - zero, recording.stamps, recording.truth[:, k]) for k in range(2)], axis=1)
-    a, b = said - said.mean(axis=0), true - true.mean(axis=0)
+    a, b = stated - stated.mean(axis=0), true - true.mean(axis=0)
     angle = math.atan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
     turned = a @ np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
     return float(np.sqrt(np.mean(np.sum((turned - b) ** 2, axis=1))))

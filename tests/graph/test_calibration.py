@@ -83,9 +83,9 @@ def test_tables_name_the_right_scalar_in_the_right_column():
     table = range_indices(calibration, anchor, IDS)
     assert table.shape == (4, 6)
     for row, a in zip(table, anchor, strict=True):
-        said = [calibration.keys[k].label if k >= 0 else None for k in row]
+        stated = [calibration.keys[k].label if k >= 0 else None for k in row]
         height = None if GIVEN[a] else f"height2:{IDS[a]}"
-        assert said == ["range_scale", f"bias:{IDS[a]}", height, "tag_x", "tag_y", "range_delay"]
+        assert stated == ["range_scale", f"bias:{IDS[a]}", height, "tag_x", "tag_y", "range_delay"]
     wheels = odometry_indices(calibration, 3)
     assert wheels.shape == (3, 4)
     for row in wheels:

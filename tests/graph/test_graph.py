@@ -167,8 +167,8 @@ def one_range(away):
     graph = Graph(np.zeros((1, 3)), np.array([[away, 0.0]]), (), Calibration((UnknownKey("height2", "A"),), np.zeros(1)))
     one, none = np.array([0]), np.zeros((1, 2))
     height = np.array([[-1, -1, 0, -1, -1, -1]])
-    said, sigma, zero = np.array([away]), np.array([0.1]), np.zeros(1)
-    return RangeEdges(one, one, said, sigma, none, zero, none, np.zeros(2), zero, height), graph
+    stated, sigma, zero = np.array([away]), np.array([0.1]), np.zeros(1)
+    return RangeEdges(one, one, stated, sigma, none, zero, none, np.zeros(2), zero, height), graph
 
 
 def test_a_tag_on_top_of_its_anchor_has_finite_derivatives():

@@ -58,17 +58,17 @@ def counted(geometry, origins, endpoints, hit, scan, weak, walls):
     hits = np.zeros((geometry.rows, geometry.cols), int)
     misses = np.zeros_like(hits)
     for number in sorted(set(scan.tolist())):
-        said = {}
+        stated = {}
         for ray in np.flatnonzero(scan == number):
             begin, end = geometry.cell_of(origins[ray]), geometry.cell_of(endpoints[ray])
             weight = WEIGHT_UNIT if hit[ray] else weak
             for cell in bresenham(*map(int, begin), *map(int, end)):
                 if not hit[ray] and geometry.inside(*cell) and walls[cell]:
                     break
-                said[cell] = max(said.get(cell, 0), weight)
+                stated[cell] = max(stated.get(cell, 0), weight)
         for ray in np.flatnonzero((scan == number) & hit):
-            said[tuple(map(int, geometry.cell_of(endpoints[ray])))] = "hit"
-        for (row, col), what in said.items():
+            stated[tuple(map(int, geometry.cell_of(endpoints[ray])))] = "hit"
+        for (row, col), what in stated.items():
             if 0 <= row < geometry.rows and 0 <= col < geometry.cols:
                 if what == "hit":
                     hits[row, col] += 1

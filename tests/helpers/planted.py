@@ -45,11 +45,11 @@ def odometry(stamps, truth, rng=None, scale=1.0, turn_scale=1.0, drift=0.0, nois
     """
     motion = se2.between(truth[:-1], truth[1:])
     length = np.hypot(motion[:, 0], motion[:, 1])
-    said = motion * [scale, scale, turn_scale]
-    said[:, 2] += drift * length
+    stated = motion * [scale, scale, turn_scale]
+    stated[:, 2] += drift * length
     if rng is not None:
-        said += rng.standard_normal(said.shape) * np.sqrt(length)[:, None] * [noise, noise, turn_noise]
-    return Odometry(stamps, chain(np.zeros(3), said))
+        stated += rng.standard_normal(stated.shape) * np.sqrt(length)[:, None] * [noise, noise, turn_noise]
+    return Odometry(stamps, chain(np.zeros(3), stated))
 
 
 def ranges(
@@ -107,9 +107,9 @@ def scans(
     return LaserScans(times, distance.astype(np.float32), -fov / 2, step, increment, 0.05, range_max)
 
 
-def recording(said, radio=None, lidar=None, mounting=NOMINAL) -> SensorLog:
+def recording(stated, radio=None, lidar=None, mounting=NOMINAL) -> SensorLog:
     """Return the parts as one recording."""
-    return SensorLog(said, radio, lidar, mounting)
+    return SensorLog(stated, radio, lidar, mounting)
 
 
 def box(width, height) -> np.ndarray:

@@ -323,7 +323,7 @@ BROKEN = {
     "ROBOTLASER1 0 0 1 0.1 8 0 0 999999999999 1 2 3": "readings",
     "ROBOTLASER1 0 0 1 0.1 8 0 0 -3 1 2 3": "readings",
     "ROBOTLASER1 0 0 1 0.1 8 0 0 2.5 1 2 3": "invalid literal",
-    "ROBOTLASER1 0 0 1 0.1 8 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 1 r 1": "says 0 readings",
+    "ROBOTLASER1 0 0 1 0.1 8 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 1 r 1": "announces 0 readings",
     "ROBOTLASER1 0 0 1 9 8 0 0 3 1 2 3 0 0 0 0 0 0 0 0 0 0 0 0 1 r 1": "more than a turn",
     "ROBOTLASER1 0 nan 1 0.1 8 0 0 3 1 2 3 0 0 0 0 0 0 0 0 0 0 0 0 1 r 1": "not finite",
     "ROBOTLASER1 0 0 1 0.1 8 0 0 3 1 x 3 0 0 0 0 0 0 0 0 0 0 0 0 1 r 1": "x",
@@ -388,7 +388,7 @@ def test_a_tail_of_zero_bytes_is_no_reason_to_refuse(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "outputs"),
     [
         (b"", "the file is empty"),
         (bytes(range(256)) * 40, "binary data"),
@@ -405,8 +405,8 @@ def test_a_tail_of_zero_bytes_is_no_reason_to_refuse(tmp_path):
         (b"SYNC a 1 r 1\n", "no odometry"),
     ],
 )
-def test_files_that_are_no_logs_get_one_clear_line(tmp_path, data, says):
-    with pytest.raises(FormatError, match=says) as caught:
+def test_files_that_are_no_logs_get_one_clear_line(tmp_path, data, outputs):
+    with pytest.raises(FormatError, match=outputs) as caught:
         read(tmp_path, data)
     assert "\n" not in str(caught.value)
     assert "a.log" in str(caught.value)

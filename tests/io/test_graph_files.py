@@ -243,15 +243,15 @@ G2O_ERRORS = [
 ]
 
 
-@pytest.mark.parametrize(("text", "says"), G2O_ERRORS)
-def test_wrong_g2o_files_are_named(tmp_path, text, says):
+@pytest.mark.parametrize(("text", "outputs"), G2O_ERRORS)
+def test_wrong_g2o_files_are_named(tmp_path, text, outputs):
     (tmp_path / "a").write_bytes(text.encode("latin1"))
-    with pytest.raises(FormatError, match=says):
+    with pytest.raises(FormatError, match=outputs):
         read_g2o(tmp_path / "a")
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "outputs"),
     [
         ("VERTEX_XY L0 1 2\n", "no poses"),
         ("VERTEX_SE2 0 1 0 0 0\n", "'1' is not a name"),
@@ -264,9 +264,9 @@ def test_wrong_g2o_files_are_named(tmp_path, text, says):
         ("VERTEX_SE3:QUAT 0 A0 0 0 0 0 0 0 1\n", "three-dimensional"),
     ],
 )
-def test_wrong_pyfg_files_are_named(tmp_path, text, says):
+def test_wrong_pyfg_files_are_named(tmp_path, text, outputs):
     (tmp_path / "a").write_text(text)
-    with pytest.raises(FormatError, match=says):
+    with pytest.raises(FormatError, match=outputs):
         read_pyfg(tmp_path / "a")
 
 

@@ -122,7 +122,7 @@ GOOD = {"image": "map.pgm", "resolution": "0.05", "origin": "[0, 0, 0]", "occupi
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "outputs"),
     [
         ({"image": ""}, "image is missing"),
         ({"image": "none.pgm"}, "cannot be opened"),
@@ -137,11 +137,11 @@ GOOD = {"image": "map.pgm", "resolution": "0.05", "origin": "[0, 0, 0]", "occupi
         ({"? strange": ""}, "not 'key: value'"),
     ],
 )
-def test_wrong_maps_are_named(tmp_path, change, says):
+def test_wrong_maps_are_named(tmp_path, change, outputs):
     write_map(tmp_path, sample())
     text = "".join(f"{key}: {value}\n" for key, value in (GOOD | change).items())
     (tmp_path / "bad.yaml").write_text(text)
-    with pytest.raises(FormatError, match=says):
+    with pytest.raises(FormatError, match=outputs):
         read_map(tmp_path / "bad.yaml")
 
 

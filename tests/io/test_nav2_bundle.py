@@ -76,9 +76,9 @@ def test_anchors_keep_their_names_and_covariances(bundle):
     folder, result = bundle
     anchors = read(folder, "anchors.yaml")["anchors"]
     assert [a["id"] for a in anchors] == [a.id for a in result.anchors]
-    for told, anchor in zip(anchors, result.anchors, strict=True):
-        assert told["position"] == pytest.approx(anchor.position.tolist(), nan_ok=True)
-        assert np.array(told["covariance"]).reshape(2, 2) == pytest.approx(anchor.covariance, abs=1e-8, nan_ok=True)
+    for answer, anchor in zip(anchors, result.anchors, strict=True):
+        assert answer["position"] == pytest.approx(anchor.position.tolist(), nan_ok=True)
+        assert np.array(answer["covariance"]).reshape(2, 2) == pytest.approx(anchor.covariance, abs=1e-8, nan_ok=True)
 
 
 def test_names_out_of_a_recording_are_text(tmp_path):

@@ -34,9 +34,9 @@ def test_closed_standard_input_is_an_error(monkeypatch, stdin):
         open_input("-")
 
 
-@pytest.mark.parametrize(("name", "says"), [("none", "No such file"), (".", "Is a directory"), ("a\0b", "null byte")])
-def test_what_cannot_be_opened_is_named(tmp_path, name, says):
-    with pytest.raises(FormatError, match=f"cannot be opened: .*{says}"):
+@pytest.mark.parametrize(("name", "outputs"), [("none", "No such file"), (".", "Is a directory"), ("a\0b", "null byte")])
+def test_what_cannot_be_opened_is_named(tmp_path, name, outputs):
+    with pytest.raises(FormatError, match=f"cannot be opened: .*{outputs}"):
         open_input(str(tmp_path / name))
 
 

@@ -50,7 +50,7 @@ def test_rolled_and_pitched_poses_keep_their_yaw(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "outputs"),
     [
         ("", "empty"),
         ("# only a comment\n", "no poses"),
@@ -60,9 +60,9 @@ def test_rolled_and_pitched_poses_keep_their_yaw(tmp_path):
         ("1 2 3 0 0 0 0 1e200\n", "not finite"),
     ],
 )
-def test_wrong_lines_are_named(tmp_path, text, says):
+def test_wrong_lines_are_named(tmp_path, text, outputs):
     (tmp_path / "a.tum").write_text(text)
-    with pytest.raises(FormatError, match=says):
+    with pytest.raises(FormatError, match=outputs):
         read_tum(tmp_path / "a.tum")
 
 

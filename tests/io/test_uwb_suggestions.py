@@ -135,11 +135,11 @@ def test_check_says_where_the_ranges_may_be(tmp_path, capsys):
     definitions, kind, fields, _ = UNKNOWN["header, id and millimetres"]
     path = bag_with(tmp_path / "x.bag", kind, fields, definitions)
     main(["check", str(path)])
-    said = capsys.readouterr().out
-    assert "-> there may be some in what was not read: /uwb_ranges" in said
-    assert "check the tag" not in said
-    assert "order of their stamps" not in said
-    (line,) = (line for line in said.splitlines() if "uwb = [" in line)
+    output = capsys.readouterr().out
+    assert "-> there may be some in what was not read: /uwb_ranges" in output
+    assert "check the tag" not in output
+    assert "order of their stamps" not in output
+    (line,) = (line for line in output.splitlines() if "uwb = [" in line)
     (tmp_path / "uwb.toml").write_text(line[line.index("uwb = [") :])
     main(["check", str(path), "--uwb-mapping", str(tmp_path / "uwb.toml")])
     assert "anchor 77: 1 ranges" in capsys.readouterr().out

@@ -92,5 +92,5 @@ def test_a_laser_upside_down_is_mapped_and_said():
     reported = build_map(replace(log, mounting=DOWN))
     assert not [d for d in reported.doubts if d.kind == "laser-turned-over"]
     np.testing.assert_array_equal(reported.trajectory, result.trajectory)
-    believed = build_map(log, MappingConfig(detect_laser_flip=False))
-    assert not [d for d in believed.doubts if d.kind == "laser-turned-over"]
+    counted = build_map(log, MappingConfig(detect_laser_flip=False))
+    assert not [d for d in counted.doubts if d.kind == "laser-turned-over"]

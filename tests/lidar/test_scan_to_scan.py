@@ -16,14 +16,14 @@ NOISE = np.array([0.01, 0.005, 0.006])
 GATE = 0.5
 
 
-def followed(truth, clouds, said):
+def odometry_steps(truth, clouds, stated):
     """Follow a chain whose wheels say the steps said (k - 1, 3)."""
-    wheels = replace(chained(truth, NOISE), motion=said)
+    wheels = replace(chained(truth, NOISE), motion=stated)
     poses = [truth[0]]
-    for step in said:
+    for step in stated:
         poses.append(se2.compose(poses[-1], step))
     raster = rasterize(clouds, 0.1, GATE)
-    steps = descend(clouds, raster, wheels.i, said, GATE, TrackingConfig())
+    steps = descend(clouds, raster, wheels.i, stated, GATE, TrackingConfig())
     result = follow(clouds, raster, wheels, Graph(np.array(poses)), steps, GATE, TrackingConfig())
     return result.steps, result.wheels, result.searched
 
@@ -38,7 +38,7 @@ def test_steps_are_measured(walk):
     """Walls seen by a hundred points of 1 cm, alike in both clouds: a few millimetres."""
     truth, clouds, exact = walk
     rng = np.random.default_rng(1)
-    steps, _, _ = followed(truth, clouds, exact + rng.standard_normal(exact.shape) * NOISE)
+    steps, _, _ = odometry_steps(truth, clouds, exact + rng.standard_normal(exact.shape) * NOISE)
     np.testing.assert_array_equal(steps.j, steps.i + 1)
     # In the middle of the hall some steps see too little wall.
     assert len(steps) > 0.85 * len(exact)
@@ -53,8 +53,8 @@ def test_slips_are_found_by_a_search(walk):
     """Wheels so bad that they miss by up to 0.3 m and 0.35 rad a step: the clouds tell, and the wheels' noise is learnt."""
     truth, clouds, exact = walk
     rng = np.random.default_rng(2)
-    said = exact + rng.uniform(-1, 1, exact.shape) * [0.3, 0.3, 0.35]
-    steps, wheels, searches = followed(truth, clouds, said)
+    stated = exact + rng.uniform(-1, 1, exact.shape) * [0.3, 0.3, 0.35]
+    steps, wheels, searches = odometry_steps(truth, clouds, stated)
     error = np.abs(se2.between(exact[steps.i], steps.T_i_j))
     good = (np.hypot(error[:, 0], error[:, 1]) < 0.03) & (error[:, 2] < 0.02)
     assert searches > 0
@@ -67,7 +67,7 @@ def test_slips_are_found_by_a_search(walk):
 def test_blind_steps_are_left_to_the_wheels():
     truth = np.column_stack([np.arange(30) * 0.3, np.zeros(30), np.zeros(30)])
     clouds = scanned(truth, box(400, 400))
-    steps, wheels, searches = followed(truth, clouds, se2.between(truth[:-1], truth[1:]))
+    steps, wheels, searches = odometry_steps(truth, clouds, se2.between(truth[:-1], truth[1:]))
     assert len(steps) == 0
     assert searches == 0
     np.testing.assert_array_equal(wheels.sqrt_information, chained(truth, NOISE).sqrt_information)
@@ -76,7 +76,7 @@ def test_blind_steps_are_left_to_the_wheels():
 def test_a_corridor_is_not_measured_along():
     truth = np.column_stack([np.arange(30) * 0.3 - 4.5, np.zeros(30), np.zeros(30)])
     clouds = scanned(truth, np.array([[-40.0, -1.0, 40.0, -1.0], [40.0, 1.0, -40.0, 1.0]]), 0.01, 3, reach=5.0)
-    steps, _, _ = followed(truth, clouds, se2.between(truth[:-1], truth[1:]))
+    steps, _, _ = odometry_steps(truth, clouds, se2.between(truth[:-1], truth[1:]))
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
     assert len(steps) > 20
     assert np.median(information[:, 0, 0]) < 0.02 * np.median(information[:, 1, 1])

@@ -58,7 +58,7 @@ def test_a_map_is_the_same_for_any_number_of_jobs(minutes, tmp_path, several):
 
 
 def same_map(one, other) -> bool:
-    """Tell whether two results agree in every bit of what was matched and traced."""
+    """Return whether two results agree in every bit of what was matched and traced."""
     pairs = [(one.trajectory, other.trajectory), (one.grid.log_odds, other.grid.log_odds)]
     pairs += [(a.T_i_j, b.T_i_j) for a, b in zip(one.closures, other.closures, strict=True)]
     return all(np.array_equal(a, b) for a, b in pairs)

@@ -80,8 +80,8 @@ def test_a_robot_that_stands_has_its_first_and_last_sample(samples):
 def test_velocity_is_the_twist_that_is_driven():
     stamps, truth = drive([(0.4, 0.1, 0.7)], [5.0])
     wheels = Odometry(stamps, truth)
-    said = velocity_at(wheels, np.array([0.0, 0.02, 2.5, 5.0]))
-    np.testing.assert_allclose(said, np.tile([0.4, 0.1, 0.7], (4, 1)), atol=1e-9)
+    stated = velocity_at(wheels, np.array([0.0, 0.02, 2.5, 5.0]))
+    np.testing.assert_allclose(stated, np.tile([0.4, 0.1, 0.7], (4, 1)), atol=1e-9)
     assert np.all(velocity_at(Odometry(stamps[:1], truth[:1]), np.array([0.0])) == 0.0)
 
 

@@ -73,14 +73,14 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
     wrong = se2.compose(exact.motion, rng.standard_normal((len(exact), 3)) * sigma * [position, position, heading])
     wheels, graph = replace(exact, motion=wrong), Graph(frames.odometry)
     some = np.sort(rng.permutation(len(exact))[: len(exact) // 2])
-    said = exact.motion[some] + (rng.random(len(some)) < 0.1)[:, None] * np.array([0.5, 0.5, 0.3])
-    steps = RelativePoseEdges(some, some + 1, said, np.tile(np.eye(3), (len(some), 1, 1)))
+    steps_measured = exact.motion[some] + (rng.random(len(some)) < 0.1)[:, None] * np.array([0.5, 0.5, 0.3])
+    steps = RelativePoseEdges(some, some + 1, steps_measured, np.tile(np.eye(3), (len(some), 1, 1)))
     learnt = reestimate_wheel_noise(wheels, steps, graph)
     factor = np.einsum("eii->ei", exact.sqrt_information / learnt.sqrt_information.clip(1e-12))
     # Medians of 500 steps are known to 5 %; a tenth of lies moves them by 12 %.
     assert np.median(factor[:, 0]) == pytest.approx(np.clip(position, 0.5, 10.0), rel=0.3)
     assert np.median(factor[:, 2]) == pytest.approx(np.clip(heading, 0.5, 10.0), rel=0.3)
-    few = RelativePoseEdges(some[:5], some[:5] + 1, said[:5], steps.sqrt_information[:5])
+    few = RelativePoseEdges(some[:5], some[:5] + 1, steps_measured[:5], steps.sqrt_information[:5])
     assert reestimate_wheel_noise(wheels, few, graph) is wheels
 
 
@@ -93,9 +93,9 @@ def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
     sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
     off = rng.standard_normal((len(exact), 3)) * sigma * 4.0
     wheels = replace(exact, motion=se2.compose(exact.motion, off))
-    said = se2.compose(wheels.motion, np.column_stack([np.zeros(len(off)), se2.inverse(off)[:, 1:]]))
+    steps_measured = se2.compose(wheels.motion, np.column_stack([np.zeros(len(off)), se2.inverse(off)[:, 1:]]))
     blind = np.tile(np.diag([0.0, 100.0, 100.0]), (len(exact), 1, 1))
-    learnt = reestimate_wheel_noise(wheels, RelativePoseEdges(exact.i, exact.j, said, blind), Graph(frames.odometry))
+    learnt = reestimate_wheel_noise(wheels, RelativePoseEdges(exact.i, exact.j, steps_measured, blind), Graph(frames.odometry))
     factor = np.einsum("eii->ei", exact.sqrt_information)[0] / np.einsum("eii->ei", learnt.sqrt_information)[0]
     assert factor == pytest.approx([1.0, 4.0, 4.0], rel=0.2)
 

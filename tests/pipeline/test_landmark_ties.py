@@ -74,8 +74,8 @@ def drive_along(scale):
     legs = [((0.4, 0.0, 0.0), (LONG + 3.0) / 0.4), turn, ((0.4, 0.0, 0.0), (LONG + 3.0) / 0.4)]
     stamps, truth = planted.drive([t for t, _ in legs], [s for _, s in legs])
     rng = np.random.default_rng(5)
-    said = planted.odometry(stamps, truth, rng, noise=0.002, turn_noise=0.002)
-    motion = se2.between(said.poses[:-1], said.poses[1:])
+    stated = planted.odometry(stamps, truth, rng, noise=0.002, turn_noise=0.002)
+    motion = se2.between(stated.poses[:-1], stated.poses[1:])
     motion[:, :2] *= scale(truth[:-1, 0])[:, None]
     lidar = planted.scans(stamps, truth, WALLS, range_max=4.0, noise=0.01, rng=rng)
     return planted.recording(Odometry(stamps, planted.chain(np.zeros(3), motion)), lidar=lidar), stamps, truth
@@ -225,13 +225,13 @@ distance = 4.0
     assert [(k.name, k.radius) for k in read.landmarks] == [("C1", 0.35), ("C2", 0.0)]
     assert read.landmark_distances[0].sigma == 0.02
     assert read + Constraints() == read
-    for wrong, said in (
+    for wrong, stated in (
         (text.replace("distance = 4.0", "distance = -4.0"), "distance"),
         (text.replace("name = ", "nmae = ", 1), "name"),
         (text.replace('["C1", "C2"]', '["C1"]'), "landmarks"),
         (text.replace("radius = 0.35", "radius = nan"), "radius"),
     ):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=stated):
             parse_constraints(wrong)
     with pytest.raises(ConfigError, match="no \\[\\[landmark\\]\\]"):
         ties(Constraints(landmark_distances=read.landmark_distances), one_cloud([[0, 0]]), np.zeros((1, 3)), np.zeros(1))

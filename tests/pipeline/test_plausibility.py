@@ -31,7 +31,7 @@ def run(seed=3, walls=None, scale=1.0, turn_scale=1.0, metres=80.0, radio_scale=
     return stamps, truth, recording(wheels, radio, lidar, LEVEL)
 
 
-def said(notices, words):
+def stated(notices, words):
     return [t.text for t in notices if words in t.text]
 
 
@@ -40,7 +40,7 @@ def test_gross_turns_leave_the_mirror_image_open(turn_scale):
     """By minus the factor that makes the turns agree, the mirror image fits as well: the ranges do not say which it is."""
     _, truth, log = run(turn_scale=turn_scale)
     result = build_map(log)
-    doubt = said(result.doubts, "may be mirrored")
+    doubt = stated(result.doubts, "may be mirrored")
     assert len(doubt) == 1
     assert "odometry's heading" in doubt[0]
     error = [aligned_error(result.trajectory[:, :2], truth[:, :2], mirrored=m) for m in (False, True)]
@@ -48,8 +48,8 @@ def test_gross_turns_leave_the_mirror_image_open(turn_scale):
 
 
 def test_wheels_that_turn_rightly_and_lasers_vouch_for_the_sign():
-    assert not said(build_map(run()[2]).doubts, "mirrored")
-    assert not said(build_map(run(turn_scale=2.0, walls=box(12, 12), metres=40.0)[2]).doubts, "mirrored")
+    assert not stated(build_map(run()[2]).doubts, "mirrored")
+    assert not stated(build_map(run(turn_scale=2.0, walls=box(12, 12), metres=40.0)[2]).doubts, "mirrored")
 
 
 def handedness(graph, lidar):
@@ -63,7 +63,7 @@ def handedness(graph, lidar):
 @pytest.mark.parametrize(("error", "doubted"), [(-1.9, True), (-1.1, True), (-0.4, False), (0.0, False), (1.0, False)])
 def test_wheels_that_turn_against_the_laser_are_doubted(error, doubted):
     graph = Graph(np.zeros((1, 3)), calibration=Calibration((UnknownKey("heading_scale"),), np.array([error])))
-    assert len(said(handedness(graph, lidar=True), "upside down")) == doubted
+    assert len(stated(handedness(graph, lidar=True), "upside down")) == doubted
 
 
 def test_known_anchors_vouch_for_the_sign():
@@ -72,7 +72,7 @@ def test_known_anchors_vouch_for_the_sign():
         anchors=tuple(GivenAnchor(name, tuple(place), 0.05) for name, place in zip(log.ranges.anchor_ids, PLACES, strict=True))
     )
     result = build_map(log, constraints=known)
-    assert not said(result.doubts, "mirrored")
+    assert not stated(result.doubts, "mirrored")
 
 
 @pytest.mark.parametrize(("known", "doubted"), [(0, True), (2, True), (3, False), (4, False)])
@@ -89,8 +89,8 @@ def test_three_known_anchors_settle_the_sign_and_two_do_not(known, doubted, lida
 def test_a_value_far_from_usual_is_told():
     tight = replace(MappingConfig().calibration, odometry_scale=0.02, range_scale_sound=0.001, range_scale=0.002)
     result = build_map(run(scale=1.12)[2], MappingConfig(calibration=tight))
-    assert said(result.warnings, "relative error of travelled distance came out as")
-    assert not said(build_map(run(scale=1.01)[2]).warnings, "came out as")
+    assert stated(result.warnings, "relative error of travelled distance came out as")
+    assert not stated(build_map(run(scale=1.01)[2]).warnings, "came out as")
 
 
 def test_ranges_without_odometry_are_left_out_and_counted():
@@ -103,7 +103,7 @@ def test_ranges_without_odometry_are_left_out_and_counted():
     outside = cut.ranges.stamps > cut.odometry.stamps[-1] + OUTSIDE
     assert 30 < outside.sum() <= late.sum()
     result = build_map(cut)
-    assert said(result.warnings, f"{outside.sum()} of {len(outside)} ranges were stamped outside the odometry's time")
+    assert stated(result.warnings, f"{outside.sum()} of {len(outside)} ranges were stamped outside the odometry's time")
     np.testing.assert_array_equal(result.range_table["weight"][outside], 0.0)
     without = replace(cut, ranges=replace(cut.ranges, **{
         n: getattr(cut.ranges, n)[~outside] for n in ("stamps", "anchor", "ranges", "quality")
@@ -138,17 +138,17 @@ def test_anchors_that_lie_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed)
     stamps, truth, log = run(seed, walls=np.concatenate([box(13, 13), box(3, 2) + 0.5]), metres=100.0)
     radio, part = log.ranges, (log.ranges.stamps - stamps[0]) / np.ptp(stamps)
     outlying = (radio.anchor == 0) & (part > 0.1) & (part < 0.5) | (radio.anchor == 1) & (part > 0.5) & (part < 0.9)
-    honest, lied = (
-        aligned_error(build_map(replace(log, ranges=replace(radio, ranges=said))).trajectory[:, :2], truth[:, :2])
-        for said in (radio.ranges, np.maximum(radio.ranges - 2.0 * outlying, 0.1))
+    consistent, lied = (
+        aligned_error(build_map(replace(log, ranges=replace(radio, ranges=stated))).trajectory[:, :2], truth[:, :2])
+        for stated in (radio.ranges, np.maximum(radio.ranges - 2.0 * outlying, 0.1))
     )
-    assert honest < 0.03
+    assert consistent < 0.03
     assert lied < 0.05
 
 
 @pytest.mark.parametrize("radio_scale", [1.0, 1.08])
 def test_ranges_or_wheels_of_another_scale_are_told(radio_scale):
     """Without a lidar nothing says which of the two is wrong, but that they differ is plain."""
-    reported = said(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
+    reported = stated(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
     assert len(reported) == (radio_scale != 1.0)
     assert all("scale of the wheels" in text for text in reported)

@@ -144,11 +144,11 @@ def test_the_result_does_not_depend_on_where_the_run_starts(seed):
         radio.stamps[in_reach], radio.anchor[in_reach], radio.ranges[in_reach], radio.quality[in_reach], radio.anchor_ids
     )
     back = reversed_in_time(wheels, radio)
-    for (one, other), said, true in (
+    for (one, other), stated, true in (
         ((wheels, radio), stamps, truth), (back, stamps, truth[::-1]), ((shorter, fewer), stamps, truth),
     ):
         bootstrapped, at = start(one, other)
-        error, anchor_error = judged(bootstrapped, at, said, true, places)
+        error, anchor_error = judged(bootstrapped, at, stated, true, places)
         assert bootstrapped.placed.all()
         assert error < WELL
         assert anchor_error < 2 * WELL

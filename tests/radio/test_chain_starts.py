@@ -74,11 +74,11 @@ def test_optimize_is_as_good_as_from_the_truth(tmp_path, seed, capsys):
     write_pyfg(tmp_path / "robots.pyfg", graph, pose_ids=names)
     words = ["--from-odometry", "--out", str(tmp_path / "out.pyfg"), "--json"]
     assert main(["optimize", str(tmp_path / "robots.pyfg"), *words]) == 0
-    said = json.loads(capsys.readouterr().out)
+    stated = json.loads(capsys.readouterr().out)
     best = optimize(replace(graph, poses=truth))[1].chi2
-    assert said["chi2"] <= 1.01 * best
-    assert said["chains"] == ROBOTS
-    assert said["certificate"].startswith("none")
+    assert stated["chi2"] <= 1.01 * best
+    assert stated["chains"] == ROBOTS
+    assert stated["certificate"].startswith("none")
     assert read_pyfg(tmp_path / "out.pyfg").pose_ids == tuple(names)
 
 

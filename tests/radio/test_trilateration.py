@@ -14,9 +14,9 @@ CONFIG = TrilaterationConfig()
 
 def measured(rng, path, anchor, sigma=0.05, bias=0.0, outliers=0.0):
     """Return ranges (m,) from a path to an anchor; outliers are 0.5 to 8 m off, four fifths of them long."""
-    said = np.hypot(*(path - anchor).T) + bias + sigma * rng.standard_normal(len(path))
+    stated = np.hypot(*(path - anchor).T) + bias + sigma * rng.standard_normal(len(path))
     wild = rng.uniform(0.5, 8.0, len(path)) * np.where(rng.random(len(path)) < 0.8, 1.0, -1.0)
-    return np.abs(said + np.where(rng.random(len(path)) < outliers, wild, 0.0))
+    return np.abs(stated + np.where(rng.random(len(path)) < outliers, wild, 0.0))
 
 
 def loop_path(rng, count=150, metres=60.0):
@@ -87,8 +87,8 @@ def test_a_corner_in_the_path_settles_the_mirror(seed, left):
 def test_the_outcome_turns_with_the_path():
     rng = np.random.default_rng(3)
     path, anchor = loop_path(rng), np.array([3.0, 6.0])
-    said, move = measured(rng, path, anchor), np.array([100.0, -50.0, 2.0])
-    here, there = trilaterate(path, said, CONFIG)[0], trilaterate(se2.transform(move, path), said, CONFIG)[0]
+    stated, move = measured(rng, path, anchor), np.array([100.0, -50.0, 2.0])
+    here, there = trilaterate(path, stated, CONFIG)[0], trilaterate(se2.transform(move, path), stated, CONFIG)[0]
     np.testing.assert_allclose(there.position, se2.transform(move, here.position), atol=0.01)
 
 
@@ -96,9 +96,9 @@ def test_a_path_that_drifts_is_trusted_as_far_as_it_drifts():
     """A path bent by 0.4 m still gives a place near the anchor, and no second one within the drift."""
     rng = np.random.default_rng(4)
     path, anchor = loop_path(rng), np.array([4.0, -7.0])
-    said = measured(rng, path, anchor)
+    stated = measured(rng, path, anchor)
     bent = path + 0.4 * np.linspace(0, 1, len(path))[:, None] * [0.7, 0.7]
-    found = trilaterate(bent, said, CONFIG, drift=0.4)
+    found = trilaterate(bent, stated, CONFIG, drift=0.4)
     assert np.hypot(*(found[0].position - anchor)) < 0.4
     assert not ambiguous(found, CONFIG)
 
@@ -131,8 +131,8 @@ def test_hypotheses_are_distinct_and_in_order():
 def test_the_search_starts_at_ten_places_at_least_two_cells_apart(seed):
     rng = np.random.default_rng(seed)
     path = np.column_stack([np.linspace(-8, 8, 160), 0.005 * rng.standard_normal(160)])
-    said = measured(rng, path, np.array([1.0, 5.0]), 0.1)
-    starts, _, step = _raster_search(path, said, CONFIG)
+    stated = measured(rng, path, np.array([1.0, 5.0]), 0.1)
+    starts, _, step = _raster_search(path, stated, CONFIG)
     apart = np.abs(starts[:, None] - starts[None]).max(axis=2) + 99.0 * np.eye(len(starts))
     assert len(starts) == 10
     # Cells are whole steps apart: nearer than two of them lie only neighbours.
@@ -155,13 +155,13 @@ def test_usable_readings_are_positive_finite_and_not_absurd():
     assert usable(readings, config).tolist() == [False, False, False, True, True, False, False, False]
 
 
-@pytest.mark.parametrize("lies", [0.0, 0.3])
+@pytest.mark.parametrize("false_ranges", [0.0, 0.3])
 @pytest.mark.parametrize("bias", [0.0, 1.2])
 def test_agreement_is_the_share_of_ranges_that_fit_a_place_whatever_the_bias(false_ranges, bias):
     rng = np.random.default_rng(7)
     path, place = loop_path(rng, metres=30.0), np.array([4.0, -3.0])
-    said = np.hypot(*(place - path).T) + bias + 0.02 * rng.standard_normal(len(path))
+    stated = np.hypot(*(place - path).T) + bias + 0.02 * rng.standard_normal(len(path))
     wrong = np.arange(len(path)) < false_ranges * len(path)
-    said = said + 3.0 * wrong
-    assert agreement(path, said, place) == pytest.approx(1.0 - wrong.mean(), abs=0.02)
-    assert agreement(path, said, np.array([8.0, 2.0])) < 0.6
+    stated = stated + 3.0 * wrong
+    assert agreement(path, stated, place) == pytest.approx(1.0 - wrong.mean(), abs=0.02)
+    assert agreement(path, stated, np.array([8.0, 2.0])) < 0.6

@@ -24,7 +24,7 @@ class Work:
     def code(self):
         return self.ended
 
-    def said(self):
+    def output(self):
         return "occupancy grid"
 
 
@@ -149,7 +149,7 @@ def test_what_makes_no_sense_changes_nothing(app, path, wish):
 
 def test_mapping_again_puts_the_new_result_beside_the_old(app):
     answer = json.loads(post(app, "/map", {"run": 0}).body)
-    assert answer["job"] == {"code": None, "said": "occupancy grid"}
+    assert answer["job"] == {"code": None, "output": "occupancy grid"}
     folder = app.runs[0].result.folder
     assert app.job.words[0] == "map"
     assert app.job.words[-4:] == ["--constraints", str(app.constraints), "--out", str(folder.with_name("map_2"))]

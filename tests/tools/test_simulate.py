@@ -75,8 +75,8 @@ def test_incidence_of_a_slanting_wall():
 def test_laser_noise_has_the_stated_size(distance, sd):
     model, n = laser.LaserModel(), 20_000
     true = np.full((n // 100, 100), distance)
-    said = laser.disturb(true, np.ones_like(true), np.zeros(true.shape, int), model, np.zeros(1), np.random.default_rng(3))
-    good = said[(said >= 20) & (said < 5600)] / 1000.0
+    output = laser.disturb(true, np.ones_like(true), np.zeros(true.shape, int), model, np.zeros(1), np.random.default_rng(3))
+    good = output[(output >= 20) & (output < 5600)] / 1000.0
     assert np.std(good) == pytest.approx(sd, rel=4.0 / np.sqrt(2 * n))
     assert np.mean(good) == pytest.approx(distance, abs=4.0 * sd / np.sqrt(n))
     assert 1.0 - len(good) / n == pytest.approx(model.blind, abs=4.0 * np.sqrt(model.blind / n) + 1e-3)
@@ -86,9 +86,9 @@ def test_lost_rays_are_codes_or_the_maximum():
     model = laser.LaserModel()
     nothing = np.full((50, 200), np.inf)
     unseen, rng = np.full(nothing.shape, -1), np.random.default_rng(4)
-    said = laser.disturb(nothing, np.ones_like(nothing), unseen, model, np.zeros(1), rng)
-    assert np.all((said < 20) | (said == 5600))
-    assert np.mean(said < 20) == pytest.approx(model.error_codes, abs=4 * np.sqrt(0.09 / said.size))
+    output = laser.disturb(nothing, np.ones_like(nothing), unseen, model, np.zeros(1), rng)
+    assert np.all((output < 20) | (output == 5600))
+    assert np.mean(output < 20) == pytest.approx(model.error_codes, abs=4 * np.sqrt(0.09 / output.size))
 
 
 def test_oblique_walls_answer_less():
@@ -97,17 +97,17 @@ def test_oblique_walls_answer_less():
     shares = []
     for degrees in (0.0, 70.0, 85.0):
         cosine = np.full((1, n), np.cos(np.deg2rad(degrees)))
-        said = laser.disturb(true, cosine, np.zeros((1, n), int), model, np.zeros(1), np.random.default_rng(5))
-        shares.append(np.mean((said >= 20) & (said < 5600)))
+        output = laser.disturb(true, cosine, np.zeros((1, n), int), model, np.zeros(1), np.random.default_rng(5))
+        shares.append(np.mean((output >= 20) & (output < 5600)))
     assert shares[0] > 0.97 > 0.8 > shares[2]
     assert shares[0] >= shares[1] > shares[2]
 
 
 def test_odometry_without_faults_is_the_motion(room):
     motion = drive.Motion(room.stamps, room.truth)
-    said = wheels.odometry(motion, room.stamps, EXACT_WHEELS, [], np.random.default_rng(0))
-    np.testing.assert_allclose(se2.compose(room.truth[0], said)[:, :2], room.truth[:, :2], atol=2e-3)
-    np.testing.assert_allclose(said[:, 2], room.truth[:, 2] - room.truth[0, 2], atol=1e-9)
+    output = wheels.odometry(motion, room.stamps, EXACT_WHEELS, [], np.random.default_rng(0))
+    np.testing.assert_allclose(se2.compose(room.truth[0], output)[:, :2], room.truth[:, :2], atol=2e-3)
+    np.testing.assert_allclose(output[:, 2], room.truth[:, 2] - room.truth[0, 2], atol=1e-9)
 
 
 def test_odometry_noise_grows_with_the_root_of_the_way():
@@ -202,10 +202,10 @@ def test_occlusion_only_lengthens():
 
 
 def test_a_lying_anchor_lies_for_its_stretch_only():
-    honest = simulate(replace(SHORT, without=("laser",)))
+    consistent = simulate(replace(SHORT, without=("laser",)))
     lying = simulate(replace(SHORT, without=("laser",), false_ranges=(FalseRanges(2, 5.0, 10.0, 3.0),)))
-    wrong = lying.ranges - honest.ranges
-    during = (honest.range_anchors == 1) & (honest.range_stamps >= 5.0) & (honest.range_stamps < 15.0)
+    wrong = lying.ranges - consistent.ranges
+    during = (consistent.range_anchors == 1) & (consistent.range_stamps >= 5.0) & (consistent.range_stamps < 15.0)
     np.testing.assert_allclose(wrong[during], 3.0)
     assert during.any()
     assert not wrong[~during].any()
@@ -266,15 +266,15 @@ def test_log_is_read_back(tmp_path, room):
     np.testing.assert_array_equal(np.isfinite(log.scans.ranges), hit)
     np.testing.assert_allclose(log.scans.ranges[hit], room.scans[hit] / 1000.0, atol=1e-6)
     assert log.ranges is not None
-    said = np.array(floorplans.ANCHOR_IDS)[room.range_anchors]
-    np.testing.assert_array_equal(np.array(log.ranges.anchor_ids)[log.ranges.anchor], said)
+    output = np.array(floorplans.ANCHOR_IDS)[room.range_anchors]
+    np.testing.assert_array_equal(np.array(log.ranges.anchor_ids)[log.ranges.anchor], output)
     np.testing.assert_allclose(log.ranges.ranges, room.ranges)
     np.testing.assert_allclose(log.mounting.T_base_laser, room.settings.laser_pose, atol=2e-6)
 
 
 def test_command_line_reaches_every_setting():
     words = (
-        "hall --out x --seed 4 --minutes 2 --nlos heavy --nlos-anchors 3,4 --lie 1:10:60:2.5 --range-bias-sd 1.5"
+        "hall --out x --seed 4 --minutes 2 --nlos heavy --nlos-anchors 3,4 --false-range 1:10:60:2.5 --range-bias-sd 1.5"
         " --range-scale 1.07"
         " --anchor-height 2 --tag-height 0.3 --laser-error 0.02,0,0.1 --laser-flipped --without uwb --people 2 --slips 3"
     )

@@ -36,7 +36,7 @@ class Fault:
     done: bool = False
 
     def active(self, time: float) -> bool:
-        """Tell whether it acts at `time` s."""
+        """Return whether it acts at `time` s."""
         return self.start <= time < self.start + self.seconds
 
 
@@ -68,7 +68,7 @@ class FaultyLine:
         return max((f.value for f in self.faults if f.kind == kind and f.active(time)), default=0.0)
 
     def is_active(self, kind: str, time: float) -> bool:
-        """Tell whether a fault of this kind acts now."""
+        """Return whether a fault of this kind acts now."""
         return any(f.kind == kind and f.active(time) for f in self.faults)
 
     def times(self) -> list[float]:

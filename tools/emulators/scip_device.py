@@ -113,7 +113,7 @@ class ScipDevice:
         self._power, self._now, self._input = now, now, bytearray()
         self._scip1, self._laser, self._adjusting = self.options.scip1, False, False
         self._stream: Stream | None = None
-        self._fault_told, self._last_command = None, b""
+        self._fault_sent, self._last_command = None, b""
         self._speed_set, self._sensitive, self._rate = "00", False, 19200
         self.host_rate = 19200 if self.options.serial else None
         """bit/s that the host has set; None = it does not matter (USB)."""
@@ -125,7 +125,7 @@ class ScipDevice:
 
     @property
     def is_streaming(self) -> bool:
-        """Tell whether MD or MS runs."""
+        """Return whether MD or MS runs."""
         return self._stream is not None
 
     def device_ms(self, now: float) -> int:
@@ -162,14 +162,14 @@ class ScipDevice:
         stream = self._stream
         assert stream is not None
         if self.fault is not None:
-            if self._fault_told == self.fault:
+            if self._fault_sent == self.fault:
                 return b""
-            self._fault_told = self.fault
+            self._fault_sent = self.fault
             if self.fault >= 50:
                 self._stream, self._laser = None, False
             return self._block(stream.echo, f"{self.fault:02d}")
-        if self._fault_told is not None and self._fault_told < 50:
-            self._fault_told = None
+        if self._fault_sent is not None and self._fault_sent < 50:
+            self._fault_sent = None
             return self._block(stream.echo, "98")
         if stream.skipped < stream.skip:
             stream.skipped += 1
@@ -393,7 +393,7 @@ class ScipDevice:
         if not rest[11:13].isdigit():
             return self._block(line, "07")
         count = int(rest[11:13])
-        self._laser, self._fault_told = True, None
+        self._laser, self._fault_sent = True, None
         body, semicolon, tail = line.partition(b";")
         self._stream = Stream(
             body, *steps, int(rest[10]), count or None, line[1:2] == b"D", semicolon + tail if semicolon else b""

@@ -44,7 +44,7 @@ class SpinningDevice:
 
     @property
     def is_streaming(self) -> bool:
-        """Tell whether readings are being sent."""
+        """Return whether readings are being sent."""
         return self.streaming and self.motor
 
     def next_time(self, now: float) -> float:

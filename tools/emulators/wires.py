@@ -57,7 +57,7 @@ class PtyWire:
         return self.master if self.connected() else None
 
     def connected(self) -> bool:
-        """Tell whether a host has the port open."""
+        """Return whether a host has the port open."""
         if self.master is None:
             return False
         poller = select.poll()
@@ -133,7 +133,7 @@ class TcpWire:
         return end.fileno() if end is not None else None
 
     def connected(self) -> bool:
-        """Tell whether a client is there."""
+        """Return whether a client is there."""
         return self._client is not None
 
     def read(self) -> bytes:

@@ -111,11 +111,11 @@ def _verb(name: str, data: bytes, *words: str, cost: int = 20, prepare: Callable
 
     def run(path: Path) -> None:
         before = {p.name for p in path.parent.iterdir()}
-        out, said = io.StringIO(), io.StringIO()
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+        out, stated = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(stated):
             code = main([word.format(path.parent) for word in words])
         left = {p.name for p in path.parent.iterdir()} - before - {"out", "out.g2o", "out.pyfg", "out.log", "out.tum"}
-        text = said.getvalue()
+        text = stated.getvalue()
         last = text.rstrip("\n").rpartition("\n")[2]
         for wrong, what in (
             (code not in (0, 1, 2, 3), f"exit code {code}"),

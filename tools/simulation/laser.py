@@ -103,15 +103,15 @@ def disturb(
     # A neighbour that sees nothing leaves no second echo to mix with: such an edge only loses rays.
     both = mix & np.concatenate([seen[:, 1:], seen[:, -1:]], axis=1)
     share = rng.random(true.shape)
-    said = np.where(both, range_ + share * (neighbour - range_), range_)
-    sd = np.maximum(model.near_sd, model.far_sd * said)
-    said = said + sd * rng.standard_normal(true.shape) + np.where(surface >= 0, colour[surface], 0.0)
+    stated = np.where(both, range_ + share * (neighbour - range_), range_)
+    sd = np.maximum(model.near_sd, model.far_sd * stated)
+    stated = stated + sd * rng.standard_normal(true.shape) + np.where(surface >= 0, colour[surface], 0.0)
     # Little light comes back from oblique and far surfaces: the angle that still answers shrinks with distance.
     limit = np.cos(model.grazing) * range_ / 3.0
     lost = rng.random(true.shape) > 1.0 / (1.0 + np.exp(np.clip((limit - cosine) / (0.15 * limit + 1e-3), -50, 50)))
     lost |= rng.random(true.shape) < model.blind
     lost |= mix & ~both
-    lost |= ~seen | (said >= model.max_range) | (said < model.min_range)
+    lost |= ~seen | (stated >= model.max_range) | (stated < model.min_range)
     code = rng.random(true.shape) < model.error_codes
     codes = np.where(code, rng.integers(0, 20, true.shape), round(model.max_range * 1000))
-    return np.where(lost, codes, np.rint(said * 1000)).astype(np.int64)
+    return np.where(lost, codes, np.rint(stated * 1000)).astype(np.int64)

@@ -58,7 +58,7 @@ def log_lines(recording: Recording) -> Iterator[bytes]:
         "uwb_tag_offset_x": f"{settings.tag[0]:.3f}",
         "uwb_tag_offset_y": f"{settings.tag[1]:.3f}",
     }
-    if settings.tell_heights:
+    if settings.write_heights:
         params |= {"uwb_tag_height": f"{settings.tag_height:.3f}", "uwb_anchor_height": f"{settings.anchor_height:.3f}"}
     yield b"# CARMEN Logfile\n"
     yield f"# simulated {settings.world}, seed {settings.seed}\n".encode()

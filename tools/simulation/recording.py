@@ -61,7 +61,7 @@ class Settings:
     false_ranges: tuple[FalseRanges, ...] = ()
     anchor_height: float = 0.6
     tag_height: float = 0.6
-    tell_heights: bool = False
+    write_heights: bool = False
     tag: tuple[float, float] = (-0.05, 0.0)
     laser_pose: tuple[float, float, float] = (0.10, 0.0, 0.0)
     """Mounting of the laser that the log tells."""
@@ -132,12 +132,12 @@ def simulate(settings: Settings) -> Recording:
     stamps = np.round(np.arange(int(seconds * settings.odometry_rate) + 1) / settings.odometry_rate, 6)
     faults = wheels.draw_errors(_lasting(settings.robot, 1, _rng(settings, 1)), settings.odometry_scale)
     slips = wheels.draw_slips(motion, _rng(settings, 2), settings.slips)
-    said = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3))
+    stated = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3))
     crowd = _people(settings, plan, seconds)
     scan_stamps, scans, surfaces = _scan(settings, plan, motion, crowd)
     told = scan_stamps + settings.laser_delay
     range_stamps, range_anchors, ranges, truth_uwb = _range(settings, plan, motion, anchors, crowd)
-    scan_poses = np.stack([np.interp(told, stamps, said[:, k]) for k in range(3)], axis=1)
+    scan_poses = np.stack([np.interp(told, stamps, stated[:, k]) for k in range(3)], axis=1)
     mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
     calibration = {
         "settings": asdict(settings),
@@ -153,7 +153,7 @@ def simulate(settings: Settings) -> Recording:
         plan,
         anchors,
         stamps,
-        said,
+        stated,
         motion.at(stamps),
         told,
         scan_poses,
@@ -233,10 +233,10 @@ def _scan(
         true, cosine, surface = laser.cast(origin, heading, plan.walls[walls], round_things, model.max_range)
         shape = (len(chunk), model.beams)
         true, cosine, surface = true.reshape(shape), cosine.reshape(shape), ids[surface].reshape(shape)
-        said = laser.disturb(true, cosine, surface, model, colour, rng)
-        out[first : first + len(chunk)] = said
+        stated = laser.disturb(true, cosine, surface, model, colour, rng)
+        out[first : first + len(chunk)] = stated
         most = 5.0 * np.maximum(model.near_sd, model.far_sd * true) + 3.0 * model.surface_sd
-        own = (np.abs(0.001 * said - true) < most) & (surface < len(plan.walls) + len(plan.columns))
+        own = (np.abs(0.001 * stated - true) < most) & (surface < len(plan.walls) + len(plan.columns))
         surfaces[first : first + len(chunk)] = np.where(own, surface, -1)
     return stamps, out, surfaces
 

@@ -69,15 +69,15 @@ def odometry(
     step = np.diff(true[:, :2], axis=0)
     way = step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)
     n = len(way)
-    said_way = errors.distance_scale * way + errors.distance_noise * np.sqrt(np.abs(way)) * rng.standard_normal(n)
+    wheel_way = errors.distance_scale * way + errors.distance_noise * np.sqrt(np.abs(way)) * rng.standard_normal(n)
     variance = errors.heading_noise_travel**2 * np.abs(way) + errors.heading_noise_turn**2 * np.abs(turn)
-    said_turn = errors.heading_scale * turn + errors.drift * way + np.sqrt(variance) * rng.standard_normal(n)
+    wheel_turn = errors.heading_scale * turn + errors.drift * way + np.sqrt(variance) * rng.standard_normal(n)
     for slip in slips:
         during = (stamps[:-1] >= slip["start"]) & (stamps[:-1] < slip["start"] + slip["seconds"])
-        said_turn[during] += slip["heading"] / max(1, during.sum())
-        said_way[during] += slip["distance"] / max(1, during.sum())
-    theta = np.concatenate([[0.0], np.cumsum(said_turn)])
-    middle = theta[:-1] + 0.5 * said_turn
-    x = np.concatenate([[0.0], np.cumsum(said_way * np.cos(middle))])
-    y = np.concatenate([[0.0], np.cumsum(said_way * np.sin(middle))])
+        wheel_turn[during] += slip["heading"] / max(1, during.sum())
+        wheel_way[during] += slip["distance"] / max(1, during.sum())
+    theta = np.concatenate([[0.0], np.cumsum(wheel_turn)])
+    middle = theta[:-1] + 0.5 * wheel_turn
+    x = np.concatenate([[0.0], np.cumsum(wheel_way * np.cos(middle))])
+    y = np.concatenate([[0.0], np.cumsum(wheel_way * np.sin(middle))])
     return np.stack([x, y, theta], axis=1)

@@ -21,7 +21,7 @@ class Finding:
     what: str
     """What was found, with figures and units."""
     advice: str
-    """What to do about it; empty where `what` says it."""
+    """What to do about it; empty where `what` contains it."""
 
 
 class Findings:

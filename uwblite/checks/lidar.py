@@ -100,6 +100,6 @@ def _check_scale(turning: Turning, figures: dict[str, float], found: Findings) -
     if abs(turning.ratio - 1.0) > max(0.12, 4.0 * turning.ratio_sigma):
         found.warning(
             "odometry",
-            f"the wheels say about {1.0 / turning.ratio:.2f} times the turns that the laser sees",
+            f"the wheels measure about {1.0 / turning.ratio:.2f} times the turns of the laser",
             "set the track width of the base; uwblite corrects it where the recording shows it",
         )

@@ -40,7 +40,7 @@ def check_ranges(log: SensorLog, found: Findings) -> dict[str, Any]:
 def _repeats(ranges: UwbRanges) -> float:
     """Return the share of readings of an anchor that have the stamp of another of the same anchor.
 
-    The ranges of one round share its stamp: only a second one of the same anchor tells of stamps that are too coarse.
+    The ranges of one round share its stamp: only a second one of the same anchor shows stamps that are too coarse.
     """
     order = np.lexsort((ranges.stamps, ranges.anchor))
     stamps, anchor = ranges.stamps[order], ranges.anchor[order]
@@ -60,7 +60,7 @@ def _check_anchor(
             "warning" if zeros + absurd > 0.1 * count else "note",
             "radio",
             f"anchor {anchor_id}: {zeros} of {count} readings are zero and {absurd} are negative or beyond {LONGEST:.0f} m",
-            "they are left out; a radio that says zero has missed its partner",
+            "they are left out; a radio that reports zero has missed its partner",
         )
     if int(usable.sum()) < FEW:
         found.warning(
@@ -79,7 +79,7 @@ def _check_anchor(
     if width < STRAIGHT:
         found.warning(
             "radio",
-            f"anchor {anchor_id} was heard on a straight path only: it may stand on either side of it",
+            f"anchor {anchor_id} was in reach on a straight path only: it may stand on either side of it",
             "drive a curve within its reach; until then its mirror image is as likely",
         )
     return {
@@ -120,7 +120,7 @@ def _width(where: Floats) -> float:
 
 
 def _check_coverage(log: SensorLog, found: Findings, window: float = 2.0) -> dict[str, float]:
-    """Share of the time in which at least one, two and three anchors are heard within a window, s."""
+    """Share of the time in which at least one, two and three anchors are in reach within a window, s."""
     ranges = log.ranges
     assert ranges is not None
     start, end = float(log.odometry.stamps[0]), float(log.odometry.stamps[-1])
@@ -134,8 +134,8 @@ def _check_coverage(log: SensorLog, found: Findings, window: float = 2.0) -> dic
     if len(ranges.anchor_ids) > 1 and shares["at least 2"] < 0.5:
         found.warning(
             "radio",
-            f"two anchors or more are heard in only {100 * shares['at least 2']:.0f} % of the time",
-            "place them so that two reach every spot; where one is heard, heading rests on the wheels",
+            f"two anchors or more are in reach in only {100 * shares['at least 2']:.0f} % of the time",
+            "place them so that two reach every spot; where one is in reach, the heading rests on the wheels",
         )
     if len(ranges.anchor_ids) == 1:
         found.note("radio", "there is one anchor", "it bounds the drift in distance, not in heading; two or more hold the map")
@@ -145,7 +145,7 @@ def _check_coverage(log: SensorLog, found: Findings, window: float = 2.0) -> dic
 def check_calibration(
     anchors: tuple[AnchorEstimate, ...], calibration: tuple[CalibrationEstimate, ...], found: Findings
 ) -> dict[str, Any]:
-    """Judge what a map from wheels and radio alone says of wheels, clocks and anchors."""
+    """Check wheels, clocks and anchors by a map from wheels and radio alone."""
     figures: dict[str, Any] = {}
     limits = {
         "odometry_scale": (
@@ -171,7 +171,7 @@ def check_calibration(
         if anchor.status == "ok" and abs(anchor.bias) > max(0.3, 3.0 * anchor.bias_sigma):
             found.note(
                 "radio",
-                f"anchor {anchor.id} says about {anchor.bias:+.2f} m too much (guess from wheels and radio)",
+                f"anchor {anchor.id} measures about {anchor.bias:+.2f} m too much (guess from wheels and radio)",
                 "usual for uncalibrated antenna delay; uwblite estimates it for each anchor",
             )
         elif anchor.status != "ok":

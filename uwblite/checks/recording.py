@@ -1,7 +1,7 @@
 """Findings about a recording before anyone maps it: what is wrong, how much, and what to do about it.
 
 Each finding is ranked: ``serious`` spoils the map or stops it, ``warning`` costs accuracy, ``note`` is good to know.
-The checks ask for no calibration and no map; where the recording itself can tell a fault from its absence (heading in
+The checks ask for no calibration and no map; where the recording itself shows whether there is a fault (heading in
 degrees, a laser upside down, clocks that differ), it is asked.
 """
 
@@ -49,7 +49,7 @@ def diagnose(
     Parameters
     ----------
     log : the recording.
-    anchors, calibration : what a map from wheels and radio alone says, where there is one: it tells the wheels' scale,
+    anchors, calibration : from a map of wheels and radio alone, where there is one: it shows the wheels' scale,
         the delay of the radio and the bias of each anchor.
     doubts : of that map; where there is a lidar, those of the ranges themselves.
     """

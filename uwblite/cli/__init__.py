@@ -166,7 +166,7 @@ def _run(module: Any, args: argparse.Namespace) -> int:
 
 
 def _flushed(code: int) -> int:
-    """Return an exit code once all that was said is out; 1 where stdout could not take it."""
+    """Return an exit code once all output is out; 1 where stdout could not take it."""
     from . import console
 
     return code if console.flush() else 1
@@ -209,7 +209,7 @@ def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) ->
     try:
         with warnings.catch_warnings():
             if not args.debug:
-                # numpy's remarks on overflows say nothing to a user; what comes of them is told in a message of ours.
+                # numpy's remarks on overflows say nothing to a user; what comes of them is in a message of ours.
                 warnings.simplefilter("ignore", RuntimeWarning)
             return int(module.run(args))
     except KeyboardInterrupt:

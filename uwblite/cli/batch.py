@@ -129,7 +129,7 @@ def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> "lis
 
 
 def is_finished(task: argparse.Namespace) -> bool:
-    """Tell whether a folder holds the map of this recording, made with these settings by this version."""
+    """Return whether a folder holds the map of this recording, made with these settings by this version."""
     from ..io.files import sha256_of
     from .map import given_files, repeat_command, settings
 

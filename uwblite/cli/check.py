@@ -165,7 +165,7 @@ def _anchor_lines(figures: dict[str, Any]) -> list[str]:
             line += f", bias guess {signed(guesses[anchor_id]['bias'], plus=True)} \u00b1{guesses[anchor_id]['sigma']:.2f} m"
         lines.append(line)
     if coverage := figures.get("uwb", {}).get("coverage"):
-        lines.append("heard at a time: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in coverage.items()))
+        lines.append("anchors in reach: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in coverage.items()))
     return lines
 
 

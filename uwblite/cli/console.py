@@ -1,7 +1,7 @@
-"""What the command line says: results on stdout, everything else on stderr, a progress bar on a terminal.
+"""Output of the command line: results on stdout, everything else on stderr, a progress bar on a terminal.
 
 A reader that leaves early (``uwblite map ... | head -1``) does not stop the work: what it no longer reads is dropped. Nor
-does a full disk behind stdout, which is told at the end. No line holds what a terminal would obey, whatever a file is named.
+does a full disk behind stdout, which is reported at the end. No line has what a terminal would obey, whatever a file's name.
 """
 
 import logging
@@ -26,14 +26,14 @@ class _Console:
         self.quiet = False
         self.bar: Progress | None = None
         self.lost = ""
-        """Why stdout did not take what was said; empty = it did."""
+        """Why stdout did not take what was written; empty = it did."""
 
 
 _CONSOLE = _Console()
 
 
 def set_up(*, quiet: bool = False, verbose: int = 0) -> None:
-    """Choose how much is said; log records of the package go to stderr."""
+    """Choose how much is written; log records of the package go to stderr."""
     _CONSOLE.quiet = quiet
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     handler = logging.StreamHandler()
@@ -90,7 +90,7 @@ def _name_of(number: int | None) -> str:
 
 
 def flush() -> bool:
-    """Push out what was said; False where stdout could not take it (disk full, not a closed pipe)."""
+    """Push out what was written; False where stdout could not take it (disk full, not a closed pipe)."""
     _flush(sys.stdout)
     _flush(sys.stderr)
     lost, _CONSOLE.lost = _CONSOLE.lost, ""

@@ -38,8 +38,8 @@ _TARGETS = ("log", "csv", "mcap", "sqlite3", "g2o", "pyfg", "tum", "kitti", "nav
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("source", help="what to convert; - reads a log from standard input")
-    parser.add_argument("target", type=place, nargs="?", help="what to make; its name tells the format, or --to does")
-    parser.add_argument("--to", choices=_TARGETS, help="format of the target where its name does not tell")
+    parser.add_argument("target", type=place, nargs="?", help="what to make; its ending names the format, or --to does")
+    parser.add_argument("--to", choices=_TARGETS, help="format of the target where its ending names none")
     parser.add_argument("--force", action="store_true", help="replace a file that is already there")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
     text = "recording that a map was made of, for its scans and odometry; repeatable, in their order"

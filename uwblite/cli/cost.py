@@ -40,7 +40,7 @@ def work_seconds(log: "SensorLog") -> float:
 def expected_seconds(log: "SensorLog") -> float:
     """Return the expected wall time of a map on this computer, s.
 
-    A short and a longer beginning of the recording are mapped: their difference tells the speed, what remains of the
+    A short and a longer beginning of the recording are mapped: their difference gives the speed, what remains of the
     shorter one is what every map takes. The trial is the work itself, so that versions of numpy and scipy, BLAS and what
     the recording holds change it as they change the map. What cannot be mapped gets the model's own speed.
     """

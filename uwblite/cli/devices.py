@@ -22,7 +22,7 @@ examples:
   uwblite devices --kinds                      what can be recorded, with names and options
 
 Looking at a port opens it, listens for a moment and asks who is there. Ports of an unknown kind are only opened when they
-are named. Nothing is changed: every finding says what to type. Exit code 0: all is well; 1: no device was found; 3: something
+are named. Nothing is changed: every finding names what to type. Exit code 0: all is well; 1: no device was found; 3: something
 needs mending.
 """
 
@@ -194,8 +194,8 @@ def _ask(port: "Port", kind: "DeviceKind", port_report: PortReport) -> bool:
     do(session.stop())
     identity = driver.identity()
     port_report.found, port_report.kind, port_report.details = True, identity.title, dict(identity.details)
-    said = {note.name for note in identity.findings}
-    shown = [*identity.findings, *(note for note in notes if note.name not in said)]
+    output = {note.name for note in identity.findings}
+    shown = [*identity.findings, *(note for note in notes if note.name not in output)]
     port_report.findings += [(note.level, note.text) for note in shown]
     return True
 
@@ -208,7 +208,7 @@ def _judge_network(port_report: PortReport, pan_id: int | None) -> None:
 
 
 def _compare_networks(reports: list[PortReport]) -> None:
-    """Nodes on one computer that are in different networks never hear each other."""
+    """Nodes on one computer that are in different networks never reach each other."""
     networks = {port_report.details["network"] for port_report in reports if "network" in port_report.details}
     if len(networks) > 1:
         for port_report in reports:

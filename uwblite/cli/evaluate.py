@@ -39,7 +39,7 @@ files (lengths in metres):
   --landmarks  name,x,y,radius[,neighbours]   neighbours: names separated by blanks; only these distances are judged
   --walls      x1,y1,x2,y2
   --relations  stamp1 stamp2 x y z roll pitch yaw: the scan of stamp2 as seen from that of stamp1. Poses are asked at the
-               lidar's clock, as the map found it; relations without an answer are counted and told
+               lidar's clock, as the map found it; relations without an answer are counted and reported
 """
 
 DEFAULT_RADIUS = 0.3
@@ -136,7 +136,7 @@ def evaluate(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
         summary["walls"] = _plain(walls)
         lines += [
             f"walls: {100 * walls.precision:.1f} % of the occupied cells lie within {walls.tolerance:g} m of a true surface, "
-            f"{100 * walls.recall:.1f} % of what was in sight is drawn"
+            f"{100 * walls.recall:.1f} % of the visible walls is drawn"
         ]
     if occupied is None and (args.landmarks or args.walls):
         lines.append("no map.yaml in the folder: columns and walls are not judged")

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     BagChoices = tuple[BagTopics, tuple[UwbMapping, ...]]
 
 GRAPHS = {".g2o": "g2o", ".graph": "g2o", ".toro": "g2o", ".pyfg": "pyfg"}
-"""TORO files are told from g2o by their tags."""
+"""TORO files differ from g2o by their tags."""
 LOGS = {".log": "log", ".clf": "log", ".bag": "bag", ".mcap": "bag", ".db3": "bag"}
 TRAJECTORIES = {".tum": "tum", ".kitti": "kitti"}
 
 
 def format_of(path: str) -> str:
-    """Return 'log', 'bag', 'csv', 'g2o', 'pyfg', 'tum', 'kitti' or 'map' (a result); '' where the name does not tell."""
+    """Return 'log', 'bag', 'csv', 'g2o', 'pyfg', 'tum', 'kitti' or 'map' (a result); '' where the name does not show it."""
     if os.path.isdir(path):
         if os.path.exists(os.path.join(path, "trajectory.tum")):
             return "map"
@@ -73,7 +73,7 @@ def graph_format(path: str) -> str:
     """Return 'g2o' or 'pyfg' for a graph's name."""
     kind = format_of(path)
     if kind not in ("g2o", "pyfg"):
-        raise ConfigError(f"{path}: the name must end in .g2o or .pyfg (or .gz behind that) to tell the format")
+        raise ConfigError(f"{path}: the name must end in .g2o or .pyfg (or .gz behind that) to show the format")
     return kind
 
 
@@ -88,7 +88,7 @@ def read_graph(path: str, *, from_odometry: bool = False) -> "GraphFile":
 
 
 def write_graph(path: str, file: "GraphFile") -> None:
-    """Write a pose graph in the format that its name tells; g2o files get their ranges too."""
+    """Write a pose graph in the format of its name; g2o files get their ranges too."""
     from ..io.g2o import write_g2o
     from ..io.pyfg import write_pyfg
 

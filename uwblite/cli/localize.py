@@ -21,7 +21,7 @@ examples:
   uwblite localize new.log --map map/ --out new.tum --picture new.png --covariance new.csv
   uwblite localize new.log --map map/ --out new/       all of these in a folder, and report.json
 
-The start pose need not be known: the anchors' ids tie the recording to the map. Where fewer than two of them are heard,
+The start pose need not be known: the anchors' ids tie the recording to the map. Where fewer than two of them are in reach,
 the walls are sought in the whole map; without lidar, the anchors alone say it to a decimetre or two. The map is not changed.
 exit code 3: written, but the walls do not fit, or an anchor was moved; the reasons are named
 """

@@ -29,7 +29,7 @@ examples:
   uwblite map run.log --out d/ --align walls --crop 0,0,12,8
   uwblite map monday.log tuesday.log --out both/       one map of several recordings: anchors tie them together
   uwblite map monday.log --out monday/ --anchors-from sunday/anchors.csv    in the frame of Sunday's map
-  uwblite map drive.bag --out map/ --uwb-mapping uwb.toml    a ROS bag with ranges of one's own kind
+  uwblite map run.bag --out map/ --uwb-mapping uwb.toml    a ROS bag with ranges of one's own kind
   uwblite map run.log --out map/ --scheduler tcp://head:8786    the heavy stages on a cluster of dask.distributed
   uwblite map run.log --out map/ --dry-run             read, check and estimate only
 

@@ -32,7 +32,7 @@ def effective_config(args: argparse.Namespace) -> "MappingConfig":
     from ..errors import ConfigError, UsageError
     from ..pipeline.mapping_config import MappingConfig, preset
 
-    # A user who says how the laser is mounted is believed.
+    # The user's mounting of the laser overrides what the scans show.
     given = ["detect_laser_flip=false"] if getattr(args, "laser_flipped", False) else []
     text = read_text(args.config) if args.config else ""
     try:
@@ -59,7 +59,7 @@ _LARGEST_SETTINGS = 1 << 20
 
 def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare how the sensors are mounted; the log's own PARAM lines hold where these are not given."""
-    group = parser.add_argument_group("mounting (what the log says is overridden)")
+    group = parser.add_argument_group("mounting (overrides what stands in the log)")
     group.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), help="laser on the base: m, m, rad")
     group.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
     group.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), help="UWB tag on the base, z above the floor: m")

@@ -14,10 +14,10 @@ HELP = "say where further anchors help most, by the expected error of a position
 EPILOG = """\
 examples:
   uwblite plan-anchors --map map/ --count 2                 -> anchor_plan.csv and anchor_plan.png
-  uwblite plan-anchors --map map/ --count 1 --reach 12      the radios are heard up to 12 m
+  uwblite plan-anchors --map map/ --count 1 --reach 12      the radios reach 12 m
   uwblite plan-anchors --map map/ --count 3 --from-nothing  as if there were no anchors yet
 
-The error at a place is that of a position from one range to each anchor within reach: 0.1 m of noise in sight, 0.5 m
+The error at a place is that of a position from one range to each anchor within reach: 0.1 m of noise in line of sight, 0.5 m
 through walls. Anchors are put on walls; where that cannot be done, the picture shows what is nearly as good.
 """
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("--map", metavar="DIR", required=True, help="folder that uwblite map wrote: map.yaml, anchors.csv")
     parser.add_argument("--count", metavar="N", type=number(above=0, whole=True), default=1, help="how many anchors (1)")
-    parser.add_argument("--reach", metavar="M", type=number(above=0), default=25.0, help="m up to which a radio is heard (25)")
+    parser.add_argument("--reach", metavar="M", type=number(above=0), default=25.0, help="m up to which a radio reaches (25)")
     parser.add_argument("--from-nothing", action="store_true", help="leave out the anchors that are there")
     parser.add_argument("--out", metavar="NAME", default="anchor_plan", help="NAME.csv and NAME.png are written (anchor_plan)")
     parser.add_argument("--force", action="store_true", help="replace files that are already there")

@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record until the time is over or somebody says stop."""
+    """Record until the time is over or somebody stops it."""
     import signal
     import socket
     import time

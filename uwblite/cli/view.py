@@ -118,8 +118,8 @@ class _Process:
         """Return its exit code; None while it runs."""
         return self._process.poll()
 
-    def said(self) -> str:
-        """Return the last line that it said."""
+    def output(self) -> str:
+        """Return the last line of its output."""
         size = os.fstat(self._output.fileno()).st_size
         tail = os.pread(self._output.fileno(), 2000, max(size - 2000, 0)).decode(errors="replace").strip()
         errors = [line for line in tail.splitlines() if "error:" in line]

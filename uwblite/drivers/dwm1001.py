@@ -73,7 +73,7 @@ class TlvProtocol(FrameReader):
 
 
 def _may_begin(data: bytes) -> bool:
-    """Tell whether bytes can be ``40 01 error type length``, or the beginning of it."""
+    """Return whether bytes can be ``40 01 error type length``, or the beginning of it."""
     if data[:2] != b"\x40\x01"[: len(data[:2])] or (len(data) > 2 and data[2] > 5):
         return False
     return len(data) < 4 or (data[2] == 0 and block_length(data[3:5]) >= 0)

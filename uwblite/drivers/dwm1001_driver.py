@@ -139,7 +139,7 @@ class Dwm1001Driver(Driver):
         return not shell or (yield from self.ask(STATUS_GET, lambda e: isinstance(e, Status), PATIENCE, 4)) is not None
 
     def _in_shell(self) -> Script[bool | None]:
-        """Tell whether the module is in its shell, and quiet; None = no answer."""
+        """Return whether the module is in its shell, and quiet; None = no answer."""
         left = _source((yield from self.sleep(DRAIN)))
         for probe, patience in () if left else PROBES:
             yield Send(probe)

@@ -89,7 +89,7 @@ class RangeReading:
     range: float
     """m."""
     quality: int
-    """0..100; 100 where the device says nothing."""
+    """0..100; 100 where the device reports none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,7 +70,7 @@ class Link:
         self.opening: Opening | None = None
         self.retry_at = 0.0
         self.attempt = 0
-        self.said: set[str] = set()
+        self.stated: set[str] = set()
         """Names of the notes since it last gave data."""
         self.last_data = self.last_message = self.opened = 0.0
         self.quiet = False

@@ -154,7 +154,7 @@ class OdometryLineDriver(LineDriver):
         return [Corrupt(b"", "line that leaps away and back")] if doubtful else []
 
     def _follows(self, before: Line, after: Line) -> bool:
-        """Tell whether a base can have moved so, and its clock have gone on so."""
+        """Return whether a base can have moved so, and its clock have gone on so."""
         spec, clock, old, new = self._format, self.clock, before.content, after.content
         waited = max(after.stamp - before.stamp, 0.0)
         elapsed = (new["t"] - old["t"]) * spec.time_unit if "t" in new else waited

@@ -172,7 +172,7 @@ class Recorder:
         pause = link.heard(now)
         if pause:
             self._note(link, Note("info", f"{link.name}-data-again", f"{link.name}: data again after {pause:.1f} s"))
-            link.said.clear()
+            link.stated.clear()
 
     def _write(self, measured: LaserScan | RangeEpoch | OdometryPose | GyroHeading, link: Link) -> None:
         tail, counts = self._tail(measured.stamp), link.counts
@@ -232,8 +232,8 @@ class Recorder:
 
     def _note(self, link: Link, note: Note) -> None:
         """Say something of a device, once until it gives data again: one that comes and goes would fill the log."""
-        if note.name not in link.said:
-            link.said.add(note.name)
+        if note.name not in link.stated:
+            link.stated.add(note.name)
             self.note(note)
 
     # ---- devices that come and go

@@ -127,7 +127,7 @@ class RpLidarProtocol(PacketReader):
         return _decode_capsule(before[1], before[0], first, span / (2 * CABINS), self.periods[1])
 
     def _follows(self, span: int) -> bool:
-        """Tell whether two capsules stand so far apart as two in a row do; otherwise some were lost between them."""
+        """Return whether two capsules stand so far apart as two in a row do; otherwise some were lost between them."""
         fits = 0 < span <= MOST_STEP and abs(span - self._span) < SAME_SPAN * span
         self._misfits = 0 if fits else self._misfits + 1
         if fits or not self._span or self._misfits > MOST_MISFITS:

@@ -59,7 +59,7 @@ def check_pyserial(url: str) -> None:
 
 
 def is_socket(url: str) -> bool:
-    """Tell whether a URL names a TCP port."""
+    """Return whether a URL names a TCP port."""
     return url.lower().startswith("socket://")
 
 

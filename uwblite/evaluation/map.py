@@ -1,7 +1,7 @@
 """How far a map is from the truth: distances between named columns, and how well its cells lie on the walls.
 
 The mean absolute error of distances between columns is the figure of the paper's Table I. It needs no alignment of the
-frames to speak of: distances are the same in all of them. The alignment only says where to look for a column.
+common frames: distances are the same in all of them. The alignment only gives where to look for a column.
 """
 
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ def landmark_errors_along(
     truth : true columns, frame of the truth.
     true_poses, poses : (n, 3) T_truth_base and T_map_base at the same stamps.
     pairs : names; None = all pairs.
-    sight : m, distance up to which a column counts as in sight.
+    reach : m, distance up to which a column counts as visible.
     most : sightings used of each column, evenly spread.
     """
     sightings = {}
@@ -121,7 +121,7 @@ def wall_errors(
     occupied : (n, 2) m, centres of the occupied cells, frame of the truth.
     walls : (w, 4) m, x1, y1, x2, y2 of straight surfaces.
     columns : (c, 3) m, x, y, radius of round ones.
-    viewpoints : (v, 2) m, the true path; only surface that can be seen from it within `sight` m counts for the recall.
+    viewpoints : (v, 2) m, the true path; only surface that can be seen from it within `reach` m counts for the recall.
     tolerance : m.
     step : m, spacing of the samples on the surfaces.
     """

@@ -1,6 +1,6 @@
 """How far relative poses of a trajectory are from given ones: the metric of Kuemmerle et al. 2009.
 
-A relation says where a scan was taken as seen from another scan; relations of neighbouring scans judge local accuracy,
+A relation is the pose of one scan relative to another; relations of neighbouring scans show local accuracy,
 those between visits to one place judge the map as a whole, and no alignment of frames is needed. With the given relative
 pose d* and the estimated one d, the error is the translation and the rotation of d*^-1 d; each relation counts once.
 
@@ -84,7 +84,7 @@ def evaluate_relations(stamps: Floats, poses: Floats, relations: Relations, dela
 
 
 def _answered(stamps: Floats, scans: Floats, delay: float) -> Bools:
-    """Tell for which scans (r,) the trajectory has a pose; its ends may be overhung by the offset of the clock."""
+    """Return for which scans (r,) the trajectory has a pose; its ends may be overhung by the offset of the clock."""
     after = np.clip(np.searchsorted(stamps, scans + delay), 1, max(len(stamps) - 1, 1))
     gap = stamps[np.minimum(after, len(stamps) - 1)] - stamps[after - 1]
     slack = abs(delay) + _EDGE

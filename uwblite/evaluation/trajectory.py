@@ -126,7 +126,7 @@ def _covered(stamps: Floats, queries: Floats, max_gap: float) -> Ints:
         return np.empty(0, dtype=np.int64)
     before, after = stamps[right - 1], stamps[right]
     inside = (queries >= before) & (queries <= after) & (after - before <= max_gap)
-    # Rounded stamps may stick out by a little; a pose held for longer than that would be invented.
+    # Rounded stamps may stick out by a little; a pose extended for longer than that would be invented.
     edge = 1e-3
     at_a_stamp = (np.abs(queries - before) <= edge) | (np.abs(queries - after) <= edge)
     return np.flatnonzero(inside | at_a_stamp)

@@ -10,7 +10,7 @@ is left out, so H stays positive semi-definite whatever the kernel. The step sol
     (H + lambda D) h = -g,    D = diag(H) (1 where an unknown is measured by nothing),
 
 which is Marquardt's scaling: it makes lambda a pure number, the same for metres, radians and scale factors, and it
-keeps the matrix positive definite where the measurements leave a direction open (an anchor never heard, a closure
+keeps the matrix positive definite where the measurements leave a direction open (an anchor without ranges, a closure
 whose information is singular): such a direction simply does not move. The model promises the decrease
 h^T (lambda D h - g); the ratio of what F really does to that promise decides. A step that decreases F is taken, and
 lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dropped and lambda is multiplied by
@@ -265,7 +265,7 @@ def _trial(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Gra
 
 
 def _linked(poses: int, linearized: list[Linearization]) -> Bools:
-    """Tell which poses (n - 1,) are measured from the one before them."""
+    """Return which poses (n - 1,) are measured from the one before them."""
     linked = np.zeros(max(poses - 1, 0), dtype=bool)
     for lin in linearized:
         ends = [number for name, number, _ in lin.blocks if name == "poses"]

@@ -47,7 +47,7 @@ class GridGeometry:
         return self.origin + self.resolution * (np.stack([col, row], axis=-1) + 0.5)
 
     def inside(self, row: Ints, col: Ints) -> Bools:
-        """Tell which cells belong to the grid."""
+        """Return which cells belong to the grid."""
         return (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
 
     def window(self, row: int, col: int, rows: int, cols: int) -> "GridGeometry":

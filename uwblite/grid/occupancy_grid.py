@@ -1,7 +1,7 @@
 """The map: a grid of log-odds of being occupied, from rays through a binary Bayes filter (paper: step 3).
 
-A cell starts unknown, log-odds 0. Every scan says of a cell at most one thing: *hit* where a ray ended, *miss* where
-rays passed through (a hit of the same scan wins, so that rays grazing a wall do not wear it away). With independent
+A cell starts unknown, log-odds 0. Every scan contributes at most one observation to a cell: *hit* where a ray ended, *miss*
+where rays passed through (a hit of the same scan wins, so that rays grazing a wall do not wear it away). With independent
 scans Bayes' rule adds log-odds,
 
     l = hits log(p_hit / (1 - p_hit)) + misses log(p_miss / (1 - p_miss)),    |l| <= clamp,
@@ -9,8 +9,8 @@ scans Bayes' rule adds log-odds,
 so only two counts per cell need be kept, their order does not matter, and work can be split and added up exactly. A person
 who stood somewhere for a few scans is outvoted by the scans that look through the place later.
 
-A beam that saw nothing is weak evidence: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique". Such
-beams never draw anything; runs of adjacent ones clear space, with less weight, up to a stated distance and never beyond a
+A beam that saw nothing is a weak observation: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique".
+Such beams never draw anything; runs of adjacent ones clear space, with less weight, up to a stated distance and never beyond a
 wall that other beams have drawn. That takes a second walk over the scans, once the walls are known.
 """
 

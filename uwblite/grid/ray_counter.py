@@ -105,7 +105,7 @@ class RayCounter:
         start = slot * window + begin[0] * width + begin[1]
         step = end - begin
         stops = None if walls is None else self._windows_of(walls, low, height, width)
-        # Stronger evidence is written later and wins.
+        # Stronger observations are written later and win.
         for rays, weight, stop in ((~hit, self._weak, stops), (hit, WEIGHT_UNIT, None)):
             if weight:
                 mark_rays(marks, start[rays], step[0, rays], step[1, rays], width, weight, stop)

@@ -111,7 +111,7 @@ def _sweep_reach(first: Floats, last: Floats, reach: NDArray[np.float32]) -> Flo
 
 
 def in_runs(flags: Bools, least: int) -> Bools:
-    """Tell which flags (s, b) stand in a run of at least `least` neighbours along the last axis that are all set."""
+    """Return which flags (s, b) stand in a run of at least `least` neighbours along the last axis that are all set."""
     if least <= 1:
         return flags
     if flags.shape[1] < least:

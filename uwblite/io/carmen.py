@@ -209,7 +209,7 @@ class _Reader:
 
     def finish(self, sha256: str, missing: str = "") -> SensorLog:
         """Return what was collected, sorted by time; `missing` is a part of the log that is not there."""
-        # A recorder that is switched off leaves half a line at the end: that one says nothing about the rest.
+        # A recorder that is switched off leaves half a line at the end: that one proves nothing about the rest.
         if self.broken - self.ends_broken > self.max_broken_share * self.messages:
             self._refuse()
         warnings = [f"part {missing} of this recording is not there: put it beside the others"] if missing else []
@@ -265,6 +265,6 @@ class _Reader:
         silent = [k + 1 for k in np.unique(tag[tag > 0]) if not self.params.tells_tag(k + 1)]
         if silent:
             name = f"uwb{silent[0]}_tag_offset_x"
-            warnings.append(f"no PARAM {name} says where tag {silent[0]} is; the middle of the base is taken")
+            warnings.append(f"no PARAM {name} gives where tag {silent[0]} is; the middle of the base is taken")
         anchor = rank[rows[:, 1].astype(np.int64)]
         return UwbRanges(rows[:, 0], anchor, rows[:, 2], rows[:, 3], tuple(ids), tag if self.tags > 1 else None)

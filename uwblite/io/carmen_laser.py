@@ -74,7 +74,7 @@ class LaserMessages:
         self._block = block
 
     def wants(self, name: bytes) -> bool:
-        """Tell whether a message is one of the laser messages read here."""
+        """Return whether a message is one of the laser messages read here."""
         return name in _RANK
 
     def take(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
@@ -109,7 +109,7 @@ class LaserMessages:
             raise BrokenLine(f"{what} has {len(tokens)} fields, far too few")
         layout = self._layout(name, b" ".join(tokens[:head]))
         if len(tokens) <= head + layout.beams:
-            raise BrokenLine(f"{what} says {layout.beams} readings but the line is too short for them")
+            raise BrokenLine(f"{what} announces {layout.beams} readings but the line is too short for them")
         readings = np.array(tokens[head : head + layout.beams], dtype=np.float64)
         stamp = self._tail(name, tokens[head + layout.beams :])
         self._queue(layout, Pending(number, 0, readings, stamp))
@@ -233,7 +233,7 @@ def _parse_head(name: bytes, tokens: list[bytes]) -> _Layout:
         raise BrokenLine(f"{what}: fields are parted unevenly")
     beams = int(tokens[-1])
     if not 1 <= beams <= MAX_BEAMS:
-        raise BrokenLine(f"{what} says {beams} readings")
+        raise BrokenLine(f"{what} announces {beams} readings")
     if name == b"FLASER":
         return _Layout(beams)
     angle_min, fov, increment, range_max = numbers(tokens[2:6], what, 4)

@@ -36,7 +36,7 @@ def stamp_of(tokens: list[bytes]) -> float:
 
 
 def is_message_name(name: bytes) -> bool:
-    """Tell whether a word could be the name of a message of some CARMEN module: capitals, digits, _ and -."""
+    """Return whether a word could be the name of a message of some CARMEN module: capitals, digits, _ and -."""
     plain = name.replace(b"_", b"").replace(b"-", b"")
     return 2 <= len(name) <= 40 and plain.isalnum() and plain.isupper() and plain[:1].isalpha()
 

@@ -84,7 +84,7 @@ _REQUIRED: Mapping[type, tuple[str, ...]] = {
 def read_anchors(path: str | os.PathLike[str], *, least: int = 1) -> Constraints:
     """Return the placed anchors of an earlier map's anchors.csv as known places; they may have been moved since.
 
-    Where the map knows an anchor at several places (``5C0B``, later ``5C0B#2``), the last one counts. Sigmas are taken as
+    Where the map has an anchor at several places (``5C0B``, later ``5C0B#2``), the last one counts. Sigmas are taken as
     the larger of x and y, and at least 2 cm: an earlier map's own frame is not surer than that.
 
     Raises

@@ -21,7 +21,7 @@ _READY = ".uwblite-ready"
 _LIST = "files"
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 Owned = Callable[[str], bool]
-"""Tells by its name whether a file belongs to a result."""
+"""Matches names of files that belong to a result."""
 
 
 @contextmanager
@@ -100,7 +100,7 @@ def _clear(home: Path, prefix: str) -> None:
 
 
 def _may_change_places(folder: Path, owned: Owned) -> bool:
-    """Tell whether a folder holds nothing but a result and nobody is known to stand in it."""
+    """Return whether a folder holds nothing but a result and no process works in it."""
     others = [p.name for p in folder.iterdir() if not (owned(p.name) and p.is_file() and not p.is_symlink())]
     if [name for name in others if not name.startswith(WAITING)] or os.path.ismount(folder):
         return False

@@ -75,7 +75,7 @@ def with_origins(graph: Graph) -> tuple[Floats, Ints]:
 
 
 def _tied(graph: Graph, chains: Ints) -> Bools:
-    """Tell of each chain whether ranges tie it to the first one, directly, over others or over landmarks."""
+    """Return for each chain whether ranges tie it to the first one, directly, over others or over landmarks."""
     count, landmarks = int(chains.max()) + 1, len(graph.anchors)
     ends = [(np.zeros(0, dtype=np.int64),) * 2]
     for e in graph.edges:

@@ -61,7 +61,7 @@ def _locked(path: str | os.PathLike[str], what: str, wait: bool) -> tuple[int, s
             return _NO_LOCKS, ""
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            # Who held it before has removed it: then others lock another file of that name.
+            # The process that locked it before has removed it: then others lock another file of that name.
             if os.path.samestat(os.fstat(handle), os.stat(name)):
                 return handle, name
         except BlockingIOError:

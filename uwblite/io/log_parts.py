@@ -66,7 +66,7 @@ def _continues(path: str) -> tuple[int, str]:
 
 
 def _goes_on(path: str) -> bool:
-    """Tell whether the last line of a part names a next one; of a packed one that is not known."""
+    """Return whether the last line of a part names a next one; of a packed one that is unknown."""
     try:
         with open(path, "rb") as file:
             file.seek(max(0, os.path.getsize(path) - TAIL_BYTES))

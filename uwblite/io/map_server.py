@@ -190,7 +190,7 @@ def _finite(text: str, key: str, path: str) -> float:
 
 
 def _read_picture(path: str) -> Image:
-    """Return the pixels (height, width, channels) of a PGM or PNG; its header tells how much of the file is read at all."""
+    """Return the pixels (height, width, channels) of a PGM or PNG; its header gives how much of the file is read at all."""
     with open_input(path) as stream:
         try:
             start = stream.read(_HEADER_BYTES)

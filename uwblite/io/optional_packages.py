@@ -1,4 +1,4 @@
-"""Packages that single formats need: how to install one here, said by the error that misses it."""
+"""Packages that single formats need: how to install one here, named by the error that misses it."""
 
 import os
 import shlex

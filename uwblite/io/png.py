@@ -65,7 +65,7 @@ def decode_png(data: bytes, path: str = "") -> Image:
 
 
 def png_shape(data: bytes, path: str = "") -> tuple[int, int, int]:
-    """Return height, width and channels that the beginning of a PNG tells.
+    """Return height, width and channels from the beginning of a PNG.
 
     Raises
     ------

@@ -155,7 +155,7 @@ def recording_figures(logs: Sequence[SensorLog], result: MapResult) -> dict[str,
 
 
 def base_name(path: str) -> str:
-    """Return the last part of a path: what a result says must not depend on the folder that the recording lies in."""
+    """Return the last part of a path: what stands in a result must not depend on the folder that the recording lies in."""
     return path.rstrip("/").rpartition("/")[2] or path
 
 

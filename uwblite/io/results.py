@@ -48,7 +48,7 @@ _CONTRACT = re.compile(
 
 
 def is_of_result(name: str) -> bool:
-    """Tell whether a file's name is one of those that a result may hold."""
+    """Return whether a file's name is one of those that a result may hold."""
     return _CONTRACT.fullmatch(name) is not None
 
 
@@ -132,7 +132,7 @@ def _title(logs: Sequence[SensorLog]) -> str:
 
 
 def _caption(logs: Sequence[SensorLog], result: MapResult) -> str:
-    """Return what the picture shows in a line: a name alone, mostly run.log, says nothing."""
+    """Return what the picture shows in a line: a name alone, mostly run.log, means nothing."""
     sums, kept = recording_figures(logs, result), sum(c.accepted for c in result.closures)
     counts = f"{sums['travelled']:.0f} m in {sums['duration'] / 60:.0f} min, {len(result.anchors)} anchors, {kept} closures"
     return f"{_title(logs[:2])}{' ...' if len(logs) > 2 else ''}: {counts}"

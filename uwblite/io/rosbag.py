@@ -26,7 +26,7 @@ from .optional_packages import missing_package
 from .uwb_mapping import UwbMapping, readings_of, short_type
 
 _SAMPLES = 20
-"""Messages of a topic that are looked at to tell how they are made."""
+"""Messages of a topic that are examined to learn how they are made."""
 
 
 def plan_bag(

@@ -120,7 +120,7 @@ class TextSource:
 
 @contextmanager
 def open_source(path: str | os.PathLike[str], digest: "hashlib._Hash | None" = None) -> Iterator[TextSource]:
-    """Open a text file, gzip or not (told by its content), or standard input for ``-``.
+    """Open a text file, gzip or not (by its content), or standard input for ``-``.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ class StoredClosure:
     accepted: bool
     reason: str
     pose: Floats | None = None
-    """(3,) measured pose of the second place in the first; m, m, rad; None where the report does not tell it."""
+    """(3,) measured pose of the second place in the first; m, m, rad; None where the report does not contain it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +69,7 @@ class StoredResult:
     @property
     def laser_delay(self) -> float:
         """Offset of the lidar's clock, s: a scan stamped t was taken at t + laser_delay by the trajectory's clock; 0 where
-        the report says nothing of it."""
+        the report does not contain it."""
         entries = self.report.get("calibration") or []
         found = [e.get("value") for e in entries if isinstance(e, dict) and e.get("name") == "laser_delay"]
         return float(found[0]) if found and isinstance(found[0], int | float) else 0.0

@@ -1,4 +1,4 @@
-"""How UWB ranges stand in ROS messages: there is no standard, so a small table says where to look.
+"""How UWB ranges stand in ROS messages: there is no standard, so a small table lists where to look.
 
 As TOML, one ``[[uwb]]`` table per kind of message; the first that fits a topic is used::
 
@@ -51,13 +51,13 @@ class UwbMapping:
     field that is an array is asked at the place of the range."""
 
     def fits(self, topic: str, message_type: str) -> bool:
-        """Tell whether the mapping is meant for a topic; ``pkg/Name`` and ``pkg/msg/Name`` are one type."""
+        """Return whether the mapping is meant for a topic; ``pkg/Name`` and ``pkg/msg/Name`` are one type."""
         return fnmatchcase(topic, self.topic) and fnmatchcase(short_type(message_type), short_type(self.type))
 
     def extract(self, message: Any, topic: str) -> list[tuple[str, float, float]]:
         """Return (anchor id, range in m, quality) of every reading in a message.
 
-        An array with a place for each anchor holds zeros or nan where an anchor was not heard: these are no readings.
+        An array with a place for each anchor holds zeros or nan where an anchor was out of reach: these are no readings.
 
         Raises
         ------
@@ -76,7 +76,7 @@ class UwbMapping:
         return found
 
     def _wanted(self, reading: Any, place: int | None = None) -> bool:
-        """Tell whether the fields of `only` have their values, in an array the value at a place."""
+        """Return whether the fields of `only` have their values, in an array the value at a place."""
         values = ((_field(reading, name, self), wanted) for name, wanted in self.only.items())
         return all(int(v if place is None or not hasattr(v, "__len__") else v[place]) == wanted for v, wanted in values)
 

@@ -107,7 +107,7 @@ def _is_id(name: str) -> bool:
 
 
 def _unit(name: str, value: Any) -> float:
-    """Return metres per unit: as the name says, and millimetres for whole numbers."""
+    """Return metres per unit: by the name, and millimetres for whole numbers."""
     if name.lower().endswith("cm"):
         return 0.01
     return 0.001 if name.lower().endswith("mm") or isinstance(value, int | np.integer) else 1.0

@@ -34,7 +34,7 @@ class CloudConfig:
     """Points with fewer neighbours are left out as noise."""
     linearity: float = setting(0.7, advanced=True)
     """Least share of a neighbourhood's spread that lies along the line for its normal to count, 0..1. A right angle has
-    about 0.75: corners say where along a corridor the robot is."""
+    about 0.75: corners fix where along a corridor the robot is."""
     raster: ClassVar[float] = 0.1
     """Cell of the tables of nearest points, m; smaller takes memory with the square and gains nothing on lines."""
     range_max: float = 30.0

@@ -84,7 +84,7 @@ def fit_circle(cells: Floats, centre: Floats, radius: float, gate: float) -> Flo
             return centre
         weight = (1.0 - (residual[near] / gate) ** 2) ** 2
         unit = ray[near] / np.maximum(distance[near], 1e-9)[:, None]
-        # A column seen from one side says little across the line of sight: the start holds it there.
+        # A column seen from one side is hardly measured across the line of sight: the start fixes it there.
         normal = (weight[:, None, None] * unit[:, :, None] * unit[:, None, :]).sum(axis=0) + 0.01 * np.eye(2)
         step = np.linalg.solve(normal, (weight * residual[near]) @ unit)
         centre = centre + step

@@ -1,4 +1,4 @@
-"""Degenerate directions of a registration: those in which only the scatter of the normals seems to hold a pose.
+"""Degenerate directions of a registration: those in which only the scatter of the normals seems to fix a pose.
 
 Normals scatter, and a wall whose normals scatter seems to resist being slid along. With the variance v of a normal's
 angle and the Jacobian J_t of the tangent, N = sum w v J_t^T J_t is the information that scatter alone would feign. In

@@ -1,8 +1,8 @@
 """Free space seen by a scan, and points that contradict it: would this pose see through a wall?
 
-A scan from one place says of every bearing how far nothing stood. A point of another scan, put into the map by a
+A scan from one place measures for every bearing how far it was free. A point of another scan, put into the map by a
 hypothetical pose, contradicts it where it lies well short of that distance; where it lies beyond, it was hidden and
-says nothing.
+shows nothing.
 """
 
 from dataclasses import dataclass
@@ -76,7 +76,7 @@ def seen_beyond(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, I
 
 
 def contradiction(free: FreeSpace, points: Floats, margin: float, least: int = 1) -> tuple[float, float]:
-    """Tell what share of points lies where free space was seen.
+    """Return what share of points lies where free space was seen.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ _NEIGHBOURS = 4
 _POINTS_AT_ONCE = 1 << 16
 """Points brought into the map's frame at once."""
 _CLOUDS_AT_ONCE = 128
-"""Clouds whose overlaps with all others are held at once; a bound on the memory."""
+"""Clouds whose overlaps with all others are in memory at once; a bound on the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +41,13 @@ class RefinementConfig:
     track_rounds: ClassVar[int] = 12
     """Most rounds of matching neighbouring clouds before loops are sought."""
     selections: int = setting(3, advanced=True)
-    """How often, at most, the pairs are chosen anew and refined."""
+    """How often, at most, the pairs are chosen again and refined."""
     same_pairs: ClassVar[float] = 0.04
-    """The pairs are not chosen anew when the poses moved by less than this (root mean square) since they were, m."""
+    """The pairs are not chosen again when the poses moved by less than this (root mean square) since they were, m."""
     first_gate: float = setting(0.5, advanced=True)
     """Farthest match in the first round, m."""
     later_gate: ClassVar[float] = 0.2
-    """Farthest match in the first round where the poses are good already: after tracking, and when pairs are chosen anew."""
+    """Farthest match in the first round where the poses are good already: after tracking, and when pairs are chosen again."""
     last_gate: ClassVar[float] = 0.12
     """Farthest match in the last rounds, m."""
     shrink: ClassVar[float] = 0.7
@@ -121,7 +121,7 @@ def choose_pairs(
 
     Parameters
     ----------
-    poses : (k, 3). path : (k,) travelled distance, m. session : (k,) recording of each keyframe.
+    poses : (k, 3). path : (k,) travelled distance, m. recording : (k,) recording of each keyframe.
     """
     k = len(clouds)
     near_i = np.concatenate([np.arange(k - n) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
@@ -175,7 +175,7 @@ def refine(
     Parameters
     ----------
     graph : wheels, radio, priors and other edges; scan edges come from here.
-    clouds, raster : see clouds.build and pair_matching.paint; the raster's reach bounds the gate.
+    clouds, raster : see clouds.build and scan_matching.rasterize; the raster's reach bounds the gate.
     twist : (k, 3) velocity of the base at each keyframe.
     i, j : (e,) pairs, see choose_pairs.
     on_round : called with (round, rounds).
@@ -191,7 +191,7 @@ def refine(
     empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names, delay)
     probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j], kernel=Kernel("cauchy", 5.0))
     normal: NormalEquations | None = None
-    # The next round looks all matches up anew: one good step is enough.
+    # The next round looks all matches up again: one good step is enough.
     brief = replace(solver, max_iterations=3, relative_decrease=0.5)
     T_i_j = probe.relative(graph)
     while True:
@@ -234,8 +234,8 @@ def with_fewer_pairs(graph: Graph, most: int = 12000) -> Graph:
     """Return the graph with at most so many scan edges between clouds of different times, each for several like it.
 
     The uncertainty of thousands of poses tied together everywhere would need a factor of hundreds of millions of
-    entries. Every m-th pair, weighing as m, and a chain of single steps tell as much, a little less at every pose: standard
-    deviations come out up to a third too large.
+    entries. Every m-th pair, weighing as m, and a chain of single steps carry as much information, a little less at every
+    pose: standard deviations come out up to a third too large.
     """
     return replace(graph, edges=tuple(_every_nth(e, most) if isinstance(e, ScanEdges) else e for e in graph.edges))
 

@@ -1,7 +1,7 @@
-"""Turning as the laser sees it and as the wheels say it, from scans a moment apart; no map is needed.
+"""Turns measured by laser and by wheels, from scans a moment apart; no map is needed.
 
 When the robot turns left by a, everything the laser sees moves right by a. Matching two scans by a shift of beams
-measures the turn; the wheels tell another. From many such pairs follow whether the laser is mounted upside down (the
+measures the turn; the wheels measure it too. From many such pairs follow whether the laser is mounted upside down (the
 sign), the clock offset (the lag at which both agree best) and the wheels' heading scale (the ratio).
 """
 
@@ -16,21 +16,21 @@ from ..sensor_log import LaserScans, SensorLog
 PAIRS = 1000
 """Scan pairs matched at most."""
 LEAST_PAIRS = 20
-"""Fewer pairs say nothing."""
+"""Fewer pairs show nothing."""
 _LAGS = np.arange(-1.0, 1.001, 0.02)
 """Clock offsets tried, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turning:
-    """What laser and wheels say of the same turns."""
+    """The same turns measured by laser and wheels."""
 
     pairs: int
     """Scan pairs that were matched."""
     typical: float
     """Median turn between them by the wheels, rad."""
     as_given: float
-    """Mean difference of turns, laser mounted as told, at the best clock offset, rad."""
+    """Mean difference of turns, laser mounted as given, at the best clock offset, rad."""
     other: float
     """The same with the laser mounted the other way up."""
     misfit: float
@@ -50,7 +50,7 @@ class Turning:
 
     @property
     def turned_over(self) -> bool:
-        """Whether the laser is mounted the other way up than told."""
+        """Whether the laser is mounted the other way up than given."""
         return self.other < 0.5 * self.as_given
 
 

@@ -19,7 +19,7 @@ def make_tree(points: Floats) -> cKDTree:
 def statistical_outlier_filter(
     points: Floats, neighbours: int, std_ratio: float, tree: cKDTree | None = None
 ) -> Bools:
-    """Tell which points are not unusually far from their nearest neighbours.
+    """Return which points are not unusually far from their nearest neighbours.
 
     A point stays if its mean distance to its nearest neighbours is at most mean + std_ratio * standard deviation of
     that distance over the whole cloud.
@@ -44,7 +44,7 @@ def statistical_outlier_filter(
 
 
 def radius_outlier_filter(points: Floats, radius: float, min_neighbours: int, tree: cKDTree | None = None) -> Bools:
-    """Tell which points have at least min_neighbours other points within the radius (m, inclusive).
+    """Return which points have at least min_neighbours other points within the radius (m, inclusive).
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ class IcpConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Where the source lies in the target, and how far to trust that."""
+    """Where the source lies in the target, and its covariance."""
 
     T_target_source: Floats
     """(3,) m, m, rad; the last iterate where not converged."""

@@ -1,6 +1,6 @@
 """Point-to-line matching of many pairs of clouds at once.
 
-Nearest neighbours come from one raster per cloud, painted so that each cell names the nearest point: looking up a
+Nearest neighbours come from one raster per cloud, in which each cell names the nearest point: looking up a
 million points is a handful of array operations and no tree. A pair's matches are condensed into the quadratic form
 of its relative pose (3 x 3), which is all that the graph needs to know of them.
 """
@@ -17,7 +17,7 @@ from .clouds import Clouds
 from .degeneracy import relative_eigen
 
 _CLOUDS_AT_ONCE = 256
-"""Clouds whose rasters are painted at once."""
+"""Clouds whose rasters are made at once."""
 _AT_ONCE = 16384
 """Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
 _SAME_FACING = float(np.sqrt(0.5))

@@ -1,4 +1,4 @@
-"""Motion from scan to scan, without wheels: what stands in for them where they say nothing.
+"""Motion from scan to scan, without wheels: what replaces them where they give no reading.
 
 Scans a moment apart are aligned point to line from a guess; where few points then match, a correlative search around it
 finds the place.
@@ -24,13 +24,13 @@ _POINTS = 200
 _GOOD_SHARE = 0.75
 """Pairs that share at least this part of their points need no search."""
 _GAIN = 0.05
-"""A search must raise the share by this to be believed."""
+"""A search must raise the share by this to count."""
 _SEARCH = (0.6, 0.6, 0.6)
 """Half-widths of the search, m, m, rad."""
 _LEAST_POINTS = 25
 """Clouds with fewer points measure nothing."""
 _AT_ONCE = 128
-"""Pairs of scans whose rasters are held at once."""
+"""Pairs of scans whose rasters are in memory at once."""
 
 
 def scan_steps(

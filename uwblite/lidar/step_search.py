@@ -113,7 +113,7 @@ class StepSearch:
 
 
 def _apart(pose: Floats, others: Floats) -> Bools:
-    """Tell which other poses (c, 3) are distinct from one."""
+    """Return which other poses (c, 3) are distinct from one."""
     off = se2.between(pose, others)
     return np.asarray((np.hypot(off[:, 0], off[:, 1]) > _DISTINCT) | (np.abs(off[:, 2]) > _DISTINCT))
 

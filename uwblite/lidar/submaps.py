@@ -73,7 +73,7 @@ def build(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: 
 
     Parameters
     ----------
-    clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. session : (k,).
+    clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. recording : (k,).
     """
     first, last = cut(path, recording, config.epsilon)
     reference = (first + last - 1) // 2

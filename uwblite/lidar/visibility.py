@@ -94,7 +94,7 @@ def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, re
 
     Parameters
     ----------
-    free : see seen_free. poses : (k, 3) T_map_base of the keyframes. session : (k,) recording of each.
+    free : see seen_free. poses : (k, 3) T_map_base of the keyframes. recording : (k,) recording of each.
 
     Returns
     -------
@@ -112,11 +112,11 @@ def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, re
 
 
 def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording: Ints) -> tuple[float, int]:
-    """Tell how much of what was seen on one visit stands in what another visit to the same place saw to be free.
+    """Return how much of what was seen on one visit stands in what another visit to the same place saw to be free.
 
     Parameters
     ----------
-    clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) travelled distance, m. session : (k,) recording.
+    clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) travelled distance, m. recording : (k,) recording.
 
     Returns
     -------

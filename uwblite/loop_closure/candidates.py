@@ -1,4 +1,4 @@
-"""Which pairs of sub-maps are worth matching: those that may overlap for all the graph knows.
+"""Which pairs of sub-maps are worth matching: those that may overlap by the graph's covariance.
 
 Where the graph's own covariance of two sub-maps is small, they are candidates when they ought to share surfaces; where
 it is large, when they might.
@@ -32,7 +32,7 @@ class Candidates:
     spread: Floats
     """(c,) 3 sigma of its position, m."""
     constrained: bool = True
-    """Radio or known anchors hold the trajectory, so that its covariance is to be believed."""
+    """Ranges or given anchors constrain the trajectory, so that its covariance is reliable."""
 
     def rows(self, chosen: slice) -> "Candidates":
         """Return some of them."""
@@ -60,9 +60,9 @@ def propose(
     Parameters
     ----------
     graph, marginals : present estimates, and the uncertainty of the sub-maps' reference keyframes.
-    session : (k,) recording of each keyframe.
+    recording : (k,) recording of each keyframe.
     tried : (target, source, searched) of earlier rounds; not proposed again.
-    held : the trajectory is held by radio.
+    constrained : ranges constrain the trajectory.
     missed : (target, source) that did not match from the graph's guess though the graph may be wrong: searched with slack.
     """
     s = len(submaps)

@@ -45,7 +45,7 @@ class LoopClosureConfig:
     """A second place that matches this share as well as the first makes a search ambiguous."""
     slip: ClassVar[float] = 1.0
     """Standard deviation, m, added to the graph's guess where matching from it failed although the sub-maps ought to
-    overlap and no radio holds the trajectory: the wheels may have slipped. Such pairs are searched anew."""
+    overlap and no range constrains the trajectory: the wheels may have slipped. Such pairs are searched once more."""
     slip_angle: ClassVar[float] = 0.2
     """The same for the heading, rad."""
     consistency: ClassVar[float] = 16.0
@@ -67,7 +67,7 @@ class LoopClosureConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closures:
-    """Closures found so far: accepted edges between keyframes, and every candidate's story."""
+    """Closures found so far: accepted edges between keyframes, and the record of every candidate."""
 
     edges: RelativePoseEdges
     """One per accepted candidate, in their order."""

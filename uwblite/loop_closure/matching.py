@@ -1,4 +1,4 @@
-"""Where candidates for loop closures fit best: searched for, aligned, held against each other's free space.
+"""Where candidates for loop closures fit best: correlative search, alignment, comparison with each other's free space.
 
 Candidates are matched a few at a time, each batch with the sub-maps it needs: by one process after the other or by
 several, with the same outcome.
@@ -139,7 +139,7 @@ def _best_places(row: Ints, tries: Aligned, candidates: int) -> tuple[Ints, Floa
 
 
 def _prepare(clouds: Clouds, k: int, prepared: dict[int, PointCloud]) -> PointCloud:
-    """Return one sub-map's cloud ready for the search; its normals tell from which side it was seen."""
+    """Return one sub-map's cloud ready for the search; its normals point to the side it was seen from."""
     if k not in prepared:
         points, normals = clouds.cloud(k)
         prepared[k] = make_cloud(points, points + normals)

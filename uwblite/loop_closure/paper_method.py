@@ -40,7 +40,7 @@ def find(
     Parameters
     ----------
     graph : poses that place the sub-maps.
-    session : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
+    recording : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
     config : its partners bound the candidates per sub-map. icp : outlier distance, iterations and fitness.
     progress : called with (done, total).
     executor : any concurrent.futures executor; the result does not depend on it.
@@ -75,7 +75,7 @@ def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> 
 
     Parameters
     ----------
-    poses : (k, 3) of the keyframes. session : (k,).
+    poses : (k, 3) of the keyframes. recording : (k,).
     limit : most partners per sub-map, best overlap first.
     """
     shared = _shared(poses[submaps.reference], submaps)

@@ -1,9 +1,9 @@
-"""Loop closures: which sub-maps show the same place, and what that says of their poses.
+"""Loop closures: which sub-maps show the same place, and the edges that follow for their poses.
 
-Candidates come from where the graph believes the sub-maps to lie, widened by its own marginal covariance. Where that
+Candidates come from where the sub-maps lie by the graph, widened by its own marginal covariance. Where that
 is small, matching starts from the graph's guess; where it is large, a correlative search over the whole uncertainty
 comes first. A match then has to explain enough points, closely enough, agree with the graph's own uncertainty, be the
-only good one, see through no wall, and finally live in peace with all other closures in the second optimisation.
+only good one, violate no free space, and finally agree with all other closures in the second optimisation.
 Every candidate is kept, with the reason for its fate.
 """
 
@@ -41,7 +41,7 @@ def find(
     ----------
     candidates : see closure_candidates.propose. submaps : their clouds.
     progress : called with (done, total).
-    free : what each sub-map saw to be free, see sight.seen_free; None = no candidate is held to see through walls.
+    free : what each sub-map saw to be free, see visibility.observed_free_space; None = free-space violations are not tested.
     executor : any concurrent.futures executor; the result does not depend on it.
     """
     if not len(candidates.target):

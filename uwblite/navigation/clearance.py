@@ -106,7 +106,7 @@ def _squared_distances(obstacles: Bools, resolution: float) -> NDArray[np.float3
 
 
 def _specks(dark: Bools, resolution: float) -> Bools:
-    """Tell which unknown cells (rows, cols) belong to islands that are too small to matter."""
+    """Return which unknown cells (rows, cols) belong to islands that are too small to matter."""
     labels, _ = ndimage.label(dark)
     small = np.bincount(labels.ravel()) * resolution**2 < _SPECK
     return np.asarray(small[labels] & dark)

@@ -1,4 +1,4 @@
-"""A gyro's heading in place of the wheels': the wheels say how far, the gyro says which way."""
+"""A gyro's heading in place of the wheels': distances from the wheels, directions from the gyro."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ LEFT_OF_BIAS = 0.003
 SCALE = 0.02
 """Standard deviation of a gyro's scale, 1; data sheets of cheap ones say 1 to 3 %."""
 PER_TURN, PER_METRE = 0.005, 0.001
-"""Random error of heading per radian and per metre, rad: a gyro neither slips nor knows how far the robot goes."""
+"""Random error of heading per radian and per metre, rad: a gyro does not slip and measures no distance."""
 
 
 def settings(

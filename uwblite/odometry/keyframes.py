@@ -18,7 +18,7 @@ class KeyframeConfig:
     angle: float = 0.35
     """Turned angle after which a new keyframe begins, rad."""
     duration: float = 1.5
-    """Time in motion after which a new keyframe begins where there is a lidar, s: wheels that slip tell little of distance."""
+    """Time in motion after which a new keyframe begins where there is a lidar, s: wheels that slip hardly measure distance."""
     scans: int = 2
     """Scans gathered into the cloud of one keyframe, nearest in time first; more average the lidar's noise."""
 
@@ -48,7 +48,7 @@ class Keyframes:
     slack: Floats
     """(k-1, 3) standard deviation of the steps among them that were not measured, m, m, rad."""
     alone: Bools
-    """(k,) its cloud is of a single scan: a further one would be laid to it by an odometry that is not believed there."""
+    """(k,) its cloud is of a single scan: a further one would be laid to it by an odometry that is not reliable there."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -64,8 +64,8 @@ def select(
     odometry : n >= 1 samples.
     config : thresholds.
     breaks : steps that were not measured; a keyframe stands on either side of each.
-    scans : keyframes are then moments at which the lidar looked, for at no other moment does it measure a pose: what the
-        odometry says between two moments, and the jitter of both clocks, stays an edge of the graph and bends no cloud.
+    scans : keyframes are then moments of scans, for at no other moment does the lidar measure a pose: what the
+        odometry measures between two moments, and the jitter of both clocks, stays an edge of the graph and bends no cloud.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def _travelled(odometry: Odometry, moments: Floats, sample: Ints) -> tuple[Float
 
 def _moments(odometry: Odometry, scans: LaserScans | None) -> tuple[Floats, Ints, Bools]:
     """Return the moments (m,) at which a keyframe may be, s, the last odometry sample before each, and whether it is
-    preferred: moments at which the lidar looked."""
+    preferred: moments of scans."""
     stamps = odometry.stamps
     if scans is None:
         return stamps, np.arange(len(stamps)), np.ones(len(stamps), dtype=bool)

@@ -1,4 +1,4 @@
-"""Anchors that were moved while they were heard: from that moment on they have a second name.
+"""Anchors that were moved during a recording: from that moment on they have a second name.
 
 The detection needs a trajectory, not a map: it is made once odometry and ranges are optimised, and where the lidar has
 straightened the trajectory once more, always from the names as recorded. Ranges to places that are wrong bend a trajectory
@@ -62,7 +62,7 @@ _TOGETHER = 30.0
 
 
 def _alike(a: UwbRanges | None, b: UwbRanges | None, moves: Moves) -> bool:
-    """Tell whether ranges are called the same, but for a few at each move."""
+    """Return whether ranges are called the same, but for a few at each move."""
     if a is None or b is None:
         return True
     differ = np.asarray(a.anchor_ids)[a.anchor] != np.asarray(b.anchor_ids)[b.anchor]

@@ -54,7 +54,7 @@ class Applied:
     motion: Floats
     """(3,) T_new_old: what the frame was moved by."""
     moved: dict[str, float]
-    """Anchors that are not where they were said to be, by id: how far off they are, m."""
+    """Anchors that are not where they were given, by id: how far off they are, m."""
 
 
 def apply(given: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:
@@ -85,7 +85,7 @@ def apply(given: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed:
 
 
 def _present(given: Constraints, anchor_ids: tuple[str, ...]) -> Constraints:
-    """Return what concerns this recording; anchors of an earlier map that are not heard any more are left out."""
+    """Return what concerns this recording; anchors of an earlier map without ranges now are left out."""
     wanted = {a.id for a in given.anchors if not a.movable} | {name for d in given.distances for name in d.anchors}
     missing = sorted(wanted - set(anchor_ids))
     if missing:
@@ -178,7 +178,7 @@ def _closures(given: Constraints, clock: Clock) -> list[Edges]:
 
 
 def _gauge(given: Constraints, graph: Graph, moved: dict[str, float]) -> list[Edges]:
-    """Hold the heading of the first pose where one known place alone leaves it open."""
+    """Fix the heading of the first pose where one given place alone leaves it open."""
     if given.poses or sum(a.id not in moved for a in given.anchors) > 1:
         return []
     root = np.diag([0.0, 0.0, 1e4])[None]

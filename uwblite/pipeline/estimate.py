@@ -27,7 +27,7 @@ class Task:
     recordings: Recordings
     config: MappingConfig
     given: Constraints
-    """What the user knows beforehand."""
+    """What the user gave beforehand."""
     stages: Stages
     """Takes the stages' figures, warnings and doubts."""
     executor: Executor | None = None
@@ -37,7 +37,7 @@ class Task:
         return self if estimate.recordings is None else replace(self, recordings=estimate.recordings)
 
     def allowed(self, i: Ints, j: Ints) -> Bools:
-        """Tell which pairs of keyframes (e,), (e,) the user has not forbidden to match."""
+        """Return which pairs of keyframes (e,), (e,) the user has not forbidden to match."""
         return self.given.allowed(self.recordings.clock, i, j)
 
 

@@ -25,7 +25,7 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     """Put every measurement into the graph; where the lidar has refined it, poses and anchors get the weights that suit each.
 
     What all ranges from one direction are wrong by alike moves an anchor, and no number of them averages it out; but it
-    tells a pose nothing false, since the anchor's place absorbs it. So the ranges weigh by their own errors while poses are
+    gives a pose nothing false, since the anchor's place absorbs it. So the ranges weigh by their own errors while poses are
     estimated, and by the common ones as well where anchors are: without feedback from anchors to poses (M. Plummer, Cuts in
     Bayesian graphical models, 2015). The outliers stay those that were found while all ranges weighed little.
     """
@@ -72,7 +72,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
     config, stages = task.config, task.stages
 
     def announce(geometry: GridGeometry) -> None:
-        """Say what a large grid will take; the caller may still stop."""
+        """Report what a large grid will take; the caller may still stop."""
         if geometry.cells >= _LARGE_GRID:
             cells, megabytes = geometry.cells / 1e6, geometry.megabytes
             stages.report(f"occupancy grid of {cells:.0f} million cells, about {megabytes:.0f} MB", 0, 1)

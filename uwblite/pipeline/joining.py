@@ -113,7 +113,7 @@ def _laid_on(
     if len(common) < 2:
         raise DataError(
             f"{recording.name} shares {len(common)} placed anchors with the others ({', '.join(common) or 'none'}); two "
-            "or more are needed to bring it into their frame: map it alone, or record where common anchors are heard"
+            "or more are needed to bring it into their frame: map it alone, or record where common anchors are in reach"
         )
     here, there = (np.array([side[name][0] for name in common]) for side in (found, placed))
     spread = np.array([np.hypot(found[name][1], placed[name][1]) for name in common])

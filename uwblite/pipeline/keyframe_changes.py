@@ -1,4 +1,4 @@
-"""Keyframes that are moved in time or added after the first optimisation, and what was told from them before.
+"""Keyframes that are moved in time or added after the first optimisation, and what was reported from them before.
 
 The lidar's clock is known only once scans have been matched, and so is where the odometry needs more keyframes. Poses are
 then read off the trajectory; odometry and ranges are measurements of the recording and are made from it again.

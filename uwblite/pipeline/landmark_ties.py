@@ -1,6 +1,6 @@
-"""True distances between landmarks: what somebody measured between columns or corners makes the map as long as it says.
+"""True distances between landmarks: what somebody measured between columns or corners makes the map as long as measured.
 
-A landmark is a place in the map as it comes out before its distances are heard. The keyframes that see what stands there
+A landmark is a place in the map as it comes out before its distances are used. The keyframes that see what stands there
 carry it along: of each visit the one that saw most keeps the landmark's place in its own frame. A measured distance ties each
 visit of one landmark to each visit of the other, so that walls, wheels and calibration move with it; all ties together
 weigh as much as the one measurement that they are.
@@ -84,7 +84,7 @@ def sightings(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: Floa
 
 
 def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
-    """Return where one cloud has a column (2,): the place of the whole map tells where to look, the cloud is what was seen."""
+    """Return where one cloud has a column (2,): the place in the whole map gives where to look, the cloud what was seen."""
     near = points[np.hypot(*(points - place).T) < radius + _NEAR]
     centre = fit_circle(near, fit_circle(near, place, radius, 0.2), radius, 0.1)
     return centre if np.hypot(*(centre - place)) < _NEAR else place

@@ -52,7 +52,7 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
 def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
     """Return the estimate by odometry and a weak hold of the ranges, and the steps that the clouds measure from there.
 
-    False ranges would tear neighbours apart; with a weak hold, neighbours follow the odometry until clouds correct it.
+    False ranges would tear neighbours apart; with weak ones, neighbours follow the odometry until clouds correct it.
     """
     weak, config = _with_inflated_ranges(estimate), task.config
     whole = replace(weak, odometry=replace(weak.odometry, kernel=SQUARED)).odometry_and_ranges
@@ -73,7 +73,7 @@ def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
 def _without_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Steps]:
     """Cut the steps of the odometry that the clouds contradict at the scans within them, and measure those anew.
 
-    Where little happens between two scans, the second is found whatever the odometry says.
+    Where little happens between two scans, the second is found by any odometry.
     """
     scans, before = estimate.scans, task.recordings
     assert scans is not None
@@ -123,7 +123,7 @@ def _match_neighbours(estimate: Estimate, steps: Steps, task: Task) -> Estimate:
 
 
 def _with_inflated_ranges(estimate: Estimate) -> Estimate:
-    """Return the estimate with ranges that hold the trajectory only where nothing else does."""
+    """Return the estimate with ranges that constrain the trajectory only where nothing else does."""
     ranges = estimate.ranges
     return estimate if ranges is None else replace(estimate, ranges=replace(ranges, sigma=ranges.sigma * _INFLATION))
 
@@ -177,7 +177,7 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _matched_once_more(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimate:
-    """Match again where ranges that weigh by their own errors alone move poses: there the lidar hardly holds them."""
+    """Match again where ranges that weigh by their own errors alone move poses: there the lidar hardly constrains them."""
     config, settings = task.config, replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
     free = with_range_noise(estimate, config)
     moved = free.with_estimates_of(optimize(free.problem, config.solver)[0])

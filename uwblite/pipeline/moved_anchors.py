@@ -71,7 +71,7 @@ def _differ(off: Floats, covariance: Floats) -> bool:
 def _places_by_recording(
     estimate: Estimate, recording_of: Ints, solver: SolverConfig, noise: RangeNoiseConfig
 ) -> tuple[Floats, Floats, Ints]:
-    """Return place (p, 2), covariance (p, 2, 2) and (anchor, recording) of each anchor as each recording heard it."""
+    """Return place (p, 2), covariance (p, 2, 2) and (anchor, recording) of each anchor in each recording."""
     ranges, graph = estimate.ranges, estimate.graph
     assert ranges is not None
     assert graph.fixed_calibration is not None

@@ -1,4 +1,4 @@
-"""What speaks against a result: warnings and doubts from the estimates themselves.
+"""Plausibility of a result: warnings and doubts from the estimates themselves.
 
 Each check adds its notices to the task's stages; docs/formats.md lists their kinds.
 """
@@ -118,7 +118,7 @@ def check_calibration(
 def check_handedness(estimate: Estimate, task: Task) -> None:
     """Doubt a map whose ranges or scans fit only where the odometry's turns are scaled grossly.
 
-    Ranges alone do not tell a map from its mirror image: a trajectory mirrored together with its anchors has the same
+    Ranges alone do not distinguish a map from its mirror image: a trajectory mirrored together with its anchors has the same
     ranges. Only the sign of the odometry's turns does, and a laser, or given anchors. Where turns must be scaled by a
     factor far from 1, by minus that factor the mirror image fits as well, and nothing decides the sign. A laser that
     sees the turns go the other way may itself be upside down.

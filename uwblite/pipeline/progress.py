@@ -43,11 +43,11 @@ class Stages:
         self.doubts.append(Notice(kind, text, figures))
 
     def mark(self) -> tuple[int, int]:
-        """Return how much was said so far."""
+        """Return how much was reported so far."""
         return len(self.warnings), len(self.doubts)
 
     def back_to(self, mark: tuple[int, int]) -> None:
-        """Forget what was said since, because the stages that said it run again."""
+        """Forget what was reported since, because the stages that reported it run again."""
         del self.warnings[mark[0] :], self.doubts[mark[1] :]
 
     def end(self, stage: str, **figures: object) -> None:

@@ -120,7 +120,7 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
             task.stages.warn(
                 "odometry-unit",
                 f"{whose}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its "
-                "odometry says: the unit of the wheels is wrong; the odometry was multiplied by that",
+                "odometry has: the unit of the wheels is wrong; the odometry was multiplied by that",
                 recording=recording.number + 1, factor=round(factor, 4),
             )  # fmt: skip
     return factors

@@ -43,7 +43,7 @@ class Recording:
 
     @property
     def anchor_ids(self) -> tuple[str, ...]:
-        """Names of the anchors it heard."""
+        """Names of the anchors to which it has ranges."""
         return self.log.ranges.anchor_ids if self.log.ranges is not None else ()
 
     @property

@@ -1,7 +1,7 @@
 """Tests of each kind of measurement against the joint estimate: what noise cannot explain is a doubt.
 
-Every test compares what the estimate leaves with what the sensor itself says of its noise, over stretches of time, and
-knows of no particular fault.
+Every test compares the residuals of the estimate with the sensor's own noise, over stretches of time, and
+is made for no particular fault.
 """
 
 import numpy as np
@@ -85,13 +85,13 @@ def check_scales(estimate: Estimate, task: Task) -> None:
     place = calibration.index(RANGE_SCALE)
     scale = 1.0 + (float(calibration.values[place]) if place >= 0 else 0.0)
     if estimate.placed.any() and abs(scale - 1.0) > _SCALE:
-        text = f"the ranges are {scale:.2f} times what the lidar's map says: one of the two has a wrong unit or scale"
+        text = f"the ranges are {scale:.2f} times those in the lidar's map: one of the two has a wrong unit or scale"
         task.stages.doubt("scales", text, ranges_by_lidar=scale)
     screenings = [recording.log.screening for recording in task.recordings.each]
     ratios = np.array([s.lidar_by_wheels for s in screenings if s is not None])
     off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _WAYS)]
     if len(off):
-        outcome = "the ranges agree with the wheels" if estimate.placed.any() else "nothing tells which of the two is right"
+        outcome = "the ranges agree with the wheels" if estimate.placed.any() else "nothing shows which of the two is right"
         text = (
             f"the lidar sees {off[0]:.2f} times the way that the wheels count, and {outcome}: the map has the lidar's scale; "
             "check the units of both"

@@ -13,7 +13,7 @@ from .mapping_config import MappingConfig
 from .recordings import Recording, Recordings
 
 _BLOCK = 32
-"""Keyframes whose rays are held in memory at once."""
+"""Keyframes whose rays are in memory at once."""
 
 
 def make(recordings: Recordings, config: MappingConfig, delay: float) -> ScanClouds:

@@ -92,7 +92,7 @@ def _anchor(
     own = residuals[ranges.anchor == k]
     # A share by distance, not by kernel weight: effective sigmas are wide where ranges repeat each other.
     used = float(np.mean(np.abs(own) < limit))
-    # The bias in the first recording that heard it; in the others it is theirs, see the calibration.
+    # The bias in the first recording with ranges to it; in the others it is theirs, see the calibration.
     bias_at = int(ranges.calibration[np.argmax(ranges.anchor == k), 1])
     bias = float(graph.calibration.values[bias_at]) if bias_at >= 0 else 0.0
     bias_sigma = float(covariance.calibration[bias_at]) if bias_at >= 0 else 0.0
@@ -113,7 +113,7 @@ def _distrusted(anchor: AnchorEstimate) -> AnchorEstimate:
 
 
 def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:
-    """Tell of anchors that were moved since when each place holds."""
+    """Report of anchors that were moved from when on each place holds."""
     bases = [name_and_number(a.id)[0] for a in anchors]
     if ranges is None or len(set(bases)) == len(bases):
         return anchors

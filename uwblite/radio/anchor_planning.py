@@ -1,6 +1,6 @@
 """Where further anchors help most: dilution of precision over the free space of a map.
 
-A range of standard deviation s from a point p to an anchor at a tells the position of p along u = (p - a) / |p - a|: it adds
+A range of standard deviation s from a point p to an anchor at a measures the position of p along u = (p - a) / |p - a|: it adds
 u u^T / s^2 to the information about p. With I(p) the sum over the anchors and a weak prior,
 
     error(p) = sqrt(trace((I(p) + 1 / s_0^2)^-1)),
@@ -21,7 +21,7 @@ from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 SIGMA_LINE_OF_SIGHT, SIGMA_BEHIND_WALLS = 0.1, 0.5
 """m; of a range in line of sight, and of one through walls, whose delay is not known."""
 _PRIOR = 3.0
-"""m; how well the position is known without ranges: it bounds the error where no anchor is heard."""
+"""m; how well the position is known without ranges: it bounds the error where no anchor is in reach."""
 _CELL = 0.2
 """m; the map is looked at in cells at least this large."""
 _MOST_POINTS, _MOST_CANDIDATES = 1500, 400
@@ -38,7 +38,7 @@ class AnchorPlan:
     places: Floats
     """(n, 2) m, map frame, the most useful first."""
     points: Floats
-    """(m, 2) m, places of the free space at which the error is told."""
+    """(m, 2) m, places of the free space at which the error is given."""
     errors: Floats
     """(n + 1, m) m, expected error of a position: with today's anchors, with the first new one, ..."""
 
@@ -51,7 +51,7 @@ def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: flo
     grid : the map; anchors are put on walls next to free space, or into the free space where there are no walls.
     anchors : (a, 2) today's anchors, m.
     count : how many more.
-    reach : m up to which a radio is heard.
+    reach : m up to which a radio reaches.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def position_errors(information: Floats) -> Floats:
 
 
 def _information(points: Floats, anchors: Floats, line_of_sight: Bools, reach: float) -> Floats:
-    """Return what a range to each anchor tells at each point (a, m, 3): xx, xy, yy, 1/m^2."""
+    """Return the information of a range to each anchor at each point (a, m, 3): xx, xy, yy, 1/m^2."""
     away = points[None] - anchors[:, None]
     distance = np.maximum(np.hypot(away[..., 0], away[..., 1]), 1e-3)
     weight = np.where(line_of_sight, SIGMA_LINE_OF_SIGHT, SIGMA_BEHIND_WALLS) ** -2.0 * (distance <= reach)
@@ -126,7 +126,7 @@ def _best(base: Floats, gains: Floats, taken: Bools) -> int:
 
 
 def _near(places: Floats, others: Floats) -> Bools:
-    """Tell which places (n, 2) are nearer to one of the others than anchors should be."""
+    """Return which places (n, 2) are nearer to one of the others than anchors should be."""
     if len(others) == 0:
         return np.zeros(len(places), dtype=np.bool_)
     return np.asarray((np.linalg.norm(places[:, None] - others[None], axis=2) < _APART).any(axis=1))
@@ -162,7 +162,7 @@ def _wall_cells(blocked: Bools, free: Bools) -> Ints:
 
 
 def _line_of_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
-    """Tell from which sources (a, 2) which targets (m, 2) are in sight (a, m).
+    """Return for which sources (a, 2) which targets (m, 2) are in sight (a, m).
 
     The first cell on the way is no obstacle: an anchor whose place is known to a decimetre may lie in its own wall.
     """

@@ -13,8 +13,8 @@ from .trilateration import TrilaterationConfig, trilaterate
 def place_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> tuple[Graph, tuple[int, ...]]:
     """Return the graph with a position for each anchor that has none, and the anchors that could not be placed.
 
-    The poses are taken as they are; anchors without a position are found from their ranges alone (anchors.locate).
-    Those that cannot be found are held at the origin with their ranges switched off.
+    The poses are taken as they are; anchors without a position are found from their ranges alone (trilateration.trilaterate).
+    Those that cannot be found are fixed at the origin with their ranges switched off.
     """
     missing = np.flatnonzero(~np.isfinite(graph.anchors).all(axis=1))
     if not len(missing):

@@ -1,9 +1,9 @@
-"""Starting values from nothing: the trajectory and the anchors grow together, outwards from the best stretch.
+"""Starting values from nothing: trajectory and anchors together, outwards from the best stretch.
 
 Raw odometry of a long run is too bent to linearise about, and anchors of unknown position cannot straighten it
 before they are placed. So the stretch whose anchors are clearest comes first; from there the interval of known
-poses grows at both ends. Each piece is laid on by the calibrated odometry, pulled onto the anchors already placed
-(graduated kernel: wide first, then tight), and whenever the interval has grown by a share, all of it is solved
+poses extends at both ends. Each piece is laid on by the calibrated odometry, pulled onto the anchors already placed
+(graduated kernel: wide first, then tight), and whenever the interval has become longer by a share, all of it is solved
 again and anchors not yet placed are searched from the poses so far.
 """
 
@@ -25,18 +25,18 @@ from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, tri
 
 @dataclass(frozen=True, slots=True)
 class BootstrapConfig:
-    """How the first estimate grows."""
+    """Bootstrap of the first estimate."""
 
     seed_distances: ClassVar[tuple[float, ...]] = (25.0, 10.0, 4.0, 60.0, 150.0)
     """Travelled distances of the first stretch, m, tried in this order until the anchors in it are clear; then all of it."""
     piece: ClassVar[float] = 0.3
     """Distance laid on at once, as a share of the first stretch; more where the prediction holds."""
     resolve_factor: ClassVar[float] = 1.35
-    """All poses so far are solved again when their number has grown by this factor."""
+    """All poses so far are solved again when their number has increased by this factor."""
     range_sigma: float = setting(0.15, advanced=True)
     """Assumed standard deviation of ranges until it is learnt, m."""
     least_sigma: ClassVar[float] = 0.05
-    """Ranges are not trusted below this while it grows, m."""
+    """Least standard deviation of ranges meanwhile, m."""
     drift: ClassVar[float] = 0.015
     """Assumed drift of the odometry per travelled metre, m/m."""
     heading_scales: ClassVar[tuple[float, ...]] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
@@ -75,7 +75,7 @@ def bootstrap_graph(
 ) -> BootstrapResult:
     """Estimate poses and anchor positions without any guess of the anchors.
 
-    Where the ranges do not agree in the end, the growth is tried again with other hypotheses of a gross heading error;
+    Where the ranges do not agree in the end, the bootstrap is tried again with other hypotheses of a gross heading error;
     the one that the ranges like best wins.
 
     Parameters
@@ -114,7 +114,7 @@ def _with(calibration: Calibration, name: str, value: float) -> Calibration | No
 
 
 class _Bootstrap:
-    """One growth: the poses in [low, high) are known, the anchors in `placed` have a position."""
+    """One attempt: the poses in [low, high) are known, the anchors in `placed` have a position."""
 
     def __init__(
         self, graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: BootstrapConfig,
@@ -131,7 +131,7 @@ class _Bootstrap:
         self.low = self.high = 0
 
     def run(self) -> None:
-        """Grow from the clearest stretch to the whole path."""
+        """Extend from the clearest stretch to the whole path."""
         piece = self.config.piece * self._seed()
         smallest = 0.3 * piece
         if self.placed.any():
@@ -151,7 +151,7 @@ class _Bootstrap:
                 self._put(anchor, hypotheses[0])
 
     def estimate(self) -> BootstrapResult:
-        """Return what was grown."""
+        """Return the estimate of this attempt."""
         final = replace(self.graph, poses=self.poses, anchors=self.anchors, calibration=self.calibration)
         found = tuple(tuple(self.hypotheses.get(k, ())) for k in range(len(self.placed)))
         return BootstrapResult(final, self.placed, found, self.doubtful)
@@ -206,7 +206,7 @@ class _Bootstrap:
         return found
 
     def _adopt(self, found: dict[int, list[AnchorHypothesis]]) -> bool:
-        """Place the anchors of which one hypothesis stands out; remember all; tell whether any was placed."""
+        """Place the anchors of which one hypothesis stands out; remember all; return whether any was placed."""
         any_new = False
         for anchor, hypotheses in found.items():
             if hypotheses:
@@ -222,7 +222,7 @@ class _Bootstrap:
         self.placed[anchor] = True
 
     def _extend(self, piece: float) -> bool:
-        """Lay on one piece at each open end by calibrated odometry; tell whether it agreed with the anchors as it was."""
+        """Lay on one piece at each open end by calibrated odometry; return whether it agreed with the anchors as it was."""
         motion = self.odometry.corrected(replace(self.graph, calibration=self.calibration))
         held = True
         if self.high < len(self.path):
@@ -239,7 +239,7 @@ class _Bootstrap:
         return held
 
     def _optimise_piece(self, low: int, high: int, held: int) -> bool:
-        """Optimise the poses of [low, high) with one of them, the anchors and the calibration held.
+        """Optimise the poses of [low, high) with one of them, the anchors and the calibration fixed.
 
         Returns True where the ranges agreed with the prediction; then nothing is moved.
         """

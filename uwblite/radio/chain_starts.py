@@ -1,7 +1,7 @@
 """Starting places for the chains of several robots that nothing but ranges ties together.
 
 Each chain is taken as rigid, as its odometry has it. Chains are placed one after another, the best tied first: for every
-heading R on a circle of starts, a range d from its point b to a placed point a says |a - R b - t| = d, which is
+heading R on a circle of starts, a range d from its point b to a placed point a means |a - R b - t| = d, which is
 trilateration of t; squared, |p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t and |t|^2. Gauss-Newton steps in
 heading and place follow, with Cauchy weights, for odometry drifts and some ranges are wrong. Several hypotheses are kept
 from chain to chain; which is right is for the optimisation of the whole graph to say.

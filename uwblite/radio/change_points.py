@@ -1,4 +1,4 @@
-"""Anchors that were moved while they were heard: two places explain what one place cannot.
+"""Anchors that were moved during a recording: two places explain what one place cannot.
 
 With the path of the tag known well enough, all ranges to an anchor are explained by one place, or those until some moment
 by one place and those after it by another. The second explanation has three numbers and the moment more, and must be
@@ -19,7 +19,7 @@ _ROUNDS = 6
 _LEAST_RANGES = 20
 """Ranges on either side of a moment."""
 _LEAST_MOVE = 0.8
-"""Shorter moves are told from blocked sight by nothing, m."""
+"""Shorter moves cannot be distinguished from a blocked line of sight, m."""
 _SIGMAS = 5.0
 """Standard deviations of the two places, together, that a move must exceed."""
 _WORSE = 0.3

@@ -5,7 +5,7 @@ bent path, the basin is lost after a few thousand poses. But the guess of the ne
 known already, is always near. So poses are added in pieces. Each time the last few hundred are optimised while older
 ones hold them; the whole is optimised again when it is longer by half, or when the last part does not fit.
 
-An anchor joins when the ranges heard so far place it, and leaves again when later ranges contradict it: the mirror
+An anchor joins when the ranges so far place it, and leaves again when later ranges contradict it: the mirror
 image of an anchor passed on one side is often found, and is recognised only after a turn.
 
 A part fits when its chi2 per degree of freedom exceeds the usual by less than five standard deviations, chi2 over dof
@@ -37,7 +37,7 @@ class IncrementalConfig:
     piece: int = 100
     """Poses added at once; over so many the guess may not bend by more than about a radian."""
     window: int = 400
-    """Poses optimised after each piece, older ones held."""
+    """Poses optimised after each piece, older ones fixed."""
     widening: int = 4
     """Factor on the window where it does not fit."""
     resolve_factor: float = 1.5
@@ -45,7 +45,7 @@ class IncrementalConfig:
     significance: float = 5.0
     """Standard deviations by which chi2 may exceed the usual."""
     probation: int = 400
-    """Poses after which an anchor that joined is no longer the first suspect."""
+    """Poses after which an anchor that joined is no longer the first to be left out."""
     min_ranges: int = 20
     """Ranges before an anchor is searched."""
     max_position_sigma: float = 0.5
@@ -78,7 +78,7 @@ def optimize_incrementally(
 
     Parameters
     ----------
-    graph : its guess of the anchors is used only for those that are held, have a prior, or are in no range edges.
+    graph : its guess of the anchors is used only for those that are fixed, have a prior, or are in no range edges.
     config : settings.
     progress : called with (poses done, poses) after every piece.
 

@@ -3,15 +3,15 @@
 Most radios are sound: their clocks are right to parts of a million and the maker calibrated the antennas to a few
 centimetres. Some are not: scales 7 % off and biases of a metre and more are on record. A prior wide enough for those
 leaves the others' anchors and the map's scale hanging in the air, wherever bias and distance look alike along a path.
-So the priors' standard deviations are chosen by the evidence, the probability of all measurements with the unknowns
+So the priors' standard deviations are chosen by marginal likelihood, the probability of all measurements with the unknowns
 integrated out (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
 Units of length: a radio measures times of flight and cannot be wrong by much, a wheel's radius is a setting and can be
 wrong by any factor. Three hypotheses are weighed: both are right, the radio's scale is off, the wheels' unit is wrong.
-The likeliest one holds, with its prior odds; where nothing speaks against it, the first. Biases: widths from sound to
-unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the evidence.
+The likeliest one holds, with its prior odds; where nothing contradicts it, the first. Biases: widths from sound to
+unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the marginal likelihood.
 
-With the posterior N(a, P) found under the prior N(0, D), the evidence of another prior N(0, D') is, relative to it,
+With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 
     2 log Z = h^T J^-1 h - a^T P^-1 a - log|J| - log|P| - log|D'| + log|D|,   J = P^-1 + D'^-1 - D^-1,   h = P^-1 a.
 """
@@ -36,7 +36,7 @@ _FARTHEST = 0.12
 
 
 def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
-    """Return the graph with the priors of units of length and biases as wide as the evidence wants them.
+    """Return the graph with the priors of units of length and biases of greatest marginal likelihood.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats)
 
 
 def log_marginal_likelihood(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> float:
-    """Return the logarithm of the evidence of other prior standard deviations, relative to those in use.
+    """Return the logarithm of the marginal likelihood of other prior standard deviations, relative to those in use.
 
     Parameters
     ----------

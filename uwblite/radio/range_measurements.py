@@ -29,7 +29,7 @@ def range_edges(
     first : the graph's number of the recording's first pose.
     anchor_ids : names of the graph's anchors; attached.anchor indexes them.
     sigma : m, for all ranges until noise is learnt.
-    search : says which readings can be distances. kernel : robust kernel of all ranges.
+    search : decides which readings can be distances. kernel : robust kernel of all ranges.
     """
     above = [mounting.height_difference(a) for a in anchor_ids]
     given = np.array([height or 0.0 for height in above])
@@ -52,7 +52,7 @@ def range_edges(
 
 
 def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: TrilaterationConfig) -> Graph:
-    """Return the graph with anchors moved to where clearly more of their ranges agree, its poses being trusted.
+    """Return the graph with anchors moved to where clearly more of their ranges agree, its poses being fixed.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ class RangeNoiseConfig:
     correlation_length: float = setting(1.5, advanced=True)
     """Distance over which the slow part stays alike, m, before it is learnt."""
     min_sigma: float = setting(0.03, advanced=True)
-    """No radio of this kind is trusted beyond this, m."""
+    """Largest standard deviation of such radios, m."""
     steady: float = 0.06
     """Standard deviation of what an anchor's errors have in common in one direction and at one distance from it, m: radiation
     patterns and received power alone make so much, and no residual shows what a wrong place of the anchor explains as well."""
@@ -143,7 +143,7 @@ def _fit(
 
 
 def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None = None) -> Floats:
-    """Return the standard deviation (m,) to give each of one anchor's ranges so that all together weigh what they know.
+    """Return the standard deviation (m,) to give each of one anchor's ranges so that all together weigh what they measure.
 
     Parameters
     ----------

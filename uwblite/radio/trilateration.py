@@ -51,7 +51,7 @@ class AnchorHypothesis:
 
 
 def usable(ranges: Floats, config: TrilaterationConfig) -> Bools:
-    """Tell which readings (m,) can be distances at all: positive, finite, below max_range."""
+    """Return which readings (m,) can be distances at all: positive, finite, below max_range."""
     return np.isfinite(ranges) & (ranges > 0.02) & (ranges < config.max_range)
 
 
@@ -63,7 +63,7 @@ def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift
     path : (m, 2) positions of the tag at the ranges, m.
     ranges : (m,) m, usable ones.
     config : search settings.
-    drift : expected error of the path within this stretch, m; ranges are not trusted below it.
+    drift : expected error of the path within this stretch, m; a lower bound of the ranges' standard deviation.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift
 
 
 def ambiguous(hypotheses: list[AnchorHypothesis], config: TrilaterationConfig) -> bool:
-    """Tell whether the second hypothesis explains the ranges about as well as the first."""
+    """Return whether the second hypothesis explains the ranges about as well as the first."""
     return len(hypotheses) > 1 and hypotheses[1].cost - hypotheses[0].cost < config.ambiguity
 
 

@@ -23,7 +23,7 @@ _MOST_SPREAD = 2.0
 _MARGIN = 0.8
 """m; free border around what is drawn."""
 _ANCHOR_REACH = 100.0
-"""m; an anchor is heard no farther away than this and the extent of the path."""
+"""m; no anchor is reached farther away than this and the extent of the path."""
 _SMALLEST = 240
 """Pixels; the picture is at least this wide and high, so that the strip below has room."""
 

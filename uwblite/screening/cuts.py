@@ -38,7 +38,7 @@ def found(log: SensorLog) -> Floats:
 
 
 def same_place(log: SensorLog, before: float, after: float) -> bool | None:
-    """Tell whether the last scan before a time and the first after another show one place; None where there are none."""
+    """Return whether the last scan before a time and the first after another show one place; None where there are none."""
     if log.scans is None or len(log.scans.stamps) < 2:
         return None
     middle = middle_stamps(log.scans)

@@ -16,14 +16,14 @@ _AGREEMENT, _CLEARLY = 0.7, 0.2
 _TURNS = 300
 """Scan pairs looked at for the way up of the laser."""
 _LEAST_TURNED, _CONCENTRATED = 0.3, 0.8
-"""Angle, rad, by which a laser looks elsewhere than told, and the share of the motions' directions that must agree on it."""
+"""Angle, rad, by which a laser points elsewhere than given, and the share of the motions' directions that must agree on it."""
 _CLEAR_WAY, _CLEAR_TURN = 0.05, 0.3
 """Pairs of scans with a longer way, m, and a smaller turn, rad, show the direction of driving."""
 _LEAST_PAIRS = 15
 
 
 def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Return the recording with a heading that counts the way the path turns; where there is a lidar it says which is right."""
+    """Return the recording with a heading that counts the way the path turns; a lidar decides which is right."""
     plain, varied = heading_agreement(log.odometry)
     if not varied or plain >= _AGREEMENT or heading_agreement(log.odometry, -1.0)[0] < plain + _CLEARLY:
         return log, []
@@ -34,7 +34,7 @@ def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     one_fits = fits[best] > 0.0
     text = f"the odometry's heading turns against its path: {best} was changed"
     if not one_fits:
-        text += ", and nothing tells whether the map is the place or its mirror image"
+        text += ", and nothing shows whether the map is the place or its mirror image"
     return tried[best], [Remark("heading-against-path", text)]
 
 
@@ -43,7 +43,7 @@ def _scaled(odometry: Odometry, factor: Floats) -> Odometry:
 
 
 def _fits_laser(log: SensorLog) -> float:
-    """Return 1 where the laser's turns agree with the wheels', -1 where they are the other way round, 0 where none tell."""
+    """Return 1 where the laser's turns agree with the wheels', -1 where they are the other way round, 0 where none decides."""
     seen = None if log.scans is None or not len(log.scans.stamps) else laser_mounting.compare(log, _TURNS)
     if seen is None or not seen.agree:
         return 0.0
@@ -54,21 +54,21 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     """Return the recording with the laser the way up that its turns show.
 
     A laser upside down, beams in the wrong order and swapped wheels look alike: scans and wheels turn opposite ways. The first
-    two are repaired so; the third would give the mirror image of the place, and nothing in the recording tells.
+    two are repaired so; the third would give the mirror image of the place, and nothing in the recording shows which.
     """
     if _fits_laser(log) >= 0.0:
         return log, []
     flipped = not log.mounting.laser_flipped
     text = (
         f"laser and wheels turn opposite ways: the laser was taken as mounted {'upside down' if flipped else 'upright'}, "
-        "not as told; if the wheels are swapped instead, the map is a mirror image: settle it by "
+        "not as given; if the wheels are swapped instead, the map is a mirror image: decide it by "
         f"{'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
     )
     return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [Remark("laser-turned-over", text, doubt=True)]
 
 
 def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
-    """Return the recording with the laser looking where the driving shows, where that is far from what was told."""
+    """Return the recording with the laser looking where the driving shows, where that is far from what was given."""
     way = [np.hypot(m[:, 0], m[:, 1]) for m in (pairs.lidar, pairs.wheels)]
     clear = pairs.measured & (np.minimum(*way) > _CLEAR_WAY) & (np.abs(pairs.lidar[:, 2]) < _CLEAR_TURN)
     if clear.sum() < _LEAST_PAIRS:
@@ -85,7 +85,7 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
     if _lever_error(pairs, clear, given, around) < _lever_error(pairs, clear, given, turned):
         mount, tags = around, np.column_stack([se2.rotate(np.full(len(tags), angle), tags[:, :2]), tags[:, 2]])
     text = (
-        f"the laser looks {np.degrees(angle):+.0f} degrees away from what was told, or the wheels drive that way; it was taken "
+        f"the laser looks {np.degrees(angle):+.0f} degrees away from its given pose, or the wheels drive so; it was taken "
         f"so: --laser-pose={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}"
     )
     mounting = replace(log.mounting, T_base_laser=mount, tag_position=tags[0], more_tags=tags[1:])

@@ -56,7 +56,7 @@ class Motion:
         return Motion(steps, span, np.array([min(most[0], 3.0 * FASTEST), most[1]]))
 
     def jumps(self) -> Bools:
-        """Tell which steps (n-1,) no motion explains."""
+        """Return which steps (n-1,) no motion explains."""
         length, turn = np.hypot(self.steps[:, 0], self.steps[:, 1]), np.abs(self.steps[:, 2])
         time = self.span + 2.0 * float(np.median(self.span)) if len(self.span) else self.span
         return (length > _LEAST_JUMP + self.speed[0] * time) | (turn > _LEAST_SPIN + self.speed[1] * time)

@@ -1,7 +1,7 @@
 """Do the ranges change by more than the robot moves? By the triangle inequality no anchor's range can.
 
 Medians of a few readings of one anchor are compared over a time: their difference is at most the way that the wheels
-count, apart from noise and blocked sight. Where several anchors exceed that together, the wheels have missed a motion.
+count, apart from noise and a blocked line of sight. Where several anchors exceed that together, the wheels missed a motion.
 """
 
 import numpy as np
@@ -14,15 +14,15 @@ _WINDOW = 3
 _LONG = 8
 """Readings over which a jump must last."""
 _SILENCE = 6.0
-"""Usual periods of an anchor after which a jump says nothing of when the robot moved."""
+"""Usual periods of an anchor after which a jump does not show when the robot moved."""
 _STRETCH = 1.5
 """Factor by which wheels may count too little."""
 _MARGIN = 0.5
-"""Change, m, that blocked sight explains."""
+"""Change, m, that a blocked line of sight explains."""
 _TIMES_NOISE = 5.0
 """Standard deviations of one reading that a median never is off."""
 _LEAST_VOTES = 2
-"""Anchors that must agree, where so many are heard."""
+"""Anchors that must agree, where so many are in reach."""
 _USABLE = (0.02, 200.0)
 """Readings outside are no distances, m."""
 

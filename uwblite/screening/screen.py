@@ -16,7 +16,7 @@ _GAP = 2.0
 _STANDS = (0.05, 0.05)
 """Way, m, and turn, rad, below which the wheels say that the robot stood meanwhile."""
 _SHORTEST_PATH = 2.0
-"""A shorter drive shows little of anything, m."""
+"""A shorter path shows little of anything, m."""
 _ANYWHERE = (20.0, 20.0, 3.0)
 """Standard deviation of a step that nothing measured, m, m, rad."""
 _STEP = 2.0
@@ -33,7 +33,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     Parameters
     ----------
     log : any recording.
-    turn_laser : take the laser as mounted the way that its scans show, not as told.
+    turn_laser : take the laser as mounted the way that its scans show, not as given.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _sorted(breaks: list[OdometryBreaks]) -> OdometryBreaks:
 
 
 def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
-    """Judge silences of the odometry: did the robot stand, drive on, or was it carried?"""
+    """Classify gaps of the odometry: did the robot stand, drive on, or was it carried?"""
     stamps, poses = log.odometry.stamps, log.odometry.poses
     span = np.diff(stamps)
     period = float(np.median(span[span > 0])) if np.any(span > 0) else 0.0
@@ -136,13 +136,13 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
 
 
 def _elsewhere(log: SensorLog, a: float, b: float) -> bool:
-    """Tell whether lidar or radio find the robot elsewhere after a time in which the wheels stood."""
+    """Return whether lidar or radio find the robot elsewhere after a time in which the wheels stood."""
     same = cuts.same_place(log, a, b)
     return not same if same is not None else range_motion.excess(log, a, b) > 0.0
 
 
 def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
-    """Leave out what was seen and heard while nobody knows where the robot was."""
+    """Leave out scans and ranges of times at which the robot's place is unknown."""
 
     def kept(stamps: Floats) -> Bools:
         inside = np.zeros(len(stamps), dtype=bool)

@@ -84,7 +84,7 @@ def _runs(flags: Bools) -> list[tuple[int, int]]:
 
 
 def _in_runs(flags: Bools, least: int) -> Bools:
-    """Tell which set flags stand in runs of at least so many."""
+    """Return which set flags stand in runs of at least so many."""
     long = np.zeros(len(flags), dtype=bool)
     for first, last in _runs(flags):
         long[first:last] = last - first >= least

@@ -1,4 +1,4 @@
-"""Units that are plainly wrong, told by name before anything is computed with them."""
+"""Units that are plainly wrong, named before anything is computed with them."""
 
 import numpy as np
 
@@ -47,7 +47,7 @@ def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, b
     Returns
     -------
     |mean exp(2 i (direction - factor heading))|, 1 for wheels that do not slide, forwards or backwards, near 0 for a wrong
-    unit or sign; and whether the path turns enough to tell.
+    unit or sign; and whether the path turns enough to decide.
     """
     xy, heading = odometry.poses[:, :2], np.unwrap(odometry.poses[:, 2])
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])

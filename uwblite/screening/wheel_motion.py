@@ -1,4 +1,4 @@
-"""Do wheels and lidar tell of the same motion, stretch by stretch? And what stands in for wheels that stand still.
+"""Do wheels and lidar measure the same motion, stretch by stretch? And what stands in for wheels that stand still.
 
 Pairs of scans a moment apart, spread over the recording, are matched and compared with the odometry of the same moment.
 One factor for all ways and one for all turns is calibration, and taken out before. What then remains over a stretch is a
@@ -41,7 +41,7 @@ _ABSOLUTE, _RELATIVE = (0.05, 0.06), 0.35
 _SEEN_MOVING = (0.03, 0.03)
 """Motion between the scans of a pair that is no noise, m and rad."""
 _MOST = 0.6
-"""Share of a stretch's pairs from which it is told."""
+"""Share of a stretch's pairs from which it is reported."""
 _LEAST_PAIRS, _LEAST_SECONDS = 6, 6.0
 """Pairs and seconds of a sustained disagreement."""
 
@@ -151,7 +151,7 @@ def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
 
 
 def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
-    """Return a doubt where wheels and lidar tell of different motions for long, one factor for all taken out."""
+    """Return a doubt where wheels and lidar measure different motions for long, one factor for all taken out."""
     own = pairs.rows(pairs.measured)
     if len(own.start) < 4 * _LEAST_PAIRS:
         return []
@@ -169,7 +169,7 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
     when = ", ".join(f"t = {a - start:.0f} to {b - start:.0f} s" for a, b in runs[:3])
     more = f", and {len(runs) - 3} more stretches" if len(runs) > 3 else ""
     text = (
-        f"wheels and lidar tell of different motions ({when}{more}): one of the two stands still, slips or is wrong by another "
+        f"wheels and lidar measure different motions ({when}{more}): one of the two stands still, slips or is wrong by another "
         "factor there than elsewhere"
     )
     return [Remark("wheels-against-lidar", text, doubt=True)]

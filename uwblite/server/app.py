@@ -39,8 +39,8 @@ class Job(Protocol):
     def code(self) -> int | None:
         """Return its exit code; None while it runs."""
 
-    def said(self) -> str:
-        """Return the last thing it said."""
+    def output(self) -> str:
+        """Return the last line of its output."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ class App:
             "runs": [described(run, self.edits) for run in self.runs],
             "edits": edited,
             "constraints": self.constraints.name,
-            "job": None if self.job is None else {"code": self.job.code(), "said": self.job.said()},
+            "job": None if self.job is None else {"code": self.job.code(), "output": self.job.output()},
         }
 
     def _post(self, path: str, body: bytes) -> Response:

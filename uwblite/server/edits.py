@@ -11,7 +11,7 @@ from ..errors import ConfigError
 from ..io.constraints_file import parse_constraints
 from ..io.stored_result import StoredClosure
 
-MARK = "# Below this line: made by uwblite view, which writes it anew. Constraints of your own belong above."
+MARK = "# Below this line: made by uwblite view, which writes it again. Constraints of your own belong above."
 _FORCED_SIGMA = (0.1, 0.1, 0.05)
 """m, m, rad; of a closure that was forced: its match is taken at its word."""
 _REJECTED_WITHIN = 1.0
@@ -62,7 +62,7 @@ def with_closure(edits: Constraints, closure: StoredClosure, wish: str) -> Const
     if wish != "force":
         raise ConfigError(f"a closure can be rejected, forced or left, not {wish[:40]!r}")
     if closure.pose is None:
-        raise ConfigError("the report does not tell the pose of this closure, so it cannot be forced")
+        raise ConfigError("the report does not contain the pose of this closure, so it cannot be forced")
     x, y, theta = closure.pose.tolist()
     forced = GivenClosure(closure.stamps, (x, y, theta), _FORCED_SIGMA, closure.recordings)
     return replace(left, closures=(*left.closures, forced))

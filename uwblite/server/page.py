@@ -68,8 +68,8 @@ async function ask(path, wish) {
 const clock = (run, k) => run.closures.find(c => c.number === k);
 function status() {
   const job = state.job;
-  if (job && job.code === null) return "mapping again ... " + job.said;
-  if (job && job.code !== 0 && job.code !== 3) return "the map was not made: " + job.said;
+  if (job && job.code === null) return "mapping again ... " + job.output;
+  if (job && job.code !== 0 && job.code !== 3) return "the map was not made: " + job.output;
   if (job && job.code === 3) return "mapped again; the result is doubted, see there";
   return state.edits ? state.edits + " changes in " + state.constraints : "click a closure or an anchor to correct it";
 }
