@@ -35,7 +35,9 @@ def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever
     assert float(stated["laser2_range_min"]) == 0.12
     log = read_log(tmp_path / "run.log")
     assert log.scans.ranges.shape[1] == 450
-    assert log.notes.skipped["ROBOTLASER2"] > 15
+    unused = log.notes.skipped["ROBOTLASER2"]
+    assert unused > 15
+    assert f"{unused} scans of a further lidar (ROBOTLASER2)" in " ".join(log.notes.warnings)
     assert set(log.ranges.tag.tolist()) == {0, 1}
     assert log.mounting.tags[1].tolist() == [-0.3, 0.0, 0.0]
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from uwblite.errors import ConfigError, FormatError, UwbliteError
 from uwblite.io.csv_folder import read_csv_folder, write_csv_folder
-from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
+from uwblite.sensor_log import Gyro, LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
 
 
 def recording():
@@ -24,6 +24,7 @@ def recording():
         UwbRanges(stamps[:20], np.arange(20) % 2, rng.uniform(1, 9, 20).round(4), np.full(20, 87.0), ("5C0B", 'a,"b')),
         LaserScans(stamps[::3], readings, -1.5, 0.1, 1e-4, 0.02, 5.6),
         mounting,
+        gyro=Gyro(stamps[5:] + 0.02, np.linspace(3.0, 9.0, 25)),
     )
 
 
@@ -40,6 +41,8 @@ def test_a_recording_survives_a_folder(tmp_path):
     assert read.mounting.laser_flipped is True
     assert read.mounting.anchor_heights == {'a,"b': 1.5}
     np.testing.assert_array_equal(read.mounting.T_base_laser, log.mounting.T_base_laser)
+    np.testing.assert_allclose(read.gyro.heading, log.gyro.heading, atol=1e-6)
+    np.testing.assert_allclose(read.gyro.stamps, log.gyro.stamps, atol=1e-6)
     with pytest.raises(ConfigError, match="--force"):
         write_csv_folder(tmp_path / "t", log)
     write_csv_folder(tmp_path / "t", log, force=True)

@@ -14,7 +14,7 @@ from uwblite.io.carmen import read_log
 from uwblite.io.rosbag import BagTopics, plan_bag, read_bag
 from uwblite.io.rosbag_writer import write_bag
 from uwblite.io.uwb_mapping import UwbMapping, parse_mappings
-from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
+from uwblite.sensor_log import Gyro, LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
 
 rosbags = pytest.importorskip("rosbags.highlevel", reason="rosbags is absent")
 
@@ -46,6 +46,17 @@ def assert_same(one, two):
     np.testing.assert_allclose(one.mounting.T_base_laser, two.mounting.T_base_laser, atol=1e-9)
     np.testing.assert_allclose(one.mounting.tag_position, two.mounting.tag_position, atol=1e-9)
     assert one.mounting.laser_flipped == two.mounting.laser_flipped
+
+
+def test_the_heading_of_a_gyro_is_an_imu(tmp_path):
+    log = replace(recording(), gyro=Gyro(np.array([1.6e9, 1.6e9 + 0.5]), np.array([0.25, 4.0])))
+    write_bag(tmp_path / "bag", log)
+    with rosbags.AnyReader([tmp_path / "bag"]) as reader:
+        (topic,) = [c for c in reader.connections if c.topic == "/imu"]
+        found = [reader.deserialize(raw, topic.msgtype) for _, _, raw in reader.messages([topic])]
+    turns = [2 * np.arctan2(m.orientation.z, m.orientation.w) for m in found]
+    assert turns == pytest.approx([0.25, 4.0])
+    assert [m.angular_velocity_covariance[0] for m in found] == [-1.0, -1.0]
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

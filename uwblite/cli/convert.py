@@ -214,6 +214,8 @@ def _convert_recording(args: argparse.Namespace, to: str) -> int:
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     scans = 0 if log.scans is None else len(log.scans.stamps)
     counts = {"odometry readings": len(log.odometry.stamps), "ranges": ranges, "scans": scans}
+    if log.gyro is not None:
+        counts["headings of the gyro"] = len(log.gyro.stamps)
     _say(args, counts, warnings=log.notes.warnings)
     if to == "log" and not args.json:
         console.say(f"next: uwblite check {args.target}")

@@ -216,6 +216,10 @@ class _Reader:
         odometry = self._finish_odometry(warnings)
         ranges = self._finish_ranges(warnings)
         scans, T_base_laser = self.laser.finish(self.params, self.skipped, warnings, self.set_back)
+        gyro = self._finish_gyro(warnings)
+        for number in range(2, 6) if scans is not None else ():
+            if unused := self.skipped.get(f"ROBOTLASER{number}"):
+                warnings.append(f"{unused} scans of a further lidar (ROBOTLASER{number}) are left out: maps use ROBOTLASER1")
         notes = LogNotes(
             source=self.path,
             sha256=sha256,
@@ -227,7 +231,7 @@ class _Reader:
             set_back=self.set_back,
         )
         mounting = self.params.mounting(T_base_laser, self.tags)
-        return SensorLog(odometry, ranges, scans, mounting, notes, gyro=self._finish_gyro(warnings))
+        return SensorLog(odometry, ranges, scans, mounting, notes, gyro=gyro)
 
     def _finish_odometry(self, warnings: list[str]) -> Odometry:
         rows = np.array(self.odometry).reshape(-1, 4)

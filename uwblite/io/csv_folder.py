@@ -4,6 +4,7 @@
 |---|---|
 | odometry.csv | stamp, x, y, theta |
 | ranges.csv | stamp, anchor, range, quality |
+| gyro.csv | stamp, heading: of a gyro, from any zero |
 | scans.csv | stamp, then one column a beam; empty = nothing seen, nan = invalid |
 | sensors.toml | geometry of the scans, mounting of the sensors |
 
@@ -24,7 +25,7 @@ import numpy as np
 from ..arrays import Floats
 from ..config import from_dict, parse_toml, setting, to_toml
 from ..errors import ConfigError, FormatError
-from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
+from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .files import replacing
 from .folders import replacing_folder
 from .source import open_source
@@ -86,12 +87,15 @@ def write_csv_folder(folder: str | os.PathLike[str], log: SensorLog, *, force: b
         _write_tables(waiting, log)
 
 
-_FILES = {"odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"}
+_FILES = {"odometry.csv", "gyro.csv", "ranges.csv", "scans.csv", "sensors.toml"}
 
 
 def _write_tables(path: Path, log: SensorLog) -> None:
     odometry = np.column_stack([log.odometry.stamps, log.odometry.poses])
     _write(path / "odometry.csv", "stamp,x,y,theta", (",".join(f"{v:.6f}" for v in row) for row in odometry.tolist()))
+    if log.gyro is not None:
+        headings = zip(log.gyro.stamps.tolist(), log.gyro.heading.tolist(), strict=True)
+        _write(path / "gyro.csv", "stamp,heading", (f"{stamp:.6f},{heading:.6f}" for stamp, heading in headings))
     if log.ranges is not None:
         log.ranges.require_one_tag("a CSV folder")
         _write(path / "ranges.csv", "stamp,anchor,range,quality", _range_rows(log.ranges))
@@ -151,10 +155,11 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
     table = _in_order(_table(path / "odometry.csv", 4, digest))
     ranges = _read_ranges(path / "ranges.csv", digest) if (path / "ranges.csv").exists() else None
     scans = _read_scans(path / "scans.csv", sensors.scans, digest) if (path / "scans.csv").exists() else None
+    gyro = _read_gyro(path / "gyro.csv", digest) if (path / "gyro.csv").exists() else None
     m = sensors.mounting
     mounting = SensorMounting(np.array(m.laser), m.laser_flipped, np.array(m.tag), m.anchor_height, m.anchor_heights)
     notes = LogNotes(source=os.fspath(folder), sha256=digest.hexdigest())
-    return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), ranges, scans, mounting, notes)
+    return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), ranges, scans, mounting, notes, gyro=gyro)
 
 
 def _lines(path: Path, digest: "hashlib._Hash") -> Iterator[str]:
@@ -203,6 +208,11 @@ def _table(path: Path, columns: int, digest: "hashlib._Hash") -> Floats:
 
 def _in_order(table: Floats) -> Floats:
     return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def _read_gyro(path: Path, digest: "hashlib._Hash") -> Gyro:
+    table = _in_order(_table(path, 2, digest))
+    return Gyro(table[:, 0].copy(), np.unwrap(table[:, 1]))
 
 
 def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:

@@ -85,6 +85,16 @@ class Messages:
         header = self.header(float(log.odometry.stamps[k]), prefix + ODOM)
         return self.make("nav_msgs/Odometry", header=header, child_frame_id=prefix + BASE, pose=pose)
 
+    def gyro(self, log: SensorLog, k: int, prefix: str = "") -> Any:
+        """Return heading k of the gyro as sensor_msgs/Imu; rate and acceleration are marked as not there (-1)."""
+        assert log.gyro is not None
+        absent = np.array([-1.0, *[0.0] * 8])
+        return self.make(
+            "sensor_msgs/Imu", header=self.header(float(log.gyro.stamps[k]), prefix + BASE),
+            orientation=self.turn(float(log.gyro.heading[k])), angular_velocity_covariance=absent,
+            linear_acceleration_covariance=absent,
+        )  # fmt: skip
+
     def range(self, log: SensorLog, k: int) -> Any:
         """Return range k as sensor_msgs/Range, with the anchor's id as its frame."""
         assert log.ranges is not None

@@ -34,9 +34,10 @@ LATCHED = ("/tf_static", "/map", "/anchors", "/closures", "/path")
 def write_bag(path: str | os.PathLike[str], log: SensorLog, *, storage: str = "mcap") -> None:
     """Write a recording as a ROS 2 bag: a folder, or one file where the name ends in ``.mcap``.
 
-    Topics: /odom (nav_msgs/Odometry), /tf with odom -> base_link, /scan (sensor_msgs/LaserScan), /uwb/anchor_ID/range
-    (sensor_msgs/Range with the anchor's id as frame_id) and /tf_static with the mounting of laser and tag. The QoS
-    profiles under which `ros2 bag play` offers them are in it: reliable, and transient local for what is sent once.
+    Topics: /odom (nav_msgs/Odometry), /imu (sensor_msgs/Imu: a gyro's heading), /tf with odom -> base_link, /scan
+    (sensor_msgs/LaserScan), /uwb/anchor_ID/range (sensor_msgs/Range with the anchor's id as frame_id) and /tf_static with
+    the mounting of laser and tag. The QoS profiles under which `ros2 bag play` offers them are in it: reliable, and
+    transient local for what is sent once.
 
     Parameters
     ----------
@@ -131,7 +132,7 @@ def recording_messages(log: SensorLog, make: Messages, *, prefix: str = "") -> I
     make : makes messages.
     prefix : of frames and topics, such as ``recording_2/``, where several recordings share a bag.
     """
-    sensors = (log.odometry, log.ranges, log.scans)
+    sensors = (log.odometry, log.gyro, log.ranges, log.scans)
     first = min(float(s.stamps[0]) for s in sensors if s is not None and len(s.stamps))
     yield first, "/tf_static", make.mounting(first, log.mounting, prefix)
     topic = f"/{prefix}"
@@ -140,6 +141,8 @@ def recording_messages(log: SensorLog, make: Messages, *, prefix: str = "") -> I
         (stamps, lambda k: (f"{topic}odom", make.odometry(log, k, prefix))),
         (stamps, lambda k: ("/tf", make.tf(float(stamps[k]), prefix + ODOM, prefix + BASE, log.odometry.poses[k]))),
     ]
+    if log.gyro is not None:
+        sources.append((log.gyro.stamps, lambda k: (f"{topic}imu", make.gyro(log, k, prefix))))
     if log.ranges is not None:
         ranges = log.ranges
         ranges.require_one_tag("a bag")
