@@ -66,8 +66,9 @@ class Unknown:
 
 
 def unknowns(
-    config: CalibrationConfig, anchor_ids: tuple[str, ...], given_height: Bools, recording: int = 0
-) -> tuple[Unknown, ...]:
+    config: CalibrationConfig, anchor_ids: tuple[str, ...], given_height: Bools, recording: int = 0,
+    rises: tuple[float, ...] = (0.0,),
+) -> tuple[Unknown, ...]:  # fmt: skip
     """List the scalar unknowns that a recording with these anchors brings into a graph.
 
     Odometry, tag and clocks, and the systematic errors of ranges to an anchor, are each recording's own: another robot,
@@ -77,6 +78,8 @@ def unknowns(
     ----------
     given_height : (a,) anchors whose height is given.
     recording : which one of the graph's.
+    rises : m, height of each of the robot's tags above the first. A further tag has its own place and antenna delay, and
+        where it hangs higher or lower its own height below the anchors.
     """
     common = (
         ("odometry_scale", config.odometry_scale, "1", "relative error of travelled distance"),
@@ -94,17 +97,22 @@ def unknowns(
     )
     where = f" in recording {recording + 1}" if recording else ""
 
-    def own(kind: str, sigma: float, unit: str, meaning: str, anchor: str | None = None) -> Unknown:
+    def own(kind: str, sigma: float, unit: str, meaning: str, anchor: str | None = None, tag: int = 0) -> Unknown:
         shared = kind in SHARED
-        key = UnknownKey(kind, anchor, None if shared else recording)
+        key = UnknownKey(kind, anchor, None if shared else recording, tag)
         return Unknown(key, sigma, unit, meaning if shared else meaning + where)
 
     listed = [own(*row) for row in common]
-    for anchor, given in zip(anchor_ids, given_height, strict=True):
-        listed.append(own(BIAS, config.range_bias, "m", f"constant error of ranges to anchor {anchor}", anchor))
-        if not given:
-            text = f"squared height of anchor {anchor} above the tag"
-            listed.append(own(HEIGHT, config.anchor_height**2, "m\u00b2", text, anchor))
+    for tag, rise in enumerate(rises):
+        name = f"tag {tag + 1}" if tag else "the tag"
+        for axis in ("x", "y") if tag else ():
+            listed.append(own(f"tag_{axis}", config.tag_offset, "m", f"correction of {name}'s {axis} on the base", tag=tag))
+        for anchor, given in zip(anchor_ids, given_height, strict=True):
+            text = f"constant error of ranges to anchor {anchor}{f' from {name}' if tag else ''}"
+            listed.append(own(BIAS, config.range_bias, "m", text, anchor, tag))
+            if not given and (rise or not tag):
+                text = f"squared height of anchor {anchor} above {name}"
+                listed.append(own(HEIGHT, config.anchor_height**2, "m\u00b2", text, anchor, tag))
     return tuple(u for u in listed if u.sigma > 0 and (u.key.recording is not None or recording == 0))
 
 
@@ -129,12 +137,19 @@ def indices(calibration: Calibration, *kinds: str) -> Ints:
     return np.array([calibration.index(kind) for kind in kinds], dtype=np.int64)
 
 
-def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str, ...]) -> Ints:
-    """Return the (m, 6) calibration indices of RangeEdges for ranges to the given anchors (m,)."""
-    own = [[calibration.index(kind, a) for kind in (BIAS, HEIGHT)] for a in anchor_ids]
-    scale, tag_x, tag_y, delay = indices(calibration, RANGE_SCALE, "tag_x", "tag_y", "range_delay").tolist()
-    table = [(scale, bias, height, tag_x, tag_y, delay) for bias, height in own]
-    return np.array(table, dtype=np.int64).reshape(-1, 6)[anchor]
+def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str, ...], tag: Ints | None = None) -> Ints:
+    """Return the (m, 6) calibration indices of RangeEdges for ranges to anchors (m,) by tags (m,), None = by one tag."""
+    tags = np.zeros(len(anchor), dtype=np.int64) if tag is None else tag
+    scale, delay = indices(calibration, RANGE_SCALE, "range_delay").tolist()
+
+    def row(name: str, number: int) -> tuple[int, ...]:
+        bias, height = (calibration.index(kind, name, tag=number) for kind in (BIAS, HEIGHT))
+        x, y = (calibration.index(kind, tag=number) for kind in ("tag_x", "tag_y"))
+        # A tag as high as the first has its squared heights.
+        return scale, bias, calibration.index(HEIGHT, name) if height < 0 else height, x, y, delay
+
+    table = [[row(name, number) for name in anchor_ids] for number in range(int(np.max(tags, initial=0)) + 1)]
+    return np.array(table, dtype=np.int64).reshape(len(table), len(anchor_ids), 6)[tags, anchor]
 
 
 def odometry_indices(calibration: Calibration, edges: int) -> Ints:

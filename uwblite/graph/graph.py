@@ -65,7 +65,7 @@ class Edges(Protocol):
 
 
 class UnknownKey(NamedTuple):
-    """What a scalar unknown is: its kind, and the anchor and the recording that it belongs to."""
+    """What a scalar unknown is: its kind, and the anchor, the recording and the robot's tag that it belongs to."""
 
     kind: str
     """One of the kinds of calibration.py."""
@@ -73,12 +73,15 @@ class UnknownKey(NamedTuple):
     """Id; None = of no single anchor."""
     recording: int | None = None
     """0, 1, ...; None = all recordings have it in common."""
+    tag: int = 0
+    """0 = the robot's first tag, or of none; 1 = its second ..."""
 
     @property
     def label(self) -> str:
-        """The key as text: ``bias:5C0B``, in the second recording ``bias:5C0B#2``."""
+        """The key as text: ``bias:5C0B``, of the second tag ``bias:5C0B@tag2``, in the second recording ``bias:5C0B#2``."""
         anchor = "" if self.anchor is None else f":{self.anchor}"
-        return f"{self.kind}{anchor}{f'#{self.recording + 1}' if self.recording else ''}"
+        tag = f"@tag{self.tag + 1}" if self.tag else ""
+        return f"{self.kind}{anchor}{tag}{f'#{self.recording + 1}' if self.recording else ''}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,10 +92,10 @@ class Calibration:
     values: Floats = field(default_factory=lambda: np.zeros(0))
     """(c,), unit by kind: see calibration.py."""
 
-    def index(self, kind: str, anchor: str | None = None, recording: int | None = None) -> int:
+    def index(self, kind: str, anchor: str | None = None, recording: int | None = None, tag: int = 0) -> int:
         """Return the position of an unknown, -1 where the graph has none such; recording None = the first that has one."""
         for number, key in enumerate(self.keys):
-            if key.kind == kind and key.anchor == anchor and recording in (None, key.recording):
+            if (key.kind, key.anchor, key.tag) == (kind, anchor, tag) and recording in (None, key.recording):
                 return number
         return -1
 

@@ -36,6 +36,8 @@ class AttachedRanges:
     """(m,) whether the range was made while there was odometry; elsewhere the robot's place is not known."""
     rise: Floats
     """(m,) height of the tag that measured above the first one, m."""
+    tag: Ints
+    """(m,) which of the robot's tags measured."""
 
 
 OUTSIDE = 0.2
@@ -68,7 +70,8 @@ def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframe
     base = se2.interpolate_trajectory(odometry.stamps, odometry.poses, log_ranges.stamps)
     arm = se2.between(keyframes.odometry[keyframe], base)
     twist = velocity_at(odometry, log_ranges.stamps)
-    tag = mounting.tags[np.zeros(len(arm), dtype=np.int64) if log_ranges.tag is None else log_ranges.tag]
+    which = np.zeros(len(arm), dtype=np.int64) if log_ranges.tag is None else log_ranges.tag
+    tag = mounting.tags[which]
     in_base = np.stack([twist[:, 0] - twist[:, 2] * tag[:, 1], twist[:, 1] + twist[:, 2] * tag[:, 0]], axis=1)
     beside = tag - mounting.tag_position
     return AttachedRanges(
@@ -81,6 +84,7 @@ def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframe
         se2.rotate(arm[:, 2], in_base),
         (log_ranges.stamps >= odometry.stamps[0] - OUTSIDE) & (log_ranges.stamps <= odometry.stamps[-1] + OUTSIDE),
         beside[:, 2],
+        which,
     )
 
 

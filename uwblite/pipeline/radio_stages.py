@@ -44,7 +44,7 @@ def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
     """Return a recording's graph by dead reckoning, with its calibration priors, odometry edges and range edges."""
     log, frames, ids = recording.log, recording.frames, recording.anchor_ids
     priors, noise = gyro.settings(log, config.calibration, config.odometry)
-    listed = calibration.unknowns(priors, ids, heights_given(recording))
+    listed = calibration.unknowns(priors, ids, heights_given(recording), rises=tag_rises(recording))
     block = calibration.block(listed)
     graph = Graph(frames.odometry.copy(), np.zeros((len(ids), 2)), (), block)
     graph = graph.with_edges(calibration.prior_edges(listed))
@@ -56,6 +56,12 @@ def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
     attached = attach_ranges(log.ranges, log.odometry, frames, log.mounting)
     ranges = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.trilateration, config.ranges.kernel)
     return Estimate(graph, odometry, ranges if np.any(ranges.weights) else None, ids)
+
+
+def tag_rises(recording: Recording) -> tuple[float, ...]:
+    """Return the height of each of a robot's tags above the first, m."""
+    heights = recording.log.mounting.tags[:, 2]
+    return tuple((heights - heights[0]).tolist())
 
 
 def heights_given(recording: Recording) -> Bools:

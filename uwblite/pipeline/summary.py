@@ -15,7 +15,7 @@ from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from . import plausibility
 from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
-from .radio_stages import heights_given
+from .radio_stages import heights_given, tag_rises
 from .recordings import Recording, Recordings
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
@@ -68,7 +68,7 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
 
 
 def _unknowns(recording: Recording, config: CalibrationConfig) -> tuple[Unknown, ...]:
-    return unknowns(config, recording.anchor_ids, heights_given(recording), recording.number)
+    return unknowns(config, recording.anchor_ids, heights_given(recording), recording.number, tag_rises(recording))
 
 
 def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, Floats]:
@@ -92,8 +92,8 @@ def _anchor(
     own = residuals[ranges.anchor == k]
     # A share by distance, not by kernel weight: effective sigmas are wide where ranges repeat each other.
     used = float(np.mean(np.abs(own) < limit))
-    # The bias in the first recording with ranges to it; in the others it is theirs, see the calibration.
-    bias_at = int(ranges.calibration[np.argmax(ranges.anchor == k), 1])
+    # The bias in the first recording with ranges to it, by the first tag; the others are in the calibration.
+    bias_at = int(ranges.calibration[ranges.anchor == k, 1].min())
     bias = float(graph.calibration.values[bias_at]) if bias_at >= 0 else 0.0
     bias_sigma = float(covariance.calibration[bias_at]) if bias_at >= 0 else 0.0
     status, reason, alternative = "ok", "", None

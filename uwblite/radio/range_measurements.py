@@ -44,7 +44,7 @@ def range_edges(
         attached.velocity,
         np.asarray(mounting.tag_position[:2], dtype=np.float64),
         given[attached.anchor] - np.where(is_given[attached.anchor], attached.rise, 0.0),
-        range_indices(calibration, attached.anchor, anchor_ids),
+        range_indices(calibration, attached.anchor, anchor_ids, attached.tag),
         kernel,
         (usable(attached.ranges, search) & attached.inside).astype(np.float64),
         attached.stamps,
