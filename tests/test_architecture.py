@@ -23,7 +23,7 @@ FLOORS = (
     ("lidar", "report"),
     ("screening",),
     ("loop_closure", "checks", "evaluation", "io"),
-    ("pipeline",),
+    ("pipeline", "localization"),
     ("mapping",),
     ("localize", "server"),
     ("cli",),
@@ -76,7 +76,7 @@ def imports_of(module: str):
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith(("io/", "drivers/"))])
 def test_files_and_devices_know_no_algorithm(module):
-    algorithms = ("radio", "lidar", "loop_closure", "pipeline", "mapping", "localize")
+    algorithms = ("radio", "lidar", "loop_closure", "pipeline", "mapping", "localize", "localization")
     solver = ("graph/solver", "graph/marginals")
     assert not [m for m in imports_of(module) if room_of(m) in algorithms or m in solver]
 

@@ -6,6 +6,7 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from .live import add_live_arguments, run_live
 from .options import add_bag_arguments, add_mounting_arguments, add_settings_arguments, place
 
 if TYPE_CHECKING:
@@ -21,22 +22,29 @@ examples:
   uwblite localize new.log --map map/ --out new.tum --picture new.png --covariance new.csv
   uwblite localize new.log --map map/ --out new/       all of these in a folder, and report.json
 
+  uwblite localize run.log --live --map map/             follow a log that is being recorded: JSON lines on stdout
+  ssh robot cat run.log | uwblite localize - --live --map map/
+  uwblite localize --live --map map/ --odometry kobuki:/dev/kobuki --lidar /dev/ttyACM1 --uwb /dev/ttyACM0
+
 The start pose need not be known: the anchors' ids tie the recording to the map. Where fewer than two of them are in reach,
 the walls are sought in the whole map; without lidar, the anchors alone say it to a decimetre or two. The map is not changed.
+With --live, a line a tenth of a second: stamp, pose, covariance, quality (0..1), lost, and why; see docs/navigation.md.
 exit code 3: written, but the walls do not fit, or an anchor was moved; the reasons are named
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
-    parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
+    text = "CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input; none with --live on devices"
+    parser.add_argument("log", nargs="?", default="", help=text)
     parser.add_argument("--map", metavar="DIR", required=True, help="folder that uwblite map wrote: anchors.csv, map.yaml")
     out = "trajectory in the map's frame, FILE.tum; any other name is a folder for it, its covariances and a report"
-    parser.add_argument("--out", type=place, metavar="FILE.tum|DIR", required=True, help=out)
+    parser.add_argument("--out", type=place, metavar="FILE.tum|DIR", help=out)
     parser.add_argument("--covariance", type=place, metavar="FILE.csv", help="covariance of every keyframe")
     parser.add_argument("--picture", type=place, metavar="FILE.png", help="the path drawn on the map")
     parser.add_argument("--force", action="store_true", help="replace files that are already there")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
+    add_live_arguments(parser)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
     add_bag_arguments(parser)
@@ -44,6 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
+    from ..errors import UsageError
+
+    if args.live:
+        return run_live(args)
+    if not args.log or not args.out:
+        raise UsageError("localize needs a recording and --out, or --live; see uwblite localize --help")
     from ..io.constraints_file import read_anchors
     from ..io.map_server import read_map
     from ..io.result_text import json_lines

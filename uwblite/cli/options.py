@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from ..io.bag_topics import BagTopics
     from ..io.uwb_mapping import UwbMapping
     from ..mapping import MappingConfig
-    from ..sensor_log import SensorLog
+    from ..sensor_log import SensorLog, SensorMounting
 
 
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
@@ -135,9 +135,15 @@ def apply_mounting(log: "SensorLog", args: argparse.Namespace) -> "SensorLog":
     """Return the log with the mounting of the command line in place of its own."""
     import dataclasses
 
+    return dataclasses.replace(log, mounting=mounted(log.mounting, args))
+
+
+def mounted(mounting: "SensorMounting", args: argparse.Namespace) -> "SensorMounting":
+    """Return a mounting with what the command line says in place of its own."""
+    import dataclasses
+
     import numpy as np
 
-    mounting = log.mounting
     if args.laser_pose is not None:
         mounting = dataclasses.replace(mounting, T_base_laser=np.array(args.laser_pose))
     if args.laser_flipped:
@@ -146,4 +152,4 @@ def apply_mounting(log: "SensorLog", args: argparse.Namespace) -> "SensorLog":
         mounting = dataclasses.replace(mounting, tag_position=np.array(args.tag))
     if args.anchor_height is not None:
         mounting = dataclasses.replace(mounting, anchor_height=args.anchor_height, anchor_heights={})
-    return dataclasses.replace(log, mounting=mounting)
+    return mounting

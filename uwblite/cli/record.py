@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
             # A Raspberry Pi without a network wakes with an old clock.
             remark += f"; this computer's clock is {last - time.monotonic() - offset:.0f} s behind the log and was moved"
             offset = last + 1.0 - time.monotonic()
-    links = _links(args, pose)
+    links = device_links(args, pose)
     for link in links:
         check_url(link.url)
         check_pyserial(link.url)
@@ -170,13 +170,14 @@ def _last_part(path: Path) -> Path:
     return path
 
 
-def _links(args: argparse.Namespace, pose: "Pose") -> list["Link"]:
+def device_links(args: argparse.Namespace, pose: "Pose" = (0.0, 0.0, 0.0)) -> list["Link"]:
+    """Return the devices that the command line names; pose is where the odometry goes on."""
     from ..drivers.devices import SENSORS, Setup, open_device
     from ..drivers.link import Link
     from ..errors import ConfigError
 
     names = ("steps", "cluster", "skip", "narrow", "baud")
-    lidar = {name: str(value) for name in names if (value := getattr(args, f"lidar_{name}")) is not None}
+    lidar = {name: str(value) for name in names if (value := getattr(args, f"lidar_{name}", None)) is not None}
     links = []
     for sensor in reversed(SENSORS):
         specs = getattr(args, sensor) or []

@@ -76,7 +76,7 @@ def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broke
         raise FormatError(f"every_nth_scan is {every_nth_scan}; it must be 1 or more")
     parts, missing = parts_of(os.fspath(path))
     digest = hashlib.sha256()
-    reader = _Reader("stdin" if parts[0] == "-" else ", ".join(parts), every_nth_scan, max_broken_share)
+    reader = LogReader("stdin" if parts[0] == "-" else ", ".join(parts), every_nth_scan, max_broken_share)
     for part in parts:
         with open_source(part, digest) as source:
             for block in source.blocks():
@@ -85,7 +85,7 @@ def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broke
     return reader.finish(digest.hexdigest(), missing)
 
 
-class _Reader:
+class LogReader:
     """Collects the messages of one log."""
 
     def __init__(self, path: str, every_nth_scan: int, max_broken_share: float) -> None:

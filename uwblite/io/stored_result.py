@@ -29,6 +29,10 @@ class StoredAnchor:
     """(2, 2) m^2."""
     status: str
     """'ok', 'mirror-ambiguous', 'unplaced' or 'distrusted'."""
+    bias: float = float("nan")
+    """m, added to every range; nan where the table does not say it."""
+    residual_rms: float = float("nan")
+    """m, spread of its range residuals; nan where the table does not say it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,11 +155,12 @@ def _anchors(path: Path) -> tuple[StoredAnchor, ...]:
     if not path.is_file():
         return ()
     table = read_csv(path)
-    values = table.numbers("x", "y", "sigma_x", "sigma_y", "covariance_xy", default=np.nan)
+    values = table.numbers("x", "y", "sigma_x", "sigma_y", "covariance_xy", "bias", "residual_rms", default=np.nan)
     found = []
-    for name, status, (x, y, sx, sy, xy) in zip(table.texts("id"), table.texts("status", default="ok"), values, strict=True):
+    texts = table.texts("id"), table.texts("status", default="ok")
+    for name, status, (x, y, sx, sy, xy, bias, rms) in zip(*texts, values, strict=True):
         off = 0.0 if np.isnan(xy) else xy
-        found.append(StoredAnchor(name, np.array([x, y]), np.array([[sx**2, off], [off, sy**2]]), status))
+        found.append(StoredAnchor(name, np.array([x, y]), np.array([[sx**2, off], [off, sy**2]]), status, bias, rms))
     return tuple(found)
 
 

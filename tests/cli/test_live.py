@@ -1,0 +1,105 @@
+"""`uwblite localize --live`: lines of JSON on stdout, warnings on stderr, and usage errors."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+from helpers.localization_room import ANCHORS, ROUND, SCANNER, cast, grid_of, known, path
+
+from uwblite import se2
+from uwblite.cli import main
+from uwblite.io.map_server import write_map
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A map folder, a log of a drive through it, and where the robot was."""
+    folder = tmp_path_factory.mktemp("live")
+    rows = "".join(f"{name},{x},{y},0.01,0.01,0.0,0.05,ok\n" for name, (x, y) in ANCHORS.items())
+    (folder / "anchors.csv").write_text("id,x,y,sigma_x,sigma_y,bias,residual_rms,status\n" + rows)
+    (folder / "trajectory.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    from helpers.localization_room import ODD
+
+    write_map(folder, grid_of(ODD))
+    poses, lines = path(ROUND)[:40], []
+    odom = se2.compose(np.array([3.0, 1.0, 0.5]), se2.between(poses[0], poses))
+    for k, (pose, said) in enumerate(zip(poses, odom, strict=True)):
+        t = f"{100 + 0.2 * k:.3f} h {0.2 * k:.3f}"
+        lines.append(f"ODOM {said[0]:.6f} {said[1]:.6f} {said[2]:.6f} 0 0 0 {t}")
+        readings = " ".join(f"{min(r, 8.0):.3f}" for r in cast(pose))
+        head = f"ROBOTLASER1 0 {SCANNER.angle_min:.9f} 3.141592654 {SCANNER.angle_increment:.9f} 8.0 0.01 0 181"
+        lines.append(f"{head} {readings} 0 0 0 0 0 0 0 0 0 0 0 0 {t}")
+        if k % 5 == 0:
+            lines += [f"UWB {n} {np.hypot(*(np.array(p) - pose[:2])):.3f} 100 {t}" for n, p in ANCHORS.items()]
+            lines.append(f"UWB STRANGER 3.000 100 {t}")
+    log = folder / "run.log"
+    log.write_text("\n".join(lines) + "\n")
+    return folder, log, poses
+
+
+def lines_of(text):
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_a_log_is_followed_and_the_pose_is_told(room, capsys):
+    folder, log, poses = room
+    assert main(["localize", str(log), "--live", "--map", str(folder), "--idle", "0.1"]) == 0
+    out, err = capsys.readouterr()
+    found = lines_of(out)
+    assert [line["stamp"] for line in found] == sorted(line["stamp"] for line in found)
+    assert not found[-1]["lost"]
+    np.testing.assert_allclose(found[-1]["pose"], poses[-1], atol=0.05)
+    assert np.linalg.eigvalsh(found[-1]["covariance"]).min() > 0
+    assert 0.9 < found[-1]["quality"] <= 1.0
+    assert found[0]["lost"]
+    assert found[0]["reason"]
+    assert "STRANGER (8)" in err
+
+
+def test_standard_input_is_followed_to_its_end(room, capsys, monkeypatch):
+    folder, log, poses = room
+    descriptor = os.open(log, os.O_RDONLY)
+    with os.fdopen(descriptor) as stream:
+        monkeypatch.setattr("sys.stdin", stream)
+        assert main(["localize", "-", "--live", "--map", str(folder), "--rate", "1"]) == 0
+    found = lines_of(capsys.readouterr().out)
+    np.testing.assert_allclose(found[-1]["pose"][:2], poses[-1][:2], atol=0.5)
+
+
+def test_a_robot_that_is_not_found_is_exit_code_3(room, tmp_path, capsys):
+    folder, log, _ = room
+    short = tmp_path / "short.log"
+    short.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
+    assert main(["localize", str(short), "--live", "--map", str(folder), "--idle", "0.1"]) == 3
+    assert all(line["lost"] for line in lines_of(capsys.readouterr().out))
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ([], "--live needs either a log"),
+        (["x.log", "--odometry", "kobuki:/dev/none"], "--live needs either a log"),
+        (["x.log", "--out", "a.tum"], "--out belongs to a recording"),
+        (["none.log"], "cannot be followed"),
+    ],
+)
+def test_wrong_usage_is_one_line(room, capsys, words, text):
+    assert main(["localize", "--live", "--map", str(room[0]), *words]) in (1, 2)
+    err = capsys.readouterr().err
+    assert text in err
+    assert "Traceback" not in err
+
+
+def test_a_recording_without_out_is_a_usage_error(room, capsys):
+    assert main(["localize", str(room[1]), "--map", str(room[0])]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+def test_a_room_is_known_from_its_folder_as_from_its_parts(room):
+    from uwblite.io.stored_result import read_result
+    from uwblite.localization.known_map import from_result
+
+    read, made = from_result(read_result(room[0])), known()
+    np.testing.assert_allclose(read.anchors.positions, made.anchors.positions)
+    np.testing.assert_allclose(read.walls.points, made.walls.points, atol=1e-9)

@@ -1,0 +1,51 @@
+"""A log that is being written reads as the whole one does, however it is cut up."""
+
+import numpy as np
+import pytest
+
+from uwblite.io.carmen import read_log
+from uwblite.io.carmen_live import LiveOdometry, LiveRange, LiveReader, LiveScan
+
+READINGS = " ".join(f"{1.0 + 0.01 * k:.3f}" for k in range(9)) + " 5.600"
+TEXT = (
+    "# CARMEN Logfile\nPARAM laser_time_increment 0.001 0 h 0\nPARAM uwb_tag_offset_x 0.2 0 h 0\n"
+    "ODOM 0 0 0 0 0 0 1.0 h 1.0\nUWB A 2.500 100 1.1 h 1.1\n"
+    f"ROBOTLASER1 0 -1.0 1.8 0.2 5.6 0.01 0 10 {READINGS} 0 0.3 0 0 0.2 0 0 0 0 0 0 0 1.15 h 1.15\n"
+    "ODOM 0.1 0 0.01 0 0 0 1.2 h 1.2\nODOM broken\nUWB2 B 3.5 90 1.3 h 1.3\nODOM 0.2 0 0.02 0 0 0 1.4 h 1.4\n"
+).encode()
+
+
+def measured(pieces):
+    reader = LiveReader()
+    return [m for piece in pieces for m in reader.feed(piece)], reader
+
+
+@pytest.mark.parametrize("size", [1, 7, 100, len(TEXT)])
+def test_pieces_of_any_size_give_what_the_whole_log_gives(tmp_path, size):
+    found, reader = measured([TEXT[k : k + size] for k in range(0, len(TEXT), size)])
+    (tmp_path / "run.log").write_bytes(TEXT)
+    log = read_log(tmp_path / "run.log", max_broken_share=0.5)
+    odometry = [m for m in found if isinstance(m, LiveOdometry)]
+    np.testing.assert_array_equal([m.pose for m in odometry], log.odometry.poses)
+    np.testing.assert_array_equal([m.stamp for m in odometry], log.odometry.stamps)
+    ranges = [(m.stamp, m.anchor_id, m.range, m.tag) for m in found if isinstance(m, LiveRange)]
+    assert ranges == [(1.1, "A", 2.5, 0), (1.3, "B", 3.5, 1)]
+    (scan,) = (m for m in found if isinstance(m, LiveScan))
+    np.testing.assert_array_equal(scan.scans.ranges, log.scans.ranges)
+    assert (scan.scans.angle_min, scan.scans.time_increment) == (log.scans.angle_min, log.scans.time_increment)
+    np.testing.assert_allclose(reader.mounting.T_base_laser, [0.1, 0, 0], atol=1e-9)
+    assert reader.mounting.tag_position[0] == 0.2
+    assert reader.broken == 1
+
+
+def test_measurements_come_in_the_order_in_which_they_were_complete():
+    found, _ = measured([TEXT])
+    assert [m.order for m in found] == sorted(m.order for m in found)
+
+
+def test_the_next_part_is_named():
+    reader = LiveReader()
+    reader.feed(b"COMMENT continued in run.2.log\n")
+    assert reader.continued == "run.2.log"
+    reader.feed(b"x" * 5)
+    assert reader.feed(b"\n") == []

@@ -1,0 +1,47 @@
+"""A log is followed as it grows, goes on in its next part, or begins anew."""
+
+import pytest
+
+from uwblite.errors import FormatError
+from uwblite.io.growing_file import HEAD_BYTES, TAIL_BYTES, GrowingFile
+
+
+def test_what_is_added_is_read(tmp_path):
+    path = tmp_path / "run.log"
+    path.write_bytes(b"one\n")
+    file = GrowingFile(str(path))
+    assert file.read() == b"one\n"
+    assert file.read() == b""
+    with path.open("ab") as more:
+        more.write(b"two")
+    assert file.read() == b"two"
+    path.write_bytes(b"3\n")
+    assert file.read() == b"3\n"
+
+
+def test_a_long_log_begins_near_its_end_with_the_params_of_its_head(tmp_path):
+    path = tmp_path / "run.log"
+    line = b"ODOM 1 2 3\n"
+    text = b"PARAM a 1\nODOM old\nPARAM b 2\n" + line * ((HEAD_BYTES + 2 * TAIL_BYTES) // len(line))
+    path.write_bytes(text)
+    file = GrowingFile(str(path))
+    assert file.skipped == len(text) - HEAD_BYTES - TAIL_BYTES
+    assert file.read() == b"PARAM a 1\nPARAM b 2\n# "
+    rest = b"".join(iter(file.read, b""))
+    assert rest == text[-TAIL_BYTES:]
+
+
+def test_it_goes_on_in_the_next_part(tmp_path):
+    (tmp_path / "run.log").write_bytes(b"COMMENT continued in run.2.log\n")
+    file = GrowingFile(str(tmp_path / "run.log"))
+    file.read()
+    assert not file.go_on_in("run.2.log")
+    (tmp_path / "run.2.log").write_bytes(b"more\n")
+    assert file.go_on_in("run.2.log")
+    assert file.read() == b"more\n"
+    file.close()
+
+
+def test_no_file_is_one_clear_error(tmp_path):
+    with pytest.raises(FormatError, match="cannot be followed"):
+        GrowingFile(str(tmp_path / "none.log"))

@@ -1,0 +1,209 @@
+"""The live localisation: starts from nowhere, stays in doubt where there is doubt, tracks, and recovers."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.localization_room import ANCHORS, EVEN, ODD, ROUND, SCANNER, errors, known, path, robot
+
+from uwblite import se2
+from uwblite.errors import DataError
+from uwblite.localization.known_map import from_result
+
+
+@pytest.fixture(scope="module")
+def drive():
+    poses = path(ROUND)
+    return poses, robot(known()).along(poses)
+
+
+def first_found(states):
+    return next((k for k, s in enumerate(states) if not s.lost), len(states))
+
+
+def test_a_start_from_nowhere_is_found_and_tracked(drive):
+    poses, states = drive
+    found = first_found(states)
+    # 0.4 m/s: two metres of driving.
+    assert found < 25
+    # Cells of 0.05 m drawn one thick: walls are off by up to half of one.
+    assert np.sqrt(np.mean(errors(states[found:], poses[found:]) ** 2)) < 0.025
+    heading = se2.wrap_angle(np.array([s.pose[2] for s in states[found:]]) - poses[found:, 2])
+    assert np.sqrt(np.mean(heading**2)) < 0.01
+    assert all(s.quality > 0.9 for s in states[found + 10 :])
+    assert not any(s.lost for s in states[found:])
+
+
+def test_covariances_are_symmetric_and_positive(drive):
+    for state in drive[1]:
+        if not np.isnan(state.pose).any():
+            np.testing.assert_array_equal(state.covariance, state.covariance.T)
+            assert np.linalg.eigvalsh(state.covariance).min() > 0
+
+
+def test_the_same_input_gives_the_same_bytes(drive):
+    poses, states = drive
+    for one, other in zip(states[:40], robot(known()).along(poses[:40]), strict=True):
+        assert one.pose.tobytes() == other.pose.tobytes()
+        assert one.covariance.tobytes() == other.covariance.tobytes()
+        assert (one.quality, one.lost, one.reason) == (other.quality, other.lost, other.reason)
+
+
+def test_walls_alone_find_the_place_where_no_other_looks_like_it():
+    poses = path(ROUND)[:75]
+    states = robot(known(anchors={})).along(poses, ranges=False)
+    found = first_found(states)
+    assert found < 60
+    assert errors(states[found:], poses[found:]).max() < 0.1
+
+
+def test_two_halves_of_an_even_room_stay_two_places_until_ranges_tell_them_apart():
+    room, poses = known(EVEN), path(ROUND)
+    drive = robot(room, walls=EVEN)
+    for state in drive.along(poses[:60], ranges=False):
+        assert state.lost
+    turned = se2.compose(np.array([8.0, 6.0, np.pi]), poses[59])
+    places = np.array([state.pose, *state.alternatives])
+    for true in (poses[59], turned):
+        assert np.hypot(*(places - true)[:, :2].T).min() < 0.1
+    later = drive.along(poses[60:100])
+    assert first_found(later) < 25
+    assert errors(later[-10:], poses[90:100]).max() < 0.1
+
+
+LINE = {"A": (0.5, 0.0), "B": (7.5, 0.0)}
+
+
+def test_mirror_images_of_a_straight_drive_stay_two_until_it_turns():
+    """Two anchors in a row with the drive: what lies left and right of them looks the same."""
+    drive = robot(known(None, LINE), anchors=LINE)
+    straight = path(((1.0, 2.0), (7.0, 2.0)))
+    state = drive.along(straight, scans=False)[-1]
+    assert state.lost
+    places = np.array([state.pose, *state.alternatives])
+    for true in (straight[-1], straight[-1] * [1, -1, -1]):
+        assert np.hypot(*(places - true)[:, :2].T).min() < 0.5
+    bend = path(((7.0, 2.0), (7.0, 5.0), (2.0, 5.0), (2.0, 2.0), (6.0, 2.0)))
+    states = drive.along(bend, scans=False)
+    assert not states[-1].lost
+    assert errors(states[-10:], bend[-10:]).max() < 0.4
+
+
+def test_a_robot_that_was_carried_away_is_lost_and_found_within_ten_seconds():
+    poses = path(ROUND)
+    drive = robot(known())
+    assert not drive.along(poses[:30])[-1].lost
+    drive.carried()
+    states = drive.along(poses[100:150])
+    lost = next(k for k, s in enumerate(states) if s.lost)
+    found = lost + first_found(states[lost:])
+    assert found < 50
+    assert errors(states[found:], poses[100 + found : 150]).max() < 0.1
+
+
+def test_ranges_alone_notice_that_it_was_carried_away():
+    poses = path(ROUND)
+    drive = robot(known(None))
+    assert not drive.along(poses[:50])[-1].lost
+    drive.carried()
+    assert any(s.lost for s in drive.along(poses[100:150]))
+
+
+def test_legs_and_moved_things_do_not_pull():
+    """Two people walk beside the robot, a quarter of its view each side."""
+    poses = path(ROUND)
+    walker = ((0.6, 0.5), (0.7, -0.5))
+
+
+    drive = robot(known())
+    states = []
+    for pose in poses[:80]:
+        here = [se2.transform(pose, np.array(w)) for w in walker]
+        legs = tuple((x - 0.15, y, x + 0.15, y) for x, y in here) + tuple((x, y - 0.15, x, y + 0.15) for x, y in here)
+        drive.walls = ODD + legs
+        states += drive.along(pose[None])
+    found = first_found(states)
+    assert found < 60
+    assert errors(states[found:], poses[found:80]).max() < 0.1
+
+
+@pytest.mark.slow
+def test_a_moved_anchor_is_named_and_does_not_pull():
+    poses = path(ROUND)
+    drive = robot(known(), anchors=ANCHORS | {"B": (5.0, 2.0)})
+    states = drive.along(np.concatenate([poses, poses[::-1] + np.array([0.0, 0.0, np.pi])]))
+    found = first_found(states)
+    assert found < len(poses)
+    assert errors(states[found : len(poses)], poses[found:]).max() < 0.1
+    assert states[-1].moved_anchors == ("B",)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (20.0, -3.0)])
+def test_a_map_that_lies_elsewhere_moves_the_poses_and_nothing_else(shift):
+    """By whole cells of the search's field: the places that are tried are then the same."""
+    poses = path(ROUND)[:40]
+    room = known()
+    walls = room.walls
+    away = np.array(shift)
+    geometry = dataclasses.replace(walls.geometry, origin=walls.geometry.origin + away)
+    moved = dataclasses.replace(
+        room,
+        anchors=dataclasses.replace(room.anchors, positions=room.anchors.positions + away),
+        walls=dataclasses.replace(walls, geometry=geometry, points=walls.points + away, origin=walls.origin + away),
+    )
+    for one, other in zip(robot(room).along(poses), robot(moved).along(poses), strict=True):
+        assert one.lost == other.lost
+        if not one.lost:
+            np.testing.assert_allclose(other.pose - [*shift, 0], one.pose, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_another_building_is_never_taken_for_this_one():
+    stranger = ((0, 0, 3, 0), (3, 0, 3, 9), (3, 9, 0, 9), (0, 9, 0, 0), (1.4, 2, 1.4, 7))
+    poses = path(((0.7, 1.0), (0.7, 8.0), (2.2, 8.0), (2.2, 1.0)))
+    states = robot(known(anchors={}), walls=stranger).along(poses, ranges=False)
+    assert all(s.lost for s in states)
+    assert states[-1].reason
+
+
+@pytest.mark.slow
+def test_a_map_of_another_scale_is_never_taken_for_this_one():
+    """A plan in feet that was read as metres."""
+    larger = {name: (3.28 * x, 3.28 * y) for name, (x, y) in ANCHORS.items()}
+    states = robot(known(None, larger)).along(path(ROUND), scans=False)
+    assert all(s.lost for s in states)
+
+
+def test_anchors_that_the_map_does_not_know_are_counted():
+    drive = robot(known(), anchors={"X": (1.0, 1.0)})
+    drive.along(path(ROUND)[:15], scans=False)
+    assert drive.localizer.strangers == {"X": 3}
+
+
+def test_a_silent_odometry_makes_the_pose_unsure():
+    poses = path(ROUND)
+    drive = robot(known())
+    before = drive.along(poses[:30])[-1]
+    drive.localizer.add_ranges(drive.stamp + 4.0, ["X"], [1.0])
+    drive.localizer.add_ranges(drive.stamp + 4.0, ["A"], [200.5])
+    after = drive.localizer.add_ranges(drive.stamp + 4.0, ["A"], [50.0])
+    assert np.trace(after.covariance) > 10 * np.trace(before.covariance)
+
+
+def test_a_map_of_nothing_is_refused(tmp_path):
+    (tmp_path / "trajectory.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    from uwblite.io.stored_result import read_result
+
+    with pytest.raises(DataError, match="neither an anchor"):
+        from_result(read_result(tmp_path))
+
+
+def test_garbage_among_the_measurements_changes_nothing(drive):
+    poses, states = drive
+    odd = robot(known())
+    odd.localizer.add_scan(50.0, np.full(181, np.nan), SCANNER)
+    odd.localizer.add_ranges(np.nan, ["A"], [1.0])
+    odd.localizer.add_ranges(99.0, ["A", "B"], [np.nan, -3.0])
+    odd.localizer.add_odometry(99.5, np.nan, 0.0, 0.0)
+    again = odd.along(poses[:30])
+    np.testing.assert_allclose(again[-1].pose, states[29].pose, atol=0.02)

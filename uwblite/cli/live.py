@@ -1,0 +1,264 @@
+"""`uwblite localize --live`: the pose as JSON lines while a robot drives."""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from . import console
+from .options import mounted, number
+
+if TYPE_CHECKING:
+    from ..io.carmen_live import Measured
+    from ..localization.known_map import KnownMap
+    from ..localization.localizer import Localizer, LocalizerState
+
+DEVICES = ("odometry", "lidar", "uwb", "gyro")
+
+
+def add_live_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of --live."""
+    group = parser.add_argument_group("live (docs/navigation.md)")
+    group.add_argument("--live", action="store_true", help="follow the log, or devices, and say the pose as it becomes known")
+    group.add_argument("--rate", metavar="HZ", type=number(above=0), default=10.0, help="lines per second of driving (10)")
+    group.add_argument("--idle", metavar="S", type=number(above=0), help="end when the log has not grown for so long (never)")
+    for name, form in (("odometry", "NAME:PORT"), ("lidar", "[NAME:]PORT"), ("uwb", "[NAME:]PORT"), ("gyro", "NAME:PORT")):
+        help_text = "device, as for uwblite record" + ("; repeatable" if name == "uwb" else "")
+        group.add_argument(f"--{name}", metavar=form, action="append", help=help_text)
+
+
+def run_live(args: argparse.Namespace) -> int:
+    """Say poses until the log ends or somebody says stop."""
+    import signal
+
+    from ..errors import UsageError
+    from ..io.stored_result import read_result
+    from ..localization.known_map import from_result
+
+    devices = any(getattr(args, name) for name in DEVICES)
+    if devices == bool(args.log):
+        raise UsageError("--live needs either a log to follow (- = standard input) or devices: --odometry, --lidar, --uwb")
+    for name in ("out", "picture", "covariance"):
+        if getattr(args, name):
+            raise UsageError(f"--{name} belongs to a recording that has ended; --live writes lines to stdout")
+    known = from_result(read_result(args.map))
+    _tell_map(known)
+    tracker = Tracker(known, args)
+    stopped: list[int] = []
+    before = {n: signal.signal(n, lambda k, _f: stopped.append(k)) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        if devices:
+            from .live_devices import record_into
+
+            record_into(args, tracker.take, lambda: bool(stopped))
+        else:
+            pieces = _stdin() if args.log == "-" else _growing(args.log, args.idle, lambda: bool(stopped))
+            for data in pieces:
+                tracker.take(data)
+                if stopped:
+                    break
+    finally:
+        for n, handler in before.items():
+            signal.signal(n, handler)
+    return tracker.ended(signal.SIGINT in stopped)
+
+
+class Tracker:
+    """From pieces of a log to lines on stdout."""
+
+    def __init__(self, known: "KnownMap", args: argparse.Namespace) -> None:
+        from ..io.carmen_live import LiveReader
+
+        self.known, self.args = known, args
+        self.reader = LiveReader()
+        self.localizer: Localizer | None = None
+        self.state: LocalizerState | None = None
+        self.on_state: Callable[[LocalizerState], None] = lambda _: None
+        self._early: list[Measured] = []
+        self._seen: dict[str, float] = {}
+        self._silent: set[str] = set()
+        self._due = -float("inf")
+        self._sees = False
+        self._was_lost = True
+
+    def take(self, data: bytes) -> None:
+        """Use a piece of the log."""
+        for measured in self.reader.feed(data):
+            self._watch(measured)
+            if self.localizer is None:
+                self._early.append(measured)
+                if self._ready(measured):
+                    self._begin()
+            else:
+                self._use(measured)
+
+    def _ready(self, measured: "Measured") -> bool:
+        """Tell whether the log has said how the sensors are mounted: with the first scan, or when none comes for 2 s."""
+        from ..io.carmen_live import LiveScan
+
+        return isinstance(measured, LiveScan) or measured.order - self._early[0].order > _NO_LIDAR
+
+    def _begin(self) -> None:
+        from ..localization.localizer import Localizer
+
+        self.localizer = Localizer(self.known, mounted(self.reader.mounting, self.args))
+        early, self._early = self._early, []
+        for measured in early:
+            self._use(measured)
+
+    def _use(self, measured: "Measured") -> None:
+        from ..io.carmen_live import LiveOdometry, LiveRange
+        from ..localization.localizer import Localizer, Scanner
+
+        assert self.localizer is not None
+        if isinstance(measured, LiveOdometry):
+            self.state = self.localizer.add_odometry(measured.stamp, *measured.pose.tolist())
+        elif isinstance(measured, LiveRange):
+            self.state = self.localizer.add_ranges(measured.stamp, [measured.anchor_id], [measured.range], measured.tag)
+        else:
+            if not self._sees and self.localizer.scanner is None and "lidar" in self._silent:
+                # It comes late: only now the log has said where the laser sits.
+                self.localizer = Localizer(self.known, mounted(self.reader.mounting, self.args))
+            self._sees = True
+            s = measured.scans
+            scanner = Scanner(s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max)
+            self.state = self.localizer.add_scan(measured.stamp, s.ranges[0], scanner)
+        self._say()
+
+    def _say(self) -> None:
+        state = self.state
+        if state is None or not state.stamp > -float("inf"):
+            return
+        self.on_state(state)
+        if state.stamp < self._due and state.lost == self._was_lost:
+            return
+        self._due, self._was_lost = state.stamp + 0.999 / self.args.rate, state.lost
+        console.say_lines(line_of(state))
+        console.flush()
+
+    def _watch(self, measured: "Measured") -> None:
+        """Say once when a sensor that was there, or should be, falls silent."""
+        from ..io.carmen_live import LiveOdometry, LiveRange
+
+        kind = "odometry" if isinstance(measured, LiveOdometry) else "uwb" if isinstance(measured, LiveRange) else "lidar"
+        if not self._seen:
+            self._seen = dict.fromkeys(_SENSORS, measured.order)
+        self._seen[kind] = max(self._seen[kind], measured.order)
+        if kind in self._silent:
+            self._silent.discard(kind)
+            console.note(f"uwblite: {kind} is back")
+        for other, last in self._seen.items():
+            if measured.order - last > _SILENCE and other not in self._silent:
+                self._silent.add(other)
+                console.note(f"uwblite: warning: nothing from {other} for {_SILENCE:.0f} s; {_SENSORS[other]}")
+
+    def ended(self, interrupted: bool) -> int:
+        """Say what was lost and return the exit code."""
+        if self.localizer is None and self._early:
+            self._begin()
+        if self.reader.broken:
+            console.note(f"uwblite: {self.reader.broken} broken lines were left out")
+        strangers = {} if self.localizer is None else self.localizer.strangers
+        if strangers:
+            console.note(f"uwblite: ranges to anchors that the map does not know: {_counted(strangers)}")
+        if interrupted:
+            return 130
+        if self.state is None:
+            console.note("uwblite: warning: the log holds no measurement")
+        return 0 if self.state is not None and not self.state.lost else 3
+
+
+_NO_LIDAR = 2.0
+"""s after which a robot counts as one without lidar."""
+_SILENCE = 5.0
+"""s."""
+_SENSORS = {
+    "odometry": "the pose is held and becomes unsure",
+    "lidar": "the pose rests on ranges and odometry",
+    "uwb": "the pose rests on scans and odometry",
+}
+"""And what it means that one is silent."""
+
+
+def line_of(state: "LocalizerState") -> str:
+    """Return a state as one line of JSON; numbers that are not known are null."""
+    import json
+
+    fields: dict[str, Any] = {
+        "stamp": round(state.stamp, 6),
+        "pose": [round(v, 5) for v in state.pose.tolist()],
+        "covariance": [[float(f"{v:.4g}") for v in row] for row in state.covariance.tolist()],
+        "quality": round(state.quality, 3),
+        "lost": state.lost,
+    }
+    if state.reason:
+        fields["reason"] = state.reason
+    if len(state.alternatives):
+        fields["alternatives"] = [[round(v, 3) for v in row] for row in state.alternatives[:_MOST_ALTERNATIVES].tolist()]
+    if state.moved_anchors:
+        fields["moved_anchors"] = list(state.moved_anchors)
+    return json.dumps(console.plain(fields), allow_nan=False)
+
+
+_MOST_ALTERNATIVES = 8
+"""In a line."""
+
+
+def _tell_map(known: "KnownMap") -> None:
+    if not known.anchors.ids:
+        console.note("uwblite: warning: the map has no anchor with a place; the walls alone tell where the robot is")
+    if known.walls is None:
+        console.note("uwblite: warning: the map has no grid; the anchors alone tell where the robot is")
+
+
+def _counted(names: dict[str, int]) -> str:
+    some = ", ".join(f"{name} ({count})" for name, count in sorted(names.items())[:10])
+    return some + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+
+
+def _stdin() -> Iterator[bytes]:
+    """Yield what standard input holds, as it comes."""
+    import os
+
+    from ..io.source import open_input
+
+    stream = open_input("-")
+    while data := os.read(stream.fileno(), 1 << 16):
+        yield data
+
+
+def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Iterator[bytes]:
+    """Yield what a log holds and what is added to it."""
+    import time
+
+    from ..io.growing_file import GrowingFile
+
+    file = GrowingFile(path)
+    if file.skipped:
+        console.note(f"uwblite: {file.skipped / 1e6:.0f} MB of {path} lie further back and are not read")
+    quiet, rest = 0.0, b""
+    try:
+        while not stopping():
+            data = file.read()
+            if data:
+                quiet, rest = 0.0, (rest + data)[-_CONTINUED:]
+                yield data
+                continue
+            mark = rest.rfind(b"COMMENT continued in ")
+            name = rest[mark:].split(b"\n")[0].split()[-1].decode("utf-8", "replace") if mark >= 0 else ""
+            if name and file.go_on_in(name):
+                rest = b""
+                continue
+            if idle is not None and quiet >= idle:
+                return
+            sys.stdout.flush()
+            time.sleep(_PAUSE)
+            quiet += _PAUSE
+    finally:
+        file.close()
+
+
+_PAUSE = 0.05
+"""s between looks at a log that does not grow."""
+_CONTINUED = 1024
+"""Bytes at the end of a part in which it names the next one."""

@@ -1,0 +1,48 @@
+"""Devices for `uwblite localize --live`: the recorder of `uwblite record`, whose lines go to the localiser and to no file."""
+
+import argparse
+import re
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from ..drivers.log_file import LogFile
+from ..drivers.recorder import Recorder
+from ..drivers.transport import check_pyserial, check_url
+from . import console
+from .record import device_links
+
+
+class LinesTo(LogFile):
+    """A log that is written nowhere."""
+
+    def __init__(self, take: Callable[[bytes], None]) -> None:
+        self._take = take
+        self.head, self.path, self.first, self.bytes, self.part = [], Path("-"), Path("-"), 0, 1
+
+    def write(self, lines: list[str]) -> None:
+        """Hand lines on."""
+        if lines:
+            data = ("\n".join(lines) + "\n").encode("ascii", "replace")
+            self.bytes += len(data)
+            self._take(data)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def record_into(args: argparse.Namespace, take: Callable[[bytes], None], stopping: Callable[[], bool]) -> None:
+    """Read devices until told to stop, and hand on what `uwblite record` would write."""
+    links = device_links(args)
+    for link in links:
+        check_url(link.url)
+        check_pyserial(link.url)
+    offset = time.time() - time.monotonic()
+    recorder = Recorder(
+        links, LinesTo(take), monotonic=time.monotonic, wall_offset=offset,
+        host=re.sub(r"\s+", "_", socket.gethostname()) or "host",
+        on_note=lambda seconds, note: console.note(f"[{seconds:8.1f} s] {note.level}: {note.text}"),
+    )  # fmt: skip
+    recorder.begin([])
+    recorder.run(duration=None, stopping=stopping)

@@ -1,0 +1,118 @@
+"""A CARMEN log as it is being written: the measurements of each piece of text, in the order of their times."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats
+from ..sensor_log import LaserScans, SensorMounting
+from .carmen import LogReader
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveOdometry:
+    """One pose of the base."""
+
+    stamp: float
+    pose: Floats
+    """(3,) m, m, rad; drifting frame."""
+    order: float
+    """s; when it is complete."""
+
+
+@dataclass(frozen=True, slots=True)
+class LiveRange:
+    """One range."""
+
+    stamp: float
+    anchor_id: str
+    range: float
+    """m."""
+    tag: int
+    """Which of the robot's tags."""
+    order: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveScan:
+    """One scan."""
+
+    stamp: float
+    """s, of the first ray."""
+    scans: LaserScans
+    """The scan and its geometry: one row."""
+    order: float
+
+
+Measured = LiveOdometry | LiveRange | LiveScan
+
+_MOST_PENDING = 1 << 20
+"""Bytes of a line without an end."""
+
+
+class LiveReader:
+    """Turn pieces of a log into measurements; what is broken is counted and skipped."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._reader = LogReader("live log", 1, 1.0)
+        self._heading: list[tuple[float, float]] = []
+        self._T_base_laser: Floats | None = None
+        self.continued = ""
+        """Name of the next part, where the log says that it goes on there."""
+        self.broken = 0
+        """Lines that could not be used."""
+
+    @property
+    def mounting(self) -> SensorMounting:
+        """Where the sensors sit, as far as the log has said it."""
+        return self._reader.params.mounting(self._T_base_laser, self._reader.tags)
+
+    def feed(self, data: bytes) -> list[Measured]:
+        """Take a piece of text and return the measurements of its whole lines, sorted by time."""
+        text = self._rest + data
+        cut = text.rfind(b"\n") + 1
+        self._rest = text[cut:]
+        if len(self._rest) > _MOST_PENDING:
+            self._rest, self.broken = b"", self.broken + 1
+        return self._taken(text[:cut]) if cut else []
+
+    def _taken(self, lines: bytes) -> list[Measured]:
+        before = self._reader
+        reader = LogReader("live log", 1, 1.0)
+        reader.params, reader.tags, reader.has_ipc = before.params, before.tags, before.has_ipc
+        reader.handlers[b"PARAM"] = reader.params.take
+        reader.laser.ipc_left_out = before.laser.ipc_left_out
+        reader.feed(lines)
+        self._reader, self.broken = reader, self.broken + reader.broken
+        if b"COMMENT continued in " in lines:
+            self.continued = lines.rpartition(b"COMMENT continued in ")[2].split(b"\n")[0].strip().decode("utf-8", "replace")
+        found: list[Measured] = [*self._poses(reader), *self._ranges(reader), *self._scans(reader)]
+        return sorted(found, key=lambda measured: measured.order)
+
+    def _poses(self, reader: LogReader) -> list[LiveOdometry]:
+        rows = np.array(reader.odometry).reshape(-1, 4)
+        return [LiveOdometry(float(row[0]), row[1:], float(row[0])) for row in rows]
+
+    def _ranges(self, reader: LogReader) -> list[LiveRange]:
+        names = {number: name.decode() for name, number in reader.uwb_ids.items()}
+        rows = np.array(reader.uwb).reshape(-1, 5).tolist()
+        reader.tags = max([reader.tags, *(int(row[4]) + 1 for row in rows)])
+        return [LiveRange(t, names[int(anchor)], metres, int(tag), t) for t, anchor, metres, _, tag in rows]
+
+    def _scans(self, reader: LogReader) -> list[LiveScan]:
+        scans, mounted = reader.laser.finish(reader.params, {}, [])
+        if scans is None:
+            return []
+        if self._T_base_laser is None:
+            self._T_base_laser = mounted
+        sweep = scans.time_increment * (scans.ranges.shape[1] - 1)
+        return [LiveScan(t, _row(scans, k), t + sweep) for k, t in enumerate(scans.stamps.tolist())]
+
+
+def _row(scans: LaserScans, k: int) -> LaserScans:
+    one = slice(k, k + 1)
+    return LaserScans(
+        scans.stamps[one], scans.ranges[one], scans.angle_min, scans.angle_increment, scans.time_increment, scans.range_min,
+        scans.range_max,
+    )  # fmt: skip

@@ -1,0 +1,60 @@
+"""A file that somebody is writing, read as it grows."""
+
+import os
+from pathlib import Path
+
+from ..errors import FormatError
+
+HEAD_BYTES = 1 << 16
+"""Bytes at the beginning of a log among which its PARAM lines stand."""
+TAIL_BYTES = 4 << 20
+"""Bytes at the end of a long log with which following begins: about a minute of a robot with a lidar."""
+_PIECE = 1 << 17
+"""Bytes read at once."""
+
+
+class GrowingFile:
+    """Follow a file from its head, and what it holds already from near its end.
+
+    Raises
+    ------
+    FormatError : it cannot be opened.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = Path(path)
+        try:
+            self._file = open(self.path, "rb", buffering=0)  # noqa: SIM115
+            size = os.fstat(self._file.fileno()).st_size
+        except OSError as error:
+            raise FormatError(f"cannot be followed: {error.strerror or error}", path) from None
+        self.skipped = max(size - HEAD_BYTES - TAIL_BYTES, 0)
+        """Bytes between head and tail that are not read."""
+        self._head_left = HEAD_BYTES if self.skipped else 0
+
+    def read(self) -> bytes:
+        """Return what is new, at most a piece; b"" where nothing is."""
+        if self._head_left:
+            data = self._file.read(self._head_left)
+            self._head_left = 0
+            self._file.seek(self.skipped + HEAD_BYTES)
+            # What was measured then is not wanted; the line into which the jump leads becomes a comment.
+            kept = [line for line in data.split(b"\n")[:-1] if line.startswith(b"PARAM ")]
+            return b"\n".join([*kept, b"# "])
+        if os.fstat(self._file.fileno()).st_size < self._file.tell():
+            self._file.seek(0)  # it was begun anew
+        return self._file.read(_PIECE)
+
+    def go_on_in(self, name: str) -> bool:
+        """Follow the next part beside this one, once it is there and this one has nothing more."""
+        following = self.path.with_name(os.path.basename(name))
+        if not following.is_file():
+            return False
+        self._file.close()
+        self.path, self.skipped, self._head_left = following, 0, 0
+        self._file = open(following, "rb", buffering=0)  # noqa: SIM115
+        return True
+
+    def close(self) -> None:
+        """Let it go."""
+        self._file.close()

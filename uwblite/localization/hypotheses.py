@@ -1,0 +1,264 @@
+"""Several robots in one: a Gaussian-sum filter, one extended Kalman filter for every place where the robot may be.
+
+Each hypothesis carries the pose, the calibration of the wheels and one slowly varying error per anchor (multipath, antenna
+patterns, an anchor's place that is off by decimetres), which fades with the distance driven. Measurements move each
+hypothesis and change its weight by how likely it made them; mirror images live side by side until one of them has become
+unlikely (D. Alspach, H. Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, 1972). All arrays hold
+all hypotheses: no step below loops over them.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from .walls import Rays, Walls
+
+POSE, WHEELS = slice(0, 3), slice(3, 6)
+"""Of the state: x, y, theta; relative error of distance, of turned angle, and heading per metre, rad/m."""
+FIRST_ANCHOR = 6
+WHEEL_SIGMA = (0.02, 0.03, 0.01)
+"""Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
+SLOW_SIGMA = 0.085
+"""m; what ranges to one anchor err alike, see RangeNoiseConfig: half of the variance of 0.12 m."""
+SLOW_LENGTH = 1.5
+"""m; the distance over which it stays alike."""
+_DISTANCE, _HEADING_PER_METRE, _HEADING_PER_TURN = 0.02, 0.02, 0.03
+"""Random errors of the wheels after one metre (m and rad) and one radian (rad), as in OdometryNoiseConfig, where the heading
+per metre is what a recording begins with before it is learnt; here nothing is learnt."""
+_STANDING = 2e-4
+"""m and rad, of every step."""
+_FLIMSY = 0.03
+"""m; standard deviation of a point about its wall: half a cell of 0.05 m and the lidar's noise at 3 m."""
+_INDEPENDENT = 20.0
+"""Points of a scan that err independently: those of one wall share the cells' rounding."""
+_GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
+"""m; gate and kernel width of each iteration of a scan's match."""
+_TAIL, _DETOUR, _WILD, _WIDTH = 0.15, 0.4, 0.05, 60.0
+"""Share of ranges with a detour and its mean, m; share of nonsense and its extent, m: the mixture of radio.nlos_mixture with
+what is usual, there being no recording to learn it from."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """Places where the robot may be."""
+
+    mean: Floats
+    """(h, 6 + a)."""
+    covariance: Floats
+    """(h, 6 + a, 6 + a)."""
+    log_weight: Floats
+    """(h,) the largest is 0."""
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    @property
+    def poses(self) -> Floats:
+        """(h, 3) T_map_base."""
+        return self.mean[:, POSE]
+
+    @property
+    def pose_covariances(self) -> Floats:
+        """(h, 3, 3) m, m, rad; map frame."""
+        return self.covariance[:, POSE, POSE]
+
+    def rows(self, which: Ints | Bools) -> "Hypotheses":
+        """Return some of them."""
+        return Hypotheses(self.mean[which], self.covariance[which], self.log_weight[which])
+
+
+def none(anchors: int) -> Hypotheses:
+    """Return no hypothesis."""
+    n = FIRST_ANCHOR + anchors
+    return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
+
+
+def started(poses: Floats, covariances: Floats, anchors: int) -> Hypotheses:
+    """Return hypotheses at poses (h, 3) with these covariances (h, 3, 3) and nothing learnt yet."""
+    empty = none(anchors)
+    n = empty.mean.shape[1]
+    mean, covariance = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
+    mean[:, POSE] = poses
+    covariance[:, POSE, POSE] = covariances
+    prior = np.concatenate([WHEEL_SIGMA, np.full(anchors, SLOW_SIGMA)]) ** 2
+    covariance[:, np.arange(3, n), np.arange(3, n)] = prior
+    return Hypotheses(mean, covariance, np.zeros(len(poses)))
+
+
+def joined(one: Hypotheses, other: Hypotheses) -> Hypotheses:
+    """Return both."""
+    return Hypotheses(*(np.concatenate([getattr(one, n), getattr(other, n)]) for n in ("mean", "covariance", "log_weight")))
+
+
+def moved(bank: Hypotheses, step: Floats, slack: float = 0.0) -> Hypotheses:
+    """Drive every hypothesis by one step of the odometry.
+
+    Parameters
+    ----------
+    step : (3,) pose of the base in the frame that it had before, by the wheels. slack : m and rad, standard deviation of
+        motion that the wheels did not see.
+
+    Notes
+    -----
+    ``d' = (1 + s) d``, ``theta' = (1 + g) theta + m |d|``; the slow errors are a Gauss-Markov process in the distance.
+    """
+    d, turn = step[:2], float(step[2])
+    way = float(np.hypot(*d))
+    mean = bank.mean.copy()
+    s, g, m = bank.mean[:, WHEELS].T
+    shift = se2.rotate(mean[:, 2] + 0.5 * (g * turn + m * way), np.outer(1.0 + s, d))
+    along = se2.rotate(mean[:, 2], np.broadcast_to(d, shift.shape))
+    n = mean.shape[1]
+    f = np.broadcast_to(np.eye(n), (len(mean), n, n)).copy()
+    across = np.stack([-shift[:, 1], shift[:, 0]], axis=1)
+    f[:, :2, 2] = across
+    f[:, :2, 3] = along
+    f[:, :2, 4], f[:, :2, 5] = 0.5 * turn * across, 0.5 * way * across
+    f[:, 2, 4], f[:, 2, 5] = turn, way
+    fade = float(np.exp(-way / SLOW_LENGTH))
+    slow = np.arange(FIRST_ANCHOR, n)
+    f[:, slow, slow] = fade
+    mean[:, :2] += shift
+    mean[:, 2] = se2.wrap_angle(mean[:, 2] + (1.0 + g) * turn + m * way)
+    mean[:, slow] *= fade
+    noise = np.zeros(n)
+    noise[:2] = _STANDING**2 + _DISTANCE**2 * way + slack**2
+    noise[2] = _STANDING**2 + _HEADING_PER_METRE**2 * way + _HEADING_PER_TURN**2 * abs(turn) + slack**2
+    noise[slow] = SLOW_SIGMA**2 * (1.0 - fade**2)
+    covariance = f @ bank.covariance @ f.transpose(0, 2, 1)
+    covariance[:, np.arange(n), np.arange(n)] += noise
+    return Hypotheses(mean, _symmetric(covariance), bank.log_weight)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeFacts:
+    """One range and what is known of it."""
+
+    anchor: int
+    """Number of the anchor in the map."""
+    place: Floats
+    """(2,) of the anchor, m."""
+    range: float
+    """m, as measured, less the anchor's bias."""
+    square: float
+    """m^2, squared height of the anchor above the tag."""
+    sigma: float
+    """m, white part of the noise."""
+    scale: float
+    """Relative error of all ranges."""
+
+
+def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses, Floats, Floats]:
+    """Correct every hypothesis by one range.
+
+    Parameters
+    ----------
+    tag : (2,) place of the tag at the range's time in the present frame of the base, m.
+
+    Returns
+    -------
+    The hypotheses, and for each the weight (h,), 0..1, that the range got and its log-likelihood (h,).
+    """
+    theta = bank.mean[:, 2]
+    lever = se2.rotate(theta, np.broadcast_to(tag, (len(bank), 2)))
+    offset = bank.mean[:, :2] + lever - fact.place
+    distance = np.sqrt(np.maximum(np.sum(offset**2, axis=1) + fact.square, 1e-4))
+    column = FIRST_ANCHOR + fact.anchor
+    error = fact.range - (1.0 + fact.scale) * distance - bank.mean[:, column]
+    jacobian = np.zeros(bank.mean.shape)
+    unit = (1.0 + fact.scale) * offset / distance[:, None]
+    jacobian[:, :2] = unit
+    jacobian[:, 2] = -unit[:, 0] * lever[:, 1] + unit[:, 1] * lever[:, 0]
+    jacobian[:, column] = 1.0
+    spread = np.einsum("hij,hj->hi", bank.covariance, jacobian)
+    own = np.einsum("hi,hi->h", jacobian, spread)
+    weight, likelihood = _judged(error, np.sqrt(own + fact.sigma**2))
+    gain = spread / (own + fact.sigma**2 / np.maximum(weight, 1e-3))[:, None]
+    gain *= (weight > 1e-3)[:, None]
+    mean = bank.mean + gain * error[:, None]
+    mean[:, 2] = se2.wrap_angle(mean[:, 2])
+    covariance = _symmetric(bank.covariance - gain[:, :, None] * spread[:, None, :])
+    return Hypotheses(mean, covariance, bank.log_weight), weight, likelihood
+
+
+def _judged(error: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """Return the weights (h,) of errors (h,) with standard deviations (h,) and their log-likelihoods, 0 = the likeliest."""
+    z = error / sigma
+    core = (1.0 - _TAIL - _WILD) * np.exp(-0.5 * z**2)
+    ratio = sigma / _DETOUR
+    late = _TAIL * ratio * np.sqrt(2.0 * np.pi) * np.exp(np.minimum(0.5 * ratio**2 - error / _DETOUR, 50.0)) * ndtr(z - ratio)
+    wild = _WILD * sigma * np.sqrt(2.0 * np.pi) / _WIDTH
+    total = core + late + wild
+    return core / total, np.log(total)
+
+
+def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypotheses:
+    """Correct every hypothesis by a scan: an iterated Kalman update with robust weights.
+
+    Parameters
+    ----------
+    rays : in the present frame of the base. fresh : 0..1, how far the scan errs independently of the one before it: walls
+        are seen with the same cells' rounding until the robot has moved.
+
+    Notes
+    -----
+    The scan measures the pose alone, so that the update is made for it, with prior information I and the scan's H and
+    gradient, and carried over to the rest of the state by its covariance with the pose.
+    """
+    if not len(bank):
+        return bank
+    prior, cross = bank.pose_covariances, bank.covariance[:, :, POSE]
+    information = np.linalg.inv(prior)
+    pose = bank.poses.copy()
+    hessian = np.zeros_like(prior)
+    for gate, scale in _GATES:
+        hessian, gradient, weight = walls.factors(pose, rays, gate, scale)
+        share = fresh * np.minimum(_INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / _FLIMSY**2
+        hessian, gradient = hessian * share[:, None, None], gradient * share[:, None]
+        away = pose - bank.poses
+        away[:, 2] = se2.wrap_angle(away[:, 2])
+        gradient += np.einsum("hij,hj->hi", information, away)
+        pose -= np.linalg.solve(information + hessian, gradient[:, :, None])[:, :, 0]
+    posterior = np.linalg.inv(information + hessian)
+    away = pose - bank.poses
+    away[:, 2] = se2.wrap_angle(away[:, 2])
+    gain = cross @ information
+    mean = bank.mean + np.einsum("hij,hj->hi", gain, away)
+    mean[:, 2] = se2.wrap_angle(mean[:, 2])
+    covariance = bank.covariance + gain @ (posterior - prior) @ gain.transpose(0, 2, 1)
+    return Hypotheses(mean, _symmetric(covariance), bank.log_weight)
+
+
+def weighed(bank: Hypotheses, log_likelihood: Floats) -> Hypotheses:
+    """Return the hypotheses with weights changed by a log-likelihood (h,), the best one's being 0 again."""
+    weight = bank.log_weight + log_likelihood
+    return replace(bank, log_weight=weight - weight.max(initial=-np.inf) if len(weight) else weight)
+
+
+def apart(one: Floats, others: Floats) -> Bools:
+    """Tell which poses (h, 3) are another place than a pose (3,): half a metre or 0.3 rad away."""
+    off = se2.between(one, others)
+    return (np.hypot(off[:, 0], off[:, 1]) > _SAME[0]) | (np.abs(off[:, 2]) > _SAME[1])
+
+
+_SAME = (0.5, 0.3)
+"""m and rad; hypotheses that are closer are one."""
+
+
+def pruned(bank: Hypotheses, most: int, least: float) -> Hypotheses:
+    """Return the best hypotheses, at most so many, none near a better one and none below a log-weight."""
+    order = np.argsort(-bank.log_weight, kind="stable")
+    kept: list[int] = []
+    for k in order.tolist():
+        if len(kept) == most or bank.log_weight[k] < least:
+            break
+        if not kept or apart(bank.poses[k], bank.poses[kept]).all():
+            kept.append(k)
+    return bank.rows(np.array(kept, dtype=np.int64))
+
+
+def _symmetric(matrices: Floats) -> Floats:
+    return 0.5 * (matrices + matrices.transpose(0, 2, 1))

@@ -1,0 +1,95 @@
+"""What a live localisation knows beforehand: anchors with their calibration, walls, and where the laser sits on the robot."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import DataError
+from ..grid.occupancy_grid import OccupancyGrid
+from ..io.stored_result import StoredAnchor, StoredResult
+from .walls import Walls, walls_of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownAnchors:
+    """Anchors of the map; the expected range is ``(1 + scale) sqrt(D^2 + height^2 + rise) + bias``, see graph.range_edges."""
+
+    ids: tuple[str, ...]
+    positions: Floats
+    """(a, 2) m, map frame."""
+    bias: Floats
+    """(a,) m."""
+    rise: Floats
+    """(a,) m^2, squared height above the tag that the map's recording showed; 0 where a height was given."""
+    sigma: Floats
+    """(a,) m, spread of the map's range residuals."""
+    scale: float = 0.0
+    """Relative error of all ranges, 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownMap:
+    """An earlier map, ready to be looked up."""
+
+    anchors: KnownAnchors
+    walls: Walls | None
+    """None: the map has no grid."""
+    laser_correction: Floats
+    """(3,) pose by which the laser's place on the base differs from what recordings say; m, m, rad."""
+    laser_delay: float = 0.0
+    """s; a scan stamped t was taken at t + laser_delay by the odometry's clock."""
+
+
+_SIGMA = 0.1
+"""m; spread of ranges to an anchor of which the map does not say it."""
+_LEAST_SIGMA = 0.05
+"""m; no radio of this kind is trusted beyond this in another recording."""
+
+
+def from_result(result: StoredResult) -> KnownMap:
+    """Return what a folder that `uwblite map` wrote knows.
+
+    Raises
+    ------
+    DataError : it holds neither an anchor with a place nor a grid.
+    """
+    calibration = _calibration(result.report)
+    anchors = known_anchors(result.anchors, calibration)
+    if not anchors.ids and result.grid is None:
+        raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: nothing tells where a robot is")
+    correction = np.array([calibration.get(f"laser_{name}", 0.0) for name in ("x", "y", "theta")])
+    walls = None if result.grid is None else walls_of(result.grid)
+    return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0))
+
+
+def known_map(anchors: tuple[StoredAnchor, ...], grid: OccupancyGrid | None) -> KnownMap:
+    """Return a map of anchors and a grid alone, with a laser that sits where recordings say."""
+    return KnownMap(known_anchors(anchors, {}), None if grid is None else walls_of(grid), np.zeros(3))
+
+
+def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float]) -> KnownAnchors:
+    """Return the anchors that have a sure place; of one that was moved, the last place."""
+    names = {a.id for a in stored}
+    last: dict[str, StoredAnchor] = {}
+    for anchor in stored:
+        name, mark, number = anchor.id.rpartition("#")
+        if anchor.status == "ok" and np.isfinite(anchor.position).all():
+            last[name if mark and number.isdigit() and name in names else anchor.id] = anchor
+    sigma = np.array([a.residual_rms if np.isfinite(a.residual_rms) else _SIGMA for a in last.values()])
+    return KnownAnchors(
+        tuple(last),
+        np.array([a.position for a in last.values()]).reshape(-1, 2),
+        np.array([a.bias if np.isfinite(a.bias) else 0.0 for a in last.values()]),
+        np.array([max(calibration.get(f"height2:{a.id}", 0.0), 0.0) for a in last.values()]),
+        np.maximum(sigma, _LEAST_SIGMA),
+        calibration.get("range_scale", 0.0),
+    )
+
+
+def _calibration(report: dict[str, Any]) -> dict[str, float]:
+    """Return the calibration values of a report by name."""
+    entries = [e for e in report.get("calibration") or () if isinstance(e, dict)]
+    found = {str(e.get("name")): e.get("value") for e in entries}
+    return {name: float(value) for name, value in found.items() if isinstance(value, int | float) and np.isfinite(value)}

@@ -1,0 +1,486 @@
+"""A robot's pose in a map that is there already, as its measurements come in.
+
+Nothing is known at the start. While the robot drives, the last metres' ranges and scans are searched for in the whole map
+(search); what is found lives on as hypotheses, each an extended Kalman filter of its own (hypotheses), and is weighed anew
+with every search. Only when one explains what was measured, twice in a row, and every other place is a few hundred times
+less likely, the pose counts as found. From then on that filter tracks, at a millisecond a scan; where measurements
+and map fall apart, the pose counts as lost, and the search begins anew with what was measured since.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import se2
+from ..arrays import Floats
+from ..odometry.attached import beam_origins
+from ..radio.trilateration import TrilaterationConfig, usable
+from ..sensor_log import SensorMounting
+from . import hypotheses, search
+from .hypotheses import Hypotheses, RangeFacts
+from .known_map import KnownMap
+from .odometer import Odometer
+from .walls import Rays
+from .window import RAYS, Ranges, Window, WindowLook, WindowRange, way_of
+
+
+@dataclass(frozen=True, slots=True)
+class Scanner:
+    """Geometry of a lidar, with the field names of sensor_msgs/LaserScan."""
+
+    angle_min: float
+    """rad."""
+    angle_increment: float
+    """rad."""
+    time_increment: float = 0.0
+    """s between rays."""
+    range_min: float = 0.02
+    range_max: float = 30.0
+    """m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalizerState:
+    """Where the robot is, as far as is known."""
+
+    stamp: float
+    """s, of the last odometry."""
+    pose: Floats
+    """(3,) T_map_base, of the likeliest hypothesis; nan where there is none."""
+    covariance: Floats
+    """(3, 3) m, m, rad; map frame; of all hypotheses together while there are several."""
+    quality: float
+    """0..1: how likely this pose is against all others, times how well the last measurements agree with the map there."""
+    lost: bool
+    """The pose is not known; what stands in `pose` is the best guess."""
+    reason: str = ""
+    """Why it is not known, for people."""
+    alternatives: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(k, 3) other poses that are possible, the likeliest first."""
+    moved_anchors: tuple[str, ...] = ()
+    """Anchors whose ranges have long disagreed with the pose that all else agrees on."""
+
+
+_SIGMA_MAP = (0.02, 0.02, 0.005)
+"""m, m, rad; what the map itself is off by: its errors are alike in neighbouring scans, and no filter averages them."""
+_FRESH_WAY = 0.1
+"""m; a scan taken so far from the last one errs independently of it; a nearer one in proportion."""
+_LEAST_FRESH = 0.1
+_STANDING_FRESH = 0.02
+"""The same for a robot that stands: its scans repeat one another."""
+_SCAN_EVIDENCE = 15.0
+"""Rays per metre of driving that count as independent when places are compared."""
+_LOOK_BACK = 4.0
+"""m driven, of whose scans places are compared."""
+_SEARCH_LOOKS = 2.5
+"""m driven, of whose scans the search makes one cloud."""
+_CERTAIN = 6.0
+"""Log-likelihood by which a place must be better than any other: 400 : 1."""
+_FORGET = -14.0
+"""Log-weight below which a hypothesis goes."""
+_SIGMA_FOUND = (0.35, 0.15)
+"""m and rad; a pose that is less sure is not found yet."""
+_FIT_SOUND, _FIT_LOST = 0.6, 0.35
+"""Share of the rays' ends on walls from which nothing is doubtful, and below which the pose is lost."""
+_RANGES_FOUND, _RANGES_LOST = 0.5, 0.25
+"""Share of the ranges that must agree with a start; mean weight of ranges below which the pose is lost."""
+_CONFIRM, _CONFIRM_ALONE = 0.5, 2.0
+"""m driven between two searches that agree; the second where scans have no ranges beside them."""
+_FIT_BESIDE_RANGES, _FIT_ALONE = -0.7, -0.25
+"""Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.15, with people
+close by -0.5; rooms that are alike in part reach -0.3."""
+_FORGETTING, _FORGETTING_RANGES = 0.1, 0.15
+"""Share of a new scan, and of a new range, in the mean of the last ones: a second of scans, two rounds of four ranges."""
+_SEARCH_WAY, _SEARCH_TIME = 0.5, 1.0
+"""m driven and s between two searches."""
+_MOST = 40
+"""Hypotheses."""
+_PATIENCE = 0.5
+"""s by which a measurement may be ahead of the odometry before the odometry counts as silent."""
+_UNSEEN_SPEED = 0.3
+"""m/s and rad/s; how fast a robot may move while its odometry is silent."""
+_CLEAR = 3.0
+"""m; up to here a ray that saw nothing would have seen a wall, as grid.max_clear_distance."""
+_TRACK_RAYS = 180
+"""Rays of a scan that are matched."""
+
+
+@dataclass(frozen=True, slots=True)
+class _WaitingRange:
+    """A range that the odometry has not reached."""
+
+    anchor: int
+    metres: float
+    tag: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _WaitingScan:
+    """A scan that the odometry has not reached."""
+
+    stamp: float
+    readings: Floats
+    scanner: Scanner
+
+
+class Localizer:
+    """Find and track a robot.
+
+    Parameters
+    ----------
+    known : the map. mounting : where the robot's sensors sit. scanner : its lidar; None where scans bring it with them.
+
+    Notes
+    -----
+    Not for several threads at once. Measurements may come out of order by some tenths of a second; one that is
+    ahead of the odometry waits for it.
+    """
+
+    def __init__(self, known: KnownMap, mounting: SensorMounting | None = None, scanner: Scanner | None = None) -> None:
+        self.known, self.mounting, self.scanner = known, mounting or SensorMounting(), scanner
+        self._mount = se2.compose(known.laser_correction, self.mounting.T_base_laser)
+        self._odometer = Odometer()
+        self._bank = hypotheses.none(len(known.anchors.ids))
+        self._field = None if known.walls is None else search.field_of(known.walls)
+        self._bounds = _bounds(known)
+        self._names = {name: k for k, name in enumerate(known.anchors.ids)}
+        told = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
+        self._square = np.square(told) + known.anchors.rise
+        self._window = Window()
+        self._waiting: list[tuple[float, int, _WaitingRange | _WaitingScan]] = []
+        self._arrived = 0
+        self._way = self._scan_way = self._search_way = 0.0
+        self._search_stamp = -np.inf
+        self._certain = False
+        self._confirmed: tuple[float, Floats] | None = None
+        self._fit = self._heard = 1.0
+        self._trust = np.full((len(known.anchors.ids), 2), (1.0, 0.0))
+        self._reason = "nothing has been measured yet"
+        self.strangers: dict[str, int] = {}
+        """Ranges to anchors that the map does not know, by id."""
+
+    # ---- what comes in
+
+    def add_odometry(self, stamp: float, x: float, y: float, theta: float) -> LocalizerState:
+        """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
+        step = self._odometer.add(stamp, np.array([x, y, theta], dtype=np.float64))
+        if step is not None:
+            self._bank = hypotheses.moved(self._bank, step)
+            self._way += way_of(step)
+        self._work_off()
+        return self.state()
+
+    def add_ranges(self, stamp: float, anchor_ids: Sequence[str], metres: ArrayLike, tag: int = 0) -> LocalizerState:
+        """Take the ranges of one round.
+
+        Parameters
+        ----------
+        stamp : s, on the odometry's clock. anchor_ids, metres : (m,) of each range. tag : which of the robot's tags measured.
+        """
+        values = np.asarray(metres, dtype=np.float64).reshape(-1)
+        good = usable(values, TrilaterationConfig())
+        for name, value in zip(np.asarray(anchor_ids)[good].tolist(), values[good].tolist(), strict=True):
+            if name in self._names:
+                self._wait(stamp, _WaitingRange(self._names[name], value, tag))
+            else:
+                self.strangers[name] = self.strangers.get(name, 0) + 1
+        self._work_off()
+        return self.state()
+
+    def add_scan(self, stamp: float, ranges: ArrayLike, scanner: Scanner | None = None) -> LocalizerState:
+        """Take a scan.
+
+        Parameters
+        ----------
+        stamp : s, of the first ray, on the lidar's clock. ranges : (b,) m; inf = nothing seen, nan = invalid.
+        scanner : geometry, where it is not the one of before.
+        """
+        self.scanner = scanner or self.scanner
+        if self.scanner is not None and self.known.walls is not None:
+            readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
+            end = stamp + self.known.laser_delay + self.scanner.time_increment * max(len(readings) - 1, 0)
+            self._wait(end, _WaitingScan(stamp + self.known.laser_delay, readings, self.scanner))
+        self._work_off()
+        return self.state()
+
+    # ---- what is known
+
+    def state(self) -> LocalizerState:
+        """Return the pose at the time of the last odometry."""
+        bank = self._bank
+        stamp = self._odometer.stamp
+        if not len(bank):
+            nothing = np.full((3, 3), np.nan)
+            return LocalizerState(stamp, np.full(3, np.nan), nothing, 0.0, True, self._reason, moved_anchors=self._moved())
+        order = np.argsort(-bank.log_weight, kind="stable")
+        best = int(order[0])
+        share = np.exp(bank.log_weight)
+        share /= share.sum()
+        covariance = bank.pose_covariances[best]
+        if not self._certain:
+            off = se2.between(np.zeros(3), bank.poses - bank.poses[best])
+            covariance = np.einsum("h,hij->ij", share, bank.pose_covariances + off[:, :, None] * off[:, None, :])
+        fit = self._fit if self._sees() else self._heard
+        quality = float(share[best]) * float(np.clip(fit / _FIT_SOUND, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
+        covariance = covariance + np.diag(np.square(_SIGMA_MAP))
+        others = bank.poses[order[1:]]
+        reason = "" if self._certain else self._reason
+        return LocalizerState(
+            stamp, bank.poses[best].copy(), covariance.copy(), quality, not self._certain, reason, others, self._moved()
+        )
+
+    def _moved(self) -> tuple[str, ...]:
+        """Return the anchors that most ranges have long disagreed with."""
+        far = (self._trust[:, 0] < _MOVED[0]) & (self._trust[:, 1] >= _MOVED[1])
+        return tuple(self.known.anchors.ids[k] for k in np.flatnonzero(far))
+
+    def _sees(self) -> bool:
+        return self.known.walls is not None and bool(self._window.looks)
+
+    # ---- measurements, in the order of their times
+
+    def _wait(self, until: float, entry: "_WaitingRange | _WaitingScan") -> None:
+        if np.isfinite(until):
+            self._waiting.append((until, self._arrived, entry))
+            self._arrived += 1
+
+    def _work_off(self) -> None:
+        """Use the measurements that the odometry has reached."""
+        if not self._waiting or not len(self._odometer):
+            return
+        self._bridge_silence()
+        now = self._odometer.stamp
+        due = sorted((w for w in self._waiting if w[0] <= now), key=lambda w: w[:2])
+        self._waiting = [w for w in self._waiting if w[0] > now]
+        for until, _, entry in due:
+            if isinstance(entry, _WaitingScan):
+                self._use_scan(entry)
+            else:
+                self._use_range(entry, until)
+        if due:
+            self._search_or_check()
+
+    def _bridge_silence(self) -> None:
+        """Where the odometry has fallen silent, let the robot stand, and the pose become unsure."""
+        latest = max(w[0] for w in self._waiting)
+        gap = latest - self._odometer.stamp
+        if gap > _PATIENCE:
+            self._odometer.add(latest - 0.1, self._odometer.pose.copy())
+            self._bank = hypotheses.moved(self._bank, np.zeros(3), _UNSEEN_SPEED * min(gap, 3.0))
+
+    def _use_range(self, entry: _WaitingRange, stamp: float) -> None:
+        anchors, tags, anchor = self.known.anchors, self.mounting.tags, entry.anchor
+        fact = RangeFacts(
+            anchor, anchors.positions[anchor], entry.metres - float(anchors.bias[anchor]), float(self._square[anchor]),
+            float(anchors.sigma[anchor]), anchors.scale,
+        )  # fmt: skip
+        then = self._odometer.at(np.array([stamp]))[0]
+        place = tags[min(max(entry.tag, 0), len(tags) - 1), :2]
+        self._window.add_range(WindowRange(fact, then, place, self._way))
+        if not len(self._bank):
+            return
+        arm = se2.transform(se2.between(self._odometer.pose, then), place)
+        bank, weight, likelihood = hypotheses.ranged(self._bank, fact, arm)
+        self._bank = hypotheses.weighed(bank, likelihood if len(bank) > 1 else np.zeros(1))
+        best = float(weight[int(np.argmax(bank.log_weight))])
+        self._trust[anchor] += (_FORGETTING * (best - self._trust[anchor, 0]), 1.0)
+        self._heard += _FORGETTING_RANGES * (best - self._heard)
+
+    def _use_scan(self, entry: _WaitingScan) -> None:
+        rays = self._rays(entry.stamp, entry.readings, entry.scanner)
+        if self._window.wants_look(self._way) and len(rays.hit):
+            self._window.add_look(WindowLook(_every(rays, RAYS), self._odometer.pose.copy(), self._way))
+            self._window.forget(self._way)
+        walls = self.known.walls
+        if not len(self._bank) or walls is None or not len(rays.hit):
+            return
+        driven = self._way - self._scan_way
+        self._scan_way = self._way
+        least = _LEAST_FRESH if driven > 1e-3 else _STANDING_FRESH
+        self._bank = hypotheses.matched(self._bank, walls, rays, float(np.clip(driven / _FRESH_WAY, least, 1.0)))
+        few = _every(rays, RAYS)
+        found = walls.agreement(self._bank.poses, few)
+        if len(self._bank) > 1:
+            self._bank = hypotheses.weighed(self._bank, _SCAN_EVIDENCE * min(driven, 1.0) * found.log_likelihood)
+        best = int(np.argmax(self._bank.log_weight))
+        if found.known[best] >= _FEW_ENDS:
+            self._fit += _FORGETTING * (float(found.on_wall[best]) - self._fit)
+
+    def _rays(self, stamp: float, readings: Floats, scanner: Scanner) -> Rays:
+        """Return thinned rays in the present frame of the base, each moved by the odometry at its own time."""
+        count = len(readings)
+        hit = (readings >= scanner.range_min) & (readings <= scanner.range_max)
+        empty = (np.isposinf(readings) | (readings > scanner.range_max)) & ~hit
+        ray = np.flatnonzero(hit | empty)
+        ray = ray[:: max(1, -(-len(ray) // _TRACK_RAYS))]
+        ends = self._odometer.at(np.array([stamp, stamp + scanner.time_increment * max(count - 1, 0)]))
+        first = se2.between(self._odometer.pose, ends[:1])
+        sweep = se2.between(ends[:1], ends[1:])
+        mounting = SensorMounting(T_base_laser=self._mount)
+        laser = beam_origins(first, sweep, np.zeros(len(ray), np.int64), ray / max(count - 1, 1), mounting)
+        sign = -1.0 if self.mounting.laser_flipped else 1.0
+        bearing = laser[:, 2] + sign * (scanner.angle_min + scanner.angle_increment * ray)
+        reach = np.where(hit[ray], readings[ray], min(_CLEAR, scanner.range_max))
+        ends_of = laser[:, :2] + reach[:, None] * np.stack(se2.cos_sin(bearing), axis=1)
+        return Rays(ends_of, laser[:, :2], hit[ray])
+
+    # ---- the start, and what ends in one
+
+    def _search_or_check(self) -> None:
+        if self._certain:
+            if self._sees() and self._fit < _FIT_LOST:
+                self._lose("the scans do not fit the walls any more")
+            elif self._heard < _RANGES_LOST and not (self._sees() and self._fit > _FIT_SOUND):
+                self._lose("the ranges do not fit the anchors any more")
+            else:
+                return
+        now = self._odometer.stamp
+        if self._way - self._search_way < _SEARCH_WAY and now - self._search_stamp < _SEARCH_TIME:
+            return
+        self._search_way, self._search_stamp = self._way, now
+        self._search()
+
+    def _lose(self, why: str) -> None:
+        self._certain, self._confirmed, self._reason = False, None, why
+        self._window.clear()
+        self._trust[:] = (1.0, 0.0)
+        self._search_way, self._search_stamp = self._way, self._odometer.stamp
+
+    def _search(self) -> None:
+        """Look for the robot in the whole map, weigh all hypotheses anew, and decide."""
+        odom = self._odometer.pose
+        ranges = self._window.heard(odom, self._way)
+        rays, ago = self._window.seen(odom, self._way, _LOOK_BACK)
+        recent = rays.rows(ago <= _SEARCH_LOOKS)
+        found = search.places(self._field, self.known.walls, recent, ranges, self._bounds)
+        self._bank = self._with_places(found.poses, ranges, recent)
+        if not len(self._bank):
+            self._reason = _too_little(rays, ranges)
+            return
+        weight = search.range_likelihood(self._bank.poses, ranges)
+        fit, known = np.zeros(len(self._bank)), np.zeros(len(self._bank))
+        if self.known.walls is not None and len(rays.hit):
+            agreement = self.known.walls.agreement(self._bank.poses, rays)
+            weight += _SCAN_EVIDENCE * (1.0 + float(ago.max())) * agreement.log_likelihood
+            fit, known = agreement.log_likelihood, agreement.known
+        self._bank = hypotheses.weighed(Hypotheses(self._bank.mean, self._bank.covariance, np.zeros(len(weight))), weight)
+        best = int(np.argmax(self._bank.log_weight))
+        pose = self._bank.poses[best].copy()
+        heard = _agreeing(pose, ranges)
+        self._reason = self._doubt(best, found.complete, float(fit[best]), float(known[best]), heard)
+        self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
+        self._decide(pose, _CONFIRM if heard.enough else _CONFIRM_ALONE)
+
+    def _with_places(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
+        """Return the hypotheses with new ones where none is near."""
+        for pose in self._bank.poses:
+            poses = poses[hypotheses.apart(pose, poses)]
+        if not len(poses):
+            return self._bank
+        scans = self.known.walls is not None and rays.hit.sum() >= _FEW_ENDS
+        covariances = np.tile(np.diag(np.square(_SIGMA_SCAN)), (len(poses), 1, 1))
+        if not scans:
+            hessian, _ = search.range_factors(poses, ranges)
+            covariances = np.linalg.inv(hessian + np.diag([0.01, 0.01, 0.1])) + np.diag(np.square(_SIGMA_FLOOR))
+        fresh = hypotheses.started(poses, covariances, len(self.known.anchors.ids))
+        if scans and self.known.walls is not None:
+            fresh = hypotheses.matched(fresh, self.known.walls, _every(rays, _TRACK_RAYS), 1.0)
+        return hypotheses.joined(self._bank, fresh)
+
+    def _doubt(self, best: int, complete: bool, fit: float, ends: float, heard: "_Heard") -> str:
+        """Return why the best hypothesis is not to be trusted yet; "" = it is."""
+        bank = self._bank
+        sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
+        rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
+        if not complete:
+            return "too many places are as likely; drive on"
+        if ends < _ENOUGH_ENDS and not heard.enough:
+            return "too little was measured yet; drive on"
+        if ends >= _ENOUGH_ENDS and fit < (_FIT_BESIDE_RANGES if heard.enough else _FIT_ALONE):
+            return "the scans fit the walls nowhere well; is this the right map?"
+        if heard.count >= _ENOUGH_RANGES and heard.share < _RANGES_FOUND:
+            return f"the ranges fit the anchors nowhere (best place: {heard.share:.0%} of them); is this the right map?"
+        if len(rivals) and rivals.max() > -_CERTAIN:
+            count = 1 + int((rivals > -_CERTAIN).sum())
+            return f"{count} places are as likely; drive on, around a corner or past another anchor"
+        if max(sigma[0], sigma[1]) > _SIGMA_FOUND[0] or sigma[2] > _SIGMA_FOUND[1]:
+            return "place or heading is not sure yet; drive on"
+        return ""
+
+    def _decide(self, pose: Floats, confirm: float) -> None:
+        """Take the best hypothesis for the truth where two searches, some way apart, came to it without a doubt."""
+        if self._reason:
+            self._confirmed = None
+            return
+        odom = self._odometer.pose
+        if self._confirmed is not None:
+            way, T_map_odom = self._confirmed
+            same = not hypotheses.apart(pose, se2.compose(T_map_odom, odom)[None])[0]
+            if same and self._way - way >= confirm:
+                self._certain = True
+                self._bank = hypotheses.pruned(self._bank, 1, -1.0)
+                self._fit = self._heard = 1.0
+                self._trust[:] = (1.0, 0.0)
+                return
+            if same:
+                self._reason = "found; a little more driving will confirm it"
+                return
+        self._confirmed = (self._way, se2.compose(pose, se2.inverse(odom)))
+        self._reason = "found; a little more driving will confirm it"
+
+
+_FEW_ENDS = 12
+"""Rays' ends in known space from which a scan says something."""
+_ENOUGH_ENDS, _ENOUGH_RANGES = 40, 6
+"""Rays' ends, or ranges to two anchors, that a start needs."""
+_SIGMA_SCAN = (0.2, 0.2, 0.06)
+"""m, m, rad; of a place that the search found by scans."""
+_SIGMA_FLOOR = (0.1, 0.1, 0.03)
+"""m, m, rad; drift within the window, on top of what ranges say of a place."""
+_MOVED = (0.2, 20.0)
+"""Mean weight below which, after so many ranges, an anchor counts as moved."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Heard:
+    """How the window's ranges agree with a pose."""
+
+    count: int
+    share: float
+    """Of the ranges that agree, 0..1."""
+    enough: bool
+    """As many to as many anchors as a start needs agree."""
+
+
+def _agreeing(pose: Floats, ranges: Ranges) -> _Heard:
+    if not len(ranges):
+        return _Heard(0, 0.0, False)
+    agree = np.abs(search.range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
+    enough = len(np.unique(ranges.anchor[agree])) >= 2 and int(agree.sum()) >= _ENOUGH_RANGES
+    return _Heard(len(ranges), float(agree.mean()), bool(enough))
+
+
+def _every(rays: Rays, count: int) -> Rays:
+    """Return at most so many rays, evenly spread."""
+    return rays.rows(np.unique(np.linspace(0, len(rays.hit) - 1, count).astype(np.int64)))
+
+
+def _too_little(rays: Rays, ranges: Ranges) -> str:
+    if not len(rays.hit) and not len(ranges):
+        return "no range to an anchor of the map and no scan has come in"
+    if not len(rays.hit) and len(np.unique(ranges.anchor)) < 2:
+        return "only one of the map's anchors is heard; two or more are needed, or a lidar"
+    return "too many places are as likely; drive on"
+
+
+_RADIO_REACH = 15.0
+"""m beyond the outermost anchors; where a robot may be in a map without a grid."""
+
+
+def _bounds(known: KnownMap) -> tuple[Floats, Floats]:
+    """Return the corners (2,) of the area in which the robot may be, m."""
+    if known.walls is not None:
+        return known.walls.geometry.origin, known.walls.geometry.corner
+    return known.anchors.positions.min(axis=0) - _RADIO_REACH, known.anchors.positions.max(axis=0) + _RADIO_REACH

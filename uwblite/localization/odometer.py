@@ -1,0 +1,83 @@
+"""The odometry of the last seconds, looked up by time."""
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats
+
+_SECONDS = 30.0
+"""s that are kept: longer than any sensor's message is late."""
+_FASTEST = 5.0
+"""m/s and rad/s; a step that is faster was not driven: the base's counters began anew."""
+_LEAST_STEP = 0.5
+"""m and rad; a smaller step is none of these."""
+
+
+class Odometer:
+    """A trajectory that grows at its end and is forgotten at its beginning."""
+
+    def __init__(self) -> None:
+        self._stamps = np.zeros(64)
+        self._poses = np.zeros((64, 3))
+        self._begin = self._end = 0
+        self.jumps = 0
+        """Steps that no robot drives; they count as standing still."""
+        self.late = 0
+        """Poses that were older than one before them, and were left out."""
+
+    def __len__(self) -> int:
+        return self._end - self._begin
+
+    @property
+    def stamp(self) -> float:
+        """Time of the last pose, s; -inf before the first."""
+        return float(self._stamps[self._end - 1]) if len(self) else -np.inf
+
+    @property
+    def pose(self) -> Floats:
+        """(3,) last pose; m, m, rad."""
+        return self._poses[self._end - 1]
+
+    def add(self, stamp: float, pose: Floats) -> Floats | None:
+        """Take a pose (3,) and return the step (3,) since the one before; None where it is not used, or is the first.
+
+        A jump goes into the trajectory, with what was there before moved along: what hangs on the last pose stays there.
+        """
+        if not np.isfinite(stamp) or not np.isfinite(pose).all():
+            self.late += 1
+            return None
+        if not len(self):
+            self._append(stamp, pose)
+            return None
+        if stamp <= self.stamp:
+            self.late += 1
+            return None
+        step = se2.between(self.pose, pose)
+        if np.abs(step).max() > max(_LEAST_STEP, _FASTEST * (stamp - self.stamp)):
+            self.jumps += 1
+            kept = slice(self._begin, self._end)
+            self._poses[kept] = se2.compose(pose, se2.between(self.pose, self._poses[kept]))
+            step = np.zeros(3)
+        self._append(stamp, pose)
+        return step
+
+    def at(self, stamps: Floats) -> Floats:
+        """Return the poses (n, 3) at times (n,); beyond either end the nearest one."""
+        kept = slice(self._begin, self._end)
+        return se2.interpolate_trajectory(self._stamps[kept], self._poses[kept], stamps)
+
+    def _append(self, stamp: float, pose: Floats) -> None:
+        if self._end == len(self._stamps):
+            self._shift()
+        self._stamps[self._end], self._poses[self._end] = stamp, pose
+        self._end += 1
+
+    def _shift(self) -> None:
+        """Make room: forget what is old, and where that is too little, take more memory."""
+        recent = int(np.searchsorted(self._stamps[: self._end], self.stamp - _SECONDS))
+        first = max(self._begin, min(recent, self._end - 2))
+        stamps, poses = self._stamps[first : self._end].copy(), self._poses[first : self._end].copy()
+        room = max(64, 2 * len(stamps))
+        self._stamps, self._poses = np.zeros(room), np.zeros((room, 3))
+        self._stamps[: len(stamps)], self._poses[: len(stamps)] = stamps, poses
+        self._begin, self._end = 0, len(stamps)

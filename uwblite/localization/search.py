@@ -1,0 +1,314 @@
+"""Where a robot may be, from nothing: every pose of the map is judged by the last metres' ranges and scans.
+
+Ranges first: a place to which the measured distances cannot belong, whatever the robot's heading, is left out. On what
+remains the scans of the last metres, laid together by the odometry, are matched by branch and bound over a pyramid of the
+walls' likelihood field, of which each level bounds the one below (W. Hess et al., Real-time loop closure in 2D lidar SLAM,
+ICRA 2016); unlike there, all poses near the best score are kept, not the best alone: a place that looks like another one is
+not decided here. Where no wall is in sight, headings and places are tried by the ranges alone. What is found is refined and
+weighed by everything that the window holds.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from .walls import Rays, Walls
+from .window import Ranges
+
+_CELL = 0.1
+"""m; cell of the likelihood field."""
+_LEVELS = 3
+"""Levels above the field; the coarsest has cells of 0.8 m."""
+_SPREAD = 0.15
+"""m; of a point about its wall: the cell, and 0.05 rad at 3 m."""
+_HEADING = 0.05
+"""rad; step of the heading."""
+_POINTS = 72
+"""Points of the scans that are matched."""
+_FARTHEST = 12.0
+"""m; points farther away are not matched: 0.05 rad is there 0.6 m."""
+_MOST_FIELD = 3_000_000
+"""Cells of the field (one byte, four levels); a larger map gets coarser ones."""
+_MOST_NODES = 60_000
+"""Nodes of a level that are followed up; where more are as good, the search is not complete."""
+_RIVAL = 0.75
+"""Poses whose score is this share of the best one's are kept."""
+_FEWEST_POINTS = 12
+"""Points of walls below which scans say nothing."""
+MOST_PLACES = 32
+"""Poses that are returned."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Field:
+    """The walls' likelihood, one byte a cell, and its maxima over squares of cells."""
+
+    cell: float
+    """m."""
+    origin: Floats
+    """(2,) lower left corner, m."""
+    levels: tuple[NDArray[np.uint8], ...]
+    """(rows, cols) each; level k holds the maximum over 2^k x 2^k cells to the upper right."""
+    free: Bools
+    """(rows, cols) cells in which a robot may stand."""
+    margin: int
+    """Cells around the map, so that points outside of it find a cell."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Where the robot may be."""
+
+    poses: Floats
+    """(c, 3)."""
+    complete: bool
+    """No place that is as good was left out."""
+
+
+def field_of(walls: Walls) -> Field:
+    """Return the likelihood field of walls."""
+    g = walls.geometry
+    size = np.array([g.cols, g.rows]) * g.resolution
+    cell = max(_CELL, float(np.sqrt((size[0] + 2 * _FARTHEST) * (size[1] + 2 * _FARTHEST) / _MOST_FIELD)))
+    margin = int(np.ceil(_FARTHEST / cell)) + 2 ** (_LEVELS + 1)
+    wide, high = (np.ceil(size / cell).astype(int) + 2 * margin).tolist()
+    origin = g.origin - margin * cell
+    x, y = origin[0] + (np.arange(wide) + 0.5) * cell, origin[1] + (np.arange(high) + 0.5) * cell
+    likelihood, free = np.empty((high, wide), np.uint8), np.empty((high, wide), bool)
+    for row in range(high):
+        distance = np.minimum(walls.distances(x, np.full(wide, y[row])), 10.0)
+        likelihood[row] = np.rint(255.0 * np.exp(-0.5 * np.square(distance / max(_SPREAD, cell))))
+        free[row] = walls.state_at(x, np.full(wide, y[row])) == 0
+    levels = [likelihood]
+    for k in range(_LEVELS):
+        below, reach = levels[-1], 2**k
+        wider = below.copy()
+        wider[:, :-reach] = np.maximum(below[:, :-reach], below[:, reach:])
+        higher = wider.copy()
+        higher[:-reach] = np.maximum(wider[:-reach], wider[reach:])
+        levels.append(higher)
+    return Field(cell, origin, tuple(levels), free, margin)
+
+
+def places(field: Field | None, walls: Walls | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Places:
+    """Search the map.
+
+    Parameters
+    ----------
+    rays : of the last metres, in the present frame of the base. ranges : of the window.
+    bounds : corners (2,) of the area in which the robot may be, m.
+
+    Returns
+    -------
+    Poses that explain the measurements about as well as the best one, at most MOST_PLACES, the best first; refined by ranges
+    where no scan says more.
+    """
+    seen = _thinned(rays) if walls is not None else np.zeros((0, 2))
+    if field is not None and len(seen) >= _FEWEST_POINTS:
+        found = _by_scans(field, seen, ranges)
+        if len(found.poses) or not len(ranges):
+            return found
+    if len(np.unique(ranges.anchor)) < 2:
+        return Places(np.zeros((0, 3)), False)
+    return _by_ranges(ranges, bounds)
+
+
+def _thinned(rays: Rays) -> Floats:
+    """Return points (p, 2) on walls, no two in one cell of the field, at most _POINTS of them."""
+    near = rays.hit & (np.hypot(*rays.ends.T) < _FARTHEST)
+    points = rays.ends[near]
+    _, first = np.unique(np.floor(points / (1.5 * _CELL)).astype(np.int64), axis=0, return_index=True)
+    chosen = np.sort(first)
+    return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.int64))]] if len(chosen) else points[:0]
+
+
+def _by_scans(field: Field, points: Floats, ranges: Ranges) -> Places:
+    """Match points (p, 2) by branch and bound where the ranges allow it."""
+    top = 2**_LEVELS
+    rows, cols = _coarse_cells(field, top)
+    centre = field.origin + (np.stack([cols, rows], axis=1) + 0.5 * top) * field.cell
+    rows, cols = (v[_allowed(centre, 0.75 * top * field.cell, ranges)] for v in (rows, cols))
+    headings = np.arange(0.0, 2.0 * np.pi - 0.5 * _HEADING, _HEADING)
+    offsets = _offsets(field, points, headings)
+    turn = np.repeat(np.arange(len(headings)), len(rows))
+    nodes = np.column_stack([turn, np.tile(rows, len(headings)), np.tile(cols, len(headings))])
+    if not len(nodes):
+        return Places(np.zeros((0, 3)), False)
+    complete, least = True, 0.0
+    scores = _scored(field, _LEVELS, offsets, nodes)
+    for level in range(_LEVELS, 0, -1):
+        least = max(least, _RIVAL * _dive(field, level, offsets, nodes, scores))
+        kept = np.flatnonzero(scores >= least)
+        if len(kept) > _MOST_NODES:
+            complete = False
+            kept = kept[np.argsort(-scores[kept], kind="stable")[:_MOST_NODES]]
+        nodes = _children(nodes[kept], 2 ** (level - 1))
+        scores = _scored(field, level - 1, offsets, nodes)
+    kept = np.flatnonzero(scores >= max(least, _RIVAL * scores.max(initial=0.0)))
+    kept = kept[np.argsort(-scores[kept], kind="stable")]
+    poses = np.column_stack([field.origin + (nodes[kept, :0:-1] + 0.5) * field.cell, se2.wrap_angle(headings[nodes[kept, 0]])])
+    inside = field.free[nodes[kept, 1], nodes[kept, 2]]
+    return _distinct(poses[inside], complete)
+
+
+def _coarse_cells(field: Field, top: int) -> tuple[Ints, Ints]:
+    """Return rows and columns of the squares of cells in which a robot may stand."""
+    high, wide = (n // top for n in field.free.shape)
+    some = field.free[: high * top, : wide * top].reshape(high, top, wide, top).any(axis=(1, 3))
+    row, col = np.nonzero(some)
+    return row.astype(np.int64) * top, col.astype(np.int64) * top
+
+
+def _offsets(field: Field, points: Floats, headings: Floats) -> Ints:
+    """Return by how many cells of the flat field (h, p) each point lies from the robot's cell."""
+    laid = se2.rotate(headings[:, None], points[None])
+    cells = np.rint(laid / field.cell).astype(np.int64)
+    return cells[..., 1] * field.free.shape[1] + cells[..., 0]
+
+
+def _scored(field: Field, level: int, offsets: Ints, nodes: Ints) -> Floats:
+    """Return the bounds (n,) of nodes: mean likelihood of the points, 0..1."""
+    flat, wide = field.levels[level].reshape(-1), field.free.shape[1]
+    scores = np.empty(len(nodes))
+    base = nodes[:, 1] * wide + nodes[:, 2]
+    for start in range(0, len(nodes), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        values = flat.take(offsets[nodes[part, 0]] + base[part, None], mode="clip")
+        scores[part] = values.sum(axis=1, dtype=np.int64)
+    return np.asarray(scores / (255.0 * offsets.shape[1]))
+
+
+_AT_ONCE = 4096
+"""Nodes scored at once: what fits into a processor's cache."""
+
+
+def _dive(field: Field, level: int, offsets: Ints, nodes: Ints, scores: Floats) -> float:
+    """Return the score of a good pose, found by following the best nodes down: a lower bound of the best one's."""
+    best = nodes[np.argsort(-scores, kind="stable")[:64]]
+    found = np.zeros(0)
+    for below in range(level - 1, -1, -1):
+        best = _children(best, 2**below)
+        found = _scored(field, below, offsets, best)
+        best = best[np.argsort(-found, kind="stable")[:64]]
+    return float(found.max(initial=0.0))
+
+
+def _children(nodes: Ints, half: int) -> Ints:
+    """Return the four quarters of each node."""
+    shift = np.array([[0, 0, 0], [0, 0, half], [0, half, 0], [0, half, half]])
+    return (nodes[:, None] + shift).reshape(-1, 3)
+
+
+def _allowed(centre: Floats, half: float, ranges: Ranges) -> Bools:
+    """Tell where (n,) the robot may be by its ranges alone, whatever its heading, within a half width of a place, m.
+
+    The tag was within |t| of where it is now: a range further off than that, the cell and four sigmas disagrees. Detours make
+    ranges long: a place that is too near an anchor is half a disagreement. The best places and those with little more stay.
+    """
+    if not len(ranges) or not len(centre):
+        return np.ones(len(centre), bool)
+    cost = np.zeros(len(centre))
+    moved = np.hypot(*ranges.tags.T)
+    for k in range(len(ranges)):
+        off = ranges.values[k] - np.hypot(*(centre - ranges.places[k]).T)
+        beyond = np.abs(off) - moved[k] - 1.5 * half - 4.0 * ranges.sigma[k]
+        # One that is a metre off is as wrong as one that is ten off.
+        cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
+    return np.asarray(cost <= cost.min() + 0.1 * len(ranges))
+
+
+def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Places:
+    """Try places and headings by the ranges alone."""
+    step = max(0.4, float(np.sqrt(np.prod(bounds[1] - bounds[0]) / 20_000)))
+    axes = [np.arange(bounds[0][k], bounds[1][k] + step, step) for k in (0, 1)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    cells = cells[_allowed(cells, 0.75 * step, ranges)]
+    headings = np.arange(0.0, 2.0 * np.pi - 0.05, 0.2)
+    if len(cells) * len(headings) > _MOST_NODES:
+        return Places(np.zeros((0, 3)), False)
+    poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
+    pick = np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.int64))
+    cost = -range_likelihood(poses, chosen(ranges, pick), wider=0.6 * step)
+    order = np.argsort(cost, kind="stable")
+    order = order[cost[order] <= cost[order[0]] + _RANGE_RIVAL]
+    return _distinct(refined_by_ranges(_distinct(poses[order], True).poses, ranges), len(order) > 0)
+
+
+_RANGE_RIVAL = 12.0
+"""Log-likelihood by which a place may be worse than the best one before it is refined."""
+
+
+def chosen(ranges: Ranges, which: Ints) -> Ranges:
+    """Return some of the ranges."""
+    return Ranges(*(getattr(ranges, n)[which] for n in ("anchor", "places", "tags", "values", "sigma")))
+
+
+def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
+    """Return errors (h, m), m, measured minus expected, offsets (h, m, 2) from the anchors and lever arms (h, m, 2)."""
+    lever = se2.rotate(poses[:, None, 2], ranges.tags[None])
+    offset = poses[:, None, :2] + lever - ranges.places
+    return ranges.values - np.hypot(offset[..., 0], offset[..., 1]), offset, lever
+
+
+def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Floats:
+    """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; detours and nonsense happen.
+
+    Ranges to one anchor err alike, see _INDEPENDENT.
+
+    Parameters
+    ----------
+    wider : added to every sigma, m: the poses are those of a grid.
+    """
+    if not len(ranges):
+        return np.zeros(len(poses))
+    error, sigma = range_errors(poses, ranges)[0], ranges.sigma + wider
+    z = error / sigma
+    late = 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z)
+    return _INDEPENDENT * np.log(0.7 * np.exp(-0.5 * z**2) + late + 0.02).sum(axis=1)
+
+
+_INDEPENDENT = 0.5
+"""Share of the window's ranges that are worth a new one: they are a quarter of a metre apart, and their errors are alike
+over 1.5 m in part."""
+
+
+def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:
+    """Return poses (h, 3) moved to where the ranges agree best nearby: Gauss-Newton with a Cauchy kernel."""
+    poses = poses.copy()
+    for _ in range(8):
+        hessian, gradient = range_factors(poses, ranges)
+        step = -np.linalg.solve(hessian + np.diag([1e-3, 1e-3, 1e-2]), gradient[:, :, None])[:, :, 0]
+        length = np.maximum(np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2]))
+        poses += step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-9))[:, None]
+    poses[:, 2] = se2.wrap_angle(poses[:, 2])
+    return poses
+
+
+def range_factors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return the quadratic form (h, 3, 3) and gradient (h, 3) of the whitened range errors at poses (h, 3)."""
+    error, offset, lever = range_errors(poses, ranges)
+    distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 0.05)
+    unit = offset / distance[..., None]
+    jacobian = np.concatenate([unit, (unit[..., 1] * lever[..., 0] - unit[..., 0] * lever[..., 1])[..., None]], axis=-1)
+    weight = _INDEPENDENT / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
+    weighted = jacobian * weight[..., None]
+    return weighted.transpose(0, 2, 1) @ jacobian, -np.einsum("hmk,hm->hk", weighted, error)
+
+
+def _distinct(poses: Floats, complete: bool) -> Places:
+    """Return the first of poses (n, 3), best first, that are not near an earlier one."""
+    kept = np.zeros((0, 3))
+    left = poses
+    while len(left) and len(kept) < MOST_PLACES:
+        kept = np.concatenate([kept, left[:1]])
+        off = se2.between(left[0], left)
+        left = left[(np.hypot(off[:, 0], off[:, 1]) > _SAME[0]) | (np.abs(off[:, 2]) > _SAME[1])]
+    return Places(kept, complete and not len(left))
+
+
+_SAME = (0.4, 0.2)
+"""m and rad; poses that are closer are one place."""

@@ -1,0 +1,228 @@
+"""A map's walls as scans are compared with them: the nearest wall of every place, and what a ray may not pass through.
+
+A scan's point lies on a wall when the nearest occupied cell is near; across the wall's line it measures the pose. A ray
+that ends in free space met something that is not in the map, and one that passes an occupied cell contradicts the map; both
+are evidence against a pose, and pull at none. Points in unknown space say nothing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from ..grid.geometry import GridGeometry
+from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+from ..lidar.clouds import stacked
+from ..lidar.point_cloud import make_cloud
+from ..lidar.scan_matching import rasterize
+
+REACH = 0.5
+"""m; a wall farther away is no neighbour."""
+_NORMAL_RADIUS = 0.2
+"""m; neighbourhood of a wall's line: four cells of 0.05 m."""
+_BEHIND = 0.013
+"""m; the surface behind the first occupied cells' centres. A cell before it is occupied where more than a third of the rays
+that reach it end in it (GridConfig.p_hit and p_miss): from 0.43 sigma of the lidar before the surface on; 0.03 m at 3 m."""
+_SIDE = (0.1, 0.15, 0.2, 0.25)
+"""m; where the free side of a wall is looked for."""
+_MOST_CELLS = 4_000_000
+"""Cells of the table of nearest walls (4 bytes each); a larger map gets coarser ones."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rays:
+    """Thinned rays of a scan in the frame of the base."""
+
+    ends: Floats
+    """(p, 2) m; of a ray that saw nothing, the place up to which it would have seen a wall."""
+    origins: Floats
+    """(p, 2) m, of the laser at each ray."""
+    hit: Bools
+    """(p,) whether the ray ended on something."""
+
+    def moved(self, pose: Floats) -> "Rays":
+        """Return the rays in the frame in which the base has this pose (3,)."""
+        return Rays(se2.transform(pose, self.ends), se2.transform(pose, self.origins), self.hit)
+
+    def rows(self, which: Ints | Bools) -> "Rays":
+        """Return some of the rays."""
+        return Rays(self.ends[which], self.origins[which], self.hit[which])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Agreement:
+    """How scans agree with the map at poses (h,)."""
+
+    log_likelihood: Floats
+    """(h,) mean over the rays; 0 = all as the map has it."""
+    on_wall: Floats
+    """(h,) share of the rays' ends, 0..1, that lie on a wall, of those in known space."""
+    known: Floats
+    """(h,) ends in known space."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walls:
+    """Occupied cells with the lines through them, and the states of all cells."""
+
+    geometry: GridGeometry
+    states: NDArray[np.int8]
+    """(rows, cols) FREE, OCCUPIED or UNKNOWN."""
+    points: Floats
+    """(n, 2) m, on the walls' lines."""
+    normals: Floats
+    """(n, 2) unit, towards the free side; 0 where there is no line."""
+    one_sided: Bools
+    """(n,) the wall was seen from the side of its normal alone."""
+    cell: float
+    """m; of the table of nearest walls."""
+    origin: Floats
+    """(2,) m, its lower left corner."""
+    nearest: NDArray[np.signedinteger]
+    """(x, y) nearest wall point of each of its cells, -1 = none within reach."""
+
+    def state_at(self, x: Floats, y: Floats) -> NDArray[np.int8]:
+        """Return the states (...) of the cells at places (...), m; UNKNOWN outside."""
+        g = self.geometry
+        col, row = _cells(x, g.origin[0], g.resolution), _cells(y, g.origin[1], g.resolution)
+        inside = (row >= 0) & (row < g.rows) & (col >= 0) & (col < g.cols)
+        flat = np.where(inside, row * g.cols + col, 0)
+        return np.where(inside, self.states.reshape(-1).take(flat), np.int8(-1))
+
+    def nearest_at(self, x: Floats, y: Floats) -> Ints:
+        """Return the nearest wall points (...) of places (...), m; -1 where none is within reach."""
+        wide, high = self.nearest.shape
+        i, j = _cells(x, self.origin[0], self.cell), _cells(y, self.origin[1], self.cell)
+        inside = (i >= 0) & (i < wide) & (j >= 0) & (j < high)
+        flat = np.where(inside, i * high + j, 0)
+        return np.where(inside, self.nearest.reshape(-1).take(flat), -1) if self.nearest.size else np.full(np.shape(x), -1)
+
+    def distances(self, x: Floats, y: Floats) -> Floats:
+        """Return the distances (...) of places (...) to the nearest wall point, m; inf beyond reach."""
+        near = self.nearest_at(x, y)
+        if not len(self.points):
+            return np.full(np.shape(x), np.inf)
+        q = self.points[near]
+        return np.where(near >= 0, np.hypot(x - q[..., 0], y - q[..., 1]), np.inf)
+
+    def factors(self, poses: Floats, rays: Rays, gate: float, scale: float) -> tuple[Floats, Floats, Floats]:
+        """Return the quadratic form of the point-to-line distances about poses (h, 3).
+
+        Parameters
+        ----------
+        gate : m; ends farther from a wall do not count. scale : m, width of the Geman-McClure kernel on the distance.
+
+        Returns
+        -------
+        hessian (h, 3, 3) : sum of w J^T J, J = (n, n . d(R p)/dtheta), as lidar.scan_matching.
+        gradient (h, 3) : sum of w J^T r. weight (h,) : sum of w.
+        """
+        c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
+        px, py = rays.ends[rays.hit].T
+        rx, ry = c * px - s * py, s * px + c * py
+        x, y = rx + poses[:, :1], ry + poses[:, 1:2]
+        near = self.nearest_at(x, y)
+        if not len(self.points):
+            return np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3)), np.zeros(len(poses))
+        nx, ny = (self.normals[:, k].take(near) for k in (0, 1))
+        dx, dy = x - self.points[:, 0].take(near), y - self.points[:, 1].take(near)
+        ox, oy = rays.origins[rays.hit].T - rays.ends[rays.hit].T
+        facing = nx * (c * ox - s * oy) + ny * (s * ox + c * oy)
+        good = (near >= 0) & (dx * dx + dy * dy <= gate * gate) & (nx * nx + ny * ny > 0.5)
+        good &= (facing > 0.0) | ~self.one_sided.take(near)
+        r = nx * dx + ny * dy
+        w = good / np.square(1.0 + np.square(r / scale))
+        jacobian = np.stack([nx, ny, ny * rx - nx * ry], axis=1)
+        weighted = jacobian * w[:, None]
+        return weighted @ jacobian.transpose(0, 2, 1), np.einsum("hkp,hp->hk", weighted, r), w.sum(axis=1)
+
+    def agreement(self, poses: Floats, rays: Rays) -> Agreement:
+        """Tell how rays agree with the map at poses (h, 3).
+
+        An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two: nothing either
+        way; a ray that passes a wall counts as if it ended in free space, or half of that where it saw nothing.
+        """
+        c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
+
+        def laid(points: Floats) -> tuple[Floats, Floats]:
+            px, py = points.T
+            return c * px - s * py + poses[:, :1], s * px + c * py + poses[:, 1:2]
+
+        x, y = laid(rays.ends)
+        on_wall = np.exp(-0.5 * np.square(np.minimum(self.distances(x, y), 10.0) / _ON_WALL))
+        value = np.log(_STRANGE + (1.0 - _STRANGE) * on_wall)
+        unknown = (self.state_at(x, y) < 0) & (on_wall < 0.5)
+        value = np.where(unknown, 0.5 * np.log(_STRANGE), value)
+        value = np.where(rays.hit, value, 0.0)
+        ox, oy = laid(rays.origins)
+        length = np.hypot(x - ox, y - oy)
+        passed = np.zeros(x.shape, dtype=bool)
+        for fraction in _LOOKS:
+            # Up to 0.3 m before the end: there the wall may be that it ends on.
+            t = fraction * np.maximum(1.0 - 0.3 / np.maximum(length, 0.3), 0.0)
+            passed |= self.state_at(ox + t * (x - ox), oy + t * (y - oy)) == OCCUPIED
+        value = np.where(passed, np.where(rays.hit, np.log(_STRANGE), 0.5 * np.log(_STRANGE)), value)
+        ends = rays.hit & ~unknown
+        known = ends.sum(axis=1).astype(np.float64)
+        share = (ends & (on_wall > 0.3)).sum(axis=1) / np.maximum(known, 1.0)
+        return Agreement(value.mean(axis=1) if x.shape[1] else np.zeros(len(poses)), share, known)
+
+
+_ON_WALL = 0.1
+"""m; standard deviation of an end about the wall: cells, lidar noise and a pose that is not refined."""
+_STRANGE = 0.1
+"""Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
+_LOOKS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Places along a ray, as shares of its length, at which it is asked whether it passes a wall."""
+
+
+def walls_of(grid: OccupancyGrid) -> Walls:
+    """Return the walls of a grid."""
+    states = grid.states()
+    occupied = _surface(grid.geometry, states)
+    if not len(occupied):
+        empty = np.zeros((0, 2))
+        return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), 1.0, np.zeros(2), np.zeros((0, 0), np.int32))
+    cloud = make_cloud(occupied, normal_radius=max(_NORMAL_RADIUS, 3.0 * grid.geometry.resolution))
+    extent = np.ptp(occupied, axis=0) + 2.0 * REACH
+    cell = max(grid.geometry.resolution, float(np.sqrt(extent[0] * extent[1] / _MOST_CELLS)))
+    raster = rasterize(stacked([cloud]), cell, REACH)
+    shape = (int(raster.shape[0, 0]), int(raster.shape[0, 1]))
+    bare = Walls(
+        grid.geometry, states, cloud.centers, cloud.normals, np.zeros(len(cloud), bool), cell, raster.origin[0],
+        raster.nearest.reshape(shape) if raster.nearest.size else np.zeros((0, 0), np.int32),
+    )  # fmt: skip
+    return _facing_free_space(bare)
+
+
+def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
+    """Return the centres (n, 2) of the occupied cells that border on free space, m.
+
+    Rays wear away the cells before a wall and noise fills the ones behind: all cells together lie 2 to 4 cm behind the surface.
+    """
+    near = np.zeros(states.shape, dtype=bool)
+    free = states == FREE
+    near[1:] |= free[:-1]
+    near[:-1] |= free[1:]
+    near[:, 1:] |= free[:, :-1]
+    near[:, :-1] |= free[:, 1:]
+    row, col = np.nonzero((states == OCCUPIED) & near)
+    return geometry.centre_of(row.astype(np.int64), col.astype(np.int64))
+
+
+def _facing_free_space(walls: Walls) -> Walls:
+    """Return the walls with normals that point to the side on which the map knows free space."""
+    free = []
+    for sign in (1.0, -1.0):
+        places = [walls.points + sign * offset * walls.normals for offset in _SIDE]
+        free.append(sum((walls.state_at(p[:, 0], p[:, 1]) == FREE).astype(np.int64) for p in places))
+    turned = np.where((free[1] > free[0])[:, None], -walls.normals, walls.normals)
+    one_sided = np.minimum(free[0], free[1]) == 0
+    points = walls.points - _BEHIND * turned * one_sided[:, None]
+    return Walls(walls.geometry, walls.states, points, turned, one_sided, walls.cell, walls.origin, walls.nearest)
+
+
+def _cells(values: Floats, origin: float, size: float) -> Ints:
+    return np.floor((values - origin) * (1.0 / size)).astype(np.int64)

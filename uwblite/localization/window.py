@@ -1,0 +1,132 @@
+"""What was measured during the last metres of driving, in the frame of the robot as it stands now: all that a start goes by.
+
+Poses of the past hang on the present one by the odometry. Whoever says where the robot is now says where everything was
+measured, so that a start is a search over one pose.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats, Ints
+from .hypotheses import RangeFacts
+from .walls import Rays
+
+LENGTH = 10.0
+"""m driven, beyond which a measurement is forgotten: the odometry has then drifted by decimetres."""
+_TURNING = 1.0
+"""m of driving that a turn by one radian counts as."""
+_LOOK_EVERY, _RANGE_EVERY = 0.4, 0.25
+"""m driven between the scans, and between the ranges to one anchor, that are kept."""
+_ALIKE = 3
+"""Ranges to one anchor that a standing robot keeps."""
+RAYS = 48
+"""Rays kept of a scan."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowRange:
+    """A range within the window."""
+
+    fact: RangeFacts
+    odom: Floats
+    """(3,) T_odom_base at its time."""
+    tag: Floats
+    """(2,) of the tag on the base, m."""
+    way: float
+    """Odometer at its time, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowLook:
+    """A scan within the window."""
+
+    rays: Rays
+    odom: Floats
+    """(3,) T_odom_base of the rays' frame."""
+    way: float
+    """Odometer at its time, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranges:
+    """The window's ranges as arrays."""
+
+    anchor: Ints
+    """(m,)."""
+    places: Floats
+    """(m, 2) of the anchors, m."""
+    tags: Floats
+    """(m, 2) of the tag, in the present frame of the base, m."""
+    values: Floats
+    """(m,) horizontal distances, m."""
+    sigma: Floats
+    """(m,) m; what drift since then adds is in it."""
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+@dataclass(slots=True)
+class Window:
+    """Measurements of the last metres; the only thing here that changes."""
+
+    ranges: list[WindowRange] = field(default_factory=list)
+    looks: list[WindowLook] = field(default_factory=list)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.ranges.clear()
+        self.looks.clear()
+
+    def forget(self, way: float, length: float = LENGTH) -> None:
+        """Forget what was measured more than a length ago, m, by the odometer."""
+        self.ranges = [r for r in self.ranges if way - r.way <= length]
+        self.looks = [k for k in self.looks if way - k.way <= length]
+
+    def add_range(self, entry: WindowRange) -> None:
+        """Keep a range, unless the robot has hardly moved since the last few to the same anchor."""
+        own = [r for r in self.ranges[-64:] if r.fact.anchor == entry.fact.anchor]
+        if len(own) < _ALIKE or entry.way - own[-_ALIKE].way >= _RANGE_EVERY:
+            self.ranges.append(entry)
+
+    def wants_look(self, way: float) -> bool:
+        """Tell whether the robot has moved enough for another scan."""
+        return not self.looks or way - self.looks[-1].way >= _LOOK_EVERY
+
+    def add_look(self, look: WindowLook) -> None:
+        """Keep a scan."""
+        self.looks.append(look)
+
+    def seen(self, odom: Floats, way: float, length: float) -> tuple[Rays, Floats]:
+        """Return the rays of the last so many metres, in the present frame of the base, and how long ago (p,) each is, m."""
+        looks = [k for k in self.looks if way - k.way <= length]
+        if not looks:
+            return Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)), np.zeros(0)
+        laid = [k.rays.moved(se2.between(odom, k.odom)) for k in looks]
+        ago = np.concatenate([np.full(len(k.rays.hit), way - k.way) for k in looks])
+        parts = ([getattr(r, name) for r in laid] for name in ("ends", "origins", "hit"))
+        return Rays(*(np.concatenate(p) for p in parts)), ago
+
+    def heard(self, odom: Floats, way: float) -> Ranges:
+        """Return the ranges, with the tag's places in the present frame of the base."""
+        rows = self.ranges
+        tags = np.array([se2.transform(se2.between(odom, r.odom), r.tag) for r in rows]).reshape(-1, 2)
+        ago = np.array([way - r.way for r in rows])
+        measured = np.array([r.fact.range / (1.0 + r.fact.scale) for r in rows])
+        level = np.sqrt(np.maximum(measured**2 - np.array([r.fact.square for r in rows]), 1e-2))
+        sigma = np.sqrt(np.array([r.fact.sigma**2 for r in rows]) + _SLOW**2 + (_DRIFT * ago) ** 2)
+        anchor = np.array([r.fact.anchor for r in rows], dtype=np.int64)
+        return Ranges(anchor, np.array([r.fact.place for r in rows]).reshape(-1, 2), tags, level, sigma)
+
+
+_SLOW = 0.1
+"""m; what ranges to one anchor err alike."""
+_DRIFT = 0.03
+"""m of drift per metre driven: scale and heading of wheels that are not calibrated."""
+
+
+def way_of(step: Floats) -> float:
+    """Return how far a step (3,) is, m, a turn counting as a way too."""
+    return float(np.hypot(step[0], step[1]) + _TURNING * abs(step[2]))
