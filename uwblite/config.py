@@ -290,7 +290,11 @@ def _write_table(lines: list[str], config: Any, path: tuple[str, ...], comments:
     hints = get_type_hints(type(config))
     tables = []
     if path:
-        lines += ["", *(_wrapped(_first_sentence(type(config))) if comments else []), f"[{'.'.join(path)}]"]
+        lines += [
+            "",
+            *(_wrapped((type(config).__doc__ or "").strip().split("\n\n")[0]) if comments else []),
+            f"[{'.'.join(path)}]",
+        ]
     for f in shown_fields(config, advanced):
         value = getattr(config, f.name)
         if dataclasses.is_dataclass(value):
@@ -314,10 +318,6 @@ def permitted(field: "dataclasses.Field[Any]", hint: Any) -> str:
     if NoneType in get_args(hint):
         parts.append('or "none"')
     return f"({'; '.join(parts)})" if parts else ""
-
-
-def _first_sentence(cls: type) -> str:
-    return (cls.__doc__ or "").strip().split("\n\n")[0]
 
 
 def _wrapped(text: str) -> list[str]:

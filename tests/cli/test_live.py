@@ -24,9 +24,9 @@ def room(tmp_path_factory):
     write_map(folder, grid_of(ODD))
     poses, lines = path(ROUND)[:40], []
     odom = se2.compose(np.array([3.0, 1.0, 0.5]), se2.between(poses[0], poses))
-    for k, (pose, said) in enumerate(zip(poses, odom, strict=True)):
+    for k, (pose, output) in enumerate(zip(poses, odom, strict=True)):
         t = f"{100 + 0.2 * k:.3f} h {0.2 * k:.3f}"
-        lines.append(f"ODOM {said[0]:.6f} {said[1]:.6f} {said[2]:.6f} 0 0 0 {t}")
+        lines.append(f"ODOM {output[0]:.6f} {output[1]:.6f} {output[2]:.6f} 0 0 0 {t}")
         readings = " ".join(f"{min(r, 8.0):.3f}" for r in cast(pose))
         head = f"ROBOTLASER1 0 {SCANNER.angle_min:.9f} 3.141592654 {SCANNER.angle_increment:.9f} 8.0 0.01 0 181"
         lines.append(f"{head} {readings} 0 0 0 0 0 0 0 0 0 0 0 0 {t}")

@@ -44,7 +44,7 @@ def transcript():
         RangeLine(1.0, TWO, PLACES, ESTIMATE, "les"),
         RangeLine(1.0, TWO, PLACES, None, "les"),
         PositionLine(1.0, (2.57, 2.0, -1.67, 97)),
-        PositionLine(1.0, (-1.31, 0.17, 0.39, 47), "4D18"),
+        PositionLine(1.0, (-1.31, 0.17, 0.39, 47)),
         TextLine(1.0, "[000044.950 INF] uwb0: panid=xBACA addr=xDECADDF048951512"),
     ]  # fmt: skip
     return frames, expected

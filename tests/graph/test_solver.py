@@ -251,15 +251,12 @@ def test_the_input_is_not_changed():
     np.testing.assert_array_equal(graph.anchors, before[1])
 
 
-def test_a_disconnected_anchor_and_pose_stay_and_are_reported():
+def test_a_disconnected_anchor_and_pose_stay():
     graph, _, _ = loop(10)
     lonely = replace(graph, poses=np.vstack([graph.poses, [7.0, 7.0, 1.0]]), anchors=np.vstack([graph.anchors, [9.0, 9.0]]))
     found, summary = optimize(lonely)
     np.testing.assert_array_equal(found.poses[-1], [7.0, 7.0, 1.0])
     np.testing.assert_array_equal(found.anchors[-1], [9.0, 9.0])
-    assert summary.unobserved["poses"].tolist() == [60]
-    assert summary.unobserved["anchors"].tolist() == [3]
-    assert summary.unobserved["calibration"].tolist() == []
     assert summary.chi2 == pytest.approx(optimize(graph)[1].chi2, rel=1e-7)
 
 

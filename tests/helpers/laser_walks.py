@@ -56,3 +56,9 @@ def walked(seed, walls=HALL, metres=60.0, half_width=4.0, spacing=6, **settings)
     truth = truth[::spacing]
     path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
     return truth, path, scanned(truth, walls, 0.01, seed, beams=300, reach=5.6)
+
+
+def in_map(clouds: Clouds, poses):
+    """Return all points and normals (p, 2) in the map frame, given keyframe poses (k, 3)."""
+    own = poses[clouds.owner]
+    return se2.transform(own, clouds.points), se2.rotate(own[:, 2], clouds.normals)

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import in_map
 from helpers.planted import box, cast
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.lidar.clouds import CloudConfig, build, in_map
+from uwblite.lidar.clouds import CloudConfig, build
 from uwblite.odometry.attached import ScanPoints
 
 EVERYTHING = CloudConfig(voxel=0.1, normal_radius=0.3, min_neighbours=0)

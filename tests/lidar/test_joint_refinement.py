@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.laser_walks import CORRIDOR, ROOM, chained, drifted, scanned, walked
+from helpers.laser_walks import CORRIDOR, ROOM, chained, drifted, in_map, scanned, walked
 from helpers.planted import aligned_error, box
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.solver import SolverConfig
-from uwblite.lidar.clouds import in_map
 from uwblite.lidar.joint_refinement import RefinementConfig, choose_pairs, refine, surface_cells, with_fewer_pairs
 from uwblite.lidar.scan_matching import rasterize
 

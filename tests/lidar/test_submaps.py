@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from helpers.laser_walks import ROOM, scanned
+from helpers.laser_walks import ROOM, in_map, scanned
 from helpers.planted import box, wander
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.lidar.clouds import Clouds, in_map
+from uwblite.lidar.clouds import Clouds
 from uwblite.lidar.submaps import SubmapConfig, build, cut
 
 KEEP = SubmapConfig(epsilon=2.0, voxel=0.08, std_ratio=1e6, min_neighbours=0)

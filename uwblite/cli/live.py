@@ -93,7 +93,7 @@ class Tracker:
                 self._use(measured)
 
     def _ready(self, measured: "Measured") -> bool:
-        """Tell whether the log has said how the sensors are mounted: with the first scan, or when none comes for 2 s."""
+        """Return whether the log has said how the sensors are mounted: with the first scan, or when none comes for 2 s."""
         from ..io.carmen_live import LiveScan
 
         return isinstance(measured, LiveScan) or measured.order - self._early[0].order > _NO_LIDAR

@@ -44,13 +44,11 @@ class RangeLine:
 
 @dataclass(frozen=True, slots=True)
 class PositionLine:
-    """One line of ``lep``; on a listener it is about another tag."""
+    """One line of ``lep``; on a listener it is of another tag."""
 
     stamp: float
     position: tuple[float, float, float, int]
     """x, y, z, m, and quality 0..100."""
-    tag_id: str = ""
-    """Four hexadecimal digits; empty on a tag."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +185,7 @@ def _find_position(text: str, stamp_at: StampAt) -> Found:
     position = _position(own.groups()) if own else _position(other.groups()[1:]) if other else None
     if position is None or position[3] > 100:
         return start, corrupt(text.encode("latin-1"), "lep line cut or garbled")
-    return start, PositionLine(stamp_at(start), position, other[1] if other else "")
+    return start, PositionLine(stamp_at(start), position)
 
 
 def _find_text(text: str, stamp_at: StampAt) -> Found:

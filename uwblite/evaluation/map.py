@@ -42,8 +42,6 @@ class WallErrors:
     """Share of the occupied cells that lie within the tolerance of a true surface."""
     recall: float
     """Share of the visible true surface that has an occupied cell within the tolerance."""
-    distance_rms: float
-    """m, rms distance of the occupied cells that lie within 5 tolerances of a true surface."""
 
 
 def landmark_errors(found: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, str], ...] | None = None) -> LandmarkErrors:
@@ -127,13 +125,11 @@ def wall_errors(
     """
     surface = sample_surfaces(walls, columns, step)
     if not len(occupied) or not len(surface):
-        return WallErrors(tolerance, 0.0, 0.0, float("nan"))
+        return WallErrors(tolerance, 0.0, 0.0)
     distance = cKDTree(surface).query(occupied)[0]
     visible = surface[visible_from(surface, walls, columns, viewpoints, reach)]
     covered = cKDTree(occupied).query(visible)[0] <= tolerance if len(visible) else np.zeros(1, dtype=bool)
-    near = distance[distance <= 5.0 * tolerance]
-    rms = float(np.sqrt(np.mean(near**2))) if len(near) else float("nan")
-    return WallErrors(tolerance, float(np.mean(distance <= tolerance)), float(np.mean(covered)), rms)
+    return WallErrors(tolerance, float(np.mean(distance <= tolerance)), float(np.mean(covered)))
 
 
 def sample_surfaces(walls: Floats, columns: Floats, step: float) -> Floats:

@@ -37,7 +37,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats
 from ..config import setting
 from ..errors import ConfigError, SolverError
 from .factorization import Factor
@@ -88,8 +88,6 @@ class SolverSummary:
     """Independent residuals of the edges in use minus free unknowns."""
     chi2_history: Floats = field(default_factory=lambda: np.zeros(0))
     """(iterations,) cost tried by each step."""
-    unobserved: dict[str, Ints] = field(default_factory=dict)
-    """By block: indices of free unknowns that no edge measures; they stay where they were."""
 
     @property
     def chi2_per_dof(self) -> float:
@@ -197,7 +195,6 @@ def minimise(
         chi2=chi2,
         dof=_independent_residuals(graph, linearized or linearize(graph)) - normal.unknowns.size,
         chi2_history=np.array(history),
-        unobserved=_unobserved(normal.unknowns, normal.diagonal),
     )
 
 
@@ -319,8 +316,3 @@ def _independent_residuals(graph: Graph, linearized: list[Linearization]) -> int
         doubtful = gram[np.abs(np.linalg.det(gram)) <= 1e-12 * np.prod(np.einsum("eii->ei", gram), axis=1)]
         total -= int(np.sum(gram.shape[1] - np.linalg.matrix_rank(doubtful, hermitian=True)))
     return total
-
-
-def _unobserved(unknowns: Unknowns, diagonal: Floats) -> dict[str, Ints]:
-    zero = np.append(diagonal <= 0, False)
-    return {name: np.nonzero(zero[number].any(axis=1))[0] for name, number in unknowns.number.items()}

@@ -188,9 +188,3 @@ def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) ->
     lines = Lines(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lines)))
     facing = np.einsum("pi,pi->p", lines.normals, origins - points)
     return lines, lines.normals * np.where(facing < 0, -1.0, 1.0)[:, None]
-
-
-def in_map(clouds: Clouds, poses: Floats) -> tuple[Floats, Floats]:
-    """Return all points and normals (p, 2) in the map frame, given keyframe poses (k, 3)."""
-    own = poses[clouds.owner]
-    return se2.transform(own, clouds.points), se2.rotate(own[:, 2], clouds.normals)

@@ -239,7 +239,7 @@ def weighed(bank: Hypotheses, log_likelihood: Floats) -> Hypotheses:
 
 
 def apart(one: Floats, others: Floats) -> Bools:
-    """Tell which poses (h, 3) are another place than a pose (3,): half a metre or 0.3 rad away."""
+    """Return which poses (h, 3) are another place than a pose (3,): half a metre or 0.3 rad away."""
     off = se2.between(one, others)
     return (np.hypot(off[:, 0], off[:, 1]) > _SAME[0]) | (np.abs(off[:, 2]) > _SAME[1])
 

@@ -92,7 +92,7 @@ class Window:
             self.ranges.append(entry)
 
     def wants_look(self, way: float) -> bool:
-        """Tell whether the robot has moved enough for another scan."""
+        """Return whether the robot has moved enough for another scan."""
         return not self.looks or way - self.looks[-1].way >= _LOOK_EVERY
 
     def add_look(self, look: WindowLook) -> None:
