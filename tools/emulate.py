@@ -22,11 +22,12 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
 
 from emulators import faults
 from emulators.dwm_device import DwmDevice, DwmOptions
 from emulators.faults import FaultyLine, parse_fault
+from emulators.hokuyo import captured
 from emulators.kobuki_device import Create2Device, KobukiDevice, TickLineDevice
 from emulators.scip_device import ScipDevice, ScipOptions
 from emulators.spinning_device import LIDARS
@@ -106,6 +107,8 @@ def parse_arguments(argv=None):
     parser.add_argument("--seed", type=int, default=0, help="of the faults (0)")
     parser.add_argument("--scip1", action="store_true", help="lidar wakes in SCIP 1.1")
     parser.add_argument("--lidar-streaming", action="store_true", help="lidar was left streaming by a dead host")
+    replay = "answer as the URG-04LX of this capture did (seconds, microseconds, length, bytes received; perhaps .gz)"
+    parser.add_argument("--lidar-replay", metavar="FILE", type=Path, help=replay)
     parser.add_argument("--lidar-clock", type=int, default=0, help="ms on its clock at power-up (16777216 wraps)")
     parser.add_argument("--lidar-skew", type=float, default=0.0, help="relative error of its crystal, e.g. 1e-4")
     parser.add_argument("--uwb-shell", action="store_true", help="tag was left in the shell")
@@ -149,6 +152,8 @@ def build(args, clock, world, truth) -> list[Plug]:
             device = LIDARS[args.lidar_kind](world, clock, on_turn=lambda t: truth("turn", t, 0))
         elif name == "lidar":
             options = ScipOptions(args.scip1, args.lidar_clock, args.lidar_skew, args.lidar_streaming)
+            if args.lidar_replay:
+                options.unit = captured(args.lidar_replay)
             options.random = random.Random(args.seed + 10)
             device = ScipDevice(world.scans(), clock, options, lambda t, v: truth("lidar", t, v))
         elif name == "uwb" and args.uwb_kind != "dwm1001":

@@ -7,6 +7,7 @@ import random
 import pytest
 from emulators.dwm_device import DwmDevice, DwmOptions
 from emulators.faults import FaultyLine, parse_fault
+from emulators.hokuyo import MODELS, Unit, captured, model
 from emulators.scip_device import ScipDevice, ScipOptions
 from emulators.world import Epoch, Scan, WorldClock
 from helpers.driver_harness import of_kind, simulate
@@ -297,7 +298,7 @@ def test_tag_that_restarts_in_mid_run_comes_back():
 @pytest.mark.parametrize("before", [b"AT", b"TM0\n", b"AT+GCAP\r2", b"2\x00", b"MD00440", b"\x00\xff~x"], ids=repr)
 def test_lidar_is_asked_everything_whatever_stood_in_its_input_line(before):
     """ModemManager's AT, a tag's probe, a time-adjust mode: geometry, name and latency are still asked for."""
-    device, sent = lidar(ScipOptions(product=("UST-30LC", "Smart-URG UST-30LC")))
+    device, sent = lidar(ScipOptions(unit=Unit("UST-30LC")))
     power_up = device.power_up
     device.power_up = lambda now: (power_up(now), device.receive(before, now))
     driver = ScipDriver()
@@ -459,3 +460,53 @@ def test_lidar_on_a_busy_computer_is_tied_as_well_as_is_stated(seed):
     # The smallest of ten delays, and so each point of the envelope, is 2.3 ms late on average.
     assert sorted(scan.spread for scan in scans)[len(scans) // 2] < 0.010
     assert sorted(errors)[int(0.95 * len(errors))] < 0.005
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_hokuyo_is_named_and_read_as_what_it_is(name):
+    """Angles, times, reach and what is no distance are the model's own."""
+    unit = model(name)
+    clock, sent = WorldClock(), []
+    count = unit.last - unit.first + 1
+    values = [1, 6, *(1000 + (7 * i) % 3000 for i in range(count - 3)), 70000]
+    scans = (Scan(unit.turn * k, values) for k in itertools.count())
+    device = ScipDevice(scans, clock, ScipOptions(unit=unit), lambda t, v: sent.append(t))
+    clock.start(START + 0.05)
+    driver = ScipDriver()
+    actions, _ = simulate(driver, device, 3.0)
+    found = of_kind(actions, LaserScan)
+    assert driver.identity().title == f"laser scanner {name}"
+    assert name in {p.value.removeprefix("SOKUIKI_Sensor_") for p in of_kind(actions, Param)}
+    assert len(found) > 1.5 / unit.turn
+    assert not of_kind(actions, Lost)
+    scan = found[-1]
+    assert len(scan.ranges) == count
+    assert scan.angle_min == pytest.approx((unit.first - unit.numbers[5]) * 2 * math.pi / unit.numbers[2])
+    assert scan.time_increment == pytest.approx(unit.turn / unit.numbers[2])
+    assert scan.range_max == unit.numbers[1] / 1000
+    # 1 is "no object in the range" of a UTM, "low intensity" of an 04LX; 6 is the other way round.
+    assert [math.isinf(r) for r in (*scan.ranges[:2], scan.ranges[-1])] == [name[:3] == "UTM", name[2] == "G", True]
+    assert scan.ranges[5] == 1.021
+    assert min(abs(scan.stamp - t) for t in sent) < scan.spread
+
+
+def test_the_captured_unit_is_emulated(shared_data):
+    """Its own answers to VV and PP, its scan, and its delay: the driver measures the delay and reads the scan."""
+    unit = captured(shared_data / "captures" / "urg04lx_timed_fw3104.logr.gz")
+    assert unit.model == "URG-04LX"
+    assert dict(unit.version)["FIRM"].startswith("3.1.04")
+    assert 0.0 < unit.latency < 0.010
+    clock, sent = WorldClock(), []
+    device = ScipDevice(
+        (Scan(0.1 * k, []) for k in itertools.count()), clock, ScipOptions(unit=unit), lambda t, v: sent.append(t)
+    )  # fmt: skip
+    clock.start(START + 0.05)
+    driver = ScipDriver()
+    actions, _ = simulate(driver, device, 6.0)
+    assert driver.facts["FIRM"] == dict(unit.version)["FIRM"]
+    scans = of_kind(actions, LaserScan)
+    assert len(scans) > 35
+    assert driver._clock.latency == pytest.approx(0.1 + unit.latency, abs=0.002)
+    assert max(min(abs(scan.stamp - t) for t in sent) for scan in scans) < 0.002
+    far = sum(math.isinf(r) for r in scans[0].ranges)
+    assert far == sum(v in (0, 6) or v >= 5600 for v in unit.values) > 0

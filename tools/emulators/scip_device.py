@@ -5,14 +5,11 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from .world import FIRST_STEP, LAST_STEP, STEPS, Feed, Scan, WorldClock
+from .hokuyo import NAMES, Unit
+from .world import Feed, Scan, WorldClock
 
-STEP_TIME = 0.1 / 1024
-TURN = 0.1
-LATENCY = 0.0015
-"""s between the end of a turn and the first byte of its scan: a real URG-04LX (firmware 3.1.04) answers 101 ms and more
-after a scan's stamp."""
 LAST_ACCEPTED = 768
+"""Step up to which a URG-04LX measures when asked."""
 
 
 def checksum(text: bytes) -> bytes:
@@ -39,12 +36,6 @@ VERSION = [
     ("VEND", "Hokuyo Automatic Co.,Ltd."), ("PROD", "SOKUIKI Sensor URG-04LX"), ("FIRM", "3.3.00(16/Apr./2008)"),
     ("PROT", "SCIP 2.0"), ("SERI", "H0700000"),
 ]  # fmt: skip
-PARAMETERS = [
-    ("MODL", "URG-04LX(Hokuyo Automatic Co.,Ltd.)"), ("DMIN", "20"), ("DMAX", "5600"), ("ARES", "1024"),
-    ("AMIN", str(FIRST_STEP)), ("AMAX", str(LAST_STEP)), ("AFRT", "384"), ("SCAN", "600"),
-]  # fmt: skip
-
-
 @dataclass
 class ScipOptions:
     """How this unit behaves."""
@@ -67,8 +58,8 @@ class ScipOptions:
     """It hangs on RS-232: bytes take their time, scans that do not fit are left out, and the host's bit rate must fit."""
     rates: tuple[int, ...] = (19200, 57600, 115200, 250000, 500000, 750000)
     """bit/s that SS grants."""
-    product: tuple[str, str] = ("URG-04LX", "SOKUIKI Sensor URG-04LX")
-    """Names in PP and VV."""
+    unit: Unit = field(default_factory=Unit)
+    """Which model, or which real unit."""
 
 
 @dataclass
@@ -99,6 +90,7 @@ class ScipDevice:
 
     def __init__(self, scans: Iterator[Scan], clock: WorldClock, options: ScipOptions | None = None, on_scan=None) -> None:
         self.options = options or ScipOptions()
+        self.unit = self.options.unit
         self._feed, self._clock = Feed(scans), clock
         self._on_scan = on_scan or (lambda *_: None)
         self._latest: Scan | None = None
@@ -124,6 +116,10 @@ class ScipDevice:
             self._stream = Stream(b"MD0044072501000", 44, 725, 1, 0, None, True, b"")
 
     @property
+    def _most(self) -> int:
+        return max(LAST_ACCEPTED, self.unit.last)
+
+    @property
     def is_streaming(self) -> bool:
         """Return whether MD or MS runs."""
         return self._stream is not None
@@ -139,7 +135,7 @@ class ScipDevice:
         """Return when `advance` has something to do, host s."""
         if self._feed.head is None:
             return math.inf
-        return self._clock.host(self._feed.head.time) + TURN + LATENCY
+        return self._clock.host(self._feed.head.time) + self.unit.turn + self.unit.latency
 
     @property
     def rate(self) -> int | None:
@@ -189,9 +185,10 @@ class ScipDevice:
         return frame
 
     def _scan_block(self, echo: bytes, status: str, scan: Scan, start: int, end: int, cluster: int, wide: bool) -> bytes:
-        first_ray = min(self._clock.host(scan.time), self._now - TURN)  # GD before the world began: the turn just over
+        # GD before the world began: the turn just over.
+        first_ray = min(self._clock.host(scan.time), self._now - self.unit.turn)
         values = self._values(scan, start, end, cluster)
-        self._on_scan(first_ray + max(0, start - FIRST_STEP) * STEP_TIME, values)
+        self._on_scan(first_ray + max(0, start - self.unit.first) * self.unit.step_time, values)
         width = 3 if wide else 2
         data = b"".join([encode(value if wide else min(value, 4095), width) for value in values])
         time = encode(self.device_ms(first_ray), 4)
@@ -203,10 +200,10 @@ class ScipDevice:
         frame = self._block(echo, status, lines)
         return frame * 2 if random and random.random() < self.options.duplicates else frame
 
-    @staticmethod
-    def _values(scan: Scan, start: int, end: int, cluster: int) -> list[int]:
+    def _values(self, scan: Scan, start: int, end: int, cluster: int) -> list[int]:
         """Merge steps: the smallest of each cluster, error codes ignored where there is a distance."""
-        steps = [scan.values[s - FIRST_STEP] if 0 <= s - FIRST_STEP < STEPS else 19 for s in range(start, end + 1)]
+        values, first = self.unit.values or scan.values, self.unit.first
+        steps = [values[s - first] if 0 <= s - first < len(values) else 19 for s in range(start, end + 1)]
         if cluster == 1:
             return steps
         groups = [steps[i : i + cluster] for i in range(0, len(steps) - len(steps) % cluster, cluster)]
@@ -265,7 +262,7 @@ class ScipDevice:
         ranges = re.fullmatch(rb"G(\d{3})(\d{3})(\d{2})", line)
         if ranges and self._laser and self._latest:
             start, end, cluster = (int(part) for part in ranges.groups())
-            if start <= end <= LAST_ACCEPTED:
+            if start <= end <= self._most:
                 values = self._values(self._latest, start, end, max(1, cluster))
                 data = b"".join([encode(min(value, 4095), 2) for value in values])
                 body = b"".join(data[i : i + 64] + b"\n" for i in range(0, len(data), 64))
@@ -281,18 +278,22 @@ class ScipDevice:
         return reply if not rest else self._block(line, "0E")
 
     def _do_VV(self, line: bytes, rest: str, now: float) -> bytes:
-        version = [(key, self.options.product[1] if key == "PROD" else value) for key, value in VERSION]
-        return self._plain(line, rest, self._block(line, "00", text_lines(version)))
+        product = f"SOKUIKI Sensor {self.unit.model}"
+        version = self.unit.version or [(key, product if key == "PROD" else value) for key, value in VERSION]
+        return self._plain(line, rest, self._answer(line, list(version)))
 
     def _do_PP(self, line: bytes, rest: str, now: float) -> bytes:
-        model = f"{self.options.product[0]}(Hokuyo Automatic Co.,Ltd.)"
-        parameters = [(key, model if key == "MODL" else value) for key, value in PARAMETERS]
-        return self._plain(line, rest, self._block(line, "00", text_lines(parameters)))
+        model = ("MODL", f"{self.unit.model}(Hokuyo Automatic Co.,Ltd.)")
+        return self._plain(line, rest, self._answer(line, [model, *zip(NAMES, map(str, self.unit.numbers), strict=True)]))
+
+    def _answer(self, line: bytes, pairs: list[tuple[str, str]]) -> bytes:
+        """Return what the captured unit answered, or lines of text."""
+        return dict(self.unit.answers).get(line.decode("ascii", "replace")) or self._block(line, "00", text_lines(pairs))
 
     def _do_II(self, line: bytes, rest: str, now: float) -> bytes:
         healthy = self.fault is None or self.fault < 50
         state = text_lines([
-            ("MODL", f"{self.options.product[0]}(Hokuyo Automatic Co.,Ltd.)"), ("LASR", "ON" if self._laser else "OFF"),
+            ("MODL", f"{self.unit.model}(Hokuyo Automatic Co.,Ltd.)"), ("LASR", "ON" if self._laser else "OFF"),
             ("SCSP", "Initial(600[rpm])<-Default setting by user"), ("MESM", "MEASURE" if self._stream else "IDLE"),
             ("SBPS", f"{self._rate}[bps]<-Default setting by user"), ("TIME", f"{self.device_ms(now):06X}"),
             ("STAT", "Sensor works well." if healthy else f"Sensor fault {self.fault}."),
@@ -367,7 +368,7 @@ class ScipDevice:
             if not part.isdigit():
                 return status
         start, end, cluster = int(rest[:4]), int(rest[4:8]), int(rest[8:10])
-        if end > LAST_ACCEPTED:
+        if end > self._most:
             return "04"
         return "05" if end < start else (start, end, max(1, cluster))
 

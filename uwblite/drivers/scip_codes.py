@@ -21,6 +21,24 @@ RANGE_CODES: dict[int, tuple[float, str]] = {
 }
 """Meaning of range values below DMIN, as REP-117 wants them: +inf = looked and saw nothing, nan = do not use."""
 
+UTM_CODES: dict[int, tuple[float, str]] = {
+    1: (INF, "no object in the range"),
+    2: (NAN, "too near"),
+    3: (NAN, "measurement error, perhaps interference"),
+    4: (NAN, "out of range at the near end"),
+    5: (NAN, "other errors"),
+}
+"""The same of the UTM-30LX (table 4 of the specification)."""
+OTHER_CODES: dict[int, tuple[float, str]] = {}
+"""Of a model whose codes are not known: nothing is taken for free space."""
+
+
+def range_codes(model: str) -> dict[int, tuple[float, str]]:
+    """Return the meaning of values below DMIN for a model as PP names it."""
+    families = {"URG": RANGE_CODES, "UBG": RANGE_CODES, "UHG": RANGE_CODES, "UTM": UTM_CODES}
+    return families.get(model[:3], OTHER_CODES)
+
+
 STATUS_BY_COMMAND: dict[str, dict[str, str]] = {
     "BM": {"00": "laser on", "01": "laser malfunction", "02": "laser is on already"},
     "QT": {"00": "laser off, stream stopped"},

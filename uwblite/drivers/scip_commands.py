@@ -1,11 +1,11 @@
-"""What to send to a URG-04LX, its geometry, and its readings in metres."""
+"""What to send to a Hokuyo, its geometry, and its readings in metres."""
 
 import math
 from dataclasses import dataclass
 
 from ..errors import ProtocolError
 from .scip import Reply
-from .scip_codes import RANGE_CODES
+from .scip_codes import range_codes
 
 BAUD_RATES = (115200, 19200, 57600, 250000, 500000, 750000)
 """bit/s of the RS-232 port, in the order tried; on USB the rate means nothing."""
@@ -60,7 +60,7 @@ def text_command(name: str) -> bytes:
     ProtocolError : not one of these; other commands can hang a URG-04LX until its power is cycled.
     """
     if name not in {"VV", "PP", "II", "BM", "QT", "RS", "TM0", "TM1", "TM2", "SCIP2.0"}:
-        raise ProtocolError(f"{name!r} is not a command for a URG-04LX; use VV PP II BM QT RS TM0 TM1 TM2 SCIP2.0")
+        raise ProtocolError(f"{name!r} is not a command that every unit knows; use VV PP II BM QT RS TM0 TM1 TM2 SCIP2.0")
     return name.encode() + b"\n"
 
 
@@ -80,7 +80,7 @@ def rate_command(rate: int) -> bytes:
     ProtocolError : not one of these.
     """
     if rate not in BAUD_RATES:
-        raise ProtocolError(f"{rate} bit/s is no speed of a URG-04LX; use {', '.join(map(str, sorted(BAUD_RATES)))}")
+        raise ProtocolError(f"{rate} bit/s is no speed of its RS-232; use {', '.join(map(str, sorted(BAUD_RATES)))}")
     return f"SS{rate:06d}\n".encode()
 
 
@@ -123,7 +123,7 @@ def to_ranges(values: tuple[int, ...], geometry: Geometry, limit: int | None = N
 
     Parameters
     ----------
-    values : mm or RANGE_CODES.
+    values : mm or range_codes of the model.
     geometry : gives DMIN and DMAX.
     limit : mm, largest value that means something, where it is below DMAX (4095 with 2 characters).
 
@@ -132,7 +132,8 @@ def to_ranges(values: tuple[int, ...], geometry: Geometry, limit: int | None = N
     tuple of float, m; +inf = nothing seen, nan = invalid.
     """
     low, high = geometry.distance_min, min(geometry.distance_max, limit or geometry.distance_max)
-    codes = [RANGE_CODES[v][0] if v in RANGE_CODES else math.nan for v in range(low)]
+    known = range_codes(geometry.model)
+    codes = [known[v][0] if v in known else math.nan for v in range(low)]
     return tuple([codes[v] if v < low else v / 1000 if v < high else math.inf for v in values])
 
 
