@@ -1,0 +1,52 @@
+"""Steps that the odometry got wrong are found again, what cannot be told apart counts as not found."""
+
+import numpy as np
+import pytest
+from helpers.laser_walks import CORRIDOR, HALL, scanned
+
+from uwblite import se2
+from uwblite.lidar.step_search import StepSearch, _apart, _chained
+
+PATH = np.array([[-1.0 + 0.3 * k, 0.5 + 0.05 * k, 0.05 * k] for k in range(6)])
+STEPS = se2.between(PATH[:-1], PATH[1:])
+
+
+def searched(walls, wrong, *, reach=8.0):
+    """Search for the last step of a path through walls, the odometry's guess of it being off by a pose (3,)."""
+    clouds = scanned(PATH, walls, 0.01, reach=reach)
+    guess = se2.compose(STEPS[4], np.array(wrong))
+    steps = np.concatenate([STEPS[:4], guess[None]])
+    return StepSearch(clouds, 0.3, 0.2).find(4, 0, steps, guess[None])
+
+
+@pytest.mark.parametrize("wrong", [(0.0, 0.0, 0.0), (0.4, -0.3, 0.15), (-0.35, 0.3, -0.2)])
+def test_a_wrong_guess_is_corrected(wrong):
+    found = searched(HALL, wrong)
+    assert found.clear
+    # 120 points with noise of 1 cm fix a pose to some millimetres.
+    np.testing.assert_allclose(found.pose, STEPS[4], atol=0.01)
+    assert found.score > 0.8
+    assert found.second < found.score
+
+
+def test_a_right_guess_stands_in_no_free_space_and_a_wrong_one_does():
+    assert not searched(HALL, (0.0, 0.0, 0.0)).contradicts
+    assert searched(HALL, (0.5, -0.4, 0.3)).contradicts
+
+
+def test_along_a_corridor_nothing_is_clear():
+    found = searched(CORRIDOR, (0.5, 0.0, 0.0), reach=5.0)
+    assert not found.clear
+    assert found.second > found.score - 0.08
+
+
+def test_views_are_chained_by_the_steps_between_them():
+    views = np.array([1, 2, 3, 4])
+    expected = se2.between(PATH[4], PATH[views])
+    np.testing.assert_allclose(_chained(STEPS, views), expected, atol=1e-12)
+
+
+def test_places_are_apart_by_distance_or_by_heading():
+    here = np.array([1.0, 2.0, 3.0])
+    others = se2.compose(here, np.array([[0.1, 0.1, 0.0], [0.11, 0.11, 0.0], [0.0, 0.0, 0.14], [0.0, 0.0, -0.16]]))
+    assert _apart(here, others).tolist() == [False, True, False, True]

@@ -1,0 +1,96 @@
+"""Keyframes moved in time or added: exact measurements stay exact, and what was stated of a step is stated of its pieces."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.planted import box, ranges, recording, scans, wander
+
+from uwblite import se2
+from uwblite.graph.graph import PriorEdges
+from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.pipeline.keyframe_changes import with_keyframes
+from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.pipeline.radio_stages import dead_reckoning
+from uwblite.pipeline.recordings import denser, gather, later
+from uwblite.sensor_log import Odometry, SensorMounting
+
+PLACES = np.array([[6.0, 4.5], [-6.0, 4.0], [5.5, -4.5]])
+MOUNTING = SensorMounting(tag_position=np.array([0.2, -0.1, 0.0]), anchor_height=0.0)
+CUT = np.array([3, 8])
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """Recordings whose odometry and ranges have no error, and the true estimate."""
+    rng = np.random.default_rng(3)
+    stamps, truth = wander(rng, 15.0)
+    seen = scans(stamps, truth, box(14, 11), rate=40.0, beams=20, sweep=0.02)
+    radio = ranges(rng, stamps, truth, PLACES, sigma=0.0, tag=(0.2, -0.1))
+    config = MappingConfig()
+    recordings = gather([recording(Odometry(stamps, truth), radio, seen, mounting=MOUNTING)], config.keyframes)
+    estimate = dead_reckoning(recordings.each[0], config)
+    n = len(estimate.graph.poses)
+    closure = RelativePoseEdges(
+        np.array([2]), np.array([n - 2]), se2.between(estimate.graph.poses[[2]], estimate.graph.poses[[n - 2]]), np.eye(3)[None]
+    )
+    prior = PriorEdges("poses", np.array([5]), estimate.graph.poses[[5]], np.eye(3)[None])
+    fixed = np.arange(n) == 4
+    graph = replace(estimate.graph, anchors=PLACES, fixed_poses=fixed).with_edges(*estimate.graph.edges, closure, prior)
+    return recordings, replace(estimate, graph=graph)
+
+
+def covariances(edges):
+    return np.linalg.inv(np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information)
+
+
+def test_the_same_keyframes_leave_all_as_it_is(exact):
+    recordings, estimate = exact
+    same = with_keyframes(estimate, recordings, later(recordings, 0.0))
+    np.testing.assert_array_equal(same.graph.poses, estimate.graph.poses)
+    np.testing.assert_allclose(same.odometry.motion, estimate.odometry.motion, atol=1e-12)
+    np.testing.assert_array_equal(same.odometry.sqrt_information, estimate.odometry.sqrt_information)
+    np.testing.assert_allclose(same.ranges.lever_arm, estimate.ranges.lever_arm, atol=1e-12)
+    np.testing.assert_array_equal(same.ranges.pose, estimate.ranges.pose)
+
+
+def test_moved_keyframes_keep_exact_measurements_exact(exact):
+    recordings, estimate = exact
+    after = later(recordings, 0.06)
+    moved = with_keyframes(estimate, recordings, after)
+    there = replace(moved.graph, poses=after.each[0].frames.odometry)
+    assert np.abs(there.poses - estimate.graph.poses).max() > 0.005
+    assert np.abs(moved.odometry.residuals(there)).max() < 1e-6
+    # Between two odometry samples (0.1 s) an arc was driven that ranges see to a tenth of a millimetre.
+    assert np.abs(moved.ranges.residuals(there) * moved.ranges.sigma[:, None]).max() < 1e-3
+    assert moved.recordings is after
+
+
+def test_added_keyframes_keep_poses_measurements_and_what_is_known_of_them(exact):
+    recordings, estimate = exact
+    after = denser(recordings, CUT, 2)
+    n, more = len(recordings.stamps), len(after.stamps)
+    assert more == n + 2 * len(CUT)
+    dense = with_keyframes(estimate, recordings, after)
+    number = np.searchsorted(after.stamps, recordings.stamps)
+    np.testing.assert_allclose(dense.graph.poses[number], estimate.graph.poses, atol=1e-9)
+    np.testing.assert_allclose(dense.graph.poses, after.each[0].frames.odometry, atol=1e-6)
+    assert np.abs(dense.odometry.residuals(dense.graph)).max() < 1e-3
+    np.testing.assert_array_equal(dense.odometry.i, np.arange(more - 1))
+    np.testing.assert_array_equal(dense.odometry.j, np.arange(1, more))
+    assert np.flatnonzero(dense.graph.fixed_poses).tolist() == [number[4]]
+    closure, prior = dense.graph.edges[-2:]
+    assert (int(closure.i[0]), int(closure.j[0]), int(prior.index[0])) == (number[2], number[n - 2], number[5])
+    assert np.abs(closure.residuals(dense.graph)).max() < 1e-9
+    assert np.abs(dense.ranges.residuals(dense.graph) * dense.ranges.sigma[:, None]).max() < 1e-3
+
+
+def test_pieces_of_a_step_have_its_variance_together(exact):
+    recordings, estimate = exact
+    after = denser(recordings, CUT, 2)
+    dense = with_keyframes(estimate, recordings, after)
+    number = np.searchsorted(after.stamps, recordings.stamps)
+    whole, pieces = covariances(estimate.odometry), covariances(dense.odometry)
+    for k, (first, last) in enumerate(pairwise(number)):
+        np.testing.assert_allclose(pieces[first:last].sum(axis=0), whole[k], rtol=1e-4)
