@@ -10,7 +10,7 @@ from helpers.planted import box
 from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.lidar.scan_matching import rasterize
-from uwblite.lidar.scan_to_scan import Steps, TrackingConfig, descend, follow
+from uwblite.lidar.scan_to_scan import Steps, TrackingConfig, descend, follow, reattached
 
 NOISE = np.array([0.01, 0.005, 0.006])
 GATE = 0.5
@@ -101,3 +101,30 @@ def test_steps_taken_over_stand_among_new_ones_in_order():
     assert both.i.tolist() == [0, 1, 2, 3, 4]
     assert both.share.tolist() == [0.5, 0.25, 0.25, 0.25, 0.5]
     np.testing.assert_array_equal(both.pose[:, 0], [0.5, 1.25, 2.25, 3.25, 2.5])
+
+
+def test_a_keyframe_that_matches_no_neighbour_is_laid_between_them(walk):
+    truth, clouds, _ = walk
+    rng = np.random.default_rng(4)
+    lines = np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
+    astray = int(np.argmax(np.convolve(lines, np.ones(5), mode="valid"))) + 2
+    poses, tied = truth + rng.standard_normal(truth.shape) * 0.003, np.ones(len(truth), dtype=bool)
+    poses[astray] = se2.compose(poses[astray], np.array([0.2, -0.1, 0.8]))
+    tied[astray] = False
+    raster = rasterize(clouds, 0.1, GATE)
+    found, laid = reattached(clouds, raster, poses, np.arange(len(truth)) * 1.0, tied, GATE, TrackingConfig())
+    assert laid.tolist() == [astray]
+    error = se2.between(se2.between(truth[astray - 1], truth[astray]), se2.between(found[astray - 1], found[astray]))
+    assert np.hypot(*error[:2]) < 0.02
+    assert abs(error[2]) < 0.01
+    np.testing.assert_array_equal(np.delete(found, astray, axis=0), np.delete(poses, astray, axis=0))
+
+
+def test_keyframes_without_neighbours_on_both_sides_stay(walk):
+    truth, clouds, _ = walk
+    tied = np.ones(len(truth), dtype=bool)
+    tied[[0, -1]] = False
+    tied[4:9] = False
+    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), truth, np.arange(len(truth)), tied, GATE, TrackingConfig())
+    assert len(laid) == 0
+    np.testing.assert_array_equal(found, truth)

@@ -173,3 +173,20 @@ def test_equal_stamps_do_no_harm():
     dense = dense_trajectory(wheels, frames, poses)
     assert np.isfinite(dense).all()
     np.testing.assert_allclose(dense[frames.index], poses, atol=1e-12)
+
+
+def test_what_odometry_misses_is_spread_as_its_errors_grow():
+    """It drives 0.2 m, turns 0.2 rad on the spot and drives 0.1 m, all too short by a tenth: turns err where it turned."""
+    stamps = np.arange(7) * 0.1
+    x = np.array([0.0, 0.1, 0.2, 0.2, 0.2, 0.25, 0.3])
+    turn = np.array([0.0, 0.0, 0.0, 0.1, 0.2, 0.2, 0.2])
+    corner = np.column_stack([np.minimum(x, 0.2), 0.0 * x, turn])
+    wheels = Odometry(stamps, se2.compose(corner, np.column_stack([x - np.minimum(x, 0.2), 0.0 * x, 0.0 * x])))
+    frames = select(wheels, KeyframeConfig(distance=1.0, angle=1.0))
+    ends = np.array([[0.0, 0.0, 0.0], se2.compose(np.array([0.22, 0.0, 0.22]), np.array([0.11, 0.0, 0.0]))])
+    assert len(frames) == 2
+    dense = dense_trajectory(wheels, frames, ends)
+    np.testing.assert_allclose(dense[[0, -1]], ends, atol=1e-9)
+    # Driving takes a share of one in seven of the heading's error: 0.3 m count as 0.03 rad of turning.
+    np.testing.assert_allclose(dense[2], [0.22, 0.0, 0.0], atol=0.003)
+    np.testing.assert_allclose(dense[4], [0.22, 0.0, 0.22], atol=0.003)

@@ -1,12 +1,20 @@
 """What noise cannot explain is a doubt; a sound recording has none."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import chained
 from helpers.room_recording import recording, two_rounds
 
+from uwblite import se2
+from uwblite.graph.calibration import scan_indices
+from uwblite.graph.graph import Calibration, Graph
+from uwblite.graph.pose_edges import ScanEdges
 from uwblite.mapping import build_map
+from uwblite.pipeline.progress import Stages
+from uwblite.pipeline.residual_tests import check_odometry_steps
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +52,32 @@ def test_a_lidar_of_another_scale_contradicts_wheels_and_radio(sound):
 
 def test_odometry_alone_drifts(sound):
     assert doubts(sound.without(uwb=True, lidar=True)) == {"odometry-alone"}
+
+
+def steps_that_slip(confirmed):
+    """Judge a chain that follows the lidar, its wheels off for 15 steps; confirmed: lidar ties these to another visit."""
+    truth = np.column_stack([np.arange(80) * 0.3, np.zeros(80), np.zeros(80)])
+    wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
+    wheels.motion[30:45, 2] += 0.2
+    i = np.arange(20, 60)
+    j = i - (20 if confirmed else 5)
+    none = np.zeros((len(i), 3))
+    root = np.zeros((len(i), 3, 3)) + np.eye(3)
+    ties = ScanEdges(i, j, se2.between(truth[i], truth[j]), root, none, none, scan_indices(Calibration()))
+    stages = Stages(None, None)
+    recordings = SimpleNamespace(stamps=np.arange(80.0), path=np.arange(80.0))
+    check_odometry_steps(
+        SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,))),
+        SimpleNamespace(recordings=recordings, stages=stages),
+    )
+    return stages
+
+
+def test_wheels_that_slip_are_a_doubt_unless_the_lidar_knows_the_place_from_another_visit():
+    alone, confirmed = steps_that_slip(False), steps_that_slip(True)
+    assert [n.kind for n in alone.doubts] == ["odometry-steps"]
+    assert alone.warnings == confirmed.doubts == []
+    (notice,) = confirmed.warnings
+    assert notice.kind == "odometry-steps"
+    assert 25 <= notice.figures["start"] <= 30
+    assert 44 <= notice.figures["end"] <= 50

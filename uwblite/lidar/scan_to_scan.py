@@ -133,6 +133,48 @@ def follow(
     return ScanOdometry(measured_steps, learnt, float(np.median(miss)) if len(miss) else 0.0, searched)
 
 
+def reattached(
+    clouds: Clouds, raster: CloudRasters, poses: Floats, stamps: Floats, tied: Bools, gate: float, config: TrackingConfig
+) -> tuple[Floats, Ints]:
+    """Lay keyframes that match none of their neighbours between these, where their clouds fit there.
+
+    A step may be wrong and yet look right to its two clouds; the next keyframe then fits the one before it, and one that
+    stands alone is astray.
+
+    Parameters
+    ----------
+    poses, stamps : (k, 3) and (k,) s. tied : (k,) keyframes that match a neighbour. gate : reach of the raster, m.
+
+    Returns
+    -------
+    Poses (k, 3), and the keyframes (r,) that were laid anew.
+    """
+    lone = np.flatnonzero(~tied & (_lines_of(clouds) >= config.min_points))
+    sound = np.flatnonzero(tied)
+    place = np.searchsorted(sound, lone)
+    inner = (place > 0) & (place < len(sound))
+    lone, before, after = lone[inner], sound[place[inner] - 1], sound[place[inner]]
+    near = after - before <= _LONGEST_RUN + 1
+    lone, before, after = lone[near], before[near], after[near]
+    share = (stamps[lone] - stamps[before]) / np.maximum(stamps[after] - stamps[before], 1e-9)
+    guess = se2.between(poses[before], se2.interpolate(poses[before], poses[after], share))
+    points, tight = pair_points(clouds, lone, config.points), min(config.gate, gate)
+    aligned = align_pairs(clouds, raster, before, lone, guess, points, gate, tight)
+    fits = aligned.share >= config.good_share
+    found, laid = poses.copy(), lone[fits]
+    found[laid] = se2.compose(poses[before[fits]], aligned.pose[fits])
+    return found, laid
+
+
+_LONGEST_RUN = 3
+"""Keyframes in a row that are laid between sound ones."""
+
+
+def _lines_of(clouds: Clouds) -> Ints:
+    """Return the number (k,) of points with a normal of each cloud."""
+    return np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
+
+
 def _searched(
     clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig
 ) -> tuple[Floats, Bools]:

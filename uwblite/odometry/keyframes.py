@@ -215,7 +215,8 @@ def velocity_at(odometry: Odometry, stamps: Floats, window: float = 0.1) -> Floa
 def dense_trajectory(odometry: Odometry, keyframes: Keyframes, poses: Floats, stamps: Floats | None = None) -> Floats:
     """Return T_map_base (n, 3) at the stamps (default: every odometry stamp) between optimised keyframes (k, 3).
 
-    The raw odometry since the keyframe is followed, and what it misses by the next keyframe is spread evenly in time.
+    The raw odometry since the keyframe is followed, and what it misses by the next keyframe is spread as errors of wheels
+    arise: of the position by the distance travelled, of the heading by the turn, and little by time.
     """
     query = odometry.stamps if stamps is None else stamps
     base = odometry.poses if stamps is None else se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps)
@@ -224,7 +225,21 @@ def dense_trajectory(odometry: Odometry, keyframes: Keyframes, poses: Floats, st
     if len(keyframes) == 1:
         return se2.compose(poses[left], since)
     missed = se2.log(se2.between(keyframes.motion, se2.between(poses[:-1], poses[1:])))
-    fraction = (query - keyframes.stamps[left]) / np.where(keyframes.duration[left] > 0, keyframes.duration[left], 1.0)
-    fraction = np.where(keyframes.duration[left] > 0, np.clip(fraction, 0.0, 1.0), 0.0)
-    dense = se2.compose(poses[left], se2.compose(since, se2.exp(fraction[:, None] * missed[left])))
+    at, ends = _error_ways(odometry, query), _error_ways(odometry, keyframes.stamps)
+    whole = np.diff(ends, axis=0)[left]
+    fraction = np.where(whole > 0.0, np.clip((at - ends[left]) / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0), 0.0)
+    dense = se2.compose(poses[left], se2.compose(since, se2.exp(fraction * missed[left])))
     return dense
+
+
+def _error_ways(odometry: Odometry, stamps: Floats) -> Floats:
+    """Return how much (m, 3) errors of wheels have grown by since the beginning, in x, y and heading, in arbitrary units."""
+    _, path, turned = _travelled(odometry, stamps, _sample(odometry, stamps))
+    position = path + _STANDING_ERROR * stamps
+    return np.column_stack([position, position, turned + _BY_PATH * path + _STANDING_ERROR * stamps])
+
+
+_STANDING_ERROR = 1e-3
+"""m/s or rad/s of travelling and turning that err as much as standing does."""
+_BY_PATH = 0.1
+"""rad/m of turning that errs as much in heading as driving straight does; of the order of the wheels' noise settings."""

@@ -6,8 +6,9 @@ is made for no particular fault.
 
 import numpy as np
 
-from ..arrays import Floats, Ints, spread_about_median
+from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..graph.calibration import RANGE_SCALE
+from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
 from ..radio.range_noise import short_term_sigma
 from .estimate import Estimate, Task
@@ -23,6 +24,8 @@ _WINDOW, _MOST = 10, 0.6
 """Steps in a row, and the share of them that must be off."""
 _MEASURED_BREAK = 0.15
 """Steps more uncertain than that, m, are no measurements."""
+_ANOTHER_VISIT = 10.0
+"""Travelled distance between two visits, m."""
 _WAYS = 0.15
 """Relative disagreement of lidar and wheels on ways from one scan to the next, which single scans show to some per cent."""
 _SCALE = 0.12
@@ -67,14 +70,33 @@ def check_odometry_steps(estimate: Estimate, task: Task) -> None:
         return
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
     off = (np.abs(wheels.residuals(graph)).max(axis=1) > _SUDDEN) & measured
+    confirmed = _confirmed(graph, task.recordings.path)
+    say, text = task.stages.doubt, "most steps of the odometry disagree with the map far beyond their noise"
+    stretch = _stretch(off & ~(confirmed[wheels.i] & confirmed[wheels.j]))
+    if stretch is None and (stretch := _stretch(off)) is not None:
+        say, text = task.stages.warn, text + "; there the lidar knows the places from other visits, and the map follows it"
+    if stretch is not None:
+        a, b = (float(stamps[wheels.i[k]] - stamps[0]) for k in stretch)
+        say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
+
+
+def _stretch(off: Bools) -> tuple[int, int] | None:
+    """Return the first and last step of where most steps in a row are off (e,); None where there is no such stretch."""
     share = np.convolve(off, np.ones(_WINDOW) / _WINDOW, mode="valid")
     if share.max() < _MOST:
-        return
-    first = int(np.argmax(share >= _MOST))
+        return None
     last = len(share) - 1 - int(np.argmax(share[::-1] >= _MOST)) + _WINDOW
-    a, b = (float(stamps[wheels.i[k]] - stamps[0]) for k in (first, min(last, len(wheels) - 1)))
-    text = f"between t = {a:.0f} and {b:.0f} s most steps of the odometry disagree with the map far beyond their noise"
-    task.stages.doubt("odometry-steps", text, start=a, end=b)
+    return int(np.argmax(share >= _MOST)), min(last, len(off) - 1)
+
+
+def _confirmed(graph: Graph, path: Floats) -> Bools:
+    """Tell which keyframes (k,) lidar ties to another visit of the place; path : (k,) travelled distance, m."""
+    confirmed = np.zeros(len(path), dtype=bool)
+    for edges in graph.edges:
+        if isinstance(edges, ScanEdges):
+            again = np.abs(path[edges.i] - path[edges.j]) > _ANOTHER_VISIT
+            confirmed[edges.i[again]] = confirmed[edges.j[again]] = True
+    return confirmed
 
 
 def check_scales(estimate: Estimate, task: Task) -> None:
