@@ -73,7 +73,7 @@ def test_one_anchor_leaves_the_heading_as_it_was():
     np.testing.assert_allclose(solved.anchors, TRUE, atol=1e-6)
 
 
-def test_solving_keeps_what_was_said_and_the_first_pose_is_free():
+def test_solving_keeps_what_was_given_and_the_first_pose_is_free():
     anchors = TRUE + np.random.default_rng(1).normal(0, 0.1, TRUE.shape)
     done = apply(Constraints(anchors=surveyed(*IDS)), first_estimate(anchors=anchors), IDS, ALL, CLOCK)
     assert not done.graph.fixed_poses.any()
@@ -97,7 +97,7 @@ def test_an_anchor_moved_since_the_earlier_map_is_named_and_does_not_bend_the_ma
     np.testing.assert_allclose(solved.anchors, anchors, atol=1e-6)
 
 
-def test_a_tape_between_anchors_is_heard():
+def test_a_given_distance_between_anchors_counts():
     known = Constraints(distances=(GivenDistance(("A", "B"), 9.0, 0.001),))
     done = apply(known, first_estimate(), IDS, ALL, CLOCK)
     assert done.graph.fixed_poses is None
@@ -118,7 +118,7 @@ def test_the_jacobian_of_a_distance_is_right():
             np.testing.assert_allclose(jacobian[:, :, axis], (up - down) / 2e-6, atol=1e-6)
 
 
-def test_a_known_closure_ties_two_times_together():
+def test_a_given_closure_ties_two_times_together():
     known = Constraints(closures=(GivenClosure((float(STAMPS[3]), float(STAMPS[30]))),))
     edges = apply(known, first_estimate(), IDS, ALL, CLOCK).graph.edges[-1]
     assert (edges.i.tolist(), edges.j.tolist()) == ([3], [30])
@@ -132,7 +132,7 @@ def test_forbidden_pairs_are_refused_both_ways_and_others_not():
     assert known.allowed(clock, np.arange(4), np.arange(4, 8)).tolist() == [False, False, True, True]
 
 
-def test_stamps_of_several_recordings_are_told_apart():
+def test_stamps_of_several_recordings_are_distinguished():
     """Two clocks that both begin at 100 s; the second is meant where it is named."""
     clock = Clock(np.concatenate([STAMPS[:20], STAMPS[:20]]), np.repeat([0, 1], 20))
     stamp = float(STAMPS[7])
@@ -199,7 +199,7 @@ within = 20
 """
 
 
-def test_a_file_says_it_all():
+def test_a_file_reports_it_all():
     known = parse_constraints(FILE)
     assert known.anchors == (GivenAnchor("5C0B", (1.0, 2.0), 0.02),)
     assert known.poses[0].pose == (0.0, 0.0, 1.5)

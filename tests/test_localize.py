@@ -53,7 +53,7 @@ def test_a_part_finds_its_place_in_the_whole(log, earlier):
     assert found.result.stages[-1].name == "walls"
 
 
-def test_without_walls_the_anchors_hold(log, earlier):
+def test_without_walls_the_anchors_fix_the_place(log, earlier):
     found = localize(part(log).without(lidar=True), anchors_of(earlier), earlier.grid)
     assert np.isnan(found.overlap)
     # Ranges of 0.06 m with slow errors, 366 of them: a decimetre or two.
@@ -82,7 +82,7 @@ def test_a_recording_with_neither_an_anchor_of_the_map_nor_walls_is_refused(log,
             localize(alone, strangers, grid)
 
 
-def test_walls_alone_find_the_place_and_it_is_said(log, earlier):
+def test_walls_alone_find_the_place_and_it_is_reported(log, earlier):
     found = localize(part(log).without(uwb=True), anchors_of(earlier), earlier.grid)
     assert np.sqrt(np.mean(errors(found, earlier) ** 2)) < 0.025
     assert any("walls alone" in w.text for w in found.result.warnings)
@@ -108,7 +108,7 @@ def test_covariances_and_anchors_move_along(log, earlier):
 
 
 @pytest.mark.slow
-def test_another_drive_through_the_same_room(tmp_path):
+def test_another_recording_through_the_same_room(tmp_path):
     spec = importlib.util.spec_from_file_location("simulate", ROOT / "tools" / "simulate.py")
     simulate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(simulate)

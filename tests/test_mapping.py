@@ -108,7 +108,7 @@ def test_the_recording_is_not_changed(minute):
     ("off", "words"),
     [({"use_uwb": False}, "no UWB"), ({"use_lidar": False}, "no lidar"), ({"use_loops": False}, None)],
 )
-def test_a_missing_sensor_is_borne_and_said(minute, truth, off, words):
+def test_a_missing_sensor_is_borne_and_reported(minute, truth, off, words):
     result = build_map(minute, MappingConfig(**off))
     stated = " ".join(w.text for w in result.warnings)
     assert words is None or words in stated
@@ -136,7 +136,7 @@ def test_wheels_alone_give_the_odometry_back(minute):
     assert len(result.warnings) == 2
 
 
-def test_sensors_that_say_nothing_of_use_are_borne_and_said(minute):
+def test_sensors_that_report_nothing_of_use_are_borne_and_reported(minute):
     silent = replace(minute.ranges, ranges=np.zeros(len(minute.ranges.ranges)))
     result = build_map(replace(minute, ranges=silent))
     assert any("no anchor" in d.text for d in result.doubts)
@@ -165,7 +165,7 @@ def test_hardly_any_recording_at_all():
         assert moved == pytest.approx(np.hypot(*(truth[-1] - truth[0])[:2]), abs=0.05)
 
 
-def test_progress_is_told_in_order(minute):
+def test_progress_is_reported_in_order(minute):
     reported = []
     result = build_map(minute, progress=lambda *a: reported.append(a))
     assert all(0 <= done <= total and total >= 1 for _, done, total in reported)
@@ -326,7 +326,7 @@ def test_a_large_grid_is_announced_and_may_be_declined(minute, monkeypatch):
 
 
 @pytest.mark.slow
-def test_wheels_in_another_unit_are_told_by_the_radio(shared_data):
+def test_wheels_in_another_unit_are_reported_by_the_radio(shared_data):
     """A lawn mower whose log has wheels 1.4 times too short: its map has the size of the radios' own survey."""
     folder = shared_data / "dwm1001_mower"
     result = build_map(read_log(folder / "run.log.gz"))

@@ -81,7 +81,7 @@ def test_the_sdist_carries_its_tests(built, tmp_path):
     assert done.returncode == 0, done.stdout
 
 
-def test_twine_has_nothing_to_say(built):
+def test_twine_finds_nothing(built):
     if importlib.util.find_spec("twine") is None:
         pytest.skip("twine is absent")
     command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, built.iterdir())]

@@ -52,7 +52,7 @@ def test_the_commands_it_ends_with_work_when_pasted(clone, tmp_path):
             assert os.path.getsize(line.partition(":")[2].strip()) > 0
 
 
-def test_every_document_that_sets_it_up_says_how_to_go_on():
+def test_every_document_that_sets_it_up_reports_how_to_go_on():
     """Whoever follows a page in its order has `uwblite` and `python` on the path before the first of them is used."""
     for page in (ROOT / "README.md", ROOT / "docs" / "getting_started.md"):
         text = page.read_text()

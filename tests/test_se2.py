@@ -138,7 +138,7 @@ def test_interpolation_follows_the_arc():
     np.testing.assert_allclose(quarter, [np.sin(np.pi / 4), 1 - np.cos(np.pi / 4), np.pi / 4], atol=1e-15)
 
 
-def test_trajectories_are_interpolated_in_time_and_held_at_their_ends():
+def test_trajectories_are_interpolated_in_time_and_fixed_at_their_ends():
     stamps = np.array([0.0, 1.0, 1.0, 3.0])
     path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0], [7.0, 0.0, 0.0]])
     at = se2.interpolate_trajectory(stamps, path, np.array([-1.0, 0.5, 1.0, 2.0, 9.0]))

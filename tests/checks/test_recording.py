@@ -151,7 +151,7 @@ def test_missing_sensors_and_notes_of_the_reader(sound):
     assert_named(replace(sound, notes=notes), "warning", "3 messages out of order")
 
 
-def test_what_the_radio_says_of_the_wheels(sound):
+def test_what_the_radio_reports_of_the_wheels(sound):
     scale = CalibrationEstimate(UnknownKey("odometry_scale"), 0.06, 0.004, "1", "error of travelled distance", "estimated")
     assert_named(sound, "warning", "the wheels are off against the radio by +6.0%", calibration=(scale,))
     unsure = replace(scale, sigma=0.05)

@@ -18,7 +18,7 @@ def _quiet_afterwards():
     console.set_up()
 
 
-def test_say_and_note_go_to_their_streams(capsys):
+def test_report_and_note_go_to_their_streams(capsys):
     console.set_up()
     console.say("result")
     console.note("beside")
@@ -74,7 +74,7 @@ def test_durations(seconds, text):
     assert console.duration(seconds) == text
 
 
-def test_operating_system_errors_say_the_way_out():
+def test_operating_system_errors_report_the_way_out():
     assert console.os_error_text(OSError(28, "No space left on device", "map.pgm")) == (
         "map.pgm: No space left on device; free some space, or write to another disk with --out"
     )

@@ -61,7 +61,7 @@ def test_units_and_parts(room_log, tmp_path, capsys):
         (["missing.bag", "x.log"], "no such file"),
     ],
 )
-def test_what_cannot_be_converted_is_said(room_log, tmp_path, capsys, monkeypatch, words, message):
+def test_what_cannot_be_converted_is_reported(room_log, tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     assert main(["convert", *(w.format(log=room_log) for w in words)]) == 1
     assert message in capsys.readouterr().err

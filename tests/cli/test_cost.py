@@ -63,6 +63,6 @@ def test_the_estimate_is_that_of_a_computer_whose_time_grows_with_the_work(log, 
     assert cost.expected_seconds(log) == pytest.approx(expected, rel=1e-6)
 
 
-def test_what_cannot_be_mapped_costs_as_the_model_says():
+def test_what_cannot_be_mapped_costs_as_the_model_reports():
     still = SensorLog(Odometry(np.array([0.0]), np.zeros((1, 3))))
     assert cost.expected_seconds(still) == pytest.approx(cost._SECONDS_AT_LEAST)

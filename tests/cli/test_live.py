@@ -42,7 +42,7 @@ def lines_of(text):
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_a_log_is_followed_and_the_pose_is_told(room, capsys):
+def test_a_log_is_followed_and_the_pose_is_reported(room, capsys):
     folder, log, poses = room
     assert main(["localize", str(log), "--live", "--map", str(folder), "--idle", "0.1"]) == 0
     out, err = capsys.readouterr()

@@ -169,7 +169,7 @@ def test_settings_are_printed_checked_and_overridden(tmp_path, capsys):
         ("turn_laser=false", "is called 'detect_laser_flip' now"),
     ],
 )
-def test_names_of_settings_that_are_gone_say_what_became_of_them(setting, words, tmp_path, capsys):
+def test_names_of_settings_that_are_gone_report_what_became_of_them(setting, words, tmp_path, capsys):
     assert main(["config", "--set", setting]) == 2
     assert words in capsys.readouterr().err
     name, value = setting.split("=")
@@ -209,7 +209,7 @@ def test_numbers_that_begin_with_a_minus_need_no_equals_sign(verb, capsys):
         (["map", "x.log"], "the following arguments are required: --out"),
     ],
 )
-def test_a_usage_error_is_short_and_says_what_was_meant(words, output, capsys):
+def test_a_usage_error_is_short_and_reports_what_was_meant(words, output, capsys):
     assert main(words) == 2
     first, second = capsys.readouterr().err.splitlines()
     assert first == f"uwblite {words[0]}: error: {output}"

@@ -35,7 +35,7 @@ def test_the_sample_is_mapped_with_every_file(mapped):
     assert set(contents(folder)) == FILES
 
 
-def test_what_is_said_has_units_sigmas_paths_and_the_next_step(mapped):
+def test_what_is_reported_has_units_sigmas_paths_and_the_next_step(mapped):
     folder, _, output = mapped
     number = r"[\u2212+]?\d+\.\d+"
     assert re.search(rf"anchor 5C0B: x {number} \u00b1\d\.\d\d m, y {number} \u00b1\d\.\d\d m, bias .* m, 190 ranges", output)
@@ -211,7 +211,7 @@ def test_a_result_to_trust_exits_with_0_and_one_in_doubt_with_3(radio_only, tmp_
             assert all("mirror-ambiguous" in doubt for doubt in doubts)
 
 
-def test_broken_lines_are_told_counted_and_skipped(radio_only, tmp_path, capsys):
+def test_broken_lines_are_reported_counted_and_skipped(radio_only, tmp_path, capsys):
     lines = (radio_only / "around.log").read_text().splitlines(keepends=True)
     lines[40:40] = ["ODOM 1 2\n"]
     lines[90:90] = ["UWB A00 far 100 1 r 1\n"]

@@ -48,7 +48,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("mistake", REFUSED)
-def test_a_mistake_is_told_before_anything_is_written(mistake, tmp_path, monkeypatch, capfd):
+def test_a_mistake_is_reported_before_anything_is_written(mistake, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken.log").write_text("not a port")
     assert main(["record", "--out", "new.log", *REFUSED[mistake]]) in (1, 2)

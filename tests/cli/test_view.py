@@ -42,7 +42,7 @@ class Served:
         self.code = self.process.wait(timeout=20)
 
 
-def test_it_says_its_address_and_ends_with_ctrl_c(mapped):
+def test_it_reports_its_address_and_ends_with_ctrl_c(mapped):
     import urllib.request
 
     with Served("map", cwd=mapped) as served, urllib.request.urlopen(served.address + "state", timeout=20) as answer:

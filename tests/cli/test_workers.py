@@ -28,7 +28,7 @@ def test_one_job_needs_no_executor_and_two_answer_in_order():
         assert list(executor.map(abs, range(-3, 3))) == [3, 2, 1, 0, 1, 2]
 
 
-def test_without_the_package_the_command_that_installs_it_is_said(monkeypatch, room_log, tmp_path, capsys):
+def test_without_the_package_the_command_that_installs_it_is_reported(monkeypatch, room_log, tmp_path, capsys):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--scheduler", "tcp://127.0.0.1:1"]) == 1
     output = capsys.readouterr().err

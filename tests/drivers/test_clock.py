@@ -28,7 +28,7 @@ def test_unwrap_counts_turns_missed_in_a_silence(turns):
     assert seconds == pytest.approx(0.1 + gap, abs=2e-3)
 
 
-def test_unwrap_says_that_the_counter_was_reset():
+def test_unwrap_reports_that_the_counter_was_reset():
     unwrapper = Unwrapper(1 << 24, 1e-3)
     unwrapper.unwrap(500_000, 0.0)
     assert unwrapper.unwrap(500_100, 0.1) == (pytest.approx(500.1), False)
@@ -70,7 +70,7 @@ def test_map_is_not_moved_by_stalls_of_the_host():
             assert clock.host(device) == pytest.approx(10.0 + device, abs=1e-6)
 
 
-def test_map_does_not_believe_an_impossible_crystal():
+def test_map_does_not_accept_an_impossible_crystal():
     clock = ClockMap()
     for k in range(300):
         clock.add(0.1 * k, 0.1 * k * 1.05)
@@ -103,7 +103,7 @@ def test_a_reset_keeps_the_latency_that_was_measured():
 
 
 @pytest.mark.parametrize("uptime", [1.2, 2.0, 30.0])
-def test_a_clock_that_is_read_after_a_replug_is_tied_anew_however_short_it_ran(uptime):
+def test_a_clock_that_is_read_after_a_replug_is_tied_again_however_short_it_ran(uptime):
     """The unit counts from 0 again after a second without power, so that its clock steps back by little or much."""
     clock = DeviceClock(1e-3, 1 << 24, period=0.1, latency=0.066)
     for zero in (100.0, 101.0 + uptime):
@@ -143,7 +143,7 @@ def test_a_clock_with_a_wrong_unit_is_noticed_and_arrivals_are_used(unit, rate):
         assert clock.rate is not None
 
 
-def test_a_clock_is_believed_through_a_stall_of_the_host():
+def test_a_clock_is_accepted_through_a_stall_of_the_host():
     clock = DeviceClock(1.0, proven=False)
     for k in range(1000):
         time = 0.02 * k

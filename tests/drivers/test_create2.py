@@ -90,7 +90,7 @@ def test_it_asks_for_the_stream_and_follows_the_circle():
     assert max(late) < 0.003
 
 
-def test_a_robot_that_fell_asleep_is_woken_and_its_gap_told():
+def test_a_robot_that_fell_asleep_is_woken_and_its_gap_reported():
     class Still:
         def poses(self):
             yield Pose(0.0, 0.0, 0.0, 0.0)

@@ -119,7 +119,7 @@ def test_lidar_pause_and_hardware_fault_are_named_and_survived():
     assert of_kind(actions, LaserScan)[-1].stamp > START + 14.5
 
 
-def test_lidar_that_is_silent_asks_for_the_port_to_be_opened_anew():
+def test_lidar_that_is_silent_asks_for_the_port_to_be_opened_again():
     device, _ = lidar()
     device.receive = lambda data, now: b""
     actions, reopens = simulate(ScipDriver(), device, 20.0)
@@ -268,7 +268,7 @@ def test_tag_on_a_bad_cable_logs_nothing_wrong(seed):
     assert abs(len(epochs) + lost - len(sent)) < 0.05 * len(sent) + 10
 
 
-def test_tag_that_falls_silent_asks_for_the_port_to_be_opened_anew():
+def test_tag_that_falls_silent_asks_for_the_port_to_be_opened_again():
     device, _ = tag()
     device.silent = True
     actions, reopens = simulate(Dwm1001Driver(), device, 15.0)

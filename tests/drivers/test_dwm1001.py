@@ -147,7 +147,7 @@ def module():
         ("ff00", "400101"), ("0c0101", "400103"), ("030401000000", "400103"), ("030401006400", "400100"), ("0b0100", "400105"),
     ],
 )  # fmt: skip
-def test_emulator_answers_as_the_guide_says(module, request_bytes, answer):
+def test_emulator_answers_as_the_guide_reports(module, request_bytes, answer):
     got = module.receive(bytes.fromhex(request_bytes), 2.0)
     assert got == bytes.fromhex(answer)
 

@@ -135,7 +135,7 @@ def test_lost_packets_are_counted_and_repeated_ones_dropped():
 
 
 @pytest.mark.parametrize("seconds", [3.0, 5.0, 20.0])
-def test_over_a_gap_the_heading_holds_and_the_travel_is_said_to_be_unknown(seconds):
+def test_over_a_gap_the_heading_holds_and_the_travel_is_reported_to_be_unknown(seconds):
     """The gyro's angle is absolute. A gap of 5 s at 0.2 m/s is 1.0 m: the smaller of the travels that fit the counters."""
     k, ticks = round(seconds / 0.02), round(0.2 * seconds / kobuki.TICK)
     actions = drive([feedback(0, 65000, 65000, 0.3), feedback(k, 65000 + ticks, 65000 + ticks, 1.1)])
@@ -146,7 +146,7 @@ def test_over_a_gap_the_heading_holds_and_the_travel_is_said_to_be_unknown(secon
     assert sum(action.count for action in actions if isinstance(action, Lost)) == k - 1
 
 
-def test_a_base_that_was_switched_on_anew_holds_its_pose():
+def test_a_base_that_was_switched_on_again_holds_its_pose():
     actions = drive([feedback(100, 700, 700, 1.0), feedback(101, 900, 900, 1.0), feedback(0, 5, 5, 0.0, stamp=9.0),
                      feedback(1, 105, 105, 0.0, stamp=9.02)])  # fmt: skip
     last, again, pose = poses(actions)[-3:]

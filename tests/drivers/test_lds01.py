@@ -26,7 +26,7 @@ def test_both_known_sums_are_taken_and_damage_is_not(rule):
     assert all(isinstance(event, Corrupt) for event in feed_whole(Lds01Protocol, bytes(broken)))
 
 
-def test_a_unit_with_another_sum_is_believed_after_two_turns():
+def test_a_unit_with_another_sum_is_accepted_after_two_turns():
     protocol, taken = Lds01Protocol(), []
     for k in range(3 * TRUST):
         taken += [k for event in protocol.feed(packet(k % 60, lambda total: total + 77), 1.0) if isinstance(event, Samples)]

@@ -49,7 +49,7 @@ def test_every_single_damaged_byte_is_noticed():
         assert all(isinstance(event, Corrupt) for event in feed_whole(LinkTrackProtocol, bytes(broken)))
 
 
-def test_frames_without_ranges_are_said():
+def test_frames_without_ranges_are_reported():
     session = open_device("uwb", "linktrack:port")[0]
     session.start(0.0)
     frame = bytearray(128)

@@ -103,7 +103,7 @@ def test_a_line_that_leaps_away_and_back_is_damage(broken):
     assert [a.why for a in actions if isinstance(a, Corrupt)] == ["line that leaps away and back"]
 
 
-def test_a_base_that_begins_anew_is_followed_from_its_second_line():
+def test_a_base_that_begins_again_is_followed_from_its_second_line():
     actions = lines_of(OdometryLineDriver(LineFormat()), [*rows(200, 100.0, 3.0), *rows(200)])
     assert len([a for a in actions if isinstance(a, OdometryPose)]) == 400
     assert [a.name for a in actions if isinstance(a, Note)] == ["odometry-clock"]

@@ -134,7 +134,7 @@ def test_kill_and_append(bench, tmp_path):
     assert any("goes on with a log that broke off" in line for line in after)
 
 
-def test_unplugging_is_survived_and_said(bench, tmp_path):
+def test_unplugging_is_survived_and_reported(bench, tmp_path):
     start, arguments, truth = bench
     faults = [w for f in ("lidar:unplug@2+1", "uwb:unplug@2.5+1", "kobuki:unplug@3+1") for w in ("--fault", f)]
     emulator = start(*faults)

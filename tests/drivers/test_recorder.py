@@ -111,7 +111,7 @@ def test_a_port_that_opens_after_the_end_is_closed_again(tmp_path):
     assert opened == ["closed"]
 
 
-def test_a_device_that_comes_and_goes_without_data_is_said_once(tmp_path):
+def test_a_device_that_comes_and_goes_without_data_is_reported_once(tmp_path):
     recorder, notes = record(tmp_path, {"odometry": BASE}, 2.5, lambda url, baud: _Flapping())
     assert recorder.links[0].counts.connects > 3
     names = [note.name for _, note in notes]
@@ -129,14 +129,14 @@ class _Flapping(TalkingPort):
         return b""
 
 
-def test_data_makes_a_reconnect_worth_saying_again(tmp_path):
+def test_data_makes_a_reconnect_worth_reporting_again(tmp_path):
     recorder, notes = record(tmp_path, {"odometry": BASE}, 2.5, lambda url, baud: TalkingPort(gone_after=0.7))
     assert recorder.links[0].counts.connects > 2
     assert sum(note.name == "odometry-gone" for _, note in notes) > 1
     assert recorder.links[0].counts.lost > 0 or recorder.links[0].counts.messages > 50
 
 
-def test_a_base_with_a_wrong_unit_of_time_is_stamped_with_arrivals_and_said(tmp_path):
+def test_a_base_with_a_wrong_unit_of_time_is_stamped_with_arrivals_and_reported(tmp_path):
     spec = BASE[0], BASE[1] + "&time_unit=0.001"
     _, notes = record(tmp_path, {"odometry": spec}, 6.0, lambda url, baud: TalkingPort())
     (note,) = [note for _, note in notes if note.name == "odometry-time-unit"]

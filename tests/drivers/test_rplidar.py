@@ -71,7 +71,7 @@ def test_every_single_damaged_byte_of_a_capsule_is_noticed():
         assert all(isinstance(event, Corrupt) or event in expected for event in events)
 
 
-def test_nodes_are_believed_sixteen_in_a_row():
+def test_nodes_are_accepted_sixteen_in_a_row():
     protocol = RpLidarProtocol()
     protocol.feed(bytes.fromhex("a55a0500004081"), 0.0)
     nodes = [struct.pack("<BHH", 0x3E, (64 * k) << 1 | 1, 4 * 1500 if k else 0) for k in range(16)]
@@ -82,7 +82,7 @@ def test_nodes_are_believed_sixteen_in_a_row():
     assert samples.ranges[1:] == (1.5,) * 15
 
 
-def test_replies_say_which_stream_comes():
+def test_replies_report_which_stream_comes():
     for text, kind in (("a55a5400004082", EXPRESS_REPLY), ("a55a0500004081", STANDARD_REPLY)):
         (reply,) = feed_whole(RpLidarProtocol, bytes.fromhex(text))
         assert reply == Reply(1.0, kind, b"")

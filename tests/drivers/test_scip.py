@@ -290,7 +290,7 @@ def status_of(answer):
         (b"VV;toolongtoolongtoolong", b"0Gg"), (b"VV;bad!", b"0Hh"), (b"VV;good string", b"00P"),
     ],
 )  # fmt: skip
-def test_emulator_answers_each_command_as_the_manual_says(unit, command, status):
+def test_emulator_answers_each_command_as_the_manual_reports(unit, command, status):
     answer = unit.receive(command + b"\n", 1.0)
     assert answer.startswith(command + b"\n")
     assert status_of(answer) == status

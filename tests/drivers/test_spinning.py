@@ -135,7 +135,7 @@ def test_a_stream_left_by_a_dead_host_is_stopped_first(name):
 
 
 @pytest.mark.parametrize("name", ["rplidar", "ydlidar-x4"])
-def test_model_and_health_are_told(name):
+def test_model_and_health_are_reported(name):
     device, turns = emulator(name, health=b"\x02\x01\x00")
     session = open_device("lidar", SPECS[name])[0]
     actions, _, _ = run(name, 3.0, device=(device, turns), session=session)
@@ -147,7 +147,7 @@ def test_model_and_health_are_told(name):
 
 
 @pytest.mark.parametrize("name", ["rplidar", "ydlidar-x4"])
-def test_who_does_not_answer_is_opened_anew(name):
+def test_who_does_not_answer_is_opened_again(name):
     device, turns = emulator(name)
     device.receive = lambda data, now: b""
     actions, _, reopens = run(name, 12.0, device=(device, turns))

@@ -45,7 +45,7 @@ def test_lines_that_users_show(name):
     assert [(r.anchor_id, pytest.approx(r.range)) for r in line.content.readings] == expected
 
 
-def test_older_at_firmware_says_rssi_and_no_ids():
+def test_older_at_firmware_reports_rssi_and_no_ids():
     text = "AT+RANGE=tid:1,mask:04,seq:63,range:(0,0,30,0,0,0,0,0),rssi:(0.00,0.00,-77.93,0.00,0.00,0.00,0.00,0.00)"
     (line,) = LineProtocol(FORMS["makerfabs-at"]).feed(text.encode() + b"\n", 1.0)
     assert [(r.anchor_id, r.range) for r in line.content.readings] == [("2", 0.3)]
@@ -133,7 +133,7 @@ def test_what_is_no_range_is_refused_in_words_and_once():
     assert not any(isinstance(action, RangeEpoch) for action in actions)
 
 
-def test_ranges_of_other_tags_are_left_out_and_that_is_said():
+def test_ranges_of_other_tags_are_left_out_and_that_is_reported():
     session = open_device("uwb", "makerfabs-at:port")[0]
     session.start(0.0)
     line = "AT+RANGE=tid:{},mask:01,seq:1,range:({},0,0,0,0,0,0,0)\n"

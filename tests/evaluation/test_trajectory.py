@@ -71,7 +71,7 @@ def test_gaps_and_ends_of_the_estimate_are_left_out():
     assert left.max() == stamps[-1]
 
 
-def test_other_clock_is_an_error_that_says_so():
+def test_other_clock_is_an_error_that_reports_so():
     stamps, poses = a_recording()
     with pytest.raises(DataError, match=r"only 0 of 400 .*same recording and clock"):
         evaluate_trajectory(stamps, poses, stamps + 1e6, poses)

@@ -27,7 +27,7 @@ def test_every_unknown_has_a_name_of_its_own_a_unit_and_a_meaning():
     assert {f"bias:{a}" for a in IDS} <= {u.key.label for u in listed}
 
 
-def test_height_is_unknown_only_where_nobody_told():
+def test_height_is_unknown_only_where_none_is_given():
     names = {u.key.label for u in unknowns(CalibrationConfig(), IDS, GIVEN)}
     assert {n for n in names if n.startswith("height2:")} == {"height2:1E05", "height2:91A3"}
 

@@ -97,7 +97,7 @@ def test_weights_follow_the_truncated_square():
     np.testing.assert_array_equal(truncated_weight(np.array([0.5, 2.0]), 1e6), [1.0, 0.0])
 
 
-def test_progress_is_told():
+def test_progress_is_reported():
     calls = []
     graph, _, _, _, _ = spoilt(1)
     optimize_gnc(graph, THRESHOLDS, progress=lambda done, most: calls.append((done, most)))

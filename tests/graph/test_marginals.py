@@ -54,7 +54,7 @@ def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(fixed):
     np.testing.assert_allclose(calibration_covariance(graph), expected, rtol=1e-6, atol=1e-15)
 
 
-def test_held_unknowns_have_no_covariance():
+def test_fixed_unknowns_have_no_covariance():
     graph, _ = calibrated()
     is_fixed = replace(graph, fixed_poses=np.arange(60) % 7 == 0, fixed_anchors=np.array([False, True, False]))
     covariance, found = dense_covariance(is_fixed), marginals(is_fixed)

@@ -210,7 +210,7 @@ def test_an_outlier_bends_the_robust_minimum_less():
     assert error(Kernel("cauchy", 2.0)) < 0.5 * error(Kernel())
 
 
-def test_held_unknowns_stay_where_they_are():
+def test_fixed_unknowns_stay_where_they_are():
     rng = np.random.default_rng(5)
     graph, _, _ = loop(5)
     some_poses, some_anchors = rng.random(len(graph.poses)) < 0.2, np.array([True, False, False])
@@ -222,7 +222,7 @@ def test_held_unknowns_stay_where_they_are():
     assert summary.chi2 < summary.chi2_initial
 
 
-def test_by_default_the_first_pose_is_held():
+def test_by_default_the_first_pose_is_fixed():
     graph, _, _ = loop(6)
     np.testing.assert_array_equal(optimize(graph)[0].poses[0], graph.poses[0])
 
@@ -385,7 +385,7 @@ def test_a_long_chain_takes_up_a_wrong_wheel_in_a_few_steps():
     assert np.abs(off[:, 2]).max() < 5 * 0.01
 
 
-def test_the_summary_tells_what_happened():
+def test_the_summary_shows_what_happened():
     graph, _, _ = loop(14)
     calls = []
     _, summary = optimize(graph, progress=lambda done, most: calls.append((done, most)))

@@ -95,7 +95,7 @@ def test_a_log_may_lack_laser_and_radio(tmp_path):
     np.testing.assert_allclose(back.odometry.poses, log.odometry.poses, atol=1e-6)
 
 
-def test_readings_mean_what_the_conventions_say(tmp_path):
+def test_readings_mean_what_the_conventions_report(tmp_path):
     log = read(tmp_path, odometry() + robotlaser([*READINGS, "0.019", "0.02", "80", "-1", "nan", "inf", "1e-3"], 0.25))
     expected = [1.0, np.inf, np.nan, 2.345, 5.599, np.nan, 0.02, np.inf, np.nan, np.nan, np.inf, np.nan]
     np.testing.assert_array_equal(log.scans.ranges[0], np.array(expected, np.float32))
@@ -191,7 +191,7 @@ def test_flaser_angles_follow_the_number_of_beams(tmp_path):
     assert read(tmp_path, odometry() + line).scans.range_max == 80.0
 
 
-def test_flaser_of_a_corrected_log_says_nothing_of_the_mounting(tmp_path):
+def test_flaser_of_a_corrected_log_reports_nothing_of_the_mounting(tmp_path):
     lines = "".join(f"FLASER 3 1 2 3 {k} {k * k} 0 {k} 0 0 {k} robot {k}\n" for k in range(9))
     log = read(tmp_path, "PARAM robot_frontlaser_offset 0.3 0 r 0\n" + odometry() + lines)
     np.testing.assert_allclose(log.mounting.T_base_laser, [0.3, 0, 0])

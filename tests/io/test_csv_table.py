@@ -50,10 +50,10 @@ def test_byte_order_mark_and_windows_line_ends(table_of):
         (b"id\0\n", "binary"),
     ],
 )
-def test_errors_say_where(table_of, text, problem):
+def test_errors_report_where(table_of, text, problem):
     with pytest.raises(FormatError, match=problem):
         table_of(text).numbers("x")
 
 
-def test_nan_is_a_number_that_says_nothing(table_of):
+def test_nan_is_a_number_without_meaning(table_of):
     assert np.isnan(table_of("id,x\nA,nan\n").numbers("x")[0, 0])

@@ -32,7 +32,7 @@ WORD = st.text("0123456789.+-ex", min_size=1, max_size=9).map(str.encode)
 
 
 @given(st.lists(WORD, min_size=1, max_size=6))
-def test_what_is_called_plain_is_what_float_says(words):
+def test_what_is_called_plain_is_what_float_reports(words):
     values, plain = decode([words], 3)
     if plain[0]:
         np.testing.assert_array_equal(values[0], np.array(words, np.float64).astype(np.float32))

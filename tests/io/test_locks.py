@@ -15,7 +15,7 @@ from uwblite.io.folders import replacing_folder
 from uwblite.io.locks import sole_writer
 
 
-def test_a_second_run_is_told_at_once(tmp_path):
+def test_a_second_run_is_reported_at_once(tmp_path):
     with sole_writer(tmp_path / "map"):
         with sole_writer(tmp_path / "other"):
             pass

@@ -20,7 +20,7 @@ def test_pipx_has_its_own_way(monkeypatch):
     assert install_command("rosbags") == "pipx inject uwblite rosbags"
 
 
-def test_a_system_that_refuses_pip_is_not_told_to_use_it(monkeypatch, tmp_path):
+def test_a_system_that_refuses_pip_is_not_reported_to_use_it(monkeypatch, tmp_path):
     marker = tmp_path / "EXTERNALLY-MANAGED"
     monkeypatch.setattr(optional_packages, "_marker", lambda: str(marker))
     monkeypatch.setattr(sys, "prefix", sys.base_prefix)

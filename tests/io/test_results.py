@@ -48,7 +48,7 @@ def test_timings_are_the_only_difference_of_two_runs(tmp_path):
     assert first == second
 
 
-def test_report_json_tells_the_story(tmp_path):
+def test_report_json_holds_every_stage(tmp_path):
     write_result(tmp_path / "map", [small_log()], small_result(), RECORD)
     report = json.loads((tmp_path / "map" / "report.json").read_text())
     assert report["schema"] == 2

@@ -67,7 +67,7 @@ def test_what_is_no_range_is_left_in_peace(tmp_path, topic, kind):
     assert not [w for w in log.notes.warnings if "ranges" in w]
 
 
-def test_a_topic_that_says_uwb_is_named_even_where_its_fields_say_nothing(tmp_path):
+def test_a_topic_that_reports_uwb_is_named_even_where_its_fields_report_nothing(tmp_path):
     definitions = {"x_msgs/msg/Blob": "uint8[] data"}
     log = read_bag(bag_with(tmp_path / "x.bag", "x_msgs/msg/Blob", {"data": [1, 2]}, definitions, "/uwb/raw"))
     (warning,) = log.notes.warnings[:1]
@@ -117,7 +117,7 @@ def test_a_known_type_with_other_fields_is_named_not_fatal(tmp_path):
     assert 'anchor = "node_id", range = "dist"' in log.notes.warnings[0]
 
 
-def test_the_plan_says_what_each_topic_is_for(tmp_path):
+def test_the_plan_reports_what_each_topic_is_for(tmp_path):
     definitions, kind, fields, _ = UNKNOWN["a list of readings"]
     topics, plan = plan_bag(bag_with(tmp_path / "x.bag", kind, fields, definitions))
     assert [plan.role(t.name) for t in topics] == ["odometry", ""]
@@ -128,7 +128,7 @@ def test_the_plan_says_what_each_topic_is_for(tmp_path):
     assert plan_topics((), lambda name: ()).uwb == {}
 
 
-def test_check_says_where_the_ranges_may_be(tmp_path, capsys):
+def test_check_reports_where_the_ranges_may_be(tmp_path, capsys):
     """One command from a bag of an unknown kind to the mapping, and one with it to findings about the ranges."""
     from uwblite.cli import main
 

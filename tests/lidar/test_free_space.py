@@ -44,7 +44,7 @@ def test_a_wall_through_the_room_contradicts():
     assert share == seen == 1.0
 
 
-def test_what_is_hidden_or_out_of_sight_says_nothing():
+def test_what_is_hidden_or_out_of_view_shows_nothing():
     behind_wall = np.stack([np.full(40, 3.0), np.linspace(-1.0, 1.0, 40)], axis=-1)
     behind_back = np.stack([np.full(40, -1.0), np.linspace(-0.2, 0.2, 40)], axis=-1)
     for points in (behind_wall, behind_back):
@@ -83,7 +83,7 @@ def test_several_scans_must_agree_where_asked():
     assert contradiction(free, inner, 0.1, least=2)[0] == 0.0
 
 
-def test_rays_that_saw_nothing_clear_only_as_far_as_told():
+def test_rays_that_saw_nothing_clear_only_as_far_as_given():
     ranges = np.full((1, len(BEARINGS)), np.inf)
     points = np.array([[1.0, 0.0], [3.0, 0.0]])
     silent = free_space(np.zeros((1, 3)), ranges, BEARINGS[0], INCREMENT)

@@ -123,7 +123,7 @@ def test_neighbours_are_of_one_recording():
     assert np.all(recording[i] == recording[j])
 
 
-def test_surface_cells_tell_the_sides_of_a_wall_apart():
+def test_surface_cells_distinguish_the_sides_of_a_wall():
     walls = np.array([[-3.0, 0.0, 3.0, 0.0]])
     truth = np.array([[0.0, -1.5, 0.0], [0.0, 1.5, 0.0], [0.3, -1.4, 1.0]])
     clouds = scanned(truth, walls)
@@ -137,7 +137,7 @@ def test_surface_cells_tell_the_sides_of_a_wall_apart():
     assert len(points) == len(clouds.points)
 
 
-def test_keyframes_without_any_return_are_held_by_the_wheels():
+def test_keyframes_without_any_return_are_fixed_by_the_wheels():
     truth = np.column_stack([np.arange(10) * 0.3, np.zeros(10), np.zeros(10)])
     clouds = scanned(truth, box(400, 400))
     graph = Graph(truth).with_edges(chained(truth, NOISE))
@@ -146,7 +146,7 @@ def test_keyframes_without_any_return_are_held_by_the_wheels():
     np.testing.assert_allclose(result.graph.poses, truth, atol=1e-9)
 
 
-def test_rounds_are_told_and_bounded():
+def test_rounds_are_reported_and_bounded():
     truth, path, clouds = room(7, 0.01, 8.0)
     graph = drifted(np.random.default_rng(1), truth, NOISE)
     recording, reported = np.zeros(len(truth), dtype=np.int64), []
@@ -164,7 +164,7 @@ def test_rounds_are_told_and_bounded():
 
 
 
-def test_fewer_pairs_tell_nearly_as_much():
+def test_fewer_pairs_inform_nearly_as_much():
     """With a fourth of the pairs every pose is held by some ties still; what lies between them is a little less sure."""
     truth, path, clouds = room(5, 0.01)
     graph = Graph(truth).with_edges(chained(truth, NOISE))

@@ -33,7 +33,7 @@ def test_the_way_up_shows_in_the_turns(seed):
         assert seen.turned_over is over
 
 
-def test_who_told_the_way_up_rightly_is_not_contradicted():
+def test_a_way_up_given_rightly_is_not_contradicted():
     log, _ = turner(DOWN)
     assert not compare(replace(log, mounting=DOWN)).turned_over
     assert compare(replace(turner(UP)[0], mounting=DOWN)).turned_over
@@ -55,7 +55,7 @@ def test_the_wheels_turn_scale_is_found(scale):
 
 
 @pytest.mark.parametrize("mounting", [UP, DOWN])
-def test_scans_that_see_nothing_have_no_say(mounting):
+def test_scans_that_see_nothing_decide_nothing(mounting):
     """In a large bare hall most scans see no wall: any turn fits two of them."""
     log, _ = turner(mounting)
     ranges = log.scans.ranges.copy()
@@ -65,14 +65,14 @@ def test_scans_that_see_nothing_have_no_say(mounting):
     assert seen.turned_over is (mounting is DOWN)
 
 
-def test_a_robot_that_never_turns_says_nothing():
+def test_a_robot_that_never_turns_reports_nothing():
     stamps, truth = drive([(0.5, 0.0, 0.0)], [20.0])
     log = recording(odometry(stamps, truth), None, scans(stamps, truth, box(40, 6)))
     assert compare(log) is None
     assert compare(replace(log, scans=replace(log.scans, stamps=log.scans.stamps[:5], ranges=log.scans.ranges[:5]))) is None
 
 
-def test_a_robot_that_turns_only_while_driving_still_says_it():
+def test_a_robot_that_turns_only_while_driving_still_reports_it():
     rng = np.random.default_rng(1)
     stamps, truth = drive([(0.6, 0.0, 0.35)] * 3, [10.0] * 3)
     seen = scans(stamps, truth, ROOM, rate=10.0, noise=0.01, rng=rng, mounting=DOWN)
@@ -81,7 +81,7 @@ def test_a_robot_that_turns_only_while_driving_still_says_it():
     assert found.turned_over
 
 
-def test_a_laser_upside_down_is_mapped_and_said():
+def test_a_laser_upside_down_is_mapped_and_reported():
     rng = np.random.default_rng(2)
     stamps, truth = wander(rng, 25.0)
     seen = scans(stamps, truth, ROOM, rate=5.0, noise=0.01, rng=rng, mounting=DOWN)

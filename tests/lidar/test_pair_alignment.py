@@ -47,7 +47,7 @@ def test_no_step_is_longer_than_allowed(world):
     np.testing.assert_allclose(np.cross(taken, step), 0.0, atol=1e-9)
 
 
-def test_motions_are_recovered_and_told_apart_from_guesses(world):
+def test_motions_are_recovered_and_distinguished_from_guesses(world):
     clouds, raster, points, exact = world
     found = align_pairs(clouds, raster, I, J, exact + np.array([0.15, -0.1, 0.08]), points, 0.5, 0.1)
     error = se2.between(exact, found.pose)

@@ -83,7 +83,7 @@ def test_lines_equal_the_eigenvectors_of_each_neighbourhood(points, radius):
             assert abs(lines.normals[k] @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_linearity_tells_walls_from_corners_and_lone_points():
+def test_linearity_shows_walls_from_corners_and_lone_points():
     along = np.arange(0.0, 1.001, 0.05)
     corner = np.vstack([np.stack([along, 0 * along], -1), np.stack([0 * along, along + 0.05], -1), [[5.0, 5.0]]])
     lines = estimate_normals(corner, make_tree(corner), 0.2)

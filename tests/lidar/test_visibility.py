@@ -42,7 +42,7 @@ def test_visits_agree_where_every_pose_is_true(drive):
 
 
 @pytest.mark.parametrize("error", [(2.0, 1.0, 0.0), (0.0, 0.0, 0.5)])
-def test_visits_disagree_where_half_of_the_drive_lies_elsewhere(drive, error):
+def test_visits_disagree_where_half_of_the_recording_lies_elsewhere(drive, error):
     truth, path, clouds = drive
     poses, half = truth.copy(), len(truth) // 2
     poses[half:] = se2.compose(np.array(error), truth[half:])
@@ -60,7 +60,7 @@ def test_recordings_are_visits_of_their_own(drive):
     assert free_space_violation(clouds, truth, 0.01 * path, recording)[1] > 0
 
 
-def test_sub_maps_in_their_place_see_through_nothing_and_elsewhere_through_walls(drive):
+def test_sub_maps_in_their_place_violate_no_free_space_and_elsewhere_they_do(drive):
     truth, path, clouds = drive
     pieces = build(clouds, truth, path, np.zeros(len(truth), dtype=np.int64), SubmapConfig(epsilon=4.0))
     free = observed_free_space(clouds, pieces, truth)
@@ -107,7 +107,7 @@ def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(drive):
     assert walkers[1] < 0.7 * walkers[0]
 
 
-def test_unrest_is_nothing_in_an_empty_hall_and_something_among_people(drive):
+def test_dynamic_points_are_none_in_an_empty_hall_and_some_among_people(drive):
     truth, path, clouds = drive
     recording = np.zeros(len(truth), dtype=np.int64)
 

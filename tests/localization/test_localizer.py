@@ -57,7 +57,7 @@ def test_walls_alone_find_the_place_where_no_other_looks_like_it():
     assert errors(states[found:], poses[found:]).max() < 0.1
 
 
-def test_two_halves_of_an_even_room_stay_two_places_until_ranges_tell_them_apart():
+def test_two_halves_of_an_even_room_stay_two_places_until_ranges_distinguish_them():
     room, poses = known(EVEN), path(ROUND)
     drive = robot(room, walls=EVEN)
     for state in drive.along(poses[:60], ranges=False):

@@ -98,7 +98,7 @@ def test_every_candidate_is_kept_with_its_reason(laps):
     assert all("still moving" in c.reason for c in short.candidates)
 
 
-def test_more_correlated_points_say_less(laps):
+def test_more_correlated_points_inform_less(laps):
     pieces, recording = pieces_of(laps)
     one, other = (find(Graph(laps[0]), pieces, recording, replace(PLAIN, correlation=c), ICP) for c in (1.0, 4.0))
     np.testing.assert_allclose(one.edges.sqrt_information, 2.0 * other.edges.sqrt_information, rtol=1e-9)

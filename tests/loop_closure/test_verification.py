@@ -162,7 +162,7 @@ def test_true_closures_are_accepted_and_measure_the_truth(hall, closures):
     assert np.abs(error[:, 2]).max() < 3 * np.sqrt(2.0 / 0.3) * NOISE[2]
 
 
-def test_every_candidate_tells_its_story(closures):
+def test_every_candidate_has_its_record(closures):
     for c in closures.candidates:
         assert c.reason
         assert 0.0 <= c.overlap <= 1.0

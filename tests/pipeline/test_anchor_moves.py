@@ -39,7 +39,7 @@ def test_a_moved_anchor_has_a_row_for_each_place(lidar):
 
 
 @pytest.mark.slow
-def test_anchors_that_change_names_at_once_are_told_apart():
+def test_anchors_that_change_names_at_once_are_distinguished():
     log = recording(two_rounds())
     ranges, following = log.ranges, np.array([1, 2, 0])
     renamed = np.where(ranges.stamps > 180.0, following[ranges.anchor], ranges.anchor)

@@ -67,7 +67,7 @@ def test_moved_keyframes_keep_exact_measurements_exact(exact):
     assert moved.recordings is after
 
 
-def test_added_keyframes_keep_poses_measurements_and_what_is_known_of_them(exact):
+def test_added_keyframes_keep_poses_measurements_and_what_is_stated_of_them(exact):
     recordings, estimate = exact
     after = denser(recordings, CUT, 2)
     n, more = len(recordings.stamps), len(after.stamps)

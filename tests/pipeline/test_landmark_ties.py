@@ -163,7 +163,7 @@ def test_a_distance_that_all_else_contradicts_is_named():
     assert [w for w in result.warnings if "a - b" in w.text and "7.000 m" in w.text]
 
 
-def test_what_is_not_there_is_said(carpet):
+def test_what_is_not_there_is_reported(carpet):
     log, _, _ = carpet
     nowhere, alone = GivenLandmark("x", (12.0, 9.0)), GivenLandmarkDistance(("x", "x"), 1.0)
     lost = Constraints(landmarks=(nowhere,), landmark_distances=(alone,))
@@ -179,7 +179,7 @@ def one_cloud(points):
     return clouds.Clouds(np.array([0, n]), points, np.zeros((n, 2)), np.zeros(n, dtype=np.int64), np.zeros(n))
 
 
-def test_a_column_is_found_beside_its_told_place():
+def test_a_column_is_found_beside_its_given_place():
     angle = np.linspace(0, 2 * np.pi, 60)
     ring = np.column_stack([4.0 + 0.3 * np.cos(angle), 1.0 + 0.3 * np.sin(angle)])
     pose = np.array([[1.0, 2.0, 0.7]])

@@ -68,7 +68,7 @@ def test_moving_the_frame_changes_no_chi2_and_no_distance(how):
     )
 
 
-def test_each_alignment_does_what_it_says():
+def test_each_alignment_does_what_it_reports():
     before = graph()
     placed = np.array([True, False, True])
     assert np.array_equal(moved(before, alignment("odometry", before, placed, walls(0.3))).poses, before.poses)

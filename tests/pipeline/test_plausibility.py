@@ -66,7 +66,7 @@ def test_wheels_that_turn_against_the_laser_are_doubted(error, doubted):
     assert len(stated(handedness(graph, lidar=True), "upside down")) == doubted
 
 
-def test_known_anchors_vouch_for_the_sign():
+def test_given_anchors_decide_the_sign():
     log = run(turn_scale=2.0)[2]
     known = Constraints(
         anchors=tuple(GivenAnchor(name, tuple(place), 0.05) for name, place in zip(log.ranges.anchor_ids, PLACES, strict=True))
@@ -77,7 +77,7 @@ def test_known_anchors_vouch_for_the_sign():
 
 @pytest.mark.parametrize(("known", "doubted"), [(0, True), (2, True), (3, False), (4, False)])
 @pytest.mark.parametrize("lidar", [False, True])
-def test_three_known_anchors_settle_the_sign_and_two_do_not(known, doubted, lidar):
+def test_three_given_anchors_decide_the_sign_and_two_do_not(known, doubted, lidar):
     """Two points and their mirror image lie on one another by a rigid motion; three do not."""
     prior = PriorEdges("anchors", np.arange(known), PLACES[:known], np.tile(np.eye(2), (known, 1, 1)))
     other = PriorEdges("calibration", np.zeros(3, int), np.zeros((3, 1)), np.ones((3, 1, 1)))
@@ -86,7 +86,7 @@ def test_three_known_anchors_settle_the_sign_and_two_do_not(known, doubted, lida
     assert len(handedness(graph, lidar)) == doubted
 
 
-def test_a_value_far_from_usual_is_told():
+def test_a_value_far_from_usual_is_reported():
     tight = replace(MappingConfig().calibration, odometry_scale=0.02, range_scale_sound=0.001, range_scale=0.002)
     result = build_map(run(scale=1.12)[2], MappingConfig(calibration=tight))
     assert stated(result.warnings, "relative error of travelled distance came out as")
@@ -133,7 +133,7 @@ def test_stretches_in_which_most_readings_disagree_are_found():
 
 
 @pytest.mark.parametrize("seed", [11, 12])
-def test_anchors_that_lie_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed):
+def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed):
     """Two of four anchors say 2 m too little for 40 % of the time each: wheels alone are soft enough to believe them."""
     stamps, truth, log = run(seed, walls=np.concatenate([box(13, 13), box(3, 2) + 0.5]), metres=100.0)
     radio, part = log.ranges, (log.ranges.stamps - stamps[0]) / np.ptp(stamps)
@@ -147,7 +147,7 @@ def test_anchors_that_lie_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed)
 
 
 @pytest.mark.parametrize("radio_scale", [1.0, 1.08])
-def test_ranges_or_wheels_of_another_scale_are_told(radio_scale):
+def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
     """Without a lidar nothing says which of the two is wrong, but that they differ is plain."""
     reported = stated(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
     assert len(reported) == (radio_scale != 1.0)

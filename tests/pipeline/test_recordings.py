@@ -63,7 +63,7 @@ def merged(two):
     return build_map([log for log, _ in two])
 
 
-def test_two_drives_share_a_frame(two, merged):
+def test_two_recordings_share_a_frame(two, merged):
     both, _ = joint_ate(merged, [truth for _, truth in two])
     alone = [build_map(log) for log, _ in two]
     single = [joint_ate(r, [t])[0] for r, (_, t) in zip(alone, two, strict=True)]
@@ -73,7 +73,7 @@ def test_two_drives_share_a_frame(two, merged):
     assert merged.warnings == ()
 
 
-def test_every_stamp_says_its_recording(two, merged):
+def test_every_stamp_reports_its_recording(two, merged):
     for n, (log, _) in enumerate(two):
         np.testing.assert_array_equal(merged.stamps[merged.recording == n], log.odometry.stamps)
     assert len(merged.keyframe_stamps) == len(merged.graph.poses)
@@ -192,7 +192,7 @@ def test_a_list_of_one_is_that_one(two):
     assert build_map([log]).trajectory.tobytes() == build_map(log).trajectory.tobytes()
 
 
-def test_no_recording_and_no_ranges_are_said(two):
+def test_no_recording_and_no_ranges_are_reported(two):
     with pytest.raises(DataError, match="no recording"):
         build_map([])
     with pytest.raises(DataError, match=r"recording 2.*shares 0 placed anchors.*two or more"):
@@ -210,7 +210,7 @@ def test_paths_of_recordings_lie_apart(two):
 
 
 @pytest.mark.slow
-def test_two_drives_through_a_simulated_hall(tmp_path):
+def test_two_recordings_through_a_simulated_hall(tmp_path):
     """Odometry of either drifts by metres; the map of both is as good as that of one."""
     logs, truths, single = [], [], []
     for seed in (31, 32):

@@ -20,7 +20,7 @@ def drive(seed, length=6.0, lidar=True):
 
 
 @pytest.mark.parametrize("steps", [[], [3], [0, 4, 5, 19]])
-def test_clouds_taken_over_are_those_made_anew(steps):
+def test_clouds_taken_over_are_those_made_again(steps):
     logs = [drive(1), drive(2, lidar=False), drive(3)]
     before = gather(logs, CONFIG.keyframes)
     last = before.each[2]

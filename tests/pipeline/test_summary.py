@@ -67,7 +67,7 @@ def test_anchors_and_biases_lie_within_their_sigmas(run):
         assert anchor.residual_rms == pytest.approx(0.04, rel=0.5)
 
 
-def test_calibration_tells_what_the_recording_shows(run):
+def test_calibration_shows_what_the_recording_shows(run):
     result = run[3]
     values = {c.name: c for c in result.calibration}
     # The unknown is what corrects the wheels: they said 0.97 of every turn.
@@ -80,7 +80,7 @@ def test_calibration_tells_what_the_recording_shows(run):
     assert all(c.reason or c.state == "estimated" for c in result.calibration)
 
 
-def test_a_run_without_lidar_says_so_and_no_more(run):
+def test_a_run_without_lidar_reports_so_and_no_more(run):
     result = run[3]
     assert [w for w in result.warnings if "no lidar" in w.text]
     assert result.grid is None
@@ -104,7 +104,7 @@ def test_a_mirror_is_named_with_its_alternative():
         assert any(anchor.id in doubt.text for doubt in result.doubts)
 
 
-def test_an_anchor_that_lies_is_named_and_bends_nothing(run):
+def test_an_anchor_with_false_ranges_is_named_and_bends_nothing(run):
     """Two thirds of one anchor's ranges are wrong by metres: the others hold the trajectory."""
     stamps, truth, log, good = run
     rng = np.random.default_rng(3)

@@ -38,7 +38,7 @@ def test_the_error_is_that_of_least_squares():
     assert np.sqrt(np.mean(np.sum(step**2, axis=0))) == pytest.approx(position_errors(information), rel=0.03)
 
 
-def test_out_of_reach_tells_nothing_and_walls_tell_less():
+def test_out_of_reach_informs_nothing_and_walls_inform_less():
     point, anchor = np.zeros((1, 2)), np.array([[5.0, 0.0]])
     cases = ((True, 9.0), (False, 9.0), (True, 4.0))
     near, behind, far = (_information(point, anchor, np.array([[sight]]), reach)[0, 0] for sight, reach in cases)
@@ -68,7 +68,7 @@ def test_the_first_place_is_the_best_of_all_and_more_never_harm():
         assert position_errors(information).mean() > one.errors[1].mean() * 0.99
 
 
-def test_anchors_go_where_none_are_in_sight():
+def test_anchors_go_where_none_are_in_line_of_sight():
     """Two rooms joined by a door; all anchors stand in the left one."""
     grid = hall(wall_at=50, door=range(28, 32))
     plan = plan_anchors(grid, np.array([[-2.0, 3.0], [-2.0, 13.0], [5.0, 8.0]]), 2)
@@ -77,7 +77,7 @@ def test_anchors_go_where_none_are_in_sight():
     assert plan.errors[-1][right].mean() < 0.6 * plan.errors[0][right].mean()
 
 
-def test_sight_ends_at_walls_and_passes_doors():
+def test_line_of_line_of_line_of_sight_ends_at_walls_and_passes_doors():
     blocked = np.zeros((9, 21), dtype=bool)
     blocked[:, 10] = True
     blocked[4, 10] = False
@@ -86,7 +86,7 @@ def test_sight_ends_at_walls_and_passes_doors():
     assert _line_of_sight(blocked, source, targets)[0].tolist() == [True, False, True, True]
 
 
-def test_what_cannot_be_planned_is_said():
+def test_what_cannot_be_planned_is_reported():
     nothing = OccupancyGrid(GridGeometry(0.2, np.zeros(2), 5, 5), np.zeros((5, 5), dtype=np.float32))
     with pytest.raises(ConfigError, match="no free space"):
         plan_anchors(nothing, np.zeros((0, 2)), 1)

@@ -106,7 +106,7 @@ def test_any_number_of_anchors_serves(count):
     assert anchor_error < (2 * WELL if count >= 3 else 4 * WELL)
 
 
-def test_anchors_that_are_heard_part_of_the_time_are_placed_when_they_come():
+def test_anchors_that_are_in_reach_part_of_the_time_are_placed_when_they_come():
     rng = np.random.default_rng(21)
     stamps, truth = wander(rng, 200.0)
     end = stamps[-1]
@@ -154,7 +154,7 @@ def test_the_result_does_not_depend_on_where_the_run_starts(seed):
         assert anchor_error < 2 * WELL
 
 
-def test_a_straight_run_says_that_its_anchors_are_ambiguous():
+def test_a_straight_run_reports_that_its_anchors_are_ambiguous():
     rng = np.random.default_rng(41)
     stamps = np.arange(800) * 0.1
     truth = np.column_stack([0.3 * stamps, 0.003 * np.sin(stamps), np.zeros(800)])

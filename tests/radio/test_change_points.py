@@ -34,7 +34,7 @@ def test_a_move_is_found_with_its_places_and_its_moment(seed, moment):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
-def test_an_anchor_that_stands_still_was_not_moved_however_often_its_sight_is_blocked(seed, share):
+def test_an_anchor_that_stands_still_was_not_moved_however_often_its_line_of_sight_is_blocked(seed, share):
     assert find_move(PATH, measured(seed, np.array([-2.0, 1.0]), share=share), STAMPS, SIGMA, TrilaterationConfig()) is None
 
 

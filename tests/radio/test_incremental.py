@@ -98,7 +98,7 @@ def test_short_and_trivial_graphs_are_one_piece():
     assert summary.chi2 == pytest.approx(0.0, abs=1e-9)
 
 
-def test_progress_is_told_in_poses():
+def test_progress_is_reported_in_poses():
     graph, _, _ = lawn(6, n=350)
     calls = []
     optimize_incrementally(graph, progress=lambda done, most: calls.append((done, most)))

@@ -108,7 +108,7 @@ def test_weighted_least_squares_finds_the_core_where_the_median_does_not(tail, d
     assert np.mean([np.median(e) for e in errors]) - 0.1 > 2.0 * (np.mean(means) - 0.1)
 
 
-def test_a_lie_of_four_tenths_is_no_part_of_the_core():
+def test_outliers_of_four_tenths_are_no_part_of_the_core():
     rng = np.random.default_rng(0)
     for offset in (3.0, -3.0):
         errors = draw(rng, 300) + np.where(np.arange(300) < 120, offset, 0.0)
@@ -132,7 +132,7 @@ def test_moving_all_errors_moves_the_core():
     np.testing.assert_allclose(other.weights(errors + 4.0), one.weights(errors), atol=1e-6)
 
 
-def test_the_shortest_half_of_a_normal_distribution_tells_its_width():
+def test_the_shortest_half_of_a_normal_distribution_shows_its_width():
     values = 3.0 + 0.2 * np.random.default_rng(1).standard_normal(20000)
     middle, sigma = shortest_half(values)
     assert middle == pytest.approx(3.0, abs=0.05)

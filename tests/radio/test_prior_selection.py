@@ -24,7 +24,7 @@ PLACES = np.array([[6.0, 4.5], [-6.0, 4.0], [5.5, -4.5], [-5.0, -4.0]])
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_evidence_is_the_integral_over_the_unknowns(seed):
+def test_marginal_likelihood_is_the_integral_over_the_unknowns(seed):
     """Linear measurements y = A x + noise: log N(y; 0, A D A^T + R) under either prior, and their difference."""
     rng = np.random.default_rng(seed)
     a, noise = rng.normal(size=(7, 3)), 0.3
@@ -144,7 +144,7 @@ def test_nothing_free_leaves_the_graph_alone():
 
 
 @pytest.mark.filterwarnings("error")
-def test_one_of_the_two_may_be_held():
+def test_one_of_the_two_may_be_fixed():
     graph, edges = solved(1, bias=(0.9, 0.4, 1.3, 0.7))
     scale = graph.calibration.index("range_scale")
     held = np.asarray(graph.fixed_calibration).copy()

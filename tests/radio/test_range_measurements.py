@@ -31,7 +31,7 @@ def world(seed, metres=40.0, anchors=3, **settings):
     return stamps, truth, frames, places, radio, edges
 
 
-def test_range_edges_say_the_slant_distance_of_tag_and_anchor():
+def test_range_edges_measure_the_slant_distance_of_tag_and_anchor():
     stamps, truth, frames, places, radio, edges = world(1, sigma=0.0)
     height = MOUNTING.height_difference(radio.anchor_ids[0])
     tag = se2.transform(se2.interpolate_trajectory(stamps, truth, radio.stamps), MOUNTING.tag_position[:2])

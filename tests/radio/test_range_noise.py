@@ -119,7 +119,7 @@ def test_learning_can_be_switched_off():
     assert noise.sigma == pytest.approx(CONFIG.sigma)
 
 
-def test_no_radio_is_trusted_beyond_the_least_sigma():
+def test_no_radio_is_weighted_beyond_the_least_sigma():
     rng = np.random.default_rng(0)
     config = replace(CONFIG, min_sigma=0.05)
     noise = learn(rng.uniform(0, 10, (300, 2)), 1e-6 * rng.standard_normal(300), np.ones(300), config)

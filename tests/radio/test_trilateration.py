@@ -34,7 +34,7 @@ def expected_sigma(path, anchor, sigma, outliers, samples):
 
 @settings(max_examples=30)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.3, 0.4]), st.floats(-0.3, 1.5))
-def test_planted_anchors_are_found_among_lies(seed, outliers, bias):
+def test_planted_anchors_are_found_among_false_ranges(seed, outliers, bias):
     rng = np.random.default_rng(seed)
     path = loop_path(rng)
     anchor = rng.uniform(-9, 9, 2)
@@ -46,7 +46,7 @@ def test_planted_anchors_are_found_among_lies(seed, outliers, bias):
     assert found[0].cost <= min(h.cost for h in found)
 
 
-def test_position_sigma_tells_the_scatter():
+def test_position_sigma_shows_the_scatter():
     rng = np.random.default_rng(1)
     path, anchor = loop_path(rng), np.array([7.0, -3.0])
     found = [trilaterate(path, measured(rng, path, anchor, 0.1), CONFIG)[0] for _ in range(60)]
@@ -92,7 +92,7 @@ def test_the_outcome_turns_with_the_path():
     np.testing.assert_allclose(there.position, se2.transform(move, here.position), atol=0.01)
 
 
-def test_a_path_that_drifts_is_trusted_as_far_as_it_drifts():
+def test_a_path_that_drifts_counts_as_far_as_it_drifts():
     """A path bent by 0.4 m still gives a place near the anchor, and no second one within the drift."""
     rng = np.random.default_rng(4)
     path, anchor = loop_path(rng), np.array([4.0, -7.0])

@@ -196,7 +196,7 @@ def test_the_script_zooms_and_toggles(tmp_path):
     assert "<title>true,true,true,true,true</title>" in shown.stdout
 
 
-def test_kept_and_rejected_closures_are_told_apart():
+def test_kept_and_rejected_closures_are_distinguished():
     groups = dict(re.findall(r'<g class="closure (kept|rejected)(?: hidden)?">(.*?)</g>', page(), re.S))
     assert groups["kept"].count("<path") == 1
     assert "consistent with the others" in groups["kept"]

@@ -55,7 +55,7 @@ def test_wheels_that_stand_still_are_replaced_by_the_motion_from_scan_to_scan(so
     assert abs(se2.wrap_angle(motion[2] - true[2])) < 2.0 * spread[2]
 
 
-def test_without_lidar_ranges_tell_that_wheels_stand_still_and_the_map_is_doubted(sound):
+def test_without_lidar_ranges_show_that_wheels_stand_still_and_the_map_is_doubted(sound):
     done = screen(frozen(sound, 120.0, 200.0).without(lidar=True))
     assert kinds(done, doubts=True) == {"wheels-stand-still"}
 
@@ -147,7 +147,7 @@ def test_ranges_that_repeat_themselves_are_left_out(sound):
     assert len(done.ranges.stamps) == len(stuck) - stuck.sum()
 
 
-def test_a_heading_against_the_path_is_turned_and_the_laser_says_how(sound):
+def test_a_heading_against_the_path_is_turned_and_the_laser_reports_how(sound):
     done = screen(with_poses(sound, sound.odometry.poses * (1, 1, -1)))
     assert kinds(done) == {"heading-against-path"}
     np.testing.assert_allclose(done.odometry.poses, sound.odometry.poses)

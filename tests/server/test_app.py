@@ -169,7 +169,7 @@ def test_a_map_that_failed_is_not_shown(app):
     assert len(json.loads(app.handle("GET", "/state", {"host": HOST}).body)["runs"]) == 1
 
 
-def test_without_the_recording_it_says_what_to_do(app):
+def test_without_the_recording_it_reports_what_to_do(app):
     app.recordings.clear()
     answer = post(app, "/map", {"run": 0})
     assert answer.status == 400

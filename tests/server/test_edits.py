@@ -34,7 +34,7 @@ def test_every_wish_is_read_back_as_it_was_made():
     assert both.forbidden[0].recordings == (1, 2)
 
 
-def test_a_later_wish_takes_the_place_of_the_earlier():
+def test_a_later_edit_replaces_the_earlier():
     edits = Constraints()
     for wish in ("reject", "force", "reject", "leave"):
         edits = with_closure(edits, closure(), wish)
@@ -47,7 +47,7 @@ def test_a_later_wish_takes_the_place_of_the_earlier():
     assert with_anchor(edits, "A", None) == Constraints()
 
 
-def test_what_cannot_be_wished_is_said():
+def test_what_cannot_be_edited_is_reported():
     with pytest.raises(ConfigError, match="not 'burn'"):
         with_closure(Constraints(), closure(), "burn")
     with pytest.raises(ConfigError, match="cannot be forced"):

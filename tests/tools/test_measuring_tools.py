@@ -70,7 +70,7 @@ def test_fewer_anchors_are_as_if_the_others_had_not_been_there(trial):
     assert reproduce_paper.with_anchors(trial, ()) is trial
 
 
-def test_rays_can_be_told_as_of_one_time(trial):
+def test_rays_can_be_given_as_of_one_time(trial):
     flat = accuracy.flat(trial.log).scans
     middle = trial.log.scans.stamps + 0.5 * trial.log.scans.time_increment * (trial.log.scans.ranges.shape[1] - 1)
     np.testing.assert_allclose(flat.stamps, middle)
@@ -88,7 +88,7 @@ def test_every_setting_that_the_tools_change_exists():
             override(preset(run.preset), run.changes)
 
 
-def test_lies_are_put_among_the_measurements(result):
+def test_false_ranges_are_put_among_the_measurements(result):
     rng = np.random.default_rng(0)
     clean = accuracy.plain(result.graph)
     spoilt = accuracy.wronged(result.graph, rng)
@@ -112,5 +112,5 @@ def test_sections_of_a_page_are_replaced_and_the_rest_is_left(tmp_path):
     assert page.read_text().index("anew") < page.read_text().index("second")
 
 
-def test_tables_say_what_is_not_known():
+def test_tables_report_what_is_not_known():
     assert trials.table(["a", "b"], [[1, float("nan")], ["x", 0.12345]]) == "| a | b |\n|---|---|\n| 1 | - |\n| x | 0.123 |\n"

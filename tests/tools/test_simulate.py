@@ -140,7 +140,7 @@ def test_motion_is_what_a_differential_drive_can_do(room):
 
 
 @pytest.mark.parametrize("world", PLANS)
-def test_drives_keep_clear_of_everything(world):
+def test_paths_keep_clear_of_everything(world):
     plan = PLANS[world]()
     motion = drive.follow(drive.wander(plan, np.random.default_rng(7), 60.0), plan.start[2], 0.2, 300.0)
     for x, y, _ in motion.poses[::20]:
@@ -201,7 +201,7 @@ def test_occlusion_only_lengthens():
     assert not radio.excess(np.zeros(4000), points, "normal", np.random.default_rng(9))[0].any()
 
 
-def test_a_lying_anchor_lies_for_its_stretch_only():
+def test_false_ranges_last_for_their_stretch_only():
     consistent = simulate(replace(SHORT, without=("laser",)))
     lying = simulate(replace(SHORT, without=("laser",), false_ranges=(FalseRanges(2, 5.0, 10.0, 3.0),)))
     wrong = lying.ranges - consistent.ranges
@@ -306,13 +306,13 @@ def test_overnight_one_anchor_of_the_site_moved_and_one_is_new():
 
 
 @pytest.mark.parametrize(("world", "least", "most"), [("arena", 3.0, 5.0), ("tunnel", 3.0, 5.0), ("site", 3.0, 5.0)])
-def test_few_anchors_are_heard_at_a_time_in_large_places(world, least, most):
+def test_few_anchors_are_in_reach_at_a_time_in_large_places(world, least, most):
     made = simulate(Settings(world=world, seed=1, minutes=10.0, speed=0.5, without=("laser",)))
     in_reach = [np.unique(made.range_anchors[np.abs(made.range_stamps - t) < 10.0]).size for t in range(10, 590, 20)]
     assert least <= np.mean(in_reach) <= most
 
 
-def test_the_oracle_is_near_the_truth_and_its_bound_says_how_near():
+def test_the_oracle_is_near_the_truth_and_its_bound_reports_how_near():
     """Errors agree with the Cramer-Rao bound, with lidar and without, and the lidar helps."""
     made = simulate(Settings(world="room", seed=1, minutes=3.0, scan_rate=2.0, uwb_rate=2.0))
     log = as_read(made).log

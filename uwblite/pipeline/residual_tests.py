@@ -90,7 +90,7 @@ def _stretch(off: Bools) -> tuple[int, int] | None:
 
 
 def _confirmed(graph: Graph, path: Floats) -> Bools:
-    """Tell which keyframes (k,) lidar ties to another visit of the place; path : (k,) travelled distance, m."""
+    """Return which keyframes (k,) lidar ties to another visit of the place; path : (k,) travelled distance, m."""
     confirmed = np.zeros(len(path), dtype=bool)
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
