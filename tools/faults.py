@@ -361,6 +361,114 @@ def merged(a: Case, b: Case) -> Case:
     return Case(replace(one, odometry=odometry, ranges=ranges, scans=scans), truth, a.anchors)
 
 
+def slipping_wheel(case: Case, rng: Rng) -> Case:
+    """One wheel spins on a smooth patch: for 6 s three times over, the wheels count a turn and way that are not."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, span = se2.between(poses[:-1], poses[1:]), np.diff(stamps)
+        for share in (0.3, 0.55, 0.8):
+            begin = stamps[0] + share * (stamps[-1] - stamps[0])
+            on = (stamps[1:] >= begin) & (stamps[1:] < begin + 6.0)
+            steps[on] += np.column_stack([0.05 * span[on], np.zeros(on.sum()), 0.25 * span[on]])
+        return chained(poses[0], steps)
+
+    return with_odometry(case, change)
+
+
+def stuck_anchor(case: Case, rng: Rng) -> Case:
+    """One anchor answers with its last range from half-way on, but for the last digit."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        own = np.flatnonzero((r.anchor == 0) & (r.stamps >= case.middle))
+        ranges = r.ranges.copy()
+        ranges[own] = ranges[own[0]] + rng.integers(-1, 2, len(own)) * 0.01
+        return replace(r, ranges=ranges)
+
+    return with_ranges(case, change)
+
+
+def one_name_for_two(case: Case, rng: Rng) -> Case:
+    """Two anchors answer to one name throughout."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        anchor = np.where(r.anchor == 1, 0, r.anchor)
+        used, anchor = np.unique(anchor, return_inverse=True)
+        return replace(r, anchor=anchor.astype(np.int64), anchor_ids=tuple(r.anchor_ids[k] for k in used))
+
+    return with_ranges(case, change)
+
+
+def turned_laser(case: Case, rng: Rng) -> Case:
+    """The lidar is mounted a quarter turn away from what the log says."""
+    return with_scans(case, lambda s: replace(s, angle_min=s.angle_min + 0.5 * np.pi))
+
+
+def reversed_scans(case: Case, rng: Rng) -> Case:
+    """The scans stand in the log in reversed order."""
+    return with_scans(case, lambda s: replace(s, ranges=s.ranges[::-1].copy()))
+
+
+def jitter(kinds: str, seconds: float) -> Fault:
+    """Stamps scatter, in order, because a busy computer sets them on arrival."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        return shifted(case, lambda t: np.maximum.accumulate(t + rng.uniform(0.0, seconds, len(t))) - t, kinds)
+
+    return fault
+
+
+def bursts(kinds: str, seconds: float) -> Fault:
+    """Readings wait in a buffer, and all that waited get the stamp at which it is emptied."""
+    return lambda case, rng: shifted(case, lambda t: np.ceil(t / seconds) * seconds - t, kinds)
+
+
+def half_twice(case: Case, rng: Rng) -> Case:
+    """Half of the lines stand in the log twice."""
+    log = case.log
+
+    def again(count: int) -> Ints:
+        return np.sort(np.concatenate([np.arange(count), rng.permutation(count)[: count // 2]]))
+
+    own = again(len(log.odometry.stamps))
+    truth, odometry = case.truth[own], Odometry(log.odometry.stamps[own], log.odometry.poses[own])
+    ranges = None if log.ranges is None else replace(
+        log.ranges, **{n: getattr(log.ranges, n)[k] for k in [again(len(log.ranges.stamps))] for n in RANGE_FIELDS}
+    )  # fmt: skip
+    scans = log.scans
+    if scans is not None:
+        own = again(len(scans.stamps))
+        scans = replace(scans, stamps=scans.stamps[own], ranges=scans.ranges[own])
+    return replace(case, log=replace(log, odometry=odometry, ranges=ranges, scans=scans), truth=truth)
+
+
+def one_radio_clock_fast(case: Case, rng: Rng) -> Case:
+    """The radio's clock runs fast by 2 %."""
+    first = float(case.log.odometry.stamps[0])
+    return shifted(case, lambda t: 0.02 * (t - first), "radio")
+
+
+def covered_beams(case: Case, rng: Rng) -> Case:
+    """A cable hangs before a third of the beams from half-way on."""
+
+    def change(s: LaserScans) -> LaserScans:
+        readings, beams = s.ranges.copy(), s.ranges.shape[1] // 3
+        late = s.stamps >= case.middle
+        readings[late, beams : 2 * beams] = rng.normal(0.25, 0.005, (int(late.sum()), beams)).astype(np.float32)
+        return replace(s, ranges=readings)
+
+    return with_scans(case, change)
+
+
+def offset_laser(case: Case, rng: Rng) -> Case:
+    """The lidar says 0.3 m too much, always."""
+    return with_scans(case, lambda s: replace(s, ranges=np.where(s.ranges < s.range_max, s.ranges + np.float32(0.3), s.ranges)))
+
+
+def round_trip(case: Case, rng: Rng) -> Case:
+    """One anchor's firmware says the way there and back."""
+    return with_ranges(case, lambda r: replace(r, ranges=np.where(r.anchor == 0, 2.0 * r.ranges, r.ranges)))
+
+
 RANGE_FIELDS = ("stamps", "anchor", "ranges", "quality")
 
 
@@ -428,6 +536,19 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "radio absent for 40 %": (absent("radio"), RADIO),
     "lidar absent for 40 %": (absent("lidar"), LIDAR),
     "no movement at all": (standing, ALL),
+    "one wheel slips, 3 times 6 s": (slipping_wheel, WHEELS),
+    "one anchor's ranges stuck from half time": (stuck_anchor, RADIO),
+    "two anchors with one name": (one_name_for_two, RADIO),
+    "one anchor says twice its distance": (round_trip, RADIO),
+    "the radio's clock runs 2 % fast": (one_radio_clock_fast, RADIO),
+    "lidar mounted 90 degrees away": (turned_laser, LIDAR),
+    "scans in reversed order": (reversed_scans, LIDAR),
+    "lidar says 0.3 m too much": (offset_laser, LIDAR),
+    "a cable before a third of the beams": (covered_beams, LIDAR),
+    "odometry stamps jitter by 0.3 s": (jitter("odometry", 0.3), WHEELS),
+    "all stamps jitter by 0.3 s": (jitter("odometry radio lidar", 0.3), ALL),
+    "odometry in bursts of 1 s": (bursts("odometry", 1.0), WHEELS),
+    "half of the lines twice": (half_twice, ALL),
 }
 """Each with the sensors it is tried with."""
 

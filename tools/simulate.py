@@ -19,6 +19,7 @@ from pathlib import Path
 from simulation.logfile import write
 from simulation.plans import PLANS
 from simulation.radio import NLOS_LEVELS, RadioModel
+from simulation.real_rooms import RealRooms
 from simulation.recording import FalseRanges, Settings, simulate, with_overrides
 
 
@@ -76,6 +77,7 @@ def parser() -> argparse.ArgumentParser:
     add("--laser-delay", type=float, help="s, stamp minus true time (0)")
     add("--robot", type=int, help="which robot, for several recordings of the same one; default: one of the seed's own")
     add("--building", type=int, help="which building of this plan; default: one of the seed's own")
+    add("--real-rooms", action="store_true", help="errors that stay with places, walls and floors; people; stops")
     add("--people", type=int, help="people walking about (0)")
     add("--without", action="append", choices=["uwb", "laser"], help="leave a sensor out; repeatable")
     radio = p.add_argument_group("radio")
@@ -100,10 +102,10 @@ def settings_from(args: argparse.Namespace) -> Settings:
     radio = {name[6:]: options.pop(name) for name in list(options) if name.startswith("range_")}
     radio_model = replace(RadioModel(), **{k: v for k, v in radio.items() if v is not None})
     false_ranges, without = options.pop("false_range"), options.pop("without")
+    rooms = RealRooms() if options.pop("real_rooms") else None
     values = {k: v for k, v in options.items() if k not in ("out", "gzip")}
-    return with_overrides(
-        Settings(), radio=radio_model, false_ranges=tuple(false_ranges or ()), without=tuple(without or ()), **values
-    )
+    lists = {"false_ranges": tuple(false_ranges or ()), "without": tuple(without or ())}
+    return with_overrides(Settings(), radio=radio_model, rooms=rooms, **lists, **values)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,6 +1,7 @@
 """The simulator: rays against geometry by hand, noise against its stated size, wheels, radio, determinism, the log."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import oracle
@@ -9,6 +10,7 @@ from simulate import parser, settings_from
 from simulation import drive, floorplans, laser, logfile, radio, recording, wheels
 from simulation.fields import smooth_field
 from simulation.plans import PLANS
+from simulation.real_rooms import RealRooms, floor_errors, own_body, range_errors, stops
 from simulation.recording import FalseRanges, Settings, simulate
 from trials import as_read
 
@@ -322,3 +324,34 @@ def test_the_oracle_is_near_the_truth_and_its_bound_reports_how_near():
     assert 0.4 * without.bound_ate < without.ate < 2.0 * without.bound_ate
     assert 0.3 * without.bound_anchors < without.anchors < 2.0 * without.bound_anchors
     assert with_lidar.bound_ate < 0.5 * without.bound_ate
+
+
+def test_real_rooms_change_every_sensor_and_nothing_changes_without_them(room):
+    easy = replace(SHORT, minutes=2.0)
+    np.testing.assert_array_equal(simulate(easy).odometry, room.odometry)
+    real = simulate(replace(easy, rooms=RealRooms(stop_every=20.0)))
+    again = simulate(replace(easy, rooms=RealRooms(stop_every=20.0)))
+    for name in ("odometry", "truth", "scans", "ranges"):
+        np.testing.assert_array_equal(getattr(real, name), getattr(again, name))
+    assert not np.array_equal(real.truth, room.truth)
+
+
+def test_errors_of_real_rooms_have_their_stated_sizes():
+    rooms, rng = RealRooms(), np.random.default_rng(1)
+    places = rng.uniform(0.0, 400.0, (20000, 2))
+    own = range_errors(rooms, np.random.default_rng(5), places)
+    # 48 waves to a field: its variance is known to about a fifth.
+    assert own.std() == pytest.approx(np.sqrt(sum(sd**2 for sd, _ in rooms.range_fields)), rel=0.25)
+    np.testing.assert_array_equal(own, range_errors(rooms, np.random.default_rng(5), places))
+    behind = np.linspace(-np.pi, np.pi, 20001)
+    late, lost = own_body(rooms, behind, rng)
+    shadowed = np.abs(behind) < rooms.body_half_angle
+    assert np.all(late[~shadowed] < 1e-9)
+    assert not lost[~shadowed].any()
+    assert late[shadowed].mean() == pytest.approx(rooms.body_excess, rel=0.1)
+    way = np.full(20000, 0.01)
+    _, turn = floor_errors(replace(rooms, patch_turn=0.0), places, way, rng, rng)
+    bumps = way.sum() / rooms.bump_every
+    assert np.sum(turn != 0.0) == pytest.approx(bumps, abs=4.0 * np.sqrt(bumps))
+    halts = stops(rooms, 600.0, rng)
+    assert all(b[0] > a[0] + a[1] for a, b in pairwise(halts))

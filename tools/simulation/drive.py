@@ -1,5 +1,6 @@
 """Where the robot goes: goals that cover the place again and again, roads between them, and a differential drive on them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ from .floorplans import FloorPlan
 
 Floats = NDArray[np.float64]
 
+_SPOT_TURN = 0.5
+"""Speed of turns on the spot, rad/s."""
 _CELL = 0.2
 """Cell of the road map, m."""
 
@@ -133,8 +136,18 @@ def _smooth(road: Floats) -> Floats:
     return ndimage.uniform_filter1d(once, 13, axis=0, mode="nearest")
 
 
-def follow(track: Floats, heading: float, speed: float, seconds: float, step: float = 0.05) -> Motion:
-    """Drive along a track by pure pursuit with bounded accelerations; two seconds of rest at either end."""
+def follow(
+    track: Floats,
+    heading: float,
+    speed: float,
+    seconds: float,
+    step: float = 0.05,
+    stops: Sequence[tuple[float, float, float]] = (),
+) -> Motion:
+    """Drive along a track by pure pursuit with bounded accelerations; two seconds of rest at either end.
+
+    At each of the stops (when, s; how long, s; by how much, rad) the robot turns on the spot, then rests.
+    """
     look, max_turn, gain = max(0.35, 1.5 * speed), 0.8, 2.5
     accel, turn_accel = 0.3 * step, 2.0 * step
     x, y, theta = float(track[0, 0]), float(track[0, 1]), heading
@@ -143,14 +156,20 @@ def follow(track: Floats, heading: float, speed: float, seconds: float, step: fl
     poses = np.empty((n, 3))
     px, py = track[:, 0].tolist(), track[:, 1].tolist()
     target, last, rest = 0, len(track) - 1, int(2.0 / step)
+    standing, turning = np.zeros(n), np.zeros(n)
+    for when, pause, turn in stops:
+        begin, turned = int(when / step), int(abs(turn) / _SPOT_TURN / step)
+        # The robot brakes before it turns.
+        standing[begin : begin + turned + int((pause + 1.0) / step)] = 1.0
+        turning[begin + int(1.0 / step) : begin + int(1.0 / step) + turned] = np.copysign(_SPOT_TURN, turn)
     for k in range(n):
         poses[k] = x, y, theta
         while target < last and (px[target] - x) ** 2 + (py[target] - y) ** 2 < look * look:
             target += 1
         error = (np.arctan2(py[target] - y, px[target] - x) - theta + np.pi) % (2 * np.pi) - np.pi
-        moving = rest <= k < n - rest
+        moving = rest <= k < n - rest and standing[k] == 0
         want_v = speed * max(0.0, np.cos(error)) if moving and abs(error) < 1.0 else 0.0
-        want_w = np.clip(gain * error, -max_turn, max_turn) if moving else 0.0
+        want_w = np.clip(gain * error, -max_turn, max_turn) if moving else turning[k]
         v += np.clip(want_v - v, -accel, accel)
         w += np.clip(want_w - w, -turn_accel, turn_accel)
         half = 0.5 * w * step

@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import drive, laser, radio, wheels
+from . import drive, laser, radio, real_rooms, wheels
 from .fields import smooth_field
 from .floorplans import FloorPlan
 from .laser import LaserModel
 from .plans import PLANS
 from .radio import RadioModel
+from .real_rooms import RealRooms
 
 Floats = NDArray[np.float64]
 
@@ -71,6 +72,8 @@ class Settings:
     uwb_delay: float = 0.0
     """Stamp of a range minus its true time on the odometry's clock."""
     laser_delay: float = 0.0
+    rooms: RealRooms | None = None
+    """Errors that stay with places, walls and floors, people and an operator who stops; None: easy rooms without them."""
     people: int = 0
     without: tuple[str, ...] = ()
     """Sensors that are missing: uwb, laser."""
@@ -127,12 +130,13 @@ def simulate(settings: Settings) -> Recording:
     plan = PLANS[settings.world]()
     seconds = 60.0 * (settings.minutes or plan.minutes)
     track = drive.wander(plan, _rng(settings, 0), settings.speed * seconds + 5.0)
-    motion = drive.follow(track, plan.start[2], settings.speed, seconds)
+    halts = [] if settings.rooms is None else real_rooms.stops(settings.rooms, seconds, _rng(settings, 10))
+    motion = drive.follow(track, plan.start[2], settings.speed, seconds, stops=halts)
     anchors = _place_anchors(settings, plan)
     stamps = np.round(np.arange(int(seconds * settings.odometry_rate) + 1) / settings.odometry_rate, 6)
     faults = wheels.draw_errors(_lasting(settings.robot, 1, _rng(settings, 1)), settings.odometry_scale)
     slips = wheels.draw_slips(motion, _rng(settings, 2), settings.slips)
-    stated = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3))
+    stated = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3), _floor(settings, motion, stamps))
     crowd = _people(settings, plan, seconds)
     scan_stamps, scans, surfaces = _scan(settings, plan, motion, crowd)
     told = scan_stamps + settings.laser_delay
@@ -166,6 +170,15 @@ def simulate(settings: Settings) -> Recording:
     )
 
 
+def _floor(settings: Settings, motion: drive.Motion, stamps: Floats) -> tuple[Floats, Floats] | None:
+    """Return what the floor adds to way, m, and turn, rad, of each step of the odometry."""
+    if settings.rooms is None:
+        return None
+    places, way = motion.at(stamps)[:, :2], np.hypot(*np.diff(motion.at(stamps)[:, :2], axis=0).T)
+    there = _lasting(settings.building, 11, _rng(settings, 11))
+    return real_rooms.floor_errors(settings.rooms, places[:-1], way, there, _rng(settings, 12))
+
+
 def _place_anchors(settings: Settings, plan: FloorPlan) -> Floats:
     if settings.anchors is None:
         return plan.anchors
@@ -183,7 +196,7 @@ def _place_anchors(settings: Settings, plan: FloorPlan) -> Floats:
 def _people(settings: Settings, plan: FloorPlan, seconds: float) -> list[drive.Motion]:
     """Return the walks of the people: 1 m/s between goals of their own."""
     walks = []
-    for k in range(settings.people):
+    for k in range(settings.people + (0 if settings.rooms is None else settings.rooms.people)):
         rng = _rng(settings, 100 + k)
         cells = drive.RoadMap(plan, 0.4).cells * 0.2
         begin = cells[rng.integers(len(cells))]
@@ -193,13 +206,26 @@ def _people(settings: Settings, plan: FloorPlan, seconds: float) -> list[drive.M
     return walks
 
 
-def _bodies(crowd: list[drive.Motion], times: Floats, robot: Floats) -> Floats:
-    """Return the circles (n, p, 3) that people are at the times (n,); one that would touch the robot is not there."""
+def _bodies(crowd: list[drive.Motion], times: Floats, robot: Floats, legs: bool = False) -> Floats:
+    """Return the circles (n, p, 3) that people are at the times (n,), or (n, 2 p, 3) their legs; none touches the robot."""
     if not crowd:
         return np.empty((len(times), 0, 3))
     xy = np.stack([walk.at(times)[:, :2] for walk in crowd], axis=1)
-    radius = np.where(np.hypot(*(xy - robot[:, None, :2]).transpose(2, 0, 1)) < 0.6, 0.0, 0.18)
+    away = np.hypot(*(xy - robot[:, None, :2]).transpose(2, 0, 1)) >= 0.6
+    if legs:
+        walks = [np.column_stack([walk.at(times)[:, :2], _course(walk, times)]) for walk in crowd]
+        pairs = [real_rooms.legs(walk, 2.0 * np.pi * times / 1.1) for walk in walks]
+        return np.concatenate(
+            [p * np.where(a[:, None, None], 1.0, [1.0, 1.0, 0.0]) for p, a in zip(pairs, away.T, strict=True)], axis=1
+        )
+    radius = np.where(away, 0.18, 0.0)
     return np.concatenate([xy, radius[..., None]], axis=2)
+
+
+def _course(walk: drive.Motion, times: Floats) -> Floats:
+    """Return the direction (n,) in which a person walks, rad."""
+    ahead = walk.at(times + 0.5)[:, :2] - walk.at(times - 0.5)[:, :2]
+    return np.arctan2(ahead[:, 1], ahead[:, 0])
 
 
 def _scan(
@@ -209,13 +235,20 @@ def _scan(
     model = settings.laser
     if "laser" in settings.without:
         return np.empty(0), np.empty((0, model.beams), dtype=np.int32), np.empty((0, model.beams), dtype=np.int16)
-    rng = _rng(settings, 5)
+    rng, rooms = _rng(settings, 5), settings.rooms
+    if rooms is not None:
+        model = replace(model, surface_sd=rooms.paint_sd, mixed=rooms.mixed, grazing=rooms.grazing)
     every = max(1, round(10.0 / settings.scan_rate))
     stamps = np.round(np.arange(0.037, motion.stamps[-1] - 0.1, 0.1 * every), 6)
     mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
     angles = mounting[2] + (-model.angles if settings.laser_flipped else model.angles)
     surfaces = _lasting(settings.building, 5, rng)
     colour = model.surface_sd * surfaces.standard_normal(len(plan.walls) + len(plan.columns) + len(crowd))
+    glass = np.zeros(len(plan.walls), dtype=bool)
+    if rooms is not None:
+        # The outer walls stay: a place without any has no map.
+        glass = _lasting(settings.building, 13, _rng(settings, 13)).random(len(plan.walls)) < rooms.glass
+        glass[:4] = False
     out = np.empty((len(stamps), model.beams), dtype=np.int32)
     surfaces = np.empty(out.shape, dtype=np.int16)
     for first in range(0, len(stamps), _CHUNK):
@@ -226,13 +259,19 @@ def _scan(
         origin = pose[:, :2] + np.stack([c * mounting[0] - s * mounting[1], s * mounting[0] + c * mounting[1]], axis=1)
         walls, columns = laser.near(plan.walls, plan.columns, origin.mean(axis=0), model.max_range + 0.5)
         still = np.broadcast_to(plan.columns[columns], (len(times), len(columns), 3))
-        round_things = np.concatenate([still, _bodies(crowd, times, pose)], axis=1)
-        bodies = len(plan.walls) + len(plan.columns) + np.arange(len(crowd))
+        people = _bodies(crowd, times, pose, legs=rooms is not None)
+        round_things = np.concatenate([still, people], axis=1)
+        whose = np.arange(people.shape[1]) // (1 if rooms is None else 2)
+        bodies = len(plan.walls) + len(plan.columns) + whose
         ids = np.concatenate([walls, len(plan.walls) + columns, bodies, [-1]])
         heading = pose[:, 2] + np.tile(angles, len(chunk))
         true, cosine, surface = laser.cast(origin, heading, plan.walls[walls], round_things, model.max_range)
         shape = (len(chunk), model.beams)
         true, cosine, surface = true.reshape(shape), cosine.reshape(shape), ids[surface].reshape(shape)
+        if rooms is not None:
+            true = np.where(real_rooms.unseen_glass(rooms, glass, surface, cosine), np.inf, true)
+            surface = np.where(np.isfinite(true), surface, -1)
+            true = true + rooms.warm_up[0] * np.exp(-chunk[:, None] / rooms.warm_up[1])
         stated = laser.disturb(true, cosine, surface, model, colour, rng)
         out[first : first + len(chunk)] = stated
         most = 5.0 * np.maximum(model.near_sd, model.far_sd * true) + 3.0 * model.surface_sd
@@ -278,6 +317,14 @@ def _range(
         extra, lost = radio.excess(shadow, tag, level, rng, there)
         noise = model.noise_sd * rng.standard_normal(len(times))
         smooth = bias[a] + model.multipath_sd * field_ + model.antenna_sd * antenna
+        if (rooms := settings.rooms) is not None:
+            hidden = radio.crossings(tag, place, np.empty((0, 4)), bodies) > 0
+            behind = np.angle(np.exp(1j * (bearing - pose[:, 2] - np.pi)))
+            body, unheard = real_rooms.own_body(rooms, behind, _rng(settings, 300 + a))
+            smooth = bias[a] + real_rooms.range_errors(rooms, there, tag) + rooms.antenna_sd * antenna + body
+            smooth += real_rooms.person_errors(rooms, hidden, _rng(settings, 400 + a))
+            noise = noise + real_rooms.gross_errors(rooms, len(times), _rng(settings, 500 + a))
+            lost = lost | unheard
         ranges[:, a] = model.scale * distance + smooth + extra + noise
         received[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < min(model.max_range, plan.radio_range))
         effort[:, a] = distance + 6.0 * shadow

@@ -60,9 +60,17 @@ def draw_slips(motion: Motion, rng: np.random.Generator, count: int) -> list[dic
 
 
 def odometry(
-    motion: Motion, stamps: Floats, errors: WheelErrors, slips: list[dict[str, float]], rng: np.random.Generator
+    motion: Motion,
+    stamps: Floats,
+    errors: WheelErrors,
+    slips: list[dict[str, float]],
+    rng: np.random.Generator,
+    floor: tuple[Floats, Floats] | None = None,
 ) -> Floats:
-    """Return the odometry poses (n, 3) at the stamps (n,): T_odom_base, beginning at the origin; theta unwrapped."""
+    """Return the odometry poses (n, 3) at the stamps (n,): T_odom_base, beginning at the origin; theta unwrapped.
+
+    The floor adds to way, m, and turn, rad, of each step (n - 1,).
+    """
     true = motion.at(stamps)
     turn = np.diff(true[:, 2])
     heading = true[:-1, 2] + 0.5 * turn
@@ -72,6 +80,8 @@ def odometry(
     wheel_way = errors.distance_scale * way + errors.distance_noise * np.sqrt(np.abs(way)) * rng.standard_normal(n)
     variance = errors.heading_noise_travel**2 * np.abs(way) + errors.heading_noise_turn**2 * np.abs(turn)
     wheel_turn = errors.heading_scale * turn + errors.drift * way + np.sqrt(variance) * rng.standard_normal(n)
+    if floor is not None:
+        wheel_way, wheel_turn = wheel_way + floor[0], wheel_turn + floor[1]
     for slip in slips:
         during = (stamps[:-1] >= slip["start"]) & (stamps[:-1] < slip["start"] + slip["seconds"])
         wheel_turn[during] += slip["heading"] / max(1, during.sum())

@@ -1,0 +1,140 @@
+"""What real rooms do to sensors beyond noise: errors that stay with a place, a wall, a direction or a floor.
+
+Averaging never removes them: who comes to the place again meets them again. The figures, each with its source:
+
+Radio. The delay of a DW1000's antenna changes with direction by 10 to 20 cm, and with the received level by -11 to +8 cm
+(Decawave APS011, section 3; Qorvo's forum, "Range error due to antenna angle/orientation"); an antenna null loses the first
+path and takes a later one, always too long. Multipath stays alike over parts of a wavelength (5 cm at 6.5 GHz; what a
+moving tag averages is left out) up to the size of a room. A body in the way delays by 0.1 to 0.5 m and loses ranges (Otim
+et al., Effects of the body wearable sensor position, Electronics 8, 2019; Kilic et al., WPNC 2012). A few ranges are wrong by
+metres, also too short (Qorvo's forum, "Strange ranging errors indoors": always the same 29 m, in one ray of 10 cm).
+
+Wheels. A bump of 10 mm under one wheel turns a base by about half a degree (Borenstein and Feng 1996, UMBmark's test of
+non-systematic errors: ten bumps make 3 to 8 degrees); the nap of a carpet and cross slopes drag a base sideways for as long
+as it is on them.
+
+Lidar. A URG-04LX errs by up to 2 to 4 cm with the brightness and material of a surface, loses dark and shiny surfaces seen
+at an angle, and drifts by about 1 cm while it warms up (Kneip et al., ICRA 2009; Okubo et al., SPIE 7332, 2009); at edges it
+reads distances between the two surfaces; glass is seen from straight ahead only.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .fields import smooth_field
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class RealRooms:
+    """Sizes of the errors; sources in the module's text."""
+
+    range_fields: tuple[tuple[float, float], ...] = ((0.04, 0.3), (0.06, 1.5), (0.06, 6.0))
+    """Standard deviation, m, and length, m, of range errors that stay with the place."""
+    antenna_sd: float = 0.06
+    """m, by the direction in which either antenna is hit."""
+    body_excess: float = 0.12
+    """m, mean, where the robot's own body stands in the way."""
+    body_half_angle: float = np.deg2rad(50.0)
+    """Half of the sector behind the tag that the body shadows, rad."""
+    body_loss: float = 0.3
+    """Share of ranges lost there."""
+    person_excess: float = 0.3
+    """m, mean, of a range through a person."""
+    gross: float = 0.01
+    """Share of ranges that are wrong by metres."""
+    gross_size: float = 3.0
+    """m, mean of these; one in four is too short."""
+    patch_length: float = 3.0
+    """Size of a patch of floor, m."""
+    patch_way: float = 0.01
+    """Relative error of ways on a patch."""
+    patch_turn: float = 0.01
+    """Turn that a patch adds, rad/m."""
+    bump_every: float = 10.0
+    """Mean way between bumps, m."""
+    bump_turn: float = np.deg2rad(0.6)
+    """rad."""
+    paint_sd: float = 0.012
+    """m, constant error of one surface."""
+    warm_up: tuple[float, float] = (0.01, 1200.0)
+    """m at the start, and the time in which it falls to a third, s."""
+    mixed: float = 0.6
+    """Share of the rays at an edge that return a distance between the two surfaces."""
+    grazing: float = np.deg2rad(72.0)
+    """Angle of incidence at which half of the rays at 3 m are lost."""
+    glass: float = 0.06
+    """Share of the walls that are glass."""
+    glass_cosine: float = 0.96
+    """Cosine of incidence below which glass is not seen."""
+    people: int = 2
+    """People walking about, each on two legs."""
+    stop_every: float = 60.0
+    """Mean time between two stops of the operator, s."""
+    stop_longest: float = 15.0
+    """s."""
+
+
+def range_errors(rooms: RealRooms, there: Rng, tag: Floats) -> Floats:
+    """Return the errors (n,), m, that stay with the places (n, 2) of the tag."""
+    return np.sum([sd * smooth_field(there, tag, length) for sd, length in rooms.range_fields], axis=0)
+
+
+def own_body(rooms: RealRooms, behind: Floats, rng: Rng) -> tuple[Floats, Bools]:
+    """Return the excess (n,), m, of ranges by the angle from straight behind the robot (n,), rad, and which are lost.
+
+    The excess grows smoothly towards the middle of the shadow, and is the same whenever the angle is.
+    """
+    depth = np.maximum(np.cos(np.clip(behind / rooms.body_half_angle, -1.0, 1.0) * 0.5 * np.pi), 0.0)
+    late = 1.0 + 0.3 * rng.standard_normal(len(behind))
+    return rooms.body_excess * 1.6 * depth * np.maximum(late, 0.0), rng.random(len(behind)) < rooms.body_loss * depth
+
+
+def person_errors(rooms: RealRooms, hidden: Bools, rng: Rng) -> Floats:
+    """Return the excess (n,), m, of ranges that a person hides."""
+    return np.where(hidden, rng.exponential(rooms.person_excess, len(hidden)), 0.0)
+
+
+def gross_errors(rooms: RealRooms, count: int, rng: Rng) -> Floats:
+    """Return errors (n,), m, of which most are 0 and a few metres long."""
+    size = rng.exponential(rooms.gross_size, count) * np.where(rng.random(count) < 0.25, -1.0, 1.0)
+    return np.where(rng.random(count) < rooms.gross, size, 0.0)
+
+
+def floor_errors(rooms: RealRooms, places: Floats, way: Floats, there: Rng, rng: Rng) -> tuple[Floats, Floats]:
+    """Return what the wheels count too much of way, m, and miss of turn, rad, in each step (n,) at places (n, 2)."""
+    slip = rooms.patch_way * smooth_field(there, places, rooms.patch_length) * way
+    drag = rooms.patch_turn * smooth_field(there, places, rooms.patch_length) * np.abs(way)
+    bumps = rng.random(len(way)) < np.abs(way) / rooms.bump_every
+    return slip, drag + np.where(bumps, rooms.bump_turn * rng.standard_normal(len(way)), 0.0)
+
+
+def stops(rooms: RealRooms, seconds: float, rng: Rng) -> list[tuple[float, float, float]]:
+    """Return when the operator stops, for how long, s, and by how much the robot turns on the spot then, rad."""
+    found, time = [], 20.0 + float(rng.exponential(rooms.stop_every))
+    while time < seconds - 20.0:
+        pause = float(rng.uniform(2.0, rooms.stop_longest))
+        turn = float(rng.choice([0.0, 0.0, 0.5 * np.pi, -0.5 * np.pi, 2.0 * np.pi, -2.0 * np.pi]))
+        found.append((time, pause, turn))
+        time += pause + abs(turn) / 0.5 + float(rng.exponential(rooms.stop_every))
+    return found
+
+
+def legs(walk: Floats, stride: Floats) -> Floats:
+    """Return the two legs (n, 2, 3), x, y, radius, of a person at poses (n, 3) with a phase of the stride (n,), rad."""
+    ahead = np.stack([np.cos(walk[:, 2]), np.sin(walk[:, 2])], axis=1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    swing = 0.25 * np.sin(stride)[:, None] * ahead
+    sides = np.stack([walk[:, :2] + 0.11 * left + swing, walk[:, :2] - 0.11 * left - swing], axis=1)
+    return np.concatenate([sides, np.full((*sides.shape[:2], 1), 0.06)], axis=2)
+
+
+def unseen_glass(rooms: RealRooms, glass: Bools, surface: NDArray[np.int64], cosine: Floats) -> Bools:
+    """Tell which rays (k, beams) go through glass; glass (w,) tells which walls are."""
+    wall = (surface >= 0) & (surface < len(glass))
+    return wall & glass[np.where(wall, surface, 0)] & (cosine < rooms.glass_cosine)
