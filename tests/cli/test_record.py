@@ -1,9 +1,13 @@
 """What `uwblite record` and `uwblite devices` say to mistakes: one clear line, at once, and no log is begun."""
 
 import socket
+import subprocess
 import sys
+import time
+import urllib.request
 
 import pytest
+from conftest import ROOT
 
 from uwblite.cli import main
 from uwblite.drivers import transport
@@ -43,6 +47,8 @@ REFUSED = {
     "an option that it does not have": ["--lidar", "/dev/null?colour=3"],
     "no port": ["--uwb", "shell:"],
     "a packed log": ["--lidar", "/dev/null", "--out", "run.log.gz"],
+    "page without a port": ["--lidar", "/dev/null", "--watch", "robot"],
+    "page beyond all ports": ["--lidar", "/dev/null", "--watch", "0.0.0.0:70000"],
     "steps of no laser": ["--lidar", "/dev/null", "--lidar-steps", "5000:99999"],
 }
 
@@ -69,6 +75,79 @@ def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path):
     out = tmp_path / "run.log"
     assert main(["record", "--lidar", str(tmp_path / "ttyLATER"), "--out", str(out), "--duration", "2"]) == 3
     assert "no such port" in out.read_text()
+
+
+class FakeChild:
+    """Stands for `uwblite watch`."""
+
+    made = ()
+
+    def __init__(self, words, niceness=0):
+        if not FakeChild.made:
+            FakeChild.made = (self,)
+        self.words, self.niceness, self.stopped = words, niceness, False
+
+    def code(self):
+        return 1
+
+    def output(self):
+        return "uwblite: error: Address already in use"
+
+    def stop(self):
+        self.stopped = True
+
+
+@pytest.mark.parametrize(
+    ("value", "address"), [([], "127.0.0.1:8000"), (["8001"], "127.0.0.1:8001"), (["0.0.0.0:8002"], "0.0.0.0:8002")]
+)
+def test_a_page_that_ends_does_not_end_the_recording(tmp_path, monkeypatch, capfd, value, address):
+    monkeypatch.setattr("uwblite.cli.child.Child", FakeChild)
+    monkeypatch.setattr(FakeChild, "made", ())
+    out = tmp_path / "run.log"
+    port = str(tmp_path / "ttyLATER")
+    assert main(["record", "--lidar", port, "--out", str(out), "--duration", "0.3", "--watch", *value]) == 3
+    output = capfd.readouterr().err
+    assert f"http://{address}/" in output
+    assert "the page has ended: Address already in use; the recording goes on" in output
+    assert "no such port" in out.read_text()
+    words = FakeChild.made[0].words
+    assert words[:2] == ["watch", str(out)]
+    assert ":".join((words[words.index("--host") + 1], words[words.index("--port") + 1])) == address
+    assert FakeChild.made[0].niceness > 0
+
+
+def test_without_processes_the_recording_goes_on(tmp_path, monkeypatch, capfd):
+    def refuse(*_):
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("uwblite.cli.child.Child", refuse)
+    out = tmp_path / "run.log"
+    assert main(["record", "--lidar", str(tmp_path / "no"), "--out", str(out), "--duration", "0.3", "--watch"]) == 3
+    assert "no page" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_recorder_with_its_page_ends_both(tmp_path):
+    out = tmp_path / "run.log"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    words = ["record", "--lidar", str(tmp_path / "no"), "--out", str(out), "--watch", str(port)]
+    process = subprocess.Popen([sys.executable, "-m", "uwblite", *words], cwd=ROOT, stderr=subprocess.PIPE)
+    try:
+        for _ in range(100):
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10) as answer:
+                    page = answer.read()
+                break
+            except OSError:
+                time.sleep(0.2)
+        assert b"uwblite watch run.log" in page
+    finally:
+        process.terminate()
+    process.wait(timeout=30)
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10)
 
 
 @pytest.mark.parametrize("url", ["/dev/ttyACM9", "socket://robot.local:2001", "LOOP://", "rfc2217://host:7000", "/dev/null"])

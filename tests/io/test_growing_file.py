@@ -45,3 +45,28 @@ def test_it_goes_on_in_the_next_part(tmp_path):
 def test_no_file_is_one_clear_error(tmp_path):
     with pytest.raises(FormatError, match="cannot be followed"):
         GrowingFile(str(tmp_path / "none.log"))
+
+
+def test_another_file_in_its_place_is_read_from_its_beginning(tmp_path):
+    path = tmp_path / "run.log"
+    path.write_bytes(b"one and more\n")
+    file = GrowingFile(str(path), whole=True)
+    assert file.read() == b"one and more\n"
+    path.rename(tmp_path / "old.log")
+    assert file.read() == b""
+    path.write_bytes(b"another, which is longer than the first\n")
+    assert file.read() == b"another, which is longer than the first\n"
+    assert file.read() == b""
+    assert file.restarts == 1
+    path.write_bytes(b"x\n")
+    assert file.read() == b"x\n"
+    assert file.restarts == 2
+
+
+def test_whole_is_whole(tmp_path):
+    path = tmp_path / "run.log"
+    text = b"ODOM 1 2 3\n" * ((HEAD_BYTES + 2 * TAIL_BYTES) // 11)
+    path.write_bytes(text)
+    file = GrowingFile(str(path), whole=True)
+    assert file.skipped == 0
+    assert b"".join(iter(file.read, b"")) == text

@@ -12,6 +12,7 @@ from uwblite.io.result_text import RunRecord
 from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
 from uwblite.server.app import app_of
+from uwblite.server.live import LivePage
 from uwblite.server.web import server_for
 
 
@@ -71,3 +72,82 @@ def test_nonsense_does_not_end_it(served, sent):
         line.shutdown(socket.SHUT_WR)
         line.recv(1000)
     assert ask(server, "GET", "/state")[0] == 200
+
+
+@pytest.fixture
+def live(monkeypatch):
+    monkeypatch.setattr("uwblite.server.web.MOST_CONNECTIONS", 8)
+    page = LivePage("live")
+    server = server_for(page)
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+    yield page, server
+    page.feed.close()
+    server.shutdown()
+    server.server_close()
+
+
+def test_events_flow_for_as_long_as_somebody_listens(live):
+    page, server = live
+    page.show_status({"summary": "one"})
+    connection = http.client.HTTPConnection(*server.server_address, timeout=10)
+    connection.request("GET", "/events")
+    answer = connection.getresponse()
+    assert answer.getheader("Content-Type") == "text/event-stream"
+    lines = iter(answer.readline, b"")
+    assert next(line for line in lines if line.startswith(b"data")) == b'data: {"summary": "one"}\n'
+    page.show_status({"summary": "two"})
+    assert next(line for line in lines if line.startswith(b"data")) == b'data: {"summary": "two"}\n'
+    page.feed.close()
+    assert list(lines) is not None
+
+
+def test_a_thousand_connections_are_turned_away_and_do_no_harm(live):
+    _, server = live
+    held = []
+    refused = 0
+    for _ in range(1000):
+        line = socket.create_connection(server.server_address, timeout=10)
+        held.append(line)
+        if len(held) > 20:
+            # The first eight hold the room with half a request each; whoever comes later is told at once.
+            old = held.pop(12)
+            refused += old.recv(100).startswith(b"HTTP/1.1 503")
+            old.close()
+    assert refused > 900
+    assert threading.active_count() < 40
+    for line in held:
+        line.close()
+    for _ in range(200):
+        status = ask(server, "GET", "/")[0]
+        if status == 200:
+            break
+    assert status == 200
+
+
+def test_of_a_thousand_bytes_of_nonsense_in_a_length_nothing_is_read(live):
+    _, server = live
+    for length in ("9" * 4000, "\u00b2", "1e3", "-1", ""):
+        with socket.create_connection(server.server_address, timeout=10) as line:
+            line.sendall(f"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: {length}\r\n\r\n".encode())
+            assert b" 413 " in line.recv(1000)
+
+
+def test_a_path_of_another_place_is_not_found(live):
+    _, server = live
+    with socket.create_connection(server.server_address, timeout=10) as line:
+        host = f"127.0.0.1:{server.server_address[1]}"
+        line.sendall(f"GET /../../etc/passwd HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+        answer = line.recv(4000)
+    assert b" 404 " in answer.split(b"\r\n")[0]
+    assert b"root:" not in answer
+
+
+def test_an_open_page_is_asked_for_by_address():
+    page = LivePage("open")
+    server = server_for(page, 0, "0.0.0.0", ("robot",))
+    assert page.names == ("robot",)
+    port = server.server_address[1]
+    assert page.handle("GET", "/", {"host": f"10.0.0.5:{port}"}).status == 200
+    assert page.handle("GET", "/", {"host": f"robot:{port}"}).status == 200
+    assert page.handle("GET", "/", {"host": f"evil.example:{port}"}).status == 403
+    server.server_close()

@@ -22,7 +22,7 @@ from ..errors import UsageError, UwbliteError
 from ..report.printable import printable
 
 VERBS = (
-    "map", "batch", "view", "localize", "plan", "check", "record", "devices", "plan-anchors", "convert", "evaluate",
+    "map", "batch", "view", "localize", "plan", "check", "record", "watch", "devices", "plan-anchors", "convert", "evaluate",
     "optimize", "config",
 )  # fmt: skip
 """In the order in which a user meets them; `uwblite VERB` is the module of the same name, with _ for -."""

@@ -23,6 +23,7 @@ examples:
                  --uwb shell:/dev/ttyACM0 --out run.log --duration 600
   uwblite record --lidar socket://robot.local:2001 --odometry kobuki:socket://robot.local:2002 --out run.log
   uwblite record ... --out run.log --append           go on after a crash
+  uwblite record ... --out run.log --watch 0.0.0.0:8000  the map while it grows, on every phone in the network
   uwblite record --uwb tlv:/dev/ttyACM0 --tag 0.2,0,0.6 --uwb tlv:/dev/ttyACM1 --tag=-0.2,0,0.6 --odometry ...
                                                       a tag in front and one behind
 
@@ -39,6 +40,8 @@ computer's monotonic clock, s).
 """
 
 
+_PAGE_NICENESS = 10
+"""Of the page beside the recorder."""
 MOST = {"uwb": 9, "lidar": 5, "gyro": 1, "odometry": 1}
 """How many of a kind a log keeps apart."""
 
@@ -59,6 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pause = "s between syncs to the disk (1; 0 = each write)"
     output.add_argument("--sync", metavar="S", type=number(least=0), default=1.0, help=pause)
     output.add_argument("--json", action="store_true", help="summary as one JSON object on stdout")
+    page = "show the map while it grows, as uwblite watch does, in a process of its own (127.0.0.1:8000)"
+    output.add_argument("--watch", metavar="[ADDRESS:]PORT", type=_page, nargs="?", const=("127.0.0.1", 8000), help=page)
     laser = parser.add_argument_group("lidar")
     laser.add_argument("--lidar-steps", metavar="A:B", help="first and last step, e.g. 128:640 (all: 44:725)")
     merged, skipped = number(1, 99, whole=True), number(0, 9, whole=True)
@@ -111,6 +116,7 @@ def run(args: argparse.Namespace) -> int:
     lasers = args.laser_pose or [(0.0, 0.0, 0.0)]
     mounting = Mounting(lasers[0], tuple(_mounting_params(args, offset)), more_lasers=tuple(lasers[1:]))
     stopped: list[int] = []
+    watching = _Watching(args) if args.watch else None
     recorder = Recorder(
         links, log, monotonic=time.monotonic, wall_offset=offset, host=re.sub(r"\s+", "_", socket.gethostname()) or "host",
         mounting=mounting, on_note=_show_note,
@@ -120,9 +126,11 @@ def run(args: argparse.Namespace) -> int:
     try:
         recorder.begin(_head(args, remark))
         _suggest_names(links)
-        recorder.run(duration=args.duration, stopping=lambda: bool(stopped), on_status=_status_line(recorder))
+        recorder.run(duration=args.duration, stopping=lambda: bool(stopped), on_status=_status_line(recorder, watching))
     finally:
         log.close()
+        if watching is not None:
+            watching.stop()
         for ending, handler in before.items():
             signal.signal(ending, handler)
     return _finish(recorder, args.json, bool(stopped) and stopped[0] == signal.SIGINT)
@@ -221,13 +229,46 @@ def _show_note(seconds: float, message: "Note") -> None:
     note(f"[{seconds:8.1f} s] {message.level}: {message.text}")
 
 
-def _status_line(recorder: "Recorder") -> Any:
-    """Return what draws the status line; on a terminal only."""
+class _Watching:
+    """`uwblite watch` beside the recorder, which goes on whatever becomes of it."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        import os
+
+        from .child import Child
+
+        host, port = args.watch
+        words = ["watch", args.out, "--host", host, "--port", str(port), "--parent", str(os.getpid())]
+        self._child: Child | None = None
+        try:
+            self._child = Child(words, _PAGE_NICENESS)
+        except OSError as error:
+            note(f"uwblite: warning: no page: {error}; the recording goes on")
+        else:
+            note(f"the map while it grows: http://{host}:{port}/")
+
+    def look(self) -> None:
+        """Say once that the page has ended, where it has."""
+        if self._child is not None and self._child.code() is not None:
+            why = self._child.output().removeprefix("uwblite: error: ")
+            note(f"uwblite: warning: the page has ended: {why}; the recording goes on")
+            self._child = None
+
+    def stop(self) -> None:
+        """End the page."""
+        if self._child is not None:
+            self._child.stop()
+
+
+def _status_line(recorder: "Recorder", watching: _Watching | None = None) -> Any:
+    """Return what draws the status line, on a terminal only, and looks after the page."""
     from .console import Progress
 
     bar = Progress()
 
     def show() -> None:
+        if watching is not None:
+            watching.look()
         if bar.active:
             bar(status_text(recorder), 0, 0)
 
@@ -249,6 +290,13 @@ def status_text(recorder: "Recorder") -> str:
         parts.append(text)
     free = recorder.log.free_bytes() / 1e9
     return f"{recorder.log.bytes / 1e6:.1f} MB | {' | '.join(parts)} | disk {free:.1f} GB left"
+
+
+def _page(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit()) or not 0 < int(port) <= 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port such as 8000 or 0.0.0.0:8000")
+    return host or "127.0.0.1", int(port)
 
 
 def _size(text: str) -> int:

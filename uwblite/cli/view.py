@@ -10,7 +10,6 @@ from .options import number
 
 if TYPE_CHECKING:
     from ..io.stored_result import StoredResult
-    from ..server.app import Job
 
 HELP = "look at results in the browser, side by side; reject or force closures, pin anchors, and map again"
 EPILOG = """\
@@ -41,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from ..server.app import app_of
     from ..server.web import server_for
     from . import console
+    from .child import Child
     from .formats import format_of
 
     folders = [path for path in args.paths if format_of(path) == "map"]
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     recordings = _recordings([path for path in args.paths if path not in folders], results)
     first = os.path.abspath(folders[0])
     constraints = Path(args.constraints or f"{first}_constraints.toml")
-    app = app_of(results, recordings, constraints, _launch)
+    app = app_of(results, recordings, constraints, Child)
     server = server_for(app, args.port)
     address = f"http://{app.host}/"
     console.say(f"open {address} in a browser; Ctrl-C ends it")
@@ -92,46 +92,3 @@ def _recordings(named: Sequence[str], results: "Sequence[StoredResult]") -> dict
             if key not in found and file is not None and sha256_of(file) == key:
                 found[key] = file.resolve()
     return found
-
-
-class _Process:
-    """`uwblite` at work for the page."""
-
-    def __init__(self, words: Sequence[str]) -> None:
-        import subprocess
-        import sys
-        import tempfile
-
-        package = (__package__ or "uwblite.cli").rpartition(".")[0]
-        root = Path(__file__).resolve().parents[package.count(".") + 2]
-        path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
-        self._output = tempfile.TemporaryFile("w+b")  # noqa: SIM115
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", package, *words],
-            stdin=subprocess.DEVNULL,
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, "PYTHONPATH": path},
-        )
-
-    def code(self) -> int | None:
-        """Return its exit code; None while it runs."""
-        return self._process.poll()
-
-    def output(self) -> str:
-        """Return the last line of its output."""
-        size = os.fstat(self._output.fileno()).st_size
-        tail = os.pread(self._output.fileno(), 2000, max(size - 2000, 0)).decode(errors="replace").strip()
-        errors = [line for line in tail.splitlines() if "error:" in line]
-        return (errors or tail.splitlines() or [""])[-1][:400]
-
-    def stop(self) -> None:
-        """End it."""
-        self._process.terminate()
-        self._process.wait()
-
-
-def _launch(words: Sequence[str]) -> "Job":
-    return _Process(words)
-
-

@@ -14,21 +14,30 @@ _PIECE = 1 << 17
 
 
 class GrowingFile:
-    """Follow a file from its head, and what it holds already from near its end.
+    """Follow a file from its head, and what it holds already from near its end or whole.
+
+    A file that became shorter, or that another has taken the place of, is read from its beginning.
+
+    Parameters
+    ----------
+    path : the file.
+    whole : read all that it holds already.
 
     Raises
     ------
     FormatError : it cannot be opened.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, *, whole: bool = False) -> None:
         self.path = Path(path)
+        self.restarts = 0
+        """How often the file was begun anew."""
         try:
             self._file = open(self.path, "rb", buffering=0)  # noqa: SIM115
             size = os.fstat(self._file.fileno()).st_size
         except OSError as error:
             raise FormatError(f"cannot be followed: {error.strerror or error}", path) from None
-        self.skipped = max(size - HEAD_BYTES - TAIL_BYTES, 0)
+        self.skipped = 0 if whole else max(size - HEAD_BYTES - TAIL_BYTES, 0)
         """Bytes between head and tail that are not read."""
         self._head_left = HEAD_BYTES if self.skipped else 0
 
@@ -42,7 +51,21 @@ class GrowingFile:
             kept = [line for line in data.split(b"\n")[:-1] if line.startswith(b"PARAM ")]
             return b"\n".join([*kept, b"# "])
         if os.fstat(self._file.fileno()).st_size < self._file.tell():
-            self._file.seek(0)  # it was begun anew
+            self._file.seek(0)
+            self.restarts += 1
+        return self._file.read(_PIECE) or self._successor()
+
+    def _successor(self) -> bytes:
+        """Return the beginning of another file that has taken this one's place; b"" where none has."""
+        try:
+            if os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno())):
+                return b""
+            other = open(self.path, "rb", buffering=0)  # noqa: SIM115
+        except OSError:
+            return b""
+        self._file.close()
+        self._file = other
+        self.restarts += 1
         return self._file.read(_PIECE)
 
     def go_on_in(self, name: str) -> bool:

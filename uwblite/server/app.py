@@ -1,9 +1,4 @@
-"""The page's requests and answers, without a socket: every rule of who may ask what stands here and is tested here.
-
-Only the computer itself may ask: the server listens on the loopback address alone, and a request must name it as its Host
-(a page elsewhere that has its name resolved to 127.0.0.1 cannot). A request of another page carries a foreign Origin and is
-refused. What changes anything must be a POST with JSON and the token that only the served page knows.
-"""
+"""The requests and answers of `uwblite view`, without a socket."""
 
 import json
 import secrets
@@ -21,12 +16,11 @@ from ..io.stored_result import StoredResult, read_result
 from .edits import edits_text, parse_edits, with_anchor, with_closure
 from .page import page
 from .remap import remap_command
+from .requests import HTML, PNG, Response, json_response, refusal, text_response
 from .runs import Run, described, run_of
 
-MOST_BYTES = 1 << 16
-"""Of a request's body."""
 _TYPES = {
-    ".html": "text/html; charset=utf-8", ".png": "image/png", ".json": "application/json", ".csv": "text/plain; charset=utf-8",
+    ".html": HTML, ".png": PNG, ".json": "application/json", ".csv": "text/plain; charset=utf-8",
     ".toml": "text/plain; charset=utf-8", ".tum": "text/plain; charset=utf-8", ".yaml": "text/plain; charset=utf-8",
 }  # fmt: skip
 _FARTHEST = 1e7
@@ -43,17 +37,6 @@ class Job(Protocol):
         """Return the last line of its output."""
 
 
-@dataclass(frozen=True, slots=True)
-class Response:
-    """What is sent back."""
-
-    status: int
-    kind: str
-    body: bytes
-    framed: bool = False
-    """A report, which brings its own styles and scripts and may do nothing else."""
-
-
 @dataclass(slots=True)
 class App:
     """The state behind the page."""
@@ -68,6 +51,7 @@ class App:
     token: str
     host: str = ""
     """Name and port under which the page is asked for, such as 127.0.0.1:8000."""
+    names: tuple[str, ...] | None = None
     own: str = ""
     """The user's part of the constraints file."""
     edits: Constraints = field(default_factory=Constraints)
@@ -86,54 +70,35 @@ class App:
         ----------
         method, target : as in the request line.
         headers : with names in lower case.
-        body : at most MOST_BYTES.
+        body : of a POST.
         """
-        if refusal := self._refused(method, headers):
-            return refusal
+        if refused := refusal(self, self.token, method, headers):
+            return refused
         path = unquote(urlsplit(target).path)
         try:
             return self._post(path, body) if method == "POST" else self._get(path)
         except UwbliteError as error:
-            return _json({"error": str(error)}, 400)
-
-    def _refused(self, method: str, headers: dict[str, str]) -> Response | None:
-        port = self.host.rpartition(":")[2]
-        names = (self.host, f"localhost:{port}")
-        if headers.get("host", "") not in names:
-            return _text("this page is for this computer only", 403)
-        origin = headers.get("origin")
-        if origin is not None and origin not in tuple(f"http://{name}" for name in names):
-            return _text("another page may not ask", 403)
-        if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
-            return _text("another page may not ask", 403)
-        if method not in ("GET", "POST"):
-            return _text("only GET and POST are known", 405)
-        if method == "POST":
-            if not secrets.compare_digest(headers.get("x-token", "").encode(), self.token.encode()):
-                return _text("the token is missing: reload the page", 403)
-            if headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-                return _text("a POST must be application/json", 415)
-        return None
+            return json_response({"error": str(error)}, 400)
 
     def _get(self, path: str) -> Response:
         if path == "/":
             return Response(200, _TYPES[".html"], page(self.token).encode())
         if path == "/state":
-            return _json(self._state())
+            return json_response(self._state())
         parts = path.strip("/").split("/")
         runs = {str(k): run for k, run in enumerate(self.runs)}
         if len(parts) == 3 and parts[0] == "run" and parts[1] in runs:
             return self._file(runs[parts[1]], parts[2])
-        return _text("there is no such page", 404)
+        return text_response("there is no such page", 404)
 
     def _file(self, run: Run, name: str) -> Response:
         """Return a file of a result; nothing but the names that a result may hold is looked for."""
         if name == "grid.png" and run.grid_png is not None:
-            return Response(200, "image/png", run.grid_png)
+            return Response(200, PNG, run.grid_png)
         file = run.result.folder / name
         kind = _TYPES.get(file.suffix)
         if not is_of_result(name) or kind is None or not file.is_file() or file.is_symlink():
-            return _text("there is no such file in this result", 404)
+            return text_response("there is no such file in this result", 404)
         return Response(200, kind, file.read_bytes(), framed=file.suffix == ".html")
 
     def _state(self) -> dict[str, Any]:
@@ -157,8 +122,8 @@ class App:
         elif path == "/map":
             self._start(self._run(wish))
         else:
-            return _text("there is no such page", 404)
-        return _json(self._state())
+            return text_response("there is no such page", 404)
+        return json_response(self._state())
 
     def _run(self, wish: dict[str, Any]) -> Run:
         return self.runs[_whole(wish, "run", len(self.runs))]
@@ -230,11 +195,3 @@ def _whole(wish: dict[str, Any], name: str, end: int) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < end:
         raise ConfigError(f"there is no {name} {str(value)[:40]}")
     return value
-
-
-def _json(value: Any, status: int = 200) -> Response:
-    return Response(status, "application/json", json.dumps(value, allow_nan=False).encode())
-
-
-def _text(text: str, status: int) -> Response:
-    return Response(status, "text/plain; charset=utf-8", text.encode())

@@ -1,0 +1,227 @@
+"""`uwblite watch`: rounds that come, fail and are forgotten, by a clock of the test's own; then as a user starts it."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from helpers.browser import CHROMIUM, Browser
+from helpers.results import small_log, small_result
+
+from uwblite.cli import main, watch
+from uwblite.io.result_text import RunRecord
+from uwblite.io.results import write_result
+from uwblite.server.live import LivePage
+
+
+def odom_lines(begin, end):
+    times = np.arange(begin, end, 0.1)
+    return "".join(f"ODOM {t - 1000:.6f} 0.0 0.0 0.0 0.0 0.0 {t:.6f} host {t:.6f}\n" for t in times)
+
+
+class FakeChild:
+    """Stands for `uwblite map`: its test says what became of it."""
+
+    made: list
+
+    def __init__(self, words, niceness=0):
+        self.words, self.niceness, self.result, self.stopped = words, niceness, None, False
+        FakeChild.made.append(self)
+
+    def code(self):
+        return self.result
+
+    def output(self):
+        return "uwblite: error: the disk is full"
+
+    def stop(self):
+        self.stopped = True
+
+
+@pytest.fixture
+def watched(tmp_path, monkeypatch):
+    """A watch of a log with fake rounds: (watch, log, folder, states)."""
+    monkeypatch.setattr("uwblite.cli.child.Child", FakeChild)
+    monkeypatch.setattr(watch, "_spent_on_rounds", lambda now: now)
+    FakeChild.made = []
+    log, folder, page = tmp_path / "run.log", tmp_path / "run_watch", LivePage("watch")
+    made = watch.Watch(str(log), str(folder), page, ["--laser-flipped"])
+
+    def state(name="status"):
+        events = page.feed.events(patience=0.01)
+        next(events)
+        found = re.search(rf"event: {name}\ndata: (.*)\n", next(events).decode())
+        return json.loads(found[1]) if found else None
+
+    return made, log, folder, state
+
+
+def make_map(folder):
+    shutil.rmtree(folder, ignore_errors=True)
+    write_result(folder, [small_log()], small_result(), RunRecord("uwblite map x", ""))
+
+
+def test_a_round_is_begun_shown_and_followed_by_the_next(watched):
+    made, log, folder, state = watched
+    made.step(0.0)
+    assert state()["advice"][0].startswith("nothing is recorded yet")
+    log.write_text(odom_lines(1000.0, 1010.0))
+    made.step(1.0)
+    assert not FakeChild.made
+    with open(log, "a") as file:
+        file.write(odom_lines(1010.0, 1030.0))
+    made.step(2.0)
+    job = FakeChild.made[0]
+    assert job.words[:4] == ["map", str(log), "--out", str(folder)]
+    assert "--laser-flipped" in job.words
+    assert job.niceness == 19
+    assert "mapping ..." in state()["rounds"]
+    make_map(folder)
+    job.result = 3
+    made.step(5.0)
+    assert len(state("map")["anchors"]) == 2
+    assert "map of 12 s, made 0 s ago" in state()["rounds"]
+    with open(log, "a") as file:
+        file.write(odom_lines(1030.0, 1060.0))
+    made.step(20.0)
+    assert len(FakeChild.made) == 1  # the round took three seconds
+    made.step(50.0)
+    assert len(FakeChild.made) == 2
+    made.close()
+    assert FakeChild.made[1].stopped
+
+
+def test_a_round_that_fails_leaves_the_page_and_the_map(watched):
+    made, log, folder, state = watched
+    make_map(folder)
+    log.write_text(odom_lines(1000.0, 1030.0))
+    made.step(0.0)
+    FakeChild.made[0].result = 0
+    made.step(1.0)
+    with open(log, "a") as file:
+        file.write(odom_lines(1030.0, 1100.0))
+    made.step(60.0)
+    FakeChild.made[1].result = 1
+    made.step(61.0)
+    assert "the last round failed: the disk is full" in state()["rounds"]
+    assert "map of 12 s" in state()["rounds"]
+    assert len(state("map")["anchors"]) == 2
+    made.step(70.0)
+    assert len(FakeChild.made) == 2
+    made.step(100.0)
+    assert len(FakeChild.made) == 3
+    (folder / "anchors.csv").write_text("\0 broken")
+    FakeChild.made[2].result = 0
+    made.step(101.0)
+    assert "the last round failed" in state()["rounds"]
+    assert "anchors.csv" in state()["rounds"]
+
+
+def test_a_round_without_end_is_ended(watched):
+    made, log, _, state = watched
+    log.write_text(odom_lines(1000.0, 1030.0))
+    made.step(0.0)
+    made.step(2000.0)
+    assert FakeChild.made[0].stopped
+    assert "more than 30 minutes" in state()["rounds"]
+
+
+def test_another_log_in_its_place_is_another_recording(watched):
+    made, log, folder, state = watched
+    make_map(folder)
+    log.write_text(odom_lines(1000.0, 1050.0))
+    made.step(0.0)
+    assert len(FakeChild.made) == 1
+    os.truncate(log, 0)
+    made.step(1.0)
+    log.write_text(odom_lines(5000.0, 5010.0))
+    made.step(2.0)
+    assert FakeChild.made[0].stopped
+    assert state("map")["anchors"] == []
+    assert "begun anew" in state()["summary"]
+    assert "map of" not in state()["rounds"]
+
+
+def test_an_earlier_watch_left_a_map(watched):
+    made, log, folder, _ = watched
+    make_map(folder)
+    again = watch.Watch(str(log), str(folder), LivePage("again"), [])
+    assert again.result is not None
+    again.step(0.0)
+    assert made.result is None
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["-"], "name the plain log"), (["run.log.gz"], "name the plain log"), (["."], "is a folder"),
+        (["run.log", "--out", "map"], "already holds a result"), (["run.log", "--set", "grid.none=1"], "grid.none"),
+        (["run.log", "--host", "256.1.1.1"], ""),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_watched_is_one_clear_line(tmp_path, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(tmp_path)
+    make_map(tmp_path / "map")
+    assert main(["watch", "--port", "0", *words]) in (1, 2)
+    output = capsys.readouterr().err
+    assert message in output
+    assert "internal" not in output
+
+
+class Watched:
+    """The program at work, until the block ends."""
+
+    def __init__(self, log, *words):
+        command = [sys.executable, "-m", "uwblite", "watch", str(log), "--port", "0", *words]
+        self.process = subprocess.Popen(
+            command, env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        output = self.process.stdout.readline()
+        self.address = re.search(r"http://127\.0\.0\.1:\d+/", output).group()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.send_signal(signal.SIGINT)
+        self.code = self.process.wait(timeout=20)
+
+
+@pytest.mark.slow
+def test_it_says_its_address_serves_and_ends_with_ctrl_c(tmp_path):
+    with Watched(tmp_path / "run.log") as served, urllib.request.urlopen(served.address, timeout=20) as answer:
+        assert b"uwblite watch run.log" in answer.read()
+    assert served.code == 0
+    with Watched(tmp_path / "run.log", "--parent", "1") as served:
+        assert served.process.wait(timeout=20) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+@pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, True)])
+def test_the_page_shows_a_log_that_grows(tmp_path, room_log, width, dark):
+    log = tmp_path / "run.log"
+    assert main(["convert", str(room_log), str(tmp_path / "whole.log"), "--end", "60"]) == 0
+    lines = (tmp_path / "whole.log").read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[: len(lines) // 2]))
+    with Watched(log) as served, Browser(tmp_path / "profile", width=width, dark=dark) as browser:
+        browser.open(served.address)
+        browser.until("document.querySelector('#map image')", patience=120)
+        browser.until("document.querySelector('#robot path')")
+        before = browser.run("document.querySelector('#robot path').getAttribute('transform')")
+        with open(log, "ab") as file:
+            file.write(b"".join(lines[len(lines) // 2 :]) + b"ODOM half a li")
+        browser.until(f"document.querySelector('#robot path').getAttribute('transform') !== {json.dumps(before)}")
+        assert browser.run("document.querySelectorAll('#sensors tr').length") == 4
+        assert browser.run("document.documentElement.scrollWidth") <= width
+        assert browser.complaints == []
+        time.sleep(0.1)

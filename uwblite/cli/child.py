@@ -1,0 +1,59 @@
+"""`uwblite` at work in a process of its own, for a page or a recorder."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+_ENDING = 10.0
+"""s that a process has to end in when it is asked to."""
+
+
+class Child:
+    """A command that runs.
+
+    Parameters
+    ----------
+    words : arguments of `uwblite`.
+    niceness : 0..19; 19 = it runs when nobody else wants to. Other than 0, numerical libraries take one core alone.
+    """
+
+    def __init__(self, words: Sequence[str], niceness: int = 0) -> None:
+        package = (__package__ or "uwblite.cli").rpartition(".")[0]
+        root = Path(__file__).resolve().parents[package.count(".") + 2]
+        path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
+        alone = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")} if niceness else {}
+        self._output = tempfile.TemporaryFile("w+b")  # noqa: SIM115
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", package, *words],
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **alone, "PYTHONPATH": path},
+        )
+        if niceness and hasattr(os, "setpriority"):
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, niceness)
+
+    def code(self) -> int | None:
+        """Return its exit code; None while it runs."""
+        return self._process.poll()
+
+    def output(self) -> str:
+        """Return the last line of its output."""
+        size = os.fstat(self._output.fileno()).st_size
+        tail = os.pread(self._output.fileno(), 2000, max(size - 2000, 0)).decode(errors="replace").strip()
+        errors = [line for line in tail.splitlines() if "error:" in line]
+        return (errors or tail.splitlines() or [""])[-1][:400]
+
+    def stop(self) -> None:
+        """End it."""
+        self._process.terminate()
+        try:
+            self._process.wait(_ENDING)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()

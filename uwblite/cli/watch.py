@@ -1,0 +1,281 @@
+"""`uwblite watch`: the map of a recording while it grows, on a local page."""
+
+import argparse
+import os
+import time
+from typing import TYPE_CHECKING
+
+from .options import add_mounting_arguments, add_settings_arguments, number, place
+
+if TYPE_CHECKING:
+    from ..io.stored_result import StoredResult
+    from ..server.live import LivePage
+    from ..server.rounds import Round
+    from .child import Child
+
+HELP = "follow a growing log: the map so far, silent sensors and what to drive next, on a page for phone and computer"
+EPILOG = """\
+examples:
+  uwblite watch run.log                       http://127.0.0.1:8000/ on this computer
+  uwblite watch run.log --host 0.0.0.0        for every phone and computer in the network
+  uwblite record ... --out run.log --watch    records and watches
+  uwblite watch run.log --laser-flipped       how the map is made, as for uwblite map
+
+The log may be written by anything, may have parts (record --rotate), and need not be there yet. It is mapped again and again
+in a process of the lowest priority, into LOG_watch, with scans left out so that a round takes a tenth of the time since the
+last one at most; once the log rests, from all scans. Whoever can reach the page can see it, and nobody can change anything.
+"""
+
+_STEP = 1.0
+"""s between looks at the log."""
+_OWN_NICENESS, _NICENESS = 5, 19
+"""Of the page and of the rounds: the recorder comes first."""
+_LONGEST = 1800.0
+"""s after which a round has failed."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the verb."""
+    parser.add_argument("log", metavar="LOG", help="CARMEN log that is being written, its first part where it has several")
+    parser.add_argument("--port", metavar="N", type=number(0, 65535, whole=True), default=8000, help="port (8000; 0 = any)")
+    parser.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="address to listen on (this computer alone)")
+    parser.add_argument("--out", metavar="DIR", type=place, help="folder for the latest map (LOG_watch)")
+    parser.add_argument("--force", action="store_true", help="replace a map that is already in --out")
+    parser.add_argument("--parent", type=number(1, whole=True), help=argparse.SUPPRESS)
+    add_settings_arguments(parser)
+    add_mounting_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the verb."""
+    import signal
+    import threading
+    from contextlib import suppress
+
+    from ..server.live import LivePage
+    from ..server.web import server_for
+    from . import console
+    from .options import effective_config
+
+    effective_config(args)
+    folder = _folder(args)
+    page = LivePage(f"uwblite watch {os.path.basename(args.log)}")
+    server = server_for(page, args.port, args.host, _own_names())
+    with suppress(OSError, AttributeError):
+        os.nice(_OWN_NICENESS)
+    console.say(f"open {_address(page)} in a browser; Ctrl-C ends it")
+    console.note(f"uwblite: the latest map is in {folder}")
+    console.flush()
+    with suppress(ValueError):  # not the main thread: signals are somebody else's
+        signal.signal(signal.SIGTERM, _interrupt)
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.2}, daemon=True).start()
+    watch = Watch(args.log, folder, page, map_options(args))
+    try:
+        while args.parent is None or os.getppid() == args.parent:
+            watch.step(time.monotonic())
+            time.sleep(_STEP)
+    except KeyboardInterrupt:
+        console.note("uwblite: the page has ended")
+    finally:
+        watch.close()
+        server.shutdown()
+        server.server_close()
+    return 0
+
+
+def _interrupt(_number: int, _frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _folder(args: argparse.Namespace) -> str:
+    """Return where the maps go, refusing what cannot be watched."""
+    from ..errors import ConfigError
+    from ..io.results import check_target
+
+    if args.log == "-" or args.log.endswith(".gz"):
+        raise ConfigError(f"{args.log} does not grow in a way that can be followed; name the plain log that is being written")
+    if os.path.isdir(args.log):
+        raise ConfigError(f"{args.log} is a folder; name the log that is being written")
+    folder = args.out or f"{os.path.splitext(args.log)[0]}_watch"
+    check_target(folder, force=args.force or not args.out)
+    return str(folder)
+
+
+def map_options(args: argparse.Namespace) -> list[str]:
+    """Return the options of `uwblite map` that settings and mounting amount to."""
+    words = [f"--set={value}" for value in args.set]
+    words += [f"--{name}={value}" for name in ("preset", "config") if (value := getattr(args, name))]
+    words += ["--laser-flipped"] if args.laser_flipped else []
+    for name in ("laser_pose", "tag"):
+        if (values := getattr(args, name)) is not None:
+            words.append(f"--{name.replace('_', '-')}=" + ",".join(map(repr, values)))
+    return words + ([] if args.anchor_height is None else [f"--anchor-height={args.anchor_height!r}"])
+
+
+def _own_names() -> tuple[str, ...]:
+    """Return the names under which other computers may know this one."""
+    import socket
+
+    name = socket.gethostname()
+    return (name, f"{name}.local") if name else ()
+
+
+def _address(page: "LivePage") -> str:
+    """Return where the page is to be found; of one that is open to the network, under this computer's address in it."""
+    import socket
+
+    host, _, port = page.host.rpartition(":")
+    if host in ("0.0.0.0", "::", ""):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.connect(("192.0.2.1", 9))  # nothing is sent; it tells which address would be used
+                host = str(probe.getsockname()[0])
+            except OSError:
+                host = "127.0.0.1"
+    return f"http://{host}:{port}/"
+
+
+class Watch:
+    """The log, its rounds and what the page shows of them.
+
+    Parameters
+    ----------
+    log : the growing log.
+    folder : where the maps go; a map of an earlier watch is shown at once.
+    page : takes what is to be seen.
+    options : for `uwblite map`.
+    """
+
+    def __init__(self, log: str, folder: str, page: "LivePage", options: list[str]) -> None:
+        from ..io.log_tail import LogTail
+
+        self.tail, self.folder, self.page, self.options = LogTail(log), folder, page, options
+        self.result: StoredResult | None = None
+        self.last: Round | None = None
+        self._job: Child | None = None
+        self._job_began = self._job_recorded = self._job_cost = 0.0
+        self._job_nth, self._failure = 1, ""
+        self._mapped_at = self._grown = float("-inf")
+        self._restarts = 0
+        self._read_result(float("-inf"))
+
+    def step(self, now: float) -> None:
+        """Look at the log and the running round, begin another where it is due, and show what there is.
+
+        Parameters
+        ----------
+        now : s, a clock that never leaps.
+        """
+        from ..server.live import watch_status
+        from ..server.rounds import next_thinning
+
+        self._follow(now)
+        if self.tail.restarts != self._restarts:
+            self._forget()
+        self._collect(now)
+        if self._job is None:
+            nth = next_thinning(self.last, self.tail.seconds, now, now - self._grown)
+            if nth is not None:
+                self._launch(nth, now)
+        self.page.show_status(watch_status(self.tail, self.result, max(now - self._grown, 0.0), self._rounds(now)))
+
+    def close(self) -> None:
+        """End a round that runs, and all listening."""
+        if self._job is not None:
+            self._job.stop()
+        self.page.feed.close()
+
+    def _follow(self, now: float) -> None:
+        """Read what is new; what has grown before the first look is as old as the file says."""
+        first = self._grown == float("-inf")
+        grown = False
+        while self.tail.poll():
+            grown = True
+        if grown:
+            self._grown = now - (_age(self.tail.path) if first else 0.0)
+        elif first:
+            self._grown = now
+
+    def _forget(self) -> None:
+        """Leave the map of a log that is no more."""
+        self._restarts = self.tail.restarts
+        if self._job is not None:
+            self._job.stop()
+        self._job = self.last = self.result = None
+        self._failure = ""
+        self.page.show_map(None)
+
+    def _launch(self, nth: int, now: float) -> None:
+        from .child import Child
+
+        words = ["map", self.tail.path, "--out", self.folder, "--force", "-q", "--every-nth-scan", str(nth), *self.options]
+        self._job_began, self._job_recorded, self._job_nth = now, self.tail.seconds, nth
+        self._job_cost = _spent_on_rounds(now)
+        try:
+            self._job = Child(words, _NICENESS)
+        except OSError as error:
+            self._ended(now, str(error))
+
+    def _collect(self, now: float) -> None:
+        if self._job is None:
+            return
+        code = self._job.code()
+        if code is None and now - self._job_began > _LONGEST:
+            self._job.stop()
+            self._ended(now, f"it took more than {_LONGEST / 60:.0f} minutes")
+        elif code in (0, 3):
+            self._ended(now, self._read_result(now))
+        elif code is not None:
+            self._ended(now, self._job.output().removeprefix("uwblite: error: ") or f"exit code {code}")
+
+    def _ended(self, now: float, failure: str) -> None:
+        from ..server.rounds import Round
+
+        self._job, self._failure = None, failure
+        self.last = Round(now, _spent_on_rounds(now) - self._job_cost, self._job_recorded, self._job_nth, bool(failure))
+
+    def _read_result(self, now: float) -> str:
+        """Show the map in the folder; return why it cannot be shown, where it is so."""
+        from ..errors import UwbliteError
+        from ..io.stored_result import read_result
+
+        if not os.path.isfile(os.path.join(self.folder, "trajectory.tum")):
+            return "there is no map"
+        try:
+            self.result = read_result(self.folder)
+        except (UwbliteError, OSError) as error:
+            return str(error)
+        self._mapped_at = now
+        self.page.show_map(self.result)
+        return ""
+
+    def _rounds(self, now: float) -> str:
+        """Return words about the latest map and the round that runs."""
+        words = []
+        if self.result is not None:
+            span = float(self.result.trajectories[-1][0][-1] - self.result.trajectories[-1][0][0])
+            made = f"made {now - self._mapped_at:.0f} s ago" if now - self._mapped_at < 1e6 else "made by an earlier watch"
+            words.append(f"map of {span:.0f} s, {made}")
+        if self._failure:
+            words.append(f"the last round failed: {self._failure}")
+        if self._job is not None:
+            words.append("mapping ...")
+        return "; ".join(words)
+
+
+def _spent_on_rounds(now: float) -> float:
+    """Return the processor time of the rounds that have ended, s; the time of the clock where the system does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return now
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _age(path: str) -> float:
+    """Return how long ago a file was written, s; 0 where that is not known."""
+    try:
+        return max(time.time() - os.stat(path).st_mtime, 0.0)
+    except OSError:
+        return 0.0

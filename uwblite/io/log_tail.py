@@ -1,0 +1,176 @@
+"""A log that grows, followed: how often each sensor is heard, which anchors, and where the odometry is.
+
+The reader keeps its place and reads what is new, whole lines only: the line that is being written now is left for the
+next time. Parts of a recording are followed in their order. A log that has become shorter, or that another file has taken
+the place of, is read from its beginning.
+"""
+
+import os
+from array import array
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import FormatError
+from .carmen_messages import numbers, stamp_of
+from .growing_file import GrowingFile
+from .source import MAX_LINE_BYTES
+
+WINDOW = 10.0
+"""s over which rates are taken."""
+_MOST_STAMPS = 2000
+"""Of a sensor within the window."""
+_ODOMETRY_STEP = 0.2
+"""s between the poses that are kept."""
+_MOST_POSES = 100_000
+"""Kept of the odometry: more than five hours."""
+_MOST_ANCHORS = 1000
+_CONTINUED = b"COMMENT continued in "
+"""What the recorder writes at the end of a part, before the name of the next."""
+
+
+@dataclass(slots=True)
+class Sensor:
+    """What was heard of a sensor."""
+
+    count: int = 0
+    last: float = float("-inf")
+    """s, latest stamp."""
+    stamps: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_STAMPS))
+    """s, the latest of them."""
+
+    def heard(self, stamp: float) -> None:
+        """Take a message."""
+        self.count += 1
+        self.last = max(self.last, stamp)
+        self.stamps.append(stamp)
+
+    def rate(self, now: float) -> float:
+        """Return messages per second over the window before a time of the log."""
+        recent = sum(stamp > now - WINDOW for stamp in self.stamps)
+        span = min(WINDOW, max(now - self.stamps[0], 1.0)) if self.stamps else WINDOW
+        return recent / span
+
+
+class LogTail:
+    """A log that is being written.
+
+    Parameters
+    ----------
+    path : its first part, which need not be there yet.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.restarts = 0
+        """How often the log began anew: it was replaced, or became shorter."""
+        self._file: GrowingFile | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self.sensors: dict[str, Sensor] = {}
+        self.anchors: dict[str, Sensor] = {}
+        self.bytes = self.broken = 0
+        self.first, self.last = float("inf"), float("-inf")
+        self._odometry = array("d")
+        self._latest: tuple[float, ...] = ()
+        self._carry = b""
+        self._following = ""
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first stamp to the last, s."""
+        return max(self.last - self.first, 0.0)
+
+    def odometry(self) -> tuple[Floats, Floats]:
+        """Return stamps (n,), s, and poses (n, 3), m, m, rad, of the wheels, a few a second and the latest."""
+        newer = self._latest if self._latest and self._latest[0] > self._odometry[-4] else ()
+        table = np.array([*self._odometry, *newer]).reshape(-1, 4)
+        return table[:, 0], table[:, 1:]
+
+    def poll(self) -> bool:
+        """Read what is new, up to a bound; return whether there was anything.
+
+        A file that cannot be read now is as one that has not grown.
+        """
+        try:
+            data = self._read()
+        except (OSError, FormatError):
+            return False
+        self._take(data)
+        return bool(data)
+
+    def _read(self) -> bytes:
+        if self._file is None or self._replaced():
+            if not os.path.isfile(self.path):
+                return b""
+            opened = GrowingFile(self.path, whole=True)
+            if self._file is not None:
+                self._file.close()
+                self._anew()
+            self._file, self._first = opened, os.stat(self.path)
+        before = self._file.restarts
+        data = self._file.read()
+        if not data and self._following and self._file.go_on_in(self._following):
+            self._carry, self._following = b"", ""
+            data = self._file.read()
+        if self._file.restarts > before:
+            self._anew()
+            self._first = os.stat(self.path)
+        return data
+
+    def _anew(self) -> None:
+        self.restarts += 1
+        self._begin()
+
+    def _replaced(self) -> bool:
+        """Tell whether the first part is another file than before, while a later one is read."""
+        if self._file is None or os.fspath(self._file.path) == self.path or not os.path.isfile(self.path):
+            return False
+        return not os.path.samestat(os.stat(self.path), self._first)
+
+    def _take(self, data: bytes) -> None:
+        self.bytes += len(data)
+        *lines, self._carry = (self._carry + data).split(b"\n")
+        if len(self._carry) > MAX_LINE_BYTES:
+            self._carry = b""
+        for line in lines:
+            try:
+                self._message(line)
+            except (ValueError, IndexError):
+                self.broken += 1
+
+    def _message(self, line: bytes) -> None:
+        name = line[: line.find(b" ")]
+        sensor = _sensor_of(name)
+        if not sensor:
+            if line.startswith(_CONTINUED):
+                self._following = line[len(_CONTINUED) :].decode("utf-8", "replace").strip()
+            return
+        stamp = stamp_of(line.rsplit(None, 3)[1:])
+        self.first, self.last = min(self.first, stamp), max(self.last, stamp)
+        self.sensors.setdefault(sensor, Sensor()).heard(stamp)
+        if sensor == "radio":
+            anchor = line.split(None, 2)[1].decode("utf-8", "replace")
+            if anchor in self.anchors or len(self.anchors) < _MOST_ANCHORS:
+                self.anchors.setdefault(anchor, Sensor()).heard(stamp)
+        elif sensor == "odometry":
+            self._pose(stamp, numbers(line.split(None, 4)[1:4], "odometry", 3))
+
+    def _pose(self, stamp: float, pose: list[float]) -> None:
+        kept, self._latest = self._odometry, (stamp, *pose)
+        if len(kept) < 4 * _MOST_POSES and (not kept or stamp >= kept[-4] + _ODOMETRY_STEP):
+            kept.extend((stamp, *pose))
+
+
+def _sensor_of(name: bytes) -> str:
+    """Return which sensor a message is of; "" of none."""
+    if name == b"ODOM":
+        return "odometry"
+    if name[:3] == b"UWB" and (len(name) == 3 or name[3:].isdigit()):
+        return "radio"
+    if name in (b"ROBOTLASER1", b"RAWLASER1", b"FLASER"):
+        return "lidar"
+    return "gyro" if name == b"GYRO" else ""

@@ -1,0 +1,120 @@
+"""What to do while the robot still drives, the most useful first: pure rules over a recording's state and its latest map."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..io.stored_result import StoredResult
+
+SILENT = 3.0
+"""s without a message of a sensor that was heard before, or five of its periods where that is longer."""
+_NOT_GROWING = 10.0
+"""s after which a log that does not grow is told."""
+_NEVER_HEARD = 15.0
+"""s of recording after which a sensor that was never heard is told."""
+_ANCHOR_LOST = 60.0
+"""s without a range of an anchor that was heard before."""
+_FAR = 0.5
+"""m; a sigma of an anchor beyond which more ranges from other sides are worth the way."""
+_OPEN_LOOP = 30.0
+"""m driven since the last loop closure, beyond which closing the next is worth the way."""
+_DRIFTED = 0.3
+"""m; a sigma of the robot beyond which closing a loop is worth the way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A sensor of the recording."""
+
+    count: int
+    rate: float
+    """Per second over the last seconds."""
+    silent: float
+    """s that other sensors have been heard since its last message."""
+
+
+def advice(
+    sensors: Mapping[str, Heard], anchors: Mapping[str, float], recorded: float, at_rest: float, result: StoredResult | None
+) -> list[str]:
+    """Return sentences in the order of their worth.
+
+    Parameters
+    ----------
+    sensors : by name: odometry, lidar, radio, gyro.
+    anchors : s since each anchor was heard.
+    recorded : length of the recording, s.
+    at_rest : s since the log has grown.
+    result : the latest map; None = there is none yet.
+    """
+    found = _about_sensors(sensors, recorded, at_rest)
+    if result is not None:
+        found += _about_anchors(result) + _about_loops(result) + _about_doubts(result)
+    if at_rest < _NOT_GROWING and "radio" in sensors and sensors["radio"].silent < SILENT:
+        gone = sorted(name for name, silent in anchors.items() if silent > _ANCHOR_LOST)
+        if gone:
+            found.append(f"not heard for more than a minute: {_listed(gone)}; out of reach, or without power")
+    return found
+
+
+def silent_after(heard: Heard) -> float:
+    """Return the silence of a sensor that is worth a word, s."""
+    return max(SILENT, 5.0 / heard.rate) if heard.rate > 0.0 else SILENT
+
+
+def _about_sensors(sensors: Mapping[str, Heard], recorded: float, at_rest: float) -> list[str]:
+    if not sensors:
+        return ["nothing is recorded yet: is the recorder running, and is this its log?"]
+    if at_rest > _NOT_GROWING:
+        return [f"the log has not grown for {at_rest:.0f} s: is the recorder still running?"]
+    late = sorted(((s.silent, name) for name, s in sensors.items() if s.silent > silent_after(s)), reverse=True)
+    found = [f"nothing heard from the {name} for {silent:.0f} s: check its cable and power" for silent, name in late]
+    missing = [name for name in ("odometry", "lidar", "radio") if name not in sensors and recorded > _NEVER_HEARD]
+    return found + [f"nothing was heard from the {name} at all: it is not recorded, or it is silent" for name in missing]
+
+
+def _about_anchors(result: StoredResult) -> list[str]:
+    found = [
+        f"anchor {a.id} may be mirrored: drive a curve near it" for a in result.anchors if a.status == "mirror-ambiguous"
+    ]
+    found += [
+        f"anchor {a.id} has no place yet: drive around it, within its reach" for a in result.anchors if a.status == "unplaced"
+    ]
+    vague = [(float(np.sqrt(np.linalg.eigvalsh(a.covariance)[-1])), a.id) for a in result.anchors if _placed(a.covariance)]
+    worst = sorted((v for v in vague if v[0] > _FAR), reverse=True)
+    return found + [f"anchor {name} is known to {sigma:.1f} m only: pass it on another side" for sigma, name in worst[:2]]
+
+
+def _placed(covariance: np.ndarray) -> bool:
+    return bool(np.isfinite(covariance).all())
+
+
+def _about_loops(result: StoredResult) -> list[str]:
+    stamps, poses = result.trajectories[-1]
+    if len(stamps) < 2 or result.grid is None:
+        return []
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    own = len(result.trajectories)
+    closed = [t for c in result.closures if c.accepted for t, r in zip(c.stamps, c.recordings, strict=True) if r == own]
+    since = float(steps[stamps[1:] > max(closed, default=-np.inf)].sum())
+    drift = float(np.sqrt(np.trace(result.keyframe_covariances[-1][:2, :2]))) if len(result.keyframe_covariances) else 0.0
+    if not closed and since > _OPEN_LOOP:
+        return ["come back to the start to close the loop: no place has been seen twice yet"]
+    if drift > _DRIFTED:
+        return [f"the robot's place is known to {drift:.1f} m only: come back to a place seen before to close the loop"]
+    if since > 2.0 * _OPEN_LOOP:
+        return [f"no loop was closed on the last {since:.0f} m: come back to a place seen before"]
+    return []
+
+
+def _about_doubts(result: StoredResult) -> list[str]:
+    return [f"the map is doubted: {text_of(d)}" for d in result.report.get("doubts") or ()]
+
+
+def text_of(notice: object) -> str:
+    """Return the words of a doubt or warning, which may be a text or a table with a text."""
+    return str(notice.get("text", "")) if isinstance(notice, dict) else str(notice)
+
+
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,129 @@
+"""A page that shows a map and what happens on it now: `uwblite watch`, and a robot that is being localised."""
+
+import os
+import secrets
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats
+from ..constraints import Constraints
+from ..io.log_tail import LogTail, Sensor
+from ..io.stored_result import StoredResult
+from .advice import Heard, advice, silent_after
+from .feed import Feed
+from .live_page import live_page
+from .requests import HTML, PNG, Response, refusal, text_response
+from .runs import described, run_of
+
+_TRAIL = 300
+"""Points of the way since the latest map."""
+
+
+class LivePage:
+    """The page's state; threads may show and serve at will.
+
+    Parameters
+    ----------
+    title : of the page.
+    """
+
+    def __init__(self, title: str) -> None:
+        self.host = ""
+        self.names: tuple[str, ...] | None = None
+        self.feed = Feed()
+        self._title = title
+        self._token = secrets.token_urlsafe(24)
+        self._picture: bytes | None = None
+        self._maps = 0
+
+    def show_map(self, result: StoredResult | None) -> None:
+        """Show another map, or with None no map any more."""
+        if result is None:
+            self._picture = None
+            empty: dict[str, Any] = {name: [] for name in ("paths", "anchors", "doubts", "warnings")}
+            self.feed.publish("map", empty | {"image": None, "accepted": 0, "candidates": 0})
+            return
+        run = run_of(result)
+        self._picture = run.grid_png
+        self._maps += 1
+        shown = described(run, Constraints())
+        kept = ("name", "doubts", "warnings", "image", "paths", "accepted", "candidates")
+        anchors = [
+            entry | {"covariance": a.covariance.tolist() if np.isfinite(a.covariance).all() else None}
+            for entry, a in zip(shown["anchors"], result.anchors, strict=True)
+        ]
+        version = f"{self._token[:8]}-{self._maps}"
+        self.feed.publish("map", {name: shown[name] for name in kept} | {"anchors": anchors, "version": version})
+
+    def show_status(self, status: Mapping[str, Any]) -> None:
+        """Show what is true now: summary, advice, sensors, pose, trail; see `watch_status`."""
+        self.feed.publish("status", dict(status))
+
+    def handle(self, method: str, target: str, headers: dict[str, str], body: bytes = b"") -> Response:
+        """Answer a request; nothing can be changed."""
+        if refused := refusal(self, self._token, method, headers):
+            return refused
+        path = urlsplit(target).path if target.startswith("/") else ""
+        if path == "/":
+            return Response(200, HTML, live_page(self._title).encode())
+        if path == "/events":
+            return Response(200, "text/event-stream", b"", stream=self.feed.events)
+        if path == "/grid.png" and self._picture is not None:
+            return Response(200, PNG, self._picture)
+        return text_response("there is no such page", 404)
+
+
+def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rounds: str) -> dict[str, Any]:
+    """Return what the page of a growing log says now.
+
+    Parameters
+    ----------
+    tail : the log.
+    result : the latest map.
+    at_rest : s since the log has grown.
+    rounds : words about the latest map and the next.
+    """
+    sensors = {name: _heard(sensor, tail.last) for name, sensor in sorted(tail.sensors.items())}
+    anchors = {name: tail.last - sensor.last for name, sensor in tail.anchors.items()}
+    summary = f"{os.path.basename(tail.path)}: {tail.seconds:.0f} s, {tail.bytes / 1e6:.1f} MB"
+    summary += f", {tail.broken} broken lines" if tail.broken else ""
+    summary += ", begun anew" if tail.restarts else ""
+    trail = _trail(tail, result)
+    return {
+        "summary": summary,
+        "rounds": rounds,
+        "advice": advice(sensors, anchors, tail.seconds, at_rest, result),
+        "sensors": [
+            {"name": name, "count": s.count, "rate": 0.0 if late else round(s.rate, 1), "silent": round(s.silent), "late": late}
+            for name, s in sensors.items()
+            for late in [s.silent > silent_after(s)]
+        ],
+        "anchors": {name: round(sensor.rate(tail.last), 1) for name, sensor in tail.anchors.items()},
+        "pose": None if trail is None else trail[-1].round(3).tolist(),
+        "trail": [] if trail is None else trail[:, :2].round(2).tolist(),
+    }
+
+
+def _heard(sensor: Sensor, now: float) -> Heard:
+    """Return what was heard of a sensor; of a silent one the rate is the one that it had."""
+    return Heard(sensor.count, sensor.rate(sensor.last), now - sensor.last)
+
+
+def _trail(tail: LogTail, result: StoredResult | None) -> Floats | None:
+    """Return the poses (k, 3) since the latest map ends, by the odometry, in the map's frame; None without a map."""
+    if result is None:
+        return None
+    stamps, poses = result.trajectories[-1]
+    times, wheels = tail.odometry()
+    later = times > stamps[-1]
+    if not len(times) or times[0] > stamps[-1] or not later.any():
+        return poses[-1:]
+    end = se2.interpolate_trajectory(times, wheels, stamps[-1])
+    chosen = np.flatnonzero(later)[:: max(int(later.sum()) // _TRAIL, 1)]
+    chosen = np.union1d(chosen, [len(times) - 1])
+    T_map_odom = se2.compose(poses[-1], se2.inverse(end))
+    return np.concatenate([poses[-1:], se2.compose(T_map_odom, wheels[chosen])])

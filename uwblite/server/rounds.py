@@ -1,0 +1,82 @@
+"""When a growing log is mapped again, and from how many of its scans.
+
+The cost of a round is processor time, expected from the last one by the law
+
+    c(T, n) ~ (T0 + T) share(n),    share(n) = min(1, (8 / n)^0.4)
+
+for T seconds of recording and every n-th scan; T0 stands for what any round takes. Up to every 8th scan the same keyframes
+are mapped, whence the 8. (Measured: a hall of 15 minutes takes 10 s with every 8th scan and 5.8 s with every 30th, one of
+5 minutes 4.6 s.) Scans are thinned out until a round fits into a tenth of PATIENCE; where that is not enough, rounds become
+rarer. In either case a round is expected to take a tenth of the time since the last one at most, so that mapping takes a
+tenth of one core and the recorder keeps the rest.
+"""
+
+from dataclasses import dataclass
+
+SHARE = 0.1
+"""Of the time that may go into rounds."""
+PATIENCE = 60.0
+"""s that a person waits for a new map; beyond, scans are left out rather than waited for."""
+LEAST_PAUSE = 10.0
+"""s between rounds."""
+LEAST_NEWS = 5.0
+"""s of recording that must be new."""
+FIRST_AFTER = 20.0
+"""s of recording before the first round: less shows no map."""
+AT_REST = 60.0
+"""s without growth after which the recording counts as finished, and is mapped from all scans."""
+_AFTER_FAILURE = 30.0
+"""s."""
+_THINNINGS = (1, 8, 16, 32)
+_SAME_KEYFRAMES, _EXPONENT = 8.0, 0.4
+_ALWAYS = 200.0
+"""s of recording that cost as much as what any round takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """A round that has ended."""
+
+    ended: float
+    """s, on the caller's clock."""
+    cost: float
+    """s of processor time that it took."""
+    recorded: float
+    """s of recording that there were when it began."""
+    every_nth_scan: int
+    failed: bool = False
+
+
+def next_thinning(last: Round | None, recorded: float, now: float, at_rest: float = 0.0) -> int | None:
+    """Return how the next round thins the scans out, or None where it is not due yet.
+
+    Parameters
+    ----------
+    last : the last round; None = this would be the first.
+    recorded : s of recording that there are.
+    now : s, on the clock of the rounds.
+    at_rest : s since the log has grown.
+    """
+    if last is None:
+        return 1 if recorded >= FIRST_AFTER else None
+    since = now - last.ended
+    if since < (_AFTER_FAILURE if last.failed else LEAST_PAUSE):
+        return None
+    if at_rest >= AT_REST:
+        best = last.every_nth_scan == 1 and last.recorded >= recorded
+        return None if best or last.failed else 1
+    if recorded - last.recorded < LEAST_NEWS and not last.failed:
+        return None
+    costs = [(n, expected_cost(last, recorded, n)) for n in _THINNINGS]
+    n, cost = next(((n, c) for n, c in costs if c <= SHARE * PATIENCE), costs[-1])
+    return n if since >= cost / SHARE else None
+
+
+def expected_cost(last: Round, recorded: float, every_nth_scan: int) -> float:
+    """Return how much processor time a round will take, s."""
+    growth = (_ALWAYS + recorded) / (_ALWAYS + last.recorded)
+    return last.cost * growth * _share(every_nth_scan) / _share(last.every_nth_scan)
+
+
+def _share(every_nth_scan: int) -> float:
+    return float(min(1.0, (_SAME_KEYFRAMES / every_nth_scan) ** _EXPONENT))
