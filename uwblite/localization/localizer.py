@@ -80,14 +80,14 @@ _CERTAIN = 6.0
 """Log-likelihood by which a place must be better than any other: 400 : 1."""
 _FORGET = -14.0
 """Log-weight below which a hypothesis goes."""
-_SIGMA_FOUND = (0.35, 0.15)
+_SIGMA_FOUND = (0.25, 0.1)
 """m and rad; a pose that is less sure is not found yet."""
-_FIT_SOUND, _FIT_LOST = 0.6, 0.35
-"""Share of the rays' ends on walls from which nothing is doubtful, and below which the pose is lost."""
+_FIT_SOUND, _FIT_LOST = -0.3, -0.7
+"""Mean log-likelihood of the last scans' rays from which nothing is doubtful, and below which the pose is lost."""
 _RANGES_FOUND, _RANGES_LOST = 0.5, 0.25
 """Share of the ranges that must agree with a start; mean weight of ranges below which the pose is lost."""
 _CONFIRM, _CONFIRM_ALONE = 0.5, 2.0
-"""m driven between two searches that agree; the second where scans have no ranges beside them."""
+"""m driven between two searches that agree; the second where scans or ranges are alone."""
 _FIT_BESIDE_RANGES, _FIT_ALONE = -0.7, -0.25
 """Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.15, with people
 close by -0.5; rooms that are alike in part reach -0.3."""
@@ -155,7 +155,7 @@ class Localizer:
         self._search_stamp = -np.inf
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
-        self._fit = self._heard = 1.0
+        self._fit, self._heard = 0.0, 1.0
         self._trust = np.full((len(known.anchors.ids), 2), (1.0, 0.0))
         self._reason = "nothing has been measured yet"
         self.strangers: dict[str, int] = {}
@@ -222,8 +222,8 @@ class Localizer:
         if not self._certain:
             off = se2.between(np.zeros(3), bank.poses - bank.poses[best])
             covariance = np.einsum("h,hij->ij", share, bank.pose_covariances + off[:, :, None] * off[:, None, :])
-        fit = self._fit if self._sees() else self._heard
-        quality = float(share[best]) * float(np.clip(fit / _FIT_SOUND, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
+        fit = np.exp(self._fit - _FIT_SOUND) if self._sees() else self._heard / _RANGES_FOUND
+        quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
         covariance = covariance + np.diag(np.square(_SIGMA_MAP))
         others = bank.poses[order[1:]]
         reason = "" if self._certain else self._reason
@@ -306,7 +306,7 @@ class Localizer:
             self._bank = hypotheses.weighed(self._bank, _SCAN_EVIDENCE * min(driven, 1.0) * found.log_likelihood)
         best = int(np.argmax(self._bank.log_weight))
         if found.known[best] >= _FEW_ENDS:
-            self._fit += _FORGETTING * (float(found.on_wall[best]) - self._fit)
+            self._fit += _FORGETTING * (float(found.log_likelihood[best]) - self._fit)
 
     def _rays(self, stamp: float, readings: Floats, scanner: Scanner) -> Rays:
         """Return thinned rays in the present frame of the base, each moved by the odometry at its own time."""
@@ -371,7 +371,7 @@ class Localizer:
         heard = _agreeing(pose, ranges)
         self._reason = self._doubt(best, found.complete, float(fit[best]), float(known[best]), heard)
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
-        self._decide(pose, _CONFIRM if heard.enough else _CONFIRM_ALONE)
+        self._decide(pose, _CONFIRM if heard.enough and known[best] >= _FEW_ENDS else _CONFIRM_ALONE)
 
     def _with_places(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
         """Return the hypotheses with new ones where none is near."""
@@ -421,7 +421,7 @@ class Localizer:
             if same and self._way - way >= confirm:
                 self._certain = True
                 self._bank = hypotheses.pruned(self._bank, 1, -1.0)
-                self._fit = self._heard = 1.0
+                self._fit, self._heard = 0.0, 1.0
                 self._trust[:] = (1.0, 0.0)
                 return
             if same:
