@@ -190,6 +190,7 @@ def line_of(state: "LocalizerState") -> str:
         "covariance": [[float(f"{v:.4g}") for v in row] for row in state.covariance.tolist()],
         "quality": round(state.quality, 3),
         "lost": state.lost,
+        "odometry": [round(v, 5) for v in state.odometry.tolist()],
     }
     if state.reason:
         fields["reason"] = state.reason

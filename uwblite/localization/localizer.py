@@ -53,6 +53,8 @@ class LocalizerState:
     """(3, 3) m, m, rad; map frame; of all hypotheses together while there are several."""
     quality: float
     """0..1: how likely this pose is against all others, times how well the last measurements agree with the map there."""
+    odometry: Floats
+    """(3,) T_odom_base at the same time, as the wheels have it: pose * odometry^-1 is T_map_odom."""
     lost: bool
     """The pose is not known; what stands in `pose` is the best guess."""
     reason: str = ""
@@ -211,9 +213,11 @@ class Localizer:
         """Return the pose at the time of the last odometry."""
         bank = self._bank
         stamp = self._odometer.stamp
+        odometry = self._odometer.pose.copy() if len(self._odometer) else np.full(3, np.nan)
         if not len(bank):
             nothing = np.full((3, 3), np.nan)
-            return LocalizerState(stamp, np.full(3, np.nan), nothing, 0.0, True, self._reason, moved_anchors=self._moved())
+            nowhere = np.full(3, np.nan)
+            return LocalizerState(stamp, nowhere, nothing, 0.0, odometry, True, self._reason, moved_anchors=self._moved())
         order = np.argsort(-bank.log_weight, kind="stable")
         best = int(order[0])
         share = np.exp(bank.log_weight)
@@ -224,11 +228,10 @@ class Localizer:
             covariance = np.einsum("h,hij->ij", share, bank.pose_covariances + off[:, :, None] * off[:, None, :])
         fit = np.exp(self._fit - _FIT_SOUND) if self._sees() else self._heard / _RANGES_FOUND
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
-        covariance = covariance + np.diag(np.square(_SIGMA_MAP))
-        others = bank.poses[order[1:]]
         reason = "" if self._certain else self._reason
+        pose, covariance = bank.poses[best].copy(), covariance + np.diag(np.square(_SIGMA_MAP))
         return LocalizerState(
-            stamp, bank.poses[best].copy(), covariance.copy(), quality, not self._certain, reason, others, self._moved()
+            stamp, pose, covariance, quality, odometry, not self._certain, reason, bank.poses[order[1:]], self._moved()
         )
 
     def _moved(self) -> tuple[str, ...]:
