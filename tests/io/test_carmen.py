@@ -218,6 +218,34 @@ def test_the_commonest_geometry_wins(tmp_path):
     assert "another geometry" in log.notes.warnings[0]
 
 
+def flaser(ranges, stamp):
+    return f"FLASER {len(ranges)} {' '.join(f'{r:.3f}' for r in ranges)} 0 0 0 0 0 0 {stamp} robot {stamp}\n"
+
+
+def test_scans_of_another_number_of_beams_are_resampled(tmp_path):
+    """180 and 181 beams of one SICK: beam k points the same way, and the last one is unknown or left out."""
+    reach = 2.0 + 0.01 * np.arange(181)
+    most, few = [flaser(reach[:180], k) for k in (0, 2, 4)], [flaser(reach, k) for k in (1, 3)]
+    log = read(tmp_path, odometry() + most[0] + few[0] + most[1] + few[1] + most[2])
+    assert log.scans.stamps.tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(log.scans.ranges, np.tile(reach[:180], (5, 1)), atol=1e-6)
+    assert any("2 of 5 scans have other beams than most; they were resampled to 180" in w for w in log.notes.warnings)
+    log = read(tmp_path, odometry() + few[0] + most[0] + few[1])
+    assert log.scans.ranges.shape == (3, 181)
+    assert np.isnan(log.scans.ranges[:, 180]).tolist() == [True, False, False]
+
+
+def test_an_increment_of_one_beam_too_few_is_said(tmp_path):
+    def scan(beams, increment):
+        numbers = f"{-np.pi / 2:.6f} {np.pi:.6f} {increment:.9f} 80 0.01 0 {beams} {' '.join(['2.0'] * beams)} 0"
+        return f"ROBOTLASER1 0 {numbers} 0 0 0 0 0 0 0 0 0 0 0 1.0 robot 1.0\n"
+
+    warnings = read(tmp_path, odometry() + scan(180, np.pi / 179)).notes.warnings
+    assert any("180 beams are said to be 1.0056 degrees apart; 1 would be usual" in w for w in warnings)
+    for beams, increment in ((180, np.pi / 180), (181, np.pi / 180), (361, np.pi / 360), (667, 0.006)):
+        assert not read(tmp_path, odometry() + scan(beams, increment)).notes.warnings
+
+
 def test_robot_poses_stand_in_for_missing_odometry(tmp_path):
     lines = [robotlaser(READINGS, k, laser=f"{k + 0.1} 0 0", robot=f"{k} 0 0") for k in range(4)]
     log = read(tmp_path, "".join(lines))

@@ -4,14 +4,16 @@ import contextlib
 import dataclasses
 import sqlite3
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.results import small_log
 
 from uwblite.errors import ConfigError, FormatError, UwbliteError
+from uwblite.io.bag_topics import TopicPlan
 from uwblite.io.carmen import read_log
-from uwblite.io.rosbag import BagTopics, plan_bag, read_bag
+from uwblite.io.rosbag import BagTopics, _Collector, plan_bag, read_bag
 from uwblite.io.rosbag_writer import write_bag
 from uwblite.io.uwb_mapping import UwbMapping, parse_mappings
 from uwblite.sensor_log import Gyro, LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
@@ -270,3 +272,29 @@ def test_a_database_that_is_no_bag(tmp_path):
     with pytest.raises(UwbliteError):
         read_bag(tmp_path / "x.db3")
     assert [p.name for p in tmp_path.iterdir()] == ["x.db3"]
+
+
+def test_scans_of_another_number_of_beams_are_resampled():
+    """A spinning lidar in a round room; scans that look elsewhere are of another one."""
+    def message(stamp, beams, first=-np.pi):
+        time = SimpleNamespace(sec=stamp, nanosec=0)
+        return SimpleNamespace(
+            header=SimpleNamespace(stamp=time, frame_id="laser"), angle_min=first, angle_increment=2 * np.pi / beams,
+            time_increment=0.0, range_min=0.1, range_max=8.0, ranges=np.full(beams, 3.0, dtype=np.float32),
+        )  # fmt: skip
+
+    found = _Collector(TopicPlan("/odom", "/scan", {}, (), (), {}))
+    for stamp, beams in enumerate([672, 679, 0, 682, 672], start=1):
+        found.take("/scan", float(stamp), message(stamp, beams) if beams else replace_ranges(message(stamp, 672)))
+    found.take("/scan", 6.0, message(6, 400, first=0.0))
+    assert found._scans().ranges.shape == (4, 672)
+    assert (found._scans().ranges == 3.0).all()
+    assert [w for w in found._warnings(0) if "scans" in w] == [
+        "2 scans of another geometry were skipped",
+        "2 of 4 scans have other beams than most; they were resampled to 672 beams",
+    ]
+
+
+def replace_ranges(message):
+    """The message without readings."""
+    return SimpleNamespace(**{**vars(message), "ranges": np.zeros(0, dtype=np.float32)})

@@ -14,6 +14,7 @@ from ..sensor_log import LaserScans
 from .carmen_messages import BrokenLine, numbers, stamp_of, time_order
 from .carmen_params import Params
 from .carmen_readings import Block, Pending
+from .scan_geometry import ScanGeometry, resampled, resampling_warning
 
 DEFAULT_RANGE_MIN = 0.02
 """m; what a scanner reports below is an error code (URG-04LX: 0..19 mm). PARAM laser_range_min wins."""
@@ -171,37 +172,66 @@ class LaserMessages:
     def finish(
         self, params: Params, skipped: dict[str, int], warnings: list[str], set_back: dict[str, float] | None = None
     ) -> tuple[LaserScans | None, Floats | None]:
-        """Return the scans of the commonest layout, sorted by time, and T_base_laser where the messages give it."""
+        """Return the scans in the geometry of most of them, sorted by time, and T_base_laser where the messages give it."""
         for name, count in self._counts.items():
             if count and name != self._kind:
                 skipped[name.decode()] = count
         kept = max(self._scans, key=lambda layout: self._scans[layout].seen, default=None)
         if kept is None or not len(self._scans[kept].stamps):
             return None, None
-        what = self._kind.decode()
-        others = sum(scans.seen for layout, scans in self._scans.items() if layout != kept)
-        scans = self._scans[kept]
-        self._scans = {}
+        what, geometry = self._kind.decode(), self._geometry(kept, params)
+        range_min = params.get("laser_range_min")
+        range_min = DEFAULT_RANGE_MIN if range_min is None else range_min
+        range_max = self._reach(kept, params)
+        stamps, ranges = self._merged(kept, params, range_min, skipped, warnings)
+        order = time_order(stamps, what, warnings, set_back)
+        time_increment = params.get("laser_time_increment")
+        if time_increment is None:
+            period = stamps[order] * 1.0
+            time_increment = _sweep_of_urg(kept.beams, geometry.angle_increment, range_max, period, self._every_nth)
+        if np.any(np.diff(order) != 1):
+            ranges = ranges[order]
+        increment = geometry.angle_increment
+        laser = LaserScans(stamps[order], ranges, geometry.angle_min, increment, time_increment, range_min, range_max)
+        warnings.extend(_fence_posts(laser))
+        return laser, self._mounting(what, warnings)
+
+    def _geometry(self, layout: _Layout, params: Params) -> ScanGeometry:
+        """Return where the beams of messages of a layout point."""
+        told = (layout.angle_min, layout.angle_increment)
+        return ScanGeometry(*(told if self._kind != b"FLASER" else params.guess_scanner(layout.beams)), layout.beams)
+
+    def _reach(self, layout: _Layout, params: Params) -> float:
+        """Return the range, m, from which a reading saw nothing."""
+        given = params.get("robot_front_laser_max", "laser_front_laser_max_range")
+        return layout.range_max or given or DEFAULT_RANGE_MAX
+
+    def _merged(
+        self, kept: _Layout, params: Params, range_min: float, skipped: dict[str, int], warnings: list[str]
+    ) -> tuple[Floats, NDArray[np.float32]]:
+        """Return stamps (k,) and cleaned readings (k, b) of all scans of the lidar, in the geometry of one layout."""
+        what, want = self._kind.decode(), self._geometry(kept, params)
+        stamps, parts, thinned, others, resized = [], [], 0, 0, 0
+        for layout in sorted(self._scans, key=lambda layout: layout != kept):
+            scans, have = self._scans.pop(layout), self._geometry(layout, params)
+            if not want.is_of_one_lidar_with(have):
+                others += scans.seen
+                continue
+            thinned += scans.seen - len(scans.stamps)
+            cleaned = _cleaned(scans.ranges, layout.beams, range_min, self._reach(layout, params))
+            if have != want:
+                resized += len(cleaned)
+                cleaned = resampled(cleaned, have, want)
+            stamps.append(np.array(scans.stamps))
+            parts.append(cleaned)
         if others:
             skipped[f"{what} of another geometry"] = others
             warnings.append(f"{others} {what} messages have another geometry than the commonest and are not used")
-        if scans.seen > len(scans.stamps) and self._every_nth > 1:
-            skipped[f"{what} thinned out"] = scans.seen - len(scans.stamps)
-        stamps = np.array(scans.stamps)
-        order = time_order(stamps, what, warnings, set_back)
-        angle_min, increment = (kept.angle_min, kept.angle_increment) if what != "FLASER" else params.guess_scanner(kept.beams)
-        given = params.get("robot_front_laser_max", "laser_front_laser_max_range")
-        range_max = kept.range_max or given or DEFAULT_RANGE_MAX
-        range_min = params.get("laser_range_min")
-        range_min = DEFAULT_RANGE_MIN if range_min is None else range_min
-        time_increment = params.get("laser_time_increment")
-        if time_increment is None:
-            time_increment = _sweep_of_urg(kept.beams, increment, range_max, stamps[order] * 1.0, self._every_nth)
-        ranges = _cleaned(scans.ranges, kept.beams, range_min, range_max)
-        if np.any(np.diff(order) != 1):
-            ranges = ranges[order]
-        laser = LaserScans(stamps[order], ranges, angle_min, increment, time_increment, range_min, range_max)
-        return laser, self._mounting(what, warnings)
+        if resized:
+            warnings.append(resampling_warning(resized, sum(map(len, stamps)), kept.beams))
+        if thinned and self._every_nth > 1:
+            skipped[f"{what} thinned out"] = thinned
+        return np.concatenate(stamps), parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _mounting(self, what: str, warnings: list[str]) -> Floats | None:
         rows = np.array(self._poses).reshape(-1, 7)
@@ -224,6 +254,26 @@ class LaserMessages:
             )
         # The poses are written to the micrometre; more digits would be noise.
         return np.round(middle, 6)
+
+
+def _fence_posts(scans: LaserScans) -> list[str]:
+    """Say where an increment looks like the field of view divided by one beam too few, as logs of SICK scanners have it."""
+    beams, degrees = scans.ranges.shape[1], math.degrees(abs(scans.angle_increment))
+    true = degrees * (beams - 1) / max(beams, 1)
+    usual = min(_USUAL_STEPS, key=lambda step: abs(step - true))
+    if beams < _FEW_BEAMS or abs(true - usual) > 1e-4 * usual:
+        return []
+    return [
+        f"{beams} beams are said to be {degrees:.4f} degrees apart; {usual:g} would be usual, with {beams + 1} beams over "
+        f"{usual * beams:g} degrees. The log is believed; if it is a SICK's, turns come out {1 / beams:.1%} too large: "
+        f"write {math.radians(usual):.9f} rad as angular_resolution"
+    ]
+
+
+_USUAL_STEPS = (0.25, 0.5, 1.0)
+"""Angles between beams of SICK scanners, degrees."""
+_FEW_BEAMS = 90
+"""Fewer beams than any of these scanners has."""
 
 
 def _parse_head(name: bytes, tokens: list[bytes]) -> _Layout:

@@ -23,6 +23,7 @@ from .bag_frames import Frames, planar
 from .bag_topics import GUESSED, ODOMETRY, BagTopic, BagTopics, TopicPlan, plan_topics, unread_warning
 from .files import sha256_of
 from .optional_packages import missing_package
+from .scan_geometry import ScanGeometry, resampled, resampling_warning
 from .uwb_mapping import UwbMapping, readings_of, short_type
 
 _SAMPLES = 20
@@ -115,6 +116,8 @@ class _Collector:
     laser_frame: str = ""
     tag_frames: Counter[str] = field(default_factory=Counter)
     odd_scans: int = 0
+    resized: int = 0
+    """Scans that were resampled to the geometry of the first."""
     unstamped: int = 0
     late: list[float] = field(default_factory=list)
 
@@ -151,12 +154,21 @@ class _Collector:
 
     def _take_scan(self, recorded: float, message: Any) -> None:
         layout = (message.angle_min, message.angle_increment, message.time_increment, message.range_min, message.range_max)
-        readings = np.asarray(message.ranges, dtype=np.float32)
-        if not self.layout:
-            self.layout, self.laser_frame = (*layout, float(len(readings))), message.header.frame_id
-        if len(readings) != self.layout[5] or abs(layout[0] - self.layout[0]) > 1e-3 or abs(layout[1] - self.layout[1]) > 1e-6:
+        readings = _cleaned(np.array(message.ranges, dtype=np.float32), *layout[3:])
+        if not len(readings):
             self.odd_scans += 1
             return
+        if not self.layout:
+            self.layout, self.laser_frame = (*layout, float(len(readings))), message.header.frame_id
+        have = ScanGeometry(layout[0], layout[1], len(readings))
+        want = ScanGeometry(self.layout[0], self.layout[1], int(self.layout[5]))
+        turned = abs(layout[0] - want.angle_min) > 1e-3 or abs(layout[1] - want.angle_increment) > 1e-6
+        if len(readings) != want.beams or turned:
+            if not want.is_of_one_lidar_with(have):
+                self.odd_scans += 1
+                return
+            self.resized += 1
+            readings = resampled(readings[None], have, want)[0]
         self.scans.append((self._time(message.header.stamp, recorded), readings))
 
     def log(self, path: str, sha256: str) -> SensorLog:
@@ -195,11 +207,6 @@ class _Collector:
         stamps = np.array([stamp for stamp, _ in self.scans])
         order = np.argsort(stamps, kind="stable")
         readings = np.stack([self.scans[k][1] for k in order])
-        # REP-117: too near and error are not "nothing seen"; but drivers older than it write 0 for no echo.
-        with np.errstate(invalid="ignore"):
-            nothing = (readings == 0.0) | (readings >= range_max)
-            readings[~(readings >= range_min)] = np.nan
-        readings[nothing] = np.inf
         return LaserScans(stamps[order], readings, angle_min, increment, time_increment, range_min, range_max)
 
     def _mounting(self, warnings: list[str]) -> SensorMounting:
@@ -238,7 +245,21 @@ class _Collector:
             yield f"{count} ranges were left out: the anchor's id {faults[min(faults)]}"
         if self.odd_scans:
             yield f"{self.odd_scans} scans of another geometry were skipped"
+        if self.resized:
+            yield resampling_warning(self.resized, len(self.scans), int(self.layout[5]))
         if self.unstamped:
             yield f"{self.unstamped} messages carry no time; the time of recording is used"
         if self.late and abs(delay := float(np.median(self.late))) > 5.0:
             yield f"headers and recording differ by {delay:.1f} s: the sensors' computers have other clocks"
+
+
+def _cleaned(readings: NDArray[np.float32], range_min: float, range_max: float) -> NDArray[np.float32]:
+    """Return readings with +inf for nothing seen and nan for too near and error, in the memory given.
+
+    REP-117 tells these apart; drivers older than it write 0 for no echo.
+    """
+    with np.errstate(invalid="ignore"):
+        nothing = (readings == 0.0) | (readings >= range_max)
+        readings[~(readings >= range_min)] = np.nan
+    readings[nothing] = np.inf
+    return readings

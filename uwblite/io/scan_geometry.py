@@ -1,0 +1,75 @@
+"""Scans of a lidar whose number of beams varies from turn to turn, brought to one geometry.
+
+Cheap spinning lidars send 672 to 682 readings a turn, as their motor runs; logs of others mix 180 and 181 beams.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Floats
+
+_SAME_VIEW = 0.03
+"""Share of the field of view by which geometries of one lidar differ at most."""
+_STEEPEST = 4.0
+"""Change of range from beam to beam, in units of range times the angle between them, up to which both are on one surface:
+one that is seen 14 degrees off its plane."""
+_NOISE = 0.05
+"""m; a change that noise alone explains."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanGeometry:
+    """Where the beams of a scan point."""
+
+    angle_min: float
+    """rad."""
+    angle_increment: float
+    """rad."""
+    beams: int
+
+    @property
+    def angles(self) -> Floats:
+        """(b,) rad."""
+        return np.asarray(self.angle_min + self.angle_increment * np.arange(self.beams), dtype=np.float64)
+
+    @property
+    def full_turn(self) -> bool:
+        """Whether the last beam is beside the first."""
+        return abs(self.beams * abs(self.angle_increment) - 2.0 * np.pi) < 1.5 * abs(self.angle_increment)
+
+    def is_of_one_lidar_with(self, other: "ScanGeometry") -> bool:
+        """Tell whether both look the same way over the same field of view, up to a few per cent or two beams."""
+        view = self.beams * self.angle_increment
+        slack = max(2.0 * abs(self.angle_increment), 2.0 * abs(other.angle_increment), _SAME_VIEW * abs(view))
+        begin = abs(self.angle_min - other.angle_min)
+        return begin <= slack and abs(view - other.beams * other.angle_increment) <= slack
+
+
+def resampled(ranges: NDArray[np.float32], have: ScanGeometry, want: ScanGeometry) -> NDArray[np.float32]:
+    """Return scans (k, b) of one geometry as another one's (k, w).
+
+    Between two beams on one surface the range is interpolated; elsewhere that of the nearer beam serves. Where no beam is
+    within half an increment, nothing is known (nan).
+    """
+    step, place = have.angle_increment, (want.angles - have.angle_min) / have.angle_increment
+    if have.full_turn:
+        place = np.mod(place + 0.5, 2.0 * np.pi / abs(step)) - 0.5
+    low = np.floor(place).astype(np.int64)
+    share = (place - low).astype(np.float32)
+    ends = np.stack([low, low + 1])
+    ends = ends % have.beams if have.full_turn else np.clip(ends, 0, have.beams - 1)
+    first, second = ranges[:, ends[0]], ranges[:, ends[1]]
+    with np.errstate(invalid="ignore"):
+        change = second - first
+        joint = np.abs(change) <= _STEEPEST * abs(step) * np.minimum(first, second) + _NOISE
+        found = np.where(joint, first + share * change, np.where(share < 0.5, first, second))
+    if not have.full_turn:
+        found[:, (place < -0.5) | (place > have.beams - 0.5)] = np.nan
+    return found.astype(np.float32)
+
+
+def resampling_warning(resized: int, scans: int, beams: int) -> str:
+    """Say that scans of another number of beams were resampled."""
+    return f"{resized} of {scans} scans have other beams than most; they were resampled to {beams} beams"
