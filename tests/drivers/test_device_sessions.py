@@ -95,7 +95,7 @@ def test_lidar_stamps_stay_within_2_ms_through_a_clock_wrap(skew):
     device, sent = lidar(ScipOptions(clock_start=(1 << 24) - 60_000, clock_skew=skew))
     rng = random.Random(0)
     delay = lambda: 0.04 if rng.random() < 0.02 else rng.expovariate(1000)  # noqa: E731
-    actions, _ = simulate(ScipDriver(), device, 120.0, jitter=delay)
+    actions, _ = simulate(ScipDriver(44, 107), device, 120.0, jitter=delay)
     scans = of_kind(actions, LaserScan)
     assert len(scans) > 1180
     assert not names(actions) & {"lidar-clock-reset", "lidar-restart"}
@@ -137,16 +137,16 @@ def test_lidar_with_scip_1_only_is_named():
     assert reopens
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_lidar_damage_costs_the_scans_that_were_damaged(seed):
     """Noise at one byte in 20,000 hits about every tenth scan; all others arrive with the right ranges."""
     device, sent = lidar()
     line = FaultyLine([parse_fault("noise=0.00005@3")], seed)
-    actions, _ = simulate(ScipDriver(), device, 60.0, line=line)
+    actions, _ = simulate(ScipDriver(), device, 40.0, line=line)
     scans = of_kind(actions, LaserScan)
     lost = sum(item.count for item in of_kind(actions, Lost))
     assert len(scans) + lost >= len(sent) - 3
-    assert 20 < lost < 130
+    assert 13 < lost < 87
     true = {tuple(v) for _, v in sent}
     wrong = sum(tuple(round(1000 * r) for r in scan.ranges) not in true for scan in scans)
     assert wrong == 0
@@ -253,7 +253,7 @@ def test_tag_settings_that_hurt_are_named():
     assert {"stationary-detection", "not-joined"} <= names(actions)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_tag_on_a_bad_cable_logs_nothing_wrong(seed):
     """One byte in a hundred is changed and TLV has no sum: reading twice keeps wrong ranges out of the log."""
     device, sent = tag(seed=seed)
@@ -427,7 +427,7 @@ def test_tag_on_a_slow_link_is_stamped_within_what_is_stated(latency, tick, spre
     assert len(epochs) > 0.97 * begun
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_tag_on_a_link_whose_delay_comes_and_goes(seed):
     """A busy computer: for seconds every answer takes up to 70 ms. No fix is logged twice, each lies within its bracket."""
     device, sent = tag(seed=seed)

@@ -119,7 +119,7 @@ def test_distances_that_no_module_sends_are_damage(readings):
 
 def test_memory_is_bounded():
     protocol = TlvProtocol()
-    for k in range(3000):
+    for k in range(900):
         protocol.feed(RNG.randbytes(997) if k % 3 else b"\x40\x01\x00\x49\xf1\x0c" * 100, 0.0)
         assert len(protocol.held.data) < 800
         assert len(protocol.held._marks) < 800

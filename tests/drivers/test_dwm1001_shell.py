@@ -78,7 +78,7 @@ def test_captured_lines(shared_data, file, good_lines, bad_lines):
     assert sum(1 for got in events if not good(got) and isinstance(got[0], Corrupt)) == bad_lines
     frames = [line + b"\r\n" for line, got in zip(lines, events, strict=True) if good(got)]
     expected = [event for got in events for event in good(got)]
-    check_transcript(ShellProtocol, frames, expected, [b"", b"\r\n", b"\xff\x00\r\n", b"1H"])
+    check_transcript(ShellProtocol, frames, expected, [b"", b"\r\n", b"\xff\x00\r\n", b"1H"], splits=60)
 
 
 def test_captured_static_ranges_have_the_stated_spread(shared_data):

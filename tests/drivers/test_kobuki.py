@@ -167,7 +167,7 @@ def test_parts_of_any_length_are_skipped_by_their_length():
 
 @pytest.mark.parametrize("skew", [0.0, 1e-4])
 def test_odometer_follows_the_emulated_circle(skew):
-    """Ten minutes of circling: encoders and gyro are rounded to 0.09 mm and 0.01 degrees, the path is 120 m."""
+    """Four minutes of circling: encoders and gyro are rounded to 0.09 mm and 0.01 degrees, the path is 48 m."""
     world, clock = RoomWorld(), WorldClock()
     truth = []
     device = KobukiDevice(
@@ -176,7 +176,7 @@ def test_odometer_follows_the_emulated_circle(skew):
     clock.start(100.0)
     driver, errors, stamps = KobukiDriver((0.0, -1.5, 0.0)), [], []
     now, rng = 100.0, random.Random(0)
-    while now < 700.0:
+    while now < 340.0:
         for event in driver.parse(device.advance(now), now + rng.expovariate(1000.0)):
             (pose,) = driver.take(event)
             true = truth.pop(0)

@@ -1,17 +1,23 @@
 """The recorder with ports of its own making: ports that hang, come and go, and say nothing."""
 
 import itertools
+import random
 import re
 import threading
 import time
+from unittest import mock
 
 import pytest
+from helpers.device_words import WORDS
+from helpers.virtual_recording import VirtualTime
 
-from uwblite.drivers.devices import open_device
+from uwblite.drivers import link as link_module
+from uwblite.drivers.devices import DEVICES, open_device
 from uwblite.drivers.link import Link
 from uwblite.drivers.log_file import LogFile
 from uwblite.drivers.recorder import Recorder
 from uwblite.drivers.transport import open_port
+from uwblite.drivers.uwb_line import BOARDS
 from uwblite.errors import DeviceError
 
 LINES = 0.02
@@ -21,14 +27,14 @@ LINES = 0.02
 class TalkingPort:
     """A base that prints ``t,x,y,theta`` fifty times a second; without a descriptor, so that it is polled."""
 
-    def __init__(self, gone_after=None):
-        self._began, self._sent, self._gone_after = time.monotonic(), 0, gone_after
+    def __init__(self, clock, gone_after=None):
+        self._clock, self._began, self._sent, self._gone_after = clock, clock(), 0, gone_after
 
     def fileno(self):
         return None
 
     def read(self):
-        elapsed = time.monotonic() - self._began
+        elapsed = self._clock() - self._began
         if self._gone_after is not None and elapsed > self._gone_after:
             raise DeviceError("unplugged")
         out = b""
@@ -46,16 +52,48 @@ class TalkingPort:
         pass
 
 
+class Waiting:
+    """Instead of waiting for bytes, moves the clock on."""
+
+    def __init__(self, clock):
+        self._clock = clock
+
+    def select(self, timeout):
+        self._clock.now += max(1e-4, timeout)
+        return []
+
+    def close(self):
+        pass
+
+
+class OpenedAtOnce:
+    """Instead of a thread that opens a port: at once, or, where that says None, never."""
+
+    def __init__(self, open_port, url, baud):
+        try:
+            self._port = open_port(url, baud)
+        except DeviceError as error:
+            self._port = error
+
+    def result(self):
+        return self._port
+
+    def give_up(self):
+        pass
+
+
 def record(tmp_path, ports, seconds, open_one):
-    """Record and return the recorder and the notes."""
+    """Record in simulated time and return the recorder and the notes; `open_one` gets URL and clock."""
     links = [Link(name, spec, open_device(sensor, spec)[0]) for name, (sensor, spec) in ports.items()]
-    log, notes = LogFile(tmp_path / "run.log", sync=60.0), []
+    log, notes, clock = LogFile(tmp_path / "run.log", sync=60.0), [], VirtualTime()
     recorder = Recorder(
-        links, log, monotonic=time.monotonic, wall_offset=0.0, host="h", on_note=lambda t, n: notes.append((t, n)),
-        open_port=open_one,
+        links, log, monotonic=clock, wall_offset=0.0, host="h", on_note=lambda t, n: notes.append((t, n)),
+        open_port=lambda url, baud: open_one(url, clock),
     )  # fmt: skip
+    recorder._selector = Waiting(clock)
     recorder.begin([])
-    recorder.run(duration=seconds, stopping=lambda: False)
+    with mock.patch.object(link_module, "Opening", OpenedAtOnce):
+        recorder.run(duration=seconds, stopping=lambda: False)
     log.close()
     return recorder, notes
 
@@ -68,21 +106,12 @@ BASE = ("odometry", "line:/dev/base?columns=t,x,y,theta")
 
 
 def test_ports_that_hang_while_they_are_opened_hold_up_nobody(tmp_path):
-    """Two TCP bridges whose hosts are dead: each attempt takes five seconds. The base loses no line."""
-    release = threading.Event()
-
-    def open_one(url, baud):
-        if "base" in url:
-            return TalkingPort()
-        release.wait(5.0)
-        raise DeviceError(f"{url}: timed out")
-
+    """Two TCP bridges whose hosts are dead. The base loses no line."""
     ports = {"uwb": ("uwb", "tlv:socket://10.0.0.1:1"), "odometry": BASE, "lidar": ("lidar", "socket://10.0.0.2:2")}
-    recorder, _ = record(tmp_path, ports, 2.0, open_one)
-    release.set()
-    assert recorder.end - recorder.start < 2.5
+    recorder, _ = record(tmp_path, ports, 20.0, lambda url, clock: TalkingPort(clock) if "base" in url else None)
+    assert recorder.end - recorder.start < 20.1
     stamps = stamps_of(tmp_path / "run.log")
-    assert len(stamps) > 0.9 * 2.0 / LINES
+    assert len(stamps) >= 20.0 / LINES - 3
     gaps = [b - a for a, b in itertools.pairwise(stamps)]
     assert sum(g == 0 for g in gaps) < 3
     counts = recorder.links[1].counts
@@ -91,28 +120,43 @@ def test_ports_that_hang_while_they_are_opened_hold_up_nobody(tmp_path):
     assert any("no data at all" in doubt for doubt in recorder.doubts())
 
 
-def test_a_port_that_opens_after_the_end_is_closed_again(tmp_path):
-    opened, release = [], threading.Event()
+def test_what_waited_in_a_port_has_no_time_and_is_dropped(tmp_path):
+    """A bridge hands out what it kept for a second before it was asked."""
+
+    def open_one(url, clock):
+        port = TalkingPort(clock)
+        port._began -= 1.0
+        return port
+
+    record(tmp_path, {"odometry": BASE}, 3.0, open_one)
+    rows = [line.split() for line in (tmp_path / "run.log").read_text().splitlines() if line.startswith("ODOM")]
+    lateness = [float(row[-3]) - float(row[1]) / 0.5 for row in rows]  # the base runs 0.01 m each 0.02 s
+    assert max(lateness) - min(lateness) < 0.03
+
+
+def test_a_port_is_opened_by_a_thread_of_its_own_and_closed_when_it_comes_too_late():
+    """Nobody waits for a bridge that takes seconds."""
+    closed, release = threading.Event(), threading.Event()
 
     class Closing(TalkingPort):
         def close(self):
-            opened.append("closed")
+            closed.set()
 
     def open_one(url, baud):
         release.wait(5.0)
-        return Closing()
+        return Closing(time.monotonic)
 
-    record(tmp_path, {"odometry": BASE}, 0.3, open_one)
+    began = time.monotonic()
+    opening = link_module.Opening(open_one, "socket://far:1", 115200)
+    assert opening.result() is None
+    opening.give_up()
+    assert time.monotonic() - began < 4.0
     release.set()
-    for _ in range(200):
-        if opened:
-            break
-        time.sleep(0.01)
-    assert opened == ["closed"]
+    assert closed.wait(5.0)
 
 
 def test_a_device_that_comes_and_goes_without_data_is_reported_once(tmp_path):
-    recorder, notes = record(tmp_path, {"odometry": BASE}, 2.5, lambda url, baud: _Flapping())
+    recorder, notes = record(tmp_path, {"odometry": BASE}, 2.5, lambda url, clock: _Flapping(clock))
     assert recorder.links[0].counts.connects > 3
     names = [note.name for _, note in notes]
     assert len(names) == len(set(names))
@@ -124,13 +168,13 @@ class _Flapping(TalkingPort):
     """Open for a moment, then gone."""
 
     def read(self):
-        if time.monotonic() - self._began > 0.1:
+        if self._clock() - self._began > 0.1:
             raise DeviceError("unplugged")
         return b""
 
 
 def test_data_makes_a_reconnect_worth_reporting_again(tmp_path):
-    recorder, notes = record(tmp_path, {"odometry": BASE}, 2.5, lambda url, baud: TalkingPort(gone_after=0.7))
+    recorder, notes = record(tmp_path, {"odometry": BASE}, 2.5, lambda url, clock: TalkingPort(clock, gone_after=0.7))
     assert recorder.links[0].counts.connects > 2
     assert sum(note.name == "odometry-gone" for _, note in notes) > 1
     assert recorder.links[0].counts.lost > 0 or recorder.links[0].counts.messages > 50
@@ -138,11 +182,73 @@ def test_data_makes_a_reconnect_worth_reporting_again(tmp_path):
 
 def test_a_base_with_a_wrong_unit_of_time_is_stamped_with_arrivals_and_reported(tmp_path):
     spec = BASE[0], BASE[1] + "&time_unit=0.001"
-    _, notes = record(tmp_path, {"odometry": spec}, 6.0, lambda url, baud: TalkingPort())
+    _, notes = record(tmp_path, {"odometry": spec}, 6.0, lambda url, clock: TalkingPort(clock))
     (note,) = [note for _, note in notes if note.name == "odometry-time-unit"]
     assert "time_unit=1" in note.text
     stamps = stamps_of(tmp_path / "run.log")
     assert stamps[-1] - stamps[0] == pytest.approx(6.0, abs=0.4)
+
+
+class HostilePort:
+    """Noise, half frames of its own answers, floods, nothing, and a cable that comes and goes."""
+
+    def __init__(self, clock, rng, words):
+        self._clock, self._rng, self._words = clock, rng, words
+        self._until = clock() + rng.expovariate(0.5)
+
+    def fileno(self):
+        return None
+
+    def _fail(self, share):
+        if self._clock() > self._until or self._rng.random() < share:
+            raise DeviceError("unplugged")
+
+    def read(self):
+        self._fail(0.0005)
+        kind = self._rng.random()
+        if kind < 0.5:
+            return b""
+        if kind < 0.51:
+            return self._rng.randbytes(20_000)
+        word = self._rng.choice(self._words)
+        return word[: self._rng.randrange(len(word) + 1)] if kind < 0.8 else word
+
+    def write(self, data):
+        self._fail(0.02)
+
+    def set_baud(self, rate):
+        self._fail(0.01)
+
+    def set_dtr(self, on):
+        self._fail(0.01)
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_nothing_that_a_port_does_ends_a_recording(tmp_path, name):
+    """Everything becomes an event: the run lasts as long as asked, the log is whole, and what it lacks is said."""
+    rng = random.Random(name)
+    words = [*WORDS.get(name, WORDS["line"]), b"\n", rng.randbytes(40)]
+
+    def open_one(url, clock):
+        if rng.random() < 0.3:
+            raise DeviceError("cannot open")
+        return HostilePort(clock, rng, words)
+
+    options = "?columns=t,x,y,theta" if name == "line" else ""
+    recorder, _ = record(tmp_path, {"it": (DEVICES[name].sensor, f"{name}:/dev/x{options}")}, 8.0, open_one)
+    assert recorder.end - recorder.start < 8.1
+    counts = recorder.links[0].counts
+    assert counts.connects > 1
+    assert sum(counts.corrupt.values()) > 10 or name in BOARDS  # boards print other lines too: these are ignored
+    text = (tmp_path / "run.log").read_text()
+    assert text.endswith("\n")
+    assert "corrupt" in text.splitlines()[-1]
+    lines = [line for line in text.splitlines() if line.startswith(("UWB ", "ODOM ", "GYRO ", "ROBOTLASER1 "))]
+    stamps = [float(line.split()[-3]) for line in lines]
+    assert all(recorder.start - 1.0 < stamp < recorder.end + 0.2 for stamp in stamps)
 
 
 def test_a_bridge_that_is_not_there_is_one_clear_error():

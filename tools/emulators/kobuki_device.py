@@ -118,20 +118,23 @@ class Create2Device(WheeledDevice):
     def power_up(self, now: float) -> None:
         """The port was opened anew; a stream that was asked for goes on."""
         self.packets = getattr(self, "packets", b"")
-        self.streaming, self.awake = bool(self.packets), False
+        self.streaming, self.awake, self._input = bool(self.packets), False, b""
 
     def receive(self, data: bytes, now: float) -> bytes:
         """Take ``128``, ``148 n packets`` and ``150 flag``."""
-        at = 0
-        while at < len(data):
-            code, at = data[at], at + 1
+        self._input += data
+        while self._input:
+            code, more = self._input[0], self._input[1:]
+            size = {148: 2 + (more[0] if more else 0), 150: 2}.get(code, 1)
+            if len(self._input) < size:
+                break
+            self._input = self._input[size:]
             if code == 128:
                 self.awake = True
             elif code == 148 and self.awake:
-                self.packets, at = data[at + 1 : at + 1 + data[at]], at + 1 + data[at]
-                self.streaming = True
+                self.packets, self.streaming = more[1 : size - 1], True
             elif code == 150:
-                self.streaming, at = bool(data[at]), at + 1
+                self.streaming = bool(more[0])
         return b""
 
     def advance(self, now: float) -> bytes:
