@@ -23,9 +23,9 @@ FLOORS = (
     ("lidar", "report"),
     ("screening",),
     ("loop_closure", "checks", "evaluation", "io"),
-    ("pipeline", "localization"),
+    ("pipeline",),
     ("mapping",),
-    ("localize", "server"),
+    ("localization", "server"),
     ("cli",),
     ("__main__",),
 )

@@ -174,7 +174,7 @@ def carried(on: Bench, leave: float, arrive: float) -> tuple[float, bool]:
         on.feed(localizer, kind, k)
     ends = se2.interpolate_trajectory(stamps, poses, np.array([leave, arrive]))
     moved = se2.compose(ends[0], se2.between(ends[1], poses))
-    shift, said = leave + 0.1 - arrive, False
+    shift, stated = leave + 0.1 - arrive, False
     for _, kind, k in on.played(arrive, arrive + 60.0):
         if kind == 0:
             state = localizer.add_odometry(stamps[k] + shift, *moved[k])
@@ -183,12 +183,12 @@ def carried(on: Bench, leave: float, arrive: float) -> tuple[float, bool]:
             state = localizer.add_ranges(r.stamps[k] + shift, [r.anchor_ids[r.anchor[k]]], [r.ranges[k]])
         else:
             state = localizer.add_scan(log.scans.stamps[k] + shift, log.scans.ranges[k])
-        said |= state.lost
-        if said and not state.lost:
+        stated |= state.lost
+        if stated and not state.lost:
             there = replace(state, stamp=state.stamp - shift)
             if (on.errors([there])[0] < WRONG).all():
-                return there.stamp - arrive, said
-    return np.inf, said
+                return there.stamp - arrive, stated
+    return np.inf, stated
 
 
 def with_moved_anchor(on: Bench) -> Bench:
@@ -227,7 +227,7 @@ def carried_row(on: Bench, count: int) -> list[object]:
     times = [carried(on, float(t), float(t) + 0.4 * (end - begin)) for t in leave]
     after = np.array([t for t, _ in times])
     typical = f"{np.median(after):.1f}" if np.isfinite(np.median(after)) else "-"
-    return [on.world, count, sum(said for _, said in times), f"{np.mean(after <= 10.0):.0%}", typical]
+    return [on.world, count, sum(stated for _, stated in times), f"{np.mean(after <= 10.0):.0%}", typical]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -197,7 +197,7 @@ class Watched:
 
 
 @pytest.mark.slow
-def test_it_says_its_address_serves_and_ends_with_ctrl_c(tmp_path):
+def test_it_reports_its_address_serves_and_ends_with_ctrl_c(tmp_path):
     with Watched(tmp_path / "run.log") as served, urllib.request.urlopen(served.address, timeout=20) as answer:
         assert b"uwblite watch run.log" in answer.read()
     assert served.code == 0

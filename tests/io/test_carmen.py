@@ -235,7 +235,7 @@ def test_scans_of_another_number_of_beams_are_resampled(tmp_path):
     assert np.isnan(log.scans.ranges[:, 180]).tolist() == [True, False, False]
 
 
-def test_an_increment_of_one_beam_too_few_is_said(tmp_path):
+def test_an_increment_of_one_beam_too_few_is_reported(tmp_path):
     def scan(beams, increment):
         numbers = f"{-np.pi / 2:.6f} {np.pi:.6f} {increment:.9f} 80 0.01 0 {beams} {' '.join(['2.0'] * beams)} 0"
         return f"ROBOTLASER1 0 {numbers} 0 0 0 0 0 0 0 0 0 0 0 1.0 robot 1.0\n"

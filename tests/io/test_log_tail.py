@@ -81,7 +81,7 @@ def test_parts_are_followed_in_their_order(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["shrinks", "replaced", "removed"])
-def test_another_log_in_its_place_begins_anew(tmp_path, how):
+def test_another_log_in_its_place_begins_again(tmp_path, how):
     log = tmp_path / "run.log"
     write(log, *(odom(t) for t in range(100)), uwb(3.0, "OLD"))
     tail = drain(LogTail(str(log)))

@@ -24,7 +24,7 @@ def result(tmp_path_factory):
     return replace(found, anchors=good, keyframe_covariances=calm, report={})
 
 
-def test_nothing_is_said_where_all_is_well(result):
+def test_nothing_is_reported_where_all_is_well(result):
     assert advice(FINE, {"A": 0.3}, 60.0, 0.0, result) == []
     assert advice(FINE, {}, 60.0, 0.0, None) == []
 
@@ -43,7 +43,7 @@ def test_a_slow_sensor_is_not_silent_between_its_messages():
     assert advice(slow, {}, 60.0, 0.0, None) == []
 
 
-def test_what_was_never_heard_and_a_log_that_rests():
+def test_what_was_never_in_reach_and_a_log_that_rests():
     assert advice({}, {}, 0.0, 0.0, None)[0].startswith("nothing is recorded yet")
     output = advice({"odometry": FINE["odometry"]}, {}, 60.0, 0.0, None)
     assert [s.partition(" at all")[0] for s in output] == [

@@ -100,7 +100,7 @@ def test_the_status_of_a_growing_log(tmp_path, stored):
     json.dumps(status, allow_nan=False)
 
 
-def test_without_a_map_or_a_log_the_status_says_so(tmp_path, stored):
+def test_without_a_map_or_a_log_the_status_reports_so(tmp_path, stored):
     status = watch_status(LogTail(str(tmp_path / "none.log")), None, 3.0, "")
     assert status["advice"] == ["nothing is recorded yet: is the recorder running, and is this its log?"]
     assert status["pose"] is None

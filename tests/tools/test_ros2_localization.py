@@ -25,7 +25,7 @@ def test_map_to_odom_takes_the_wheels_pose_to_the_maps():
         np.testing.assert_allclose(se2.compose(node.map_odom(tuple(pose), tuple(odometry)), odometry), pose, atol=1e-12)
 
 
-def test_a_pose_that_is_found_is_told_once():
+def test_a_pose_that_is_found_is_reported_once():
     lines = [line(0, [None] * 3, [0, 0, 0], True), line(1, [1, 2, 0], [0, 0, 0]), line(2, [1, 2, 0], [0, 0, 0]),
              line(3, [1, 2, 0], [0, 0, 0], True), line(4, [1, 2, 0], [0, 0, 0])]  # fmt: skip
     assert [(f.stamp, f.found) for f in node.fixes(lines)] == [(1, True), (2, False), (4, True)]
@@ -101,7 +101,7 @@ def test_transforms_and_the_initial_pose_are_sent(ros, monkeypatch):
     assert ros.ended == ["node", "rclpy"]
 
 
-def test_without_ros_it_says_what_is_missing(monkeypatch, capsys):
+def test_without_ros_it_reports_what_is_missing(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert node.main([]) == 1
     assert "source the setup of ROS 2" in capsys.readouterr().err

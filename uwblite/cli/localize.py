@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ..grid.occupancy_grid import OccupancyGrid
-    from ..localize import Localization
+    from ..localization.localize import Localization
 
 HELP = "find the trajectory of a new recording in an existing map, by its anchors and walls"
 EPILOG = """\
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     from ..io.map_server import read_map
     from ..io.result_text import json_lines
     from ..io.results import repair_result
-    from ..localize import localize
+    from ..localization.localize import localize
     from . import console
     from .formats import read_recording, refuse_existing
     from .options import apply_mounting, bag_choices, effective_config

@@ -126,7 +126,7 @@ class LogTail:
         self._begin()
 
     def _replaced(self) -> bool:
-        """Tell whether the first part is another file than before, while a later one is read."""
+        """Return whether the first part is another file than before, while a later one is read."""
         if self._file is None or os.fspath(self._file.path) == self.path or not os.path.isfile(self.path):
             return False
         return not os.path.samestat(os.stat(self.path), self._first)

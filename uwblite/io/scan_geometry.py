@@ -40,7 +40,7 @@ class ScanGeometry:
         return abs(self.beams * abs(self.angle_increment) - 2.0 * np.pi) < 1.5 * abs(self.angle_increment)
 
     def is_of_one_lidar_with(self, other: "ScanGeometry") -> bool:
-        """Tell whether both look the same way over the same field of view, up to a few per cent or two beams."""
+        """Return whether both look the same way over the same field of view, up to a few per cent or two beams."""
         view = self.beams * self.angle_increment
         slack = max(2.0 * abs(self.angle_increment), 2.0 * abs(other.angle_increment), _SAME_VIEW * abs(view))
         begin = abs(self.angle_min - other.angle_min)

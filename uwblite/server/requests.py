@@ -62,7 +62,7 @@ def refusal(page: Page, token: str, method: str, headers: dict[str, str]) -> Res
 
 
 def _is_ours(page: Page, host: str) -> bool:
-    """Tell whether a host and port are the server's; of one that is open every address is: no foreign name is one."""
+    """Return whether a host and port are the server's; of one that is open every address is: no foreign name is one."""
     name, _, port = host.rpartition(":")
     if port != page.host.rpartition(":")[2]:
         return False

@@ -11,7 +11,7 @@ from uwblite import se2
 from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.errors import DataError
 from uwblite.io.carmen import read_log
-from uwblite.localize import localize
+from uwblite.localization.localize import localize
 from uwblite.mapping import MappingConfig, build_map
 
 

@@ -12,20 +12,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import se2
-from .arrays import Floats
-from .constraints import Constraints
-from .errors import DataError
-from .grid.occupancy_grid import OccupancyGrid
-from .lidar.clouds import stacked
-from .lidar.correlative_matching import CorrelativeConfig, search
-from .lidar.pair_alignment import align_pairs
-from .lidar.point_cloud import PointCloud, make_cloud, two_sided
-from .lidar.scan_matching import nondegenerate_step, pair_points, rasterize
-from .map_result import MapResult, Notice, StageSummary
-from .mapping import MappingConfig, Progress, build_map
-from .pipeline import map_frame
-from .sensor_log import SensorLog
+from .. import se2
+from ..arrays import Floats
+from ..constraints import Constraints
+from ..errors import DataError
+from ..grid.occupancy_grid import OccupancyGrid
+from ..lidar.clouds import stacked
+from ..lidar.correlative_matching import CorrelativeConfig, search
+from ..lidar.pair_alignment import align_pairs
+from ..lidar.point_cloud import PointCloud, make_cloud, two_sided
+from ..lidar.scan_matching import nondegenerate_step, pair_points, rasterize
+from ..map_result import MapResult, Notice, StageSummary
+from ..mapping import MappingConfig, Progress, build_map
+from ..pipeline import map_frame
+from ..sensor_log import SensorLog
 
 LEAST_OVERLAP = 0.4
 """Share of the new walls that must lie on earlier ones; the rest may be new, or not seen before."""
