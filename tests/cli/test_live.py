@@ -2,6 +2,7 @@
 
 import json
 import os
+import socket
 
 import numpy as np
 import pytest
@@ -103,3 +104,27 @@ def test_a_room_is_known_from_its_folder_as_from_its_parts(room):
     read, made = from_result(read_result(room[0])), known()
     np.testing.assert_allclose(read.anchors.positions, made.anchors.positions)
     np.testing.assert_allclose(read.walls.points, made.walls.points, atol=1e-9)
+
+
+def test_the_page_shows_the_map_and_the_robot_on_it(room, capsys, monkeypatch):
+    """What is published is what a browser would get."""
+    from uwblite.server.feed import Feed
+
+    folder, log, poses = room
+    published = []
+    monkeypatch.setattr(Feed, "publish", lambda _, name, value: published.append((name, value)))
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    words = ["localize", str(log), "--live", "--map", str(folder), "--idle", "0.1", "--serve", str(port)]
+    assert main(words) == 0
+    assert f"open http://127.0.0.1:{port}/" in capsys.readouterr().err
+    names = [name for name, _ in published]
+    assert names[0] == "map"
+    assert published[0][1]["image"]["width"] > 8
+    first, last = published[1][1], published[-1][1]
+    assert first["pose"] is None
+    assert first["advice"][0].startswith("Lost:")
+    np.testing.assert_allclose(last["pose"], poses[-1], atol=0.06)
+    assert last["advice"] == []
+    assert len(last["trail"]) > 5
+    json.dumps([value for _, value in published], allow_nan=False)

@@ -60,10 +60,10 @@ def run(args: argparse.Namespace) -> int:
     effective_config(args)
     folder = _folder(args)
     page = LivePage(f"uwblite watch {os.path.basename(args.log)}")
-    server = server_for(page, args.port, args.host, _own_names())
+    server = server_for(page, args.port, args.host, own_names())
     with suppress(OSError, AttributeError):
         os.nice(_OWN_NICENESS)
-    console.say(f"open {_address(page)} in a browser; Ctrl-C ends it")
+    console.say(f"open {address_of(page)} in a browser; Ctrl-C ends it")
     console.note(f"uwblite: the latest map is in {folder}")
     console.flush()
     with suppress(ValueError):  # not the main thread: signals are somebody else's
@@ -112,7 +112,7 @@ def map_options(args: argparse.Namespace) -> list[str]:
     return words + ([] if args.anchor_height is None else [f"--anchor-height={args.anchor_height!r}"])
 
 
-def _own_names() -> tuple[str, ...]:
+def own_names() -> tuple[str, ...]:
     """Return the names under which other computers may know this one."""
     import socket
 
@@ -120,7 +120,7 @@ def _own_names() -> tuple[str, ...]:
     return (name, f"{name}.local") if name else ()
 
 
-def _address(page: "LivePage") -> str:
+def address_of(page: "LivePage") -> str:
     """Return where the page is to be found; of one that is open to the network, under this computer's address in it."""
     import socket
 
