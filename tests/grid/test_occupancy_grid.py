@@ -154,11 +154,27 @@ def test_geometry_turns_cells_into_metres_and_back():
     assert geometry.centre_of(np.array(0), np.array(0))[1] < geometry.centre_of(np.array(1), np.array(0))[1]
 
 
-def test_too_large_a_map_is_refused_before_memory_is_taken():
-    with pytest.raises(ConfigError, match=r"million cells.*grid\.resolution"):
-        GridGeometry.around(np.zeros(2), np.full(2, 1e7), 0.05, 10**6)
-    with pytest.raises(ConfigError):
+@pytest.mark.parametrize("size", [(70.0, 40.0), (51.0, 51.0), (1e7, 1e7), (1e6, 0.1)])
+def test_too_large_a_map_gets_larger_cells(size):
+    high = np.array(size)
+    grid = GridGeometry.around(np.zeros(2), high, 0.05, 10**6)
+    assert grid.cells <= 10**6
+    assert (grid.corner >= high).all()
+    assert (grid.origin <= 0.0).all()
+    quarters = grid.resolution / 0.05 * 4.0
+    assert quarters == pytest.approx(round(quarters))
+    # No coarser than needed: a quarter of the resolution asked for less, and there would be too many.
+    finer = grid.resolution - 0.25 * 0.05
+    if size[0] == size[1]:
+        assert finer < 0.05 or (size[0] / finer + 4) ** 2 > 0.98 * 10**6
+    assert grid.resolution > 0.05
+
+
+def test_a_map_without_a_size_is_refused():
+    with pytest.raises(ConfigError, match="no map of nan"):
         GridGeometry.around(np.zeros(2), np.array([np.nan, 1.0]), 0.05, 10**6)
+    with pytest.raises(ConfigError, match=r"grid\.max_cells"):
+        GridGeometry.around(np.zeros(2), np.ones(2), 0.05, 10)
 
 
 def room_scans(poses, half=2.0, beams=360, noise=0.0, range_max=10.0, seed=0):
@@ -408,16 +424,17 @@ def test_a_scan_that_a_wrong_reading_threw_far_away_is_not_drawn_and_counted(far
     np.testing.assert_array_equal(grid.log_odds, plain.log_odds)
 
 
-def test_a_grid_too_large_is_refused_before_it_is_allocated():
-    """Two places far apart make a map of 10^12 cells: the refusal says how large, what it would take and what to change."""
+def test_a_grid_too_large_is_made_coarser_before_it_is_allocated():
+    """Two places far apart would make a map of 10^12 cells."""
     poses = drive(4)
     poses[2:, :2] = 5e4
     tracemalloc.start()
-    with pytest.raises(ConfigError, match=r"million cells, about \d+ MB.*grid\.resolution.*grid\.max_cells"):
-        from_scans(poses, room_scans(drive(4)), GridConfig())
+    grid = from_scans(poses, room_scans(drive(4)), GridConfig(max_cells=10**6))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 50e6
+    assert grid.geometry.resolution > 50.0
+    assert grid.scans_used == 4
     reported = []
     sweeps = Sweeps(room_scans(drive(3)), drive(3))
     grid = from_sweeps([sweeps], announce=reported.append)

@@ -61,25 +61,28 @@ class GridGeometry:
         Parameters
         ----------
         low, high : (2,) corners of the box, m.
-        resolution : edge of a cell, m.
+        resolution : edge of a cell, m; larger by quarters of it where there would be too many cells.
         max_cells : most cells allowed.
         margin : cells added on every side.
 
         Raises
         ------
-        ConfigError : the grid would be larger than max_cells; nothing has been allocated.
+        ConfigError : the box has no finite size, or max_cells is too few for any grid.
         """
-        first = np.floor(low / resolution) - margin
-        last = np.floor(high / resolution) + 1 + margin
-        width, height = (last - first).tolist()
-        if not width * height <= max_cells:
-            coarser = resolution * np.sqrt(width * height / max_cells) * 1.1
-            extent = high - low
-            raise ConfigError(
-                f"the map would be {extent[0]:.0f} x {extent[1]:.0f} m, {width * height / 1e6:.0f} million cells, about "
-                f"{width * height * BYTES_PER_CELL / 1e6:.0f} MB at {resolution:g} m resolution; set grid.resolution to "
-                f"{coarser:.2g} or more, or a smaller grid.max_range, or raise grid.max_cells"
-            )
+        finest, extent = resolution, high - low
+        while True:
+            first = np.floor(low / resolution) - margin
+            last = np.floor(high / resolution) + 1 + margin
+            width, height = (last - first).tolist()
+            if width * height <= max_cells:
+                break
+            if not np.isfinite(extent).all() or max_cells < (2 * margin + 2) ** 2:
+                raise ConfigError(
+                    f"no map of {extent[0]:g} x {extent[1]:g} m fits into {max_cells} cells; raise grid.max_cells, or set a "
+                    "smaller grid.max_range"
+                )
+            times = resolution / finest * np.sqrt(width * height / max_cells)
+            resolution = finest * max(np.ceil(4.0 * times) / 4.0, resolution / finest + 0.25)
         return GridGeometry(resolution, first * resolution, int(height), int(width))
 
 

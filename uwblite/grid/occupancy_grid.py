@@ -73,7 +73,7 @@ class GridConfig:
     move_angle: float = 0.2
     """... or has turned this far, rad."""
     max_cells: int = 40_000_000
-    """Largest grid, cells (12 bytes each while it is made); a larger one is refused rather than run out of memory."""
+    """Largest grid, cells (12 bytes each while it is made); a larger map is drawn with larger cells."""
 
     def __post_init__(self) -> None:
         if not self.resolution > 0:
@@ -160,14 +160,14 @@ def from_sweeps(
     ----------
     recordings : their scans with known poses.
     config : settings.
-    geometry : the grid to fill; None = the smallest around all rays.
+    geometry : the grid to fill; None = the smallest around all rays, coarser where config.max_cells asks for it.
     executor : any concurrent.futures executor; the result does not depend on it.
     progress : called after every batch of scans.
     announce : called with the geometry before the grid is allocated.
 
     Raises
     ------
-    ConfigError : the map would be larger than config.max_cells.
+    ConfigError : poses or readings are not finite.
     DataError : there are no scans.
     """
     if not any(len(sweeps.first) for sweeps in recordings):

@@ -86,10 +86,29 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
             " both; they are not drawn",
             scans=grid.scans_astray,
         )
+    _check_resolution(grid.geometry, config.grid.resolution, task)
     if config.crop is not None:
         grid = cropped(grid, config.crop)
     stages.end("occupancy grid", scans=grid.scans_used, rows=grid.geometry.rows, cols=grid.geometry.cols)
     return grid
+
+
+def _check_resolution(geometry: GridGeometry, asked: float, task: Task) -> None:
+    """Say where the map is drawn coarser than asked for; one that no building fills is a doubt."""
+    edge = geometry.resolution
+    if edge <= asked:
+        return
+    most = task.config.grid.max_cells / 1e6
+    text = (
+        f"the map is drawn with cells of {edge:g} m instead of {asked:g} m: there would be more than {most:g} million; "
+        "raise grid.max_cells where there is memory (12 bytes each), or set --crop or a smaller grid.max_range"
+    )
+    say = task.stages.warn if edge <= _COARSEST * asked else task.stages.doubt
+    say("coarse-grid", text, resolution=edge, asked=asked)
+
+
+_COARSEST = 10.0
+"""Times the cells asked for up to which a map is large; beyond, poses or readings are astray."""
 
 
 def _sweeps(recording: Recording, graph: Graph) -> Sweeps:
