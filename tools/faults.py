@@ -15,8 +15,10 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -681,6 +683,25 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
     return Outcome(world, name, sensors, *figures, code, stated, check, time.process_time() - began, warnings)
 
 
+Task = tuple[str, str, str, Case, Fault]
+_tasks: list[Task] = []
+"""What forked processes find in their memory: faults are functions and do not travel."""
+
+
+def _numbered(number: int) -> Outcome:
+    return tried(_tasks[number])
+
+
+def outcomes(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
+    """Try all tasks, in order, in so many processes."""
+    _tasks[:] = tasks
+    if jobs == 1:
+        yield from map(_numbered, range(len(tasks)))
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("fork")) as pool:
+        yield from pool.map(_numbered, range(len(tasks)))
+
+
 def checked(log: SensorLog) -> bool:
     """Return whether `uwblite check` finds anything serious."""
     return bool(examined(log)[0].serious)
@@ -730,6 +751,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--only", action="append", default=[], metavar="WORD", help="faults whose names contain it; repeatable")
     p.add_argument("--sensors", default="all,no-lidar,no-uwb")
+    p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
     p.add_argument("--print", action="store_true", help="do not write docs/accuracy.md")
     p.add_argument("--verbose", action="store_true", help="show warnings too")
     args = p.parse_args(argv)
@@ -745,7 +767,7 @@ def main(argv: list[str] | None = None) -> int:
                 fault = two_robots(clean_cases([world], args.minutes, args.seed + 1)[world])
             tasks += [(world, name, s, case, fault) for s in kinds if s in args.sensors.split(",")]
     done = []
-    for outcome in map(tried, tasks):
+    for outcome in outcomes(tasks, args.jobs):
         done.append(outcome)
         print(" | ".join(f"{c:.3f}" if isinstance(c, float) else str(c) for c in shown(outcome)), flush=True)
         if args.verbose:

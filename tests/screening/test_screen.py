@@ -229,3 +229,13 @@ def test_a_gap_in_which_the_robot_drove_on_keeps_nothing_that_others_saw_meanwhi
 def test_a_clock_that_was_set_back_is_a_doubt(sound):
     done = screen(replace(sound, notes=LogNotes(set_back={"radio": 30.0, "odometry": 0.2})))
     assert [r.kind for r in done.screening.remarks if r.doubt] == ["clock-set-back"]
+
+
+def test_readings_that_come_in_bursts_are_spread_over_the_time_since_the_burst_before(sound):
+    late = np.ceil(sound.odometry.stamps / 1.0 - 1e-9)
+    done = screen(replace(sound, odometry=replace(sound.odometry, stamps=late)))
+    assert kinds(done) == {"stamps-in-bursts"}
+    # The first burst may be of any length; all others are 20 readings at 20 Hz.
+    off = done.odometry.stamps - sound.odometry.stamps
+    assert np.abs(off[40:-40] - np.median(off)).max() < 0.051
+    assert np.all(np.diff(done.odometry.stamps) > 0.0)

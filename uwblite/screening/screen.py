@@ -44,11 +44,13 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     remarks = _clock_remarks(log)
     units.refuse_wrong_lengths(log)
     odometry, repeats = odometry_chain.without_repeats(log.odometry)
+    log, bursts = stuck_sensors.without_bursts(replace(log, odometry=odometry))
+    odometry = log.odometry
     odometry, glitches = odometry_chain.without_glitches(odometry)
     units.refuse_degrees(odometry)
     odometry, jumps, broken = odometry_chain.rejoined(odometry)
     log, turned = heading_from_gyro(replace(log, odometry=odometry))
-    remarks += [*_repeats(repeats), *glitches, *broken, *turned]
+    remarks += [*_repeats(repeats), *bursts, *glitches, *broken, *turned]
     repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_repeated_ranges, directions.heading_with_the_path]
     for repair in repairs + [directions.laser_upright] * turn_laser:
         log, more = repair(log)

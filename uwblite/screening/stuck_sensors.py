@@ -1,4 +1,4 @@
-"""Sensors that say the same again and again while the robot moves, and readings that were written twice."""
+"""Sensors that repeat themselves while the robot moves, readings that were written twice, and stamps that stand still."""
 
 from dataclasses import replace
 
@@ -15,6 +15,48 @@ _SAME_SCANS = 3
 """Equal scans in a row that no lidar gives: some beam of hundreds always changes."""
 _LEAST_SEEN = 10
 """Beams that must see something; scans that see nothing are rightly equal."""
+
+
+def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Spread readings of odometry and lidar that share one stamp because they waited in a buffer.
+
+    Each burst is spread evenly over the time since the one before; what then remains is a delay, which is calibrated.
+    """
+    remarks = []
+    odometry, scans = log.odometry, log.scans
+    spread = _spread(odometry.stamps)
+    if spread is not None:
+        log = replace(log, odometry=replace(odometry, stamps=spread[0]))
+        remarks.append(_burst_remark("odometry readings", *spread[1:]))
+    if scans is not None and (spread := _spread(scans.stamps)) is not None:
+        log = replace(log, scans=replace(scans, stamps=spread[0]))
+        remarks.append(_burst_remark("scans", *spread[1:]))
+    return log, remarks
+
+
+def _spread(stamps: Floats) -> tuple[Floats, float, float] | None:
+    """Return stamps (n,) with bursts spread, s, usual size of a burst and time between two; None without bursts."""
+    distinct, group, size = np.unique(stamps, return_inverse=True, return_counts=True)
+    usual = float(np.median(size[group])) if len(stamps) else 0.0
+    if len(distinct) < _LEAST_BURSTS or usual < _BURST:
+        return None
+    gap = np.diff(distinct)
+    between = float(np.median(gap))
+    gap = np.minimum(np.concatenate([[between], gap]), between)
+    place = np.arange(len(stamps)) - np.searchsorted(stamps, distinct)[group]
+    return stamps - gap[group] * (1.0 - (place + 1.0) / size[group]), usual, between
+
+
+def _burst_remark(what: str, size: float, between: float) -> Remark:
+    text = (
+        f"{what} come in bursts of about {size:.0f} with one stamp, every {between:.2f} s: they were spread over the time "
+        "since the burst before; stamp each reading when it is made"
+    )
+    return Remark("stamps-in-bursts", text)
+
+
+_BURST, _LEAST_BURSTS = 4, 5
+"""Readings with one stamp that make a burst (two or three are a coarse clock), and bursts that must be."""
 
 
 def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
