@@ -51,6 +51,8 @@ LINKS = ("whole", "bytes", "noise", "loss", "replug", "reset", "slow")
 """As it comes; byte by byte; 1 byte in 2,000 changed; 1 in 2,000 lost; the cable pulled for 3 s; the device's clock or the
 device reset; 40 ms round trip, 16 ms steps and up to 10 ms of jitter."""
 HALFWAY = 0.5
+STEP, PAUSE = 0.02, 0.25
+"""m or rad by which a pose may leave the truth from one reading to the next; s, of a gyro."""
 CORNER, FALSE_RAYS = 0.06, 0.01
 """m, share: rays between two readings on both sides of a corner differ by as much."""
 
@@ -90,7 +92,8 @@ def emulator(name, seconds, *, reset):
         device = UwbBoard(world.epochs(), clock, write, lambda t, rows: sent.append((t, [mm / 1000 for _, mm, _ in rows])))
     else:
         kind = GyroLineDevice if name == "gyro" else BASES[name]
-        device = kind(world.poses(), clock, on_packet=lambda t, x, y, theta: sent.append((t, (x, y, theta))))
+        plain = (lambda x, y, theta: (theta, 0.0)) if name == "gyro" else (lambda x, y, theta: (x, y))
+        device = kind(world.poses(), clock, on_packet=lambda t, *pose: sent.append((t, plain(*pose))))
     if reset:
         advance, done = device.advance, []
 
@@ -136,8 +139,8 @@ def measured(name, actions):
     if sensor_of(name) == "uwb":
         return [(epoch.stamp, [r.range for r in epoch.readings]) for epoch in of_kind(actions, RangeEpoch)]
     if name == "gyro":
-        return [(g.stamp, (0.0, 0.0, g.heading)) for g in of_kind(actions, GyroHeading)]
-    return [(pose.stamp, (pose.x, pose.y, pose.theta)) for pose in of_kind(actions, OdometryPose)]
+        return [(g.stamp, (g.heading, 0.0)) for g in of_kind(actions, GyroHeading)]
+    return [(pose.stamp, (pose.x, pose.y)) for pose in of_kind(actions, OdometryPose)]
 
 
 def judge(name, got, sent):
@@ -157,15 +160,16 @@ def judge(name, got, sent):
         return judge_scans(name, got, [t for t, _ in sent])
     if sensor_of(name) == "uwb":
         return judge_ranges(got, sent)
-    stamps, errors, false, shift = [t for t, _ in sent], [], 0, (0.0, 0.0)
+    stamps, errors, false, shift, before = [t for t, _ in sent], [], 0, (0.0, 0.0), math.nan
     for stamp, pose in got:
         at = bisect_left(stamps, stamp)
         near = min(range(max(0, at - 1), min(len(sent), at + 1)), key=lambda k: abs(stamps[k] - stamp))
         errors.append(abs(stamps[near] - stamp))
         here = pose[0] - sent[near][1][0], pose[1] - sent[near][1][1]
-        step = math.hypot(here[0] - shift[0], here[1] - shift[1])
-        false += bool(errors[1:]) and step > 0.02  # m: no damage may move the pose
-        shift = here
+        step = math.remainder(math.hypot(here[0] - shift[0], here[1] - shift[1]), 2 * math.pi if name == "gyro" else math.inf)
+        # No damage may move the pose; a gyro's heading is held over a pause.
+        false += abs(step) > STEP and (name != "gyro" or stamp - before < PAUSE)
+        shift, before = here, stamp
     return false, errors
 
 

@@ -52,3 +52,18 @@ def test_what_happens_in_a_gap_is_not_guessed():
 def test_columns_without_a_turn_are_refused(columns):
     with pytest.raises(ConfigError, match="gyro line"):
         open_device("gyro", f"line:x?columns={columns}")
+
+
+def test_a_digit_that_is_lost_from_the_time_is_damage_and_no_gap():
+    driver = open_device("gyro", "line:port?columns=t,turn_rate&time_unit=0.001")[0].driver
+    actions = []
+    for k in range(1500):
+        text = str(10 * k + 20_000)
+        time = text[:2] + text[3:] if k in (700, 900) else text
+        for event in driver.parse(f"{time},0.1\n".encode(), 50 + 0.01 * k):
+            actions += driver.take(event)
+    assert not [a for a in actions if isinstance(a, Lost)]
+    assert [a.why for a in actions if isinstance(a, Corrupt)] == ["line whose time leaps"] * 2
+    stamps = [a.stamp for a in actions if isinstance(a, GyroHeading)]
+    assert len(stamps) == 1498
+    assert max(abs(s - t) for s, t in zip(stamps[-500:], [50 + 0.01 * k for k in range(1000, 1500)], strict=True)) < 0.002

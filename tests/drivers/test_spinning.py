@@ -115,6 +115,8 @@ def test_replugged_it_goes_on_with_the_same_geometry(name):
     first, _, _ = run(name, 4.0, device=(device, turns), session=session)
     second, _, _ = run(name, 4.0, device=(device, turns), session=session, start=1010.0)
     scans = [of_kind(actions, LaserScan) for actions in (first, second)]
+    away = sum(scans[0][-1].stamp + 0.1 < turn < scans[1][0].stamp - 0.1 for turn in turns) + 6.0 / (turns[9] - turns[8])
+    assert abs(sum(event.count for event in of_kind(second, Lost)) - away) < 12
     assert all(len(part) > 15 for part in scans)
     assert len({(len(s.ranges), s.angle_increment) for part in scans for s in part}) == 1
     ahead = -FAR if name.startswith("ydlidar") else 0.0

@@ -44,7 +44,7 @@ class GyroLineDriver(LineDriver):
 
     def __init__(self, line_format: LineFormat, baud: int = 115200) -> None:
         super().__init__(values_by(line_format), "gyro that prints lines", baud, line_format.time_unit)
-        self._unit, self._heading = line_format.angle_unit, 0.0
+        self._angle_unit, self._heading = line_format.angle_unit, 0.0
         self._last: tuple[float, float] | None = None
 
     def begin(self) -> None:
@@ -55,12 +55,14 @@ class GyroLineDriver(LineDriver):
     def take(self, event: Line) -> list[Action]:
         """Turn a line into a heading."""
         self.ready, values = True, event.content
+        if self.leaps(values.get("t"), event.stamp):
+            return [Corrupt(b"", "line whose time leaps")]
         stamp, elapsed, actions = self.timed(values.get("t"), event.stamp)
         if elapsed == 0:
             return [Corrupt(b"", "line sent twice")]
-        rate = values.get("turn_rate", 0.0) * self._unit
+        rate = values.get("turn_rate", 0.0) * self._angle_unit
         if "theta" in values:
-            self._heading += math.remainder(values["theta"] * self._unit - self._heading, 2 * math.pi)
+            self._heading += math.remainder(values["theta"] * self._angle_unit - self._heading, 2 * math.pi)
         elif self._last is not None:
             step = stamp - self._last[0] if elapsed is None else elapsed
             if 0.0 < step <= MAX_STEP:

@@ -12,14 +12,12 @@ from typing import Any
 from ..errors import ConfigError
 from .events import Action, Corrupt, Note, OdometryPose, Pose
 from .odometer import WheelOdometer, wrapped
-from .text_lines import Line, LineDriver, columns_of, number_of
+from .text_lines import LEAP_TIME, Line, LineDriver, columns_of, number_of
 
 LEAP_SPEED, LEAP_TURN = 3.0, 10.0
 """m/s and rad/s that no base of this kind reaches: a line that asks for more is damaged, or the base began anew."""
 LEAST_STEP = 0.1
 """s; over shorter times rounded numbers may seem faster."""
-LEAP_TIME = 1.0
-"""s by which the base's clock may run ahead of the arrivals between two lines."""
 COLUMNS = ("t", "x", "y", "theta", "left", "right", "speed", "turn_rate", "-")
 
 

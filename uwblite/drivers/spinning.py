@@ -44,9 +44,9 @@ class SpinningDriver(Driver):
         self._time = 0.0
 
     def begin(self) -> None:
-        """Forget half a packet and half a turn."""
+        """Forget half a packet and half a turn; when the last reading came tells what is missing before the next."""
         super().begin()
-        self._forget()
+        self._assembler.clear()
 
     def _forget(self) -> None:
         self._assembler.clear()
@@ -141,8 +141,10 @@ def _elapsed(before: Samples, samples: Samples) -> tuple[float, bool]:
 
     And whether the first reading follows the last one by about one spacing.
     """
-    count, span = len(samples.turned), _span(samples)
-    if span <= 0.0:
+    count = len(samples.turned)
+    # A frame of one reading, as a YDLIDAR sends at the start of a turn, shows no spacing: that of the one before counts.
+    spacing = _span(samples) / count or _span(before) / len(before.turned)
+    if spacing <= 0.0:
         return count * samples.period, True
-    spacings = (samples.turned[0] - before.turned[-1]) % 1.0 / (span / count)
+    spacings = (samples.turned[0] - before.turned[-1]) % 1.0 / spacing
     return (count - 1 + spacings) * samples.period, spacings < 2.0

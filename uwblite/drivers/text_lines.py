@@ -11,6 +11,8 @@ from .events import Action, Corrupt, Lost, corrupt
 from .framing import LineReader
 from .session import Driver, Script, Wait
 
+LEAP_TIME = 1.0
+"""s by which the device's clock may run ahead of the arrivals between two lines."""
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
@@ -98,11 +100,32 @@ class LineDriver(Driver):
     def __init__(self, parse: Callable[[str], Any], title: str, baud: int, time_unit: float) -> None:
         super().__init__(LineProtocol(parse), title)
         self.baud, self.clock = baud, DeviceClock(time_unit, proven=False)
+        self._unit = time_unit
+        self._before: tuple[float, float] | None = None
+        """Time of the device, its own unit, and arrival, s, of the last line that was believed."""
+        self._doubted = False
 
     def script(self) -> Script[None]:
         """Pass over the first line, of which the port may have shown only the end; then listen."""
         yield Wait(None)
         yield from super().script()
+
+    def leaps(self, time: float | None, arrival: float) -> bool:
+        """Tell whether a line's time leaps: lines have no sum, and a digit that is lost makes another number.
+
+        Of two in a row the second one counts: the device began anew.
+
+        Parameters
+        ----------
+        time : of the device, its own unit; None = the line tells none. arrival : s, host clock.
+        """
+        before, known = self._before, self.clock.proven and self.clock.rate is None
+        if time is not None and before is not None and known:
+            elapsed, waited = (time - before[0]) * self._unit, max(arrival - before[1], 0.0)
+            self._doubted = not self._doubted and not -1e-9 <= elapsed <= waited + LEAP_TIME
+        if time is not None and not self._doubted:
+            self._before = time, arrival
+        return self._doubted
 
     def timed(self, time: float | None, arrival: float) -> tuple[float, float | None, list[Action]]:
         """Return the stamp of a line, s, the time since the one before by the device, s, and what is missing in between.

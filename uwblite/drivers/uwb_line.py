@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..errors import ConfigError
-from .events import Action, Note, RangeEpoch, RangeReading
+from .events import Action, Corrupt, Note, RangeEpoch, RangeReading
 from .session import Identity
 from .text_lines import Line, LineDriver, columns_of, number_of
 
@@ -191,6 +191,8 @@ class UwbLineDriver(LineDriver):
         self._tag, self.ready = content.tag or self._tag, True
         if not content.readings:
             return []
+        if self.leaps(content.time, event.stamp):
+            return [Corrupt(b"", "line whose time leaps")]
         stamp, _, lost = self.timed(content.time, event.stamp)
         return [*lost, RangeEpoch(stamp, content.readings)]
 
