@@ -193,7 +193,7 @@ def test_timings_come_from_the_caller_s_clock(minute):
 
 
 def test_the_result_does_not_depend_on_the_odometry_s_frame(minute, truth):
-    """Turned and shifted by a kilometre, the odometry says the same."""
+    """Turned and shifted by a kilometre, the odometry measures the same."""
     far = Odometry(minute.odometry.stamps, se2.compose(np.array([900.0, -400.0, 2.0]), minute.odometry.poses))
     assert ate(build_map(replace(minute, odometry=far)), truth) < ROOM_ATE
 
@@ -225,7 +225,7 @@ FALSE_RANGES = (FalseRanges(anchor=2, start=60.0, seconds=120.0, metres=3.0),)
     ids=["hall", "lab", "corridor", "nlos", "slips", "false ranges", "heights", "no uwb", "people", "mounting"],
 )
 def test_simulated_worlds(tmp_path, limit, settings):
-    """Odometry alone drifts by decimetres to metres within these minutes; the bars are those of drives four times as long."""
+    """Odometry alone drifts by decimetres to metres within these minutes; the bars are for recordings four times as long."""
     log, truth = simulated(tmp_path, scan_rate=5.0, **settings)
     result = build_map(log)
     assert ate(result, truth) < limit

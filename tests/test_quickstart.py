@@ -1,4 +1,4 @@
-"""tools/quickstart: what it tells a new user to paste works, from any folder and with a bare environment."""
+"""tools/quickstart: what it asks a new user to paste works, from any folder and with a bare environment."""
 
 import os
 import shutil

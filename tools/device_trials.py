@@ -5,7 +5,7 @@
 
 Sessions talk to the emulators in simulated time, so that the machine's load does not matter. A reading is false when the
 emulator never sent it; a stamp's error is against the emulator's own time. Missing counts what was sent after the first
-reading and did not come; lost is what the session says. Processor time is that of the session alone, memory what it
+reading and did not come; lost is what the session counts. Processor time is that of the session alone, memory what it
 holds at the end. A scan of a spinning lidar is false where more than one ray in a hundred differs from the room by 6 cm.
 """
 

@@ -7,7 +7,7 @@
 
 A case is silently wrong when the map is trusted (exit code 0) and yet the trajectory is off by more than 0.5 m (rms), or
 an anchor that is called ok by more than 1 m and three standard deviations. Without lidar and without given anchors
-nothing but the odometry tells a map from its mirror image: there the result is judged up to reflection.
+nothing but the odometry distinguishes a map from its mirror image: there the result is judged up to reflection.
 """
 
 import argparse
@@ -158,7 +158,7 @@ def glitch(case: Case, rng: Rng) -> Case:
 
 
 def rescaled(x: float, y: float, theta: float) -> Fault:
-    """Multiply what the odometry says."""
+    """Multiply the odometry."""
     return lambda case, rng: with_odometry(case, lambda stamps, poses: poses * np.array([x, y, theta]))
 
 
@@ -206,7 +206,7 @@ def repeated_scan(start: float) -> Fault:
 
 
 def laser_factor(factor: float) -> Fault:
-    """Scale all readings and the most the lidar says."""
+    """Scale all readings and the lidar's largest range."""
     return lambda case, rng: with_scans(
         case, lambda s: replace(s, ranges=(s.ranges * factor).astype(np.float32), range_max=s.range_max * factor)
     )
@@ -266,7 +266,7 @@ def rotated_ids(case: Case, rng: Rng) -> Case:
 
 
 def shuffled_ids(case: Case, rng: Rng) -> Case:
-    """From half-way on the names are drawn anew for every range."""
+    """From half-way on the names are drawn again for every range."""
     return with_ranges(
         case,
         lambda r: replace(
@@ -401,7 +401,7 @@ def one_name_for_two(case: Case, rng: Rng) -> Case:
 
 
 def turned_laser(case: Case, rng: Rng) -> Case:
-    """The lidar is mounted a quarter turn away from what the log says."""
+    """The lidar is mounted a quarter turn away from what stands in the log."""
     return with_scans(case, lambda s: replace(s, angle_min=s.angle_min + 0.5 * np.pi))
 
 
@@ -462,12 +462,12 @@ def covered_beams(case: Case, rng: Rng) -> Case:
 
 
 def offset_laser(case: Case, rng: Rng) -> Case:
-    """The lidar says 0.3 m too much, always."""
+    """The lidar measures 0.3 m too much, always."""
     return with_scans(case, lambda s: replace(s, ranges=np.where(s.ranges < s.range_max, s.ranges + np.float32(0.3), s.ranges)))
 
 
 def round_trip(case: Case, rng: Rng) -> Case:
-    """One anchor's firmware says the way there and back."""
+    """One anchor's firmware reports the way there and back."""
     return with_ranges(case, lambda r: replace(r, ranges=np.where(r.anchor == 0, 2.0 * r.ranges, r.ranges)))
 
 
@@ -475,7 +475,7 @@ RANGE_FIELDS = ("stamps", "anchor", "ranges", "quality")
 
 
 def standing(case: Case, rng: Rng) -> Case:
-    """The robot never moves: every sensor says all the time what it said within the first second and a half."""
+    """The robot never moves: every sensor repeats all the time what it measured within the first second and a half."""
     first = case.log.odometry.stamps[0]
     with_ = kept(case, lambda t: t < first + 1.5)
     log, new = case.log, with_.log
@@ -541,11 +541,11 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "one wheel slips, 3 times 6 s": (slipping_wheel, WHEELS),
     "one anchor's ranges stuck from half time": (stuck_anchor, RADIO),
     "two anchors with one name": (one_name_for_two, RADIO),
-    "one anchor says twice its distance": (round_trip, RADIO),
+    "one anchor reports twice its distance": (round_trip, RADIO),
     "the radio's clock runs 2 % fast": (one_radio_clock_fast, RADIO),
     "lidar mounted 90 degrees away": (turned_laser, LIDAR),
     "scans in reversed order": (reversed_scans, LIDAR),
-    "lidar says 0.3 m too much": (offset_laser, LIDAR),
+    "lidar measures 0.3 m too much": (offset_laser, LIDAR),
     "a cable before a third of the beams": (covered_beams, LIDAR),
     "odometry stamps jitter by 0.3 s": (jitter("odometry", 0.3), WHEELS),
     "all stamps jitter by 0.3 s": (jitter("odometry radio lidar", 0.3), ALL),

@@ -49,7 +49,7 @@ _PATTERN = 6
 
 @dataclass(frozen=True)
 class OracleFigures:
-    """How far the optimum is from the truth, and how far the Cramer-Rao bound says it is."""
+    """How far the optimum is from the truth, and how far by the Cramer-Rao bound."""
 
     ate: float
     """m, of the keyframes after rigid alignment."""

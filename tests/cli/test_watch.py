@@ -146,7 +146,7 @@ def test_another_log_in_its_place_is_another_recording(watched):
     made.step(2.0)
     assert FakeChild.made[0].stopped
     assert state("map")["anchors"] == []
-    assert "begun anew" in state()["summary"]
+    assert "begun again" in state()["summary"]
     assert "map of" not in state()["rounds"]
 
 

@@ -1,4 +1,4 @@
-"""Small worlds with a known truth: drives, the odometry they leave, ranges to planted anchors and scans of straight walls."""
+"""Small worlds with a known truth: paths, the odometry along them, ranges to planted anchors and scans of straight walls."""
 
 from math import atan2, cos, hypot, remainder, sin, tau
 
@@ -57,7 +57,7 @@ def ranges(
 ) -> UwbRanges:
     """Return ranges to anchors (a, 2), one at a time round robin, stamped between the poses.
 
-    bias : (a,) m. outliers : share of the ranges that are 0.5 to 5 m long or short. heard : (a, 2) s, first and last time.
+    bias : (a,) m. outliers : share of the ranges that are 0.5 to 5 m long or short. in_reach : (a, 2) s, first and last time.
     """
     count = int((stamps[-1] - stamps[0]) * rate * len(anchors))
     times = np.sort(rng.uniform(stamps[0], stamps[-1], count))

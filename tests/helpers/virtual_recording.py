@@ -102,7 +102,7 @@ def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), par
     path : of the log.
     devices : list of (sensor, session, device); several of a sensor are numbered in this order.
     seconds : how long.
-    begin : told the clock's time at the start.
+    begin : called with the clock's time at the start.
 
     Returns
     -------

@@ -87,7 +87,7 @@ def test_neighbourhood_means_take_noise_out_and_the_normals_scatter_as_stated(no
     x = np.arange(-7.0, 7.0, 0.05)
     seen = np.column_stack([x, 2.0 + noise * rng.standard_normal(len(x))])
     clouds = build(rays_from(seen, np.zeros(len(x), dtype=int)), 1, CloudConfig(voxel=0.05, normal_radius=0.21, linearity=0.5))
-    inner = np.abs(clouds.points[:, 0]) < 6.0  # farther on, grazing rays cannot tell from which side they come
+    inner = np.abs(clouds.points[:, 0]) < 6.0  # farther on, grazing rays do not show from which side they come
     # Nine points, some of which share a cell, in every neighbourhood.
     assert clouds.points[inner, 1].std() < 1.3 * noise / np.sqrt(8)
     angle = np.arctan2(clouds.normals[inner, 0], -clouds.normals[inner, 1])

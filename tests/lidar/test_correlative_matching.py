@@ -17,7 +17,7 @@ CENTRE = (3.0, 1.5)
 
 
 def rivalry(found):
-    """Return the second score relative to the first: near 1 the clouds do not tell the two places apart."""
+    """Return the second score relative to the first: near 1 the clouds do not distinguish the two places."""
     return found.scores[1] / found.scores[0] if len(found.scores) > 1 else 0.0
 
 

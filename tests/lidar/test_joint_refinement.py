@@ -1,4 +1,4 @@
-"""Joint refinement: pairs that see the same surfaces, noise-free rooms to a millimetre, noise told as it is."""
+"""Joint refinement: pairs that see the same surfaces, noise-free rooms to a millimetre, noise stated as it is."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def room(seed, noise=0.0, metres=25.0):
 
 
 def test_a_noise_free_room_is_found_to_a_millimetre():
-    """The wheels say the truth but are believed to 1 cm a step; the start is off by drift of that size. Asked to go on
+    """The wheels are exact but stated to 1 cm a step; the start is off by drift of that size. Asked to go on
     until nothing moves, the rounds end at the truth."""
     truth, path, clouds = room(1)
     start = drifted(np.random.default_rng(2), truth, NOISE)

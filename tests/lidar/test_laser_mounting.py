@@ -17,7 +17,7 @@ UP, DOWN = SensorMounting(), SensorMounting(laser_flipped=True)
 
 
 def turner(mounting=UP, lag=0.0, turn_scale=1.0, seed=0):
-    """A recording of a robot that turns on the spot now and then; its log says nothing of how the laser hangs."""
+    """A recording of a robot that turns on the spot now and then; its log does not contain how the laser hangs."""
     rng = np.random.default_rng(seed)
     stamps, truth = drive(TURNS, [4.0] * len(TURNS))
     seen = scans(stamps, truth, ROOM, rate=10.0, noise=0.01, rng=rng, mounting=mounting)

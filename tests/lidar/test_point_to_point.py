@@ -1,4 +1,4 @@
-"""Known motions recovered within noise, honest information, named failures."""
+"""Known motions recovered within noise, consistent information, named failures."""
 
 from dataclasses import replace
 

@@ -243,7 +243,7 @@ def test_nothing_to_match_is_no_information():
 
 
 def test_opposite_sides_of_a_thin_wall_do_not_match():
-    """Two lasers on either side of a wall 2 cm thick see the same line; their normals tell the sides apart."""
+    """Two lasers on either side of a wall 2 cm thick see the same line; their normals distinguish the sides."""
     walls = np.array([[-3.0, 0.0, 3.0, 0.0], [-3.0, 0.02, 3.0, 0.02]])
     truth = np.array([[0.0, -1.5, 0.0], [0.0, 1.5, 0.0], [0.5, -1.5, 0.0]])
     clouds = scanned(truth, walls)

@@ -50,7 +50,7 @@ def test_steps_are_measured(walk):
 
 
 def test_slips_are_found_by_a_search(walk):
-    """Wheels so bad that they miss by up to 0.3 m and 0.35 rad a step: the clouds tell, and the wheels' noise is learnt."""
+    """Wheels so bad that they miss by up to 0.3 m and 0.35 rad a step: the clouds show it, and the noise is re-estimated."""
     truth, clouds, exact = walk
     rng = np.random.default_rng(2)
     stated = exact + rng.uniform(-1, 1, exact.shape) * [0.3, 0.3, 0.35]

@@ -1,4 +1,4 @@
-"""Steps that the odometry got wrong are found again, what cannot be told apart counts as not found."""
+"""Steps that the odometry got wrong are found again, what cannot be distinguished counts as not found."""
 
 import numpy as np
 import pytest

@@ -183,7 +183,7 @@ def test_closures_take_the_drift_out(hall, closures):
 
 
 def given(hall, pairs, guess, sigma) -> Candidates:
-    """Return candidates for pairs (c, 2) of sub-maps with guesses (c, 3) believed to be right to sigma (3,)."""
+    """Return candidates for pairs (c, 2) of sub-maps with guesses (c, 3) stated to be right to sigma (3,)."""
     covariance = np.tile(np.diag(np.asarray(sigma) ** 2), (len(pairs), 1, 1))
     target, source = np.asarray(pairs).T
     return Candidates(target, source, guess, covariance, np.full(len(pairs), 3.0 * max(sigma[:2])))
@@ -201,7 +201,7 @@ def accepted_pairs(hall, closures) -> np.ndarray:
 
 
 def test_a_match_that_the_graph_rules_out_is_rejected(hall, closures):
-    """A guess that is off by 0.25 m but believed to 1 cm: the match is right, and one of the two must be wrong."""
+    """A guess that is off by 0.25 m but stated to 1 cm: the match is right, and one of the two must be wrong."""
     pairs = accepted_pairs(hall, closures)
     one = given(hall, pairs, np.zeros((len(pairs), 3)), [0.01, 0.01, 0.004])
     guess = true_poses(hall, one) + np.array([0.18, 0.18, 0.0])
@@ -211,7 +211,7 @@ def test_a_match_that_the_graph_rules_out_is_rejected(hall, closures):
 
 
 def test_sub_maps_of_different_places_are_rejected_with_a_reason(hall):
-    """Pairs that have no surface in common, claimed to lie on top of each other and believed to 0.1 m."""
+    """Pairs that have no surface in common, claimed to lie on top of each other and stated to 0.1 m."""
     truth, pieces = hall[0], hall[3]
     a, b = np.triu_indices(len(pieces), 2)
     apart = np.hypot(*(truth[pieces.reference[a], :2] - truth[pieces.reference[b], :2]).T) > 6.0
@@ -236,7 +236,7 @@ def test_where_the_search_finds_no_place_at_all_that_is_the_reason(hall, closure
 
 
 def test_a_wide_uncertainty_is_searched(hall, closures):
-    """Guesses off by up to 1 m and 0.3 rad, believed to 0.5 m: most are found again, none wrongly."""
+    """Guesses off by up to 1 m and 0.3 rad, stated to 0.5 m: most are found again, none wrongly."""
     pairs = accepted_pairs(hall, closures)[:8]
     rng = np.random.default_rng(10)
     one = given(hall, pairs, np.zeros((len(pairs), 3)), [0.5, 0.5, 0.15])
@@ -306,7 +306,7 @@ def test_contradicting_closures_are_dropped_with_a_reason(seed):
 
 
 def test_a_pair_that_was_matched_twice_has_two_fates(hall):
-    """Tried directly and later after a search: the right measurement stands, the wrong one goes, and each says so."""
+    """Tried directly and later after a search: the right measurement stands, the wrong one goes, and each reports it."""
     rng = np.random.default_rng(1)
     truth = hall[0]
     graph = drifted(rng, truth, NOISE)

@@ -18,7 +18,7 @@ BIAS = 0.01
 
 
 def gyro_of(stamps, truth, rng=None, bias=BIAS, noise=0.0, rate=100.0) -> Gyro:
-    """Return what a gyro says of a true motion; noise: rad per square root of a second."""
+    """Return a gyro's readings of a true motion; noise: rad per square root of a second."""
     when = np.arange(stamps[0], stamps[-1], 1.0 / rate)
     heading = np.interp(when, stamps, np.unwrap(truth[:, 2])) + bias * (when - when[0])
     if rng is not None:

@@ -64,7 +64,7 @@ def test_the_wheels_variance_adds_up_along_the_way(seed):
 
 @pytest.mark.parametrize(("position", "heading"), [(3.0, 0.8), (1.0, 5.0), (100.0, 1.0)])
 def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
-    """Wheels that err so many times as much as stated; most steps are measured, exactly, and some of those are lies."""
+    """Wheels that err so many times as much as stated; most steps are measured, exactly, and some of those are outliers."""
     rng = np.random.default_rng(1)
     stamps, truth = wander(rng, 300.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig())
@@ -77,7 +77,7 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
     steps = RelativePoseEdges(some, some + 1, steps_measured, np.tile(np.eye(3), (len(some), 1, 1)))
     learnt = reestimate_wheel_noise(wheels, steps, graph)
     factor = np.einsum("eii->ei", exact.sqrt_information / learnt.sqrt_information.clip(1e-12))
-    # Medians of 500 steps are known to 5 %; a tenth of lies moves them by 12 %.
+    # Medians of 500 steps are known to 5 %; a tenth of outliers moves them by 12 %.
     assert np.median(factor[:, 0]) == pytest.approx(np.clip(position, 0.5, 10.0), rel=0.3)
     assert np.median(factor[:, 2]) == pytest.approx(np.clip(heading, 0.5, 10.0), rel=0.3)
     few = RelativePoseEdges(some[:5], some[:5] + 1, steps_measured[:5], steps.sqrt_information[:5])

@@ -16,7 +16,7 @@ def room():
 
 
 @pytest.mark.parametrize(("most", "kind"), [(10_000, "warnings"), (150, "doubts")])
-def test_a_map_larger_than_allowed_is_drawn_coarser_and_said(room, most, kind):
+def test_a_map_larger_than_allowed_is_drawn_coarser_and_reported(room, most, kind):
     result = build_map(room, replace(MappingConfig(), grid=GridConfig(max_cells=most)))
     assert result.grid.geometry.cells <= most
     (notice,) = [n for n in getattr(result, kind) if n.kind == "coarse-grid"]

@@ -65,11 +65,11 @@ def post(x, y, radius=0.3, sides=12):
 WALLS = np.vstack([
     [[-30.0, 1.5, 60.0, 1.5], [-30.0, -1.5, 60.0, -1.5]], post(2.0, 0.9), post(2.0 + LONG, 0.9),
 ])  # fmt: skip
-"""A corridor without end or feature, but for two columns out of sight of each other."""
+"""A corridor without end or feature, but for two columns not visible from each other."""
 
 
 def drive_along(scale):
-    """There and back along it, with wheels that make of a metre at x what scale(x) says."""
+    """There and back along it, with wheels that make of a metre at x scale(x)."""
     turn = ((0.0, 0.0, 0.4), np.pi / 0.4)
     legs = [((0.4, 0.0, 0.0), (LONG + 3.0) / 0.4), turn, ((0.4, 0.0, 0.0), (LONG + 3.0) / 0.4)]
     stamps, truth = planted.drive([t for t, _ in legs], [s for _, s in legs])
@@ -89,7 +89,7 @@ def carpet():
 
 @pytest.fixture(scope="module")
 def wrong_wheels():
-    """Wheels that are smaller than the robot believes, everywhere."""
+    """Wheels that are smaller than the robot is configured for, everywhere."""
     return drive_along(lambda x: np.full(len(x), SCALE))
 
 

@@ -1,4 +1,4 @@
-"""What tells against a result: turns of the wrong sign, values far from usual, ranges out of time; and where the map begins."""
+"""What contradicts a result: turns of the wrong sign, values far from usual, ranges out of time; and where the map begins."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -134,7 +134,7 @@ def test_stretches_in_which_most_readings_disagree_are_found():
 
 @pytest.mark.parametrize("seed", [11, 12])
 def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed):
-    """Two of four anchors say 2 m too little for 40 % of the time each: wheels alone are soft enough to believe them."""
+    """Two of four anchors measure 2 m too little for 40 % of the time each: wheels alone are weak enough to follow them."""
     stamps, truth, log = run(seed, walls=np.concatenate([box(13, 13), box(3, 2) + 0.5]), metres=100.0)
     radio, part = log.ranges, (log.ranges.stamps - stamps[0]) / np.ptp(stamps)
     outlying = (radio.anchor == 0) & (part > 0.1) & (part < 0.5) | (radio.anchor == 1) & (part > 0.5) & (part < 0.9)
@@ -148,7 +148,7 @@ def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_la
 
 @pytest.mark.parametrize("radio_scale", [1.0, 1.08])
 def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
-    """Without a lidar nothing says which of the two is wrong, but that they differ is plain."""
+    """Without a lidar nothing shows which of the two is wrong, but that they differ is plain."""
     reported = stated(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
     assert len(reported) == (radio_scale != 1.0)
     assert all("scale of the wheels" in text for text in reported)

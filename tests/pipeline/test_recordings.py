@@ -159,7 +159,7 @@ def test_wheels_and_radio_alone_share_a_frame(two):
 
 
 def test_a_third_links_two_that_share_nothing():
-    """West hears A and B, east C and D; the third hears all. Order does not matter."""
+    """West has ranges to A and B, east to C and D; the third to all. Order does not matter."""
     whole, truth = drive(4, lidar=False, start=900.0)
     parts = []
     for seed, keep in ((5, (0, 1)), (6, (2, 3))):

@@ -16,7 +16,7 @@ from uwblite.sensor_log import SensorMounting
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
 BIAS = np.array([0.4, -0.1, 0.2, 0.0])
 LEVEL = SensorMounting(anchor_height=0.0)
-"""Anchors at the height of the tag, and told so."""
+"""Anchors at the height of the tag, which is given."""
 
 
 def planted_run(seed=1, metres=150.0, sigma=0.04, **more):

@@ -1,4 +1,4 @@
-"""Starting values from nothing: planted worlds are grown from bent odometry and unknown anchors."""
+"""Starting values from nothing: planted worlds are recovered from bent odometry and unknown anchors."""
 
 from dataclasses import replace
 
@@ -19,8 +19,8 @@ from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
 
 SIGMA = 0.05
 WELL = 0.3
-"""m. Ranges of 0.05 m hold a pose to a few centimetres where three anchors are heard; between ranges odometry drifts. A
-grown trajectory is good enough as a start when it lies well within the width of the kernels that follow."""
+"""m. Ranges of 0.05 m hold a pose to a few centimetres where three anchors are in reach; between ranges odometry drifts. A
+bootstrapped trajectory is good enough as a start when it lies well within the width of the kernels that follow."""
 
 
 def start(wheels: Odometry, radio: UwbRanges) -> tuple[BootstrapResult, np.ndarray]:
@@ -165,7 +165,7 @@ def test_a_straight_run_reports_that_its_anchors_are_ambiguous():
     assert all(len(h) >= 2 for h in bootstrapped.hypotheses)
     for k, place in enumerate(places):
         found = np.array([h.position for h in bootstrapped.hypotheses[k][:2]])
-        # Ranges fix how far along and how far aside; on which side is a guess, and both guesses are told.
+        # Ranges fix how far along and how far aside; on which side is a guess, and both guesses are returned.
         sides = np.array([[place[0], abs(place[1])], [place[0], -abs(place[1])]])
         gap = np.hypot(*(found[:, None] - sides[None]).transpose(2, 0, 1))
         assert gap.min(axis=0).max() < 1.0

@@ -1,4 +1,4 @@
-"""An anchor that is moved while it is heard is told from one that is not, and the moment is found."""
+"""An anchor that is moved during a recording is distinguished from one that is not, and the moment is found."""
 
 from itertools import pairwise
 

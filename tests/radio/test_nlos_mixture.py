@@ -1,4 +1,4 @@
-"""Errors of ranges: core, detours and nonsense told apart; late errors pull less than early ones."""
+"""Errors of ranges: core, detours and nonsense separated; late errors pull less than early ones."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_late_errors_pull_less_than_early_ones():
 )
 def test_the_parts_are_recovered(tail, detour, wild):
     """Mean of ten draws of 1000: shares scatter by sqrt(p (1 - p) / 10000) and are shrunk by 15 clean ranges in 1000; the
-    core's mean and width by 0.07 / sqrt(5000), and a detour shorter than the core's width cannot be told from it."""
+    core's mean and width by 0.07 / sqrt(5000), and a detour shorter than the core's width cannot be distinguished from it."""
     fits = [fit(draw(np.random.default_rng(k), 1000, tail, detour, wild), 0.03) for k in range(10)]
     assert np.mean([m.centre for m in fits]) == pytest.approx(0.1, abs=0.006)
     assert np.mean([m.sigma for m in fits]) == pytest.approx(0.07, abs=0.005)

@@ -1,4 +1,4 @@
-"""Widths of priors by the evidence: the formula against an integral, and the choice on planted radios."""
+"""Widths of priors by marginal likelihood: the formula against an integral, and the choice on planted radios."""
 
 from dataclasses import replace
 

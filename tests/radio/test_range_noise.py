@@ -1,4 +1,4 @@
-"""Noise of ranges: white and slow part told apart, and what many alike ranges weigh together."""
+"""Noise of ranges: white and slow part separated, and what many alike ranges weigh together."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""First positions of anchors: planted ones are found among lies, mirrors are named."""
+"""First positions of anchors: planted ones are found among false ranges, mirrors are named."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_planted_anchors_are_found_among_false_ranges(seed, outliers, bias):
     path = loop_path(rng)
     anchor = rng.uniform(-9, 9, 2)
     found = trilaterate(path, measured(rng, path, anchor, 0.05, bias, outliers), CONFIG)
-    # A weak prior pulls the bias towards 0 by less than its own uncertainty; a kernel that drops lies costs a half.
+    # A weak prior pulls the bias towards 0 by less than its own uncertainty; a kernel that drops outliers costs a half.
     tolerance = 5 * 1.5 * expected_sigma(path, anchor, 0.05, outliers, CONFIG.samples)
     assert np.hypot(*(found[0].position - anchor)) < max(tolerance, 0.05)
     assert abs(found[0].bias - bias) < max(tolerance, 0.05)

@@ -26,7 +26,7 @@ def share(image, colour, tolerance=12):
 
 
 KEYS = [Key("path", PATH, "line"), Key("start", START, "disc"), Key("end", PATH, "ring")]
-"""What the legend of a path alone says."""
+"""The legend of a path alone."""
 PATH_IN_ROOM = np.stack([np.linspace(-1.0, 3.0, 50), np.linspace(2.0, 4.0, 50), np.zeros(50)], axis=1)
 
 

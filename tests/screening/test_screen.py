@@ -1,4 +1,4 @@
-"""What a recording says against itself is repaired where it can be, and said in any case."""
+"""Contradictions within a recording are repaired where they can be, and reported in any case."""
 
 from dataclasses import replace
 

@@ -33,8 +33,8 @@ def test_silent_sensors_come_first_the_longest_before_all(result):
     silent = FINE | {"lidar": Heard(450, 10.0, 12.0), "radio": Heard(90, 2.0, 30.0)}
     mirrored = replace(result, anchors=(replace(result.anchors[0], status="mirror-ambiguous"),))
     output = advice(silent, {}, 60.0, 0.0, mirrored)
-    assert output[0].startswith("nothing heard from the radio for 30 s")
-    assert output[1].startswith("nothing heard from the lidar for 12 s")
+    assert output[0].startswith("no message from the radio for 30 s")
+    assert output[1].startswith("no message from the lidar for 12 s")
     assert output[2] == f"anchor {result.anchors[0].id} may be mirrored: drive a curve near it"
 
 
@@ -47,7 +47,7 @@ def test_what_was_never_in_reach_and_a_log_that_rests():
     assert advice({}, {}, 0.0, 0.0, None)[0].startswith("nothing is recorded yet")
     output = advice({"odometry": FINE["odometry"]}, {}, 60.0, 0.0, None)
     assert [s.partition(" at all")[0] for s in output] == [
-        "nothing was heard from the lidar", "nothing was heard from the radio",
+        "no message came from the lidar", "no message came from the radio",
     ]  # fmt: skip
     assert advice(FINE, {}, 60.0, 42.0, None) == ["the log has not grown for 42 s: is the recorder still running?"]
 
@@ -76,5 +76,5 @@ def test_doubts_of_the_map_and_anchors_out_of_reach(result):
     output = advice(FINE, {"A": 70.0, "B": 1.0}, 100.0, 0.0, doubted)
     assert output == [
         "the map is doubted: measurements lie far off",
-        "not heard for more than a minute: A; out of reach, or without power",
+        "no range for more than a minute: A; out of reach, or without power",
     ]

@@ -1,4 +1,4 @@
-"""The constraints file of the page: the user's part stays, the page's part is written anew, both are read as written."""
+"""The constraints file of the page: the user's part stays, the page's part is written again, both are read as written."""
 
 import numpy as np
 import pytest

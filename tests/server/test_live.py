@@ -91,7 +91,7 @@ def test_the_status_of_a_growing_log(tmp_path, stored):
     assert sensors["odometry"]["rate"] == pytest.approx(10.0, abs=0.2)
     assert sensors["radio"]["late"]
     assert sensors["radio"]["rate"] == 0.0
-    assert status["advice"][0] == "nothing heard from the radio for 5 s: check its cable and power"
+    assert status["advice"][0] == "no message from the radio for 5 s: check its cable and power"
     x, y, theta = poses[-1]
     ahead = 0.2 * (times[-1] - stamps[-1])
     assert status["pose"] == pytest.approx([x + ahead * np.cos(theta), y + ahead * np.sin(theta), theta], abs=0.02)

@@ -109,7 +109,7 @@ def test_a_thousand_connections_are_turned_away_and_do_no_harm(live):
         line = socket.create_connection(server.server_address, timeout=10)
         held.append(line)
         if len(held) > 20:
-            # The first eight hold the room with half a request each; whoever comes later is told at once.
+            # The first eight hold the room with half a request each; whoever comes later is refused at once.
             old = held.pop(12)
             refused += old.recv(100).startswith(b"HTTP/1.1 503")
             old.close()

@@ -1,4 +1,4 @@
-"""The tools that measure: normalised errors of known covariances, drives with fewer anchors, pages written in sections."""
+"""The tools that measure: normalised errors of known covariances, recordings with fewer anchors, pages written in sections."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -6,7 +6,7 @@ A fault is written ``KIND[=VALUE][@START[+SECONDS]]``; times in s since the emul
     insert=0.01         a random byte put in after one in a hundred
     drop=0.01           one byte in a hundred lost
     garbage=200         so many random bytes at START
-    silent@20+5         the device says nothing for 5 s
+    silent@20+5         the device sends nothing for 5 s
     unplug@20+3         the port vanishes for 3 s
     hang@30             the device answers nothing until it is unplugged
     baud                the host has set another speed: every byte is wrong

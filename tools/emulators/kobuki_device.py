@@ -84,7 +84,7 @@ class WheeledDevice:
         return self.encode(ms, round(self._left), round(self._right), pose.theta, turn / self.PERIOD)
 
     def encode(self, ms: int, left: int, right: int, theta: float, turn_rate: float) -> bytes:
-        """Return a packet: the base's clock, the ticks of its wheels, what its gyro says (rad, rad/s)."""
+        """Return a packet: the base's clock, the ticks of its wheels, what its gyro measures (rad, rad/s)."""
         raise NotImplementedError
 
 
@@ -116,7 +116,7 @@ class Create2Device(WheeledDevice):
     SIZES = MappingProxyType({7: 1, 22: 2, 43: 2, 44: 2})
 
     def power_up(self, now: float) -> None:
-        """The port was opened anew; a stream that was asked for goes on."""
+        """The port was opened again; a stream that was asked for goes on."""
         self.packets = getattr(self, "packets", b"")
         self.streaming, self.awake, self._input = bool(self.packets), False, b""
 

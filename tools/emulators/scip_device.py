@@ -1,4 +1,4 @@
-"""An emulated URG-04LX: SCIP 1.1 until told otherwise, then SCIP 2.0. Bytes in, bytes out, time brought by the caller."""
+"""An emulated URG-04LX: SCIP 1.1 until commanded otherwise, then SCIP 2.0. Bytes in, bytes out, time brought by the caller."""
 
 import math
 import re

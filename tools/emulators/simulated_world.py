@@ -12,7 +12,7 @@ from .world import Epoch, Pose, RoomWorld
 NEAR = 25.0
 """m around the robot within which walls are looked at."""
 AGAIN = 1.0
-"""s after which the walls near the robot are chosen anew."""
+"""s after which the walls near the robot are chosen again."""
 
 
 class SimulatedWorld(RoomWorld):

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from .world import WorldClock
 
 FAR = math.atan(-21.8 / 155.3) / (2 * math.pi)
-"""Turns by which a YDLIDAR's far readings point elsewhere than its motor says."""
+"""Turns by which a YDLIDAR's far readings point elsewhere than its motor."""
 
 
 class SpinningDevice:

@@ -34,7 +34,7 @@ class UwbBoard:
         return self._clock.host(self._feed.head.time) if self._feed.head is not None else math.inf
 
     def receive(self, data: bytes, now: float) -> bytes:
-        """Ignore what the host says."""
+        """Ignore what the host sends."""
         return b""
 
     def advance(self, now: float) -> bytes:

@@ -1,4 +1,4 @@
-"""Device clocks: counters that wrap or start anew, and their time in seconds of the host.
+"""Device clocks: counters that wrap or restart, and their time in seconds of the host.
 
 `DeviceClock` is what drivers use: it unwraps the counter, notices resets, counts frames that are missing and maps to
 host time.
@@ -29,7 +29,7 @@ TOGETHER = 5.0
 RATE_WINDOW = 1.0
 """s of arrivals whose smallest delay is compared with that of the window before."""
 WRONG_RATE = 0.05
-"""Relative error of a device clock that no crystal has: its unit of time is not what was believed."""
+"""Relative error of a device clock that no crystal has: its unit of time is not the stated one."""
 WITNESSES = 3
 """Windows in a row that must say so."""
 GAP = 1.6
@@ -57,11 +57,11 @@ class Unwrapper:
         Parameters
         ----------
         count : the device's counter.
-        now : arrival at the host, s; tells how often the counter wrapped in a long silence.
+        now : arrival at the host, s; shows how often the counter wrapped in a long silence.
 
         Returns
         -------
-        seconds : s since counter value 0 of the first turn; starts anew after a reset.
+        seconds : s since counter value 0 of the first turn; restarts after a reset.
         reset : the counter went back or leapt: another power-up. The caller's clock map is void.
         """
         if self._total is None:
@@ -159,7 +159,7 @@ def _lower_hull(points: deque[tuple[float, float]]) -> list[tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What the clock says of one frame."""
+    """The clock's reading of one frame."""
 
     stamp: float
     """s, host clock."""
@@ -168,7 +168,7 @@ class Reading:
     missing: int
     """Frames that did not arrive in between."""
     reset: bool
-    """The device counted anew: it was powered up again."""
+    """The device counted from zero: it was powered up again."""
     spread: float
     """s by which the stamp may be wrong to either side."""
 
@@ -176,7 +176,7 @@ class Reading:
 class DeviceClock:
     """The clock that a device stamps its frames with.
 
-    A reset costs the map between the clocks, which begins anew, but not what was measured of the link: the delay of a
+    A reset costs the map between the clocks, which begins again, but not what was measured of the link: the delay of a
     frame is a property of the device and its cable.
 
     Parameters
@@ -207,7 +207,7 @@ class DeviceClock:
         self._tie: tuple[float, float] | None = None
         """s, between which host time minus device time lay."""
         self._tied_at = 0.0
-        """s, device time of the last reading that says so."""
+        """s, device time of the last reading that shows it."""
         self._windows: list[tuple[float, float]] = []
         self._witnesses = 0
 
@@ -222,7 +222,7 @@ class DeviceClock:
         if reset or (self._last is not None and not sent - LEAP < believed < answered + LEAP):
             self._begin_anew()
         low, high = self._tie if self._tie and device - self._tied_at < TOGETHER else (-math.inf, math.inf)
-        # Counts are whole: the reading was made up to half a count before or after what it says.
+        # Counts are whole: the reading was made up to half a count before or after its value.
         self._tie = max(low, sent - device - self._half), min(high, answered - device + self._half)
         self.tied, self._tied_at = max(self._half, (self._tie[1] - self._tie[0]) / 2), device
 

@@ -1,6 +1,6 @@
 """iRobot Create 2 and Roomba 500 to 900: wheel odometry from the encoder counts of the Open Interface. Sans-I/O.
 
-115200 bit/s. ``128`` starts the interface (passive mode: the robot drives as its buttons say, nothing moves by itself),
+115200 bit/s. ``128`` starts the interface (passive mode: the robot drives as its buttons command, nothing moves by itself),
 ``148 n packets...`` streams packets every 15 ms, big-endian::
 
     13h | length | 7, bumps and wheel drops (1) | 43, left encoder (2) | 44, right encoder (2) | 22, mV (2) | check
@@ -43,7 +43,7 @@ STALL = 0.3
 LOW_VOLTAGE = 13.0
 """V."""
 WINDOW, BUCKET, MOST_SKEW = 4.0, 0.05, 0.1
-"""s, s, share: how far back the map from frames to time looks; the period is told as 15 ms, and is not measured."""
+"""s, s, share: how far back the map from frames to time looks; the period is stated as 15 ms, and is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class Create2Driver(Driver):
             actions.append(Lost(stamp, round(pause / PERIOD) - 1))
         if pause > MAX_BLIND:
             self._odometer.forget()
-            text = f"odometry: the base was not heard for {pause:.1f} s: its motion meanwhile is unknown, pose held"
+            text = f"odometry: the base sent nothing for {pause:.1f} s: its motion meanwhile is unknown, pose held"
             actions.append(Note("warning", "odometry-gap", text))
         travel, turn = self._odometer.update(event.left, event.right)
         if event.wheel_drop and not (last and last.wheel_drop):

@@ -34,7 +34,7 @@ SENSORS = ("uwb", "lidar", "gyro", "odometry")
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What a driver is told besides its options."""
+    """What a driver gets besides its options."""
 
     start: Pose = (0.0, 0.0, 0.0)
     """Pose of the base with which odometry goes on."""
@@ -100,7 +100,7 @@ class DeviceKind:
     talks: bool = False
     """It talks unasked, so that listening finds it."""
     probe: bool = True
-    """`uwblite devices` can tell it from others."""
+    """`uwblite devices` can distinguish it from others."""
     silent: str = "it does not answer: check its power and its cable, unplug it and plug it in again"
     """What to do when it does not answer."""
     options: str = ""
@@ -240,7 +240,7 @@ def open_device(sensor: str, spec: str, setup: Setup | None = None, more: dict[s
     ----------
     sensor : one of SENSORS.
     spec : ``[NAME:]PORT[?option=value&...]``.
-    setup : what the driver is told.
+    setup : what the driver gets besides its options.
     more : options from elsewhere; those of `spec` win.
 
     Returns

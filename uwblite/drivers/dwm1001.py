@@ -5,7 +5,7 @@ Type, length, value; little-endian. Every answer begins ``40 01 error``; blocks 
     -> 32 00           <- 40 01 00 | 5A 02 status            is there a new fix? (cleared by reading)
     -> 0C 00           <- 40 01 00 | 41 0D position | 49 L n  n x (address 2, distance 4 mm, quality 1, position 13)
 
-There is no checksum: blocks are believed only behind a header, with a known type, a length that fits it and values
+There is no checksum: blocks are accepted only behind a header, with a known type, a length that fits it and values
 that a module can send. The head of an answer inside a block means that the block broke off. The firmware closes a
 request after 0.76 ms without a byte, so a request must be written in one write.
 Sources: DWM1001 firmware API guide 2.3; the vendor's host code.
@@ -38,14 +38,14 @@ class TlvProtocol(FrameReader):
         self._inside = False
 
     def frame_size(self, head: bytes) -> int:
-        """Tell the head of an answer by the type and length of the block behind it."""
+        """Recognise the head of an answer by the type and length of the block behind it."""
         return 3 if _may_begin(head) else -1
 
     def measure(self, at: int) -> int:
         """Return the size of the head or block at `at`; 0 = wait for more bytes; -n = the first n bytes are noise."""
         buffer = self.held.data
         if buffer[at] == self.lead:
-            # Bytes that were taken already are believed to be a head only together with the block that follows.
+            # Bytes that were taken already are accepted as a head only together with the block that follows.
             want = 5 if at < self.taken else 3
             head = bytes(buffer[at : at + want])
             return (3 if len(head) == want else 0) if _may_begin(head) else self._noise(-1)

@@ -1,6 +1,6 @@
 """Blocks in the answers of a DWM1001 with PANS R2: type, length, value; little-endian.
 
-A block is believed only with a known type, a length that fits it and values that a module can send.
+A block is accepted only with a known type, a length that fits it and values that a module can send.
 Sources: DWM1001 firmware API guide 2.3; the vendor's host code.
 """
 

@@ -40,7 +40,7 @@ WIDEST = 0.2
 MAX_FAILURES = 40
 """Requests without an answer after which the module is started again."""
 UNJOINED = 3.0
-"""s without a fix after which a tag is told to have no network."""
+"""s without a fix after which a tag is reported to have no network."""
 
 Readings = tuple[RangeReading, ...]
 Bracket = tuple[float, float]

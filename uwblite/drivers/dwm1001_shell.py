@@ -204,7 +204,7 @@ def _position(groups: Sequence[str]) -> tuple[float, float, float, int]:
 
 @dataclass(frozen=True, slots=True)
 class NodeInfo:
-    """What `si` says of a node."""
+    """The answer of a node to `si`."""
 
     short_id: str = ""
     """Four hexadecimal digits."""

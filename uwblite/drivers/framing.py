@@ -1,7 +1,7 @@
 """From bytes to frames: the one place that waits for the rest of a frame, and that finds the next one after damage.
 
 Bytes come in pieces of any size; each keeps the time at which its own piece arrived, so that noise before a frame does
-not lend it its time. A binary protocol is a `FrameReader` that says how long a frame is and what it holds; a protocol of
+not lend it its time. A binary protocol is a `FrameReader` that returns how long a frame is and what it contains; a protocol of
 text lines uses a `LineReader`. What is no frame becomes `Corrupt`.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 from .events import Corrupt, corrupt
 
 CHUNK = 512
-"""Bytes looked at together, so that noise of any length is held at most in pieces of this size."""
+"""Bytes looked at together, so that noise of any length is kept at most in pieces of this size."""
 
 
 class StampedBuffer:
@@ -53,10 +53,10 @@ class StampedBuffer:
 
 
 class FrameReader:
-    """Binary frames; a protocol derives from this and says `frame_size` and `decode`.
+    """Binary frames; a protocol derives from this and defines `frame_size` and `decode`.
 
     A frame is decoded when it is complete. If it is damaged, the search for the next one goes on at its second byte, so a
-    frame that broke off does not take the next one with it. At most one frame and CHUNK bytes are held.
+    frame that broke off does not take the next one with it. At most one frame and CHUNK bytes are kept.
     """
 
     lead = 0
@@ -165,7 +165,7 @@ class FrameReader:
 
 
 class PacketReader(FrameReader):
-    """Frames that prove themselves by a check; a protocol derives from this and says `size_at` and `decode`.
+    """Frames that prove themselves by a check; a protocol derives from this and defines `size_at` and `decode`.
 
     A head in noise may claim more bytes than ever come. Where a whole frame stands behind a head that still waits, that
     head was noise.

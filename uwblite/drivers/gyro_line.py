@@ -34,8 +34,8 @@ def gyro_format(columns: str, time_unit: float, angle_unit: float, prefix: str) 
 class GyroLineDriver(LineDriver):
     """A gyro that prints lines. Nothing is ever sent.
 
-    A heading that the gyro tells is taken; a rate is integrated with the trapezoidal rule. Where readings are missing
-    the heading is held: the mapper sees the gap by the stamps.
+    A heading that the gyro sends is taken; a rate is integrated with the trapezoidal rule. Where readings are missing
+    the heading stays: the mapper sees the gap by the stamps.
 
     Parameters
     ----------

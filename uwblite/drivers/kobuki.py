@@ -128,7 +128,7 @@ class KobukiDriver(Driver):
         if reading.elapsed is not None and reading.elapsed <= 0:
             return [Corrupt(b"", "packet sent twice")]
         if reading.elapsed is None:
-            self._odometer.forget()  # the base was switched on anew
+            self._odometer.forget()  # the base was switched on again
         # The gyro's angle is absolute, so the heading holds over any gap; the travel is ambiguous after a long one.
         elapsed = reading.elapsed or math.inf
         travel, _ = self._odometer.update(event.left, event.right, event.heading, still=elapsed > MAX_GUESS)
@@ -136,7 +136,7 @@ class KobukiDriver(Driver):
         if reading.reset or (reading.elapsed or 0.0) > MAX_BLIND:
             text = "odometry: the base restarted: its motion meanwhile is unknown, pose held"
             if not reading.reset:
-                text = f"odometry: the base was not heard for {reading.elapsed:.1f} s: how far it went meanwhile is unknown"
+                text = f"odometry: the base sent nothing for {reading.elapsed:.1f} s: how far it went meanwhile is unknown"
             actions.append(Note("warning", "odometry-gap", text))
         if event.wheel_drop and not self._wheel_drop:
             actions.append(Note("warning", "wheel-drop", "odometry: a wheel hangs in the air; travel is not to be trusted"))

@@ -77,7 +77,7 @@ class LdLidarProtocol(PacketReader):
 
 
 def _is_sound(packet: bytearray) -> bool:
-    """Return whether the angles are angles and fit the speed; in the manual's example they span twice what the rate says."""
+    """Return whether the angles are angles and fit the speed; in the manual's example they span twice what the rate gives."""
     (speed, start), (end,) = struct.unpack_from("<HH", packet, 2), struct.unpack_from("<H", packet, SIZE - 5)
     if speed > MOST_SPEED or start >= 36000 or end >= 36000:
         return False

@@ -4,8 +4,8 @@
 
     FA | A0 + number | speed (2, 0.1 rev/min) | 6 x (intensity (2), range (2, mm), reserved (2)) | sum | sum
 
-Readings are one degree apart, clockwise. The two last bytes are equal; how they are computed is told differently: the
-complement of the sum of the bytes before, or that sum plus one. Both are tried, and a unit that uses neither is believed
+Readings are one degree apart, clockwise. The two last bytes are equal; sources differ on how they are computed: the
+complement of the sum of the bytes before, or that sum plus one. Both are tried, and a unit that uses neither is accepted
 when the bytes are equal. Sources: the maker's driver hls_lfcd_lds_driver (layout, commands; it checks no sum), users'
 decoders (sums).
 """

@@ -10,9 +10,9 @@ from .session import Session
 from .transport import Opening, Port
 
 SILENCE = 3.0
-"""s without a measurement before it is said."""
+"""s without a measurement before it is reported."""
 HANG = 10.0
-"""s without a measurement before the port is opened anew."""
+"""s without a measurement before the port is opened again."""
 BACK_OFF = (0.1, 0.2, 0.4, 0.7, 1.0)
 """s between attempts to open a port that is gone; the last one repeats."""
 
@@ -100,7 +100,7 @@ class Link:
         self.opening = None
         if not isinstance(port, DeviceError):
             try:
-                port.read()  # what waited came nobody knows when
+                port.read()  # what waited came at an unknown time
             except DeviceError as error:
                 port.close()
                 port = error
@@ -168,7 +168,7 @@ class Link:
         return pause
 
     def watch(self, now: float) -> tuple[Note | None, bool]:
-        """Return what is to be said of a device that falls silent, and whether its port should be opened anew."""
+        """Return what is to be reported of a device that falls silent, and whether its port should be opened again."""
         silent, note = now - max(self.last_message, self.opened), None
         if silent > SILENCE and not self.quiet:
             self._fall_silent()

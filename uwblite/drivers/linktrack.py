@@ -5,7 +5,7 @@ signed, mm, 0 = none) at byte 22, ..., local time (4, ms) at byte 108, ..., sum 
 ``55 xx``. Source: the maker's nlink_unpack, as many programs carry it.
 
 BU03, 115200 bit/s, 35 bytes and perhaps more: ``AA 25 01``, eight ranges (32-bit, mm, 0 = none). It has no sum: a frame is
-believed when no range is beyond 65 m, which is 16 bits that must be zero. Source: bytes shown by users.
+accepted when no range is beyond 65 m, which is 16 bits that must be zero. Source: bytes shown by users.
 """
 
 import struct
@@ -22,7 +22,7 @@ LINKTRACK_BAUD, LINKTRACK_SIZE = 921600, 128
 LINKTRACK_HEAD = b"\x55\x01"
 BU03_BAUD, BU03_SIZE, BU03_HEAD = 115200, 35, b"\xaa\x25\x01"
 MUCH = 50
-"""Frames in a row without a range after which it is said."""
+"""Frames in a row without a range after which it is reported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class TagFrame:
     stamp: float
     """s, arrival of its first byte."""
     time: int | None
-    """ms, the tag's clock, wraps at 2**32; None = not told."""
+    """ms, the tag's clock, wraps at 2**32; None = not sent."""
     readings: tuple[RangeReading, ...]
 
 

@@ -1,7 +1,7 @@
 """The log on disk: CARMEN text, appended line by line so that a crash costs at most the line being written.
 
 Lines reach the kernel at once (unbuffered), so ``kill -9`` loses at most the last one, and a second thread asks the disk
-to keep them every `sync` seconds, so a power cut loses at most that. When the file has grown to `rotate` bytes the next
+to keep them every `sync` seconds, so a power cut loses at most that. When the file has reached `rotate` bytes the next
 part begins, with the PARAM lines repeated, so that each part can be read alone.
 """
 

@@ -30,7 +30,7 @@ class WheelOdometer:
         Parameters
         ----------
         left, right : ticks.
-        heading : rad, of a gyro, from any zero; None = the wheels tell the turn.
+        heading : rad, of a gyro, from any zero; None = the turn is the wheels'.
         still : what the counters did is unknown: the wheels count as still, a gyro does not.
         """
         last, self._last = self._last, (left, right, heading)
@@ -48,11 +48,11 @@ class WheelOdometer:
 
     @property
     def started(self) -> bool:
-        """The counters were read, or the pose was told."""
+        """The counters or the pose were read."""
         return self._last is not None
 
     def place(self, x: float, y: float, theta: float) -> None:
-        """Take a pose that the base tells itself; m, m, rad."""
+        """Take a pose that the base computes itself; m, m, rad."""
         self.pose, self._last = (x, y, math.remainder(theta, 2 * math.pi)), (0.0, 0.0, None)
 
     def forget(self) -> None:

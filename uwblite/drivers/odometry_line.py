@@ -1,6 +1,6 @@
 """Odometry of other bases: one text line per sample, columns by configuration. Sans-I/O.
 
-There is no standard for what hobby controllers print, so the columns are told: ``t,x,y,theta`` or ``t,left,right``
+There is no standard for what hobby controllers print, so the columns are given: ``t,x,y,theta`` or ``t,left,right``
 (encoder ticks) in any order, ``-`` for a column to skip. A line that does not fit is Corrupt.
 """
 
@@ -15,7 +15,7 @@ from .odometer import WheelOdometer, wrapped
 from .text_lines import LEAP_TIME, Line, LineDriver, columns_of, number_of
 
 LEAP_SPEED, LEAP_TURN = 3.0, 10.0
-"""m/s and rad/s that no base of this kind reaches: a line that asks for more is damaged, or the base began anew."""
+"""m/s and rad/s that no base of this kind reaches: a line that asks for more is damaged, or the base restarted."""
 LEAST_STEP = 0.1
 """s; over shorter times rounded numbers may seem faster."""
 COLUMNS = ("t", "x", "y", "theta", "left", "right", "speed", "turn_rate", "-")
@@ -173,7 +173,7 @@ class OdometryLineDriver(LineDriver):
         if self.clock.rate is not None:
             actions += self.say_once(self._wrong_unit(self.clock.rate))
         elif elapsed is None and "t" in values and self._odometer.started:
-            actions.append(Note("warning", "odometry-clock", "odometry: its clock leapt; time mapping starts anew"))
+            actions.append(Note("warning", "odometry-clock", "odometry: its clock leapt; time mapping starts again"))
         theta = values["theta"] * unit.angle_unit if "theta" in values else None
         if "left" in values:
             self._odometer.update(values["left"], values["right"], theta)
@@ -183,7 +183,7 @@ class OdometryLineDriver(LineDriver):
         return [*actions, OdometryPose(stamp, *self._odometer.pose, speed, rate)]
 
     def _wrong_unit(self, rate: float) -> Note:
-        text = "odometry: column t does not count seconds as time_unit says"
+        text = "odometry: column t does not count seconds as time_unit states"
         if math.isfinite(rate) and rate > 0:
             text += f", it runs {rate:.4g} times too fast: say time_unit={self._format.time_unit / rate:.1g}"
         return Note("error", "odometry-time-unit", text + "; until then lines are stamped with their arrival")

@@ -1,7 +1,7 @@
 """The recorder: several devices, one loop, one log.
 
-One thread waits on all ports at once. Each port has a session that says what to send and what was measured; the
-recorder writes measurements as log lines, reconnects devices that vanish, says when one falls silent, and counts what
+One thread waits on all ports at once. Each port has a session that decides what to send and what was measured; the
+recorder writes measurements as log lines, reconnects devices that vanish, reports when one falls silent, and counts what
 was lost. It reads no clock of its own: the caller hands in `monotonic`, and stamps become wall time by one offset fixed
 at the start, so that a clock set by NTP in mid-run moves nothing.
 """
@@ -50,7 +50,7 @@ class Recorder:
     wall_offset : s to add to `monotonic` for the log's timestamps.
     host : name of this computer, for the log.
     mounting : sensors on the base.
-    on_note : told (seconds since start, Note) for each thing a person must know.
+    on_note : called with (seconds since start, Note) for each thing a person must know.
     open_port : (url, baud) -> Port.
     """
 

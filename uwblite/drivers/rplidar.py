@@ -8,7 +8,7 @@ of 84 bytes, 32 readings each, little-endian::
 
 Angles run clockwise. The readings stand between the first angle of their capsule and that of the next, each less its
 offset (1/8 degree). Standard scan streams nodes of 5 bytes (start bit and its inverse, quality; check bit, angle
-(degrees * 64); range (mm * 4)), which have three check bits only: they are believed sixteen at a time, in a row, with
+(degrees * 64); range (mm * 4)), which have three check bits only: they are accepted sixteen at a time, in a row, with
 rising angles. Sources: RPLIDAR interface protocol; the maker's SDK (order of the bits, angle formula, start-up).
 """
 
@@ -54,7 +54,7 @@ MOST_NODE_STEP = 15 * 64
 FAN = Fan(720, 0.15, 12.0)
 """A1: 12 m; 4000 readings a second at 5.5 turns."""
 USUAL_PERIODS = (476e-6, 238e-6)
-"""s between readings, standard and express; the SDK's figures where the unit does not tell."""
+"""s between readings, standard and express; the SDK's figures where the unit sends none."""
 
 
 USUAL_SPEED = 660
@@ -69,7 +69,7 @@ def motor(speed: int) -> bytes:
 class RpLidarProtocol(PacketReader):
     """Bytes of the lidar in, Samples, Reply and Corrupt out.
 
-    A capsule is decoded when the next one has come. What kind of stream comes is said by the reply that announces it.
+    A capsule is decoded when the next one has come. What kind of stream comes is in the reply that announces it.
     """
 
     def __init__(self) -> None:

@@ -163,7 +163,7 @@ class ScipProtocol:
             events.append(corrupt(data, "line outside a frame"))
 
     def _close(self, events: list[Event], cut: bool = False) -> None:
-        """Decode the frame held; `cut` says that its closing empty line never came."""
+        """Decode the frame held; `cut` : its closing empty line never came."""
         frame, self._frame = self._frame, []
         if not frame:
             return

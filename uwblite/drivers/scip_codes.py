@@ -77,7 +77,7 @@ def status_meaning(command: str, status: str) -> tuple[str, str]:
     text : what it means.
     """
     if len(status) == 1:
-        return ("ok", "SCIP 1.1: ok") if status == "0" else ("scip1", "the unit speaks SCIP 1.1; send SCIP2.0")
+        return ("ok", "SCIP 1.1: ok") if status == "0" else ("scip1", "the unit has SCIP 1.1; send SCIP2.0")
     known = STATUS_BY_COMMAND.get(command[:2], STATUS_OF_SCANS if command[:1] in "GM" else {})
     text = known.get(status) or STATUS_OF_ALL.get(status)
     if command[:1] in "GM" and status.isdigit():

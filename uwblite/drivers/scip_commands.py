@@ -13,7 +13,7 @@ BAUD_RATES = (115200, 19200, 57600, 250000, 500000, 750000)
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """What PP says of the unit; defaults are those of the URG-04LX."""
+    """The answer of the unit to PP; defaults are those of the URG-04LX."""
 
     model: str = "URG-04LX"
     distance_min: int = 20
@@ -60,7 +60,7 @@ def text_command(name: str) -> bytes:
     ProtocolError : not one of these; other commands can hang a URG-04LX until its power is cycled.
     """
     if name not in {"VV", "PP", "II", "BM", "QT", "RS", "TM0", "TM1", "TM2", "SCIP2.0"}:
-        raise ProtocolError(f"{name!r} is not a command that every unit knows; use VV PP II BM QT RS TM0 TM1 TM2 SCIP2.0")
+        raise ProtocolError(f"{name!r} is not a command that every unit has; use VV PP II BM QT RS TM0 TM1 TM2 SCIP2.0")
     return name.encode() + b"\n"
 
 

@@ -47,7 +47,7 @@ PAUSE_PATIENCE = 10.0
 FAULT_PAUSE = 2.0
 """s before a unit with a hardware fault is tried again."""
 MAX_ROUNDS = 3
-"""Starts without a scan before the port is opened anew."""
+"""Starts without a scan before the port is opened again."""
 FULL_LINE = 0.92
 """Share of a period that a scan may take on the line; above, the unit leaves scans out."""
 FAST_RATES = (500000, 250000, 750000, 115200, 57600)
@@ -58,7 +58,7 @@ NARROW = 4095
 
 
 class ScipDriver(Driver):
-    """One lidar that speaks SCIP 2.0.
+    """One lidar with SCIP 2.0.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class ScipDriver(Driver):
         self._rounds = 0
 
     def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return Reply, Distances and Corrupt; remember what the unit says of itself."""
+        """Return Reply, Distances and Corrupt; remember what the unit reports of itself."""
         events = super().parse(data, now)
         for event in events:
             if isinstance(event, Reply) and event.command in WITH_LINES and event.status == "00":
@@ -124,7 +124,7 @@ class ScipDriver(Driver):
         return reply
 
     def _find(self) -> Script[bool]:
-        """Make the unit quiet, whatever state and bit rate a dead host left it in; False: Reopen was said."""
+        """Make the unit quiet, whatever state and bit rate a dead host left it in; False: Reopen was sent."""
         yield from self.sleep(DRAIN)
         for rate in (self.baud, *(rate for rate in BAUD_RATES if rate != self.baud)):
             if rate != self.baud:
@@ -150,7 +150,7 @@ class ScipDriver(Driver):
         if kind == "scip1":
             switched = yield from self._request("SCIP2.0")
             if switched is not None and status_meaning("SCIP2.0", switched.status)[0] == "scip1":
-                text = "lidar: it speaks SCIP 1.1 only; its firmware (before 3.0) needs the maker's update to SCIP 2.0"
+                text = "lidar: it has SCIP 1.1 only; its firmware (before 3.0) needs the maker's update to SCIP 2.0"
                 yield from self.say_once(Note("error", "lidar-scip1-only", text))
                 yield Reopen("SCIP 1.1 only")
                 return False
@@ -183,7 +183,7 @@ class ScipDriver(Driver):
                 yield Param(f"laser_{name}", self.facts[key].replace(" ", "_"))
 
     def _take_geometry(self, reply: Reply | None) -> Script[None]:
-        """Believe PP when it came twice alike: the sums of its lines are wrong in some units and cannot be asked for."""
+        """Accept PP when it came twice alike: the sums of its lines are wrong in some units and cannot be asked for."""
         before, problem = None, "no answer to PP"
         for _ in range(PARAMETER_READS):
             try:
@@ -228,7 +228,7 @@ class ScipDriver(Driver):
         return scan_command(first, last, cluster=self._cluster, skip=self._skip, wide=self._wide, geometry=unit)
 
     def _read_scans(self) -> Script[str]:
-        """Stream until something is wrong; return what, "" where it was said already."""
+        """Stream until something is wrong; return what, "" where it was reported already."""
         refusal = yield from self._begin_stream()
         if refusal:
             return refusal
@@ -271,7 +271,7 @@ class ScipDriver(Driver):
         return f"{reply.command[:2]} refused, {text}" if kind == "refused" else ""
 
     def _fit_line(self, seconds: float) -> Script[bool]:
-        """Make scans fit the line, one of which took so long on it; True: the stream must begin anew."""
+        """Make scans fit the line, one of which took so long on it; True: the stream must begin again."""
         if seconds <= FULL_LINE * self.period:
             return False
         yield from self._request("QT")
@@ -313,7 +313,7 @@ class ScipDriver(Driver):
     def _scan(self, scan: Distances) -> Script[None]:
         reading = self._clock.read(scan.time + TRUNCATION, scan.stamp)
         if reading.reset:
-            yield Note("warning", "lidar-clock-reset", "lidar: its clock was reset; time mapping starts anew")
+            yield Note("warning", "lidar-clock-reset", "lidar: its clock was reset; time mapping starts again")
         if reading.elapsed is not None and reading.elapsed < 0.5 * self.period:
             yield Corrupt(b"", "scan sent twice")
             return

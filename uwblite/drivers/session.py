@@ -72,7 +72,7 @@ class Driver:
         self.now = 0.0
         """s, host clock: the time of what is being handled."""
         self.ready = False
-        """The device was found and has said who it is."""
+        """The device was found and identified."""
         self._told: set[str] = set()
 
     def begin(self) -> None:
@@ -105,7 +105,7 @@ class Driver:
     # ---- words of a script
 
     def say_once(self, *notes: Note) -> list[Action]:
-        """Return the notes that were not said yet."""
+        """Return the notes that were not reported yet."""
         fresh = [note for note in notes if note.name not in self._told]
         self._told.update(note.name for note in fresh)
         return list(fresh)

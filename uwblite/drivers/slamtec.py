@@ -79,7 +79,7 @@ def decode_reply(data: bytes, stamp: float) -> Reply:
 
 
 def answers(kind: int) -> Callable[[Any], bool]:
-    """Return what tells a reply of a kind from other events."""
+    """Return what distinguishes a reply of a kind from other events."""
     return lambda event: isinstance(event, Reply) and event.kind == kind
 
 

@@ -9,20 +9,20 @@ from .session import Driver, Identity, Script, Wait
 from .sweep import Fan, Samples, SweepAssembler
 
 SILENCE = 3.0
-"""s without a reading after which the lidar is started anew."""
+"""s without a reading after which the lidar is started again."""
 WINDOW, BUCKET, MOST_SKEW = 4.0, 0.05, 0.1
-"""s, s, share: a lidar without a clock measures at a rate that is told within a few percent only."""
+"""s, s, share: a lidar without a clock measures at a rate that is stated within a few percent only."""
 LONG = 0.6
-"""Turns without a reading after which, by the motor's place alone, nobody knows how many went by."""
+"""Turns without a reading after which, by the motor's place alone, it is unknown how many went by."""
 PAUSE = 1.0
-"""s without bytes after which the motor's place tells nothing, even where it seems to go on."""
+"""s without bytes after which the motor's place shows nothing, even where it seems to go on."""
 
 
 class SpinningDriver(Driver):
     """A spinning lidar that streams; kinds derive from this, and say how it is started if it does not stream unasked.
 
     A lidar that stamps its packets has a `DeviceClock`. For others the readings themselves are the clock: they come at a
-    constant rate, and how many are missing is told by where the motor stands.
+    constant rate, and how many are missing follows from where the motor stands.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ class Samples:
     stamp: float
     """s, arrival of the frame's first byte; the last reading was made just before."""
     clock: int | None
-    """Device clock at the last reading, its own ticks; None where the device tells no time."""
+    """Device clock at the last reading, its own ticks; None where the device sends no time."""
     period: float
     """s between readings."""
     turned: tuple[float, ...]

@@ -93,7 +93,7 @@ class LineDriver(Driver):
 
     Parameters
     ----------
-    parse : what a line says. title : of the device, for people. baud : bit/s.
+    parse : a line -> its content. title : of the device, for people. baud : bit/s.
     time_unit : s per unit of its time.
     """
 
@@ -111,13 +111,13 @@ class LineDriver(Driver):
         yield from super().script()
 
     def leaps(self, time: float | None, arrival: float) -> bool:
-        """Tell whether a line's time leaps: lines have no sum, and a digit that is lost makes another number.
+        """Return whether a line's time leaps: lines have no sum, and a digit that is lost makes another number.
 
         Of two in a row the second one counts: the device began anew.
 
         Parameters
         ----------
-        time : of the device, its own unit; None = the line tells none. arrival : s, host clock.
+        time : of the device, its own unit; None = the line has none. arrival : s, host clock.
         """
         before, known = self._before, self.clock.proven and self.clock.rate is None
         if time is not None and before is not None and known:
@@ -132,7 +132,7 @@ class LineDriver(Driver):
 
         Parameters
         ----------
-        time : of the device, its own unit; None = the line tells none. arrival : s, host clock.
+        time : of the device, its own unit; None = the line has none. arrival : s, host clock.
         """
         if time is None:
             return arrival, None, []

@@ -1,7 +1,7 @@
 """Ports by URL: the only file that knows pyserial, which is imported when a serial port is first opened.
 
 ``/dev/ttyACM0`` or a path in ``/dev/serial/by-id`` opens a port, ``socket://host:port`` a bridge (ser2net, an emulator),
-``loop://`` a port that hears itself. Reads never block.
+``loop://`` a port that receives what it sends. Reads never block.
 """
 
 import contextlib
@@ -107,7 +107,7 @@ def open_port(url: str, baud: int) -> Port:
 
     Raises
     ------
-    DeviceError : cannot be opened; the message says how to mend it.
+    DeviceError : cannot be opened; the message says how to fix it.
     """
     return SocketPort(url) if is_socket(url) else SerialPort(url, baud)
 
@@ -261,7 +261,7 @@ class SerialPort:
         return data
 
     def _hung_up(self) -> bool:
-        """Tell a terminal that has nothing to say from one that is gone: both read as nothing."""
+        """Distinguish a terminal without data from one that is gone: both read as nothing."""
         poller = select.poll()
         poller.register(self._serial.fileno(), select.POLLIN)
         return any(flags & ~select.POLLIN for _, flags in poller.poll(0))

@@ -15,19 +15,19 @@ from .session import Identity
 from .text_lines import Line, LineDriver, columns_of, number_of
 
 MOST_RANGE = 1000.0
-"""m; no UWB radio hears further."""
+"""m; no UWB radio reaches further."""
 NAME = re.compile(r"[A-Za-z0-9_.:-]{1,32}")
 
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """What a line says."""
+    """The content of a line."""
 
     readings: tuple[RangeReading, ...] = ()
     time: float | None = None
-    """The board's own time, its own unit; None = not told."""
+    """The board's own time, its own unit; None = not sent."""
     tag: str = ""
-    """Who measured, where the line says so."""
+    """Who measured, where the line contains it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Refused:
 
 
 Parse = Callable[[str], Ranges | Refused | str | None]
-"""A line -> what it says; text = why it is damaged; None = not meant for us."""
+"""A line -> its content; text = why it is damaged; None = not meant for us."""
 
 # ---- boards with a form of their own
 
@@ -168,7 +168,7 @@ class UwbLineDriver(LineDriver):
 
     Parameters
     ----------
-    parse : what a line says.
+    parse : a line -> its content.
     title : of the board, for people.
     baud : bit/s.
     time_unit : s per unit of column t.

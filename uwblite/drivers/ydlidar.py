@@ -37,7 +37,7 @@ FAN_X4, FAN_X2 = Fan(720, 0.12, 10.0), Fan(480, 0.12, 8.0)
 _OFFSET, _BASE = 21.8, 155.3
 """mm, of the formula above."""
 _FAR = math.atan(-_OFFSET / _BASE) / (2.0 * math.pi)
-"""Turns, what the formula says of a far wall: the motor's zero is put there, so that far readings point where it stands."""
+"""Turns, what the formula gives for a far wall: the motor's zero is put there, so that far readings point where it stands."""
 
 
 class YdLidarProtocol(PacketReader):

@@ -1,4 +1,4 @@
-"""What a live localisation knows beforehand: anchors with their calibration, walls, and where the laser sits on the robot."""
+"""What a live localisation is given: anchors with their calibration, walls, and where the laser sits on the robot."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -45,11 +45,11 @@ class KnownMap:
 _SIGMA = 0.1
 """m; spread of ranges to an anchor of which the map does not say it."""
 _LEAST_SIGMA = 0.05
-"""m; no radio of this kind is trusted beyond this in another recording."""
+"""m; largest standard deviation of such radios in another recording."""
 
 
 def from_result(result: StoredResult) -> KnownMap:
-    """Return what a folder that `uwblite map` wrote knows.
+    """Return what a folder that `uwblite map` wrote contains.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def from_result(result: StoredResult) -> KnownMap:
     calibration = _calibration(result.report)
     anchors = known_anchors(result.anchors, calibration)
     if not anchors.ids and result.grid is None:
-        raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: nothing tells where a robot is")
+        raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: nothing locates a robot")
     correction = np.array([calibration.get(f"laser_{name}", 0.0) for name in ("x", "y", "theta")])
     walls = None if result.grid is None else walls_of(result.grid)
     return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0))

@@ -1,10 +1,10 @@
 """A robot's pose in a map that is there already, as its measurements come in.
 
 Nothing is known at the start. While the robot drives, the last metres' ranges and scans are searched for in the whole map
-(search); what is found lives on as hypotheses, each an extended Kalman filter of its own (hypotheses), and is weighed anew
+(search); what is found lives on as hypotheses, each an extended Kalman filter of its own (hypotheses), and is weighted again
 with every search. Only when one explains what was measured, twice in a row, and every other place is a few hundred times
 less likely, the pose counts as found. From then on that filter tracks, at a millisecond a scan; where measurements
-and map fall apart, the pose counts as lost, and the search begins anew with what was measured since.
+and map fall apart, the pose counts as lost, and the search begins again with what was measured since.
 """
 
 from collections.abc import Sequence
@@ -352,7 +352,7 @@ class Localizer:
         self._search_way, self._search_stamp = self._way, self._odometer.stamp
 
     def _search(self) -> None:
-        """Look for the robot in the whole map, weigh all hypotheses anew, and decide."""
+        """Look for the robot in the whole map, weight all hypotheses again, and decide."""
         odom = self._odometer.pose
         ranges = self._window.heard(odom, self._way)
         rays, ago = self._window.seen(odom, self._way, _LOOK_BACK)
@@ -393,7 +393,7 @@ class Localizer:
         return hypotheses.joined(self._bank, fresh)
 
     def _doubt(self, best: int, complete: bool, fit: float, ends: float, heard: "_Heard") -> str:
-        """Return why the best hypothesis is not to be trusted yet; "" = it is."""
+        """Return why the best hypothesis is not certain yet; "" = it is."""
         bank = self._bank
         sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
         rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
@@ -435,7 +435,7 @@ class Localizer:
 
 
 _FEW_ENDS = 12
-"""Rays' ends in known space from which a scan says something."""
+"""Rays' ends in known space from which a scan counts."""
 _ENOUGH_ENDS, _ENOUGH_RANGES = 40, 6
 """Rays' ends, or ranges to two anchors, that a start needs."""
 _SIGMA_SCAN = (0.2, 0.2, 0.06)
@@ -474,7 +474,7 @@ def _too_little(rays: Rays, ranges: Ranges) -> str:
     if not len(rays.hit) and not len(ranges):
         return "no range to an anchor of the map and no scan has come in"
     if not len(rays.hit) and len(np.unique(ranges.anchor)) < 2:
-        return "only one of the map's anchors is heard; two or more are needed, or a lidar"
+        return "only one of the map's anchors is in reach; two or more are needed, or a lidar"
     return "too many places are as likely; drive on"
 
 

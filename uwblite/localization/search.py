@@ -4,7 +4,7 @@ Ranges first: a place to which the measured distances cannot belong, whatever th
 remains the scans of the last metres, laid together by the odometry, are matched by branch and bound over a pyramid of the
 walls' likelihood field, of which each level bounds the one below (W. Hess et al., Real-time loop closure in 2D lidar SLAM,
 ICRA 2016); unlike there, all poses near the best score are kept, not the best alone: a place that looks like another one is
-not decided here. Where no wall is in sight, headings and places are tried by the ranges alone. What is found is refined and
+not decided here. Where no wall is visible, headings and places are tried by the ranges alone. What is found is refined and
 weighed by everything that the window holds.
 """
 
@@ -105,7 +105,7 @@ def places(field: Field | None, walls: Walls | None, rays: Rays, ranges: Ranges,
     Returns
     -------
     Poses that explain the measurements about as well as the best one, at most MOST_PLACES, the best first; refined by ranges
-    where no scan says more.
+    where no scan measures more.
     """
     seen = _thinned(rays) if walls is not None else np.zeros((0, 2))
     if field is not None and len(seen) >= _FEWEST_POINTS:
@@ -204,7 +204,7 @@ def _children(nodes: Ints, half: int) -> Ints:
 
 
 def _allowed(centre: Floats, half: float, ranges: Ranges) -> Bools:
-    """Tell where (n,) the robot may be by its ranges alone, whatever its heading, within a half width of a place, m.
+    """Return where (n,) the robot may be by its ranges alone, whatever its heading, within a half width of a place, m.
 
     The tag was within |t| of where it is now: a range further off than that, the cell and four sigmas disagrees. Detours make
     ranges long: a place that is too near an anchor is half a disagreement. The best places and those with little more stay.

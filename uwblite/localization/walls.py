@@ -2,7 +2,7 @@
 
 A scan's point lies on a wall when the nearest occupied cell is near; across the wall's line it measures the pose. A ray
 that ends in free space met something that is not in the map, and one that passes an occupied cell contradicts the map; both
-are evidence against a pose, and pull at none. Points in unknown space say nothing.
+count against a pose, and pull at none. Points in unknown space count for nothing.
 """
 
 from dataclasses import dataclass
@@ -139,7 +139,7 @@ class Walls:
         return weighted @ jacobian.transpose(0, 2, 1), np.einsum("hkp,hp->hk", weighted, r), w.sum(axis=1)
 
     def agreement(self, poses: Floats, rays: Rays) -> Agreement:
-        """Tell how rays agree with the map at poses (h, 3).
+        """Return how rays agree with the map at poses (h, 3).
 
         An end on a wall counts log 1, one in free space log 0.1, one in unknown space the mean of the two: nothing either
         way; a ray that passes a wall counts as if it ended in free space, or half of that where it saw nothing.
@@ -213,7 +213,7 @@ def _surface(geometry: GridGeometry, states: NDArray[np.int8]) -> Floats:
 
 
 def _facing_free_space(walls: Walls) -> Walls:
-    """Return the walls with normals that point to the side on which the map knows free space."""
+    """Return the walls with normals that point to the side on which the map has free space."""
     free = []
     for sign in (1.0, -1.0):
         places = [walls.points + sign * offset * walls.normals for offset in _SIDE]

@@ -1,6 +1,6 @@
 """What was measured during the last metres of driving, in the frame of the robot as it stands now: all that a start goes by.
 
-Poses of the past hang on the present one by the odometry. Whoever says where the robot is now says where everything was
+Poses of the past hang on the present one by the odometry. The place of the robot now fixes where everything was
 measured, so that a start is a search over one pose.
 """
 

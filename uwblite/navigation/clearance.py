@@ -46,7 +46,7 @@ class ClearanceMap:
     """Of the robot, m."""
 
     def passable(self) -> Bools:
-        """Tell in which cells' centres (rows, cols) the robot may stand, so that every step to a neighbour is safe too."""
+        """Return in which cells' centres (rows, cols) the robot may stand, so that every step to a neighbour is safe too."""
         # A step is as long as the diagonal at most: see the bound of a line above.
         return self.squared >= self.radius**2 + 0.5 * self.geometry.resolution**2
 

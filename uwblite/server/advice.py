@@ -8,13 +8,13 @@ import numpy as np
 from ..io.stored_result import StoredResult
 
 SILENT = 3.0
-"""s without a message of a sensor that was heard before, or five of its periods where that is longer."""
+"""s without a message of a sensor that sent before, or five of its periods where that is longer."""
 _NOT_GROWING = 10.0
-"""s after which a log that does not grow is told."""
+"""s after which a log that does not grow is reported."""
 _NEVER_HEARD = 15.0
-"""s of recording after which a sensor that was never heard is told."""
+"""s of recording after which a sensor that never sent is reported."""
 _ANCHOR_LOST = 60.0
-"""s without a range of an anchor that was heard before."""
+"""s without a range of an anchor that was in reach before."""
 _FAR = 0.5
 """m; a sigma of an anchor beyond which more ranges from other sides are worth the way."""
 _OPEN_LOOP = 30.0
@@ -31,7 +31,7 @@ class Heard:
     rate: float
     """Per second over the last seconds."""
     silent: float
-    """s that other sensors have been heard since its last message."""
+    """s that other sensors have sent since its last message."""
 
 
 def advice(
@@ -42,7 +42,7 @@ def advice(
     Parameters
     ----------
     sensors : by name: odometry, lidar, radio, gyro.
-    anchors : s since each anchor was heard.
+    anchors : s since the last range of each anchor.
     recorded : length of the recording, s.
     at_rest : s since the log has grown.
     result : the latest map; None = there is none yet.
@@ -53,7 +53,7 @@ def advice(
     if at_rest < _NOT_GROWING and "radio" in sensors and sensors["radio"].silent < SILENT:
         gone = sorted(name for name, silent in anchors.items() if silent > _ANCHOR_LOST)
         if gone:
-            found.append(f"not heard for more than a minute: {_listed(gone)}; out of reach, or without power")
+            found.append(f"no range for more than a minute: {_listed(gone)}; out of reach, or without power")
     return found
 
 
@@ -68,9 +68,9 @@ def _about_sensors(sensors: Mapping[str, Heard], recorded: float, at_rest: float
     if at_rest > _NOT_GROWING:
         return [f"the log has not grown for {at_rest:.0f} s: is the recorder still running?"]
     late = sorted(((s.silent, name) for name, s in sensors.items() if s.silent > silent_after(s)), reverse=True)
-    found = [f"nothing heard from the {name} for {silent:.0f} s: check its cable and power" for silent, name in late]
+    found = [f"no message from the {name} for {silent:.0f} s: check its cable and power" for silent, name in late]
     missing = [name for name in ("odometry", "lidar", "radio") if name not in sensors and recorded > _NEVER_HEARD]
-    return found + [f"nothing was heard from the {name} at all: it is not recorded, or it is silent" for name in missing]
+    return found + [f"no message came from the {name} at all: it is not recorded, or it is silent" for name in missing]
 
 
 def _about_anchors(result: StoredResult) -> list[str]:

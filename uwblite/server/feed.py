@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 _PATIENCE = 10.0
-"""s of silence after which a line goes out all the same: it tells who has left, and keeps lines open in between."""
+"""s of silence after which a line goes out all the same: it shows who has left, and keeps lines open in between."""
 
 
 class Feed:

@@ -78,7 +78,7 @@ class LivePage:
 
 
 def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rounds: str) -> dict[str, Any]:
-    """Return what the page of a growing log says now.
+    """Return what the page of a log that is being written shows now.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rou
     anchors = {name: tail.last - sensor.last for name, sensor in tail.anchors.items()}
     summary = f"{os.path.basename(tail.path)}: {tail.seconds:.0f} s, {tail.bytes / 1e6:.1f} MB"
     summary += f", {tail.broken} broken lines" if tail.broken else ""
-    summary += ", begun anew" if tail.restarts else ""
+    summary += ", begun again" if tail.restarts else ""
     trail = _trail(tail, result)
     return {
         "summary": summary,
@@ -109,7 +109,7 @@ def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rou
 
 
 def _heard(sensor: Sensor, now: float) -> Heard:
-    """Return what was heard of a sensor; of a silent one the rate is the one that it had."""
+    """Return what came from a sensor; of a silent one the rate is the one that it had."""
     return Heard(sensor.count, sensor.rate(sensor.last), now - sensor.last)
 
 
