@@ -25,7 +25,8 @@ FLOORS = (
     ("loop_closure", "checks", "evaluation", "io"),
     ("pipeline",),
     ("mapping",),
-    ("localization", "server"),
+    ("localization",),
+    ("server",),
     ("cli",),
     ("__main__",),
 )

@@ -123,7 +123,7 @@ def test_the_page_shows_the_map_and_the_robot_on_it(room, capsys, monkeypatch):
     assert published[0][1]["image"]["width"] > 8
     first, last = published[1][1], published[-1][1]
     assert first["pose"] is None
-    assert first["advice"][0].startswith("Lost:")
+    assert first["advice"][0].startswith("the pose is not known: ")
     np.testing.assert_allclose(last["pose"], poses[-1], atol=0.06)
     assert last["advice"] == []
     assert len(last["trail"]) > 5

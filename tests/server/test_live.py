@@ -47,6 +47,8 @@ def test_a_map_with_its_picture_anchors_and_path(page, stored):
     assert page.handle("GET", f"/grid.png?{shown['version']}", HOST).body.startswith(b"\x89PNG")
     page.show_map(stored)
     assert states(page)["map"]["version"] != shown["version"]
+    page.show_map(stored, paths=False)
+    assert states(page)["map"]["paths"] == []
     page.show_map(replace(stored, grid=None))
     assert states(page)["map"]["image"] is None
     page.show_map(None)

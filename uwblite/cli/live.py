@@ -3,11 +3,12 @@
 import argparse
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from . import console
 from .options import mounted, number
-from .record import page_place
+from .serving import LOCAL, page_address, serving
 
 if TYPE_CHECKING:
     from ..io.carmen_live import Measured
@@ -25,7 +26,7 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--rate", metavar="HZ", type=number(above=0), default=10.0, help="lines per second of driving (10)")
     group.add_argument("--idle", metavar="S", type=number(above=0), help="end when the log has not grown for so long (never)")
     page = "show the pose on the map, on a page for this computer; an address opens it to others, such as 0.0.0.0:8000"
-    group.add_argument("--serve", metavar="[ADDRESS:]PORT", type=page_place, nargs="?", const=("127.0.0.1", 8000), help=page)
+    group.add_argument("--serve", metavar="[ADDRESS:]PORT", type=page_address, nargs="?", const=LOCAL, help=page)
     for name, form in (("odometry", "NAME:PORT"), ("lidar", "[NAME:]PORT"), ("uwb", "[NAME:]PORT"), ("gyro", "NAME:PORT")):
         help_text = "device, as for uwblite record" + ("; repeatable" if name == "uwb" else "")
         group.add_argument(f"--{name}", metavar=form, action="append", help=help_text)
@@ -33,8 +34,6 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_live(args: argparse.Namespace) -> int:
     """Say poses until the log ends or somebody says stop."""
-    import signal
-
     from ..errors import UsageError
     from ..io.stored_result import read_result
     from ..localization.known_map import from_result
@@ -49,7 +48,14 @@ def run_live(args: argparse.Namespace) -> int:
     known = from_result(result)
     _tell_map(known)
     tracker = Tracker(known, args)
-    close = _served(args.serve, result, tracker) if args.serve else lambda: None
+    with _shown(result, tracker, args.serve):
+        return _track(tracker, args, devices)
+
+
+def _track(tracker: "Tracker", args: argparse.Namespace, devices: bool) -> int:
+    """Follow devices or a log and return the exit code."""
+    import signal
+
     stopped: list[int] = []
     before = {n: signal.signal(n, lambda k, _f: stopped.append(k)) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -66,7 +72,6 @@ def run_live(args: argparse.Namespace) -> int:
     finally:
         for n, handler in before.items():
             signal.signal(n, handler)
-        close()
     return tracker.ended(signal.SIGINT in stopped)
 
 
@@ -187,55 +192,26 @@ _SENSORS = {
 """And what it means that one is silent."""
 
 
-def _served(place: tuple[str, int], result: "StoredResult", tracker: Tracker) -> Callable[[], None]:
-    """Show the poses on a page; return what ends it."""
-    import threading
-
+@contextmanager
+def _shown(result: "StoredResult", tracker: Tracker, where: tuple[str, int] | None) -> Iterator[None]:
+    """Show the poses on a page, where one is wanted, until the block ends."""
+    if where is None:
+        yield
+        return
     from ..server.live import LivePage
-    from ..server.web import server_for
-    from .watch import address_of, own_names
+    from ..server.pose_status import PoseStatus
 
-    page = LivePage(f"uwblite localize: {result.folder.name}")
-    server = server_for(page, place[1], place[0], own_names())
-    page.show_map(result)
-    shown = Shown(page.show_status)
-    tracker.on_state = shown.take
-    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.2}, daemon=True).start()
-    console.note(f"uwblite: open {address_of(page)} in a browser")
+    page, status = LivePage(f"uwblite localize: {result.folder.name}"), PoseStatus()
+    page.show_map(result, paths=False)
 
-    def close() -> None:
-        page.feed.close()
-        server.shutdown()
-        server.server_close()
+    def show(state: "LocalizerState") -> None:
+        if (news := status.take(state)) is not None:
+            page.show_status(news)
 
-    return close
-
-
-class Shown:
-    """Poses as the page wants them, a few a second of driving, with the way of the last minutes."""
-
-    def __init__(self, show: Callable[[dict[str, Any]], None]) -> None:
-        self._show, self._due = show, -float("inf")
-        self._trail: list[list[float]] = []
-
-    def take(self, state: "LocalizerState") -> None:
-        """Show a state, unless one was shown a moment ago."""
-        if state.stamp < self._due:
-            return
-        self._due = state.stamp + _SHOW_EVERY
-        pose = None if state.pose[0] != state.pose[0] else [round(v, 3) for v in state.pose.tolist()]
-        if pose is not None and not state.lost:
-            self._trail = [*self._trail[-_TRAIL:], pose[:2]]
-        sigma = "" if pose is None else f" ± {float(state.covariance[:2, :2].trace() / 2) ** 0.5:.2f} m"
-        place = "" if pose is None else f"x {pose[0]:.2f} m, y {pose[1]:.2f} m{sigma}, quality {state.quality:.2f}"
-        advice = [f"Lost: {state.reason}"] if state.lost else []
-        advice += [f"anchor {name} does not stand where the map has it" for name in state.moved_anchors]
-        status = {"summary": place or "not found yet", "pose": pose, "trail": list(self._trail), "advice": advice}
-        self._show(status | {"fine": "The pose is known."})
-
-
-_SHOW_EVERY, _TRAIL = 0.2, 600
-"""s of driving between pictures; points of the way."""
+    tracker.on_state = show
+    with serving(page, *where) as address:
+        console.note(f"uwblite: open {address} in a browser")
+        yield
 
 
 def line_of(state: "LocalizerState") -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from .console import note, say, say_json
 from .options import number, numbers, place
+from .serving import LOCAL, page_address
 
 if TYPE_CHECKING:
     from ..drivers.events import Note, Pose
@@ -63,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument("--sync", metavar="S", type=number(least=0), default=1.0, help=pause)
     output.add_argument("--json", action="store_true", help="summary as one JSON object on stdout")
     page = "show the map while it grows, as uwblite watch does, in a process of its own (127.0.0.1:8000)"
-    output.add_argument("--watch", metavar="[ADDRESS:]PORT", type=page_place, nargs="?", const=("127.0.0.1", 8000), help=page)
+    output.add_argument("--watch", metavar="[ADDRESS:]PORT", type=page_address, nargs="?", const=LOCAL, help=page)
     laser = parser.add_argument_group("lidar")
     laser.add_argument("--lidar-steps", metavar="A:B", help="first and last step, e.g. 128:640 (all: 44:725)")
     merged, skipped = number(1, 99, whole=True), number(0, 9, whole=True)
@@ -290,14 +291,6 @@ def status_text(recorder: "Recorder") -> str:
         parts.append(text)
     free = recorder.log.free_bytes() / 1e9
     return f"{recorder.log.bytes / 1e6:.1f} MB | {' | '.join(parts)} | disk {free:.1f} GB left"
-
-
-def page_place(text: str) -> tuple[str, int]:
-    """Read where a page is served: PORT or ADDRESS:PORT."""
-    host, _, port = text.rpartition(":")
-    if not (port.isascii() and port.isdigit()) or not 0 < int(port) <= 65535:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port such as 8000 or 0.0.0.0:8000")
-    return host or "127.0.0.1", int(port)
 
 
 def _size(text: str) -> int:

@@ -49,37 +49,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     import signal
-    import threading
     from contextlib import suppress
 
     from ..server.live import LivePage
-    from ..server.web import server_for
     from . import console
     from .options import effective_config
+    from .serving import serving
 
     effective_config(args)
     folder = _folder(args)
     page = LivePage(f"uwblite watch {os.path.basename(args.log)}")
-    server = server_for(page, args.port, args.host, own_names())
-    with suppress(OSError, AttributeError):
-        os.nice(_OWN_NICENESS)
-    console.say(f"open {address_of(page)} in a browser; Ctrl-C ends it")
-    console.note(f"uwblite: the latest map is in {folder}")
-    console.flush()
-    with suppress(ValueError):  # not the main thread: signals are somebody else's
-        signal.signal(signal.SIGTERM, _interrupt)
-    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.2}, daemon=True).start()
-    watch = Watch(args.log, folder, page, map_options(args))
-    try:
-        while args.parent is None or os.getppid() == args.parent:
-            watch.step(time.monotonic())
-            time.sleep(_STEP)
-    except KeyboardInterrupt:
-        console.note("uwblite: the page has ended")
-    finally:
-        watch.close()
-        server.shutdown()
-        server.server_close()
+    with serving(page, args.host, args.port) as address:
+        with suppress(OSError, AttributeError):
+            os.nice(_OWN_NICENESS)
+        console.say(f"open {address} in a browser; Ctrl-C ends it")
+        console.note(f"uwblite: the latest map is in {folder}")
+        console.flush()
+        with suppress(ValueError):  # not the main thread: signals are somebody else's
+            signal.signal(signal.SIGTERM, _interrupt)
+        watch = Watch(args.log, folder, page, map_options(args))
+        try:
+            while args.parent is None or os.getppid() == args.parent:
+                watch.step(time.monotonic())
+                time.sleep(_STEP)
+        except KeyboardInterrupt:
+            console.note("uwblite: the page has ended")
+        finally:
+            watch.close()
     return 0
 
 
@@ -110,29 +106,6 @@ def map_options(args: argparse.Namespace) -> list[str]:
         if (values := getattr(args, name)) is not None:
             words.append(f"--{name.replace('_', '-')}=" + ",".join(map(repr, values)))
     return words + ([] if args.anchor_height is None else [f"--anchor-height={args.anchor_height!r}"])
-
-
-def own_names() -> tuple[str, ...]:
-    """Return the names under which other computers may know this one."""
-    import socket
-
-    name = socket.gethostname()
-    return (name, f"{name}.local") if name else ()
-
-
-def address_of(page: "LivePage") -> str:
-    """Return where the page is to be found; of one that is open to the network, under this computer's address in it."""
-    import socket
-
-    host, _, port = page.host.rpartition(":")
-    if host in ("0.0.0.0", "::", ""):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.connect(("192.0.2.1", 9))  # nothing is sent; it tells which address would be used
-                host = str(probe.getsockname()[0])
-            except OSError:
-                host = "127.0.0.1"
-    return f"http://{host}:{port}/"
 
 
 class Watch:
@@ -180,10 +153,9 @@ class Watch:
         self.page.show_status(watch_status(self.tail, self.result, max(now - self._grown, 0.0), self._rounds(now)))
 
     def close(self) -> None:
-        """End a round that runs, and all listening."""
+        """End a round that runs."""
         if self._job is not None:
             self._job.stop()
-        self.page.feed.close()
 
     def _follow(self, now: float) -> None:
         """Read what is new; what has grown before the first look is as old as the file says."""

@@ -40,8 +40,8 @@ class LivePage:
         self._picture: bytes | None = None
         self._maps = 0
 
-    def show_map(self, result: StoredResult | None) -> None:
-        """Show another map, or with None no map any more."""
+    def show_map(self, result: StoredResult | None, *, paths: bool = True) -> None:
+        """Show another map, or with None no map any more; its paths only where they are wanted."""
         if result is None:
             self._picture = None
             empty: dict[str, Any] = {name: [] for name in ("paths", "anchors", "doubts", "warnings")}
@@ -56,8 +56,9 @@ class LivePage:
             entry | {"covariance": a.covariance.tolist() if np.isfinite(a.covariance).all() else None}
             for entry, a in zip(shown["anchors"], result.anchors, strict=True)
         ]
+        hidden: dict[str, Any] = {} if paths else {"paths": []}
         version = f"{self._token[:8]}-{self._maps}"
-        self.feed.publish("map", {name: shown[name] for name in kept} | {"anchors": anchors, "version": version})
+        self.feed.publish("map", {name: shown[name] for name in kept} | {"anchors": anchors, "version": version} | hidden)
 
     def show_status(self, status: Mapping[str, Any]) -> None:
         """Show what is true now: summary, advice, sensors, pose, trail; see `watch_status`."""

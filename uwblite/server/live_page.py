@@ -23,7 +23,7 @@ overflow-wrap:anywhere}svg{display:block;width:100%;max-height:80vh;background:#
 @media (prefers-color-scheme:dark){svg{background:#262d36}}image{image-rendering:pixelated}
 .path,.trail{fill:none;stroke:var(--path);stroke-width:2;vector-effect:non-scaling-stroke}.trail{stroke:var(--robot)}
 .p1{stroke:@path1@}.p2{stroke:@path2@}.p3{stroke:@path3@}.robot{fill:var(--robot);stroke:#fff;stroke-width:1;
-vector-effect:non-scaling-stroke}.anchor{fill:var(--anchor)}.sigma{fill:var(--anchor);fill-opacity:.15;
+vector-effect:non-scaling-stroke}.lost{fill-opacity:.35}.anchor{fill:var(--anchor)}.sigma{fill:var(--anchor);fill-opacity:.15;
 stroke:var(--anchor);vector-effect:non-scaling-stroke}text{fill:var(--anchor);font-family:system-ui,sans-serif}
 ol{margin:0;padding-left:1.3rem}li{margin:.2rem 0}li:first-child{font-weight:600}.advice{background:var(--warn)}
 .fine{background:var(--good)}.late{background:var(--bad)}
@@ -51,6 +51,10 @@ function shape(name, attrs, text = "") {
   return node;
 }
 const line = points => points.map(p => p[0] + "," + -p[1]).join(" ");
+function arrow(pose, r, name) {
+  return shape("path", {class: name, d: `M${r} 0L${-.7 * r} ${.7 * r}L${-.3 * r} 0L${-.7 * r} ${-.7 * r}Z`,
+    transform: `translate(${pose[0]} ${-pose[1]}) rotate(${-pose[2] * 180 / Math.PI})`});
+}
 function ellipse(a) {
   const [[xx, xy], [, yy]] = a.covariance, half = (xx + yy) / 2, off = Math.hypot((xx - yy) / 2, xy);
   const axis = v => Math.min(2 * Math.sqrt(Math.max(v, 0)), 3), turn = Math.atan2(2 * xy, xx - yy) / 2 * 180 / Math.PI;
@@ -90,12 +94,13 @@ function drawMap() {
 }
 function drawRobot() {
   const layer = at("robot"), size = Number(at("map").dataset.size);
+  if (layer) layer.replaceChildren();
   if (!layer || !now || !now.pose) return;
-  const [x, y, theta] = now.pose, r = size / 45, [x0, y0, x1, y1] = shown;
+  const [x, y] = now.pose, r = size / 45, [x0, y0, x1, y1] = shown;
   if (x < x0 || x > x1 || y < y0 || y > y1) return drawMap();
-  layer.replaceChildren(shape("polyline", {class: "trail", points: line(now.trail || [])}), shape("path", {class: "robot",
-    d: `M${r} 0L${-.7 * r} ${.7 * r}L${-.3 * r} 0L${-.7 * r} ${-.7 * r}Z`,
-    transform: `translate(${x} ${-y}) rotate(${-theta * 180 / Math.PI})`}));
+  layer.replaceChildren(shape("polyline", {class: "trail", points: line(now.trail || [])}),
+    ...(now.alternatives || []).map(p => arrow(p, r, "robot lost")), arrow(now.pose, r, now.lost ? "robot lost" : "robot"));
+  if (now.covariance) layer.prepend(ellipse({place: now.pose, covariance: now.covariance}));
 }
 function rows(names, lines) {
   return [el("tr", {}, ...names.map(n => el("th", {}, n))), ...lines.map(([late, ...cells]) => el("tr", late

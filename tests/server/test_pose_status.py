@@ -1,0 +1,47 @@
+"""A robot on the page: what is known of it, and what to do when nothing is."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwblite.localization.localizer import LocalizerState
+from uwblite.server.pose_status import PoseStatus
+
+KNOWN = LocalizerState(10.0, np.array([1.0, 2.0, 0.5]), np.diag([4e-4, 9e-4, 1e-4]), 0.9, np.zeros(3), False)
+
+
+def test_a_known_pose_with_its_way():
+    status = PoseStatus()
+    first = status.take(KNOWN)
+    assert first["pose"] == [1.0, 2.0, 0.5]
+    assert first["advice"] == []
+    assert "quality 0.90, known to 0.04 m" in first["summary"]
+    assert status.take(replace(KNOWN, stamp=10.1)) is None
+    later = status.take(replace(KNOWN, stamp=10.3, pose=np.array([1.5, 2.0, 0.5])))
+    assert later["trail"] == [[1.0, 2.0], [1.5, 2.0]]
+    assert np.array(later["covariance"]) == pytest.approx(np.diag([4e-4, 9e-4]))
+    json.dumps(later, allow_nan=False)
+
+
+def test_a_lost_one_says_why_and_forgets_its_way():
+    status = PoseStatus()
+    status.take(KNOWN)
+    lost = replace(
+        KNOWN, stamp=11.0, pose=np.full(3, np.nan), covariance=np.full((3, 3), np.nan), lost=True, reason="two places fit",
+        alternatives=np.array([[1.0, 1.0, 0.0], [5.0, 5.0, 3.0]]), moved_anchors=("91A3",),
+    )  # fmt: skip
+    shown = status.take(lost)
+    assert shown["pose"] is shown["covariance"] is None
+    assert shown["advice"][0] == "the pose is not known: two places fit"
+    assert shown["advice"][1].startswith("anchor 91A3 has been moved")
+    assert shown["trail"] == []
+    assert len(shown["alternatives"]) == 2
+    json.dumps(shown, allow_nan=False)
+
+
+def test_a_log_that_begins_anew_is_shown_at_once():
+    status = PoseStatus()
+    status.take(replace(KNOWN, stamp=1e6))
+    assert status.take(KNOWN) is not None

@@ -1,0 +1,49 @@
+"""What the page says of a robot that is being localised."""
+
+import math
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from ..localization.localizer import LocalizerState
+
+_EVERY = 0.2
+"""s between states that are shown."""
+_TRAIL = 300
+"""Points of the way that is shown: the last minute."""
+_MOST_ALTERNATIVES = 8
+
+
+class PoseStatus:
+    """Thins the states out, and remembers the way."""
+
+    def __init__(self) -> None:
+        self._trail: deque[list[float]] = deque(maxlen=_TRAIL)
+        self._shown = -math.inf
+
+    def take(self, state: LocalizerState) -> dict[str, Any] | None:
+        """Return what there is to show of a state; None where the last one will do."""
+        if 0.0 <= state.stamp - self._shown < _EVERY:
+            return None
+        self._shown = state.stamp
+        known = bool(np.isfinite(state.pose).all())
+        if state.lost:
+            self._trail.clear()
+        elif known:
+            self._trail.append(state.pose[:2].round(2).tolist())
+        sigma = np.sqrt(np.diag(state.covariance))
+        place = f", known to {math.hypot(sigma[0], sigma[1]):.2f} m" if np.isfinite(sigma).all() and not state.lost else ""
+        advice = [f"the pose is not known: {state.reason or 'drive on, past walls and anchors'}"] if state.lost else []
+        moved = "has been moved since the map was made, or its line of sight is blocked"
+        advice += [f"anchor {name} {moved}" for name in state.moved_anchors]
+        return {
+            "summary": f"t = {state.stamp:.1f} s, quality {state.quality:.2f}{place}",
+            "advice": advice,
+            "fine": "The pose is known.",
+            "pose": state.pose.round(3).tolist() if known else None,
+            "covariance": state.covariance[:2, :2].tolist() if known and np.isfinite(state.covariance).all() else None,
+            "alternatives": state.alternatives[:_MOST_ALTERNATIVES].round(2).tolist(),
+            "lost": state.lost,
+            "trail": list(self._trail),
+        }
