@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT
 
 from uwblite.cli import main
-from uwblite.drivers import transport
+from uwblite.drivers import ports
 from uwblite.drivers.devices import DEVICES
 from uwblite.drivers.transport import check_url
 from uwblite.errors import ConfigError
@@ -188,7 +188,7 @@ def test_without_pyserial_nothing_is_tried_for_ever(tmp_path, monkeypatch, capfd
 
 def test_ports_of_which_none_was_found_are_not_all_well(monkeypatch, capfd):
     """A Raspberry Pi's header has a UART, whether something hangs on it or not."""
-    monkeypatch.setattr(transport, "plugged_in", lambda: [transport.PluggedIn("/dev/ttyS0", "ttyS0", "")])
+    monkeypatch.setattr(ports, "plugged_in", lambda: [ports.PluggedIn("/dev/ttyS0", "ttyS0", "")])
     assert main(["devices"]) == 1
     output = capfd.readouterr()
     assert "all is well" not in output.err + output.out

@@ -55,7 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Look at the ports and report."""
     from ..drivers.devices import kinds_on_usb
-    from ..drivers.transport import check_url, plugged_in
+    from ..drivers.ports import plugged_in
+    from ..drivers.transport import check_url
     from ..errors import DeviceError
 
     if args.kinds:

@@ -218,7 +218,7 @@ def _head(args: argparse.Namespace, remark: str) -> list[str]:
 
 
 def _suggest_names(links: list["Link"]) -> None:
-    from ..drivers.transport import stable_name
+    from ..drivers.ports import stable_name
 
     for link in links:
         better = stable_name(link.url)

@@ -1,8 +1,4 @@
-"""The conversation with a URG-04LX: start-up, streaming and recovery.
-
-The order is that of drivers that survived the field: drain, QT, out of SCIP 1.1 or the time-adjust mode where the answer
-says so, VV, PP, II, a few TM1 to tie the device clock to the host's, MD without end. Only commands that every URG-04LX
-knows are sent; others can hang it until its power is cycled.
+"""Scans of a Hokuyo: streaming, slow lines and recovery; `scip_unit` finds it.
 
 Time of a scan. The device stamps the first step of its field of view (the specification leaves open whether it means
 step 0, which would be 4.3 ms earlier). A scan arrives after its turn: the lower envelope of arrivals follows the device
@@ -13,29 +9,14 @@ request and reply.
 import math
 from typing import Any
 
-from ..errors import ProtocolError
-from .clock import DeviceClock, Reading
-from .events import Action, Corrupt, LaserScan, Lost, Note, Param, Reopen, Send, SetBaud
-from .scip import TIME_MODULUS, WITH_LINES, Distances, Reply, ScipProtocol
+from .clock import Reading
+from .events import Action, Corrupt, LaserScan, Lost, Note, Reopen, Send, SetBaud
+from .scip import Distances, Reply
 from .scip_codes import status_meaning
-from .scip_commands import BAUD_RATES, Geometry, parse_geometry, rate_command, scan_command, text_command, to_ranges
-from .session import Driver, Identity, Script, Wait
+from .scip_commands import BAUD_RATES, rate_command, scan_command, text_command, to_ranges
+from .scip_unit import PATIENCE, SETTLE, TRUNCATION, ScipUnit
+from .session import Identity, Script, Wait
 
-DRAIN = 0.25
-"""s to wait for silence before the first word."""
-PATIENCE = 0.4
-"""s to wait for an answer."""
-SETTLE = 0.1
-"""s for a flush or another bit rate to take effect."""
-PARAMETER_READS = 4
-TIME_READS = 8, 40
-"""Readings of the clock, at least and at most; a busy computer needs more of them."""
-GOOD_TIE = 0.002
-"""s to which the clocks should be tied to each other."""
-NOMINAL_SPREAD = 0.035
-"""s by which the nominal delay may be wrong: between the end of the sweep and that of the turn."""
-TRUNCATION = 0.5
-"""ms; stamps are truncated to 1 ms, half of that makes them unbiased."""
 SCAN_PATIENCE = 1.0
 """s without a scan, or ten periods, after which the laser is started again."""
 FIRST_PATIENCE = 3.0
@@ -57,7 +38,7 @@ NARROW = 4095
 """mm, the largest reading of two characters."""
 
 
-class ScipDriver(Driver):
+class ScipDriver(ScipUnit):
     """One lidar with SCIP 2.0.
 
     Parameters
@@ -73,24 +54,11 @@ class ScipDriver(Driver):
         self, start: int | None = None, end: int | None = None, *, cluster: int = 1, skip: int = 0, wide: bool = True,
         baud: int = BAUD_RATES[0], stream: bool = True,
     ) -> None:  # fmt: skip
-        super().__init__(ScipProtocol(), "laser scanner")
-        self.baud = baud
-        self.geometry = Geometry()
-        self.facts: dict[str, str] = {}
-        """KEY: value of VV, PP and II."""
+        super().__init__(baud)
         self._start, self._end, self._cluster, self._skip, self._wide = start, end, max(1, cluster), skip, wide
         self._stream = stream
-        self._clock = DeviceClock(1e-3, TIME_MODULUS, latency=self.geometry.period, spread=NOMINAL_SPREAD)
         self._rates_tried: set[int] = set()
         self._rounds = 0
-
-    def parse(self, data: bytes, now: float) -> list[Any]:
-        """Return Reply, Distances and Corrupt; remember what the unit reports of itself."""
-        events = super().parse(data, now)
-        for event in events:
-            if isinstance(event, Reply) and event.command in WITH_LINES and event.status == "00":
-                self.facts.update(event.fields())
-        return events
 
     def stop(self) -> list[Action]:
         """Return what switches the laser off and ends the stream."""
@@ -103,6 +71,7 @@ class ScipDriver(Driver):
             if not (yield from self._find()):
                 return
             yield from self._greet()
+            self._scan_request()  # steps that the unit does not have are the user's mistake: say so now
             self.ready = True
             if not self._stream:
                 return
@@ -113,106 +82,6 @@ class ScipDriver(Driver):
             if why:
                 yield Note("warning", "lidar-restart", f"lidar: {why}; starting it again")
         yield Reopen("the laser does not start")
-
-    # ---- finding it
-
-    def _request(self, command: str, tries: int = 2) -> Script[Reply | None]:
-        def answers(event: Any) -> bool:
-            return isinstance(event, Reply) and event.command == command
-
-        reply: Reply | None = yield from self.ask(text_command(command), answers, PATIENCE, tries)
-        return reply
-
-    def _find(self) -> Script[bool]:
-        """Make the unit quiet, whatever state and bit rate a dead host left it in; False: Reopen was sent."""
-        yield from self.sleep(DRAIN)
-        for rate in (self.baud, *(rate for rate in BAUD_RATES if rate != self.baud)):
-            if rate != self.baud:
-                yield SetBaud(rate)
-            reply = yield from self._request("QT", 1)
-            if reply is None:
-                # A single QT may be ignored, or half a command of another program stood before it.
-                yield from self._flush()
-                reply = yield from self._request("QT", 1)
-            if reply is not None:
-                self.baud = rate
-                return (yield from self._make_quiet(reply))
-        text = (
-            "lidar: no answer at any bit rate. Unplug it and plug it in again (about one power-up in ten needs that),"
-            " check its 5 V supply, and that no other program has the port"
-        )
-        yield from self.say_once(Note("error", "lidar-silent", text))
-        yield Reopen("no answer at any bit rate")
-        return False
-
-    def _make_quiet(self, reply: Reply) -> Script[bool]:
-        kind, _ = status_meaning(reply.command, reply.status)
-        if kind == "scip1":
-            switched = yield from self._request("SCIP2.0")
-            if switched is not None and status_meaning("SCIP2.0", switched.status)[0] == "scip1":
-                text = "lidar: it has SCIP 1.1 only; its firmware (before 3.0) needs the maker's update to SCIP 2.0"
-                yield from self.say_once(Note("error", "lidar-scip1-only", text))
-                yield Reopen("SCIP 1.1 only")
-                return False
-            yield from self.say_once(Note("info", "lidar-scip1", "lidar: it woke in SCIP 1.1; switched to SCIP 2.0"))
-        elif kind != "ok":
-            # Foreign bytes stood before QT, or the unit was left in the time-adjust mode.
-            yield from self._flush()
-            yield from self._request("TM2")
-        if kind != "ok":
-            yield from self._request("QT")
-        return True
-
-    def _flush(self) -> Script[None]:
-        """End the line that the unit may be in, and let its answer pass."""
-        yield Send(b"\n")
-        yield from self.sleep(SETTLE)
-
-    # ---- who it is, and its clock
-
-    def _greet(self) -> Script[None]:
-        for command in WITH_LINES:
-            reply = yield from self._request(command)
-            if reply is not None and status_meaning(command, reply.status)[0] != "ok":
-                yield from self._flush()
-                reply = yield from self._request(command)
-            if command == "PP":
-                yield from self._take_geometry(reply)
-        for name, key in (("product", "PROD"), ("firmware", "FIRM"), ("serial", "SERI")):
-            if key in self.facts:
-                yield Param(f"laser_{name}", self.facts[key].replace(" ", "_"))
-
-    def _take_geometry(self, reply: Reply | None) -> Script[None]:
-        """Accept PP when it came twice alike: the sums of its lines are wrong in some units and cannot be asked for."""
-        before, problem = None, "no answer to PP"
-        for _ in range(PARAMETER_READS):
-            try:
-                geometry = parse_geometry(reply) if reply else None
-                if geometry and geometry == before:
-                    self.geometry = geometry
-                    break
-                before, problem = geometry or before, "two answers to PP differ" if geometry else problem
-            except ProtocolError as error:
-                problem = str(error)
-            reply = yield from self._request("PP", 1)
-        else:
-            self.geometry = before or Geometry()
-            text = f"lidar: {problem}; going on with {'the last answer' if before else 'the limits of a URG-04LX'}"
-            yield from self.say_once(Note("warning", "lidar-parameters", text))
-        self._scan_request()  # steps that the unit does not have are the user's mistake: say so now
-
-    def _tie_clock(self) -> Script[None]:
-        """Read the clock a few times in the time-adjust mode; without it, what was measured before stays in force."""
-        entered = yield from self._request("TM0")
-        for k in range(TIME_READS[1] if entered and status_meaning("TM0", entered.status)[0] == "ok" else 0):
-            sent = self.now
-            if k >= TIME_READS[0] and self._clock.tied < GOOD_TIE:
-                break
-            reply = yield from self._request("TM1", 1)
-            if reply is None or not reply.lines:
-                break
-            self._clock.tie(int(reply.lines[0]) + TRUNCATION, sent, reply.stamp)
-        yield from self._request("TM2")
 
     # ---- scans
 

@@ -10,7 +10,6 @@ import select
 import socket
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -55,7 +54,7 @@ _KINDS = ("alt", "cp2110", "hwgrep", "loop", "rfc2217", "socket", "spy")
 def check_pyserial(url: str) -> None:
     """Raise DeviceError if the port needs pyserial and it is not installed."""
     if not is_socket(url):
-        _pyserial()
+        pyserial()
 
 
 def is_socket(url: str) -> bool:
@@ -63,7 +62,8 @@ def is_socket(url: str) -> bool:
     return url.lower().startswith("socket://")
 
 
-def _pyserial() -> Any:
+def pyserial() -> Any:
+    """Return the package that opens serial ports, or raise DeviceError where it is not installed."""
     try:
         import serial
     except ImportError:
@@ -216,7 +216,7 @@ class SerialPort:
     """
 
     def __init__(self, url: str, baud: int) -> None:
-        serial = _pyserial()
+        serial = pyserial()
         self.url = url
         self._errors = (OSError, serial.SerialException)
         self._local = "://" not in url
@@ -306,46 +306,3 @@ def _explain(url: str, error: Exception) -> str:
     if path.is_char_device() and "configure port" in text:
         return f"{url}: not a serial port"
     return f"{url}: cannot open ({text})"
-
-
-def stable_name(url: str) -> str | None:
-    """Return the by-id path of a port that was named by a number that changes with the order of plugging.
-
-    Parameters
-    ----------
-    url : as the user gave it.
-
-    Returns
-    -------
-    str, or None where there is none or the path is one already.
-    """
-    if "://" in url or "/serial/by-" in url or not BY_ID.is_dir():
-        return None
-    target = os.path.realpath(url)
-    return next((str(entry) for entry in sorted(BY_ID.iterdir()) if os.path.realpath(entry) == target), None)
-
-
-@dataclass(frozen=True, slots=True)
-class PluggedIn:
-    """A serial port of this computer."""
-
-    path: str
-    """by-id path where there is one."""
-    description: str
-    usb_id: str
-    """"vvvv:pppp" in lower-case hexadecimal, or ""."""
-
-
-def plugged_in() -> list[PluggedIn]:
-    """List the USB serial ports of this computer, and the UART of a Raspberry Pi's header."""
-    _pyserial()
-    from serial.tools.list_ports import comports
-
-    found = []
-    for port in sorted(comports()):
-        usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None else ""
-        if not usb and port.device not in ("/dev/ttyAMA0", "/dev/ttyS0", "/dev/serial0"):
-            continue
-        text = " ".join(str(part) for part in (port.manufacturer, port.product) if part) or str(port.description)
-        found.append(PluggedIn(stable_name(port.device) or port.device, text, usb))
-    return found
