@@ -9,6 +9,7 @@ import pytest
 from helpers.planted import drive, odometry, ranges, recording, wander
 from helpers.results import FILES, contents
 
+from uwblite import se2
 from uwblite.cli import main
 from uwblite.io.carmen import read_log, write_log
 from uwblite.io.locks import sole_writer
@@ -25,7 +26,7 @@ def mapped(tmp_path_factory, room_log):
     folder = tmp_path_factory.mktemp("room") / "map"
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
-        code = main(["map", str(room_log), "--out", str(folder)])
+        code = main(["map", str(room_log), "--out", str(folder), "--corrected-log", str(folder.parent / "corrected.log")])
     return folder, code, output.getvalue()
 
 
@@ -99,6 +100,30 @@ def test_the_same_log_in_another_folder_gives_the_same_bytes(radio_only, tmp_pat
     one, two = contents(tmp_path / "one"), contents(tmp_path / "two")
     assert one == two
     assert str(tmp_path).encode() not in b"".join(one.values())
+
+
+def test_the_corrected_log_has_the_scans_where_the_map_has_them(mapped, room_log):
+    raw, log = read_log(room_log), read_log(mapped[0].parent / "corrected.log")
+    np.testing.assert_array_equal(log.scans.stamps, raw.scans.stamps)
+    np.testing.assert_array_equal(log.scans.ranges, raw.scans.ranges)
+    stamps, poses = read_tum(mapped[0] / "trajectory.tum")
+    shift = se2.interpolate_trajectory(stamps, poses, log.odometry.stamps)[:, :2] - log.odometry.poses[:, :2]
+    # The lidar's clock and half a turn of it lie between the stamps and the poses: 0.1 s at 0.3 m/s at most.
+    assert np.hypot(shift[:, 0], shift[:, 1]).max() < 0.03
+
+
+def test_a_corrected_log_is_refused_before_the_work_where_it_cannot_be_written(room_log, tmp_path, capsys):
+    there = tmp_path / "there.log"
+    there.write_text("")
+    for logs, name, why in (
+        ([room_log, room_log], tmp_path / "new.log", "one CARMEN log"),
+        (["record.bag"], tmp_path / "new.log", "one CARMEN log"),
+        ([room_log], there, "give --force"),
+    ):
+        words = [*map(str, logs), "--out", str(tmp_path / "map"), "--corrected-log", str(name)]
+        assert main(["map", *words]) == 2
+        assert why in capsys.readouterr().err
+    assert not (tmp_path / "map").exists()
 
 
 def test_a_result_is_not_replaced_unasked(mapped, room_log, capsys):

@@ -66,6 +66,8 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
     box = "keep this part of the grid, m: short for --set crop=[...]"
     output.add_argument("--crop", metavar="X0,Y0,X1,Y1", type=numbers(4), help=box)
     output.add_argument("--scale-map", action="store_true", help="write the probabilities too: map_scale.png (mode: scale)")
+    text = "the CARMEN log's scans with corrected laser poses, as GMapping's users exchange; one CARMEN log only"
+    output.add_argument("--corrected-log", metavar="FILE", help=text)
     output.add_argument("--no-timings", action="store_true", help="leave timings out of report.json: same run, same bytes")
     output.add_argument("--report-timings", action="store_true", help="show the stages' seconds in report.html too")
     beforehand = parser.add_argument_group("known beforehand")
@@ -83,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
     from ..io.locks import sole_writer
     from ..io.results import check_target
 
+    _check_corrected_log(args)
     if args.dry_run:
         return _map(args)
     with sole_writer(args.out):
@@ -170,7 +173,38 @@ def make(
         scale_map=args.scale_map,
     )
     names = write_result(args.out, kept, result, record)
+    if getattr(args, "corrected_log", None):
+        _write_corrected_log(args, kept[0], result)
     return Made(kept, result, names, reading + time.perf_counter() - began)
+
+
+def _check_corrected_log(args: argparse.Namespace) -> None:
+    """Refuse --corrected-log beforehand where it cannot be written."""
+    import os
+
+    from ..errors import UsageError
+    from .formats import format_of
+
+    if not args.corrected_log:
+        return
+    if len(args.logs) > 1 or args.logs[0] == "-" or format_of(args.logs[0]) in ("bag", "csv"):
+        raise UsageError("--corrected-log needs one CARMEN log in a file: its lines are read once more; see uwblite convert")
+    if os.path.exists(args.corrected_log) and not args.force:
+        raise UsageError(f"{args.corrected_log} is there already; give --force to replace it")
+    if os.path.exists(args.corrected_log) and os.path.samefile(args.corrected_log, args.logs[0]):
+        raise UsageError("--corrected-log names the log itself; give another file")
+
+
+def _write_corrected_log(args: argparse.Namespace, log: "SensorLog", result: "MapResult") -> None:
+    from ..io.corrected_log import poses_of_scans, write_corrected_log
+    from . import console
+
+    written, left_out = write_corrected_log(args.corrected_log, args.logs[0], partial(poses_of_scans, result, log))
+    if left_out:
+        console.note(
+            f"uwblite: {args.corrected_log} has {written} scans; {left_out} laser messages are broken or outside the "
+            "trajectory's time and were left out"
+        )
 
 
 def config_text(config: "MappingConfig") -> str:

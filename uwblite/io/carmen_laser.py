@@ -27,7 +27,7 @@ POSE_TOLERANCE = 0.01
 
 _RANK = {b"RAWLASER1": 0, b"FLASER": 1, b"ROBOTLASER1": 2}
 """Messages that may carry the same scans; only those of the highest rank in the log are used."""
-_HEAD = {b"RAWLASER1": 9, b"FLASER": 2, b"ROBOTLASER1": 9}
+HEAD = {b"RAWLASER1": 9, b"FLASER": 2, b"ROBOTLASER1": 9}
 """Words before the readings."""
 _LAYOUTS_KEPT = 1000
 _URG_PERIOD = 0.1
@@ -93,7 +93,7 @@ class LaserMessages:
 
     def _take_evenly_spaced(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
         """Take a line whose words are parted by single blanks, leaving the readings undecoded."""
-        gaps, head = self._block.gaps, gap + _HEAD[name] - 1
+        gaps, head = self._block.gaps, gap + HEAD[name] - 1
         if head >= len(gaps) or gaps[head] >= end:
             raise BrokenLine("too short")
         layout = self._layout(name, self._block.text[start : gaps[head]])
@@ -105,7 +105,7 @@ class LaserMessages:
 
     def _take_any(self, name: bytes, number: int, tokens: list[bytes]) -> None:
         """Take a line the general way."""
-        what, head = name.decode(), _HEAD[name]
+        what, head = name.decode(), HEAD[name]
         if len(tokens) < head:
             raise BrokenLine(f"{what} has {len(tokens)} fields, far too few")
         layout = self._layout(name, b" ".join(tokens[:head]))
@@ -131,26 +131,9 @@ class LaserMessages:
 
     def _tail(self, name: bytes, tail: list[bytes]) -> float:
         """Read what follows the readings; remember the poses, return the stamp."""
-        if name == b"FLASER":
-            if len(tail) not in (8, 9):
-                raise BrokenLine(f"FLASER has {len(tail)} fields behind its readings, expected 9")
-            poses, rest = numbers(tail[:6], "FLASER", 6), tail[6:]
-        else:
-            rest = tail[1 + int(tail[0]) :] if tail and len(tail[0]) < 10 and tail[0].isdigit() else tail
-            if name == b"RAWLASER1":
-                rest = rest if len(rest) in (2, 3) else tail
-                if len(rest) not in (2, 3):
-                    raise BrokenLine(f"RAWLASER1 has {len(tail)} fields behind its readings, expected 4 + remissions")
-                return stamp_of(rest)
-            rest = rest if 12 <= len(rest) <= 14 else tail
-            if not 12 <= len(rest) <= 14:
-                raise BrokenLine(f"ROBOTLASER1 has {len(tail)} fields behind its readings, expected 15 + remissions")
-            poses = numbers(rest[:6], "ROBOTLASER1", 6)
-            # 14 = with turn_axis and ipc_timestamp, 12 = with neither; 13 is one of them.
-            has_ipc = len(rest) == 14 or (len(rest) == 13 and not self.ipc_left_out)
-            rest = rest[-3:] if has_ipc else rest[-2:]
-        stamp = stamp_of(rest)
-        self._poses.extend((stamp, *poses))
+        at, stamp = split_tail(name, tail, self.ipc_left_out)
+        if name != b"RAWLASER1":
+            self._poses.extend((stamp, *numbers(tail[at : at + 6], name.decode(), 6)))
         return stamp
 
     def decode(self) -> Iterator[tuple[int, ValueError]]:
@@ -256,6 +239,26 @@ class LaserMessages:
         return np.round(middle, 6)
 
 
+def split_tail(name: bytes, tail: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
+    """Return which word behind the readings the poses of laser and robot begin at (RAWLASER1 has none), and the stamp, s."""
+    if name == b"FLASER":
+        if len(tail) not in (8, 9):
+            raise BrokenLine(f"FLASER has {len(tail)} fields behind its readings, expected 9")
+        return 0, stamp_of(tail[6:])
+    rest = tail[1 + int(tail[0]) :] if tail and len(tail[0]) < 10 and tail[0].isdigit() else tail
+    if name == b"RAWLASER1":
+        rest = rest if len(rest) in (2, 3) else tail
+        if len(rest) not in (2, 3):
+            raise BrokenLine(f"RAWLASER1 has {len(tail)} fields behind its readings, expected 4 + remissions")
+        return len(tail) - len(rest), stamp_of(rest)
+    rest = rest if 12 <= len(rest) <= 14 else tail
+    if not 12 <= len(rest) <= 14:
+        raise BrokenLine(f"ROBOTLASER1 has {len(tail)} fields behind its readings, expected 15 + remissions")
+    # 14 = with turn_axis and ipc_timestamp, 12 = with neither; 13 is one of them.
+    has_ipc = len(rest) == 14 or (len(rest) == 13 and not ipc_left_out)
+    return len(tail) - len(rest), stamp_of(rest[-3:] if has_ipc else rest[-2:])
+
+
 def _fence_posts(scans: LaserScans) -> list[str]:
     """Say where an increment looks like the field of view divided by one beam too few, as logs of SICK scanners have it."""
     beams, degrees = scans.ranges.shape[1], math.degrees(abs(scans.angle_increment))
@@ -279,7 +282,7 @@ _FEW_BEAMS = 90
 def _parse_head(name: bytes, tokens: list[bytes]) -> _Layout:
     """Read the words before the readings."""
     what = name.decode()
-    if len(tokens) != _HEAD[name]:
+    if len(tokens) != HEAD[name]:
         raise BrokenLine(f"{what}: fields are parted unevenly")
     beams = int(tokens[-1])
     if not 1 <= beams <= MAX_BEAMS:

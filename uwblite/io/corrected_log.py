@@ -1,0 +1,122 @@
+"""CARMEN logs with corrected laser poses, as users of GMapping exchange maps: the scans of the input, where they were taken."""
+
+import os
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats
+from ..map_result import MapResult
+from ..sensor_log import SensorLog
+from .carmen_laser import HEAD, split_tail
+from .files import replacing
+from .log_parts import parts_of
+from .source import open_source
+
+PosesAt = Callable[[Floats], tuple[Floats, Floats]]
+"""Returns the poses of laser and robot (n, 3) in the map at stamps (n,) of scans, s; nan where there is none."""
+
+_LASER = (b"FLASER", b"ROBOTLASER1")
+_KEPT = (b"PARAM", b"#")
+_ODOM_WITHOUT_IPC = 9
+"""Words of an ODOM line that leaves out ipc_timestamp."""
+
+
+def write_corrected_log(path: str | os.PathLike[str], source: str, poses_at: PosesAt) -> tuple[int, int]:
+    """Write the laser messages of a CARMEN log with corrected poses; PARAM lines and comments stay, all else is left out.
+
+    FLASER gets the corrected pose of the laser and keeps the odometry's pose behind it; ROBOTLASER1 gets those of laser and
+    robot, whose difference is the mounting. Readings and stamps stay as they are.
+
+    Parameters
+    ----------
+    path : the file; replaced only when the new one is complete; compressed where it ends in ``.gz``.
+    source : the log that was mapped, or one of its parts.
+    poses_at : poses of laser and robot.
+
+    Returns
+    -------
+    Scans written, and laser messages left out: broken ones, and those at times at which the map knows no pose.
+    """
+    written = left_out = 0
+    with replacing(path) as stream:
+        for part in parts_of(source)[0]:
+            with open_source(part) as text:
+                for lines, missing in _corrected(text.blocks(), poses_at):
+                    stream.write(b"".join(lines))
+                    written += sum(line.startswith(_LASER) for line in lines)
+                    left_out += missing
+    return written, left_out
+
+
+_OUTSIDE = 0.2
+"""Scans so far outside the trajectory's time, s, beside the offset of the lidar's clock, have the pose of its end."""
+
+
+def poses_of_scans(result: MapResult, log: SensorLog, stamps: Floats) -> tuple[Floats, Floats]:
+    """Return the poses of laser and robot (n, 3) in the map in the middle of scans stamped `stamps` (n,), s.
+
+    Parameters
+    ----------
+    result, log : the map of a single recording, and the recording. Scans outside its time have nan.
+    """
+    calibration, scans = result.graph.calibration, log.scans
+    delay = calibration.get("laser_delay")
+    half = 0.0 if scans is None else 0.5 * scans.time_increment * (scans.ranges.shape[1] - 1)
+    robot = se2.interpolate_trajectory(result.stamps, result.trajectory, stamps + (delay + half)).reshape(-1, 3)
+    slack = abs(delay) + half + _OUTSIDE
+    robot[(stamps < result.stamps[0] - slack) | (stamps > result.stamps[-1] + slack)] = np.nan
+    correction = np.array([calibration.get(name) for name in ("laser_x", "laser_y", "laser_theta")])
+    return se2.compose(robot, se2.compose(correction, log.mounting.T_base_laser)), robot
+
+
+def _corrected(blocks: Iterator[bytes], poses_at: PosesAt) -> Iterator[tuple[list[bytes], int]]:
+    """Yield the lines of each block as they are to be written, and how many laser messages are left out of it."""
+    ipc_left_out = False
+    for block in blocks:
+        kept: list[bytes | tuple[list[bytes], int]] = []
+        stamps, broken = [], 0
+        for line in block.splitlines(keepends=True):
+            if line.startswith(_KEPT):
+                kept.append(line)
+            elif line.startswith(b"ODOM "):
+                ipc_left_out = len(line.split()) == _ODOM_WITHOUT_IPC
+            elif line.startswith(tuple(name + b" " for name in _LASER)):
+                try:
+                    words = line.split()
+                    at, stamp = _poses_in(words, ipc_left_out)
+                    kept.append((words, at))
+                    stamps.append(stamp)
+                except (ValueError, IndexError):
+                    broken += 1
+        yield _with_poses(kept, np.array(stamps), broken, poses_at)
+
+
+def _poses_in(words: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
+    """Return the word at which the poses of a laser message begin, and its stamp, s."""
+    name = words[0]
+    behind = HEAD[name] + int(words[HEAD[name] - 1])
+    at, stamp = split_tail(name, words[behind:], ipc_left_out)
+    return behind + at, stamp
+
+
+def _with_poses(
+    kept: list[bytes | tuple[list[bytes], int]], stamps: Floats, broken: int, poses_at: PosesAt
+) -> tuple[list[bytes], int]:
+    """Return lines in which the words at the poses are corrected, and the number of scans left out."""
+    laser, robot = poses_at(stamps)
+    lines, scan = [], 0
+    for entry in kept:
+        if isinstance(entry, bytes):
+            lines.append(entry)
+            continue
+        words, at = entry
+        corrected = laser[scan] if words[0] == b"FLASER" else np.concatenate([laser[scan], robot[scan]])
+        scan += 1
+        if np.isfinite(corrected).all():
+            words[at : at + len(corrected)] = [b"%.6f" % value for value in corrected.tolist()]
+            lines.append(b" ".join(words) + b"\n")
+        else:
+            broken += 1
+    return lines, broken
