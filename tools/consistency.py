@@ -141,13 +141,16 @@ HEAD = (
 )
 
 
-def document(found: Sequence[Consistency], minutes: float) -> str:
+def document(found: Sequence[Consistency], minutes: float, easy: bool) -> str:
     """Return the section of the page."""
+    real = "rooms whose errors stay with places, walls and directions (tools/simulation/real_rooms.py)"
+    rooms = "easy rooms" if easy else real
     names = list(dict.fromkeys(c.name for c in found))
     rows = [row(n, [c for c in found if c.name == n]) for n in names]
     rows.append(row("all", found))
     return (
-        f"## Are the stated uncertainties true?\n\n{len(found)} simulated recordings of {minutes:g} min. Normalised errors "
+        f"## Are the stated uncertainties true? {'Easy' if easy else 'Real'} rooms\n\n{len(found)} simulated recordings of "
+        f"{minutes:g} min in {rooms}. Normalised errors\n"
         "squared (in brackets what is expected of true\ncovariances), in the frame of the first pose, relative to which the "
         "covariances are; the share of them inside the\nquantile of 95 %; rms error and rms stated standard deviation of the "
         "positions, m; anchors that are not ok (not counted), and maps that are doubted.\n\n" + table(HEAD, rows)
@@ -181,11 +184,11 @@ def main(argv: list[str] | None = None) -> int:
         found_text = f"poses {c.poses.mean():.2f}, anchors {c.anchors.mean() if len(c.anchors) else float('nan'):.2f}"
         found_text += f", {c.error:.4f} m of {c.stated:.4f} m stated"
         print(f"{len(found)} of {len(tasks)}, {c.name}: {found_text}", file=sys.stderr, flush=True)
-    text = document(found, args.minutes)
+    text = document(found, args.minutes, args.easy)
     if args.print:
         print(text)
     else:
-        write_section(args.out, "consistency", text)
+        write_section(args.out, "consistency" if args.easy else "consistency in real rooms", text)
     return 0
 
 
