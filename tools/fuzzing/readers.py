@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -20,12 +21,14 @@ from uwblite.io.constraints_file import parse_constraints, read_anchors
 from uwblite.io.csv_folder import read_csv_folder, write_csv_folder
 from uwblite.io.csv_table import read_csv
 from uwblite.io.g2o import read_g2o
+from uwblite.io.log_tail import LogTail
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png
 from uwblite.io.pyfg import read_pyfg
 from uwblite.io.tum import read_tum
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.mapping import MappingConfig
+from uwblite.server.live import watch_status
 
 from .small_files import ANCHORS, G2O, KNOWN, LOG, MAPPING, PYFG, TABLE, TORO, TUM
 
@@ -95,6 +98,14 @@ def _toro(poses: int) -> bytes:
     return TORO + "".join(f"{edge}\n" for edge in edges).encode()
 
 
+def _followed(path: Path) -> object:
+    """Follow a log to its end and return what the page would be sent."""
+    tail = LogTail(str(path))
+    while tail.poll():
+        pass
+    return json.dumps(watch_status(tail, None, 0.0, ""), allow_nan=False)
+
+
 def _file(name: str, data: bytes, read: Read, cost: int = 1) -> Case:
     return Case(name, read, lambda folder: (folder / name).write_bytes(data), cost)
 
@@ -114,7 +125,8 @@ def _verb(name: str, data: bytes, *words: str, cost: int = 20, prepare: Callable
         out, stated = io.StringIO(), io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(stated):
             code = main([word.format(path.parent) for word in words])
-        left = {p.name for p in path.parent.iterdir()} - before - {"out", "out.g2o", "out.pyfg", "out.log", "out.tum"}
+        made_here = {"out", *(f"out.{ending}" for ending in ("g2o", "pyfg", "log", "tum", "csv", "png"))}
+        left = {p.name for p in path.parent.iterdir()} - before - made_here
         text = stated.getvalue()
         last = text.rstrip("\n").rpartition("\n")[2]
         for wrong, what in (
@@ -195,6 +207,7 @@ def cases() -> dict[str, Case]:
         "settings": _file("x.toml", to_toml(MappingConfig()).encode()[:2500].rpartition(b"\n")[0], _text(_settings)),
         "constraints": _file("x.toml", KNOWN * 3, _text(parse_constraints)),
         "mapping": _file("x.toml", MAPPING * 3, _text(parse_mappings)),
+        "log tail": _file("x.log", _log(20), _followed),
     }
     for name in ("odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"):
         found[name] = Case(f"tables/{name}", lambda path: read_csv_folder(path.parent), _tables)
@@ -212,6 +225,10 @@ def cases() -> dict[str, Case]:
         "convert": _verb("x.log", log, "convert", "{}/x.log", "{}/out.log", "-q", "--force", cost=5),
         "localize": _verb(
             "x.log", log, "localize", "{}/x.log", "--map", "{}", "--out", "{}/out.tum", *shared, cost=100, prepare=_map_folder
+        ),
+        "plan": _verb(
+            "map.pgm", b"", "plan", "--map", "{}/map.yaml", "--from", "0,-0.88", "--to", "1,-0.88", "--radius", "0",
+            "--unknown", "price", "--out", "{}/out", *shared, cost=20, prepare=_map_folder,
         ),
         "optimize g2o": _verb("x.g2o", G2O, "optimize", "{}/x.g2o", "--out", "{}/out.pyfg", *shared, cost=10),
         "optimize toro": _verb("x.graph", TORO, "optimize", "{}/x.graph", "--out", "{}/out.g2o", *shared, cost=10),
