@@ -10,6 +10,7 @@ from uwblite.errors import Cancelled, ConfigError, SolverError
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
+from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import SolverConfig, edge_weights, linearize, optimize
 from uwblite.graph.unknowns import moved, moved_along
@@ -494,3 +495,43 @@ def test_public_pose_graphs_reach_their_optimum(name, shared_data):
     assert summary.converged
     assert summary.chi2 == pytest.approx(OPTIMA[name], rel=1e-6)
     assert found.chi2() == pytest.approx(summary.chi2, rel=1e-12)
+
+
+def far_anchor(seed, off, across):
+    """Return a graph of fixed poses nearly in line with an anchor far off that starts a twentieth of the distance away."""
+    rng = np.random.default_rng(seed)
+    n, sigma = 40, 0.1
+    poses = np.column_stack([np.linspace(0.0, 10.0, n), across * rng.standard_normal(n), np.zeros(n)])
+    place = np.array([[off, 0.02 * off]])
+    measured = np.hypot(*(poses[:, :2] - place).T) + sigma * rng.standard_normal(n)
+    none, zeros = np.full((n, 6), -1), np.zeros((n, 2))
+    edges = RangeEdges(
+        np.arange(n),
+        np.zeros(n, dtype=int),
+        measured,
+        np.full(n, sigma),
+        zeros,
+        np.zeros(n),
+        zeros,
+        np.zeros(2),
+        np.zeros(n),
+        none,
+    )
+    start = place + rng.normal(0.0, max(1.0, 0.05 * off), (1, 2))
+    return Graph(poses, start, (edges,), fixed_poses=np.ones(n, dtype=bool))
+
+
+@pytest.mark.parametrize("off", [20.0, 200.0, 1000.0])
+@pytest.mark.parametrize("across", [0.0, 0.1])
+def test_an_anchor_in_line_with_its_robots_is_found_from_afar(off, across):
+    """The steps end at a minimum: descent by another method from there gains next to nothing."""
+    for seed in range(6):
+        solved, summary = optimize(far_anchor(seed, off, across))
+        assert summary.converged, summary.reason
+        edges = solved.edges[0]
+
+        def residuals(place, edges=edges, poses=solved.poses):
+            return (np.hypot(*(poses[:, :2] - place).T) - edges.ranges) / edges.sigma
+
+        further = least_squares(residuals, solved.anchors[0], x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        assert summary.chi2 < 2.0 * further.cost + 0.1

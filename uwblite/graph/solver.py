@@ -7,11 +7,13 @@ The cost is F(x) = sum_e w_e rho(|r_e(x)|^2) with whitened residuals r_e. One it
 that is, iteratively reweighted least squares: rho' = weight(|r|^2) is taken where the step starts and its own derivative
 is left out, so H stays positive semi-definite whatever the kernel. The step solves
 
-    (H + lambda D) h = -g,    D = diag(H) (1 where an unknown is measured by nothing),
+    (H + lambda D) h = -g,    D = largest diag(H) so far (1 where an unknown is measured by nothing),
 
 which is Marquardt's scaling: it makes lambda a pure number, the same for metres, radians and scale factors, and it
 keeps the matrix positive definite where the measurements leave a direction open (an anchor without ranges, a closure
-whose information is singular): such a direction simply does not move. The model promises the decrease
+whose information is singular): such a direction simply does not move. D never shrinks (J. J. More, The Levenberg-Marquardt
+algorithm, 1978): an anchor that comes into line with the poses that hear it loses all curvature across that line, and a
+damping that went with it would brake every other direction before this one. The model promises the decrease
 h^T (lambda D h - g); the ratio of what F really does to that promise decides. A step that decreases F is taken, and
 lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dropped and lambda is multiplied by
 nu = 2, 4, 8, ... (H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05; K. Madsen, H. B. Nielsen,
@@ -145,7 +147,7 @@ def minimise(
     to_come = _extrapolated if all(edges.kernel.name == "none" for edges in graph.edges) else _as_much_again
     reason, improved = "", True
     factor: Factor | None = None
-    linked = _linked(len(graph.poses), linearized)
+    linked, scale = _linked(len(graph.poses), linearized), np.zeros(normal.unknowns.size)
     while not reason:
         reused = factor is not None
         if improved:
@@ -153,8 +155,9 @@ def minimise(
             # The normal equations hold it all now; the Jacobians of a recording of hours are large.
             linearized = []
             diagonal = normal.diagonal
-            scale = np.where(diagonal > 0, diagonal, 1.0)
-            if np.max(np.abs(normal.gradient) / np.sqrt(scale)) <= config.gradient_tolerance:
+            curvature = np.where(diagonal > 0, diagonal, 1.0)
+            scale = np.maximum(scale, curvature)
+            if np.max(np.abs(normal.gradient) / np.sqrt(curvature)) <= config.gradient_tolerance:
                 reason = GRADIENT
                 break
         if len(history) == config.max_iterations:
@@ -186,7 +189,8 @@ def minimise(
             if not reused:
                 damping, growth = max(damping * growth, _FIRST_BRAKE), growth * 2.0
         if not reason and damping > _MOST_DAMPING:
-            reason = STUCK
+            # At a minimum no step helps either: then all that the gradient could still bring is lost in rounding.
+            reason = NO_DECREASE if np.max(normal.gradient**2 / scale) <= _ROUNDING * chi2 else STUCK
     return graph, SolverSummary(
         converged=reason in (NO_DECREASE, GRADIENT),
         reason=reason,
@@ -215,6 +219,10 @@ _NEAR = 1e-2
 """A step that decreased chi2 by less than this fraction of it changed H so little that the next one takes its factor."""
 _NEARLY_FREE = 1e-6
 """lambda up to which that holds."""
+_KEPT = 0.5
+"""Share of its promise below which a step went where the cost is no parabola, and tells nothing of those to come."""
+_ROUNDING = 1e-12
+"""Share of chi2 that the rounding of thousands of residuals hides."""
 _LEAST_DAMPING = 1e-14
 _FIRST_BRAKE = 1e-5
 """Least lambda after a step that failed."""
@@ -222,8 +230,8 @@ _MOST_DAMPING = 1e12
 
 
 def _extrapolated(decrease: float, last: float, promised: float) -> float:
-    """Return the sum of the geometric series that the last two decreases begin."""
-    if not np.isfinite(last):
+    """Return the sum of the geometric series that the last two decreases begin, where the steps keep what they promise."""
+    if not np.isfinite(last) or decrease < _KEPT * promised:
         return max(decrease, promised)
     return decrease * (decrease / (last - decrease)) if decrease < last else np.inf
 
