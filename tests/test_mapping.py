@@ -339,10 +339,25 @@ def test_wheels_in_another_unit_are_reported_by_the_radio(shared_data):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="ATE 0.091 m with lidar, 0.054 m without: the lidar's weight in large empty halls is too high")
 def test_a_lidar_that_sees_little_does_no_harm_to_the_radio(tmp_path):
-    """A nearly empty hall: with lidar no worse than without, up to a twentieth."""
-    logfile.write(simulate(Settings(world="arena", seed=2, minutes=12.0, speed=0.4)), tmp_path)
-    log, truth = read_log(tmp_path / "run.log"), read_tum(tmp_path / "truth.tum")
-    alone = ate(build_map(log, replace(MappingConfig(), use_lidar=False)), truth)
-    assert ate(build_map(log), truth) < 1.05 * alone
+    """A nearly empty hall: with lidar no worse than without, up to a twentieth, on average over three drives."""
+    fused, alone = [], []
+    for seed in (1, 2, 3):
+        log, truth = simulated(tmp_path / str(seed), world="arena", seed=seed, minutes=12.0, speed=0.4)
+        alone.append(ate(build_map(log, replace(MappingConfig(), use_lidar=False)), truth))
+        fused.append(ate(build_map(log), truth))
+    assert np.mean(fused) < 1.05 * np.mean(alone)
+    assert max(fused) < 0.09
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_ranges_through_walls_move_no_anchor(tmp_path, seed):
+    """Through the block of a corridor ranges are 0.3 m late, always in the same directions; the map shows which they are."""
+    log, truth = simulated(tmp_path, world="corridor", minutes=10.0, seed=seed)
+    result = build_map(log)
+    laid = evaluate_trajectory(result.stamps, result.trajectory, *truth).T_truth_map
+    rows = [row.split(",") for row in (tmp_path / "truth_anchors.csv").read_text().split()[1:]]
+    places = {row[0]: np.array(row[1:3], dtype=float) for row in rows}
+    off = np.array([se2.transform(laid, a.position) - places[a.id] for a in result.anchors])
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.2

@@ -156,3 +156,23 @@ def test_ranges_of_weight_zero_move_no_anchor_and_teach_no_noise():
     silent, unknown = learn_noise(nothing, graph, 2, RangeNoiseConfig(sigma=0.4))
     assert [n.sigma for n in unknown] == pytest.approx([0.4, 0.4])
     assert not silent.weights.any()
+
+
+def test_ranges_through_something_weigh_together_as_one_draw_of_their_delay():
+    _, truth, frames, places, _, edges = world(11, 150.0, 1, sigma=0.0, rate=4.0)
+    rng, graph = np.random.default_rng(8), Graph(truth[frames.index], places)
+    through = edges.tag_positions(graph.poses)[:, 0] > 0.0
+    late = np.where(through, 0.4, 0.0)
+    noisy = replace(edges, ranges=edges.distances(graph) + 0.05 * rng.standard_normal(len(edges)) + late)
+    learnt, (noise,) = learn_noise(noisy, graph, 1, RangeNoiseConfig(), steady=True, blocked=through)
+    information = learnt.weights / learnt.sigma**2
+    assert 0.3 < through.mean() < 0.7
+    assert noise.sigma < 0.1
+    # Their common delay of 0.4 m, spread() of which is 1.4826 times as much, at the least.
+    assert information[through].sum() < 1.0 / 0.4**2
+    poses, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig(), blocked=through)
+    told = poses.weights / poses.sigma**2
+    assert information[through].sum() < told[through].sum() < 0.2 * told[~through].sum()
+    none, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig(), blocked=np.zeros(len(edges), dtype=bool))
+    plain, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig())
+    np.testing.assert_array_equal(none.weights, plain.weights)

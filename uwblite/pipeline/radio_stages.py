@@ -18,6 +18,7 @@ from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.wheels import wheel_edges
 from ..radio import bootstrap, prior_selection
+from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
 from . import joining, map_frame
@@ -140,7 +141,13 @@ def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool 
     """Re-estimate the ranges' noise from their residuals; steady: see range_measurements.learn_noise."""
     if estimate.ranges is None:
         return estimate
-    ranges, _ = learn_noise(estimate.ranges, estimate.graph, len(estimate.anchor_ids), config.ranges, steady=steady)
+    graph, through = estimate.graph, None
+    if (steady or estimate.joint is not None) and estimate.scans is not None and config.ranges.learn:
+        seen = estimate.scans.clouds
+        surfaces = se2.transform(graph.poses[seen.owner], seen.points)
+        tags = estimate.ranges.tag_positions(graph.poses)
+        through = blocked(tags, graph.anchors[estimate.ranges.anchor], surfaces)
+    ranges, _ = learn_noise(estimate.ranges, graph, len(estimate.anchor_ids), config.ranges, steady=steady, blocked=through)
     return replace(estimate, ranges=ranges)
 
 
@@ -171,6 +178,10 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors."""
     if estimate.ranges is None:
         return estimate
-    estimate = with_range_noise(estimate, task.config, steady=True)
-    edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
+    roughly = replace(task.config.solver, max_iterations=min(task.config.solver.max_iterations, _ROUGH_ITERATIONS))
+    for _ in range(_NOISE_ROUNDS - 1):
+        # The marginal likelihood is one about the optimum of the very weights that it is computed with.
+        estimate = with_range_noise(estimate, task.config, steady=True)
+        edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
+        estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*edges), roughly)[0])
     return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))

@@ -1,0 +1,67 @@
+"""Which ranges were measured through something that the lidar saw.
+
+What stands between tag and anchor makes ranges longer, never shorter. Where such ranges come in the same directions again
+and again, no residual tells the delay from another place of the anchor; the map does.
+"""
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+
+_CELL = 0.2
+"""Side of a cell of the map, m; a wall is about as thick."""
+_LEAST_POINTS = 3
+"""Points of clouds from which a cell is taken as a surface: people who pass leave fewer."""
+_NEAR_TAG = 0.4
+"""The way through the robot itself does not count, m."""
+_NEAR_ANCHOR = 1.0
+"""Nor the last metre: an anchor hangs on a wall, and its place is not yet known better than that."""
+_MOST_CELLS = 100_000_000
+"""A larger map (2 x 2 km) gets coarser cells; a bound on the memory."""
+_SAMPLES_AT_ONCE = 1 << 20
+"""Places looked up at once."""
+
+
+def blocked(tags: Floats, anchors: Floats, surfaces: Floats) -> Bools:
+    """Return which straight ways (m,) from a tag to an anchor lead through a surface.
+
+    Parameters
+    ----------
+    tags, anchors : (m, 2) both ends of each way, m, map frame.
+    surfaces : (p, 2) points of all clouds, m, map frame.
+    """
+    if not len(surfaces) or not len(tags):
+        return np.zeros(len(tags), dtype=bool)
+    low, cell, occupied = _occupied(surfaces)
+    way = anchors - tags
+    length = np.hypot(way[:, 0], way[:, 1])
+    count = np.maximum(np.ceil((length - _NEAR_TAG - _NEAR_ANCHOR) / (0.5 * cell)), 0.0).astype(np.int64)
+    through = np.zeros(len(tags), dtype=bool)
+    for part in np.array_split(np.arange(len(tags)), 1 + int(count.sum()) // _SAMPLES_AT_ONCE):
+        row = np.repeat(part, count[part])
+        begins = np.cumsum(count[part]) - count[part]
+        along = _NEAR_TAG + 0.5 * cell * (np.arange(len(row)) - np.repeat(begins, count[part]))
+        place = tags[row] + way[row] * (along / length[row])[:, None]
+        np.logical_or.at(through, row, _look_up(place, low, cell, occupied))
+    return through
+
+
+def _occupied(surfaces: Floats) -> tuple[Floats, float, Bools]:
+    """Return the lower corner (2,) of the map, the side of its cells and which of them (x, y) hold a surface."""
+    low, high = surfaces.min(axis=0), surfaces.max(axis=0)
+    cell = max(_CELL, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
+    place = _cells(surfaces, low, cell)
+    shape = place.max(axis=0) + 1
+    hits = np.bincount(place[:, 0] * shape[1] + place[:, 1], minlength=int(shape.prod()))
+    return low, cell, (hits >= _LEAST_POINTS).reshape(shape)
+
+
+def _cells(places: Floats, low: Floats, cell: float) -> Ints:
+    return np.floor((places - low) / cell).astype(np.int64)
+
+
+def _look_up(places: Floats, low: Floats, cell: float, occupied: Bools) -> Bools:
+    """Return which places (s,) lie in a cell with a surface."""
+    x, y = _cells(places, low, cell).T
+    inside = (x >= 0) & (y >= 0) & (x < occupied.shape[0]) & (y < occupied.shape[1])
+    return np.asarray(inside & occupied[np.where(inside, x, 0), np.where(inside, y, 0)])
