@@ -7,6 +7,7 @@
     python tools/accuracy.py ablation --set keyframes.scans=3
 
 Parts: simulated (buildings x seeds against bars), real (recordings of others, where they are: UWBLITE_SHARED_DATA),
+benchmark (two of them against relations and published figures; --perturb N: N perturbed runs of each as well),
 ablation (each ingredient switched off in turn), injection (false closures and ranges into a good graph). How true the
 stated uncertainties are is measured by tools/consistency.py, which writes into the same page.
 """
@@ -27,6 +28,7 @@ from trials import ROOT, SHARED, Figures, Trial, as_read, judged, made, spread_o
 
 from uwblite import se2
 from uwblite.config import override
+from uwblite.evaluation.relations import Relations, evaluate_relations
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.gnc import optimize_gnc
 from uwblite.graph.graph import Edges, Graph
@@ -34,12 +36,13 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.io.carmen import read_log
+from uwblite.io.relations_file import read_relations
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.se2 import align
 from uwblite.sensor_log import SensorLog
 
-PARTS = ("simulated", "real", "ablation", "injection")
+PARTS = ("simulated", "real", "benchmark", "ablation", "injection")
 WORST = 1.6
 """The worst seed may exceed the bar on the mean by this factor."""
 
@@ -241,6 +244,55 @@ def real(args: argparse.Namespace) -> str:
     return f"## Recordings of others\n\nDefaults, from the raw logs; m.\n\n{text}{more}"
 
 
+BENCHMARK = {"mit-csail": (0.049, 0.45, 0.106, 0.049, 0.004, 0.032), "fr079": (0.061, 0.65, 0.258, 0.061, 0.056, 0.045)}
+"""Bars on the mean errors over relations, m and degrees; translations that others reached, m: scan matching, GMapping, graph
+mapping (Kuemmerle et al. 2009) and Cartographer (Hess et al. 2016)."""
+PERTURBED = 1.3
+"""Perturbed recordings may exceed the bars by this factor."""
+
+
+def perturbed(log: SensorLog, seed: int) -> SensorLog:
+    """Return the recording with a tenth of its scans gone and steps of the odometry wrong by 2 %; seed 0 = as it is."""
+    if seed == 0 or log.scans is None:
+        return log
+    rng = np.random.default_rng(seed)
+    kept = rng.random(len(log.scans.stamps)) > 0.1
+    scans = replace(log.scans, stamps=log.scans.stamps[kept], ranges=log.scans.ranges[kept])
+    steps = se2.between(log.odometry.poses[:-1], log.odometry.poses[1:])
+    poses = [log.odometry.poses[0]]
+    for step in steps * (1.0 + 0.02 * rng.standard_normal(steps.shape)):
+        poses.append(se2.compose(poses[-1], step))
+    return replace(log, scans=scans, odometry=replace(log.odometry, poses=np.array(poses)))
+
+
+def benchmark(args: argparse.Namespace) -> str:
+    """Judge maps by the relations of Kuemmerle et al.; with --perturb N, of N perturbed recordings, too."""
+    rows, config = [], override(MappingConfig(), args.set)
+    for name in asked(args, list(BENCHMARK)):
+        folder, (bar, turn, *others) = SHARED / "kummerle" / name, BENCHMARK[name]
+        if not folder.is_dir():
+            continue
+        log, relations = read_log(folder / "run.log.gz"), Relations(*read_relations(folder / "truth.relations.gz"))
+        for seed in range(args.perturb + 1):
+            result = build_map(perturbed(log, seed), config)
+            delay = result.graph.calibration.get("laser_delay")
+            found = evaluate_relations(result.stamps, result.trajectory, relations, delay)
+            shift, angle = found.translations.mean, math.degrees(found.rotations.mean)
+            good = shift <= bar * (PERTURBED if seed else 1.0) and angle <= turn * (PERTURBED if seed else 1.0)
+            kept = "yes" if good and found.answered.all() and not result.doubts else "**no**"
+            title = f"{name}, perturbed {seed}" if seed else name
+            doubts = ", ".join(notice.kind for notice in result.doubts)
+            rows.append([title, shift, f"{bar:g}", f"{angle:.2f}", f"{turn:g}", f"{found.far:.1%}", kept, doubts, *others])
+            print(f"{title}: {shift:.4f} m, {angle:.3f} deg {doubts}", file=sys.stderr, flush=True)
+    head = ["recording", "translation", "bar", "rotation, deg", "bar", "beyond 0.5 m", "kept", "doubts"]
+    text = table([*head, "scan matching", "GMapping", "graph mapping", "Cartographer"], rows)
+    return (
+        "## SLAM benchmark of Kuemmerle et al. 2009\n\nDefaults, from the raw logs: mean errors over all relations, each "
+        "counts once; m. The last columns are\ntranslations that others published. Perturbed: a tenth of the scans left out at "
+        f"random, steps of the odometry wrong\nby 2 %; {PERTURBED} times the bar is allowed.\n\n{text}"
+    )
+
+
 def true_path(folder: Path, log: SensorLog) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps and poses of the reference."""
     for name in ("truth.tum", "truth_position.tum"):
@@ -376,9 +428,10 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting; repeatable")
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     p.add_argument("--oracle", action="store_true", help="also what the measurements allow; minutes a recording")
+    p.add_argument("--perturb", type=int, default=0, metavar="N", help="perturbed runs of each benchmark recording (0)")
     p.add_argument("--quick", action="store_true", help="recordings of 6 min")
     args = p.parse_args(argv)
-    made_by = {"simulated": simulated, "real": real, "ablation": ablation, "injection": injection}
+    made_by = {"simulated": simulated, "real": real, "benchmark": benchmark, "ablation": ablation, "injection": injection}
     if not args.print and not args.out.exists():
         args.out.write_text(HEAD)
     for part in args.parts or PARTS:
