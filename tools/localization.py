@@ -209,7 +209,8 @@ def start_row(on: Bench, name: str, count: int) -> list[object]:
     ways = np.array([s.way for s in found])
     within = np.isfinite(ways)
     typical, slow = (float(np.quantile(ways[within], q)) if within.any() else np.nan for q in (0.5, 0.95))
-    return [on.world, name, count, f"{within.mean():.0%}", f"{typical:.1f}", f"{slow:.1f}", sum(s.wrong for s in found)]
+    shown = [f"{v:.1f}" if np.isfinite(v) else "-" for v in (typical, slow)]
+    return [name, count, f"{within.mean():.0%}", *shown, sum(s.wrong for s in found)]
 
 
 def track_rows(on: Bench, seconds: float) -> list[list[object]]:
@@ -217,7 +218,7 @@ def track_rows(on: Bench, seconds: float) -> list[list[object]]:
     rows = [(name, track(on, seconds, *used)) for name, used in KINDS.items()]
     rows.insert(1, ("one anchor moved by 2.2 m", track(with_moved_anchor(on), seconds)))
     spent = [f"{t.per_scan:.1f}" if np.isfinite(t.per_scan) else "-" for _, t in rows]
-    return [[on.world, name, t.rms, t.worst, f"{t.lost:.1%}", cpu] for (name, t), cpu in zip(rows, spent, strict=True)]
+    return [[name, t.rms, t.worst, f"{t.lost:.1%}", cpu] for (name, t), cpu in zip(rows, spent, strict=True)]
 
 
 def carried_row(on: Bench, count: int) -> list[object]:
@@ -227,7 +228,7 @@ def carried_row(on: Bench, count: int) -> list[object]:
     times = [carried(on, float(t), float(t) + 0.4 * (end - begin)) for t in leave]
     after = np.array([t for t, _ in times])
     typical = f"{np.median(after):.1f}" if np.isfinite(np.median(after)) else "-"
-    return [on.world, count, sum(stated for _, stated in times), f"{np.mean(after <= 10.0):.0%}", typical]
+    return [count, sum(stated for _, stated in times), f"{np.mean(after <= 10.0):.0%}", typical]
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -240,23 +241,24 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--print", action="store_true", help="write nothing")
     args = parser.parse_args(argv)
-    starts, tracks, lifted = [], [], []
     for world in args.only.split(","):
-        on = bench(world, WORLDS[world], args.seed)
-        starts += [start_row(on, name, args.starts if name == "all sensors" else max(args.starts // 5, 1)) for name in KINDS]
-        tracks += track_rows(on, args.seconds)
-        lifted.append(carried_row(on, args.carried))
-        for row in (*starts[-len(KINDS) :], *tracks[-len(KINDS) - 1 :], lifted[-1]):
-            print(*row, flush=True)
-    head = ("world", "sensors", "starts", f"found within {MOST_WAY:.0f} m", "median, m driven", "95 %, m", "wrong")
-    parts = [table(head, starts)]
-    parts.append(table(("world", "tracking", "rms, m", "worst, m", "lost", "CPU per scan, ms"), tracks))
-    parts.append(table(("world", "carried away", "said lost", "found again within 10 s", "median, s"), lifted))
-    text = "\n".join(parts)
-    print(text)
-    if not args.print:
-        write_section(ROOT / "docs" / "navigation.md", "localization", text)
+        text = report(bench(world, WORLDS[world], args.seed), args.starts, args.carried, args.seconds)
+        print(text, flush=True)
+        if not args.print:
+            write_section(ROOT / "docs" / "navigation.md", f"localization {world}", text)
     return 0
+
+
+def report(on: Bench, starts: int, lifted: int, seconds: float) -> str:
+    """Return the tables of one world."""
+    few = max(starts // 10, 2)
+    rows = [start_row(on, name, starts if name == "all sensors" else few) for name in KINDS]
+    head = (on.world, "starts", f"found within {MOST_WAY:.0f} m", "median, m driven", "95 %, m", "wrong")
+    parts = [table(head, rows)]
+    parts.append(table((f"{on.world}, tracking", "rms, m", "worst, m", "lost", "CPU per scan, ms"), track_rows(on, seconds)))
+    head = (f"{on.world}, carried away", "said lost", "found again within 10 s", "median, s")
+    parts.append(table(head, [carried_row(on, lifted)]))
+    return "\n".join(parts)
 
 
 if __name__ == "__main__":
