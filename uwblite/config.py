@@ -290,11 +290,8 @@ def _write_table(lines: list[str], config: Any, path: tuple[str, ...], comments:
     hints = get_type_hints(type(config))
     tables = []
     if path:
-        lines += [
-            "",
-            *(_wrapped((type(config).__doc__ or "").strip().split("\n\n")[0]) if comments else []),
-            f"[{'.'.join(path)}]",
-        ]
+        text = _wrapped((type(config).__doc__ or "").strip().split("\n\n")[0]) if comments else []
+        lines += ["", *text, f"[{'.'.join(path)}]"]
     for f in shown_fields(config, advanced):
         value = getattr(config, f.name)
         if dataclasses.is_dataclass(value):

@@ -13,6 +13,7 @@ from uwblite.graph.calibration import (
     scan_indices,
     unknowns,
     with_free,
+    with_nonnegative_heights,
 )
 from uwblite.graph.graph import Calibration, Graph
 
@@ -118,3 +119,17 @@ def test_no_anchors_no_range_table():
     calibration = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
     assert all(key.anchor is None for key in calibration.keys)
     assert range_indices(calibration, np.zeros(0, dtype=np.int64), ()).shape == (0, 6)
+
+
+def test_heights_below_zero_are_fixed_there_and_nothing_else_changes():
+    calibration = block(unknowns(CalibrationConfig(), IDS, GIVEN))
+    low, high = calibration.index("height2", "1E05"), calibration.index("height2", "91A3")
+    bias = calibration.index("bias", "1E05")
+    values = np.zeros(len(calibration.values))
+    values[[low, high, bias]] = -0.3, 0.4, -0.2
+    before = np.arange(len(values)) == bias
+    graph = Graph(np.zeros((1, 3)), np.zeros((3, 2)), (), calibration, fixed_calibration=before)
+    graph = with_nonnegative_heights(graph.updated(graph.poses, graph.anchors, values))
+    values[low] = 0.0
+    np.testing.assert_array_equal(graph.calibration.values, values)
+    assert np.flatnonzero(graph.fixed_calibration).tolist() == sorted([low, bias])

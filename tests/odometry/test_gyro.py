@@ -88,8 +88,12 @@ def test_priors_and_noise_are_a_gyros_and_what_is_off_stays_off():
     assert settings(log, config.calibration, config.odometry) == (config.calibration, config.odometry)
     log = replace(log, gyro=Gyro(np.zeros(1), np.zeros(1)))
     calibration, noise = settings(log, config.calibration, config.odometry)
-    assert calibration.heading_rate == LEFT_OF_BIAS
-    assert noise.heading_per_turn < config.odometry.heading_per_turn
+    given = replace(calibration, heading_rate=LEFT_OF_BIAS, heading_scale=0.02, heading_per_metre=0.001)
+    assert calibration == given
+    assert noise == replace(config.odometry, heading_per_turn=0.005, heading_per_metre=0.001)
+    tight = replace(config.calibration, heading_scale=0.01, heading_per_metre=0.0)
+    kept = settings(log, tight, config.odometry)[0]
+    assert (kept.heading_scale, kept.heading_per_metre) == (0.01, 0.0)
     assert settings(log, replace(config.calibration, heading_rate=0.0), config.odometry)[0].heading_rate == 0.0
 
 

@@ -60,3 +60,11 @@ def test_two_moves_are_found_in_the_order_of_time():
     np.testing.assert_allclose([m.stamp for m in moves], [60.0, 110.0], atol=4.0)
     for move, (before, after) in zip(moves, pairwise(places), strict=True):
         np.testing.assert_allclose([move.before, move.after], [before, after], atol=0.5)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_short_move_cannot_be_distinguished_from_a_blocked_line_of_sight(seed):
+    """Two places 0.65 m apart explain these ranges clearly better than one; the least move is 0.8 m."""
+    place = np.array([-2.0, 1.0])
+    ranges = measured(seed, place, place + np.array([0.0, 0.65]), share=0.0)
+    assert find_move(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig()) is None

@@ -25,7 +25,7 @@ def test_a_known_pose_with_its_way():
     json.dumps(later, allow_nan=False)
 
 
-def test_a_lost_one_says_why_and_forgets_its_way():
+def test_a_lost_one_reports_why_and_forgets_its_way():
     status = PoseStatus()
     status.take(KNOWN)
     lost = replace(
@@ -41,7 +41,7 @@ def test_a_lost_one_says_why_and_forgets_its_way():
     json.dumps(shown, allow_nan=False)
 
 
-def test_a_log_that_begins_anew_is_shown_at_once():
+def test_a_log_that_begins_again_is_shown_at_once():
     status = PoseStatus()
     status.take(replace(KNOWN, stamp=1e6))
     assert status.take(KNOWN) is not None

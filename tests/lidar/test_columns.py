@@ -1,0 +1,57 @@
+"""Columns among cells: circles planted on a grid, seen from all sides or from one, beside walls and beside each other."""
+
+import numpy as np
+import pytest
+
+from uwblite.lidar.columns import Landmarks, find_columns, fit_circle
+
+CELL = 0.05
+
+
+def circle(centre, radius, begin=0.0, end=2.0 * np.pi):
+    angle = np.linspace(begin, end, 200)
+    return np.asarray(centre) + radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def cells_of(points):
+    """Return the middles of the cells in which points (n, 2) lie."""
+    return (np.unique(np.floor(points / CELL), axis=0) + 0.5) * CELL
+
+
+def expected(*places, radius=0.25):
+    return Landmarks(tuple("abc"[: len(places)]), np.array(places), np.full(len(places), radius))
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.2), (-0.5, 0.6)])
+def test_a_column_is_found_where_it_stands(shift):
+    centre = np.array([2.013, -1.022]) + shift
+    found = find_columns(cells_of(circle(centre, 0.25)), expected((2.0, -1.0)))
+    # Cells round to half a cell; the circle's many cells average that to a fifth of one.
+    assert np.hypot(*(found.positions[0] - centre)) < 0.2 * CELL
+    assert found.names == ("a",)
+
+
+def test_half_of_a_column_is_enough_and_less_than_a_third_is_not():
+    half, part = (circle((2.0, -1.0), 0.25, 0.3, 0.3 + share * 2.0 * np.pi) for share in (0.55, 0.2))
+    assert np.hypot(*(find_columns(cells_of(half), expected((2.2, -1.1))).positions[0] - (2.0, -1.0))) < CELL
+    assert np.isnan(find_columns(cells_of(part), expected((2.2, -1.1))).positions).all()
+
+
+def test_walls_and_empty_maps_have_no_column():
+    wall = np.column_stack([np.linspace(0.0, 4.0, 400), np.full(400, -1.0)])
+    assert np.isnan(find_columns(cells_of(wall), expected((2.0, -1.0))).positions).all()
+    assert np.isnan(find_columns(np.zeros((0, 2)), expected((2.0, -1.0))).positions).all()
+
+
+def test_a_column_is_not_taken_for_its_neighbour():
+    """One of two stands, 0.9 m from the place of the other, within its search radius but nearer to its own place."""
+    found = find_columns(cells_of(circle((0.9, 0.0), 0.25)), expected((0.0, 0.0), (0.9, 0.0)))
+    assert np.isnan(found.positions[0]).all()
+    assert np.hypot(*(found.positions[1] - (0.9, 0.0))) < 0.2 * CELL
+
+
+def test_a_circle_is_fitted_exactly_and_what_lies_outside_the_gate_does_not_pull():
+    points = np.concatenate([circle((1.0, 2.0), 0.3, 0.0, 4.0), [[1.5, 2.0], [1.0, 2.5]]])
+    np.testing.assert_allclose(fit_circle(points, np.array([1.02, 1.97]), 0.3, 0.1), (1.0, 2.0), atol=1e-4)
+    lone = np.array([[5.0, 5.0]])
+    np.testing.assert_array_equal(fit_circle(lone, np.array([1.0, 2.0]), 0.3, 0.1), (1.0, 2.0))
