@@ -77,7 +77,7 @@ def test_anchors_go_where_none_are_in_line_of_sight():
     assert plan.errors[-1][right].mean() < 0.6 * plan.errors[0][right].mean()
 
 
-def test_line_of_line_of_line_of_line_of_line_of_line_of_line_of_line_of_line_of_line_of_line_of_sight_ends_at_walls_and_passes_doors():
+def test_line_of_sight_ends_at_walls_and_passes_doors():
     blocked = np.zeros((9, 21), dtype=bool)
     blocked[:, 10] = True
     blocked[4, 10] = False
