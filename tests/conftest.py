@@ -43,6 +43,16 @@ def room_log():
 
 
 @pytest.fixture(scope="session")
+def minute_log(room_log, tmp_path_factory):
+    """Path of its first minute: for tests of what the program does with a recording, whatever the map is."""
+    from uwblite.io.carmen import read_log, write_log
+
+    path = tmp_path_factory.mktemp("minute") / "minute.log.gz"
+    write_log(path, read_log(room_log).crop(0.0, 60.0))
+    return path
+
+
+@pytest.fixture(scope="session")
 def log(room_log):
     """That recording, read."""
     from uwblite.io.carmen import read_log

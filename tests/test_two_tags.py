@@ -118,6 +118,7 @@ def test_each_tag_has_its_own_place_delay_and_height(told):
     assert not [u for u in level if u.key.kind == "height2" and u.key.tag]
 
 
+@pytest.mark.slow
 def test_the_map_uses_both_tags():
     """Without a lidar the heading comes from the wheels and, with two tags, from the radio as well."""
     rng = np.random.default_rng(8)

@@ -5,7 +5,7 @@ examples:
   python tools/check.py                     lint, types and the fast tests
   python tools/check.py --slow              the slow tests too
   python tools/check.py --tests -k icp      only tests, and only some
-  python tools/check.py --tests -n 4        in four processes (two where pytest-xdist is installed)
+  python tools/check.py --tests -n 4        in four processes (three where pytest-xdist is installed)
 """
 
 import argparse
@@ -42,10 +42,13 @@ def main() -> int:
 
 
 def _workers(pytest_args: list[str]) -> list[str]:
-    """Return the options for two test processes, where pytest-xdist is there and nothing else is asked for."""
+    """Return the options for several test processes, where pytest-xdist is there and nothing else is asked for.
+
+    Two processes work while a third waits: tests of devices wait for emulated ports.
+    """
     if importlib.util.find_spec("xdist") is None or (os.cpu_count() or 1) < 2 or {"-n", "-s", "--pdb"} & set(pytest_args):
         return []
-    return ["-n", "2", "--dist", "worksteal"]
+    return ["-n", "3", "--dist", "worksteal"]
 
 
 def _numpy_has_exact_types() -> bool:

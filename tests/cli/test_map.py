@@ -64,26 +64,29 @@ def test_every_odometry_stamp_has_a_pose(mapped):
     assert np.all(np.diff(stamps) > 0)
 
 
-def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(mapped, room_log, tmp_path, capsys):
-    assert main(["map", str(room_log), "--out", str(tmp_path / "again"), "--jobs", "2", "-q"]) == mapped[1]
-    first, second = contents(mapped[0]), contents(tmp_path / "again")
+def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(minute_log, tmp_path, capsys):
+    codes = [main(["map", str(minute_log), "--out", str(tmp_path / jobs), "--jobs", jobs, "-q"]) for jobs in "12"]
+    assert codes[0] == codes[1]
+    first, second = contents(tmp_path / "1"), contents(tmp_path / "2")
     assert {name for name in first if first[name] != second[name]} <= {"report.json"}
     one, two = (json.loads(c["report.json"]) for c in (first, second))
     one.pop("timings"), two.pop("timings")
     assert one == two
 
 
-def test_the_command_in_the_report_makes_the_same_map(mapped, room_log, tmp_path, monkeypatch, capsys):
+def test_the_command_in_the_report_makes_the_same_map(minute_log, tmp_path, monkeypatch, capsys):
     import shlex
     import shutil
 
-    words = shlex.split(json.loads((mapped[0] / "report.json").read_text())["command"])
+    code = main(["map", str(minute_log), "--out", str(tmp_path / "first"), "--resolution", "0.1", "--no-timings"])
+    first = contents(tmp_path / "first")
+    words = shlex.split(json.loads(first["report.json"])["command"])
     monkeypatch.chdir(tmp_path)
-    shutil.copy(room_log, tmp_path)
-    (tmp_path / "config.toml").write_bytes((mapped[0] / "config.toml").read_bytes())
-    assert main(words[1:]) == mapped[1]
-    assert (tmp_path / "map_again" / "map.pgm").read_bytes() == (mapped[0] / "map.pgm").read_bytes()
-    assert (tmp_path / "map_again" / "trajectory.tum").read_bytes() == (mapped[0] / "trajectory.tum").read_bytes()
+    shutil.copy(minute_log, tmp_path)
+    (tmp_path / "config.toml").write_bytes(first["config.toml"])
+    assert main(words[1:]) == code
+    assert (tmp_path / "map_again" / "map.pgm").read_bytes() == first["map.pgm"]
+    assert (tmp_path / "map_again" / "trajectory.tum").read_bytes() == first["trajectory.tum"]
 
 
 def test_the_same_log_in_another_folder_gives_the_same_bytes(radio_only, tmp_path, monkeypatch, capsys):
@@ -134,8 +137,8 @@ def test_a_result_is_not_replaced_unasked(mapped, room_log, capsys):
 
 
 @pytest.mark.parametrize("without", ["uwb", "loops", "lidar"])
-def test_a_sensor_may_be_missing(room_log, tmp_path, capsys, without):
-    code = main(["map", str(room_log), "--out", str(tmp_path / "map"), "--without", without, "--json"])
+def test_a_sensor_may_be_missing(minute_log, tmp_path, capsys, without):
+    code = main(["map", str(minute_log), "--out", str(tmp_path / "map"), "--without", without, "--json"])
     assert code in (0, 3)
     summary = json.loads(capsys.readouterr().out)
     names = {Path(name).name for name in summary["files"]}
@@ -144,9 +147,10 @@ def test_a_sensor_may_be_missing(room_log, tmp_path, capsys, without):
     assert summary["exit_code"] == code
 
 
-def test_mounting_and_settings_of_the_command_line_count(room_log, tmp_path, capsys):
+@pytest.mark.slow
+def test_mounting_and_settings_of_the_command_line_count(minute_log, tmp_path, capsys):
     words = ["--laser-pose=0.1,0,0", "--tag", "-0.05,0,0.6", "--resolution", "0.1", "--without", "loops", "--scale-map"]
-    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
+    assert main(["map", str(minute_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
     yaml = (tmp_path / "map" / "map.yaml").read_text()
     assert "resolution: 0.1" in yaml
     assert "use_loops = false" in (tmp_path / "map" / "config.toml").read_text()
@@ -155,26 +159,30 @@ def test_mounting_and_settings_of_the_command_line_count(room_log, tmp_path, cap
     assert (tmp_path / "map" / "map_scale.png").exists()
 
 
-def test_a_dry_run_writes_nothing(room_log, tmp_path, capsys):
-    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--dry-run"]) == 0
+def test_a_dry_run_writes_nothing(minute_log, tmp_path, capsys):
+    assert main(["map", str(minute_log), "--out", str(tmp_path / "map"), "--dry-run"]) == 0
     assert "expected cost" in capsys.readouterr().out
     assert not (tmp_path / "map").exists()
 
 
+@pytest.mark.slow
 def test_check_of_the_sample(room_log, capsys):
     assert main(["check", str(room_log)]) == 0
     text = capsys.readouterr().out
     assert "bias guess" in text
     assert "next: uwblite map" in text
     assert "SERIOUS" not in text
-    assert main(["check", str(room_log), "--json", "--quick"]) == 0
+
+
+def test_check_shows_programs_figures_and_cost(minute_log, capsys):
+    assert main(["check", str(minute_log), "--json", "--quick"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["figures"]["lidar"]["beams"] == 682
     assert summary["expected cost of map"]["megabytes"] > 50
 
 
-def test_check_exits_with_3_where_a_finding_spoils_the_map(room_log, capsys):
-    assert main(["check", str(room_log), "--laser-flipped", "--quick"]) == 3
+def test_check_exits_with_3_where_a_finding_spoils_the_map(minute_log, capsys):
+    assert main(["check", str(minute_log), "--laser-flipped", "--quick"]) == 3
     assert "mounted upright" in capsys.readouterr().out
 
 
@@ -236,6 +244,7 @@ def test_a_result_to_trust_exits_with_0_and_one_in_doubt_with_3(radio_only, tmp_
             assert all("mirror-ambiguous" in doubt for doubt in doubts)
 
 
+@pytest.mark.slow
 def test_broken_lines_are_reported_counted_and_skipped(radio_only, tmp_path, capsys):
     lines = (radio_only / "around.log").read_text().splitlines(keepends=True)
     lines[40:40] = ["ODOM 1 2\n"]
@@ -261,6 +270,7 @@ def test_too_many_broken_lines_are_refused_and_nothing_is_written(radio_only, tm
     assert not (tmp_path / "map").exists()
 
 
+@pytest.mark.slow
 def test_a_second_map_lies_in_the_frame_of_the_first_and_names_what_was_moved(mapped, room_log, tmp_path, capsys):
     from uwblite.io.csv_table import read_csv
 
@@ -277,18 +287,19 @@ def test_a_second_map_lies_in_the_frame_of_the_first_and_names_what_was_moved(ma
         assert np.hypot(*np.subtract(found[name], position)) < 0.4, name
 
 
-def test_a_file_of_constraints_pins_the_map(room_log, tmp_path, capsys):
+def test_a_file_of_constraints_pins_the_map(minute_log, tmp_path, capsys):
     (tmp_path / "known.toml").write_text("[[pose]]\nstamp = 0\npose = [10, 20, 1.5707963]\nsigma = [0.001, 0.001, 0.001]\n")
     words = ["--constraints", str(tmp_path / "known.toml"), "--without", "lidar"]
-    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
+    assert main(["map", str(minute_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
     _, poses = read_tum(tmp_path / "map" / "trajectory.tum")
     assert np.allclose(poses[0], (10, 20, np.pi / 2), atol=0.01)
     assert "--constraints" in json.loads((tmp_path / "map" / "report.json").read_text())["command"]
     (tmp_path / "known.toml").write_text("[[anchor]]\nid = 'FFFF'\nposition = [1, 2]\n")
-    assert main(["map", str(room_log), "--out", str(tmp_path / "other"), *words]) == 1
+    assert main(["map", str(minute_log), "--out", str(tmp_path / "other"), *words]) == 1
     assert "no ranges to anchor FFFF" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_forbidden_closure_is_listed_as_such(room_log, tmp_path, capsys):
     (tmp_path / "known.toml").write_text("[[forbidden_closure]]\nstamps = [30, 200]\nwithin = 30\n")
     words = ["--constraints", str(tmp_path / "known.toml"), "--without", "uwb"]
@@ -303,7 +314,7 @@ def test_a_forbidden_closure_is_listed_as_such(room_log, tmp_path, capsys):
 
 def test_localize_finds_a_part_in_the_map(mapped, room_log, tmp_path, capsys):
     part = tmp_path / "part.log"
-    assert main(["convert", str(room_log), str(part), "--start", "120"]) == 0
+    assert main(["convert", str(room_log), str(part), "--start", "120", "--end", "180"]) == 0
     words = ["--map", str(mapped[0]), "--out", str(tmp_path / "p.tum"), "--picture", str(tmp_path / "p.png")]
     before = contents(mapped[0])
     assert main(["localize", str(part), *words, "--covariance", str(tmp_path / "p.csv")]) == 0
@@ -324,6 +335,7 @@ def test_localize_finds_a_part_in_the_map(mapped, room_log, tmp_path, capsys):
     assert main(["localize", str(part), "--map", str(tmp_path), "--out", str(tmp_path / "q.tum")]) == 1
 
 
+@pytest.mark.slow
 def test_two_recordings_become_one_map_through_their_anchors(mapped, room_log, tmp_path, capsys):
     parts = [tmp_path / "first.log", tmp_path / "second.log"]
     assert main(["convert", str(room_log), str(parts[0]), "--end", "110"]) == 0
@@ -343,9 +355,10 @@ def test_two_recordings_become_one_map_through_their_anchors(mapped, room_log, t
     assert np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=1))) < 0.06
 
 
+@pytest.mark.slow
 def test_a_folder_of_localize_is_exchanged_as_a_whole(mapped, room_log, tmp_path, monkeypatch):
     part = tmp_path / "part.log"
-    main(["convert", str(room_log), str(part), "--start", "100", "--end", "140"])
+    main(["convert", str(room_log), str(part), "--start", "100", "--end", "125"])
     words = ["localize", str(part), "--map", str(mapped[0]), "--out", str(tmp_path / "where")]
     assert main([*words, "--picture", str(tmp_path / "where" / "mine.png")]) == 0
     before = {p.name: p.read_bytes() for p in (tmp_path / "where").iterdir()}
@@ -365,7 +378,7 @@ def test_a_folder_of_localize_is_exchanged_as_a_whole(mapped, room_log, tmp_path
 
 def test_localize_fills_a_folder_but_never_the_map_s(mapped, room_log, tmp_path, capsys):
     part, out = tmp_path / "part.log", tmp_path / "there"
-    assert main(["convert", str(room_log), str(part), "--start", "150"]) == 0
+    assert main(["convert", str(room_log), str(part), "--start", "150", "--end", "190"]) == 0
     before = contents(mapped[0])
     assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(mapped[0]), "--force"]) == 1
     assert "is the map itself" in capsys.readouterr().err
@@ -381,6 +394,7 @@ def test_localize_fills_a_folder_but_never_the_map_s(mapped, room_log, tmp_path,
     assert contents(mapped[0]) == before
 
 
+@pytest.mark.slow
 def test_localize_in_a_map_without_anchors_goes_by_its_walls(mapped, room_log, tmp_path, capsys):
     import shutil
 
@@ -389,7 +403,7 @@ def test_localize_in_a_map_without_anchors_goes_by_its_walls(mapped, room_log, t
     header = (bare / "anchors.csv").read_text().splitlines()[0]
     (bare / "anchors.csv").write_text(header + "\n")
     part = tmp_path / "part.log"
-    assert main(["convert", str(room_log), str(part), "--start", "120"]) == 0
+    assert main(["convert", str(room_log), str(part), "--start", "120", "--end", "180"]) == 0
     capsys.readouterr()
     assert main(["localize", str(part), "--map", str(bare), "--out", str(tmp_path / "p.tum"), "--json"]) in (0, 3)
     summary = json.loads(capsys.readouterr().out)
@@ -400,11 +414,12 @@ def test_localize_in_a_map_without_anchors_goes_by_its_walls(mapped, room_log, t
     assert "no anchor in it has a place" in capsys.readouterr().err
 
 
-def test_every_third_scan_makes_a_map_too(room_log, tmp_path, capsys):
+@pytest.mark.slow
+def test_every_third_scan_makes_a_map_too(minute_log, tmp_path, capsys):
     """What is not read is counted and not held; the command in the report says so."""
-    assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--every-nth-scan", "3"]) in (0, 3)
+    assert main(["map", str(minute_log), "--out", str(tmp_path / "map"), "--every-nth-scan", "3"]) in (0, 3)
     report = json.loads((tmp_path / "map" / "report.json").read_text())
-    whole = read_log(room_log).scans
+    whole = read_log(minute_log).scans
     assert report["recording"]["scans"] == -(-len(whole.stamps) // 3)
     assert "--every-nth-scan=3" in report["command"]
 

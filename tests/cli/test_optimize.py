@@ -25,6 +25,7 @@ def figures(capsys, *words, code=0):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_incremental_reaches_the_minimum_that_all_at_once_misses(tmp_path, capsys):
     graph = lawn(0)[0]
     path = written(tmp_path / "bent.pyfg", graph)

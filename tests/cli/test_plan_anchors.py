@@ -18,6 +18,7 @@ def mapped(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_places_go_to_a_table_and_a_picture(mapped, capsys):
     words = ["plan-anchors", "--map", str(mapped / "map"), "--count", "2", "--out", str(mapped / "plan")]
     assert main(words) == 0

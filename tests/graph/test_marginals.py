@@ -106,6 +106,7 @@ def test_relative_covariance_of_neighbours_is_that_of_their_odometry():
     np.testing.assert_allclose(relative, np.tile(turn @ np.diag(sigma**2) @ turn.T, (3, 1, 1)), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_covariances_are_those_of_repeated_experiments():
     """300 graphs that differ by their noise: errors over predicted sigmas have mean square 1 to sqrt(2 / 300) each."""
     sums, repeats = np.zeros(3), 300

@@ -98,7 +98,7 @@ def test_lines_are_bresenhams_in_every_direction(reach):
 
 def test_long_lines_round_exactly_in_both_precisions():
     rng = np.random.default_rng(1)
-    for n in (255, 256, 257, 2000, 9999):
+    for n in (255, 256, 257, 2000, 5000):
         d = np.unique(np.concatenate([[0, 1, n // 2, n - 1, n], rng.integers(0, n, 3)]))
         marks = np.zeros((n + 1) * (n + 1), np.uint8)
         for shorter in d:

@@ -81,9 +81,10 @@ def test_a_robot_that_turns_only_while_driving_still_reports_it():
     assert found.turned_over
 
 
+@pytest.mark.slow
 def test_a_laser_upside_down_is_mapped_and_reported():
     rng = np.random.default_rng(2)
-    stamps, truth = wander(rng, 25.0)
+    stamps, truth = wander(rng, 12.0)
     seen = scans(stamps, truth, ROOM, rate=5.0, noise=0.01, rng=rng, mounting=DOWN)
     log = recording(odometry(stamps, truth, rng, noise=0.005, turn_noise=0.005), None, seen)
     result = build_map(log)

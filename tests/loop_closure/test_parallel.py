@@ -30,11 +30,11 @@ def test_answers_come_in_the_order_of_the_tasks(workers):
 
 @pytest.fixture(scope="module")
 def minutes(room_log, tmp_path_factory):
-    """Two recordings of 50 s in one room, as files."""
+    """Two recordings of 30 s in one room, as files."""
     folder, log = tmp_path_factory.mktemp("minutes"), read_log(room_log)
     paths = [folder / "one.log", folder / "two.log"]
     for path, start in zip(paths, (0.0, 50.0), strict=True):
-        write_log(path, log.crop(start, start + 50.0))
+        write_log(path, log.crop(start, start + 30.0))
     return paths
 
 
@@ -43,10 +43,10 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-@pytest.mark.parametrize("several", [False, True])
+@pytest.mark.parametrize("several", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_map_is_the_same_for_any_number_of_jobs(minutes, tmp_path, several):
     written = []
-    for jobs in (1, 2, 3):
+    for jobs in (1, 3):
         out = tmp_path / f"jobs{jobs}"
         logs = [str(path) for path in (minutes if several else minutes[:1])]
         main(["map", *logs, "--out", str(out), "--jobs", str(jobs), "--no-timings", "--quiet"])
@@ -64,7 +64,7 @@ def same_map(one, other) -> bool:
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
-@pytest.mark.parametrize("method", ["search", "icp"])
+@pytest.mark.parametrize("method", [pytest.param("search", marks=pytest.mark.slow), "icp"])
 def test_closures_and_rays_do_not_depend_on_the_executor(minutes, method):
     log = read_log(minutes[0])
     config = MappingConfig()

@@ -108,6 +108,7 @@ def stretch(result, stamps, truth):
     return np.hypot(*(ends[1] - ends[0])[:2]) / np.hypot(*(truth[there] - truth[0])[:2])
 
 
+@pytest.mark.slow
 def test_a_measured_distance_gives_the_map_its_true_length(carpet):
     log, stamps, truth = carpet
     before = stretch(build_map(log), stamps, truth)
@@ -137,6 +138,7 @@ def test_a_measured_distance_calibrates_the_wheels(wrong_wheels):
     assert scale.sigma < 0.01
 
 
+@pytest.mark.slow
 def test_places_are_those_of_the_map_as_it_is_turned(carpet):
     log, stamps, truth = carpet
     plain = build_map(log, MappingConfig(align="first-pose"))

@@ -47,6 +47,7 @@ def test_gross_turns_leave_the_mirror_image_open(turn_scale):
     assert min(error) < 0.3
 
 
+@pytest.mark.slow
 def test_wheels_that_turn_rightly_and_lasers_vouch_for_the_sign():
     assert not stated(build_map(run()[2]).doubts, "mirrored")
     assert not stated(build_map(run(turn_scale=2.0, walls=box(12, 12), metres=40.0)[2]).doubts, "mirrored")
@@ -132,6 +133,7 @@ def test_stretches_in_which_most_readings_disagree_are_found():
     assert outlier_stretches(stamps[:99], np.zeros(99, dtype=bool)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 12])
 def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed):
     """Two of four anchors measure 2 m too little for 40 % of the time each: wheels alone are weak enough to follow them."""
@@ -146,7 +148,7 @@ def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_la
     assert lied < 0.05
 
 
-@pytest.mark.parametrize("radio_scale", [1.0, 1.08])
+@pytest.mark.parametrize("radio_scale", [1.0, pytest.param(1.08, marks=pytest.mark.slow)])
 def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
     """Without a lidar nothing shows which of the two is wrong, but that they differ is plain."""
     reported = stated(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")

@@ -114,6 +114,7 @@ def test_ranges_of_all_are_counted_and_listed(two, merged):
     assert len(merged.range_table["stamp"]) == sum(len(log.ranges.stamps) for log, _ in two)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [(4.5, -1.0), (0.9, 0.7)])
 def test_a_moved_anchor_is_named_and_stands_at_both_places(two, shift):
     there = PLACES + np.array([[0, 0], shift, [0, 0], [0, 0]])
@@ -131,6 +132,7 @@ def test_a_moved_anchor_is_named_and_stands_at_both_places(two, shift):
     assert joint_ate(result, [truth for _, truth in two])[0] < 0.03
 
 
+@pytest.mark.slow
 def test_other_robots_mounting_is_respected(two):
     """The second robot carries its tag elsewhere, and its laser sees with other beams."""
     mounting = replace(LEVEL, tag_position=np.array([0.25, -0.15, 0.0]))
@@ -144,6 +146,7 @@ def test_other_robots_mounting_is_respected(two):
     assert not [w for w in result.warnings if "moved" in w.text]
 
 
+@pytest.mark.slow
 def test_one_of_them_may_lack_lidar(two):
     blind = two[1][0].without(lidar=True)
     result = build_map([two[0][0], blind])
@@ -181,14 +184,14 @@ def test_a_third_links_two_that_share_nothing():
 
 
 def test_equal_input_gives_equal_bytes(two):
-    short = [log.crop(end=log.odometry.stamps[0] + 60.0) for log, _ in two]
+    short = [log.crop(end=log.odometry.stamps[0] + 20.0) for log, _ in two]
     one, other = build_map(short), build_map(short)
     assert one.trajectory.tobytes() == other.trajectory.tobytes()
     assert one.grid.log_odds.tobytes() == other.grid.log_odds.tobytes()
 
 
 def test_a_list_of_one_is_that_one(two):
-    log = two[0][0].crop(end=60.0)
+    log = two[0][0].crop(end=20.0)
     assert build_map([log]).trajectory.tobytes() == build_map(log).trajectory.tobytes()
 
 

@@ -31,7 +31,7 @@ def test_a_sound_recording_has_no_doubts(sound, without):
     assert doubts(sound.without(**without)) == set()
 
 
-@pytest.mark.parametrize("lidar", [False, True])
+@pytest.mark.parametrize("lidar", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ranges_that_are_no_distances(sound, lidar):
     wild = np.random.default_rng(1).uniform(0.5, 15.0, len(sound.ranges.stamps))
     result = build_map(replace(sound, ranges=replace(sound.ranges, ranges=wild)).without(lidar=not lidar))
@@ -39,11 +39,13 @@ def test_ranges_that_are_no_distances(sound, lidar):
     assert all(a.status != "ok" for a in result.anchors)
 
 
+@pytest.mark.slow
 def test_a_radio_whose_clock_is_seconds_late(sound):
     late = replace(sound.ranges, stamps=sound.ranges.stamps + 6.0)
     assert "range-scatter" in doubts(replace(sound, ranges=late))
 
 
+@pytest.mark.slow
 def test_a_lidar_of_another_scale_contradicts_wheels_and_radio(sound):
     scans = replace(sound.scans, ranges=sound.scans.ranges * np.float32(1.25), range_max=7.0)
     assert "scales" in doubts(replace(sound, scans=scans))

@@ -46,6 +46,7 @@ def test_out_of_reach_informs_nothing_and_walls_inform_less():
     assert not far.any()
 
 
+@pytest.mark.slow
 def test_the_first_place_is_the_best_of_all_and_more_never_harm():
     grid = hall()
     anchors = np.array([[-2.0, 3.0], [-2.0, 13.0]])
@@ -94,8 +95,9 @@ def test_what_cannot_be_planned_is_reported():
         plan_anchors(hall(10, 10), np.zeros((0, 2)), 50)
 
 
+@pytest.mark.slow
 def test_same_map_same_plan():
-    one, two = (plan_anchors(hall(wall_at=40), np.zeros((0, 2)), 4) for _ in range(2))
+    one, two = (plan_anchors(hall(wall_at=40), np.zeros((0, 2)), 2) for _ in range(2))
     np.testing.assert_array_equal(one.places, two.places)
-    apart = np.linalg.norm(one.places[:, None] - one.places[None], axis=2) + 9 * np.eye(4)
+    apart = np.linalg.norm(one.places[:, None] - one.places[None], axis=2) + 9 * np.eye(2)
     assert apart.min() >= 1.0

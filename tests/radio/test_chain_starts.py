@@ -90,6 +90,7 @@ def test_a_chain_that_nothing_ties_is_named(tmp_path):
         read_pyfg(tmp_path / "robots.pyfg", from_odometry=True)
 
 
+@pytest.mark.slow
 def test_four_robots_of_tiers_from_their_odometry(shared_data, tmp_path):
     path = shared_data / "pose_graphs" / "tiers.pyfg.gz"
     whole = read_pyfg(path)

@@ -23,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    parser.add_argument("--quick", action="store_true", help="leave out what needs a trial map from wheels and radio")
+    text = "make no trial maps: no scales and biases, a coarser estimate of the time"
+    parser.add_argument("--quick", action="store_true", help=text)
     add_mounting_arguments(parser)
     add_bag_arguments(parser)
 
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
 
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
     diagnosis, problem = (diagnose(log), "") if args.quick else examined(log)
-    cost = expected_cost(log)
+    cost = expected_cost(log, trial=not args.quick)
     if args.json:
         console.say_json(summary_json(args.log, diagnosis, cost, problem))
     else:
@@ -66,17 +67,18 @@ def examined(log: "SensorLog") -> tuple["Diagnosis", str]:
     return diagnose(log, anchors=trial.anchors, calibration=trial.calibration, doubts=trial.doubts), ""
 
 
-def expected_cost(log: "SensorLog") -> dict[str, float]:
+def expected_cost(log: "SensorLog", *, trial: bool = True) -> dict[str, float]:
     """Return the time and memory that `uwblite map` is expected to need on this computer, and the size of the map.
 
-    They are those of the recording as a map repairs it; empty where it refuses the recording.
+    They are those of the recording as a map repairs it; empty where it refuses the recording. Without a trial the time is
+    that of a model, for the computer of docs/performance.md.
     """
     import numpy as np
 
     from ..errors import DataError
     from ..mapping import MappingConfig
     from ..screening.screen import screen
-    from .cost import expected_megabytes, expected_seconds
+    from .cost import expected_megabytes, expected_seconds, model_seconds
 
     try:
         log = screen(log)
@@ -91,7 +93,7 @@ def expected_cost(log: "SensorLog") -> dict[str, float]:
     beams = 0 if log.scans is None else log.scans.ranges.shape[1]
     path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
     return {
-        "seconds": round(expected_seconds(log), 1),
+        "seconds": round(expected_seconds(log) if trial else model_seconds(log), 1),
         "megabytes": round(expected_megabytes(path, scans, beams, cells), 0),
         "map width m": round(float(size[0]), 1) if cells else 0.0,
         "map height m": round(float(size[1]), 1) if cells else 0.0,

@@ -37,6 +37,11 @@ def work_seconds(log: "SensorLog") -> float:
     return per_metre * path + _SECONDS_PER_RANGE * ranges + _SECONDS_PER_READING * readings
 
 
+def model_seconds(log: "SensorLog") -> float:
+    """Return the wall time of a map on the computer of docs/performance.md, s."""
+    return _SECONDS_AT_LEAST + work_seconds(log)
+
+
 def expected_seconds(log: "SensorLog") -> float:
     """Return the expected wall time of a map on this computer, s.
 
@@ -48,7 +53,7 @@ def expected_seconds(log: "SensorLog") -> float:
     parts = [beginning(log, share * _TRIAL_SECONDS) for share in (0.25, 1.0)]
     (short, first), (long, second) = ((work_seconds(part), _seconds_of(part)) for part in parts)
     if first is None or second is None or long <= 0.0:
-        return _SECONDS_AT_LEAST + whole
+        return model_seconds(log)
     slowness = second / long
     if long > 1.5 * short:
         # A computer that is busy with other things may give the shorter one the worse time.
