@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from conftest import ROOT
 from helpers.results import contents
@@ -19,10 +21,11 @@ from uwblite.io.carmen import read_log, write_log
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory, room_log):
-    """Three recordings: half a minute, what is none, and too little to be trusted."""
+    """Three recordings: half a minute, what is none, and one whose tag measured nothing."""
     folder, log = tmp_path_factory.mktemp("drives"), read_log(room_log)
-    for name, start, end in (("monday.log", 0.0, 30.0), ("tuesday.log.gz", 60.0, 72.0)):
-        write_log(folder / name, log.crop(start, end))
+    silent = replace(log.ranges, ranges=np.zeros(len(log.ranges.ranges)))
+    write_log(folder / "monday.log", log.crop(0.0, 30.0))
+    write_log(folder / "tuesday.log.gz", replace(log, ranges=silent).crop(60.0, 72.0))
     (folder / "notes.log").write_text("bread, milk\n")
     return [str(folder / name) for name in ("monday.log", "notes.log", "tuesday.log.gz")]
 

@@ -122,5 +122,6 @@ def test_steps_that_the_unit_does_not_have_are_refused_at_once():
     session.feed(b"QT\n00P\n\n", 1.1)
     session.feed(b"VV\n00P\n\n", 1.2)
     asked_again = b"PP\n00P\nAMIN:44;7\n\n" * 6  # the answer is not complete
+    session.feed(asked_again, 1.4)
     with pytest.raises(ProtocolError, match=r"44\.\.725"):
-        session.feed(asked_again, 1.4)
+        session.feed(b"II\n00P\n\n", 1.5)
