@@ -99,6 +99,8 @@ def test_every_command_runs(document, workspace):
         if package := needed(info):
             skipped.append(package)
             continue
+        if "map" in info:
+            map_run_log()
         for words in commands(text):
             if words[0] == "tools/quickstart":
                 assert " ".join(words) in (ROOT / ".ci" / "run").read_text()
@@ -117,6 +119,11 @@ def test_every_command_runs(document, workspace):
         pytest.skip(f"absent: {', '.join(skipped)}; the other commands ran")
 
 
+def map_run_log():
+    """Make the folder map that a block begins with."""
+    assert main(["map", "run.log", "--out", "map", "--force", "-q"]) == 0
+
+
 def tool_beside(name):
     """Return a program installed beside this Python."""
     return os.path.join(os.path.dirname(sys.executable), name)
@@ -125,7 +132,9 @@ def tool_beside(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
 def test_every_python_example_works(document, workspace, capsys):
-    for _, text in blocks(document, "python"):
+    for info, text in blocks(document, "python"):
+        if "map" in info:
+            map_run_log()
         exec(compile(text, document.name, "exec"), {})
 
 
