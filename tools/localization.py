@@ -27,8 +27,8 @@ from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.io.result_text import RunRecord
 from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
-from uwblite.localization.known_map import KnownMap, from_result
 from uwblite.localization import Localizer, LocalizerState, Scanner
+from uwblite.localization.known_map import KnownMap, from_result
 from uwblite.mapping import build_map
 
 WORLDS = {"hall": 20.0, "lab": 10.0, "warehouse": 40.0}

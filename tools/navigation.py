@@ -29,8 +29,8 @@ from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.io.result_text import RunRecord
 from uwblite.io.results import write_result
 from uwblite.io.stored_result import StoredResult, read_result
-from uwblite.localization.known_map import KnownMap, from_result
 from uwblite.localization import Localizer, Scanner
+from uwblite.localization.known_map import KnownMap, from_result
 from uwblite.mapping import build_map
 from uwblite.navigation.planner import Planner, make_planner
 from uwblite.pipeline.mapping_config import preset

@@ -129,7 +129,7 @@ def test_frames_that_are_missing_are_counted_across_a_reset_and_with_a_learned_p
     ("unit", "rate"), [(1e-3, 1e-3), (1e-6, 1e-6), (1.0, 1.0), (60.0, 60.0), (1000.0, 1000.0), (1e6, None)]
 )
 def test_a_clock_with_a_wrong_unit_is_noticed_and_arrivals_are_used(unit, rate):
-    """A base counts seconds; what is believed to be its unit is wrong by a factor."""
+    """A base counts seconds; its stated unit is wrong by a factor."""
     clock = DeviceClock(unit, proven=False)
     readings = [(0.02 * k, clock.read(0.02 * k, 50 + 0.02 * k + 0.003 * (k % 2))) for k in range(600)]
     assert max(abs(reading.stamp - 50 - time) for time, reading in readings) < 0.004

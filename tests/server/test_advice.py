@@ -9,9 +9,9 @@ from helpers.results import small_log, small_result
 from uwblite.io.result_text import RunRecord
 from uwblite.io.results import write_result
 from uwblite.io.stored_result import read_result
-from uwblite.server.advice import Heard, advice
+from uwblite.server.advice import SensorState, advice
 
-FINE = {"odometry": Heard(900, 20.0, 0.0), "lidar": Heard(450, 10.0, 0.1), "radio": Heard(90, 2.0, 0.4)}
+FINE = {"odometry": SensorState(900, 20.0, 0.0), "lidar": SensorState(450, 10.0, 0.1), "radio": SensorState(90, 2.0, 0.4)}
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_nothing_is_reported_where_all_is_well(result):
 
 
 def test_silent_sensors_come_first_the_longest_before_all(result):
-    silent = FINE | {"lidar": Heard(450, 10.0, 12.0), "radio": Heard(90, 2.0, 30.0)}
+    silent = FINE | {"lidar": SensorState(450, 10.0, 12.0), "radio": SensorState(90, 2.0, 30.0)}
     mirrored = replace(result, anchors=(replace(result.anchors[0], status="mirror-ambiguous"),))
     output = advice(silent, {}, 60.0, 0.0, mirrored)
     assert output[0].startswith("no message from the radio for 30 s")
@@ -39,7 +39,7 @@ def test_silent_sensors_come_first_the_longest_before_all(result):
 
 
 def test_a_slow_sensor_is_not_silent_between_its_messages():
-    slow = FINE | {"radio": Heard(9, 0.2, 10.0)}
+    slow = FINE | {"radio": SensorState(9, 0.2, 10.0)}
     assert advice(slow, {}, 60.0, 0.0, None) == []
 
 

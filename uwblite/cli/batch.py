@@ -106,7 +106,7 @@ def folder_names(logs: Sequence[str]) -> list[str]:
 
 
 def _stem(log: str) -> str:
-    """Return the name of a recording without .gz and what tells its format."""
+    """Return the name of a recording without .gz and what names its format."""
     name = os.path.basename(os.path.abspath(log)).removesuffix(".gz")
     return os.path.splitext(name)[0] or name
 

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def examined(log: "SensorLog") -> tuple["Diagnosis", str]:
-    """Diagnose a recording with a map from wheels and radio alone: it tells scales, clocks, biases and ranges that are none.
+    """Diagnose a recording with a map from wheels and radio alone: it shows scales, clocks, biases and ranges that are none.
 
     Returns
     -------

@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _target_format(args: argparse.Namespace) -> str:
-    """Return the format that --to or the target's name tells; '' where neither does."""
+    """Return the format that --to or the target's name states; '' where neither does."""
     from .formats import format_of
 
     if args.to:

@@ -33,7 +33,7 @@ class LinesTo(LogFile):
 
 
 def record_into(args: argparse.Namespace, take: Callable[[bytes], None], stopping: Callable[[], bool]) -> None:
-    """Read devices until told to stop, and hand on what `uwblite record` would write."""
+    """Read devices until asked to stop, and hand on what `uwblite record` would write."""
     links = device_links(args)
     for link in links:
         check_url(link.url)

@@ -59,7 +59,7 @@ def _address(listening: str) -> str:
     if host in ("0.0.0.0", ""):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
-                probe.connect(("192.0.2.1", 9))  # nothing is sent; it tells which address would be used
+                probe.connect(("192.0.2.1", 9))  # nothing is sent; it shows which address would be used
                 host = str(probe.getsockname()[0])
             except OSError:
                 host = LOCAL[0]

@@ -196,7 +196,7 @@ class DeviceClock:
     ) -> None:  # fmt: skip
         self.latency, self.tied, self.period = latency, spread, period
         """s; `tied` is by how much the delay may be wrong."""
-        self.proven, self._believed = proven, proven
+        self.proven, self._expected = proven, proven
         self.rate: float | None = None
         """Device seconds per host second where these disagree: frames are then stamped with their arrival."""
         self._unwrapper, self._map = Unwrapper(modulus, tick), ClockMap()
@@ -218,8 +218,8 @@ class DeviceClock:
         with it.
         """
         device, reset = self._unwrapper.unwrap(count, answered)
-        believed = self._map.host(device) - self.latency
-        if reset or (self._last is not None and not sent - LEAP < believed < answered + LEAP):
+        expected = self._map.host(device) - self.latency
+        if reset or (self._last is not None and not sent - LEAP < expected < answered + LEAP):
             self._begin_anew()
         low, high = self._tie if self._tie and device - self._tied_at < TOGETHER else (-math.inf, math.inf)
         # Counts are whole: the reading was made up to half a count before or after its value.
@@ -245,7 +245,7 @@ class DeviceClock:
         missing = self._missing(elapsed, arrival)
         self._arrival, self._last = arrival, device
         self._map.add(device, arrival)
-        if not self._believed:
+        if not self._expected:
             self._check_rate(device, arrival, reset=reset)
         self._learn_latency()
         stamp, spread = self._map.host(device) - self.latency, self.tied + self._half + 2 * self._map.excess

@@ -159,7 +159,7 @@ class Link:
 
     # ---- its data
 
-    def heard(self, now: float) -> float:
+    def received(self, now: float) -> float:
         """Count a measurement; return the length of the silence that it ends, s, 0 = there was none."""
         self.counts.messages += 1
         pause = now - self.last_message if self.quiet else 0.0

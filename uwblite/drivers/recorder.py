@@ -40,7 +40,7 @@ POLL = 0.005
 
 
 class Recorder:
-    """Record until told to stop.
+    """Record until asked to stop.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ class Recorder:
         return link.port is not None
 
     def _message(self, link: Link, now: float) -> None:
-        pause = link.heard(now)
+        pause = link.received(now)
         if pause:
             self._note(link, Note("info", f"{link.name}-data-again", f"{link.name}: data again after {pause:.1f} s"))
             link.stated.clear()

@@ -44,7 +44,7 @@ class SpinningDriver(Driver):
         self._time = 0.0
 
     def begin(self) -> None:
-        """Forget half a packet and half a turn; when the last reading came tells what is missing before the next."""
+        """Forget half a packet and half a turn; the time of the last reading shows what is missing before the next."""
         super().begin()
         self._assembler.clear()
 

@@ -102,7 +102,7 @@ class LineDriver(Driver):
         self.baud, self.clock = baud, DeviceClock(time_unit, proven=False)
         self._unit = time_unit
         self._before: tuple[float, float] | None = None
-        """Time of the device, its own unit, and arrival, s, of the last line that was believed."""
+        """Time of the device, its own unit, and arrival, s, of the last line that was accepted."""
         self._doubted = False
 
     def script(self) -> Script[None]:
@@ -113,7 +113,7 @@ class LineDriver(Driver):
     def leaps(self, time: float | None, arrival: float) -> bool:
         """Return whether a line's time leaps: lines have no sum, and a digit that is lost makes another number.
 
-        Of two in a row the second one counts: the device began anew.
+        Of two in a row the second one counts: the device began again.
 
         Parameters
         ----------

@@ -220,7 +220,7 @@ _NEAR = 1e-2
 _NEARLY_FREE = 1e-6
 """lambda up to which that holds."""
 _KEPT = 0.5
-"""Share of its promise below which a step went where the cost is no parabola, and tells nothing of those to come."""
+"""Share of its promise below which a step went where the cost is no parabola, and predicts none of those to come."""
 _ROUNDING = 1e-12
 """Share of chi2 that the rounding of thousands of residuals hides."""
 _LEAST_DAMPING = 1e-14

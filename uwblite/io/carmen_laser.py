@@ -181,8 +181,8 @@ class LaserMessages:
 
     def _geometry(self, layout: _Layout, params: Params) -> ScanGeometry:
         """Return where the beams of messages of a layout point."""
-        told = (layout.angle_min, layout.angle_increment)
-        return ScanGeometry(*(told if self._kind != b"FLASER" else params.guess_scanner(layout.beams)), layout.beams)
+        stated = (layout.angle_min, layout.angle_increment)
+        return ScanGeometry(*(stated if self._kind != b"FLASER" else params.guess_scanner(layout.beams)), layout.beams)
 
     def _reach(self, layout: _Layout, params: Params) -> float:
         """Return the range, m, from which a reading saw nothing."""
@@ -268,7 +268,7 @@ def _fence_posts(scans: LaserScans) -> list[str]:
         return []
     return [
         f"{beams} beams are said to be {degrees:.4f} degrees apart; {usual:g} would be usual, with {beams + 1} beams over "
-        f"{usual * beams:g} degrees. The log is believed; if it is a SICK's, turns come out {1 / beams:.1%} too large: "
+        f"{usual * beams:g} degrees. The log is used as it is; if it is a SICK's, turns come out {1 / beams:.1%} too large: "
         f"write {math.radians(usual):.9f} rad as angular_resolution"
     ]
 

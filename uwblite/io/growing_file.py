@@ -31,7 +31,7 @@ class GrowingFile:
     def __init__(self, path: str, *, whole: bool = False) -> None:
         self.path = Path(path)
         self.restarts = 0
-        """How often the file was begun anew."""
+        """How often the file was begun again."""
         try:
             self._file = open(self.path, "rb", buffering=0)  # noqa: SIM115
             size = os.fstat(self._file.fileno()).st_size

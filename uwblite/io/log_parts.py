@@ -34,7 +34,7 @@ def parts_of(path: str) -> tuple[list[str], str]:
         root, ending = root + ending, ""
     number, before_it = _continues(path)
     if number > 1 and not root.endswith(f".{number}"):
-        return [path], before_it  # it was renamed: where the others are cannot be told
+        return [path], before_it  # it was renamed: where the others are is not known
     root = root.removesuffix(f".{number}") if number > 1 else root
 
     def name(part: int) -> str:

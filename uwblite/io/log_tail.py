@@ -1,4 +1,4 @@
-"""A log that grows, followed: how often each sensor is heard, which anchors, and where the odometry is.
+"""A log that grows, followed: how often each sensor reports, which anchors, and where the odometry is.
 
 The reader keeps its place and reads what is new, whole lines only: the line that is being written now is left for the
 next time. Parts of a recording are followed in their order. A log that has become shorter, or that another file has taken
@@ -33,7 +33,7 @@ _CONTINUED = b"COMMENT continued in "
 
 @dataclass(slots=True)
 class Sensor:
-    """What was heard of a sensor."""
+    """What came of a sensor."""
 
     count: int = 0
     last: float = float("-inf")
@@ -41,7 +41,7 @@ class Sensor:
     stamps: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_STAMPS))
     """s, the latest of them."""
 
-    def heard(self, stamp: float) -> None:
+    def received(self, stamp: float) -> None:
         """Take a message."""
         self.count += 1
         self.last = max(self.last, stamp)
@@ -65,7 +65,7 @@ class LogTail:
     def __init__(self, path: str) -> None:
         self.path = path
         self.restarts = 0
-        """How often the log began anew: it was replaced, or became shorter."""
+        """How often the log began again: it was replaced, or became shorter."""
         self._file: GrowingFile | None = None
         self._begin()
 
@@ -151,11 +151,11 @@ class LogTail:
             return
         stamp = stamp_of(line.rsplit(None, 3)[1:])
         self.first, self.last = min(self.first, stamp), max(self.last, stamp)
-        self.sensors.setdefault(sensor, Sensor()).heard(stamp)
+        self.sensors.setdefault(sensor, Sensor()).received(stamp)
         if sensor == "radio":
             anchor = line.split(None, 2)[1].decode("utf-8", "replace")
             if anchor in self.anchors or len(self.anchors) < _MOST_ANCHORS:
-                self.anchors.setdefault(anchor, Sensor()).heard(stamp)
+                self.anchors.setdefault(anchor, Sensor()).received(stamp)
         elif sensor == "odometry":
             self._pose(stamp, numbers(line.split(None, 4)[1:4], "odometry", 3))
 

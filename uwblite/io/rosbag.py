@@ -256,7 +256,7 @@ class _Collector:
 def _cleaned(readings: NDArray[np.float32], range_min: float, range_max: float) -> NDArray[np.float32]:
     """Return readings with +inf for nothing seen and nan for too near and error, in the memory given.
 
-    REP-117 tells these apart; drivers older than it write 0 for no echo.
+    REP-117 distinguishes these; drivers older than it write 0 for no echo.
     """
     with np.errstate(invalid="ignore"):
         nothing = (readings == 0.0) | (readings >= range_max)

@@ -259,14 +259,14 @@ def _look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> Ints:
 
 
 _MEASURED = 2.0
-"""Multiple of the feigned information that a direction must exceed to have been measured."""
+"""Multiple of the spurious information that a direction must exceed to have been measured."""
 
 
 def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
     """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with
     L^T L the information in those directions (unscaled by noise).
 
-    In the basis B that diagonalises both, feigned = B B^T and hessian = B V diag(l) V^T B^T; l must exceed a multiple
+    In the basis B that diagonalises both, spurious = B B^T and hessian = B V diag(l) V^T B^T; l must exceed a multiple
     of 1, see degeneracy.
     """
     basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.spurious)

@@ -147,7 +147,7 @@ def reattached(
 
     Returns
     -------
-    Poses (k, 3), and the keyframes (r,) that were laid anew.
+    Poses (k, 3), and the keyframes (r,) that were placed again.
     """
     lone = np.flatnonzero(~tied & (_lines_of(clouds) >= config.min_points))
     sound = np.flatnonzero(tied)

@@ -148,8 +148,8 @@ class Localizer:
         self._field = None if known.walls is None else search.field_of(known.walls)
         self._bounds = _bounds(known)
         self._names = {name: k for k, name in enumerate(known.anchors.ids)}
-        told = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
-        self._square = np.square(told) + known.anchors.rise
+        heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
+        self._square = np.square(heights) + known.anchors.rise
         self._window = Window()
         self._waiting: list[tuple[float, int, _WaitingRange | _WaitingScan]] = []
         self._arrived = 0
@@ -157,7 +157,7 @@ class Localizer:
         self._search_stamp = -np.inf
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
-        self._fit, self._heard = 0.0, 1.0
+        self._fit, self._ranges_fit = 0.0, 1.0
         self._trust = np.full((len(known.anchors.ids), 2), (1.0, 0.0))
         self._reason = "nothing has been measured yet"
         self.strangers: dict[str, int] = {}
@@ -226,7 +226,7 @@ class Localizer:
         if not self._certain:
             off = se2.between(np.zeros(3), bank.poses - bank.poses[best])
             covariance = np.einsum("h,hij->ij", share, bank.pose_covariances + off[:, :, None] * off[:, None, :])
-        fit = np.exp(self._fit - _FIT_SOUND) if self._sees() else self._heard / _RANGES_FOUND
+        fit = np.exp(self._fit - _FIT_SOUND) if self._sees() else self._ranges_fit / _RANGES_FOUND
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
         reason = "" if self._certain else self._reason
         pose, covariance = bank.poses[best].copy(), covariance + np.diag(np.square(_SIGMA_MAP))
@@ -289,7 +289,7 @@ class Localizer:
         self._bank = hypotheses.weighed(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = float(weight[int(np.argmax(bank.log_weight))])
         self._trust[anchor] += (_FORGETTING * (best - self._trust[anchor, 0]), 1.0)
-        self._heard += _FORGETTING_RANGES * (best - self._heard)
+        self._ranges_fit += _FORGETTING_RANGES * (best - self._ranges_fit)
 
     def _use_scan(self, entry: _WaitingScan) -> None:
         rays = self._rays(entry.stamp, entry.readings, entry.scanner)
@@ -335,7 +335,7 @@ class Localizer:
         if self._certain:
             if self._sees() and self._fit < _FIT_LOST:
                 self._lose("the scans do not fit the walls any more")
-            elif self._heard < _RANGES_LOST and not (self._sees() and self._fit > _FIT_SOUND):
+            elif self._ranges_fit < _RANGES_LOST and not (self._sees() and self._fit > _FIT_SOUND):
                 self._lose("the ranges do not fit the anchors any more")
             else:
                 return
@@ -354,7 +354,7 @@ class Localizer:
     def _search(self) -> None:
         """Look for the robot in the whole map, weight all hypotheses again, and decide."""
         odom = self._odometer.pose
-        ranges = self._window.heard(odom, self._way)
+        ranges = self._window.ranges_since(odom, self._way)
         rays, ago = self._window.seen(odom, self._way, _LOOK_BACK)
         recent = rays.rows(ago <= _SEARCH_LOOKS)
         found = search.places(self._field, self.known.walls, recent, ranges, self._bounds)
@@ -371,10 +371,10 @@ class Localizer:
         self._bank = hypotheses.weighed(Hypotheses(self._bank.mean, self._bank.covariance, np.zeros(len(weight))), weight)
         best = int(np.argmax(self._bank.log_weight))
         pose = self._bank.poses[best].copy()
-        heard = _agreeing(pose, ranges)
-        self._reason = self._doubt(best, found.complete, float(fit[best]), float(known[best]), heard)
+        fitting = _agreeing(pose, ranges)
+        self._reason = self._doubt(best, found.complete, float(fit[best]), float(known[best]), fitting)
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
-        self._decide(pose, _CONFIRM if heard.enough and known[best] >= _FEW_ENDS else _CONFIRM_ALONE)
+        self._decide(pose, _CONFIRM if fitting.enough and known[best] >= _FEW_ENDS else _CONFIRM_ALONE)
 
     def _with_places(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
         """Return the hypotheses with new ones where none is near."""
@@ -392,19 +392,19 @@ class Localizer:
             fresh = hypotheses.matched(fresh, self.known.walls, _every(rays, _TRACK_RAYS), 1.0)
         return hypotheses.joined(self._bank, fresh)
 
-    def _doubt(self, best: int, complete: bool, fit: float, ends: float, heard: "_Heard") -> str:
+    def _doubt(self, best: int, complete: bool, fit: float, ends: float, fitting: "_RangeFit") -> str:
         """Return why the best hypothesis is not certain yet; "" = it is."""
         bank = self._bank
         sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
         rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
         if not complete:
             return "too many places are as likely; drive on"
-        if ends < _ENOUGH_ENDS and not heard.enough:
+        if ends < _ENOUGH_ENDS and not fitting.enough:
             return "too little was measured yet; drive on"
-        if ends >= _ENOUGH_ENDS and fit < (_FIT_BESIDE_RANGES if heard.enough else _FIT_ALONE):
+        if ends >= _ENOUGH_ENDS and fit < (_FIT_BESIDE_RANGES if fitting.enough else _FIT_ALONE):
             return "the scans fit the walls nowhere well; is this the right map?"
-        if heard.count >= _ENOUGH_RANGES and heard.share < _RANGES_FOUND:
-            return f"the ranges fit the anchors nowhere (best place: {heard.share:.0%} of them); is this the right map?"
+        if fitting.count >= _ENOUGH_RANGES and fitting.share < _RANGES_FOUND:
+            return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
         if len(rivals) and rivals.max() > -_CERTAIN:
             count = 1 + int((rivals > -_CERTAIN).sum())
             return f"{count} places are as likely; drive on, around a corner or past another anchor"
@@ -424,7 +424,7 @@ class Localizer:
             if same and self._way - way >= confirm:
                 self._certain = True
                 self._bank = hypotheses.pruned(self._bank, 1, -1.0)
-                self._fit, self._heard = 0.0, 1.0
+                self._fit, self._ranges_fit = 0.0, 1.0
                 self._trust[:] = (1.0, 0.0)
                 return
             if same:
@@ -447,7 +447,7 @@ _MOVED = (0.2, 20.0)
 
 
 @dataclass(frozen=True, slots=True)
-class _Heard:
+class _RangeFit:
     """How the window's ranges agree with a pose."""
 
     count: int
@@ -457,12 +457,12 @@ class _Heard:
     """As many to as many anchors as a start needs agree."""
 
 
-def _agreeing(pose: Floats, ranges: Ranges) -> _Heard:
+def _agreeing(pose: Floats, ranges: Ranges) -> _RangeFit:
     if not len(ranges):
-        return _Heard(0, 0.0, False)
+        return _RangeFit(0, 0.0, False)
     agree = np.abs(search.range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
     enough = len(np.unique(ranges.anchor[agree])) >= 2 and int(agree.sum()) >= _ENOUGH_RANGES
-    return _Heard(len(ranges), float(agree.mean()), bool(enough))
+    return _RangeFit(len(ranges), float(agree.mean()), bool(enough))
 
 
 def _every(rays: Rays, count: int) -> Rays:

@@ -8,7 +8,7 @@ from ..arrays import Floats
 _SECONDS = 30.0
 """s that are kept: longer than any sensor's message is late."""
 _FASTEST = 5.0
-"""m/s and rad/s; a step that is faster was not driven: the base's counters began anew."""
+"""m/s and rad/s; a step that is faster was not driven: the base's counters began again."""
 _LEAST_STEP = 0.5
 """m and rad; a smaller step is none of these."""
 

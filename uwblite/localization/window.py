@@ -109,7 +109,7 @@ class Window:
         parts = ([getattr(r, name) for r in laid] for name in ("ends", "origins", "hit"))
         return Rays(*(np.concatenate(p) for p in parts)), ago
 
-    def heard(self, odom: Floats, way: float) -> Ranges:
+    def ranges_since(self, odom: Floats, way: float) -> Ranges:
         """Return the ranges, with the tag's places in the present frame of the base."""
         rows = self.ranges
         tags = np.array([se2.transform(se2.between(odom, r.odom), r.tag) for r in rows]).reshape(-1, 2)

@@ -2,7 +2,7 @@
 
 The detection needs a trajectory, not a map: it is made once odometry and ranges are optimised, and where the lidar has
 straightened the trajectory once more, always from the names as recorded. Ranges to places that are wrong bend a trajectory
-that odometry alone holds, and the bent one hides moves. So where one anchor was moved, the trajectory is estimated anew with
+that odometry alone holds, and the bent one hides moves. So where one anchor was moved, the trajectory is estimated again with
 all anchors apart before and after, which presumes nothing of any, and the moves are found on that one.
 """
 

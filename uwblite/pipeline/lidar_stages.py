@@ -87,7 +87,7 @@ def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
 
 
 def _without_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Steps]:
-    """Cut the steps of the odometry that the clouds contradict at the scans within them, and measure those anew.
+    """Cut the steps of the odometry that the clouds contradict at the scans within them, and measure those again.
 
     Where little happens between two scans, the second is found by any odometry.
     """
@@ -150,7 +150,7 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
         graph = graph.with_estimates_of(replace(refined.graph, poses=poses))
         settings = replace(settings, first_gate=rules.later_gate)
         refined = _refine(graph, edges, scans, i, j, settings, task, "scan-to-scan matching")
-        figures = {**figures, "laid_anew": len(laid)}
+        figures = {**figures, "placed_again": len(laid)}
     task.stages.end(
         "scan-to-scan matching", pairs=len(i), used=int(refined.used.sum()), gate=round(gate, 3),
         sigma=round(refined.sigma, 4), rounds=refined.rounds, **figures,

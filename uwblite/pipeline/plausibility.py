@@ -51,7 +51,7 @@ def judge(
 
 
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
-    """Name anchors that are not ok; where none of those heard has one place alone, their mirror ambiguity is a doubt."""
+    """Name anchors that are not ok; where none of those in reach has one place alone, their mirror ambiguity is a doubt."""
     unclear = not any(anchor.status == "ok" for anchor in anchors)
     for anchor in anchors:
         if anchor.status != "ok":

@@ -1,7 +1,7 @@
 """Which ranges were measured through something that the lidar saw.
 
 What stands between tag and anchor makes ranges longer, never shorter. Where such ranges come in the same directions again
-and again, no residual tells the delay from another place of the anchor; the map does.
+and again, no residual distinguishes the delay from another place of the anchor; the map does.
 """
 
 import numpy as np

@@ -96,7 +96,7 @@ def _lever_error(pairs: Pairs, clear: Bools, given: Floats, mount: Floats) -> fl
     """Return how far ways by lidar and wheels differ with the laser mounted so, m, mean over turning pairs.
 
     A laser that was mounted another way round stands where it was given; where the wheels drive another way instead, it
-    stands elsewhere on their base, and its tag as well. Turns swing the laser about the base: that tells the two apart.
+    stands elsewhere on their base, and its tag as well. Turns swing the laser about the base: that distinguishes the two.
     """
     laser = se2.compose(se2.compose(se2.inverse(given), pairs.lidar[clear]), given)
     base = se2.compose(se2.compose(mount, laser), se2.inverse(mount))

@@ -182,7 +182,7 @@ def unmatched(pairs: Pairs) -> list[Remark]:
         return []
     text = (
         f"scans a moment apart do not show the same things (nine of ten pairs share less than {100 * most:.0f} % of their "
-        "points): the readings are noise, or the order of the beams or their angles are not as told"
+        "points): the readings are noise, or the order of the beams or their angles are not as stated"
     )
     return [Remark("scans-do-not-match", text, doubt=True)]
 

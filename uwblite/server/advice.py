@@ -24,7 +24,7 @@ _DRIFTED = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class SensorState:
     """A sensor of the recording."""
 
     count: int
@@ -35,7 +35,11 @@ class Heard:
 
 
 def advice(
-    sensors: Mapping[str, Heard], anchors: Mapping[str, float], recorded: float, at_rest: float, result: StoredResult | None
+    sensors: Mapping[str, SensorState],
+    anchors: Mapping[str, float],
+    recorded: float,
+    at_rest: float,
+    result: StoredResult | None,
 ) -> list[str]:
     """Return sentences in the order of their worth.
 
@@ -57,12 +61,12 @@ def advice(
     return found
 
 
-def silent_after(heard: Heard) -> float:
+def silent_after(sensor: SensorState) -> float:
     """Return the silence of a sensor that is worth a word, s."""
-    return max(SILENT, 5.0 / heard.rate) if heard.rate > 0.0 else SILENT
+    return max(SILENT, 5.0 / sensor.rate) if sensor.rate > 0.0 else SILENT
 
 
-def _about_sensors(sensors: Mapping[str, Heard], recorded: float, at_rest: float) -> list[str]:
+def _about_sensors(sensors: Mapping[str, SensorState], recorded: float, at_rest: float) -> list[str]:
     if not sensors:
         return ["nothing is recorded yet: is the recorder running, and is this its log?"]
     if at_rest > _NOT_GROWING:

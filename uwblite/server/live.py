@@ -13,7 +13,7 @@ from ..arrays import Floats
 from ..constraints import Constraints
 from ..io.log_tail import LogTail, Sensor
 from ..io.stored_result import StoredResult
-from .advice import Heard, advice, silent_after
+from .advice import SensorState, advice, silent_after
 from .feed import Feed
 from .live_page import live_page
 from .requests import HTML, PNG, Response, refusal, text_response
@@ -88,7 +88,7 @@ def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rou
     at_rest : s since the log has grown.
     rounds : words about the latest map and the next.
     """
-    sensors = {name: _heard(sensor, tail.last) for name, sensor in sorted(tail.sensors.items())}
+    sensors = {name: _state_of(sensor, tail.last) for name, sensor in sorted(tail.sensors.items())}
     anchors = {name: tail.last - sensor.last for name, sensor in tail.anchors.items()}
     summary = f"{os.path.basename(tail.path)}: {tail.seconds:.0f} s, {tail.bytes / 1e6:.1f} MB"
     summary += f", {tail.broken} broken lines" if tail.broken else ""
@@ -109,9 +109,9 @@ def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rou
     }
 
 
-def _heard(sensor: Sensor, now: float) -> Heard:
+def _state_of(sensor: Sensor, now: float) -> SensorState:
     """Return what came from a sensor; of a silent one the rate is the one that it had."""
-    return Heard(sensor.count, sensor.rate(sensor.last), now - sensor.last)
+    return SensorState(sensor.count, sensor.rate(sensor.last), now - sensor.last)
 
 
 def _trail(tail: LogTail, result: StoredResult | None) -> Floats | None:
