@@ -22,18 +22,16 @@ BASES = {"kobuki": KobukiDevice, "create2": Create2Device, "line": TickLineDevic
 OPTIONS = {
     "line": "?columns=t,left,right&time_unit=0.001&tick=0.0001&wheel_base=0.30",
     "uwb-line": "?columns=t,id,range,quality&prefix=UWB&unit=0.001&time_unit=0.001",
-    "rplidar-standard": "?standard=1",
 }
 TOGETHER = [
     ("ld06", "linktrack", "create2"), ("lds01", "makerfabs", "line"), ("rplidar", "makerfabs-at", "kobuki"),
-    ("rplidar-standard", "bu01", "create2"), ("ydlidar-x2", "dwm3001", "line"), ("ydlidar-x4", "bu03", "kobuki"),
-    ("ld06", "uwb-line", "kobuki"), ("lds01", "tlv", "create2"),
+    ("ydlidar-x2", "dwm3001", "line"), ("ydlidar-x4", "bu03", "kobuki"), ("ld06", "uwb-line", "kobuki"),
+    ("lds01", "bu01", "create2"),
 ]  # fmt: skip
 
 
 def session(sensor, name):
-    kind = name.removesuffix("-standard")
-    return open_device(sensor, f"{kind}:port{OPTIONS.get(name, '')}")[0]
+    return open_device(sensor, f"{name}:port{OPTIONS.get(name, '')}")[0]
 
 
 @pytest.mark.slow
