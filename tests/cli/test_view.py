@@ -1,13 +1,9 @@
 """`uwblite view` as a user starts it, and in Chromium: a closure is rejected with a click and the map made again."""
 
-import re
-import signal
-import subprocess
-import sys
 
 import pytest
-from conftest import ROOT
 from helpers.browser import CHROMIUM, Browser
+from helpers.served import Served
 
 from uwblite.cli import main
 from uwblite.io.constraints_file import parse_constraints
@@ -22,30 +18,10 @@ def mapped(tmp_path_factory, room_log):
     return folder
 
 
-class Served:
-    """The program at work, until the block ends."""
-
-    def __init__(self, *words, cwd):
-        command = [sys.executable, "-m", "uwblite", "view", *words]
-        self.process = subprocess.Popen(
-            command, cwd=cwd, env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        output = self.process.stdout.readline()
-        self.address = re.search(r"http://127\.0\.0\.1:\d+/", output).group()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.process.send_signal(signal.SIGINT)
-        self.code = self.process.wait(timeout=20)
-
-
 def test_it_reports_its_address_and_ends_with_ctrl_c(mapped):
     import urllib.request
 
-    with Served("map", cwd=mapped) as served, urllib.request.urlopen(served.address + "state", timeout=20) as answer:
+    with Served("view", "map", cwd=mapped) as served, urllib.request.urlopen(served.address + "state", timeout=20) as answer:
         assert b'"name": "map"' in answer.read()
     assert served.code == 0
 
@@ -69,7 +45,7 @@ def test_what_cannot_be_shown_is_one_clear_line(mapped, capsys, words, message):
 @pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, True)])
 def test_a_click_rejects_a_closure_and_maps_again(mapped, tmp_path, width, dark):
     (mapped / "map_constraints.toml").unlink(missing_ok=True)
-    with Served("map", cwd=mapped) as served, Browser(tmp_path / "profile", width=width, dark=dark) as browser:
+    with Served("view", "map", cwd=mapped) as served, Browser(tmp_path / "profile", width=width, dark=dark) as browser:
         browser.open(served.address)
         browser.until("document.querySelector('section svg line.closure')")
         assert browser.run("document.documentElement.scrollWidth") <= width

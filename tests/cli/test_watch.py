@@ -4,17 +4,14 @@ import json
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import time
 import urllib.request
 
 import numpy as np
 import pytest
-from conftest import ROOT
 from helpers.browser import CHROMIUM, Browser
 from helpers.results import small_log, small_result
+from helpers.served import Served
 
 from uwblite.cli import main, watch
 from uwblite.io.result_text import RunRecord
@@ -176,32 +173,17 @@ def test_what_cannot_be_watched_is_one_clear_line(tmp_path, monkeypatch, capsys,
     assert "internal" not in output
 
 
-class Watched:
-    """The program at work, until the block ends."""
-
-    def __init__(self, log, *words):
-        command = [sys.executable, "-m", "uwblite", "watch", str(log), "--port", "0", *words]
-        self.process = subprocess.Popen(
-            command, env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        output = self.process.stdout.readline()
-        self.address = re.search(r"http://127\.0\.0\.1:\d+/", output).group()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.process.send_signal(signal.SIGINT)
-        self.code = self.process.wait(timeout=20)
+def served_watch(log, *words):
+    """The page of a log."""
+    return Served("watch", str(log), "--port", "0", *words)
 
 
 @pytest.mark.slow
 def test_it_reports_its_address_serves_and_ends_with_ctrl_c(tmp_path):
-    with Watched(tmp_path / "run.log") as served, urllib.request.urlopen(served.address, timeout=20) as answer:
+    with served_watch(tmp_path / "run.log") as served, urllib.request.urlopen(served.address, timeout=20) as answer:
         assert b"uwblite watch run.log" in answer.read()
     assert served.code == 0
-    with Watched(tmp_path / "run.log", "--parent", "1") as served:
+    with served_watch(tmp_path / "run.log", "--parent", "1") as served:
         assert served.process.wait(timeout=20) == 0
 
 
@@ -213,7 +195,7 @@ def test_the_page_shows_a_log_that_grows(tmp_path, room_log, width, dark):
     assert main(["convert", str(room_log), str(tmp_path / "whole.log"), "--end", "60"]) == 0
     lines = (tmp_path / "whole.log").read_bytes().splitlines(keepends=True)
     log.write_bytes(b"".join(lines[: len(lines) // 2]))
-    with Watched(log) as served, Browser(tmp_path / "profile", width=width, dark=dark) as browser:
+    with served_watch(log) as served, Browser(tmp_path / "profile", width=width, dark=dark) as browser:
         browser.open(served.address)
         browser.until("document.querySelector('#map image')", patience=120)
         browser.until("document.querySelector('#robot path')")

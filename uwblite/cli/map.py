@@ -47,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace a result that is already there")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
     parser.add_argument("--dry-run", action="store_true", help="read, check and estimate time and memory; write nothing")
+    text = "the CARMEN log's scans with corrected laser poses, as GMapping's users exchange; one CARMEN log only"
+    parser.add_argument("--corrected-log", metavar="FILE", help=text)
     add_worker_arguments(parser, "processes for the heavy stages (1)")
     add_map_arguments(parser)
 
@@ -66,8 +68,6 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
     box = "keep this part of the grid, m: short for --set crop=[...]"
     output.add_argument("--crop", metavar="X0,Y0,X1,Y1", type=numbers(4), help=box)
     output.add_argument("--scale-map", action="store_true", help="write the probabilities too: map_scale.png (mode: scale)")
-    text = "the CARMEN log's scans with corrected laser poses, as GMapping's users exchange; one CARMEN log only"
-    output.add_argument("--corrected-log", metavar="FILE", help=text)
     output.add_argument("--no-timings", action="store_true", help="leave timings out of report.json: same run, same bytes")
     output.add_argument("--report-timings", action="store_true", help="show the stages' seconds in report.html too")
     beforehand = parser.add_argument_group("known beforehand")
@@ -100,7 +100,7 @@ def _map(args: argparse.Namespace) -> int:
     with workers(args.jobs if len(args.logs) > 1 else 1) as executor:
         logs = read_logs(args, executor)
     reading = time.perf_counter() - began
-    _tell_reader_warnings(logs)
+    _report_reader_warnings(logs)
     if args.dry_run:
         return max(_dry_run(args, log) for log in logs)
     made = _make_shown(args, logs, reading)
@@ -266,7 +266,7 @@ def _make_shown(args: argparse.Namespace, logs: "list[SensorLog]", reading: floa
         progress.close()
 
 
-def _tell_reader_warnings(logs: list["SensorLog"]) -> None:
+def _report_reader_warnings(logs: list["SensorLog"]) -> None:
     from . import console
 
     for notes in (log.notes for log in logs):

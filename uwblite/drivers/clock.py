@@ -220,7 +220,7 @@ class DeviceClock:
         device, reset = self._unwrapper.unwrap(count, answered)
         expected = self._map.host(device) - self.latency
         if reset or (self._last is not None and not sent - LEAP < expected < answered + LEAP):
-            self._begin_anew()
+            self._begin_again()
         low, high = self._tie if self._tie and device - self._tied_at < TOGETHER else (-math.inf, math.inf)
         # Counts are whole: the reading was made up to half a count before or after its value.
         self._tie = max(low, sent - device - self._half), min(high, answered - device + self._half)
@@ -240,7 +240,7 @@ class DeviceClock:
         """
         device, reset = self._unwrapper.unwrap(count, arrival)
         if reset:
-            self._begin_anew()
+            self._begin_again()
         elapsed = None if self._last is None else device - self._last
         missing = self._missing(elapsed, arrival)
         self._arrival, self._last = arrival, device
@@ -253,7 +253,7 @@ class DeviceClock:
             stamp = arrival
         return Reading(stamp, elapsed, missing, reset, spread)
 
-    def _begin_anew(self) -> None:
+    def _begin_again(self) -> None:
         self._map, self._last, self._tie = ClockMap(), None, None
         self._windows.clear()
 

@@ -109,7 +109,7 @@ class LogTail:
             opened = GrowingFile(self.path, whole=True)
             if self._file is not None:
                 self._file.close()
-                self._anew()
+                self._restart()
             self._file, self._first = opened, os.stat(self.path)
         before = self._file.restarts
         data = self._file.read()
@@ -117,11 +117,11 @@ class LogTail:
             self._carry, self._following = b"", ""
             data = self._file.read()
         if self._file.restarts > before:
-            self._anew()
+            self._restart()
             self._first = os.stat(self.path)
         return data
 
-    def _anew(self) -> None:
+    def _restart(self) -> None:
         self.restarts += 1
         self._begin()
 

@@ -1,0 +1,27 @@
+"""A verb that serves a page, as a process, until a block ends."""
+
+import re
+import signal
+import subprocess
+import sys
+
+from conftest import ROOT
+
+
+class Served:
+    """The program at work: `address` of its page; `code`, its exit code after Ctrl-C at the end of the block."""
+
+    def __init__(self, verb, *words, cwd=None):
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "uwblite", verb, *words], cwd=cwd,
+            env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self.address = re.search(r"http://127\.0\.0\.1:\d+/", self.process.stdout.readline()).group()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.send_signal(signal.SIGINT)
+        self.code = self.process.wait(timeout=20)
