@@ -283,7 +283,7 @@ def test_scans_of_another_number_of_beams_are_resampled():
             time_increment=0.0, range_min=0.1, range_max=8.0, ranges=np.full(beams, 3.0, dtype=np.float32),
         )  # fmt: skip
 
-    found = _Collector(TopicPlan("/odom", "/scan", {}, (), (), {}))
+    found = _Collector(TopicPlan("/odom", "/scan", "", {}, (), (), {}))
     for stamp, beams in enumerate([672, 679, 0, 682, 672], start=1):
         found.take("/scan", float(stamp), message(stamp, beams) if beams else replace_ranges(message(stamp, 672)))
     found.take("/scan", 6.0, message(6, 400, first=0.0))

@@ -307,7 +307,7 @@ def repeat_command(args: argparse.Namespace) -> str:
         words.append("--laser-pose=" + ",".join(map(repr, args.laser_pose)))
     if args.laser_flipped:
         words.append("--laser-flipped")
-    for option in ("odometry_topic", "scan_topic", "uwb_mapping", "base_frame"):
+    for option in ("odometry_topic", "scan_topic", "imu_topic", "uwb_mapping", "base_frame"):
         if value := getattr(args, option):
             words.append(f"--{option.replace('_', '-')}={base_name(value) if option == 'uwb_mapping' else value}")
     words += [f"--uwb-topic={topic}" for topic in args.uwb_topic]

@@ -71,6 +71,7 @@ def add_bag_arguments(parser: argparse.ArgumentParser) -> None:
     bag = parser.add_argument_group("ROS bags (topics are guessed by their types where these are not given)")
     bag.add_argument("--odometry-topic", metavar="TOPIC", default="", help="nav_msgs/Odometry of the wheels")
     bag.add_argument("--scan-topic", metavar="TOPIC", default="", help="sensor_msgs/LaserScan")
+    bag.add_argument("--imu-topic", metavar="TOPIC", default="", help="sensor_msgs/Imu for the heading; none = the odometry's")
     bag.add_argument("--uwb-topic", metavar="TOPIC", action="append", default=[], help="ranges; repeatable")
     bag.add_argument("--uwb-mapping", metavar="FILE.toml", help="where ranges stand in messages, see docs/formats.md")
     bag.add_argument("--base-frame", metavar="FRAME", default="", help="frame of the robot (the odometry's child frame)")
@@ -82,7 +83,7 @@ def bag_choices(args: argparse.Namespace) -> "tuple[BagTopics, tuple[UwbMapping,
     from ..io.uwb_mapping import parse_mappings
 
     mappings = parse_mappings(read_text(args.uwb_mapping), args.uwb_mapping) if args.uwb_mapping else ()
-    return BagTopics(args.odometry_topic, args.scan_topic, tuple(args.uwb_topic), args.base_frame), mappings
+    return BagTopics(args.odometry_topic, args.scan_topic, tuple(args.uwb_topic), args.imu_topic, args.base_frame), mappings
 
 
 def number(

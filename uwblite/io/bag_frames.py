@@ -21,7 +21,7 @@ class Frames:
         for t in transforms:
             shift, turn = t.transform.translation, t.transform.rotation
             pose = np.eye(4)
-            pose[:3, :3] = _rotation(turn.x, turn.y, turn.z, turn.w)
+            pose[:3, :3] = rotation(turn.x, turn.y, turn.z, turn.w)
             pose[:3, 3] = shift.x, shift.y, shift.z
             self._parents.setdefault(_name(t.child_frame_id), (_name(t.header.frame_id), pose))
 
@@ -62,7 +62,7 @@ def _name(frame: str) -> str:
     return frame.lstrip("/")
 
 
-def _rotation(x: float, y: float, z: float, w: float) -> Floats:
+def rotation(x: float, y: float, z: float, w: float) -> Floats:
     """Return the rotation matrix of a quaternion of any positive length; the identity where it has none."""
     n = x * x + y * y + z * z + w * w
     if not 1e-12 < n < 1e12:

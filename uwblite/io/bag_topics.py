@@ -1,4 +1,4 @@
-"""Which topics of a bag hold wheels, scans, ranges and transforms; and which may hold ranges that no mapping reads."""
+"""Which topics of a bag hold wheels, scans, an IMU, ranges and transforms; and which may hold ranges that no mapping reads."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,6 +11,9 @@ from .uwb_messages import KNOWN
 from .uwb_suggestions import as_toml, suggested
 
 ODOMETRY, SCAN, TRANSFORMS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage"
+IMU = "sensor_msgs/msg/Imu"
+NONE = "none"
+"""In place of the topic of an IMU: no IMU is read."""
 
 Samples = Callable[[str], Sequence[Any]]
 """First messages of a topic, by its name."""
@@ -23,6 +26,8 @@ class BagTopics:
     odometry: str = ""
     scan: str = ""
     uwb: tuple[str, ...] = ()
+    imu: str = ""
+    """NONE = the heading is the odometry's, whatever IMU there is."""
     base_frame: str = ""
     """Empty = the odometry's child frame."""
 
@@ -46,6 +51,7 @@ class TopicPlan:
 
     odometry: str
     scan: str
+    imu: str
     uwb: dict[str, tuple[UwbMapping, ...]]
     tf: tuple[str, ...]
     passed_over: tuple[str, ...]
@@ -55,7 +61,7 @@ class TopicPlan:
 
     def role(self, name: str) -> str:
         """Return what a topic is read for; '' where it is not read."""
-        roles = {self.odometry: "odometry", self.scan: "scans"} | dict.fromkeys(self.uwb, "ranges")
+        roles = {self.odometry: "odometry", self.scan: "scans", self.imu: "heading"} | dict.fromkeys(self.uwb, "ranges")
         return roles.get(name, "")
 
 
@@ -79,9 +85,12 @@ def plan_topics(
         topics, ODOMETRY, ("odom", "wheel"), ("filtered", "gps", "visual")
     )
     scan = _named(topics, asked.scan, SCAN, "scans") or _best(topics, SCAN, ("/scan",), ("sonar", "ultra", "back", "rear"))
+    imu = "" if asked.imu == NONE else _named(topics, asked.imu, IMU, "headings")
+    if not asked.imu:
+        imu = _best(topics, IMU, ("imu",), ("camera", "realsense", "zed", "oak", "head", "arm", "mag"))
     for name in asked.uwb:
         _topic(topics, name)
-    others = (t for t in topics if t.name not in (odometry, scan) and t.type != TRANSFORMS)
+    others = (t for t in topics if t.name not in (odometry, scan) and t.type not in (IMU, TRANSFORMS))
     rest = [*others, *(t for t in topics if t.name in asked.uwb and t.name in (odometry, scan))]
     _check_mappings(rest, mappings)
     uwb, unread = {}, {}
@@ -94,10 +103,10 @@ def plan_topics(
         if t.name in asked.uwb and t.name not in uwb:
             raise ConfigError(_no_mapping(t, unread.get(t.name)))
     kept = uwb if asked.uwb else _uncorrected(uwb)
-    spare = [t.name for t in topics if t.type in (ODOMETRY, SCAN) and t.name not in (odometry, scan)]
+    spare = [t.name for t in topics if t.type in (ODOMETRY, SCAN, IMU) and t.name not in (odometry, scan, imu)]
     spare += [name for name in uwb if name not in kept]
     tf = tuple(t.name for t in topics if t.type == TRANSFORMS)
-    return TopicPlan(odometry, scan, kept, tf, tuple(spare), {} if asked.uwb else unread)
+    return TopicPlan(odometry, scan, imu, kept, tf, tuple(spare), {} if asked.uwb else unread)
 
 
 def unread_warning(plan: TopicPlan) -> str:

@@ -1,7 +1,8 @@
 """ROS bags to recordings and back, with the package `rosbags` (the extra ``uwblite[bag]``); no ROS is needed.
 
 Reads ROS 1 bags and ROS 2 bags in sqlite3 or MCAP. Wheel odometry comes from nav_msgs/Odometry, scans from
-sensor_msgs/LaserScan, ranges by a mapping (see uwb_mapping), mountings from tf. Times are those of the headers.
+sensor_msgs/LaserScan, headings from sensor_msgs/Imu, ranges by a mapping (see uwb_mapping), mountings from tf. Times are
+those of the headers.
 """
 
 import os
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError, UwbliteError
 from ..sensor_log import LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id
 from .bag_frames import Frames, planar
+from .bag_imu import ImuReadings
 from .bag_topics import GUESSED, ODOMETRY, BagTopic, BagTopics, TopicPlan, plan_topics, unread_warning
 from .files import sha256_of
 from .optional_packages import missing_package
@@ -70,7 +72,7 @@ def read_bag(path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings
     with _opened(path) as reader:
         plan = plan_topics(_topics(reader), partial(_samples, reader), topics, mappings)
         found = _Collector(plan, topics.base_frame)
-        wanted = {found.plan.odometry, found.plan.scan, *found.plan.uwb, *found.plan.tf}
+        wanted = {found.plan.odometry, found.plan.scan, found.plan.imu, *found.plan.uwb, *found.plan.tf}
         for connection, recorded, raw in reader.messages(connections=[c for c in reader.connections if c.topic in wanted]):
             found.take(connection.topic, recorded / 1e9, reader.deserialize(raw, connection.msgtype))
         if topics.base_frame:
@@ -111,6 +113,7 @@ class _Collector:
     odometry: list[tuple[float, float, float, float]] = field(default_factory=list)
     ranges: list[tuple[float, str, float, float]] = field(default_factory=list)
     scans: list[tuple[float, NDArray[np.float32]]] = field(default_factory=list)
+    imu: ImuReadings = field(default_factory=ImuReadings)
     layout: tuple[float, ...] = ()
     """angle_min, angle_increment, time_increment, range_min, range_max, beams of the first scan."""
     laser_frame: str = ""
@@ -132,6 +135,8 @@ class _Collector:
             self.odometry.append((self._time(message.header.stamp, recorded), pose.position.x, pose.position.y, float(yaw)))
         elif topic == self.plan.scan:
             self._take_scan(recorded, message)
+        elif topic == self.plan.imu:
+            self.imu.take(self._time(message.header.stamp, recorded), message)
         else:
             mappings = self.plan.uwb[topic]
             stamp = recorded
@@ -180,8 +185,10 @@ class _Collector:
         table = table[np.argsort(table[:, 0], kind="stable")]
         warnings = list(self._warnings(len(self.odometry) - len(table)))
         mounting = self._mounting(warnings)
+        gyro = self.imu.gyro(self.frames, self.base_frame, warnings) if self.plan.imu else None
         notes = LogNotes(source=path, sha256=sha256, warnings=tuple(warnings), unread=tuple(self.plan.unread))
-        return SensorLog(Odometry(table[:, 0].copy(), table[:, 1:].copy()), self._ranges(), self._scans(), mounting, notes)
+        odometry = Odometry(table[:, 0].copy(), table[:, 1:].copy())
+        return SensorLog(odometry, self._ranges(), self._scans(), mounting, notes, gyro=gyro)
 
     def _ranges(self) -> UwbRanges | None:
         faults = self._faults_of_ids()

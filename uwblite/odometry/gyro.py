@@ -22,6 +22,20 @@ LEFT_OF_BIAS = 0.003
 """Standard deviation of the bias that is left, rad/s: a MEMS gyro drifts so within minutes, and with its temperature."""
 SCALE = 0.02
 """Standard deviation of a gyro's scale, 1; data sheets of cheap ones say 1 to 3 %."""
+LEAST_TURNS = 0.1
+"""rad by which wheels and gyro must turn in a window, root mean square, for their turns to be compared."""
+ALIKE, UNLIKE = 0.8, 0.3
+"""Correlation of the turns of gyro and wheels from which one factor leads from one to the other; below which both are not
+of one robot. Slipping wheels do not come down to it."""
+READINGS = {
+    1.0: "",
+    -1.0: "it turns against the wheels, and is turned over (a sensor upside down, or one that counts clockwise)",
+    np.pi / 180.0: "it counts degrees",
+    -np.pi / 180.0: "it counts degrees, and turns against the wheels",
+}
+"""What makes radians counter-clockwise of a heading -> why."""
+SLIP = 3.0
+"""Factor by which the turns of wheels may be wrong: those of tracks and four driven wheels are, by half."""
 PER_TURN, PER_METRE = 0.005, 0.001
 """Random error of heading per radian and per metre, rad: a gyro does not slip and measures no distance."""
 
@@ -45,6 +59,9 @@ def settings(
 def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     """Return the recording with the gyro's heading in its odometry, less the gyro's bias; and a remark.
 
+    A heading that is turned over or in degrees is recognised by the wheels and set right; one that has nothing in common
+    with their turns is not taken.
+
     Each step of the wheels keeps its length; its direction turns by half of what both headings differ in (the chord of
     an arc). The bias is the gyro's turn rate while the wheels stand, else the median difference to that of the wheels;
     what is left of it is estimated with the map (``heading_rate``).
@@ -57,6 +74,10 @@ def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     if gyro is None or len(gyro.stamps) < 2 or len(odometry.stamps) < 2:
         return log, []
     steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
+    factor, why = _reading(gyro, odometry)
+    if not factor:
+        return log, [Remark("gyro", why)]
+    gyro = Gyro(gyro.stamps, factor * gyro.heading)
     covered = _covered(gyro, odometry.stamps)
     if not covered.any():
         return log, [Remark("gyro", "the gyro was silent while the wheels were read: their heading is taken")]
@@ -70,7 +91,7 @@ def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     poses = np.column_stack([xy, se2.wrap_angle(theta)])
     how = "by the robot's rests" if standing else "against the wheels"
     text = f"the heading is the gyro's in {covered.mean():.0%} of the odometry; its bias is {bias:+.5f} rad/s {how}"
-    return replace(log, odometry=Odometry(odometry.stamps, poses)), [Remark("gyro", text)]
+    return replace(log, odometry=Odometry(odometry.stamps, poses)), [Remark("gyro", f"{text}; {why}" if why else text)]
 
 
 def _covered(gyro: Gyro, stamps: Floats) -> Bools:
@@ -84,19 +105,39 @@ def _covered(gyro: Gyro, stamps: Floats) -> Bools:
 
 def _bias(gyro: Gyro, odometry: Odometry) -> tuple[float, bool]:
     """Return the gyro's bias, rad/s, and whether it is from rests."""
-    begin, end = max(gyro.stamps[0], odometry.stamps[0]), min(gyro.stamps[-1], odometry.stamps[-1])
-    wheels = np.unwrap(odometry.poses[:, 2])
-
-    def change(values: Floats, stamps: Floats, span: float) -> tuple[Floats, Floats]:
-        at = np.arange(begin, end - span, 0.5 * span)
-        return at, np.interp(at + span, stamps, values) - np.interp(at, stamps, values)
-
-    _, turned = change(gyro.heading, gyro.stamps, 1.0)
-    way = [change(odometry.poses[:, k], odometry.stamps, 1.0)[1] for k in (0, 1)]
-    by_wheels = change(wheels, odometry.stamps, 1.0)[1]
-    rests = (np.hypot(*way) < STANDING[0]) & (np.abs(by_wheels) < STANDING[1])
+    turned, by_wheels, way = _changes(gyro, odometry, 1.0)
+    rests = (way < STANDING[0]) & (np.abs(by_wheels) < STANDING[1])
     if rests.sum() >= 2 * LEAST_STANDING:
         return float(np.median(turned[rests])), True
-    _, turned = change(gyro.heading, gyro.stamps, WINDOW)
-    _, by_wheels = change(wheels, odometry.stamps, WINDOW)
+    turned, by_wheels, _ = _changes(gyro, odometry, WINDOW)
     return (float(np.median(turned - by_wheels)) / WINDOW if len(turned) else 0.0), False
+
+
+def _reading(gyro: Gyro, odometry: Odometry) -> tuple[float, str]:
+    """Return by what the gyro's heading is to be multiplied, and why; 0 where it is not that of this robot."""
+    turned, by_wheels, _ = _changes(gyro, odometry, WINDOW)
+    if len(turned) < 4:
+        return 1.0, ""
+    turned, by_wheels = turned - np.median(turned), by_wheels - np.median(by_wheels)
+    by_gyro, size = np.sqrt(np.mean(turned**2)), np.sqrt(np.mean(by_wheels**2))
+    if min(by_gyro, size) < LEAST_TURNS:
+        return 1.0, ""
+    alike = float(np.mean(turned * by_wheels) / (by_gyro * size))
+    if abs(alike) < UNLIKE:
+        return 0.0, f"gyro and wheels turn otherwise (correlation {alike:.2f}): the heading of the wheels is taken"
+    signs = [factor for factor in READINGS if factor * alike > 0.0]
+    factor = min(signs, key=lambda factor: abs(np.log(size / by_gyro / abs(factor))))
+    sure = abs(alike) > ALIKE and abs(np.log(size / by_gyro / abs(factor))) < np.log(SLIP)
+    return (factor, READINGS[factor]) if sure else (1.0, "")
+
+
+def _changes(gyro: Gyro, odometry: Odometry, span: float) -> tuple[Floats, Floats, Floats]:
+    """Return by what gyro and wheels turned in windows of `span` s, rad, and how far the wheels came, m, (w,) each."""
+    begin, end = max(gyro.stamps[0], odometry.stamps[0]), min(gyro.stamps[-1], odometry.stamps[-1])
+    at = np.arange(begin, end - span, 0.5 * span)
+
+    def change(values: Floats, stamps: Floats) -> Floats:
+        return np.asarray(np.interp(at + span, stamps, values) - np.interp(at, stamps, values))
+
+    way = np.hypot(*(change(odometry.poses[:, k], odometry.stamps) for k in (0, 1)))
+    return change(gyro.heading, gyro.stamps), change(np.unwrap(odometry.poses[:, 2]), odometry.stamps), way

@@ -9,7 +9,7 @@ from ..errors import ConfigError
 
 _REPEATED = (
     "--every-nth-scan", "--laser-pose", "--laser-flipped", "--tag", "--anchor-height", "--anchors-from",
-    "--odometry-topic", "--scan-topic", "--uwb-topic", "--uwb-mapping", "--base-frame",
+    "--odometry-topic", "--scan-topic", "--imu-topic", "--uwb-topic", "--uwb-mapping", "--base-frame",
 )  # fmt: skip
 """Options of the earlier command that hold again."""
 _FLAGS = ("--laser-flipped",)
