@@ -358,3 +358,19 @@ def test_all_edges_of_a_kind_are_counted(tmp_path, capsys):
     (tmp_path / "a.g2o").write_text(edges)
     assert main(["optimize", str(tmp_path / "a.g2o"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["edges"] == {"RelativePoseEdges": 3}
+
+
+def test_an_edge_that_leaves_a_direction_open_is_written_so_that_readers_can_factorize_it(tmp_path):
+    """The Cholesky factor of a singular matrix, as gtsam takes it, breaks down; the direction stays as good as open."""
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.1, 0.2]])
+    L = np.array([[80.0, 60.0, -10.0], [0.0, 0.0, 90.0], [0.0, 0.0, 0.0]])
+    edge = RelativePoseEdges(np.array([0]), np.array([1]), np.array([[1.1, 0.0, 0.18]]), L[None])
+    graph = Graph(poses, np.zeros((0, 2)), (edge,))
+    for name, write, read in (("x.g2o", write_g2o, read_g2o), ("x.pyfg", write_pyfg, read_pyfg)):
+        write(tmp_path / name, graph)
+        back = read(tmp_path / name).graph
+        [found] = [e for e in back.edges if isinstance(e, RelativePoseEdges)]
+        [information] = np.swapaxes(found.sqrt_information, 1, 2) @ found.sqrt_information
+        factor = np.linalg.cholesky(information)
+        np.testing.assert_allclose(factor @ factor.T, L.T @ L, atol=1e-3)
+        assert back.chi2() == pytest.approx(graph.chi2(), rel=1e-5)

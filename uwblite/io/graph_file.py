@@ -119,7 +119,8 @@ def plain_edges(graph: Graph) -> PlainEdges:
     Odometry and scan edges become measurements between the poses of the base. A range becomes the range from the pose
     itself that leaves the same residual at the present estimate. Weights scale the information; robust kernels and
     priors on calibration have no place in the formats and are left out. Where nothing is calibrated and lever arms are
-    zero nothing changes, so that chi2 stays what it was. Ranges to anchors without a position are left out.
+    zero nothing changes, so that chi2 stays what it was. Ranges to anchors without a position are left out. Directions that
+    an edge does not measure get an information too small to matter (see `definite`).
     """
     relative: list[tuple[Ints, Ints, Floats, Floats]] = []
     sightings: list[tuple[Ints, Ints, Floats, Floats]] = []
@@ -161,11 +162,11 @@ def plain_edges(graph: Graph) -> PlainEdges:
         i,
         j,
         T,
-        information,
-        _stacked(sightings, (none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))),
+        definite(information),
+        _definite(_stacked(sightings, (none, none, np.zeros((0, 2)), np.zeros((0, 2, 2))))),
         _stacked(ranges, (none, none, np.zeros(0), np.zeros(0))),
-        _stacked(priors["poses"], (none, np.zeros((0, 3)), no_information)),
-        _stacked(priors["anchors"], (none, np.zeros((0, 2)), np.zeros((0, 2, 2)))),
+        _definite(_stacked(priors["poses"], (none, np.zeros((0, 3)), no_information))),
+        _definite(_stacked(priors["anchors"], (none, np.zeros((0, 2)), np.zeros((0, 2, 2))))),
         _stacked(between_poses, (none, none, np.zeros(0), np.zeros(0))),
         _stacked(between_landmarks, (none, none, np.zeros(0), np.zeros(0))),
     )
@@ -206,6 +207,11 @@ def _stacked(parts: Sequence[tuple[Any, ...]], empty: tuple[Any, ...]) -> Any:
     return tuple(np.concatenate(column) for column in zip(empty, *parts, strict=True))
 
 
+def _definite(columns: Any) -> Any:
+    """Return columns whose last one is information matrices."""
+    return (*columns[:-1], definite(columns[-1]))
+
+
 def symmetric(upper: Floats, size: int) -> Floats:
     """Return symmetric matrices (e, size, size) from their upper triangles row by row (e, size (size + 1) / 2)."""
     row, col = np.triu_indices(size)
@@ -218,6 +224,22 @@ def upper_triangle(matrices: Floats) -> Floats:
     """Return the upper triangles row by row (e, size (size + 1) / 2) of matrices (e, size, size)."""
     row, col = np.triu_indices(matrices.shape[1])
     return matrices[:, row, col]
+
+
+_FLATTEST = 1e-8
+"""Least eigenvalue of an information matrix in a file, relative to its largest. A direction that was not measured has none,
+but readers invert the matrix or take its Cholesky factor, which breaks down without an error (gtsam)."""
+
+
+def definite(information: Floats) -> Floats:
+    """Return information matrices (e, k, k), those that are singular to working precision made positive definite."""
+    if len(information) == 0:
+        return information
+    values, vectors = np.linalg.eigh(information)
+    least = np.maximum(_FLATTEST * values[:, -1:], np.finfo(np.float64).tiny)
+    flat = values[:, 0] < least[:, 0]
+    raised = (vectors * np.maximum(values, least)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return np.where(flat[:, None, None], raised, information)
 
 
 def told_places(vertices: Records, index_of: Ints, count: int, content: RecordFile, forget: bool) -> Floats:

@@ -39,9 +39,6 @@ _LAYOUTS = {
 }
 _SPATIAL = ("VERTEX_SE3", "VERTEX_XYZ", "EDGE_SE3")
 _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
-_FLATTEST = 1e-8
-"""Least eigenvalue of an information matrix, relative to its largest, before it is inverted: the format holds covariances,
-and a direction that was not measured has none."""
 
 
 def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
@@ -193,7 +190,6 @@ def _covariances(information: Floats) -> Floats:
     if len(information) == 0:
         return upper_triangle(information)
     values, vectors = np.linalg.eigh(information)
-    values = np.maximum(values, np.maximum(_FLATTEST * values[:, -1:], np.finfo(np.float64).tiny))
     return upper_triangle((vectors / values[:, None, :]) @ np.swapaxes(vectors, 1, 2))
 
 
