@@ -29,11 +29,11 @@ from .pipeline import (
 )
 from .pipeline.estimate import Estimate, Task
 from .pipeline.mapping_config import MappingConfig
-from .pipeline.progress import Progress, Stages
+from .pipeline.progress import Progress, Stage, Stages
 from .pipeline.recordings import gather
 from .sensor_log import SensorLog
 
-__all__ = ["MappingConfig", "Progress", "build_map"]
+__all__ = ["MappingConfig", "Progress", "Stage", "build_map"]
 
 
 def build_map(
@@ -90,10 +90,8 @@ def build_map(
 _MOST_MOVES = 3
 """How often, at most, a map begins again because anchors were moved while it was recorded."""
 
-Stage = Callable[[Estimate, Task], Estimate]
 
-
-def _stages(task: Task) -> Iterator[Stage]:
+def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     """Yield the stages that follow the first optimisation, by what was recorded, given and asked for."""
     config, given = task.config, task.given
     if given != Constraints():

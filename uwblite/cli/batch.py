@@ -73,7 +73,7 @@ def tasks_of(args: argparse.Namespace) -> list[argparse.Namespace]:
     ------
     UsageError, ConfigError : settings or files that no map could be made with, or two folders of the same name.
     """
-    from .map import known, settings
+    from .making import known, settings
     from .options import bag_choices
 
     settings(args), known(args), bag_choices(args)
@@ -131,7 +131,7 @@ def _rows(args: argparse.Namespace, tasks: Sequence[argparse.Namespace]) -> "lis
 def is_finished(task: argparse.Namespace) -> bool:
     """Return whether a folder holds the map of this recording, made with these settings by this version."""
     from ..io.files import sha256_of
-    from .map import given_files, repeat_command, settings
+    from .making import given_files, repeat_command, settings
 
     report = _report(task.out)
     if not report or not os.path.exists(task.logs[0]):
@@ -148,7 +148,7 @@ def is_finished(task: argparse.Namespace) -> bool:
 def _hash_of_settings(config: Any) -> str:
     import hashlib
 
-    from .map import config_text
+    from .making import config_text
 
     return hashlib.sha256(config_text(config).encode()).hexdigest()
 
@@ -172,7 +172,7 @@ def map_one(task: argparse.Namespace) -> Outcome:
     from ..io.locks import sole_writer
     from ..io.results import check_target
     from . import failure
-    from .map import make, read_logs
+    from .making import make, read_logs
 
     try:
         with warnings.catch_warnings(), sole_writer(task.out):

@@ -9,12 +9,9 @@ import os
 import sys
 import time
 import traceback
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 from ..report.printable import encodable, printable
-
-if TYPE_CHECKING:
-    from .stage_shares import Overall
 
 _LOGGER = logging.getLogger("uwblite")
 
@@ -135,13 +132,11 @@ class Progress:
     """A progress bar on stderr, with the time left; silent where stderr is not a terminal.
 
     Call it as ``progress(stage, done, total)``: the signature that ``build_map`` asks for. The time left is that of the
-    stage, or of all stages where `overall` knows their shares.
+    stage, or of all stages where their share that is done is given as well.
     """
 
-    def __init__(
-        self, stream: TextIO | None = None, clock: Any = time.monotonic, overall: "Overall | None" = None
-    ) -> None:
-        self.overall, self.first = overall, 0.0 if overall is None else clock()
+    def __init__(self, stream: TextIO | None = None, clock: Any = time.monotonic) -> None:
+        self.first = clock()
         self.stream = sys.stderr if stream is None else stream
         self.clock = clock
         self.active = self.stream.isatty() and not _CONSOLE.quiet
@@ -150,23 +145,21 @@ class Progress:
         if self.active:
             _CONSOLE.bar = self
 
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """Show that `done` of `total` steps of a stage are behind us."""
+    def __call__(self, stage: str, done: int, total: int, share: float | None = None) -> None:
+        """Show that `done` of `total` steps of a stage are behind us, and which share, 0..1, of all stages."""
         if not self.active:
             return
         now = self.clock()
-        if self.overall is not None:
-            self.overall.take(stage, done, total)
         if stage != self.stage:
             self.clear()
             self.stage, self.began, self.shown = stage, now, -1.0
         if now - self.shown < 0.1 and done < total:
             return
         self.shown = now
-        if self.overall is None:
+        if share is None:
             self._draw(progress_line(stage, done, total, now - self.began))
         else:
-            self._draw(overall_line(stage, self.overall.share, now - self.first))
+            self._draw(overall_line(stage, share, now - self.first))
 
     def _draw(self, line: str) -> None:
         line = printable(line)[: self._columns() - 1]

@@ -1,6 +1,9 @@
 """How far a map is on the whole: the share of the time that each stage usually takes."""
 
-import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..mapping import Stage
 
 _SHARES = (
     ("keyframes", 0.01), ("edges", 0.06), ("bootstrap", 0.03), ("first optimisation", 0.10), ("constraints", 0.01),
@@ -18,23 +21,21 @@ class Overall:
         self.share = 0.0
         """Of the whole work, 0..1; never falls."""
 
-    def take(self, stage: str, done: int, total: int) -> float:
+    def take(self, stage: "Stage", done: int, total: int) -> float:
         """Return the share of the whole work that is done; a stage that is not known leaves it as it is.
 
         Parameters
         ----------
-        stage : name; a number behind it counts the rounds of a stage, whose number is not known beforehand: each takes
-            half of what is left of the stage's share.
+        stage : of one with laps, whose number is not known beforehand, each lap takes half of what is left of its share.
         done, total : steps of the stage.
         """
-        name, number = re.fullmatch(r"(.*?)(?: (\d+))?", stage, re.DOTALL).groups()  # type: ignore[union-attr]
         within = min(done / total, 1.0) if total > 0 else 0.0
-        if number:
-            within = 1.0 - 0.5 ** (int(number) - 1 + within)
+        if stage.lap:
+            within = 1.0 - 0.5 ** (stage.lap - 1 + within)
         before = 0.0
         whole = sum(share for _, share in _SHARES)
         for known, share in _SHARES:
-            if known == name:
+            if known == stage.name:
                 self.share = max(self.share, (before + share * within) / whole)
                 break
             before += share

@@ -9,7 +9,7 @@ from ..loop_closure import candidates as closure_candidates
 from ..loop_closure import closures, paper_method, verification
 from ..loop_closure.closures import Closures
 from .estimate import Estimate, Task
-from .progress import solver_figures
+from .progress import Stage, solver_figures
 
 
 def close_loops(estimate: Estimate, task: Task) -> Estimate:
@@ -39,7 +39,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
         found = closures.merged(found, new)
         base, found = verification.reconcile(base, found, config.loop_closure, config.solver)
         task.stages.end(
-            f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(candidates.target),
+            Stage("loop closure", lap + 1), submaps=len(pieces), candidates=len(candidates.target),
             accepted=len(new.edges), kept=len(found.edges),
         )  # fmt: skip
         tied = len(found.edges) >= config.loop_closure.enough * len(pieces)
@@ -63,11 +63,11 @@ def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
         )
         found = _without_forbidden(found, task)
         task.stages.end(
-            f"loop closure {lap + 1}", submaps=len(pieces), candidates=len(found.candidates), accepted=len(found.edges)
+            Stage("loop closure", lap + 1), submaps=len(pieces), candidates=len(found.candidates), accepted=len(found.edges)
         )
         solved, result = optimize(graph.with_edges(*edges, found.edges), config.solver)
         estimate = replace(estimate, closures=found).with_estimates_of(solved)
-        task.stages.end(f"second optimisation {lap + 1}", **solver_figures(result))
+        task.stages.end(Stage("second optimisation", lap + 1), **solver_figures(result))
     return estimate
 
 

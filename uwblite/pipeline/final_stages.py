@@ -14,6 +14,7 @@ from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid, Sweeps
 from .estimate import Estimate, Task
 from .map_frame import cropped
+from .progress import Stage
 from .radio_stages import with_range_noise
 from .recordings import Recording
 
@@ -75,7 +76,8 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
         """Report what a large grid will take; the caller may still stop."""
         if geometry.cells >= _LARGE_GRID:
             cells, megabytes = geometry.cells / 1e6, geometry.megabytes
-            stages.report(f"occupancy grid of {cells:.0f} million cells, about {megabytes:.0f} MB", 0, 1)
+            detail = f"of {cells:.0f} million cells, about {megabytes:.0f} MB"
+            stages.report(Stage("occupancy grid", detail=detail), 0, 1)
 
     reporter = stages.reporter("occupancy grid")
     grid = grids.from_sweeps(sweeps, config.grid, executor=task.executor, progress=reporter, announce=announce)

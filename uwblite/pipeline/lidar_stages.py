@@ -20,7 +20,7 @@ from ..lidar.scan_to_scan import Steps
 from . import scan_clouds
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
-from .progress import solver_figures
+from .progress import Stage, solver_figures
 from .radio_stages import with_range_noise
 from .recordings import denser, later
 
@@ -204,7 +204,7 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
         estimate = with_range_noise(replace(estimate, graph=graph, joint=refined.edges), config, steady=True)
         shift = float(np.sqrt(np.mean(np.sum((graph.poses - before)[:, :2] ** 2, axis=1))))
         task.stages.end(
-            f"joint refinement {lap + 1}", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
+            Stage("joint refinement", lap + 1), pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
             sigma=round(refined.sigma, 4), shift=round(shift, 5), **solver_figures(refined.summary),
         )  # fmt: skip
         if shift < config.refinement.same_pairs:

@@ -7,7 +7,25 @@ from ..graph.solver import SolverSummary
 from ..map_result import Notice, StageSummary
 from ..sensor_log import SensorLog
 
-Progress = Callable[[str, int, int], object]
+
+class Stage(str):
+    """What progress is made with: text for people, such as ``loop closure 2``, and its parts for programs."""
+
+    name: str
+    """Of the stage, without its lap."""
+    lap: int
+    """1, 2, ... of a stage that is repeated until nothing changes; else 0."""
+    detail: str
+    """What the user should know before it begins; empty as a rule."""
+
+    def __new__(cls, name: str, lap: int = 0, detail: str = "") -> "Stage":
+        """Make the text of the parts."""
+        stage = super().__new__(cls, " ".join(filter(None, (name, str(lap or ""), detail))))
+        stage.name, stage.lap, stage.detail = name, lap, detail
+        return stage
+
+
+Progress = Callable[[Stage, int, int], object]
 """progress(stage, done, total); returning False asks to stop, see errors.Cancelled."""
 
 
@@ -31,6 +49,7 @@ class Stages:
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Report progress; raises Cancelled where the callback returns False."""
+        stage = stage if isinstance(stage, Stage) else Stage(stage)
         if self._progress is not None and self._progress(stage, done, total) is False:
             raise Cancelled(f"stopped by the caller during {stage}")
 

@@ -1,0 +1,159 @@
+"""Recordings of a command line read, mapped and written, as `uwblite map` and `uwblite batch` do it; nothing is said here."""
+
+import argparse
+import shlex
+import sys
+import time
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+from .workers import versions
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from ..constraints import Constraints
+    from ..map_result import MapResult
+    from ..mapping import MappingConfig, Progress
+    from ..sensor_log import SensorLog
+
+
+class Made(NamedTuple):
+    """A map that is written."""
+
+    logs: "list[SensorLog]"
+    result: "MapResult"
+    names: list[str]
+    """Of the files in --out, in the order in which a user wants to see them."""
+    seconds: float
+    """From the first recording's first byte to the last file."""
+
+
+def read_logs(args: argparse.Namespace, executor: "Executor | None" = None) -> "list[SensorLog]":
+    """Return the recordings of the command line, with its mounting."""
+    from .formats import read_recording
+    from .options import apply_mounting, bag_choices
+
+    read = partial(read_recording, every_nth_scan=args.every_nth_scan, bag=bag_choices(args))
+    return [apply_mounting(log, args) for log in (executor.map if executor else map)(read, args.logs)]
+
+
+def make(
+    args: argparse.Namespace,
+    logs: "list[SensorLog]",
+    reading: float,
+    progress: "Progress | None" = None,
+    executor: "Executor | None" = None,
+) -> Made:
+    """Map recordings and write the result; say nothing.
+
+    Parameters
+    ----------
+    args : the command line: settings, constraints, --out.
+    logs : as `read_logs` returns them; the list is emptied, for scans that no map looks at are most of the memory.
+    reading : time that it took to read them, s.
+    progress, executor : see `build_map`.
+    """
+    from ..io.result_text import RunRecord
+    from ..io.results import write_result
+    from ..mapping import build_map
+    from ..pipeline.scan_selection import prepared
+
+    config, constraints = settings(args), known(args)
+    began = time.perf_counter()
+    kept = [prepared(logs.pop(0), config) for _ in range(len(logs))]
+    log = kept[0] if len(kept) == 1 else kept
+    result = build_map(
+        log, config, constraints=constraints, progress=progress, executor=executor, clock=time.perf_counter
+    )
+    record = RunRecord(
+        command=repeat_command(args),
+        config=config_text(config),
+        versions=versions(),
+        given=given_files(args),
+        preset=args.preset or "",
+        seconds=0.0 if args.no_timings else reading + time.perf_counter() - began,
+        reading_seconds=reading,
+        peak_rss_bytes=peak_memory(),
+        timings_in_report=args.report_timings,
+        scale_map=args.scale_map,
+    )
+    names = write_result(args.out, kept, result, record)
+    return Made(kept, result, names, reading + time.perf_counter() - began)
+
+
+def config_text(config: "MappingConfig") -> str:
+    """Return the config.toml of a result."""
+    from ..config import to_toml
+
+    return to_toml(config, header="settings in force; `uwblite config` explains them")
+
+
+def given_files(args: argparse.Namespace) -> dict[str, str]:
+    """Return the SHA-256 of the files that the command line names beside recordings and settings, by option.
+
+    What can be read once only, such as a pipe, has none.
+    """
+    import os
+
+    from ..io.files import sha256_of
+
+    named = {"constraints": args.constraints, "anchors-from": args.anchors_from, "uwb-mapping": args.uwb_mapping}
+    return {option: sha256_of(file) for option, file in named.items() if file and os.path.isfile(file)}
+
+
+def settings(args: argparse.Namespace) -> "MappingConfig":
+    from ..config import override
+    from .options import effective_config
+
+    config = override(effective_config(args), [f"use_{name}=false" for name in args.without])
+    short = {"grid.resolution": args.resolution, "align": args.align, "crop": args.crop and list(args.crop)}
+    return override(config, [f"{name}={value}" for name, value in short.items() if value is not None])
+
+
+def known(args: argparse.Namespace) -> "Constraints":
+    from ..constraints import Constraints
+    from ..io.constraints_file import parse_constraints, read_anchors
+    from .options import read_text
+
+    earlier = read_anchors(args.anchors_from) if args.anchors_from else Constraints()
+    if not args.constraints:
+        return earlier
+    return earlier + parse_constraints(read_text(args.constraints), args.constraints)
+
+
+def repeat_command(args: argparse.Namespace) -> str:
+    """Return the command that makes the same map again, with the recordings and the result's config.toml at hand.
+
+    Files stand with their names alone: the result is the same wherever they lie.
+    """
+    from ..io.result_text import base_name
+
+    words = ["uwblite", "map", *map(base_name, args.logs), "--config", "config.toml"]
+    if args.every_nth_scan > 1:
+        words.append(f"--every-nth-scan={args.every_nth_scan}")
+    for option, value in (("--constraints", args.constraints), ("--anchors-from", args.anchors_from)):
+        words += [option, base_name(value)] if value else []
+    if args.laser_pose is not None:
+        words.append("--laser-pose=" + ",".join(map(repr, args.laser_pose)))
+    if args.laser_flipped:
+        words.append("--laser-flipped")
+    for option in ("odometry_topic", "scan_topic", "imu_topic", "uwb_mapping", "base_frame"):
+        if value := getattr(args, option):
+            words.append(f"--{option.replace('_', '-')}={base_name(value) if option == 'uwb_mapping' else value}")
+    words += [f"--uwb-topic={topic}" for topic in args.uwb_topic]
+    if args.tag is not None:
+        words.append("--tag=" + ",".join(map(repr, args.tag)))
+    if args.anchor_height is not None:
+        words.append(f"--anchor-height={args.anchor_height!r}")
+    return shlex.join([*words, "--out", "map_again"])
+
+
+def peak_memory() -> int:
+    """Return the peak resident memory of this process and the largest of its children, bytes; 0 where it is not known."""
+    try:
+        import resource
+    except ImportError:
+        return 0
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
