@@ -84,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
 
         write_tum(args.trajectory, file.stamps, solved.poses)
     figures = _figures(solved_file, summary, [file.anchor_ids[k] for k in lost])
+    figures |= _certificate(solved, summary, args.robust)
     if args.robust:
         figures["outliers"] = outliers
     if args.json:
@@ -179,10 +180,23 @@ def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> di
         "converged": summary.converged,
         "reason": summary.reason,
         "chains": int(file.chains.max(initial=0)) + 1,
-        "certificate": "none: the minimum is a local one",
         "unplaced_anchors": lost,
         "exit_code": 0 if summary.converged else 3,
     }
+
+
+def _certificate(graph: "Graph", summary: "SolverSummary", robust: bool) -> dict[str, Any]:
+    """Return what is known of the global minimum."""
+    from ..graph.certificate import Certificate, certify
+
+    if robust:
+        known = Certificate(False, 0.0, "a search decided which edges are outliers")
+    elif not summary.converged:
+        known = Certificate(False, 0.0, "the search did not converge")
+    else:
+        known = certify(graph)
+    certificate = "global minimum" if known.is_global else f"none: {known.reason}"
+    return {"certificate": certificate, "chi2_lower_bound": known.lower_bound}
 
 
 def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
@@ -194,7 +208,9 @@ def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
     )
     if not figures["converged"]:
         lines.append("DOUBT: not converged; try --set max_iterations=1000, --from-odometry --incremental or --robust")
-    lines.append("no certificate: whether a lower minimum exists is not known")
+    bound = figures["chi2_lower_bound"]
+    below = f"; no minimum lies below chi2 {bound:.6g}" if bound > 0.0 else ""
+    lines.append(f"certificate: {figures['certificate']}{below}")
     if figures["chains"] > 1:
         lines[0] += f"; {figures['chains']} chains that nothing but ranges ties together"
     if "outliers" in figures:
