@@ -1,44 +1,43 @@
 #!/usr/bin/env python3
 """A robot drives to goals by the live pose alone, in the simulator; writes docs/navigation.md.
 
-    python tools/navigation.py                      lab and hall, 20 goals each
+    python tools/navigation.py                      lab, hall, warehouse and arena, 20 goals each
     python tools/navigation.py --only lab --goals 5 --print
+    python tools/navigation.py --keep /tmp/grounds  maps and recordings are kept there and used again
 
 The robot plans in the map of a recording, follows by pure pursuit where it believes to be, and is told nothing else: its wheels
-err as the recording's do, it begins at an unknown place, and where it is lost it turns on the spot until it is found. A goal is
-reached within 0.10 m of the truth; what it touches and how near it comes to obstacles is measured in the true building.
-With the map of the defaults, that of the paper's settings, and by dead reckoning from a start that is told.
+err as the recording's do, people walk about, it begins at an unknown place, and where it is lost it turns on the spot until it
+is found. A goal is reached within 0.10 m of the truth; what it touches and how near it comes to obstacles is measured in the
+true building. With the map of the defaults, that of the paper's settings, and by dead reckoning from a start that is told.
 """
 
 import argparse
 import sys
-import tempfile
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from simulation import laser, radio, wheels
-from simulation.fields import smooth_field
+from grounds import Ground, Place, mapped
+from simulation import real_rooms, wheels
+from simulation.drive import Motion
 from simulation.plans import PLANS
-from simulation.recording import Settings
-from trials import ROOT, made, table, write_section
+from simulation.recording import people, picked, ranged, scene_of, swept
+from trials import ROOT, table, write_section
 
 from uwblite import se2
 from uwblite.errors import UwbliteError
-from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.io.result_text import RunRecord
-from uwblite.io.results import write_result
-from uwblite.io.stored_result import StoredResult, read_result
 from uwblite.localization import Localizer, Scanner
-from uwblite.localization.known_map import KnownMap, from_result
-from uwblite.mapping import build_map
+from uwblite.localization.known_map import KnownMap
 from uwblite.navigation.planner import Planner, make_planner
-from uwblite.pipeline.mapping_config import preset
 from uwblite.sensor_log import SensorMounting
 
-WORLDS = {"lab": 10.0, "hall": 20.0}
-"""Minutes of the recording that the map is made of."""
-BUILDING = 7
+WORLDS = ("lab", "hall", "warehouse", "arena")
+PEOPLE = 2
+"""Who walk about besides those of real rooms."""
+WALKED = 1800.0
+"""s after which the people begin their walks again."""
 RADIUS = 0.2
 """m, of the robot."""
 MARGIN = 0.1
@@ -51,41 +50,54 @@ SPEED, TURN, LOOK = 0.25, 0.8, 0.35
 """m/s, rad/s, m of pure pursuit."""
 MOST_SECONDS, MOST_LOST = 240.0, 60.0
 """s for a goal, and of being lost before it is given up."""
+NEAREST, FARTHEST = 2.0, 12.0
+"""m between one goal and the next."""
 
 
-@dataclass
 class Robot:
-    """A robot in the true building."""
+    """A robot in the true building.
 
-    world: str
-    seed: int
-    pose: np.ndarray
-    odometry: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    stamp: float = 0.0
+    Parameters
+    ----------
+    place : the building, and the recording of which its map is made. seed : of the noise. pose : (3,) where it begins.
+    """
 
-    def __post_init__(self) -> None:
-        self.plan, self.settings = PLANS[self.world](), Settings(world=self.world, building=BUILDING)
-        self.rng = np.random.default_rng([self.seed, 77])
-        self.faults = wheels.draw_errors(self.rng, 1.0)
-        model = self.settings.laser
-        surfaces = len(self.plan.walls) + len(self.plan.columns)
-        self.colour = model.surface_sd * np.random.default_rng([BUILDING, 1005]).standard_normal(surfaces)
-        bias = np.random.default_rng([BUILDING, 1006]).standard_normal(len(self.plan.anchors))
-        self.bias = self.settings.radio.bias_sd * bias
+    def __init__(self, place: Place, seed: int, pose: np.ndarray) -> None:
+        self.plan, self.settings = PLANS[place.world](), replace(place.settings, seed=seed, people=PEOPLE)
+        self.pose, self.odometry, self.stamp = pose, np.zeros(3), 0.0
         self.speed = self.turn = 0.0
+        self._noise: dict[int, np.random.Generator] = {}
+        rooms = self.settings.rooms
+        self.faults = wheels.draw_errors(self._draw(1), 1.0 if rooms is None else rooms.wheels)
+        self.crowd = people(self.settings, self.plan, WALKED)
+        self.scene = scene_of(self.settings, self.plan, self.crowd, self._draw(5))
+        self._last: deque[tuple[float, np.ndarray]] = deque([(0.0, pose)], maxlen=4)
+
+    def _draw(self, part: int) -> np.random.Generator:
+        """Return the generator of a part of the noise, which goes on where it was."""
+        return self._noise.setdefault(part, np.random.default_rng([self.settings.seed, part]))
+
+    def put(self, pose: np.ndarray) -> None:
+        """Set it down elsewhere, which its wheels do not notice."""
+        self.pose, self.speed, self.turn = pose, 0.0, 0.0
+        self._last.clear()
+        self._last.append((self.stamp, pose))
 
     def drive(self, speed: float, turn: float) -> None:
         """Drive for a step, as fast as wheels can change their speed."""
         self.speed += float(np.clip(speed - self.speed, -0.5 * STEP, 0.5 * STEP))
         self.turn += float(np.clip(turn - self.turn, -2.0 * STEP, 2.0 * STEP))
-        way, angle = self.speed * STEP, self.turn * STEP
-        self.pose = se2.compose(self.pose, se2.exp([way, 0.0, angle]))
-        f = self.faults
-        stated = f.distance_scale * way + f.distance_noise * np.sqrt(abs(way)) * self.rng.standard_normal()
-        noise = np.sqrt(f.heading_noise_travel**2 * abs(way) + f.heading_noise_turn**2 * abs(angle))
-        told = f.heading_scale * angle + f.drift * way + noise * self.rng.standard_normal()
-        self.odometry = se2.compose(self.odometry, se2.exp([stated, 0.0, told]))
+        before, way, angle = self.pose, self.speed * STEP, self.turn * STEP
+        self.pose = before + np.array([*se2.rotate(before[2] + 0.5 * angle, np.array([way, 0.0])), angle])
+        ends = np.array([self.stamp, self.stamp + STEP])
+        motion, rooms, floor = Motion(ends, np.stack([before, self.pose])), self.settings.rooms, None
+        if rooms is not None:
+            there = np.random.default_rng([self.settings.building, 1011])
+            floor = real_rooms.floor_errors(rooms, before[None, :2], np.array([abs(way)]), there, self._draw(12))
+        step = wheels.odometry(motion, ends, self.faults, [], self._draw(3), floor)[1]
+        self.odometry = se2.compose(self.odometry, step)
         self.stamp += STEP
+        self._last.append((self.stamp, self.pose))
 
     def clearance(self) -> float:
         """Return how far the robot's rim is from the nearest obstacle, m; below 0 it touches."""
@@ -98,31 +110,23 @@ class Robot:
     def scan(self) -> np.ndarray:
         """Return the readings of a sweep that ends now, m."""
         model = self.settings.laser
-        back = -model.time_increment * np.arange(model.beams)[::-1]
-        poses = se2.compose(self.pose, se2.exp(np.stack([self.speed * back, 0.0 * back, self.turn * back], axis=1)))
-        mount = np.asarray(self.settings.laser_pose)
-        origin = poses[:, :2] + se2.rotate(poses[:, 2], np.broadcast_to(mount[:2], (model.beams, 2)))
-        walls, columns = laser.near(self.plan.walls, self.plan.columns, self.pose[:2], model.max_range + 0.5)
-        ids = np.concatenate([walls, len(self.plan.walls) + columns, [-1]])
-        angles = poses[:, 2] + mount[2] + model.angles
-        true, cosine, surface = laser.cast(origin, angles, self.plan.walls[walls], self.plan.columns[columns], model.max_range)
-        stated = laser.disturb(true[None], cosine[None], ids[surface][None], model, self.colour, self.rng)[0] * 0.001
+        times = self.stamp - model.time_increment * np.arange(model.beams)[::-1]
+        stamps, poses = (np.array(v) for v in zip(*self._last, strict=True))
+        scene = replace(self.scene, crowd=self._walks())
+        millimetres = swept(scene, times[:1], times, Motion(stamps, poses).at(times), self._draw(5))[0][0]
+        stated = 0.001 * millimetres
         return np.where(stated >= model.max_range, np.inf, np.where(stated < model.min_range, np.nan, stated))
 
     def ranges(self) -> tuple[list[str], list[float]]:
         """Return a round of ranges."""
-        model, place = self.settings.radio, se2.transform(self.pose, np.asarray(self.settings.tag))
-        names, values = [], []
-        for a, anchor in enumerate(self.plan.anchors):
-            there = np.random.default_rng([BUILDING, 1200 + a])
-            alike = model.multipath_sd * smooth_field(there, place[None], model.multipath_length)[0]
-            shadow = self.plan.opacity * radio.crossings(place[None], anchor, self.plan.walls, self.plan.columns)
-            extra, lost = radio.excess(shadow, place[None], "normal", self.rng, there)
-            if not lost[0] and self.rng.random() >= model.loss:
-                names.append(self.plan.anchor_ids[a])
-                noise = model.noise_sd * self.rng.standard_normal()
-                values.append(float(np.hypot(*(anchor - place)) + self.bias[a] + alike + extra[0] + noise))
-        return names[: model.per_epoch], values[: model.per_epoch]
+        now, settings = np.array([self.stamp]), self.settings
+        measured = ranged(settings, self.plan, self.plan.anchors, now, self.pose[None], self._walks(), self._draw)
+        anchors = picked(*measured[1:], settings.radio.per_epoch, self._draw(8))[1]
+        return [self.plan.anchor_ids[a] for a in anchors], np.maximum(measured[0][0, anchors], 0.0).tolist()
+
+    def _walks(self) -> list[Motion]:
+        """Return the walks of the people, moved to the round of theirs that it is now."""
+        return [replace(walk, stamps=walk.stamps + WALKED * (self.stamp // WALKED)) for walk in self.crowd]
 
 
 @dataclass
@@ -224,46 +228,36 @@ def pursued(path: np.ndarray, pose: np.ndarray, rest: float) -> tuple[float, flo
     return float(speed), float(np.clip(2.5 * bearing, -TURN, TURN))
 
 
-@dataclass(frozen=True)
-class Ground:
-    """A map and where it lies over the building."""
-
-    result: StoredResult
-    known: KnownMap
-    T_truth_map: np.ndarray
-
-
-def mapped(world: str, name: str, seed: int = 1) -> Ground:
-    """Map a recording with a preset."""
-    trial = made(replace(Settings(world=world, building=BUILDING, seed=seed), minutes=WORLDS[world], scan_rate=5.0))
-    made_of = build_map(trial.log, preset(name))
-    with tempfile.TemporaryDirectory(prefix="uwblite-") as folder:
-        write_result(Path(folder) / "map", [trial.log], made_of, RunRecord("tools/navigation.py", ""))
-        result = read_result(Path(folder) / "map")
-    path = evaluate_trajectory(made_of.stamps, made_of.trajectory, trial.stamps, trial.poses)
-    return Ground(result, from_result(result), path.T_truth_map)
-
-
-def driven(ground: Ground, world: str, goals: int, dead_reckoning: bool, seed: int = 5) -> Tally:
+def driven(ground: Ground, place: Place, goals: int, dead_reckoning: bool, seed: int = 5) -> Tally:
     """Drive to so many goals, one after the other."""
     assert ground.result.grid is not None
     planner = make_planner(ground.result.grid, RADIUS + MARGIN)
     rng = np.random.default_rng(seed)
-    start = np.asarray(PLANS[world]().start)
-    robot = Robot(world, seed, start + np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)]))
+    start = np.asarray(PLANS[place.world]().start)
+    robot = Robot(place, seed, start + np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)]))
     driver, tally = Driver(robot, planner, ground.T_truth_map, None if dead_reckoning else ground.known), Tally()
-    rows, cols = np.divmod(planner.nodes, planner.clearance.geometry.cols)
-    places = planner.clearance.geometry.centre_of(rows, cols)
-    here = se2.transform(se2.inverse(ground.T_truth_map), robot.pose[:2])
-    reachable = _reachable(planner, here)
-    for _ in range(goals):
-        goal = places[reachable[rng.integers(len(reachable))]]
+    for goal in _goals(ground, planner, start[:2], rng, goals):
         before = tally.touched
         driver.go(goal, tally)
         if tally.touched > before:
             # Somebody puts it back to where it may stand, which it is not told.
-            robot.pose, robot.speed, robot.turn = start.copy(), 0.0, 0.0
+            robot.put(start.copy())
     return tally
+
+
+def _goals(
+    ground: Ground, planner: Planner, start: np.ndarray, rng: np.random.Generator, count: int
+) -> Iterator[np.ndarray]:
+    """Yield goals (2,) in the map that can be reached, each NEAREST to FARTHEST m from the one before."""
+    rows, cols = np.divmod(planner.nodes, planner.clearance.geometry.cols)
+    places = planner.clearance.geometry.centre_of(rows, cols)
+    here = se2.transform(se2.inverse(ground.T_truth_map), start)
+    places = places[_reachable(planner, here)]
+    for _ in range(count):
+        away = np.hypot(*(places - here).T)
+        some = np.flatnonzero((away >= NEAREST) & (away <= FARTHEST))
+        here = places[some[rng.integers(len(some))]]
+        yield here
 
 
 def _reachable(planner: Planner, here: np.ndarray) -> np.ndarray:
@@ -290,12 +284,17 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default=",".join(WORLDS), help="worlds, separated by commas")
     parser.add_argument("--goals", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=301)
+    parser.add_argument("--building", type=int, default=31, help="paint of walls, glass, multipath, biases of anchors")
+    parser.add_argument("--easy", action="store_true", help="rooms without the errors of real ones")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep maps and recordings, and use those that are there")
     parser.add_argument("--print", action="store_true", help="write nothing")
     args = parser.parse_args(argv)
     rows = []
     for world in args.only.split(","):
         for label, name, dead in VARIANTS:
-            tally = driven(mapped(world, name), world, args.goals, dead)
+            place = Place(world, args.building, args.seed, args.easy)
+            tally = driven(mapped(place, name, args.keep), place, args.goals, dead)
             errors = np.array(tally.errors or [np.nan])
             rows.append([world, label, f"{tally.reached} of {tally.goals}", float(np.median(errors)), float(errors.max()),
                          tally.nearest, tally.touched, tally.lost, tally.recovered])  # fmt: skip

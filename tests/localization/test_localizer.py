@@ -109,6 +109,18 @@ def test_ranges_alone_notice_that_it_was_carried_away():
     assert any(s.lost for s in drive.along(poses[100:150]))
 
 
+def test_scans_of_unknown_space_speak_for_no_pose_that_ranges_contradict():
+    """Carried to where the walls of the map are out of sight: what fitted before must not vouch for the old place."""
+    poses = path(ROUND)
+    drive = robot(known())
+    assert not drive.along(poses[:30])[-1].lost
+    drive.carried()
+    # A scan beyond the map's edge: every ray ends in unknown space.
+    drive.walls = ((-30.0, 3.0, 30.0, 3.0),)
+    states = drive.along(np.column_stack([np.linspace(30, 31, 40), np.full(40, 5.5), np.zeros(40)]))
+    assert states[-1].lost
+
+
 def test_legs_and_moved_things_do_not_pull():
     """Two people walk beside the robot, a quarter of its view each side."""
     poses = path(ROUND)

@@ -1,11 +1,14 @@
 """The tools that measure the live pose: what they count, on a world small enough to be told by hand."""
 
+import grounds
 import localization
 import navigation
 import numpy as np
 import pytest
 
 from uwblite import se2
+
+ROOM = grounds.Place("room", 7, 1, easy=True)
 
 
 def test_pursuit_drives_along_a_path_and_stops_at_its_end():
@@ -24,14 +27,14 @@ def test_pursuit_drives_along_a_path_and_stops_at_its_end():
 
 
 def test_the_rim_of_a_robot_is_nearer_than_its_middle():
-    robot = navigation.Robot("room", 1, np.array([1.0, 0.5, 0.0]))
+    robot = navigation.Robot(ROOM, 1, np.array([1.0, 0.5, 0.0]))
     assert robot.clearance() <= 0.5 - navigation.RADIUS + 1e-12
     robot.pose = np.array([1.0, 0.1, 0.0])
     assert robot.clearance() < 0
 
 
 def test_wheels_err_and_the_robot_moves_as_reported():
-    robot = navigation.Robot("room", 1, np.array([3.0, 3.0, 0.0]))
+    robot = navigation.Robot(ROOM, 1, np.array([3.0, 3.0, 0.0]))
     for _ in range(100):
         robot.drive(0.2, 0.0)
     true, output = robot.pose[0] - 3.0, robot.odometry[0]
@@ -41,7 +44,7 @@ def test_wheels_err_and_the_robot_moves_as_reported():
 
 
 def test_a_sweep_of_a_standing_robot_sees_the_walls():
-    robot = navigation.Robot("room", 1, np.array([3.0, 3.0, 0.0]))
+    robot = navigation.Robot(ROOM, 1, np.array([3.0, 3.0, 0.0]))
     readings = robot.scan()
     seen = readings[np.isfinite(readings)]
     assert len(seen) > 300

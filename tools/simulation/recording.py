@@ -1,5 +1,6 @@
 """One drive through one building: every sensor's part."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -138,7 +139,7 @@ def simulate(settings: Settings) -> Recording:
     faults = wheels.draw_errors(_lasting(settings.robot, 1, _rng(settings, 1)), size)
     slips = wheels.draw_slips(motion, _rng(settings, 2), settings.slips)
     stated = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3), _floor(settings, motion, stamps))
-    crowd = _people(settings, plan, seconds)
+    crowd = people(settings, plan, seconds)
     scan_stamps, scans, surfaces = _scan(settings, plan, motion, crowd)
     told = scan_stamps + settings.laser_delay
     range_stamps, range_anchors, ranges, truth_uwb = _range(settings, plan, motion, anchors, crowd)
@@ -194,7 +195,7 @@ def _place_anchors(settings: Settings, plan: FloorPlan) -> Floats:
     return np.array(places) + rng.uniform(-0.1, 0.1, (len(places), 2))
 
 
-def _people(settings: Settings, plan: FloorPlan, seconds: float) -> list[drive.Motion]:
+def people(settings: Settings, plan: FloorPlan, seconds: float) -> list[drive.Motion]:
     """Return the walks of the people: 1 m/s between goals of their own."""
     walks = []
     for k in range(settings.people + (0 if settings.rooms is None else settings.rooms.people)):
@@ -236,13 +237,37 @@ def _scan(
     model = settings.laser
     if "laser" in settings.without:
         return np.empty(0), np.empty((0, model.beams), dtype=np.int32), np.empty((0, model.beams), dtype=np.int16)
-    rng, rooms = _rng(settings, 5), settings.rooms
+    rng, every = _rng(settings, 5), max(1, round(10.0 / settings.scan_rate))
+    stamps = np.round(np.arange(0.037, motion.stamps[-1] - 0.1, 0.1 * every), 6)
+    scene = scene_of(settings, plan, crowd, rng)
+    out = np.empty((len(stamps), model.beams), dtype=np.int32)
+    surfaces = np.empty(out.shape, dtype=np.int16)
+    for first in range(0, len(stamps), _CHUNK):
+        chunk = slice(first, first + _CHUNK)
+        times = (stamps[chunk, None] + model.time_increment * np.arange(model.beams)).ravel()
+        out[chunk], surfaces[chunk] = swept(scene, stamps[chunk], times, motion.at(times), rng)
+    return stamps, out, surfaces
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a laser meets."""
+
+    settings: Settings
+    plan: FloorPlan
+    crowd: list[drive.Motion]
+    model: LaserModel
+    colour: Floats
+    """(s,) m, constant error of each surface: walls, columns, people."""
+    glass: NDArray[np.bool_]
+    """(w,) which walls are of glass."""
+
+
+def scene_of(settings: Settings, plan: FloorPlan, crowd: list[drive.Motion], rng: np.random.Generator) -> Scene:
+    """Draw what stays with the surfaces of a building."""
+    model, rooms = settings.laser, settings.rooms
     if rooms is not None:
         model = replace(model, surface_sd=rooms.paint_sd, mixed=rooms.mixed, grazing=rooms.grazing)
-    every = max(1, round(10.0 / settings.scan_rate))
-    stamps = np.round(np.arange(0.037, motion.stamps[-1] - 0.1, 0.1 * every), 6)
-    mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
-    angles = mounting[2] + (-model.angles if settings.laser_flipped else model.angles)
     surfaces = _lasting(settings.building, 5, rng)
     colour = model.surface_sd * surfaces.standard_normal(len(plan.walls) + len(plan.columns) + len(crowd))
     glass = np.zeros(len(plan.walls), dtype=bool)
@@ -250,35 +275,40 @@ def _scan(
         # The outer walls stay: a place without any has no map.
         glass = _lasting(settings.building, 13, _rng(settings, 13)).random(len(plan.walls)) < rooms.glass
         glass[:4] = False
-    out = np.empty((len(stamps), model.beams), dtype=np.int32)
-    surfaces = np.empty(out.shape, dtype=np.int16)
-    for first in range(0, len(stamps), _CHUNK):
-        chunk = stamps[first : first + _CHUNK]
-        times = (chunk[:, None] + model.time_increment * np.arange(model.beams)).ravel()
-        pose = motion.at(times)
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        origin = pose[:, :2] + np.stack([c * mounting[0] - s * mounting[1], s * mounting[0] + c * mounting[1]], axis=1)
-        walls, columns = laser.near(plan.walls, plan.columns, origin.mean(axis=0), model.max_range + 0.5)
-        still = np.broadcast_to(plan.columns[columns], (len(times), len(columns), 3))
-        people = _bodies(crowd, times, pose, legs=rooms is not None)
-        round_things = np.concatenate([still, people], axis=1)
-        whose = np.arange(people.shape[1]) // (1 if rooms is None else 2)
-        bodies = len(plan.walls) + len(plan.columns) + whose
-        ids = np.concatenate([walls, len(plan.walls) + columns, bodies, [-1]])
-        heading = pose[:, 2] + np.tile(angles, len(chunk))
-        true, cosine, surface = laser.cast(origin, heading, plan.walls[walls], round_things, model.max_range)
-        shape = (len(chunk), model.beams)
-        true, cosine, surface = true.reshape(shape), cosine.reshape(shape), ids[surface].reshape(shape)
-        if rooms is not None:
-            true = np.where(real_rooms.unseen_glass(rooms, glass, surface, cosine), np.inf, true)
-            surface = np.where(np.isfinite(true), surface, -1)
-            true = true + rooms.warm_up[0] * np.exp(-chunk[:, None] / rooms.warm_up[1])
-        stated = laser.disturb(true, cosine, surface, model, colour, rng)
-        out[first : first + len(chunk)] = stated
-        most = 5.0 * np.maximum(model.near_sd, model.far_sd * true) + 3.0 * model.surface_sd
-        own = (np.abs(0.001 * stated - true) < most) & (surface < len(plan.walls) + len(plan.columns))
-        surfaces[first : first + len(chunk)] = np.where(own, surface, -1)
-    return stamps, out, surfaces
+    return Scene(settings, plan, crowd, model, colour, glass)
+
+
+def swept(
+    scene: Scene, stamps: Floats, times: Floats, pose: Floats, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the readings (k, beams), mm, and surfaces (k, beams) of sweeps that begin at the stamps (k,).
+
+    The rays leave at the times (k * beams,) from poses (k * beams, 3) of the base.
+    """
+    settings, plan, model, rooms = scene.settings, scene.plan, scene.model, scene.settings.rooms
+    mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
+    angles = mounting[2] + (-model.angles if settings.laser_flipped else model.angles)
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    origin = pose[:, :2] + np.stack([c * mounting[0] - s * mounting[1], s * mounting[0] + c * mounting[1]], axis=1)
+    walls, columns = laser.near(plan.walls, plan.columns, origin.mean(axis=0), model.max_range + 0.5)
+    still = np.broadcast_to(plan.columns[columns], (len(times), len(columns), 3))
+    people = _bodies(scene.crowd, times, pose, legs=rooms is not None)
+    round_things = np.concatenate([still, people], axis=1)
+    whose = np.arange(people.shape[1]) // (1 if rooms is None else 2)
+    bodies = len(plan.walls) + len(plan.columns) + whose
+    ids = np.concatenate([walls, len(plan.walls) + columns, bodies, [-1]])
+    heading = pose[:, 2] + np.tile(angles, len(stamps))
+    true, cosine, surface = laser.cast(origin, heading, plan.walls[walls], round_things, model.max_range)
+    shape = (len(stamps), model.beams)
+    true, cosine, surface = true.reshape(shape), cosine.reshape(shape), ids[surface].reshape(shape)
+    if rooms is not None:
+        true = np.where(real_rooms.unseen_glass(rooms, scene.glass, surface, cosine), np.inf, true)
+        surface = np.where(np.isfinite(true), surface, -1)
+        true = true + rooms.warm_up[0] * np.exp(-stamps[:, None] / rooms.warm_up[1])
+    stated = laser.disturb(true, cosine, surface, model, scene.colour, rng)
+    most = 5.0 * np.maximum(model.near_sd, model.far_sd * true) + 3.0 * model.surface_sd
+    own = (np.abs(0.001 * stated - true) < most) & (surface < len(plan.walls) + len(plan.columns))
+    return stated, np.where(own, surface, -1)
 
 
 def _range(
@@ -286,7 +316,7 @@ def _range(
 ) -> tuple[Floats, NDArray[np.int64], Floats, dict[str, Any]]:
     """Return stamps (m,), anchor indices (m,), ranges (m,) and what is true of the radio."""
     model, count = settings.radio, len(anchors)
-    bias = model.bias_sd * _lasting(settings.building, 6, _rng(settings, 6)).standard_normal(count)
+    bias = _biases(settings, count)
     truth: dict[str, Any] = {
         "bias": dict(zip(plan.anchor_ids, bias.tolist(), strict=False)),
         "scale": model.scale,
@@ -296,14 +326,36 @@ def _range(
     if "uwb" in settings.without or count == 0:
         return np.empty(0), np.empty(0, dtype=np.int64), np.empty(0), truth
     times = np.round(np.arange(0.213, motion.stamps[-1], 1.0 / settings.uwb_rate), 6)
-    pose = motion.at(times)
+    measured = ranged(settings, plan, anchors, times, motion.at(times), crowd, lambda part: _rng(settings, part))
+    rng = _rng(settings, 8)
+    epoch, anchor = picked(*measured[1:], model.per_epoch, rng)
+    stamps, values = times[epoch], np.maximum(measured[0][epoch, anchor], 0.0)
+    values = _spoil(settings, stamps, anchor, values, rng, max(plan.size))
+    return stamps + settings.uwb_delay, anchor, np.round(values, 3), truth
+
+
+def ranged(
+    settings: Settings,
+    plan: FloorPlan,
+    anchors: Floats,
+    times: Floats,
+    pose: Floats,
+    crowd: list[drive.Motion],
+    draw: Callable[[int], np.random.Generator],
+) -> tuple[Floats, Floats, Floats]:
+    """Return what a tag would measure (n, a), m, at poses (n, 3) of the base, whether it is received, and at what effort.
+
+    `draw` returns the generator of a part of the noise; what stays with building and robot comes from the settings.
+    """
+    model, count = settings.radio, len(anchors)
+    bias = _biases(settings, count)
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     tag = pose[:, :2] + np.stack([c * settings.tag[0] - s * settings.tag[1], s * settings.tag[0] + c * settings.tag[1]], axis=1)
     bodies = _bodies(crowd, times, pose)
     ranges, received, effort = (np.empty((len(times), count)) for _ in range(3))
     pattern = _lasting(settings.robot, 7, _rng(settings, 7)).integers(2**31)
     for a, place in enumerate(anchors):
-        rng = _rng(settings, 200 + a)
+        rng = draw(200 + a)
         there = _lasting(settings.building, 200 + a, rng)
         ray = place - tag
         distance = np.sqrt((ray * ray).sum(axis=1) + (settings.anchor_height - settings.tag_height) ** 2)
@@ -321,20 +373,29 @@ def _range(
         if (rooms := settings.rooms) is not None:
             hidden = radio.crossings(tag, place, np.empty((0, 4)), bodies) > 0
             behind = np.angle(np.exp(1j * (bearing - pose[:, 2] - np.pi)))
-            body, unheard = real_rooms.own_body(rooms, behind, _rng(settings, 300 + a))
+            body, unheard = real_rooms.own_body(rooms, behind, draw(300 + a))
             smooth = bias[a] + real_rooms.range_errors(rooms, there, tag) + rooms.antenna_sd * antenna + body
-            smooth += real_rooms.person_errors(rooms, hidden, _rng(settings, 400 + a))
-            noise = noise + real_rooms.gross_errors(rooms, len(times), _rng(settings, 500 + a))
+            smooth += real_rooms.person_errors(rooms, hidden, draw(400 + a))
+            noise = noise + real_rooms.gross_errors(rooms, len(times), draw(500 + a))
             lost = lost | unheard
         ranges[:, a] = model.scale * distance + smooth + extra + noise
         received[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < min(model.max_range, plan.radio_range))
         effort[:, a] = distance + 6.0 * shadow
-    rng = _rng(settings, 8)
+    return ranges, received, effort
+
+
+def picked(
+    received: Floats, effort: Floats, most: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return epoch (m,) and anchor (m,) of the ranges that a tag reports: the easiest of each epoch, so many at most."""
     rank = np.argsort(np.argsort(effort + rng.uniform(0, 3, effort.shape), axis=1), axis=1)
-    epoch, anchor = np.nonzero((received > 0) & (rank < model.per_epoch))
-    stamps, values = times[epoch], np.maximum(ranges[epoch, anchor], 0.0)
-    values = _spoil(settings, stamps, anchor, values, rng, max(plan.size))
-    return stamps + settings.uwb_delay, anchor, np.round(values, 3), truth
+    epoch, anchor = np.nonzero((received > 0) & (rank < most))
+    return epoch, anchor
+
+
+def _biases(settings: Settings, count: int) -> Floats:
+    """Return the constant errors (a,) of the anchors, m."""
+    return settings.radio.bias_sd * _lasting(settings.building, 6, _rng(settings, 6)).standard_normal(count)
 
 
 def _spoil(

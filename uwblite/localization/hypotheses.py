@@ -93,6 +93,15 @@ def joined(one: Hypotheses, other: Hypotheses) -> Hypotheses:
     return Hypotheses(*(np.concatenate([getattr(one, n), getattr(other, n)]) for n in ("mean", "covariance", "log_weight")))
 
 
+def placed(bank: Hypotheses, which: int, pose: Floats, covariance: Floats) -> Hypotheses:
+    """Return the hypotheses with another pose (3,) and covariance (3, 3) of one of them, which then say nothing of the rest."""
+    mean, whole = bank.mean.copy(), bank.covariance.copy()
+    mean[which, POSE] = pose
+    whole[which, POSE, :] = whole[which, :, POSE] = 0.0
+    whole[which, POSE, POSE] = covariance
+    return Hypotheses(mean, whole, bank.log_weight)
+
+
 def moved(bank: Hypotheses, step: Floats, slack: float = 0.0) -> Hypotheses:
     """Drive every hypothesis by one step of the odometry.
 

@@ -93,8 +93,13 @@ _CONFIRM, _CONFIRM_ALONE = 0.5, 2.0
 _FIT_BESIDE_RANGES, _FIT_ALONE = -0.7, -0.25
 """Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.15, with people
 close by -0.5; rooms that are alike in part reach -0.3."""
-_FORGETTING, _FORGETTING_RANGES = 0.1, 0.15
+_FORGETTING, _FORGETTING_RANGES = 0.1, 0.2
 """Share of a new scan, and of a new range, in the mean of the last ones: a second of scans, two rounds of four ranges."""
+_SEEN = 0.5
+"""Share of the last scans that must have met known space for their fit to speak for a pose that ranges contradict."""
+_SOUND_WEIGHT = 0.5
+"""Weight from which a range speaks for the pose; what was measured since the last one, or the last scan that fits, begins the
+search of a robot that is lost."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 1.0
 """m driven and s between two searches."""
 _MOST = 40
@@ -157,7 +162,8 @@ class Localizer:
         self._search_stamp = -np.inf
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
-        self._fit, self._ranges_fit = 0.0, 1.0
+        self._fit, self._seen, self._ranges_fit = 0.0, 0.0, 1.0
+        self._sound = -np.inf
         self._trust = np.full((len(known.anchors.ids), 2), (1.0, 0.0))
         self._reason = "nothing has been measured yet"
         self.strangers: dict[str, int] = {}
@@ -281,7 +287,7 @@ class Localizer:
         )  # fmt: skip
         then = self._odometer.at(np.array([stamp]))[0]
         place = tags[min(max(entry.tag, 0), len(tags) - 1), :2]
-        self._window.add_range(WindowRange(fact, then, place, self._way))
+        self._window.add_range(WindowRange(fact, then, place, self._way, stamp))
         if not len(self._bank):
             return
         arm = se2.transform(se2.between(self._odometer.pose, then), place)
@@ -290,11 +296,13 @@ class Localizer:
         best = float(weight[int(np.argmax(bank.log_weight))])
         self._trust[anchor] += (_FORGETTING * (best - self._trust[anchor, 0]), 1.0)
         self._ranges_fit += _FORGETTING_RANGES * (best - self._ranges_fit)
+        if best > _SOUND_WEIGHT:
+            self._sound = max(self._sound, stamp)
 
     def _use_scan(self, entry: _WaitingScan) -> None:
         rays = self._rays(entry.stamp, entry.readings, entry.scanner)
         if self._window.wants_look(self._way) and len(rays.hit):
-            self._window.add_look(WindowLook(_every(rays, RAYS), self._odometer.pose.copy(), self._way))
+            self._window.add_look(WindowLook(_every(rays, RAYS), self._odometer.pose.copy(), self._way, self._odometer.stamp))
             self._window.forget(self._way)
         walls = self.known.walls
         if not len(self._bank) or walls is None or not len(rays.hit):
@@ -308,8 +316,12 @@ class Localizer:
         if len(self._bank) > 1:
             self._bank = hypotheses.weighed(self._bank, _SCAN_EVIDENCE * min(driven, 1.0) * found.log_likelihood)
         best = int(np.argmax(self._bank.log_weight))
-        if found.known[best] >= _FEW_ENDS:
+        informative = bool(found.known[best] >= _FEW_ENDS)
+        self._seen += _FORGETTING * (informative - self._seen)
+        if informative:
             self._fit += _FORGETTING * (float(found.log_likelihood[best]) - self._fit)
+            if found.log_likelihood[best] > _FIT_SOUND:
+                self._sound = max(self._sound, self._odometer.stamp)
 
     def _rays(self, stamp: float, readings: Floats, scanner: Scanner) -> Rays:
         """Return thinned rays in the present frame of the base, each moved by the odometry at its own time."""
@@ -335,7 +347,7 @@ class Localizer:
         if self._certain:
             if self._sees() and self._fit < _FIT_LOST:
                 self._lose("the scans do not fit the walls any more")
-            elif self._ranges_fit < _RANGES_LOST and not (self._sees() and self._fit > _FIT_SOUND):
+            elif self._ranges_fit < _RANGES_LOST and not (self._seen > _SEEN and self._fit > _FIT_SOUND):
                 self._lose("the ranges do not fit the anchors any more")
             else:
                 return
@@ -347,7 +359,7 @@ class Localizer:
 
     def _lose(self, why: str) -> None:
         self._certain, self._confirmed, self._reason = False, None, why
-        self._window.clear()
+        self._window.begin(self._sound)
         self._trust[:] = (1.0, 0.0)
         self._search_way, self._search_stamp = self._way, self._odometer.stamp
 
@@ -370,6 +382,8 @@ class Localizer:
             fit, known = agreement.log_likelihood, agreement.known
         self._bank = hypotheses.weighed(Hypotheses(self._bank.mean, self._bank.covariance, np.zeros(len(weight))), weight)
         best = int(np.argmax(self._bank.log_weight))
+        if known[best] < _FEW_ENDS and len(ranges):
+            self._bank = hypotheses.placed(self._bank, best, *search.range_moments(self._bank.poses[best], ranges))
         pose = self._bank.poses[best].copy()
         fitting = _agreeing(pose, ranges)
         self._reason = self._doubt(best, found.complete, float(fit[best]), float(known[best]), fitting)
@@ -424,7 +438,7 @@ class Localizer:
             if same and self._way - way >= confirm:
                 self._certain = True
                 self._bank = hypotheses.pruned(self._bank, 1, -1.0)
-                self._fit, self._ranges_fit = 0.0, 1.0
+                self._fit, self._seen, self._ranges_fit = 0.0, 1.0 if self._sees() else 0.0, 1.0
                 self._trust[:] = (1.0, 0.0)
                 return
             if same:

@@ -288,6 +288,29 @@ def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:
     return poses
 
 
+def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return the mean (3,) and covariance (3, 3) of the pose by the ranges alone, about a pose (3,) where they agree best.
+
+    Detours leave the likelihood flat where its curvature, with every range that is late left out, promises a sharp peak: the
+    moments are summed over a lattice of poses.
+    """
+    axes = [np.linspace(-reach, reach, 2 * count + 1) for reach, count in zip(_LATTICE, _LATTICE_STEPS, strict=True)]
+    off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    weight = range_likelihood(pose + off, ranges)
+    weight = np.exp(weight - weight.max())
+    weight /= weight.sum()
+    mean = weight @ off
+    steps = np.array([axis[1] - axis[0] for axis in axes])
+    off -= mean
+    # Each point of the lattice stands for a cell: the cell's own variance besides.
+    covariance = (off * weight[:, None]).T @ off + np.diag(steps**2 / 12.0)
+    return np.concatenate([pose[:2] + mean[:2], [se2.wrap_angle(pose[2] + mean[2])]]), covariance
+
+
+_LATTICE, _LATTICE_STEPS = (1.5, 1.5, 0.6), (8, 8, 4)
+"""m, m, rad about a pose, and steps to either side: several times what a start may be off by."""
+
+
 def range_factors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     """Return the quadratic form (h, 3, 3) and gradient (h, 3) of the whitened range errors at poses (h, 3)."""
     error, offset, lever = range_errors(poses, ranges)

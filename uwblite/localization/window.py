@@ -36,6 +36,8 @@ class WindowRange:
     """(2,) of the tag on the base, m."""
     way: float
     """Odometer at its time, m."""
+    stamp: float
+    """s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +49,8 @@ class WindowLook:
     """(3,) T_odom_base of the rays' frame."""
     way: float
     """Odometer at its time, m."""
+    stamp: float
+    """s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,10 +79,10 @@ class Window:
     ranges: list[WindowRange] = field(default_factory=list)
     looks: list[WindowLook] = field(default_factory=list)
 
-    def clear(self) -> None:
-        """Forget everything."""
-        self.ranges.clear()
-        self.looks.clear()
+    def begin(self, stamp: float) -> None:
+        """Forget what was measured up to a time, s."""
+        self.ranges = [r for r in self.ranges if r.stamp > stamp]
+        self.looks = [k for k in self.looks if k.stamp > stamp]
 
     def forget(self, way: float, length: float = LENGTH) -> None:
         """Forget what was measured more than a length ago, m, by the odometer."""
