@@ -1,5 +1,7 @@
 """Two tags and two lidars in one recording, kept apart."""
 
+import math
+
 import pytest
 from emulators.kobuki_device import KobukiDevice
 from emulators.spinning_device import LdLidarDevice, Lds01Device
@@ -12,7 +14,7 @@ from uwblite.drivers.devices import open_device
 from uwblite.io.carmen import read_log
 
 
-def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever(tmp_path):
+def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever(tmp_path, capsys):
     world, clock = RoomWorld(), WorldClock()
     devices = [
         ("odometry", open_device("odometry", "kobuki:x")[0], KobukiDevice(world.poses(), clock)),
@@ -23,7 +25,7 @@ def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever
     ]
     recorder = record(
         tmp_path / "run.log", devices, 5.0, laser=(0.1, 0.0, 0.0), more_lasers=((-0.2, 0.0, 3.141593),),
-        params=[("uwb2_tag_offset_x", "-0.3")], begin=clock.start,
+        params=[("uwb2_tag_offset_x", "-0.3"), ("laser2_flipped", "on")], begin=clock.start,
     )  # fmt: skip
     assert [link.name for link in recorder.links] == ["odometry", "lidar", "lidar2", "uwb", "uwb2"]
     assert all(link.counts.messages > 15 for link in recorder.links)
@@ -37,9 +39,23 @@ def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever
     assert log.scans.ranges.shape[1] == 450
     unused = log.notes.skipped["ROBOTLASER2"]
     assert unused > 15
-    assert f"{unused} scans of a further lidar (ROBOTLASER2)" in " ".join(log.notes.warnings)
+    (warning,) = (text for text in log.notes.warnings if "one lidar, here the first" in text)
+    assert f"scans of others are left out ({unused} of ROBOTLASER2); --scan-topic ROBOTLASER2" in warning
     assert set(log.ranges.tag.tolist()) == {0, 1}
     assert log.mounting.tags[1].tolist() == [-0.3, 0.0, 0.0]
+    assert not log.mounting.laser_flipped
+    other = read_log(tmp_path / "run.log", scan_message="ROBOTLASER2")
+    assert other.scans.ranges.shape == (unused, 360)
+    assert other.scans.range_min == 0.12
+    assert other.scans.time_increment == pytest.approx(float(stated["laser2_time_increment"]))
+    assert other.mounting.T_base_laser[:2].tolist() == [-0.2, 0.0]
+    assert abs(other.mounting.T_base_laser[2]) == pytest.approx(math.pi, abs=1e-5)
+    assert other.mounting.laser_flipped
+    assert "here ROBOTLASER2" in other.notes.warnings[0]
+    assert main(["check", str(tmp_path / "run.log"), "--scan-topic", "ROBOTLASER3"]) == 1
+    assert "no scans of ROBOTLASER3; it has ROBOTLASER1, ROBOTLASER2" in capsys.readouterr().err
+    assert main(["check", str(tmp_path / "run.log"), "--scan-topic", "/scan"]) == 1
+    assert "scans are not read from '/scan'" in capsys.readouterr().err
 
 
 def test_more_than_a_log_keeps_apart_is_refused(tmp_path, capsys):

@@ -39,14 +39,15 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
     ----------
     path : the file or folder; - is standard input.
     every_nth_scan : how many scans are left out.
-    bag : topics and mappings of a bag, as `options.bag_choices` returns them.
+    bag : topics and mappings of a bag, of a log the message of the scans, as `options.bag_choices` returns them.
 
     Raises
     ------
     ConfigError : topics or mappings are named for what is no bag.
     """
     kind = format_of(path)
-    if bag is not None and kind != "bag" and (bag[1] or bag[0] != type(bag[0])()):
+    scan_message = bag[0].scan if bag is not None and kind not in ("bag", "csv") else ""
+    if bag is not None and kind != "bag" and (bag[1] or bag[0] != type(bag[0])(scan=scan_message)):
         raise ConfigError(f"{path} is no ROS bag: --uwb-mapping and the topics are for bags")
     if kind == "csv":
         from ..io.csv_folder import read_csv_folder
@@ -58,7 +59,7 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
         return _with_every_nth(read_bag(path, *(bag or ())), every_nth_scan)
     from ..io.carmen import read_log
 
-    return read_log(path, every_nth_scan=every_nth_scan)
+    return read_log(path, every_nth_scan=every_nth_scan, scan_message=scan_message)
 
 
 def _with_every_nth(log: "SensorLog", n: int) -> "SensorLog":

@@ -70,7 +70,8 @@ def add_bag_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare which topics of a ROS bag are read; recordings of other kinds have none."""
     bag = parser.add_argument_group("ROS bags (topics are guessed by their types where these are not given)")
     bag.add_argument("--odometry-topic", metavar="TOPIC", default="", help="nav_msgs/Odometry of the wheels")
-    bag.add_argument("--scan-topic", metavar="TOPIC", default="", help="sensor_msgs/LaserScan")
+    scans = "sensor_msgs/LaserScan; of a .log its messages, e.g. ROBOTLASER2 for the second lidar"
+    bag.add_argument("--scan-topic", metavar="TOPIC", default="", help=scans)
     bag.add_argument("--imu-topic", metavar="TOPIC", default="", help="sensor_msgs/Imu for the heading; none = the odometry's")
     bag.add_argument("--uwb-topic", metavar="TOPIC", action="append", default=[], help="ranges; repeatable")
     bag.add_argument("--uwb-mapping", metavar="FILE.toml", help="where ranges stand in messages, see docs/formats.md")

@@ -76,7 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mounting = parser.add_argument_group("mounting, for the log")
     pose = "laser on the base: m, m, rad; once for each --lidar, in their order"
     mounting.add_argument("--laser-pose", metavar="X,Y,THETA", type=numbers(3), action="append", help=pose)
-    mounting.add_argument("--laser-flipped", action="store_true", help="the laser is mounted upside down")
+    flipped, which = "the laser is mounted upside down; K: the K-th lidar", number(1, MOST["lidar"], whole=True)
+    mounting.add_argument("--laser-flipped", metavar="K", nargs="?", const=1, type=which, action="append", help=flipped)
     tag = "UWB tag on the base, z above the floor: m; once for each --uwb, in their order"
     mounting.add_argument("--tag", metavar="X,Y,Z", type=numbers(3), action="append", help=tag)
     mounting.add_argument("--anchor-height", metavar="H", type=number(), help="height of the anchors above the floor, m")
@@ -205,8 +206,7 @@ def _mounting_params(args: argparse.Namespace, offset: float) -> list[tuple[str,
         params += [(name, f"{value:.6f}") for name, value in zip(names, position, strict=True)]
     if args.anchor_height is not None:
         params.append(("uwb_anchor_height", f"{args.anchor_height:.6f}"))
-    if args.laser_flipped:
-        params.append(("laser_flipped", "on"))
+    params += [(f"laser{k if k > 1 else ''}_flipped", "on") for k in args.laser_flipped or ()]
     return params
 
 

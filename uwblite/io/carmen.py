@@ -24,7 +24,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..errors import FormatError
+from ..errors import ConfigError, FormatError
 from ..sensor_log import Gyro, LogNotes, Odometry, SensorLog, UwbRanges, fault_of_id
 from .carmen_laser import LaserMessages
 from .carmen_messages import BrokenLine, is_message_name, numbers, stamp_of, time_order, why_broken
@@ -46,13 +46,16 @@ _UNUSED = frozenset(
     b"VECTORMOVE ROBOTVELOCITY FOLLOWTRAJECTORY BASEVELOCITY SCANMARK PANTILT VISION".split()
 )
 """Messages of CARMEN that carry nothing uwblite uses."""
+_LIDARS = tuple(f"ROBOTLASER{number}" for number in range(1, 6))
 _NAMES_COUNTED = 100
 """Distinct names of foreign messages counted one by one."""
 _HOPELESS = 20_000
 """Broken lines after which reading stops early when nearly all lines are broken."""
 
 
-def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broken_share: float = 0.05) -> SensorLog:
+def read_log(
+    path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broken_share: float = 0.05, scan_message: str = ""
+) -> SensorLog:
     """Read one CARMEN log, plain or gzip; ``-`` reads standard input.
 
     A log that was cut into parts by `uwblite record --rotate` is read whole, whichever of its parts is named.
@@ -63,6 +66,7 @@ def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broke
     path : the file.
     every_nth_scan : keep every n-th laser scan; the others are counted and never decoded.
     max_broken_share : share of the messages that may be broken (0..1); each is skipped and counted in the notes.
+    scan_message : the messages whose scans are read, for example ROBOTLASER2 of a second lidar; empty = the first lidar's.
 
     Returns
     -------
@@ -71,12 +75,13 @@ def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broke
     Raises
     ------
     FormatError : the file cannot be read, is no CARMEN log, has no odometry, or too many of its lines are broken.
+    ConfigError : there are no scans of the message that was asked for.
     """
     if every_nth_scan < 1:
         raise FormatError(f"every_nth_scan is {every_nth_scan}; it must be 1 or more")
     parts, missing = parts_of(os.fspath(path))
     digest = hashlib.sha256()
-    reader = LogReader("stdin" if parts[0] == "-" else ", ".join(parts), every_nth_scan, max_broken_share)
+    reader = LogReader("stdin" if parts[0] == "-" else ", ".join(parts), every_nth_scan, max_broken_share, scan_message)
     for part in parts:
         with open_source(part, digest) as source:
             for block in source.blocks():
@@ -88,10 +93,10 @@ def read_log(path: str | os.PathLike[str], *, every_nth_scan: int = 1, max_broke
 class LogReader:
     """Collects the messages of one log."""
 
-    def __init__(self, path: str, every_nth_scan: int, max_broken_share: float) -> None:
-        self.path, self.max_broken_share = path, max_broken_share
-        self.params = Params()
-        self.laser = LaserMessages(every_nth_scan)
+    def __init__(self, path: str, every_nth_scan: int, max_broken_share: float, scan_message: str = "") -> None:
+        self.path, self.max_broken_share, self.scan_message = path, max_broken_share, scan_message
+        self.params = Params(int(scan_message[-1]) if scan_message[-1:].isdigit() else 1)
+        self.laser = LaserMessages(every_nth_scan, scan_message)
         self.odometry = array("d")
         self.uwb = array("d")
         self.tags = 1
@@ -131,8 +136,8 @@ class LogReader:
                 handler = self.handlers.get(name)
                 if handler is not None:
                     handler(block[start:end].split())
-                elif self.laser.wants(name):
-                    self.laser.take(name, number, start, end, gap)
+                elif name in self.laser.kinds:
+                    self.laser.take(self.laser.kinds[name], number, start, end, gap)
                 elif not self._unused(name, block, start, end):
                     continue
             except (BrokenLine, ValueError) as error:
@@ -217,9 +222,15 @@ class LogReader:
         ranges = self._finish_ranges(warnings)
         scans, T_base_laser = self.laser.finish(self.params, self.skipped, warnings, self.set_back)
         gyro = self._finish_gyro(warnings)
-        for number in range(2, 6) if scans is not None else ():
-            if unused := self.skipped.get(f"ROBOTLASER{number}"):
-                warnings.append(f"{unused} scans of a further lidar (ROBOTLASER{number}) are left out: maps use ROBOTLASER1")
+        others = {name: self.skipped[name] for name in _LIDARS if name in self.skipped}
+        if self.scan_message and scans is None:
+            there = f"; it has {', '.join(others)}" if others else ""
+            raise ConfigError(f"the log has no scans of {self.scan_message}{there}")
+        if scans is not None and others:
+            counts = ", ".join(f"{count} of {name}" for name, count in others.items())
+            used = self.scan_message or "the first"
+            hint = f"--scan-topic {min(others)} would take those of another"
+            warnings.append(f"a map uses one lidar, here {used}; scans of others are left out ({counts}); {hint}")
         notes = LogNotes(
             source=self.path,
             sha256=sha256,

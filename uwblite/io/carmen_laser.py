@@ -1,6 +1,7 @@
 """The laser messages of a CARMEN log: found line by line, decoded in bulk."""
 
 import math
+import re
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats
+from ..errors import ConfigError
 from ..sensor_log import LaserScans
 from .carmen_messages import BrokenLine, numbers, stamp_of, time_order
 from .carmen_params import Params
@@ -56,10 +58,37 @@ class _Scans:
     pending: list[Pending] = field(default_factory=list)
 
 
-class LaserMessages:
-    """Collects the scans of one log; `begin` a block, `take` its lines, `decode` the block, `finish` the log."""
+def kinds_of(message: str) -> dict[bytes, bytes]:
+    """Return the messages that hold the scans of one lidar, each with the kind that it is read as.
 
-    def __init__(self, every_nth_scan: int) -> None:
+    Parameters
+    ----------
+    message : name of the only message to read, such as ROBOTLASER2 of the second lidar; empty = the first lidar's.
+
+    Raises
+    ------
+    ConfigError : scans are not read from such a message.
+    """
+    if not message:
+        return {name: name for name in _RANK}
+    kind = "FLASER" if message == "RLASER" else re.sub("(?<=LASER)[1-5]$", "1", message)
+    if kind.encode() not in _RANK:
+        raise ConfigError(f"scans are not read from {message!r}; choose ROBOTLASER1 to 5, RAWLASER1 to 5, FLASER or RLASER")
+    return {message.encode(): kind.encode()}
+
+
+class LaserMessages:
+    """Collects the scans of one log; `begin` a block, `take` its lines, `decode` the block, `finish` the log.
+
+    Parameters
+    ----------
+    every_nth_scan : how many are left out.
+    message : see `kinds_of`.
+    """
+
+    def __init__(self, every_nth_scan: int, message: str = "") -> None:
+        self.kinds = kinds_of(message)
+        """Names of the messages that are read -> what they are read as."""
         self.ipc_left_out = False
         """Whether the log leaves out ipc_timestamp; decides where a line alone does not."""
         self._every_nth = every_nth_scan
@@ -74,12 +103,8 @@ class LaserMessages:
         """Start a block of lines."""
         self._block = block
 
-    def wants(self, name: bytes) -> bool:
-        """Return whether a message is one of the laser messages read here."""
-        return name in _RANK
-
     def take(self, name: bytes, number: int, start: int, end: int, gap: int) -> None:
-        """Take line `number`, block[start:end], whose name ends at gaps[gap]."""
+        """Take line `number`, block[start:end], whose name ends at gaps[gap], as a message of kind `name`."""
         self._counts[name] += 1
         if name != self._kind:
             if self._kind and _RANK[name] < _RANK[self._kind]:

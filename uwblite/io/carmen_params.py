@@ -28,14 +28,23 @@ _NUMBERS = frozenset(
 )
 _TAG = ("tag_offset_x", "tag_offset_y", "tag_height")
 _FURTHER_TAG = re.compile(r"uwb[2-9]_tag_(offset_x|offset_y|height)")
+_OF_LASER = ("laser_time_increment", "laser_range_min", "laser_flipped")
+"""What is told of the first lidar; of the second it is laser2_time_increment and so on."""
 _FLIPPED = ("laser_flipped", "laser_front_laser_flipped", "laser_laser1_flipped", "robot_frontlaser_flipped")
 _TRUE = {b"1": True, b"on": True, b"true": True, b"yes": True, b"0": False, b"off": False, b"false": False, b"no": False}
 
 
 class Params:
-    """The PARAM lines seen so far; a later line wins."""
+    """The PARAM lines seen so far; a later line wins.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    laser : which of the robot's lidars is read, counted from 1.
+    """
+
+    def __init__(self, laser: int = 1) -> None:
+        self._names = {} if laser == 1 else dict.fromkeys(_OF_LASER, "")
+        self._names |= {name.replace("laser", f"laser{laser}", 1): name for name in _OF_LASER}
         self._numbers: dict[str, float] = {}
         self._flipped = False
 
@@ -44,6 +53,7 @@ class Params:
         if len(tokens) < 3:
             raise BrokenLine("PARAM needs a name and a value")
         name = tokens[1].decode()
+        name = self._names.get(name, name)
         if name in _FLIPPED:
             if tokens[2].lower() not in _TRUE:
                 raise BrokenLine(f"PARAM {name} must be on or off")
