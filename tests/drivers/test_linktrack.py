@@ -28,8 +28,11 @@ def test_transcript_in_every_split_and_among_noise(name):
 
 def test_bytes_that_a_user_shows():
     """A BU03 with two anchors in reach; the program beside these bytes reads 2.030 and 1.240 m."""
-    (event,) = feed_whole(Bu03Protocol, bytes.fromhex("aa2501 ee070000 d8040000" + "00000000" * 6))
-    assert [(r.anchor_id, r.range) for r in event.readings] == [("0", 2.03), ("1", 1.24)]
+    ranges = bytes.fromhex("aa2501 ee070000 d8040000" + "00000000" * 6)
+    for end in (b"\x5e\x55", ranges[:2]):  # firmware that ends a frame, and that begins the next one at once
+        (event,) = feed_whole(Bu03Protocol, ranges + end)
+        assert [(r.anchor_id, r.range) for r in event.readings] == [("0", 2.03), ("1", 1.24)]
+    assert not good(feed_whole(Bu03Protocol, ranges + b"\x5e\x00"))
 
 
 def test_negative_ranges_and_absent_anchors_are_none():

@@ -7,6 +7,7 @@ from operator import xor
 
 import pytest
 from helpers.driver_harness import feed_whole
+from helpers.lidar_bench import LaserScan, emulator, of_kind, run
 
 from uwblite.drivers.events import Corrupt
 from uwblite.drivers.rplidar import EXPRESS, EXPRESS_REPLY, HEALTH, STANDARD_REPLY, STOP, RpLidarProtocol, motor
@@ -86,3 +87,11 @@ def test_replies_report_which_stream_comes():
     for text, kind in (("a55a5400004082", EXPRESS_REPLY), ("a55a0500004081", STANDARD_REPLY)):
         (reply,) = feed_whole(RpLidarProtocol, bytes.fromhex(text))
         assert reply == Reply(1.0, kind, b"")
+
+
+def test_firmware_without_express_scan_is_read_in_standard_scan():
+    device, turns = emulator("rplidar")
+    device.COMMANDS = {code: reply for code, reply in device.COMMANDS.items() if code != 0x82}
+    actions, turns, reopens = run("rplidar", 4.0, device=(device, turns))
+    assert not reopens
+    assert len(of_kind(actions, LaserScan)) > 5

@@ -60,14 +60,12 @@ def range_errors(scans, world=None, every=1):
     world, errors, unknown, rays = world or RoomWorld(), [], 0, 0
     for scan in scans:
         count = len(scan.ranges)
-        for i in range(0, count, every):
-            rays += 1
-            if math.isnan(scan.ranges[i]):
-                unknown += 1
-                continue
-            time = scan.stamp + i * scan.time_increment - 1000.0
-            truths = world.look([time] * 3, [(i + side) / count for side in (-1, 0, 1)])
-            errors.append(min(abs(scan.ranges[i] - mm / 1000) for mm in truths))
+        looked = range(0, count, every)
+        known = [i for i in looked if not math.isnan(scan.ranges[i])]
+        rays, unknown = rays + len(looked), unknown + len(looked) - len(known)
+        times = [scan.stamp + i * scan.time_increment - 1000.0 for i in known]
+        beside = [world.look(times, [(i + side) / count for i in known]) for side in (-1, 0, 1)]
+        errors += [min(abs(scan.ranges[i] - mm / 1000) for mm in truths) for i, *truths in zip(known, *beside, strict=True)]
     return errors, unknown / max(rays, 1)
 
 

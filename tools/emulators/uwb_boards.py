@@ -76,16 +76,16 @@ def bu01(epoch: Epoch, number: int, ms: int) -> bytes:
 
 def dwm3001(epoch: Epoch, number: int, ms: int) -> bytes:
     """Write as the CLI firmware of the DWM3001CDK does; every tenth round one anchor does not answer."""
-    rows = [f'[mac_address=0x{a:04X}, status="SUCCESS", distance[cm]={round(mm / 10)}]' for a, mm, _ in epoch.readings]
+    angles = '"LPDoA_deg":0.00,"LAoA_deg":0.00,"LFoM":0,"RAoA_deg":0.00,"CFO_100ppm":622'
+    rows = [f'{{"Addr":"0x{a:04X}","Status":"Ok","D_cm":{round(mm / 10)},{angles}}}' for a, mm, _ in epoch.readings]
     if number % 10 == 0 and rows:
-        rows[0] = rows[0].partition(", status")[0] + ', status="RX_TIMEOUT"]'
-    head = f"SESSION_INFO_NTF: {{session_handle=1, sequence_number={number}, block_index={number}, n_measurements={len(rows)}"
-    return (head + "\r\n " + ";\r\n ".join(rows) + "}\r\n").encode()
+        rows[0] = rows[0].partition("Ok")[0] + 'Err"}'
+    return f'{{"Block":{number}, "results":[{",".join(rows)}]}}\r\n'.encode()
 
 
 def bu03(epoch: Epoch, number: int, ms: int) -> bytes:
     """Write as a BU03 does."""
-    return b"\xaa\x25\x01" + struct.pack("<8I", *slots(epoch))
+    return b"\xaa\x25\x01" + struct.pack("<8I", *slots(epoch)) + b"\x00\x55"
 
 
 def linktrack(epoch: Epoch, number: int, ms: int) -> bytes:

@@ -166,11 +166,11 @@ class RoomWorld:
 
     def look(self, times: list[float], bearings: list[float]) -> list[int]:
         """Return what a laser on the base sees at world times `times`, mm, at bearings in turns clockwise."""
-        seen = []
+        seen, rate = [], self.SPEED / self.RADIUS
         for time, bearing in zip(times, bearings, strict=True):
-            pose = self.pose(time)
-            angle = pose.theta - 2 * math.pi * bearing
-            seen.append(round(1000 * self._distance(pose.x, pose.y, math.cos(angle), math.sin(angle))))
+            theta = max(0.0, time) * rate
+            x, y, angle = self.RADIUS * math.sin(theta), -self.RADIUS * math.cos(theta), theta - 2 * math.pi * bearing
+            seen.append(round(1000 * self._distance(x, y, math.cos(angle), math.sin(angle))))
         return seen
 
     def _distance(self, x: float, y: float, cos: float, sin: float) -> float:

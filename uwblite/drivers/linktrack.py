@@ -4,8 +4,9 @@ LinkTrack, 921600 bit/s by default, 128 bytes, little-endian: ``55 01``, id, rol
 signed, mm, 0 = none) at byte 22, ..., local time (4, ms) at byte 108, ..., sum of all bytes before. Other frames begin
 ``55 xx``. Source: the maker's nlink_unpack, as many programs carry it.
 
-BU03, 115200 bit/s, 35 bytes and perhaps more: ``AA 25 01``, eight ranges (32-bit, mm, 0 = none). It has no sum: a frame is
-accepted when no range is beyond 65 m, which is 16 bits that must be zero. Source: bytes shown by users.
+BU03, 115200 bit/s, 37 bytes: ``AA 25 01``, eight ranges (32-bit, mm, 0 = none), a byte, ``55``; some end after the ranges.
+No sum is known: a frame is accepted when no range is beyond 65 m, which is 16 bits of each that must be zero, and its end
+or the next head follows. Sources: bytes shown by users, users' programs.
 """
 
 import struct
@@ -20,7 +21,7 @@ from .session import Driver
 ANCHORS = 8
 LINKTRACK_BAUD, LINKTRACK_SIZE = 921600, 128
 LINKTRACK_HEAD = b"\x55\x01"
-BU03_BAUD, BU03_SIZE, BU03_HEAD = 115200, 35, b"\xaa\x25\x01"
+BU03_BAUD, BU03_SIZE, BU03_SHORT, BU03_HEAD, BU03_END = 115200, 37, 35, b"\xaa\x25\x01", 0x55
 MUCH = 50
 """Frames in a row without a range after which it is reported."""
 
@@ -62,16 +63,20 @@ class LinkTrackProtocol(PacketReader):
 class Bu03Protocol(PacketReader):
     """Bytes of the tag in, TagFrame and Corrupt out."""
 
-    noise, smallest = "no range frame", BU03_SIZE
+    noise, smallest = "no range frame", BU03_SHORT
 
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[at] != BU03_HEAD[0]:
             return to_next(buffer, at, BU03_HEAD[0])
         frame = bytes(buffer[at : at + BU03_SIZE])
-        if frame[:3] != BU03_HEAD[: len(frame)] or any(any(frame[i : i + 2]) for i in range(5, len(frame), 4)):
+        if frame[:3] != BU03_HEAD[: len(frame)] or any(any(frame[i : i + 2]) for i in range(5, min(len(frame), BU03_SHORT), 4)):
             return -1
-        return BU03_SIZE if len(frame) == BU03_SIZE else 0
+        if frame[BU03_SHORT:] == BU03_HEAD[:2]:
+            return BU03_SHORT
+        if len(frame) < BU03_SIZE:
+            return 0
+        return BU03_SIZE if frame[-1] == BU03_END else -1
 
     def decode(self, frame: bytes, stamp: float) -> TagFrame:
         """Decode a frame."""

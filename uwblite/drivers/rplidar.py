@@ -184,7 +184,7 @@ class RpLidarDriver(SlamtecDriver):
 
     Parameters
     ----------
-    express : 4000 readings a second and more; otherwise standard scan, which firmware before 1.17 has alone.
+    express : 4000 readings a second and more, where the firmware has it (from 1.17); otherwise standard scan.
     baud : bit/s to try first.
     """
 
@@ -207,8 +207,9 @@ class RpLidarDriver(SlamtecDriver):
     def _stream(self) -> Script[bool]:
         yield from self.ask(PERIODS, answers(PERIODS_REPLY), 0.2)
         yield Send(motor(USUAL_SPEED))
-        request, kind = (EXPRESS, EXPRESS_REPLY) if self._express else (STANDARD, STANDARD_REPLY)
-        return (yield from self.ask(request, answers(kind), 0.5, 2)) is not None
+        if self._express and (yield from self.ask(EXPRESS, answers(EXPRESS_REPLY), 0.5, 2)) is not None:
+            return True
+        return (yield from self.ask(STANDARD, answers(STANDARD_REPLY), 0.5, 2)) is not None
 
     def stop(self) -> list[Action]:
         """Stop stream and motor."""

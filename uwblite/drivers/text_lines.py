@@ -65,7 +65,7 @@ class LineProtocol:
     most : bytes of a line.
     """
 
-    def __init__(self, parse: Callable[[str], Any], most: int = 1024) -> None:
+    def __init__(self, parse: Callable[[str], Any], most: int = 4096) -> None:
         self._parse, self._most = parse, most
         self.reset()
 

@@ -61,7 +61,7 @@ def _each(pattern: str, unit: float) -> Parse:
 
 _NUMBERS = r"((?:-?\d+)?(?:,(?:-?\d+)?)*)"
 _AT_RANGE = re.compile(
-    rf"AT\+RANGE=tid:(\d+),mask:[0-9A-Fa-f]+,seq:\d+,range:\({_NUMBERS}\)(?:.*?ancid:\({_NUMBERS}\))?"
+    rf"AT\+RANGE=tid:(\d+),\s*mask:[0-9A-Fa-f]+,\s*seq:\s*\d+,\s*range:\s*\({_NUMBERS}\)(?:.*?ancid:\s*\({_NUMBERS}\))?"
 )
 
 
@@ -87,8 +87,12 @@ BOARDS: dict[str, Parse] = {
     "makerfabs-at": _at_range,
     # an0:1.23m
     "bu01": _each(r"\ban(?P<id>\d+):(?P<range>\d+\.\d+)m", 1.0),
+    # {"Block":27, "results":[{"Addr":"0x0001","Status":"Ok","D_cm":245,"CFO_100ppm":87},{"Addr":"0x0002","Status":"Err"}]}
     # [mac_address=0x0001, status="SUCCESS", distance[cm]=245];
-    "dwm3001": _each(r'mac_address=0x(?P<id>[0-9A-Fa-f]{4}),\s*status="SUCCESS",\s*distance\[cm\]=(?P<range>-?\d+)', 0.01),
+    "dwm3001": _each(
+        r'(?:"Addr"\s*:\s*"|mac_address=)0x(?P<id>[0-9A-Fa-f]{4})"?\s*,\s*"?[Ss]tatus"?\s*[:=]\s*"(?:Ok|SUCCESS)"\s*,'
+        r'\s*(?:"D_cm"\s*:|distance\[cm\]=)\s*(?P<range>-?\d+)', 0.01,
+    ),
 }  # fmt: skip
 
 
