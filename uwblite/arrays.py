@@ -1,4 +1,4 @@
-"""Names for arrays of one element type (shapes stand where an array is used), and robust spreads of their values."""
+"""Names for arrays of one element type (shapes stand where an array is used), robust spreads of values, runs of flags."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,12 @@ MAD_TO_SIGMA = 1.4826
 """Standard deviation / median absolute deviation of normal errors: the inverse of their 0.75 quantile."""
 _SIGMA_OF_MEDIAN = 1.2533
 """Standard deviation of a median of normal values / that of their mean: sqrt(pi / 2)."""
+
+
+def runs_of(flags: Bools) -> list[tuple[int, int]]:
+    """Return first and one past the last of each run of set flags (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int64)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def spread(errors: Floats) -> float:

@@ -130,6 +130,13 @@ def interpolate_trajectory(stamps: Floats, poses: Floats, query: ArrayLike) -> F
     return interpolate(poses[left], poses[left + 1], fraction)
 
 
+def chain(start: Floats, steps: Floats) -> Floats:
+    """Return the poses (n + 1, 3) of a chain of steps (n, 3), each in the frame of the pose before it, from a start (3,)."""
+    theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    xy = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(rotate(theta[:-1], steps[:, :2]), axis=0)])
+    return np.column_stack([xy, wrap_angle(theta)])
+
+
 def between_jacobians(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
     """Return the Jacobians (..., 3, 3) of between(a, b) by the coordinates of a and of b."""
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))

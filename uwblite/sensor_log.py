@@ -4,6 +4,7 @@ Every array is time-ordered. Times are seconds of one clock (the log's ipc_times
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,6 +22,11 @@ class Odometry:
     """(n,) s, non-decreasing."""
     poses: Floats
     """(n, 3) x, y, theta of T_odom_base; m, m, rad."""
+
+    @property
+    def travelled(self) -> Floats:
+        """(n,) m, distance since the first stamp."""
+        return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T))])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +96,10 @@ class LaserScans:
     def middles(self) -> Floats:
         """(k,) s, time of the ray in the middle of each scan."""
         return self.stamps + 0.5 * self.time_increment * self.ranges.shape[1]
+
+    def rows(self, which: slice | Ints | Bools) -> "LaserScans":
+        """Return some of the scans."""
+        return replace(self, stamps=self.stamps[which], ranges=self.ranges[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,6 +179,13 @@ class OdometryBreaks:
     def none() -> "OdometryBreaks":
         """Return no breaks."""
         return OdometryBreaks(np.zeros(0), np.zeros((0, 3)))
+
+    @staticmethod
+    def of_all(parts: "Sequence[OdometryBreaks]") -> "OdometryBreaks":
+        """Return the breaks of one or more parts, in the order of time."""
+        stamps, sigma = np.concatenate([b.stamps for b in parts]), np.concatenate([b.sigma for b in parts])
+        order = np.argsort(stamps, kind="stable")
+        return OdometryBreaks(stamps[order], sigma[order])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -286,7 +303,7 @@ class SensorLog:
             ranges = ranges.rows(cut)
         if scans is not None:
             cut = part(scans.stamps)
-            scans = replace(scans, stamps=scans.stamps[cut], ranges=scans.ranges[cut])
+            scans = scans.rows(cut)
         gyro = self.gyro
         if gyro is not None:
             cut = part(gyro.stamps)

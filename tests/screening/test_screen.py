@@ -8,8 +8,8 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.screening.odometry_chain import chained
 from uwblite.screening.screen import screen
+from uwblite.se2 import chain as chained
 from uwblite.sensor_log import LogNotes, Odometry, UwbRanges
 
 

@@ -24,8 +24,7 @@ def check_ranges(log: SensorLog, found: Findings) -> dict[str, Any]:
     positive = ranges.ranges[ranges.ranges > 0]
     if len(positive) > FEW and np.quantile(positive, 0.95) < 0.1:
         found.warning("radio", f"95 % of the ranges are below {np.quantile(positive, 0.95):.3f} m", "check the unit: metres")
-    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T))])
-    travelled = np.interp(ranges.stamps, log.odometry.stamps, path)
+    travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
     where = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, ranges.stamps)[:, :2]
     figures["anchors"] = {}
     for index, anchor_id in enumerate(ranges.anchor_ids):

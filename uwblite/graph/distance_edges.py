@@ -6,12 +6,12 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from .graph import Graph, Linearization
+from .graph import EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AnchorDistanceEdges:
+class AnchorDistanceEdges(EdgeTable):
     """Distance between two anchors: e = |a_i - a_j| - d."""
 
     i: Ints
@@ -45,7 +45,7 @@ class AnchorDistanceEdges:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PointDistanceEdges:
+class PointDistanceEdges(EdgeTable):
     """Distance between two points that are fixed to poses: e = |X_i p_i - X_j p_j| - d.
 
     The points are landmarks as the two poses saw them: between them the map has to have the measured length.

@@ -12,7 +12,7 @@ residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with 
 """
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -35,13 +35,18 @@ class Linearization:
     """An edge may name several unknowns of one block; each is an entry of its own."""
 
 
-def pick_rows(edges: Any, which: Ints) -> Any:
-    """Return some of the edges of a kind (rows of every array but those its SHARED names); kernel and kind stay."""
-    shared = getattr(edges, "SHARED", ())
-    own = {f.name: getattr(edges, f.name) for f in fields(edges)}
-    arrays = {n: v for n, v in own.items() if isinstance(v, np.ndarray) and len(v) and n not in shared}
-    per_edge = {n: v[which] for n, v in arrays.items()}
-    return replace(edges, **per_edge)
+class EdgeTable:
+    """A kind of edges: a dataclass of arrays with a row per edge."""
+
+    __slots__ = ()
+    SHARED: ClassVar[tuple[str, ...]] = ()
+    """Names of the arrays that all edges share."""
+
+    def rows(self, which: Ints | Bools) -> Self:
+        """Return some of the edges."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        arrays = {n: v for n, v in own.items() if isinstance(v, np.ndarray) and len(v) and n not in self.SHARED}
+        return replace(self, **{n: v[which] for n, v in arrays.items()})  # type: ignore[type-var]
 
 
 class Edges(Protocol):
@@ -56,6 +61,9 @@ class Edges(Protocol):
         """(e,) factors on each edge's cost (0 switches it off), None = all 1."""
 
     def __len__(self) -> int: ...
+
+    def rows(self, which: Ints | Bools) -> Self:
+        """Return some of the edges."""
 
     def residuals(self, graph: "Graph") -> Floats:
         """Return whitened residuals (e, d)."""
@@ -155,7 +163,7 @@ def whiten(sqrt_information: Floats, values: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PriorEdges:
+class PriorEdges(EdgeTable):
     """Direct knowledge of unknowns of one block: a surveyed anchor, a pinned pose, a plausible calibration."""
 
     block: str

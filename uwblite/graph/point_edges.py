@@ -6,12 +6,12 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from .graph import Graph, Linearization
+from .graph import EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LandmarkEdges:
+class LandmarkEdges(EdgeTable):
     """Position of a landmark, kept among the anchors, in the frame of a pose: e = X^-1 a - z."""
 
     pose: Ints

@@ -4,13 +4,13 @@ Residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with 
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from .graph import Block, Graph, Linearization, pick_rows, whiten
+from .graph import Block, EdgeTable, Graph, Linearization, whiten
 from .robust import SQUARED, Kernel
 
 # An edge between poses has the error e = Z^-1 (Xi^-1 Xj); with m = tj - ti - R(theta_i) z its plane part is
@@ -47,7 +47,7 @@ def _by_pose(*columns: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RelativePoseEdges:
+class RelativePoseEdges(EdgeTable):
     """Pose j as seen from pose i: loop closures, scan matches, and edges read from files."""
 
     i: Ints
@@ -61,14 +61,8 @@ class RelativePoseEdges:
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
-    SHARED: ClassVar[tuple[str, ...]] = ()
-
     def __len__(self) -> int:
         return len(self.i)
-
-    def rows(self, which: Ints) -> "RelativePoseEdges":
-        """Return the edges with these indices."""
-        return cast(RelativePoseEdges, pick_rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
@@ -84,7 +78,7 @@ class RelativePoseEdges:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OdometryEdges:
+class OdometryEdges(EdgeTable):
     """Motion from pose i to pose j by odometry, corrected by its calibration.
 
     With distance scale 1 + s and heading error delta = k dtheta + b length + g duration, the measured motion
@@ -108,8 +102,6 @@ class OdometryEdges:
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
-    SHARED: ClassVar[tuple[str, ...]] = ()
-
     def __len__(self) -> int:
         return len(self.i)
 
@@ -129,10 +121,6 @@ class OdometryEdges:
         direction = se2.rotate(delta / 2.0, self.motion[:, :2])
         z = np.concatenate([direction * (1.0 + s)[:, None], (self.motion[:, 2] + delta)[:, None]], axis=1)
         return z, direction, s
-
-    def rows(self, which: Ints) -> "OdometryEdges":
-        """Return the edges with these indices."""
-        return cast(OdometryEdges, pick_rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
@@ -169,7 +157,7 @@ _LEAST_SCALE = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanEdges:
+class ScanEdges(EdgeTable):
     """Pose of cloud j in cloud i by scan matching, with the lidar's mounting and clock as unknowns.
 
     Clouds stand in the base frame through the nominal mounting and the clock they were made with. The true frame of cloud

@@ -1,13 +1,13 @@
 """Edges between a pose and an anchor: UWB ranges."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from .graph import Block, Graph, Linearization, pick_rows
+from .graph import Block, EdgeTable, Graph, Linearization
 from .robust import SQUARED, Kernel
 
 _LEAST_SQUARE = 1e-4
@@ -15,7 +15,7 @@ _LEAST_SQUARE = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RangeEdges:
+class RangeEdges(EdgeTable):
     """Distance between the tag, carried by a pose, and an anchor (paper: UWB distance edges).
 
     The tag stands at ``u = lever_arm + R(turn) tag + velocity delay`` in the frame of the pose; with the planar
@@ -84,10 +84,6 @@ class RangeEdges:
         """Return the expected slant distances (e,), m, before scale and bias."""
         _, _, reach, cal = self._geometry(graph)
         return _slant(reach, cal)
-
-    def rows(self, which: Ints) -> "RangeEdges":
-        """Return the edges with these indices."""
-        return cast(RangeEdges, pick_rows(self, which))
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 1), expected minus measured."""

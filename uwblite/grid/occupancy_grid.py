@@ -269,7 +269,7 @@ class _Task:
         tasks = []
         for part in np.array_split(np.arange(len(self.chosen)), parts):
             own = self.chosen[part]
-            scans = replace(self.scans, stamps=self.scans.stamps[own], ranges=self.scans.ranges[own])
+            scans = self.scans.rows(own)
             last = None if self.last is None else self.last[part]
             tasks.append(_Task(scans, np.arange(len(own)), self.first[part], last, self.flipped, self.config))
         return [task for task in tasks if len(task.chosen)]

@@ -56,7 +56,7 @@ def _scans(result: StoredResult, recording: int, log: SensorLog) -> Iterator[tup
     chosen = _nearest(log.scans.stamps, stamps)
     near = np.abs(log.scans.stamps[chosen] - stamps) <= _SAME_TIME
     keyframes, chosen = keyframes[near], chosen[near]
-    seen = replace(log.scans, stamps=log.scans.stamps[chosen], ranges=log.scans.ranges[chosen])
+    seen = log.scans.rows(chosen)
     yield from zip(keyframes.tolist(), scan_lines(replace(log, scans=seen)), strict=True)
 
 

@@ -218,16 +218,8 @@ def refine(
             on_round(rounds, config.rounds)
         last = gate <= config.last_gate * 1.001
         if rounds >= config.rounds or (last and moved < config.convergence):
-            return RefinementResult(graph, _only(edges, used), i, j, factors, used, sigma, rounds, summary)
+            return RefinementResult(graph, replace(edges.rows(used), weights=None), i, j, factors, used, sigma, rounds, summary)
         gate = max(gate * config.shrink, config.last_gate)
-
-
-def _only(edges: ScanEdges, used: Bools) -> ScanEdges:
-    """Return the edges that counted."""
-    return replace(
-        edges, i=edges.i[used], j=edges.j[used], T_i_j=edges.T_i_j[used], sqrt_information=edges.sqrt_information[used],
-        twist_i=edges.twist_i[used], twist_j=edges.twist_j[used], weights=None,
-    )
 
 
 def with_fewer_pairs(graph: Graph, most: int = 12000) -> Graph:
@@ -271,4 +263,4 @@ def _every_nth(edges: ScanEdges, most: int) -> ScanEdges:
     weights[kept] *= len(far) / max(len(kept), 1)
     chosen = np.zeros(len(edges), dtype=bool)
     chosen[steps] = chosen[kept] = True
-    return replace(_only(edges, chosen), weights=weights[chosen])
+    return replace(edges, weights=weights).rows(chosen)

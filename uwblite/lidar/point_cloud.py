@@ -16,9 +16,7 @@ def make_tree(points: Floats) -> cKDTree:
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
-def statistical_outlier_filter(
-    points: Floats, neighbours: int, std_ratio: float, tree: cKDTree | None = None
-) -> Bools:
+def statistical_outlier_filter(points: Floats, neighbours: int, std_ratio: float) -> Bools:
     """Return which points are not unusually far from their nearest neighbours.
 
     A point stays if its mean distance to its nearest neighbours is at most mean + std_ratio * standard deviation of
@@ -29,7 +27,6 @@ def statistical_outlier_filter(
     points : (n, 2), m.
     neighbours : how many nearest neighbours; a smaller cloud uses all it has.
     std_ratio : in standard deviations.
-    tree : kd-tree of the points, where there is one.
 
     Returns
     -------
@@ -38,30 +35,16 @@ def statistical_outlier_filter(
     k = min(neighbours, len(points) - 1)
     if k < 1:
         return np.ones(len(points), bool)
-    tree = make_tree(points) if tree is None else tree
-    mean = tree.query(points, k=list(range(2, k + 2)))[0].mean(axis=1)
+    mean = make_tree(points).query(points, k=list(range(2, k + 2)))[0].mean(axis=1)
     return np.asarray(mean <= mean.mean() + std_ratio * mean.std())
 
 
-def radius_outlier_filter(points: Floats, radius: float, min_neighbours: int, tree: cKDTree | None = None) -> Bools:
-    """Return which points have at least min_neighbours other points within the radius (m, inclusive).
-
-    Parameters
-    ----------
-    points : (n, 2), m.
-    radius : m.
-    min_neighbours : how many others a point needs to stay.
-    tree : kd-tree of the points, where there is one.
-
-    Returns
-    -------
-    (n,) True where the point stays.
-    """
+def radius_outlier_filter(points: Floats, radius: float, min_neighbours: int) -> Bools:
+    """Return which points (n, 2), m, have at least min_neighbours others within the radius, m, inclusive."""
     if min_neighbours < 1 or len(points) == 0:
         return np.ones(len(points), bool)
-    tree = make_tree(points) if tree is None else tree
     bound = np.nextafter(radius, np.inf)
-    farthest = tree.query(points, k=[min_neighbours + 1], distance_upper_bound=bound)[0]
+    farthest = make_tree(points).query(points, k=[min_neighbours + 1], distance_upper_bound=bound)[0]
     return np.asarray(farthest[:, 0] <= radius)
 
 

@@ -43,11 +43,6 @@ def nearest_by_bearing(clouds: Clouds) -> Floats:
     return nearest
 
 
-def free_from(poses: Floats, nearest: Floats) -> FreeSpace:
-    step = 2.0 * np.pi / _BEARINGS
-    return free_space(poses, nearest, -np.pi + 0.5 * step, step, blur=1)
-
-
 def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list[FreeSpace]:
     """Return what each sub-map saw to be free, from some of its keyframes.
 
@@ -59,7 +54,7 @@ def observed_free_space(clouds: Clouds, submaps: Submaps, poses: Floats) -> list
     free = []
     for first, last, reference in zip(submaps.first, submaps.last, submaps.reference, strict=True):
         views = np.unique(np.linspace(first, last - 1, _VIEWS).round().astype(np.int64))
-        free.append(free_from(se2.between(poses[reference], poses[views]), nearest[views]))
+        free.append(free_space(se2.between(poses[reference], poses[views]), nearest[views]))
     return free
 
 
@@ -81,7 +76,7 @@ def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, 
 
     Parameters
     ----------
-    free_a, free_b : see seen_free. points_a (n, 2), points_b (m, 2), m : each in its own frame.
+    free_a, free_b : see observed_free_space. points_a (n, 2), points_b (m, 2), m : each in its own frame.
     T_a_b : (3,) pose of b in a.
     """
     one, _ = contradiction(free_a, se2.transform(T_a_b, points_b), _MARGIN)
@@ -94,7 +89,7 @@ def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, re
 
     Parameters
     ----------
-    free : see seen_free. poses : (k, 3) T_map_base of the keyframes. recording : (k,) recording of each.
+    free : see observed_free_space. poses : (k, 3) T_map_base of the keyframes. recording : (k,) recording of each.
 
     Returns
     -------
@@ -127,7 +122,7 @@ def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording:
     through, seen, visits = 0.0, 0.0, 0
     for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
         points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
-        share, visible = contradiction(free_from(np.zeros((1, 3)), nearest[a : a + 1]), points, _MARGIN)
+        share, visible = contradiction(free_space(np.zeros((1, 3)), nearest[a : a + 1]), points, _MARGIN)
         if visible * len(points) >= _COMMON:
             through += share * visible * len(points)
             seen += visible * len(points)

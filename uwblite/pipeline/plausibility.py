@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, runs_of
 from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
@@ -166,9 +166,7 @@ def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]
     order = np.argsort(stamps, kind="stable")
     bins = np.array_split(order, min(40, len(order) // 20))
     bad = np.array([agrees[b].mean() < 0.4 for b in bins], dtype=bool)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int64)))
-    runs = edges.reshape(-1, 2)
-    return [(float(stamps[bins[a][0]]), float(stamps[bins[b - 1][-1]])) for a, b in runs if b - a >= 2]
+    return [(float(stamps[bins[a][0]]), float(stamps[bins[b - 1][-1]])) for a, b in runs_of(bad) if b - a >= 2]
 
 
 def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], task: Task) -> None:

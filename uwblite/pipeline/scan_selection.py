@@ -51,6 +51,6 @@ def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorL
     left_out = log.notes.scans_left_out + len(scans.stamps) - len(kept)
     return replace(
         log,
-        scans=replace(scans, stamps=scans.stamps[kept], ranges=scans.ranges[kept]),
+        scans=scans.rows(kept),
         notes=replace(log.notes, scans_left_out=left_out),
     )

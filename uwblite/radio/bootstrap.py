@@ -123,7 +123,7 @@ class _Bootstrap:
         self.graph, self.odometry, self.ranges, self.path = graph, odometry, ranges, path
         self.config, self.search = config, search
         self.live = np.ones(len(ranges), dtype=bool) if ranges.weights is None else ranges.weights > 0
-        self.poses = _dead_reckon(graph.poses[0], odometry.corrected(graph))
+        self.poses = se2.chain(graph.poses[0], odometry.corrected(graph))
         self.anchors, self.calibration = graph.anchors.copy(), graph.calibration
         self.placed = np.zeros(len(graph.anchors), dtype=bool)
         self.sigma = np.full(len(graph.anchors), config.range_sigma)
@@ -228,13 +228,13 @@ class _Bootstrap:
         if self.high < len(self.path):
             old, new = self.high, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
             self.high = max(min(new, len(self.path)), old + 1)
-            self.poses[old - 1 : self.high] = _dead_reckon(self.poses[old - 1], motion[old - 1 : self.high - 1])
+            self.poses[old - 1 : self.high] = se2.chain(self.poses[old - 1], motion[old - 1 : self.high - 1])
             held &= self._optimise_piece(old - 1, self.high, old - 1)
         if self.low > 0:
             old, new = self.low, int(np.searchsorted(self.path, self.path[self.low] - piece))
             self.low = min(new, old - 1)
             back = se2.inverse(motion[self.low : old])[::-1]
-            self.poses[self.low : old + 1] = _dead_reckon(self.poses[old], back)[::-1]
+            self.poses[self.low : old + 1] = se2.chain(self.poses[old], back)[::-1]
             held &= self._optimise_piece(self.low, old + 1, old)
         return held
 
@@ -276,14 +276,6 @@ class _Bootstrap:
         radio = self.ranges.rows(np.flatnonzero(which))
         radio = replace(radio, pose=radio.pose - low, sigma=self.sigma[radio.anchor])
         return Graph(self.poses[low:high], self.anchors, (), self.calibration).with_edges(wheels, radio)
-
-
-def _dead_reckon(start: Floats, motion: Floats) -> Floats:
-    """Chain motions (n-1, 3) from a start pose (3,) into poses (n, 3)."""
-    theta = start[2] + np.concatenate([[0.0], np.cumsum(motion[:, 2])])
-    steps = se2.rotate(theta[:-1], motion[:, :2])
-    xy = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    return np.concatenate([xy, se2.wrap_angle(theta)[:, None]], axis=1)
 
 
 def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:

@@ -22,7 +22,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import ConfigError
-from ..graph.graph import Edges, Graph, PriorEdges, pick_rows
+from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
 from ..graph.solver import Progress, SolverConfig, SolverSummary, check, optimize
@@ -108,7 +108,7 @@ def _by_time(edges: Edges, graph: Graph) -> _Kind:
     blocks = edges.linearize(graph).blocks
     latest = np.max([np.full(len(edges), -1), *(index for name, index, _ in blocks if name == "poses")], axis=0)
     order = np.argsort(latest, kind="stable")
-    return _Kind(pick_rows(edges, order), latest[order], tuple(i[order] for name, i, _ in blocks if name == "anchors"))
+    return _Kind(edges.rows(order), latest[order], tuple(i[order] for name, i, _ in blocks if name == "anchors"))
 
 
 class _Part(NamedTuple):
@@ -246,7 +246,7 @@ class _Incremental:
             for anchors in kind.anchors:
                 which = which[use[anchors[which]]]
             if len(which):
-                edges = pick_rows(kind.edges, which)
+                edges = kind.edges.rows(which)
                 yield replace(edges, kernel=kernel) if kernel is not None and isinstance(edges, RangeEdges) else edges
 
     def _search(self, now: int) -> None:

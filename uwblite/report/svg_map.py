@@ -7,6 +7,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..map_result import AnchorEstimate, LoopClosure, MapResult
+from .picture_frame import round_length
 from .printable import sigma_text
 
 MOST_POINTS = 4000
@@ -77,7 +78,7 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     parts += [_end_mark(result, recording, size) for recording in np.unique(result.recording).tolist()]
     parts.append("</g>")
     parts.append('<g class="anchors">' + "".join(_anchor_mark(a, size) for a in result.anchors) + "</g>")
-    bar = _scale_length(size)
+    bar = round_length(size / 5.0)
     svg = (
         f'<svg id="map-view" viewBox="{x:.3f} {y:.3f} {width:.3f} {height:.3f}" role="img" aria-label="map"'
         f' style="--s:{size / 900:.6f};aspect-ratio:{width:.3f}/{height:.3f}">{"".join(parts)}'
@@ -103,12 +104,6 @@ def _switch(name: str, text: str, on: bool) -> str:
     """Return the switch of a layer of the map, with the colour it has there."""
     state = " checked" if on else ""
     return f'<label><input type=checkbox{state} data-layer="{name}"> <i class="key key-{name}"></i> {escape(text)}</label>'
-
-
-def _scale_length(size: float) -> float:
-    """Return a round length of about a fifth of the size, m."""
-    power = 10.0 ** np.floor(np.log10(size / 5.0))
-    return float(max(k * power for k in (1.0, 2.0, 5.0) if k * power <= size / 5.0))
 
 
 def _anchor_mark(anchor: AnchorEstimate, size: float) -> str:

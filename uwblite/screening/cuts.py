@@ -11,7 +11,6 @@ from ..arrays import Floats, Ints
 from ..lidar.scan_odometry import scan_steps
 from ..sensor_log import SensorLog
 from . import range_motion
-from .wheel_motion import middle_stamps
 
 _NEIGHBOURS = 8
 """Scans on either side that say how much scans usually differ."""
@@ -41,7 +40,7 @@ def same_place(log: SensorLog, before: float, after: float) -> bool | None:
     """Return whether the last scan before a time and the first after another show one place; None where there are none."""
     if log.scans is None or len(log.scans.stamps) < 2:
         return None
-    middle = middle_stamps(log.scans)
+    middle = log.scans.middles
     first, second = int(np.searchsorted(middle, before, "right")) - 1, int(np.searchsorted(middle, after))
     if first < 0 or second >= len(middle) or middle[second] - after > 2.0 or before - middle[first] > 2.0:
         return None
@@ -68,7 +67,7 @@ def _by_lidar(log: SensorLog) -> Floats:
     low, high = np.maximum(jumps - 1, 0), np.minimum(jumps + 2, len(scans.stamps) - 1)
     apart = (share < _SAME_PLACE) & (share > 0.0)
     apart[apart] &= _shares(log, low[apart], high[apart]) < _SAME_PLACE
-    middle = middle_stamps(scans)
+    middle = scans.middles
     return 0.5 * (middle[jumps[apart]] + middle[jumps[apart] + 1])
 
 
@@ -86,6 +85,6 @@ def _shares(log: SensorLog, first: Ints, second: Ints) -> Floats:
     assert log.scans is not None
     if not len(first):
         return np.zeros(0)
-    middle, odometry = middle_stamps(log.scans), log.odometry
+    middle, odometry = log.scans.middles, log.odometry
     at = (se2.interpolate_trajectory(odometry.stamps, odometry.poses, middle[k]) for k in (first, second))
     return scan_steps(log.scans, log.mounting, first, second, se2.between(*at), searches=len(first))[1]

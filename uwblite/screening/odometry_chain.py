@@ -115,15 +115,8 @@ def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Remark]
         f"the odometry breaks at t = {where}{' ...' if len(at) > 5 else ''} s (by up to {largest:.2f} m): other "
         "sensors alone tie the two sides"
     )
-    joined = Odometry(odometry.stamps, chained(odometry.poses[0], steps))
+    joined = Odometry(odometry.stamps, se2.chain(odometry.poses[0], steps))
     return joined, OdometryBreaks(odometry.stamps[at], np.array(sigma)), [Remark("odometry-breaks", text)]
-
-
-def chained(start: Floats, steps: Floats) -> Floats:
-    """Return the poses (n + 1, 3) of a chain of steps (n, 3) from a start (3,)."""
-    theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
-    xy = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(se2.rotate(theta[:-1], steps[:, :2]), axis=0)])
-    return np.column_stack([xy, se2.wrap_angle(theta)])
 
 
 def without_repeats(odometry: Odometry) -> tuple[Odometry, int]:

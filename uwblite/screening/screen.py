@@ -59,12 +59,12 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     log, pairs, turned = _looking_ahead(log)
     log, pairs, lost, standing = _lost_wheels(log, pairs)
     remarks += [*more, *turned, *standing]
-    cut, more = _cuts(log, _sorted([gaps, lost]).stamps)
+    cut, more = _cuts(log, OdometryBreaks.of_all([gaps, lost]).stamps)
     if pairs is not None:
         more += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]))
     more += _hardly_moving(log.odometry)
     ratio = float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
-    return replace(log, screening=Screening((*remarks, *more), _sorted([jumps, gaps, lost, cut]), ratio))
+    return replace(log, screening=Screening((*remarks, *more), OdometryBreaks.of_all([jumps, gaps, lost, cut]), ratio))
 
 
 def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Remark]]:
@@ -103,12 +103,6 @@ def _clock_remarks(log: SensorLog) -> list[Remark]:
 def _repeats(count: int) -> list[Remark]:
     text = f"{count} odometry readings stand in the log twice and were left out once"
     return [Remark("repeated-odometry", text)] if count else []
-
-
-def _sorted(breaks: list[OdometryBreaks]) -> OdometryBreaks:
-    stamps, sigma = np.concatenate([b.stamps for b in breaks]), np.concatenate([b.sigma for b in breaks])
-    order = np.argsort(stamps, kind="stable")
-    return OdometryBreaks(stamps[order], sigma[order])
 
 
 def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
@@ -156,9 +150,10 @@ def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
         return log
     ranges, scans = log.ranges, log.scans
     if ranges is not None:
-        ranges = stuck_sensors.rows_of_ranges(ranges, kept(ranges.stamps))
+        left = kept(ranges.stamps)
+        ranges = ranges.rows(left) if left.any() else None
     if scans is not None:
-        scans = stuck_sensors.rows_of_scans(scans, kept(scans.stamps))
+        scans = scans.rows(kept(scans.stamps))
     return replace(log, ranges=ranges, scans=scans)
 
 

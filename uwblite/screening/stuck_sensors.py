@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Bools, Floats
-from ..sensor_log import LaserScans, Remark, SensorLog, UwbRanges
+from ..arrays import Bools, Floats, runs_of
+from ..sensor_log import Remark, SensorLog
 
 _SAME_RANGES = 12
 """Equal ranges in a row that no radio gives while the robot moves: their noise is centimetres, their resolution millimetres."""
@@ -72,14 +72,13 @@ def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     wrong = twice | stuck
     if not wrong.any():
         return log, []
-    kept = replace(scans, stamps=scans.stamps[~wrong], ranges=scans.ranges[~wrong])
     remarks = []
     if stuck.any():
         start = float(log.odometry.stamps[0])
         when = _when(scans.stamps, stuck, start)
         share = f"{int(stuck.sum())} of {len(stuck)} scans repeat the one before to the last digit ({when})"
         remarks.append(Remark("repeated-scans", f"{share}: the lidar or its driver stood still; they were left out"))
-    return replace(log, scans=kept), remarks
+    return replace(log, scans=scans.rows(~wrong)), remarks
 
 
 def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
@@ -87,15 +86,14 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     ranges = log.ranges
     if ranges is None or len(ranges.stamps) < 2:
         return log, []
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T))])
-    travelled = np.interp(ranges.stamps, log.odometry.stamps, way)
+    travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
     wrong, remarks, start = np.zeros(len(ranges.stamps), dtype=bool), [], float(log.odometry.stamps[0])
     for anchor, name in enumerate(ranges.anchor_ids):
         own = np.flatnonzero(ranges.anchor == anchor)
         same = np.concatenate([[False], np.diff(ranges.ranges[own]) == 0.0])
         twice = same & np.concatenate([[False], np.diff(ranges.stamps[own]) == 0.0])
         stuck = np.zeros(len(own), dtype=bool)
-        for first, last in _runs(same & ~twice):
+        for first, last in runs_of(same & ~twice):
             far = travelled[own[last - 1]] - travelled[own[first - 1]] > _MOVED
             if last - first >= _SAME_RANGES and far and ranges.ranges[own[first]] > 0.0:
                 stuck[first - 1 : last] = True
@@ -104,37 +102,21 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
             text = f"anchor {name} repeats one range to the last digit while the robot moves ({when}); these were left out"
             remarks.append(Remark("repeated-ranges", text))
         wrong[own[twice | stuck]] = True
-    return (replace(log, ranges=rows_of_ranges(ranges, ~wrong)), remarks) if wrong.any() else (log, [])
-
-
-def rows_of_ranges(ranges: UwbRanges, kept: Bools) -> UwbRanges | None:
-    """Return some of the ranges; None where none is left."""
-    if not kept.any():
-        return None
-    return ranges.rows(kept)
-
-
-def rows_of_scans(scans: LaserScans, kept: Bools) -> LaserScans:
-    """Return some of the scans."""
-    return replace(scans, stamps=scans.stamps[kept], ranges=scans.ranges[kept])
-
-
-def _runs(flags: Bools) -> list[tuple[int, int]]:
-    """Return first and one past the last of each run of set flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int64)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    if not wrong.any():
+        return log, []
+    return replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)), remarks
 
 
 def _in_runs(flags: Bools, least: int) -> Bools:
     """Return which set flags stand in runs of at least so many."""
     long = np.zeros(len(flags), dtype=bool)
-    for first, last in _runs(flags):
+    for first, last in runs_of(flags):
         long[first:last] = last - first >= least
     return long
 
 
 def _when(stamps: Floats, flags: Bools, start: float) -> str:
     """Return when the flags are set, in words."""
-    runs = _runs(flags)
+    runs = runs_of(flags)
     text = ", ".join(f"t = {stamps[a] - start:.0f} to {stamps[b - 1] - start:.0f} s" for a, b in runs[:3])
     return text + (f", and {len(runs) - 3} more stretches" if len(runs) > 3 else "")

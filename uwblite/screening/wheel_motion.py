@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, sigma_of_median, spread_about_median
+from ..arrays import Bools, Floats, Ints, runs_of, sigma_of_median, spread_about_median
 from ..lidar.scan_odometry import scan_steps
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, Remark, SensorLog
-from .odometry_chain import chained
 
 _PAIRS = 250
 """Pairs of scans compared over the whole recording."""
@@ -71,11 +70,6 @@ class Pairs:
         return Pairs(self.start[which], self.end[which], self.lidar[which], self.wheels[which], self.share[which])
 
 
-def middle_stamps(scans: LaserScans) -> Floats:
-    """Return the time of the middle ray of each scan, s."""
-    return scans.stamps + 0.5 * scans.time_increment * scans.ranges.shape[1]
-
-
 def standing(odometry: Odometry, least: float = _LEAST_STANDING) -> list[tuple[float, float]]:
     """Return the stretches (first and last stamp, s) in which the wheels count nothing."""
     steps, stamps = se2.between(odometry.poses[:-1], odometry.poses[1:]), odometry.stamps
@@ -85,9 +79,9 @@ def standing(odometry: Odometry, least: float = _LEAST_STANDING) -> list[tuple[f
     moving = np.zeros(len(stamps), dtype=bool)
     for sums, still in ((way, _STILL[0]), (turn, _STILL[1])):
         moving |= np.interp(after, number, sums) - np.interp(before, number, sums) > still
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~moving, [False]]).astype(np.int64))).reshape(-1, 2)
     # Half a second before and after a stretch without motion around it there was none either.
-    runs = [(max(float(stamps[a]) - _EDGE, stamps[0]), min(float(stamps[b - 1]) + _EDGE, stamps[-1])) for a, b in edges]
+    runs = [(float(stamps[a]) - _EDGE, float(stamps[b - 1]) + _EDGE) for a, b in runs_of(~moving)]
+    runs = [(max(a, float(stamps[0])), min(b, float(stamps[-1]))) for a, b in runs]
     return [(a, b) for a, b in runs if b - a >= least]
 
 
@@ -96,7 +90,7 @@ def compare(log: SensorLog) -> Pairs | None:
     scans = log.scans
     if scans is None or len(scans.stamps) < 20 or scans.ranges.shape[1] < 30:
         return None
-    middle = middle_stamps(scans)
+    middle = scans.middles
     first, second = _chosen(log, middle)
     if not len(first):
         return None
@@ -161,8 +155,7 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
     bad = np.hypot(off[:, 0], off[:, 1]) > _ABSOLUTE[0] + _RELATIVE * np.hypot(larger[:, 0], larger[:, 1])
     bad |= np.abs(off[:, 2]) > _ABSOLUTE[1] + _RELATIVE * larger[:, 2]
     smooth = np.convolve(bad, np.ones(_LEAST_PAIRS) / _LEAST_PAIRS, mode="same") > _MOST
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], smooth, [False]]).astype(np.int64))).reshape(-1, 2)
-    runs = [(own.start[a], own.end[b - 1]) for a, b in edges if own.end[b - 1] - own.start[a] >= _LEAST_SECONDS]
+    runs = [(own.start[a], own.end[b - 1]) for a, b in runs_of(smooth) if own.end[b - 1] - own.start[a] >= _LEAST_SECONDS]
     runs = runs or _other_scale(own, start)
     if not runs:
         return []
@@ -264,13 +257,11 @@ def replaced(log: SensorLog, stretches: list[tuple[float, float]]) -> tuple[Odom
     for a, b in stretches:
         odometry, own = _replaced(odometry, scans, log, a, b)
         breaks.append(own)
-    stamps, sigma = np.concatenate([k.stamps for k in breaks]), np.concatenate([k.sigma for k in breaks])
-    order = np.argsort(stamps, kind="stable")
-    return odometry, OdometryBreaks(stamps[order], sigma[order])
+    return odometry, OdometryBreaks.of_all(breaks)
 
 
 def _replaced(odometry: Odometry, scans: LaserScans, log: SensorLog, a: float, b: float) -> tuple[Odometry, OdometryBreaks]:
-    middle = middle_stamps(scans)
+    middle = scans.middles
     period = max(float(np.median(np.diff(middle))), 1e-3)
     first_scan, last_scan = max(int(np.searchsorted(middle, a)) - 1, 0), min(int(np.searchsorted(middle, b)), len(middle) - 1)
     inside = np.unique([*range(first_scan, last_scan, max(1, round(_SCANS_APART / period))), last_scan]).astype(np.int64)
@@ -278,7 +269,7 @@ def _replaced(odometry: Odometry, scans: LaserScans, log: SensorLog, a: float, b
     if len(inside) < 2:
         return odometry, OdometryBreaks.none()
     steps, share = _smooth_steps(scans, log, inside)
-    chain = chained(np.zeros(3), steps)
+    chain = se2.chain(np.zeros(3), steps)
     at = middle[inside]
     own = (odometry.stamps > at[0]) & (odometry.stamps <= at[-1])
     first, last = int(np.argmax(own)), len(own) - 1 - int(np.argmax(own[::-1]))

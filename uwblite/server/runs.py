@@ -10,6 +10,7 @@ from ..constraints import Constraints
 from ..io.map_server import trinary_image
 from ..io.png import encode_png
 from ..io.stored_result import StoredResult
+from .advice import text_of
 from .edits import wish_for
 
 _MOST_POINTS = 3000
@@ -41,8 +42,8 @@ def described(run: Run, edits: Constraints) -> dict[str, Any]:
     order = sorted(range(len(result.closures)), key=lambda k: not result.closures[k].accepted)[:_MOST_CLOSURES]
     return {
         "name": run.name,
-        "doubts": [_text(d) for d in report.get("doubts") or ()],
-        "warnings": [_text(w) for w in report.get("warnings") or ()],
+        "doubts": [text_of(d) for d in report.get("doubts") or ()],
+        "warnings": [text_of(w) for w in report.get("warnings") or ()],
         "recordings": [os.path.basename(str(i.get("source", ""))) for i in report.get("inputs") or ()],
         "preset": report.get("preset") or "defaults",
         "accepted": sum(c.accepted for c in result.closures),
@@ -73,11 +74,6 @@ def described(run: Run, edits: Constraints) -> dict[str, Any]:
             for k in order
         ],
     }
-
-
-def _text(notice: Any) -> str:
-    """Return the words of a doubt or warning, which may be a text or a table with a text."""
-    return str(notice.get("text", "")) if isinstance(notice, dict) else str(notice)
 
 
 def _image(result: StoredResult) -> dict[str, float] | None:
