@@ -262,7 +262,7 @@ def test_real_recordings_with_a_truth(shared_data, name):
 @pytest.mark.slow
 def test_the_labyrinth_is_right_up_to_its_mirror_image(shared_data):
     """Its wheels say every turn twice as large and the other way round (against the directions in which the true positions
-    move: correlation -0.87). Ranges know no left and right, so the wheels' word decides between the two images."""
+    move: correlation -0.87). Ranges know no left and right, so the odometry decides between the two images."""
     folder = shared_data / "labyrinth"
     stamps, truth = read_tum(folder / "truth_position.tum")
     result = build_map(read_log(folder / "run.log.gz"))

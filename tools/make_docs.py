@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write docs/tuning.md from the docstrings of the settings; ``--check`` only tells whether it is up to date."""
+"""Write docs/tuning.md from the docstrings of the settings; ``--check`` only says whether it is up to date."""
 
 import dataclasses
 import sys

@@ -12,7 +12,7 @@ from uwblite.graph.solver import optimize
 
 
 def dense_covariance(graph):
-    """Return the covariance of every block of unknowns with every other, zero where held, by a dense inverse."""
+    """Return the covariance of every block of unknowns with every other, zero where fixed, by a dense inverse."""
     H, _, number = dense_system(graph)
     padded = np.zeros((len(H) + 1, len(H) + 1))
     padded[:-1, :-1] = np.linalg.inv(H)
@@ -69,7 +69,7 @@ def test_relative_covariances_follow_from_the_joint_one(few):
     graph, _ = calibrated()
     rng = np.random.default_rng(0)
     i, j = rng.integers(0, 3 if few else 60, 200), rng.integers(0, 60, 200)
-    i[:2], j[:2] = [0, 5], [5, 0]  # from and to the held pose
+    i[:2], j[:2] = [0, 5], [5, 0]  # from and to the fixed pose
     covariance, found = dense_covariance(graph), marginals(graph)
     for a, b, relative in zip(i, j, found.relative(i, j), strict=True):
         J = np.hstack(se2.between_jacobians(graph.poses[a], graph.poses[b]))

@@ -172,7 +172,7 @@ def test_rounds_are_reported_and_bounded():
 
 
 def test_fewer_pairs_inform_nearly_as_much():
-    """With a fourth of the pairs every pose is held by some ties still; what lies between them is a little less sure."""
+    """With a fourth of the pairs every pose has some ties still; what lies between them is a little less sure."""
     truth, path, clouds = room(5, 0.01)
     graph = Graph(truth).with_edges(chained(truth, NOISE))
     result = refined(graph, clouds, path, selections=1)

@@ -40,14 +40,14 @@ def test_the_raster_names_the_nearest_point_to_a_cell(seed):
         grid = np.stack(np.meshgrid(*(np.arange(s) for s in cells.shape), indexing="ij"), axis=-1)
         centres = raster.origin[k] + (grid + 0.5) * cell
         nearest, _ = cKDTree(clouds.points[own]).query(centres)
-        painted = cells >= 0
+        filled = cells >= 0
         # A point stands for the centre of its cell: off by at most half the diagonal, for the point named and for the true one.
         slack = cell * np.sqrt(2) / 2
-        assert np.all(painted[nearest < reach - slack])
-        assert not np.any(painted[nearest > reach + slack])
-        named_rows = clouds.offsets[k] + cells[painted]
-        named = np.hypot(*(clouds.points[named_rows] - centres[painted]).T)
-        assert np.all(named <= nearest[painted] + 2 * slack + 1e-9)
+        assert np.all(filled[nearest < reach - slack])
+        assert not np.any(filled[nearest > reach + slack])
+        named_rows = clouds.offsets[k] + cells[filled]
+        named = np.hypot(*(clouds.points[named_rows] - centres[filled]).T)
+        assert np.all(named <= nearest[filled] + 2 * slack + 1e-9)
         assert np.isin(named_rows, own).all()
 
 

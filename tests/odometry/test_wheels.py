@@ -114,8 +114,8 @@ def test_noise_does_not_draw_the_wheels_scale(calibration):
     noise = rng.standard_normal((len(exact), 3)) * sigma
     wheels = replace(exact, motion=exact.motion / [1 + scale, 1 + scale, 1 + turn] + noise)
     graph = Graph(truth[frames.index], calibration=block(names), fixed_poses=np.ones(len(frames), dtype=bool))
-    held = ~graph.calibration.of_kinds("odometry_scale", "heading_scale")
-    solved, _ = optimize(replace(graph, fixed_calibration=held).with_edges(replace(wheels, kernel=SQUARED)))
+    fixed = ~graph.calibration.of_kinds("odometry_scale", "heading_scale")
+    solved, _ = optimize(replace(graph, fixed_calibration=fixed).with_edges(replace(wheels, kernel=SQUARED)))
     reach = sigma[0] / np.sqrt((wheels.motion**2).sum(axis=0))
     assert solved.calibration.get("odometry_scale") == pytest.approx(scale, abs=4 * reach[0])
     assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])

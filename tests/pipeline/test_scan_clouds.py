@@ -1,4 +1,4 @@
-"""Clouds of keyframes: after keyframes were added, those taken over and those made anew are what all made anew would be."""
+"""Clouds of keyframes: after keyframes were added, those taken over and those made again are as if all were made at once."""
 
 import numpy as np
 import pytest
@@ -28,13 +28,13 @@ def test_clouds_taken_over_are_those_made_again(steps):
     assert len(after.stamps) > len(before.stamps)
     old = scan_clouds.make(before, CONFIG, 0.02)
     mixed, former = scan_clouds.remake(old, before, after, CONFIG)
-    anew = scan_clouds.make(after, CONFIG, 0.02)
+    fresh = scan_clouds.make(after, CONFIG, 0.02)
     for name in ("offsets", "points", "normals", "owner", "normal_variance"):
-        np.testing.assert_array_equal(getattr(mixed.clouds, name), getattr(anew.clouds, name))
-    for k in range(len(anew.clouds)):
-        np.testing.assert_array_equal(cells(mixed.raster, k), cells(anew.raster, k))
-    assert mixed.delay == anew.delay == 0.02
-    # Steps that were cut and their neighbours alone are made anew.
+        np.testing.assert_array_equal(getattr(mixed.clouds, name), getattr(fresh.clouds, name))
+    for k in range(len(fresh.clouds)):
+        np.testing.assert_array_equal(cells(mixed.raster, k), cells(fresh.raster, k))
+    assert mixed.delay == fresh.delay == 0.02
+    # Steps that were cut and their neighbours alone are made again.
     assert 0 < np.sum(former < 0) < len(former) / 2
     np.testing.assert_array_equal(before.stamps[former[former >= 0]], after.stamps[former >= 0])
 

@@ -1,4 +1,4 @@
-"""What a DWM1001 tag says: distances with errors that are noise only in part.
+"""Ranges of a DWM1001 tag: distances with errors that are noise only in part.
 
 range = scale * distance + bias(anchor) + multipath(anchor, place) + antenna(directions) + excess(occlusion) + noise.
 

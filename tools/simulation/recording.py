@@ -66,9 +66,9 @@ class Settings:
     write_heights: bool = False
     tag: tuple[float, float] = (-0.05, 0.0)
     laser_pose: tuple[float, float, float] = (0.10, 0.0, 0.0)
-    """Mounting of the laser that the log tells."""
+    """Mounting of the laser as the log states it."""
     laser_error: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """True mounting minus told mounting."""
+    """True mounting minus stated mounting."""
     laser_flipped: bool = False
     uwb_delay: float = 0.0
     """Stamp of a range minus its true time on the odometry's clock."""
@@ -141,9 +141,9 @@ def simulate(settings: Settings) -> Recording:
     stated = wheels.odometry(motion, stamps, faults, slips, _rng(settings, 3), _floor(settings, motion, stamps))
     crowd = people(settings, plan, seconds)
     scan_stamps, scans, surfaces = _scan(settings, plan, motion, crowd)
-    told = scan_stamps + settings.laser_delay
+    stated_at = scan_stamps + settings.laser_delay
     range_stamps, range_anchors, ranges, truth_uwb = _range(settings, plan, motion, anchors, crowd)
-    scan_poses = np.stack([np.interp(told, stamps, stated[:, k]) for k in range(3)], axis=1)
+    scan_poses = np.stack([np.interp(stated_at, stamps, stated[:, k]) for k in range(3)], axis=1)
     mounting = np.asarray(settings.laser_pose) + np.asarray(settings.laser_error)
     calibration = {
         "settings": asdict(settings),
@@ -161,7 +161,7 @@ def simulate(settings: Settings) -> Recording:
         stamps,
         stated,
         motion.at(stamps),
-        told,
+        stated_at,
         scan_poses,
         scans,
         surfaces,

@@ -1,4 +1,4 @@
-"""What the wheels say: a differential drive whose wheels and track are not quite what the robot believes."""
+"""Odometry of a differential drive whose wheels and track differ a little from its settings."""
 
 from dataclasses import dataclass
 

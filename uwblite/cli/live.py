@@ -241,9 +241,9 @@ _MOST_ALTERNATIVES = 8
 
 def _tell_map(known: "KnownMap") -> None:
     if not known.anchors.ids:
-        console.note("uwblite: warning: the map has no anchor with a place; the walls alone tell where the robot is")
+        console.note("uwblite: warning: the map has no anchor with a place: the robot is localised by the walls alone")
     if known.walls is None:
-        console.note("uwblite: warning: the map has no grid; the anchors alone tell where the robot is")
+        console.note("uwblite: warning: the map has no grid: the robot is localised by the anchors alone")
 
 
 def _counted(names: dict[str, int]) -> str:

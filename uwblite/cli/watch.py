@@ -236,7 +236,7 @@ class Watch:
 
 
 def _spent_on_rounds(now: float) -> float:
-    """Return the processor time of the rounds that have ended, s; the time of the clock where the system does not tell."""
+    """Return the processor time of the rounds that have ended, s; the time of the clock where the system does not count it."""
     try:
         import resource
     except ImportError:

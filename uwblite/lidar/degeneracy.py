@@ -1,7 +1,7 @@
 """Degenerate directions of a registration: those in which only the scatter of the normals seems to fix a pose.
 
 Normals scatter, and a wall whose normals scatter seems to resist being slid along. With the variance v of a normal's
-angle and the Jacobian J_t of the tangent, N = sum w v J_t^T J_t is the information that scatter alone would feign. In
+angle and the Jacobian J_t of the tangent, N = sum w v J_t^T J_t is the spurious information of scatter alone. In
 the basis B that diagonalises both, H = B V diag(l) V^T B^T and N = B B^T, a direction was measured where its l exceeds
 a multiple of 1. That depends neither on units nor on the frame.
 """

@@ -48,7 +48,7 @@ class PairFactors:
     hessian: Floats
     """(e, 3, 3) sum of w J^T J of the point-to-line distances by T_i_j (x, y, theta), 1/m^2-like, unscaled by noise."""
     spurious: Floats
-    """(e, 3, 3) part of it that the scatter of the normals alone would feign, see degeneracy."""
+    """(e, 3, 3) spurious part of it, by the scatter of the normals alone, see degeneracy."""
     gradient: Floats
     """(e, 3) sum of w J^T r."""
     matched: Ints
@@ -81,7 +81,7 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
     offsets = sorted((o for o in offsets if np.hypot(*o) * cell <= reach), key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o))
     for some in _blocks(clouds):
-        _paint(clouds, some, raster, offsets)
+        _claim_cells(clouds, some, raster, offsets)
     return raster
 
 
@@ -99,7 +99,7 @@ def _blocks(clouds: Clouds) -> Iterator[slice]:
         yield slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds)))
 
 
-def _paint(clouds: Clouds, some: slice, raster: CloudRasters, offsets: list[tuple[int, int]]) -> None:
+def _claim_cells(clouds: Clouds, some: slice, raster: CloudRasters, offsets: list[tuple[int, int]]) -> None:
     """Let the points of some clouds claim the cells at these offsets from their own, the last offset with most right."""
     usable, owner, x, y = _usable(clouds, some)
     rows = (usable - clouds.offsets[owner]).astype(raster.nearest.dtype)

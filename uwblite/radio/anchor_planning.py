@@ -162,7 +162,7 @@ def _wall_cells(blocked: Bools, free: Bools) -> Ints:
 
 
 def _line_of_sight(blocked: Bools, sources: Ints, targets: Ints) -> Bools:
-    """Return for which sources (a, 2) which targets (m, 2) are in sight (a, m).
+    """Return for which sources (a, 2) which targets (m, 2) the line of sight is free (a, m).
 
     The first cell on the way is no obstacle: an anchor whose place is known to a decimetre may lie in its own wall.
     """

@@ -138,8 +138,8 @@ class _Bootstrap:
             self._solve((10.0, 3.0))
             solved = self.high - self.low
             while not self._complete():
-                held = self._extend(piece)
-                piece = 1.5 * piece if held else max(0.8 * piece, smallest)
+                agreed = self._extend(piece)
+                piece = 1.5 * piece if agreed else max(0.8 * piece, smallest)
                 if self.high - self.low >= self.config.resolve_factor * solved or self._complete():
                     self._solve((6.0, 3.0))
                     solved = self.high - self.low
@@ -224,21 +224,21 @@ class _Bootstrap:
     def _extend(self, piece: float) -> bool:
         """Lay on one piece at each open end by calibrated odometry; return whether it agreed with the anchors as it was."""
         motion = self.odometry.corrected(replace(self.graph, calibration=self.calibration))
-        held = True
+        agreed = True
         if self.high < len(self.path):
             old, new = self.high, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
             self.high = max(min(new, len(self.path)), old + 1)
             self.poses[old - 1 : self.high] = se2.chain(self.poses[old - 1], motion[old - 1 : self.high - 1])
-            held &= self._optimise_piece(old - 1, self.high, old - 1)
+            agreed &= self._optimise_piece(old - 1, self.high, old - 1)
         if self.low > 0:
             old, new = self.low, int(np.searchsorted(self.path, self.path[self.low] - piece))
             self.low = min(new, old - 1)
             back = se2.inverse(motion[self.low : old])[::-1]
             self.poses[self.low : old + 1] = se2.chain(self.poses[old], back)[::-1]
-            held &= self._optimise_piece(self.low, old + 1, old)
-        return held
+            agreed &= self._optimise_piece(self.low, old + 1, old)
+        return agreed
 
-    def _optimise_piece(self, low: int, high: int, held: int) -> bool:
+    def _optimise_piece(self, low: int, high: int, fixed_pose: int) -> bool:
         """Optimise the poses of [low, high) with one of them, the anchors and the calibration fixed.
 
         Returns True where the ranges agreed with the prediction; then nothing is moved.
@@ -248,7 +248,7 @@ class _Bootstrap:
         if not errors or float(np.median(np.abs(errors[0]))) < 2.0:
             return True
         fixed = np.zeros(high - low, dtype=bool)
-        fixed[held - low] = True
+        fixed[fixed_pose - low] = True
         everything = np.ones(len(self.anchors), dtype=bool)
         unmoved = np.ones(len(self.calibration.values), dtype=bool)
         part = replace(part, fixed_poses=fixed, fixed_anchors=everything, fixed_calibration=unmoved)

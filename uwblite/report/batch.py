@@ -41,7 +41,7 @@ class BatchRow:
     """Of the map along y, m."""
     warnings: int | None = None
     seconds: float | None = None
-    """Wall time of reading, mapping and writing; None where the result does not tell it."""
+    """Wall time of reading, mapping and writing; None where the result does not contain it."""
 
 
 _COLUMNS = tuple(f.name for f in fields(BatchRow))
