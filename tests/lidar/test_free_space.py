@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.lidar.free_space import contradiction, free_space
+from uwblite.lidar.free_space import contradiction, free_space, seen_beyond
 
 INCREMENT = np.deg2rad(1.0)
 BEARINGS = np.deg2rad(np.arange(-179.5, 180.0))
@@ -79,6 +79,17 @@ def test_where_no_surface_was_seen_nothing_is_known():
     points = np.array([[1.0, 0.0], [3.0, 0.0]])
     for missing in (np.inf, np.nan):
         assert contradiction(free_space(np.zeros((1, 3)), np.full((1, 360), missing)), points, 0.1) == (0.0, 0.0)
+
+
+def test_one_point_is_enough_and_what_is_near_an_unknown_bearing_is_not_in_view():
+    free = free_space(np.zeros((1, 3)), np.where(VIEW, 2.0, np.inf)[None])
+    assert contradiction(free, np.array([[1.0, 0.0]]), 0.1) == (1.0, 1.0)
+    assert contradiction(free, np.array([[-0.05, 0.0]]), 0.1) == (0.0, 0.0)
+
+
+def test_straight_behind_is_one_direction():
+    behind = free_space(np.zeros((1, 3)), np.where(np.arange(360) < 2, 2.0, np.inf)[None])
+    assert seen_beyond(behind, np.array([[-1.0, 0.0], [-1.0, 1e-9]]), 0.1)[0].tolist() == [1, 0]
 
 
 def test_a_bearing_is_free_only_as_far_as_its_neighbours():

@@ -10,7 +10,7 @@ from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
-from uwblite.radio.incremental import IncrementalConfig, optimize_incrementally
+from uwblite.radio.incremental import IncrementalConfig, _Incremental, optimize_incrementally
 
 
 def rms(a, b):
@@ -115,3 +115,39 @@ def test_results_are_the_same_every_time():
 def test_settings_are_checked(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         IncrementalConfig(**wrong)
+
+
+def _with_wrong_anchor(joined_at, wrong=5, n=400):
+    """Return the state of a path driven so far, all anchors joined at pose 0 but for some, and one of them in a wrong place."""
+    graph, truth, anchors = lawn(1, n=n)
+    state = _Incremental(graph, IncrementalConfig(probation=250))
+    places = anchors.copy()
+    places[wrong] += [6.0, -4.0]
+    state.graph = replace(graph, poses=truth, anchors=places)
+    state.joined[:], state.joined_at[:] = True, 0
+    for anchor, when in joined_at.items():
+        state.joined_at[anchor] = when
+    return state
+
+
+@pytest.mark.parametrize(
+    ("joined_at", "left"),
+    [({}, {5}), ({5: 160, 9: 390}, {5, 9}), ({9: 390}, {5})],
+    ids=["an old one, by its outliers", "those that joined last", "an old one, where those that joined last are sound"],
+)
+def test_an_anchor_in_a_wrong_place_leaves(joined_at, left):
+    state = _with_wrong_anchor(joined_at)
+    part = state._solve(200, 400)
+    assert not part.fits
+    found = state._without_outliers(part, 200, 400)
+    assert found.fits
+    assert set(np.flatnonzero(~state.joined)) == left
+    assert set(np.flatnonzero(state.joined_at == len(state.guess))) == left
+
+
+def test_nobody_leaves_where_that_does_not_help():
+    state = _with_wrong_anchor({})
+    state.usual = 1e-3
+    part = state._solve(200, 400)
+    assert state._without_outliers(part, 200, 400) is part
+    assert state.joined.all()
