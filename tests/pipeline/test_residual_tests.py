@@ -56,17 +56,19 @@ def test_odometry_alone_drifts(sound):
     assert doubts(sound.without(uwb=True, lidar=True)) == {"odometry-alone"}
 
 
-def steps_that_slip(confirmed):
-    """Judge a chain that follows the lidar, its wheels off for 15 steps; confirmed: lidar ties these to another visit."""
-    truth = np.column_stack([np.arange(80) * 0.3, np.zeros(80), np.zeros(80)])
+def steps_that_slip(spans, doubts=(), degenerate=False, standing=False):
+    """Judge a chain that follows the lidar, its wheels off for 15 steps; spans: keyframes between which scan edges stand."""
+    truth = np.column_stack([np.arange(80) * (0.0 if standing else 0.3), np.zeros(80), np.zeros(80)])
     wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
     wheels.motion[30:45, 2] += 0.2
-    i = np.arange(20, 60)
-    j = i - (20 if confirmed else 5)
+    j = np.concatenate([np.arange(20, 60) for _ in spans])
+    i = j - np.repeat(spans, 40)
     none = np.zeros((len(i), 3))
-    root = np.zeros((len(i), 3, 3)) + np.eye(3)
+    root = np.zeros((len(i), 3, 3)) + np.diag([0.0 if degenerate else 100.0, 100.0, 1000.0])
     ties = ScanEdges(i, j, se2.between(truth[i], truth[j]), root, none, none, scan_indices(Calibration()))
     stages = Stages(None, None)
+    for kind in doubts:
+        stages.doubt(kind, "")
     recordings = SimpleNamespace(stamps=np.arange(80.0), path=np.arange(80.0))
     check_odometry_steps(
         SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,))),
@@ -75,11 +77,30 @@ def steps_that_slip(confirmed):
     return stages
 
 
-def test_wheels_that_slip_are_a_doubt_unless_the_lidar_knows_the_place_from_another_visit():
-    alone, confirmed = steps_that_slip(False), steps_that_slip(True)
-    assert [n.kind for n in alone.doubts] == ["odometry-steps"]
-    assert alone.warnings == confirmed.doubts == []
-    (notice,) = confirmed.warnings
+VISITS, NEIGHBOURS = (20,), (1, 2)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"spans": (1,)},
+        {"spans": NEIGHBOURS, "degenerate": True},
+        {"spans": NEIGHBOURS, "standing": True},
+        {"spans": NEIGHBOURS, "doubts": ("free-space-violation",)},
+        {"spans": NEIGHBOURS, "doubts": ("no-closure",)},
+    ],
+)
+def test_wheels_that_slip_are_a_doubt_where_nothing_else_fixes_the_poses(case):
+    stages = steps_that_slip(**case)
+    assert [n.kind for n in stages.doubts] == [*case.get("doubts", ()), "odometry-steps"]
+    assert stages.warnings == []
+
+
+@pytest.mark.parametrize("spans", [VISITS, NEIGHBOURS])
+def test_wheels_that_slip_are_a_warning_where_the_lidar_fixes_every_pose(spans):
+    stages = steps_that_slip(spans)
+    assert stages.doubts == []
+    (notice,) = stages.warnings
     assert notice.kind == "odometry-steps"
     assert 25 <= notice.figures["start"] <= 30
     assert 44 <= notice.figures["end"] <= 50

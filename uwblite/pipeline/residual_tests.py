@@ -6,6 +6,7 @@ is made for no particular fault.
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph
@@ -26,6 +27,18 @@ _MEASURED_BREAK = 0.15
 """Steps more uncertain than that, m, are no measurements."""
 _ANOTHER_VISIT = 10.0
 """Travelled distance between two visits, m."""
+_NEAR = 4
+"""Keyframes that a scan edge of the same visit spans, at most."""
+_CLEAR_PLACE, _CLEAR_HEADING = 0.05, 0.02
+"""Standard deviations, m and rad, up to which a scan edge fixes a pose in every direction; none does along a bare corridor."""
+_AGREES = 4.0
+"""Standard deviations within which a scan edge agrees with the map."""
+_REDUNDANT = 2
+"""Scan edges that have to fix a step: one alone has nothing to agree with."""
+_MOVING = 0.05
+"""m or rad; over a smaller step a lidar that sees the robot itself would agree, too."""
+_CONTRADICTED = ("free-space-violation", "contradicting-closures", "no-closure")
+"""Doubts that tell of a map whose scan edges may be wrong together."""
 _WAYS = 0.15
 """Relative disagreement of lidar and wheels on ways from one scan to the next, which single scans show to some per cent."""
 _SCALE = 0.12
@@ -64,17 +77,24 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, task: Task) -> No
 
 
 def check_odometry_steps(estimate: Estimate, task: Task) -> None:
-    """Find stretches in which most steps of the odometry are off by more than their noise, whatever it was estimated to be."""
+    """Find stretches in which most steps of the odometry are off by more than their noise, whatever it was estimated to be.
+
+    They are a doubt of the map, unless the lidar fixes the poses there by itself: from other visits, or from clear and
+    redundant matches of the neighbouring clouds in a map that nothing else contradicts. Then the odometry is at fault alone.
+    """
     wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
     if len(wheels) < _WINDOW:
         return
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
     off = (np.abs(wheels.residuals(graph)).max(axis=1) > _SUDDEN) & measured
     confirmed = _confirmed(graph, task.recordings.path)
+    fixed = confirmed[wheels.i] & confirmed[wheels.j]
+    if not any(notice.kind in _CONTRADICTED for notice in task.stages.doubts):
+        fixed |= _fixed_by_neighbours(graph)[wheels.i]
     say, text = task.stages.doubt, "most steps of the odometry disagree with the map far beyond their noise"
-    stretch = _stretch(off & ~(confirmed[wheels.i] & confirmed[wheels.j]))
+    stretch = _stretch(off & ~fixed)
     if stretch is None and (stretch := _stretch(off)) is not None:
-        say, text = task.stages.warn, text + "; there the lidar knows the places from other visits, and the map follows it"
+        say, text = task.stages.warn, text + "; there the lidar fixes every pose, and the map follows it: check the odometry"
     if stretch is not None:
         a, b = (float(stamps[wheels.i[k]] - stamps[0]) for k in stretch)
         say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
@@ -97,6 +117,28 @@ def _confirmed(graph: Graph, path: Floats) -> Bools:
             again = np.abs(path[edges.i] - path[edges.j]) > _ANOTHER_VISIT
             confirmed[edges.i[again]] = confirmed[edges.j[again]] = True
     return confirmed
+
+
+def _fixed_by_neighbours(graph: Graph) -> Bools:
+    """Return at which keyframes (k,) a step begins that several scan edges of the same visit fix and agree on."""
+    count = np.zeros(len(graph.poses) + 1, dtype=np.int64)
+    for edges in graph.edges:
+        if isinstance(edges, ScanEdges):
+            good = (np.abs(edges.i - edges.j) <= _NEAR) & _clear(edges)
+            good &= np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < _AGREES
+            np.add.at(count, np.minimum(edges.i, edges.j)[good], 1)
+            np.add.at(count, np.maximum(edges.i, edges.j)[good], -1)
+    steps = se2.between(graph.poses[:-1], graph.poses[1:])
+    moves = np.append((np.hypot(steps[:, 0], steps[:, 1]) > _MOVING) | (np.abs(steps[:, 2]) > _MOVING), False)
+    return (np.cumsum(count)[:-1] >= _REDUNDANT) & moves
+
+
+def _clear(edges: ScanEdges) -> Bools:
+    """Return which scan edges (e,) fix a pose in all directions."""
+    information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
+    units = np.array([_CLEAR_PLACE, _CLEAR_PLACE, _CLEAR_HEADING])
+    # With the limits as units, the least eigenvalue is 1 where the least certain direction has the limit as its sigma.
+    return np.asarray(np.linalg.eigvalsh(information * np.outer(units, units))[:, 0] > 1.0)
 
 
 def check_scales(estimate: Estimate, task: Task) -> None:
