@@ -17,7 +17,7 @@ from ..graph.solver import optimize
 from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult
 from ..lidar.scan_to_scan import Steps
-from . import scan_clouds
+from . import scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
 from .progress import Stage, solver_figures
@@ -155,7 +155,8 @@ def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Tas
         "scan-to-scan matching", pairs=len(i), used=int(refined.used.sum()), gate=round(gate, 3),
         sigma=round(refined.sigma, 4), rounds=refined.rounds, **figures,
     )  # fmt: skip
-    return replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
+    estimate = replace(estimate, graph=graph.with_estimates_of(refined.graph), steps=refined.edges)
+    return turn_checks.with_constant_turn_scales(estimate, task)
 
 
 def _with_inflated_ranges(estimate: Estimate) -> Estimate:

@@ -15,6 +15,7 @@ from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..odometry.attached import OUTSIDE
 from .estimate import Estimate, Task
 from .residual_tests import check_residuals
+from .turn_checks import check_turn_scales
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate is worth a warning."""
@@ -47,6 +48,7 @@ def judge(
     else:
         check_residuals(estimate, np.zeros(0), task)
     check_handedness(estimate, task)
+    check_turn_scales(estimate, task)
     check_fit(task)
 
 

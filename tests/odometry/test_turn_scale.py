@@ -1,0 +1,78 @@
+"""The scale of turns from step to step: recovered where it is constant, not bent by one bad turn, and told where it varies."""
+
+import numpy as np
+import pytest
+from helpers.laser_walks import chained
+
+from uwblite import se2
+from uwblite.graph.calibration import CalibrationConfig, block, odometry_indices, scan_indices, unknowns
+from uwblite.graph.graph import Graph
+from uwblite.graph.pose_edges import ScanEdges
+from uwblite.odometry.turn_scale import turn_scales
+
+STEPS, NOISE = 400, 0.01
+CALIBRATION = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
+INDEX = CALIBRATION.index("heading_scale")
+
+
+def found(scale, *, missed=(), frozen=(), seed=0, turned_round=False):
+    """Compare wheels whose turns are to be multiplied by 1 + scale (number or one per step) with exact scans.
+
+    missed, frozen : steps of which the wheels count no turn, or nothing. turned_round : every other edge measures i from j.
+    """
+    rng = np.random.default_rng(seed)
+    motion = np.column_stack([np.full(STEPS, 0.2), np.zeros(STEPS), rng.uniform(-0.35, 0.35, STEPS)])
+    truth = np.zeros((STEPS + 1, 3))
+    for k, step in enumerate(motion):
+        truth[k + 1] = se2.compose(truth[k], step)
+    wheels = chained(truth, np.full(3, NOISE))
+    object.__setattr__(wheels, "calibration", odometry_indices(CALIBRATION, STEPS))
+    wheels.motion[:, 2] = wheels.motion[:, 2] / (1.0 + scale) + NOISE * rng.standard_normal(STEPS)
+    wheels.motion[list(missed), 2] = 0.0
+    wheels.motion[list(frozen)] = 0.0
+    i, j = np.arange(STEPS), np.arange(1, STEPS + 1)
+    if turned_round:
+        i, j = np.where(i % 2, j, i), np.where(i % 2, i, j)
+    none = np.zeros((STEPS, 3))
+    seen = ScanEdges(i, j, se2.between(truth[i], truth[j]), none[:, None] + np.eye(3), none, none, scan_indices(CALIBRATION))
+    return turn_scales(wheels, seen, Graph(truth, calibration=CALIBRATION))[INDEX]
+
+
+@pytest.mark.parametrize("scale", [-0.3, 0.0, 0.1, 0.8])
+@pytest.mark.parametrize("turned_round", [False, True])
+def test_a_constant_scale_is_recovered(scale, turned_round):
+    scales = [found(scale, seed=seed, turned_round=turned_round) for seed in range(5)]
+    for one in scales:
+        assert abs(one.value - scale) < 4.0 * one.sigma
+        assert one.sigma < 0.02 * (1.0 + scale) ** 2
+        assert not one.contradicts(scale)
+        assert one.contradicts(scale + 0.2)
+        assert not one.varies
+
+
+def test_turns_the_other_way_have_a_scale_of_minus_two():
+    assert found(-2.0).value == pytest.approx(-2.0, abs=0.02)
+
+
+def test_turns_that_the_wheels_missed_do_not_bend_the_scale():
+    bad = found(0.05, missed=range(100, 120))
+    assert abs(bad.value - 0.05) < 4.0 * bad.sigma + 0.01
+    assert not bad.varies
+
+
+def test_wheels_that_freeze_have_no_other_scale():
+    frozen = found(0.05, frozen=range(100, 300))
+    assert abs(frozen.value - 0.05) < 4.0 * frozen.sigma
+    assert not frozen.varies
+
+
+def test_a_scale_that_differs_between_stretches_is_told():
+    assert found(np.where(np.arange(STEPS) < STEPS // 2, 0.0, 0.5)).varies
+
+
+def test_few_turns_show_nothing():
+    truth = np.zeros((30, 3))
+    wheels = chained(truth, np.full(3, NOISE))
+    none = np.zeros((0, 3))
+    steps = ScanEdges(np.zeros(0, int), np.zeros(0, int), none, np.zeros((0, 3, 3)), none, none, scan_indices(CALIBRATION))
+    assert turn_scales(wheels, steps, Graph(truth, calibration=CALIBRATION)) == {}
