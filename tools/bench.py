@@ -175,10 +175,11 @@ def bench_icp(repeats: int) -> None:
     from bench_peers import open3d_align, small_gicp_align
 
     from uwblite import se2
+    from uwblite.lidar.cloud_rasters import rasterize
     from uwblite.lidar.clouds import stacked
     from uwblite.lidar.pair_alignment import align_pairs
     from uwblite.lidar.point_cloud import make_cloud
-    from uwblite.lidar.scan_matching import pair_points, rasterize
+    from uwblite.lidar.scan_matching import pair_points
 
     first, second = np.array([0]), np.array([1])
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from uwblite import se2
+from uwblite.lidar.clouds import Clouds
 from uwblite.lidar.point_cloud import PointCloud, make_cloud
 
 ROOM = np.array(
@@ -32,3 +33,13 @@ def pair(walls, truth, rng, centre, spacing=0.05, noise=NOISE) -> tuple[PointClo
     """Return the clouds of two views, both seen from the same place, the centre."""
     target, source = views(walls, truth, rng, spacing, noise)
     return make_cloud(target, np.asarray(centre)), make_cloud(source, se2.transform(se2.inverse(truth), np.asarray(centre)))
+
+
+def scattered(rng, counts) -> Clouds:
+    """Return random clouds, every point with a random normal but a tenth without."""
+    n = int(np.sum(counts))
+    angle = rng.uniform(-np.pi, np.pi, n)
+    normals = np.column_stack([np.cos(angle), np.sin(angle)]) * (rng.random(n) > 0.1)[:, None]
+    owner = np.repeat(np.arange(len(counts)), counts)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Clouds(offsets, rng.uniform(-2, 3, (n, 2)), normals, owner, np.full(n, 1e-3))

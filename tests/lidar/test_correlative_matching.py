@@ -7,11 +7,12 @@ import pytest
 from helpers.registration_worlds import CORRIDOR, ROOM, pair, wall_points
 
 from uwblite import se2
+from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import stacked
 from uwblite.lidar.correlative_matching import CorrelativeConfig, _target_field, score_grid, search
 from uwblite.lidar.pair_alignment import align_pairs
 from uwblite.lidar.point_cloud import make_cloud
-from uwblite.lidar.scan_matching import pair_points, rasterize
+from uwblite.lidar.scan_matching import pair_points
 
 CENTRE = (3.0, 1.5)
 

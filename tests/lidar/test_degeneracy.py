@@ -5,9 +5,10 @@ import pytest
 import scipy.linalg
 from helpers.registration_worlds import CORRIDOR, ROOM, pair
 
+from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import stacked
 from uwblite.lidar.degeneracy import relative_eigen
-from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points, rasterize
+from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points
 
 CENTRE = (3.0, 1.5)
 

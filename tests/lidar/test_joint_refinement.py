@@ -11,6 +11,7 @@ from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.solver import SolverConfig
+from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
     choose_pairs,
@@ -19,7 +20,6 @@ from uwblite.lidar.joint_refinement import (
     with_fewer_pairs,
     with_surface_errors,
 )
-from uwblite.lidar.scan_matching import rasterize
 
 CONFIG = RefinementConfig()
 NOISE = np.array([0.01, 0.005, 0.006])

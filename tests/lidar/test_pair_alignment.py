@@ -6,10 +6,11 @@ from helpers import registration_worlds as worlds
 from helpers.laser_walks import ROOM, scanned
 
 from uwblite import se2
+from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import stacked
 from uwblite.lidar.pair_alignment import align_pairs
 from uwblite.lidar.point_cloud import make_cloud, two_sided
-from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points, rasterize
+from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points
 
 TRUTH = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
 I, J = np.array([0, 0, 2]), np.array([1, 2, 1])

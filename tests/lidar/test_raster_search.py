@@ -6,8 +6,8 @@ from helpers.laser_walks import HALL, scanned
 from scipy.spatial import cKDTree
 
 from uwblite import se2
+from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.raster_search import _LEAST_SHARE, _SEPARATION, Window, _maxima, best_poses
-from uwblite.lidar.scan_matching import rasterize
 
 CELL, REACH = 0.1, 0.5
 WINDOW = Window(distance=0.3, angle=0.12)

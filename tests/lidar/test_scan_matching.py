@@ -1,54 +1,17 @@
-"""Matching of pairs: the raster against a tree, the condensed cost against numbers, known motions, blind directions."""
+"""Matching of pairs: the condensed cost against numbers, known motions, blind directions."""
 
 import numpy as np
 import pytest
 from helpers.laser_walks import CORRIDOR, ROOM, scanned
+from helpers.registration_worlds import scattered
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
-from uwblite.lidar.clouds import Clouds
-from uwblite.lidar.scan_matching import PairFactors, match, measured, nondegenerate_step, pair_points, rasterize
-
-
-def scattered(rng, counts) -> Clouds:
-    """Return random clouds, every point with a random normal but a tenth without."""
-    n = int(np.sum(counts))
-    angle = rng.uniform(-np.pi, np.pi, n)
-    normals = np.column_stack([np.cos(angle), np.sin(angle)]) * (rng.random(n) > 0.1)[:, None]
-    owner = np.repeat(np.arange(len(counts)), counts)
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return Clouds(offsets, rng.uniform(-2, 3, (n, 2)), normals, owner, np.full(n, 1e-3))
-
-
-@settings(max_examples=15)
-@given(st.integers(0, 1000))
-def test_the_raster_names_the_nearest_point_to_a_cell(seed):
-    rng = np.random.default_rng(seed)
-    clouds, cell, reach = scattered(rng, [40, 0, 1, 80]), 0.05, 0.3
-    raster = rasterize(clouds, cell, reach)
-    usable = np.any(clouds.normals != 0.0, axis=1)
-    for k in range(4):
-        own = np.flatnonzero(usable & (clouds.owner == k))
-        cells = raster.nearest[raster.start[k] : raster.start[k] + raster.shape[k].prod()].reshape(raster.shape[k])
-        if not len(own):
-            assert np.all(cells == -1)
-            continue
-        grid = np.stack(np.meshgrid(*(np.arange(s) for s in cells.shape), indexing="ij"), axis=-1)
-        centres = raster.origin[k] + (grid + 0.5) * cell
-        nearest, _ = cKDTree(clouds.points[own]).query(centres)
-        filled = cells >= 0
-        # A point stands for the centre of its cell: off by at most half the diagonal, for the point named and for the true one.
-        slack = cell * np.sqrt(2) / 2
-        assert np.all(filled[nearest < reach - slack])
-        assert not np.any(filled[nearest > reach + slack])
-        named_rows = clouds.offsets[k] + cells[filled]
-        named = np.hypot(*(clouds.points[named_rows] - centres[filled]).T)
-        assert np.all(named <= nearest[filled] + 2 * slack + 1e-9)
-        assert np.isin(named_rows, own).all()
+from uwblite.lidar.cloud_rasters import rasterize
+from uwblite.lidar.scan_matching import PairFactors, match, measured, nondegenerate_step, pair_points
 
 
 @settings(max_examples=20)

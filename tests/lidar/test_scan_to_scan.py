@@ -9,7 +9,7 @@ from helpers.planted import box
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
-from uwblite.lidar.scan_matching import rasterize
+from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.scan_to_scan import Steps, TrackingConfig, descend, follow, reattached
 
 NOISE = np.array([0.01, 0.005, 0.006])

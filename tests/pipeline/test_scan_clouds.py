@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.planted import box, odometry, recording, scans, wander
 
-from uwblite.lidar import scan_matching
+from uwblite.lidar import cloud_rasters
 from uwblite.pipeline import scan_clouds
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.recordings import denser, gather
@@ -39,7 +39,7 @@ def test_clouds_taken_over_are_those_made_again(steps):
     np.testing.assert_array_equal(before.stamps[former[former >= 0]], after.stamps[former >= 0])
 
 
-def cells(raster: scan_matching.CloudRasters, k: int) -> np.ndarray:
+def cells(raster: cloud_rasters.CloudRasters, k: int) -> np.ndarray:
     """The cells of one cloud's raster."""
     start = int(raster.start[k])
     return raster.nearest[start : start + int(raster.shape[k].prod())]

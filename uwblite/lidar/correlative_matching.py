@@ -19,9 +19,9 @@ from scipy import fft
 from .. import se2
 from ..arrays import Floats, Ints
 from ..config import setting
+from .cloud_rasters import rasterize
 from .clouds import stacked
 from .point_cloud import PointCloud
-from .scan_matching import rasterize
 
 Singles = NDArray[np.float32]
 

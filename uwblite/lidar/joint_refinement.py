@@ -21,8 +21,9 @@ from ..graph.normal_equations import NormalEquations
 from ..graph.pose_edges import ScanEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, SolverSummary, check, linearize, minimise
+from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .scan_matching import CloudRasters, PairFactors, match, measured, pair_points
+from .scan_matching import PairFactors, match, measured, pair_points
 
 _NEIGHBOURS = 4
 """Clouds no farther apart in the chain than this are neighbours."""
@@ -175,7 +176,7 @@ def refine(
     Parameters
     ----------
     graph : wheels, radio, priors and other edges; scan edges come from here.
-    clouds, raster : see clouds.build and scan_matching.rasterize; the raster's reach bounds the gate.
+    clouds, raster : see clouds.build and cloud_rasters.rasterize; the raster's reach bounds the gate.
     twist : (k, 3) velocity of the base at each keyframe.
     i, j : (e,) pairs, see choose_pairs.
     on_round : called with (round, rounds).

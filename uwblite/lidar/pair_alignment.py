@@ -6,8 +6,9 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
+from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .scan_matching import CloudRasters, PairFactors, PairPoints, match, nondegenerate_step
+from .scan_matching import PairFactors, PairPoints, match, nondegenerate_step
 
 _FARTHEST, _WIDEST = 0.3, 0.15
 """Longest step of one iteration, m and rad."""

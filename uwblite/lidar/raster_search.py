@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
+from .cloud_rasters import CloudRasters
 from .clouds import Clouds
-from .scan_matching import CloudRasters
 
 _LEAST_SHARE = 0.5
 """Of the best score, that another local maximum must reach."""

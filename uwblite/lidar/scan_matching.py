@@ -1,11 +1,9 @@
 """Point-to-line matching of many pairs of clouds at once.
 
-Nearest neighbours come from one raster per cloud, in which each cell names the nearest point: looking up a
-million points is a handful of array operations and no tree. A pair's matches are condensed into the quadratic form
-of its relative pose (3 x 3), which is all that the graph needs to know of them.
+Nearest neighbours come from one raster per cloud. A pair's matches are condensed into the quadratic form of its relative
+pose (3 x 3), which is all that the graph needs to know of them.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -13,32 +11,14 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
+from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
 from .degeneracy import relative_eigen
 
-_CLOUDS_AT_ONCE = 256
-"""Clouds whose rasters are made at once."""
 _AT_ONCE = 16384
 """Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
 _SAME_FACING = float(np.sqrt(0.5))
 """Least cosine between the normals of two matched points."""
-_NOBODY = -1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CloudRasters:
-    """A raster for every cloud: which of its points is nearest to each cell around it."""
-
-    cell: float
-    """m."""
-    origin: Floats
-    """(k, 2) lower corner of each cloud's raster in its own frame, m."""
-    shape: Ints
-    """(k, 2) cells in x and y; the outermost ones name no point."""
-    start: Ints
-    """(k,) first cell of each raster in `nearest`."""
-    nearest: NDArray[np.signedinteger]
-    """(cells,) number of the nearest point within its cloud, -1 = none within reach; 16 bits where they suffice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,75 +39,6 @@ class PairFactors:
     """(e,) sum of w r^2, m^2."""
     weight: Floats
     """(e,) sum of w."""
-
-
-def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
-    """Build the rasters: each point with a normal claims the cells within reach, nearer cells last.
-
-    Parameters
-    ----------
-    cell, reach : cell size and distance up to which a point is a neighbour, m.
-    """
-    low, high = _boxes(clouds)
-    filled = np.isfinite(low[:, :1])
-    margin = reach + cell
-    low = np.where(filled, low - margin, 0.0)
-    shape = np.where(filled, np.ceil((high + margin - low) / cell), 0.0).astype(np.int64) + filled
-    size = shape[:, 0] * shape[:, 1]
-    start = np.concatenate([[0], np.cumsum(size)[:-1]])
-    narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
-    raster = CloudRasters(cell, low, shape, start, np.full(int(size.sum()), _NOBODY, dtype=np.int16 if narrow else np.int32))
-    steps = int(np.floor(reach / cell))
-    offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
-    offsets = sorted((o for o in offsets if np.hypot(*o) * cell <= reach), key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o))
-    for some in _blocks(clouds):
-        _claim_cells(clouds, some, raster, offsets)
-    return raster
-
-
-def chosen_rasters(one: CloudRasters, other: CloudRasters, which: Ints) -> CloudRasters:
-    """Return the rasters of some clouds (w,), those of the other numbered on behind those of the one."""
-    nearest = np.concatenate([one.nearest, other.nearest])
-    origin, shape = np.concatenate([one.origin, other.origin]), np.concatenate([one.shape, other.shape])
-    start = np.concatenate([one.start, other.start + len(one.nearest)])
-    return CloudRasters(one.cell, origin[which], shape[which], start[which], nearest)
-
-
-def _blocks(clouds: Clouds) -> Iterator[slice]:
-    """Yield the clouds a bounded number at a time."""
-    for first in range(0, len(clouds), _CLOUDS_AT_ONCE):
-        yield slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds)))
-
-
-def _claim_cells(clouds: Clouds, some: slice, raster: CloudRasters, offsets: list[tuple[int, int]]) -> None:
-    """Let the points of some clouds claim the cells at these offsets from their own, the last offset with most right."""
-    usable, owner, x, y = _usable(clouds, some)
-    rows = (usable - clouds.offsets[owner]).astype(raster.nearest.dtype)
-    stride, low = raster.shape[owner, 1], raster.origin[owner]
-    cx, cy = ((x - low[:, 0]) / raster.cell).astype(np.int64), ((y - low[:, 1]) / raster.cell).astype(np.int64)
-    base = cx * stride + cy + raster.start[owner]
-    for dx, dy in offsets:
-        raster.nearest[base + (dx * stride + dy)] = rows
-
-
-def _usable(clouds: Clouds, some: slice) -> tuple[Ints, Ints, Floats, Floats]:
-    """Return rows, clouds and coordinates (p,) of the points with a normal of some clouds."""
-    first, end = clouds.offsets[some.start], clouds.offsets[some.stop]
-    usable = first + np.flatnonzero(np.any(clouds.normals[first:end] != 0.0, axis=1))
-    x, y = clouds.points[usable].T.astype(np.float64)
-    return usable, clouds.owner[usable], x, y
-
-
-def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
-    """Return the corners (k, 2) of a box around the points with a normal of each cloud; inf where it has none."""
-    low, high = np.full((len(clouds), 2), np.inf), np.full((len(clouds), 2), -np.inf)
-    for some in _blocks(clouds):
-        _, owner, x, y = _usable(clouds, some)
-        if len(owner):
-            begins = np.flatnonzero(np.concatenate([[True], np.diff(owner) > 0]))
-            low[owner[begins]] = np.minimum.reduceat(np.stack([x, y]), begins, axis=1).T
-            high[owner[begins]] = np.maximum.reduceat(np.stack([x, y]), begins, axis=1).T
-    return low, high
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +63,7 @@ def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
     """List up to `limit` evenly spaced points with normals of the source cloud j (e,) of each pair."""
     usable = np.any(clouds.normals != 0.0, axis=1)
     ranks = np.concatenate([[0], np.cumsum(usable)])
-    rows = np.append(np.flatnonzero(usable), _NOBODY).astype(np.int32)
+    rows = np.append(np.flatnonzero(usable), NOBODY).astype(np.int32)
     begin, end = ranks[clouds.offsets[j]], ranks[clouds.offsets[j + 1]]
     take = np.minimum(end - begin, limit)
     rank = np.arange(take.max(initial=0))
@@ -210,7 +121,7 @@ def _match(
     px, py = surface.x.take(row), surface.y.take(row)
     rx, ry = c * px - s * py, s * px + c * py
     x, y = rx + T_i_j[:, :1], ry + T_i_j[:, 1:2]
-    found = _look_up(raster, i, x, y)
+    found = look_up(raster, i, x, y)
     near = found >= 0
     target = found + clouds.offsets[i, None]
     target *= near
@@ -240,22 +151,6 @@ def _match(
         squared=summed[:, 3, 3],
         weight=np.einsum("en,en->e", root, root),
     )
-
-
-def _look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> Ints:
-    """Return the number (e, n) of the point of cloud i (e,) nearest to each x, y (e, n), m; -1 where none is near."""
-    per_cell = 1.0 / raster.cell
-    # Truncation takes what lies up to a cell below the raster into its rim, which names no point.
-    cx = ((x - raster.origin[i, :1]) * per_cell).astype(np.int32)
-    cy = ((y - raster.origin[i, 1:]) * per_cell).astype(np.int32)
-    wide, high = raster.shape[i, :1].astype(np.uint32), raster.shape[i, 1:].astype(np.uint32)
-    inside = (cx.view(np.uint32) < wide) & (cy.view(np.uint32) < high)
-    cell = cx * raster.shape[i, 1:] + cy
-    cell += raster.start[i, None]
-    cell *= inside
-    if not len(raster.nearest):
-        return np.full(x.shape, _NOBODY, dtype=np.int64)
-    return np.where(inside, raster.nearest.take(cell), _NOBODY).astype(np.int64)
 
 
 _MEASURED = 2.0

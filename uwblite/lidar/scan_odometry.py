@@ -10,12 +10,12 @@ from .. import se2
 from ..arrays import Floats, Ints
 from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
-from . import clouds, scan_matching
+from . import cloud_rasters, clouds, scan_matching
+from .cloud_rasters import CloudRasters
 from .clouds import CloudConfig, Clouds
 from .correlative_matching import CorrelativeConfig, search
 from .pair_alignment import align_pairs
 from .point_cloud import make_cloud
-from .scan_matching import CloudRasters
 
 _FIRST_GATE, _LAST_GATE = 0.4, 0.12
 """Farthest match in the first and last iteration, m."""
@@ -67,7 +67,7 @@ def _block(
     chosen, where = np.unique(np.concatenate([first, second]), return_inverse=True)
     i, j = np.split(where.reshape(-1), 2)
     built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
-    raster = scan_matching.rasterize(built, config.raster, _FIRST_GATE)
+    raster = cloud_rasters.rasterize(built, config.raster, _FIRST_GATE)
     points = scan_matching.pair_points(built, j, _POINTS)
     aligned = align_pairs(built, raster, i, j, guess, points, _FIRST_GATE, _LAST_GATE)
     enough = aligned.factors.asked >= _LEAST_POINTS

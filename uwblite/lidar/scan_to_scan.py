@@ -15,9 +15,10 @@ from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
 from ..odometry.wheels import reestimate_wheel_noise
+from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .pair_alignment import align_pairs
-from .scan_matching import CloudRasters, match, measured, pair_points
+from .scan_matching import match, measured, pair_points
 from .step_search import StepSearch
 
 
@@ -102,7 +103,7 @@ def descend(
 
     Parameters
     ----------
-    clouds, raster : see clouds.build and scan_matching.rasterize. gate : reach of the raster, m.
+    clouds, raster : see clouds.build and cloud_rasters.rasterize. gate : reach of the raster, m.
     """
     points = pair_points(clouds, i + 1, config.points)
     aligned = align_pairs(clouds, raster, i, i + 1, guess, points, gate, min(config.gate, gate))
@@ -117,7 +118,7 @@ def follow(
 
     Parameters
     ----------
-    clouds, raster : see clouds.build and scan_matching.rasterize.
+    clouds, raster : see clouds.build and cloud_rasters.rasterize.
     wheels : edges between neighbouring keyframes. graph : holds their calibration.
     steps : the same steps as descent leaves them, see descend. gate : reach of the raster, m.
     """

@@ -12,11 +12,12 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
+from .cloud_rasters import rasterize
 from .clouds import Clouds
 from .free_space import free_space
 from .pair_alignment import align_pairs
 from .raster_search import Window, best_poses
-from .scan_matching import pair_points, rasterize
+from .scan_matching import pair_points
 from .visibility import nearest_by_bearing, violates_free_space
 
 _VIEWS = 6

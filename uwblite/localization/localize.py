@@ -17,11 +17,12 @@ from ..arrays import Floats
 from ..constraints import Constraints
 from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
+from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import stacked
 from ..lidar.correlative_matching import CorrelativeConfig, search
 from ..lidar.pair_alignment import align_pairs
 from ..lidar.point_cloud import PointCloud, make_cloud, two_sided
-from ..lidar.scan_matching import nondegenerate_step, pair_points, rasterize
+from ..lidar.scan_matching import nondegenerate_step, pair_points
 from ..map_result import MapResult, Notice, StageSummary
 from ..mapping import MappingConfig, Progress, build_map
 from ..pipeline import map_frame

@@ -14,9 +14,9 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import stacked
 from ..lidar.point_cloud import make_cloud
-from ..lidar.scan_matching import rasterize
 
 REACH = 0.5
 """m; a wall farther away is no neighbour."""

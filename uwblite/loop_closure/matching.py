@@ -12,12 +12,13 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
+from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds
 from ..lidar.correlative_matching import CorrelativeConfig, search
 from ..lidar.free_space import FreeSpace
 from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.point_cloud import PointCloud, make_cloud
-from ..lidar.scan_matching import PairFactors, match, pair_points, rasterize
+from ..lidar.scan_matching import PairFactors, match, pair_points
 from ..lidar.visibility import violates_free_space
 from .candidates import Candidates
 from .closures import LoopClosureConfig

@@ -11,8 +11,8 @@ from ..constraints import Constraints
 from ..graph.graph import Edges, Graph
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
+from ..lidar.cloud_rasters import CloudRasters
 from ..lidar.clouds import Clouds
-from ..lidar.scan_matching import CloudRasters
 from ..loop_closure.closures import Closures, no_closures
 from ..radio.bootstrap import BootstrapResult
 from .mapping_config import MappingConfig

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Ints
-from ..lidar import clouds, scan_matching
+from ..lidar import cloud_rasters, clouds
 from ..lidar.clouds import Clouds
 from ..odometry.attached import choose_scans, scan_points
 from .estimate import ScanClouds
@@ -36,11 +36,11 @@ def remake(old: ScanClouds, before: Recordings, after: Recordings, config: Mappi
     new = _with_raster(clouds.joined(parts), config, old.delay)
     place = np.where(former >= 0, former, len(old.clouds) + np.cumsum(former < 0) - 1)
     both = clouds.joined([old.clouds, new.clouds]).chosen(place)
-    return ScanClouds(both, scan_matching.chosen_rasters(old.raster, new.raster, place), old.delay), former
+    return ScanClouds(both, cloud_rasters.chosen_rasters(old.raster, new.raster, place), old.delay), former
 
 
 def _with_raster(built: Clouds, config: MappingConfig, delay: float) -> ScanClouds:
-    raster = scan_matching.rasterize(built, config.clouds.raster, max(config.refinement.first_gate, 0.2))
+    raster = cloud_rasters.rasterize(built, config.clouds.raster, max(config.refinement.first_gate, 0.2))
     return ScanClouds(built, raster, delay)
 
 
