@@ -7,9 +7,11 @@ So the priors' standard deviations are chosen by marginal likelihood, the probab
 integrated out (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
 Units of length: a radio measures times of flight and cannot be wrong by much, a wheel's radius is a setting and can be
-wrong by any factor. Three hypotheses are weighed: both are right, the radio's scale is off, the wheels' unit is wrong.
-The likeliest one holds, with its prior odds; where nothing contradicts it, the first. Biases: widths from sound to
-unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the marginal likelihood.
+wrong by any factor. Whether the wheels' unit is wrong is decided: the likelier hypothesis holds, with its prior odds, and
+where nothing contradicts it, that all are right. The scale of the radios and their biases can be wrong by little or much:
+widths from sound to unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the
+marginal likelihood. A scale that is clearly off floats with the widest. So a scale stays where it is as long as the
+recording cannot tell, moves a part of the way where it leans to one side, and floats where the evidence is positive.
 
 With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 
@@ -29,8 +31,12 @@ from ..graph.marginals import calibration_covariance
 
 _STEPS = 4
 """Widths tried from sound to unsound, evenly spaced in their logarithm."""
-_UNSOUND = 0.1
-"""Odds beforehand that a unit of length is wrong, against all being right."""
+_WRONG_UNIT = 0.1
+"""Odds beforehand that the wheels' unit of length is wrong, against all units being right."""
+_OFF = 1.0
+"""Odds beforehand that the radio's scale is off, by whatever order of magnitude, against being sound."""
+_CLEARLY = 3.0
+"""Posterior odds from which on the scale is off and floats; positive evidence (Kass and Raftery, Bayes factors, 1995)."""
 _FARTHEST = 0.12
 """Relative error beyond which no radio's scale is off: it measures times of flight. 0.07 is on record."""
 
@@ -45,9 +51,9 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     config : the narrowest and widest priors.
     """
     groups = [_free(graph, name) for name in ("range_scale", "odometry_scale", "bias")]
-    which, scales = np.concatenate(groups), len(groups[0]) + len(groups[1])
+    which, radios, scales = np.concatenate(groups), len(groups[0]), len(groups[0]) + len(groups[1])
     sigma = _prior_sigma(graph)
-    if not len(groups[0]) + len(groups[2]) or not np.all(np.isfinite(sigma[which])):
+    if not radios + len(groups[2]) or not np.all(np.isfinite(sigma[which])):
         return graph
     try:
         covariance = calibration_covariance(graph.with_edges(*edges))[np.ix_(which, which)]
@@ -58,36 +64,57 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     if not determined:
         return graph
     mean, before = graph.calibration.values[which], sigma[which]
-    units, odds = _units(len(groups[0]), len(groups[1]), config)
+    units, odds, hypothesis = _units(radios, len(groups[1]), config)
     biases = np.array(_between(config.range_bias_sound, config.range_bias, _STEPS) if len(groups[2]) else [1.0])
     tried = [[np.append(unit, np.full(len(groups[2]), bias)) for bias in biases] for unit in units]
     worth = np.array([[log_marginal_likelihood(mean, covariance, before, widths) for widths in row] for row in tried])
     if not np.isfinite(worth).any():
         return graph
-    if len(groups[0]):
+    if radios:
         off = [abs(_mean_under(mean, covariance, before, row[0])[0]) for row in tried]
         odds = np.where(np.array(off) > _FARTHEST, -np.inf, odds)
-    best = int(np.argmax(np.logaddexp.reduce(worth, axis=1) + odds))
-    likely = np.exp(worth[best] - worth[best].max())
-    sigma[which[:scales]] = units[best]
-    sigma[which[scales:]] = np.exp(likely @ np.log(biases) / likely.sum())
+    likely = np.exp(worth + odds[:, None] - (worth + odds[:, None]).max())
+    rows = hypothesis == np.argmax(np.bincount(hypothesis, likely.sum(axis=1)))
+    likely, units = likely[rows], units[rows]
+    sigma[which[:scales]] = _unit_widths(units, likely.sum(axis=1))
+    sigma[which[scales:]] = np.exp(likely.sum(axis=0) @ np.log(biases) / likely.sum())
     return _with_prior_sigma(graph, sigma)
 
 
-def _units(radios: int, wheels: int, config: CalibrationConfig) -> tuple[Floats, Floats]:
-    """Return widths (h, radios + wheels) under each hypothesis about the units of lengths, and their logarithmic odds (h,).
+def _unit_widths(units: Floats, likely: Floats) -> Floats:
+    """Return the widths (n,) to take of those under one hypothesis about the wheels (h, n), the first of a sound radio.
 
-    All units are right; the radio's is off; the wheels' of one recording is wrong; those of all recordings are.
+    Parameters
+    ----------
+    likely : (h,) how likely each is.
     """
-    sound = np.append(np.full(radios, config.range_scale_sound or config.range_scale), np.full(wheels, config.odometry_scale))
-    units = [sound]
-    if radios and 0.0 < config.range_scale_sound < config.range_scale:
-        units.append(np.append(np.full(radios, config.range_scale), sound[radios:]))
+    if likely[1:].sum() > _CLEARLY * likely[0]:
+        return np.asarray(units[likely > 0.0][-1])
+    return np.asarray(np.exp(likely @ np.log(units) / likely.sum()))
+
+
+def _units(radios: int, wheels: int, config: CalibrationConfig) -> tuple[Floats, Floats, Ints]:
+    """Return the widths of units of length that are tried, and which hypothesis about the wheels' unit each is under.
+
+    All units of wheels are right, and the radio's scale is sound or off by more and more; that of one recording's wheels is
+    wrong; those of all recordings are.
+
+    Returns
+    -------
+    Widths (h, radios + wheels), their logarithmic odds (h,), and numbers of hypotheses (h,).
+    """
+    scales = _between(config.range_scale_sound, config.range_scale, _STEPS) if radios else [1.0]
+    right = np.full(wheels, config.odometry_scale)
+    units = [np.append(np.full(radios, scale), right) for scale in scales]
+    odds = [1.0, *np.full(len(scales) - 1, _OFF / max(len(scales) - 1, 1))]
+    hypothesis = [0] * len(scales)
     if wheels and config.odometry_unit > config.odometry_scale:
         wrong = [np.arange(wheels) == k for k in range(wheels)]
-        for which in wrong if wheels == 1 else [*wrong, np.ones(wheels, dtype=bool)]:
-            units.append(np.append(sound[:radios], np.where(which, config.odometry_unit, sound[radios:])))
-    return np.array(units), np.append(0.0, np.full(len(units) - 1, np.log(_UNSOUND)))
+        for number, these in enumerate(wrong if wheels == 1 else [*wrong, np.ones(wheels, dtype=bool)]):
+            units.append(np.append(units[0][:radios], np.where(these, config.odometry_unit, right)))
+            odds.append(_WRONG_UNIT)
+            hypothesis.append(number + 1)
+    return np.array(units), np.log(odds), np.array(hypothesis)
 
 
 def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> Floats:
