@@ -68,7 +68,9 @@ def build_map(
     estimate = radio_stages.first_optimisation(task)
     if np.any((factors := radio_stages.odometry_unit_factors(estimate, task)) != 1.0):
         logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
-        task = replace(task, recordings=gather(logs, config.keyframes))
+        # A unit that the ranges have set says nothing about the ranges' own.
+        free = replace(config.calibration, odometry_scale=config.calibration.odometry_unit)
+        task = replace(task, recordings=gather(logs, config.keyframes), config=replace(config, calibration=free))
         estimate = radio_stages.first_optimisation(task)
     before = stages.mark()
     renamed = anchor_moves.first_with_moves_apart(estimate, task, logs)
