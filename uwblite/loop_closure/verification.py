@@ -25,6 +25,7 @@ from ..lidar.pair_alignment import Aligned
 from ..lidar.scan_matching import measured
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
+from . import slid_stretches
 from .candidates import Candidates
 from .closures import Closures, LoopClosureConfig, no_closures
 from .matching import ClosureMatches, fit
@@ -118,6 +119,22 @@ def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solve
     -------
     The solved graph (without the closure edges) and the closures that remain; the others carry the reason.
     """
+    solved, left = _tightened(graph, closures, config, solver)
+    for _ in range(_SLID):
+        by = slid_stretches.moved_by(left.edges, solved)
+        if not by.any():
+            break
+        reasons = [f"the odometry would have to jump by {jump:.1f} m and back again" for jump in by]
+        solved, left = _tightened(graph, left.without(by == 0.0, "contradicts-graph", reasons), config, solver)
+    return solved, left
+
+
+_SLID = 3
+"""How often, at most, stretches that slid are sought: without the closures that moved one, another may show."""
+
+
+def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:
+    """Solve the graph with closures under a kernel that tightens; drop those at odds."""
     if not len(closures.edges):
         return graph, closures
     solved = graph

@@ -11,6 +11,7 @@ from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
+from ..loop_closure.slid_stretches import jumps, scans_fixing
 from ..radio.range_noise import short_term_sigma
 from .estimate import Estimate, Task
 
@@ -27,12 +28,6 @@ _MEASURED_BREAK = 0.15
 """Steps more uncertain than that, m, are no measurements."""
 _ANOTHER_VISIT = 10.0
 """Travelled distance between two visits, m."""
-_NEAR = 4
-"""Keyframes that a scan edge of the same visit spans, at most."""
-_CLEAR_PLACE, _CLEAR_HEADING = 0.05, 0.02
-"""Standard deviations, m and rad, up to which a scan edge fixes a pose in every direction; none does along a bare corridor."""
-_AGREES = 4.0
-"""Standard deviations within which a scan edge agrees with the map."""
 _REDUNDANT = 2
 """Scan edges that have to fix a step: one alone has nothing to agree with."""
 _MOVING = 0.05
@@ -54,6 +49,7 @@ def check_residuals(estimate: Estimate, residuals: Floats, task: Task) -> None:
     """
     check_range_scatter(estimate, residuals, task)
     check_odometry_steps(estimate, task)
+    check_odometry_jumps(estimate, task)
     check_scales(estimate, task)
     check_support(estimate, task)
 
@@ -119,26 +115,38 @@ def _confirmed(graph: Graph, path: Floats) -> Bools:
     return confirmed
 
 
+def check_odometry_jumps(estimate: Estimate, task: Task) -> None:
+    """Doubt a map in which the robot jumps from one keyframe to the next and neither odometry nor scans measured it.
+
+    Closures alone say so then, and in corridors that repeat themselves they may all be wrong alike.
+    """
+    wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
+    if estimate.placed.any():
+        return
+    rows, by = jumps(wheels, graph)
+    rows, by = (v[1.0 / wheels.sqrt_information[rows, 0, 0] < _MEASURED_BREAK] for v in (rows, by))
+    far = np.hypot(by[:, 0], by[:, 1])
+    if far.max(initial=0.0) < _FAR:
+        return
+    worst = int(np.argmax(far))
+    when = float(stamps[wheels.i[rows[worst]]] - stamps[0])
+    task.stages.doubt(
+        "odometry-jumps",
+        f"at t = {when:.0f} s the map moves by {far[worst]:.1f} m more or less than the odometry counts, and no scan "
+        f"measures it ({len(rows)} such steps): closures there may be of places that look alike",
+        steps=len(rows), metres=float(far[worst]), at=when,
+    )  # fmt: skip
+
+
+_FAR = 1.0
+"""m; no wheel slips by that within one step between keyframes."""
+
+
 def _fixed_by_neighbours(graph: Graph) -> Bools:
     """Return at which keyframes (k,) a step begins that several scan edges of the same visit fix and agree on."""
-    count = np.zeros(len(graph.poses) + 1, dtype=np.int64)
-    for edges in graph.edges:
-        if isinstance(edges, ScanEdges):
-            good = (np.abs(edges.i - edges.j) <= _NEAR) & _clear(edges)
-            good &= np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < _AGREES
-            np.add.at(count, np.minimum(edges.i, edges.j)[good], 1)
-            np.add.at(count, np.maximum(edges.i, edges.j)[good], -1)
     steps = se2.between(graph.poses[:-1], graph.poses[1:])
     moves = np.append((np.hypot(steps[:, 0], steps[:, 1]) > _MOVING) | (np.abs(steps[:, 2]) > _MOVING), False)
-    return (np.cumsum(count)[:-1] >= _REDUNDANT) & moves
-
-
-def _clear(edges: ScanEdges) -> Bools:
-    """Return which scan edges (e,) fix a pose in all directions."""
-    information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
-    units = np.array([_CLEAR_PLACE, _CLEAR_PLACE, _CLEAR_HEADING])
-    # With the limits as units, the least eigenvalue is 1 where the least certain direction has the limit as its sigma.
-    return np.asarray(np.linalg.eigvalsh(information * np.outer(units, units))[:, 0] > 1.0)
+    return (scans_fixing(graph) >= _REDUNDANT) & moves
 
 
 def check_scales(estimate: Estimate, task: Task) -> None:

@@ -1,0 +1,93 @@
+"""Closures of places that look alike do not slide a stretch of a corridor; a wheel that slips once is believed."""
+
+import numpy as np
+import pytest
+from helpers.laser_walks import chained
+
+from uwblite import se2
+from uwblite.graph.calibration import scan_indices
+from uwblite.graph.graph import Calibration, Graph
+from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
+from uwblite.graph.solver import SolverConfig
+from uwblite.loop_closure.closures import Closures, LoopClosureConfig
+from uwblite.loop_closure.slid_stretches import jumps, moved_by, scans_fixing, slid
+from uwblite.loop_closure.verification import _tightened, reconcile
+from uwblite.map_result import LoopClosure
+from uwblite.odometry.wheels import OdometryNoiseConfig
+
+KEYFRAMES, SLIDE = 60, 2.9
+NOISE = np.array([0.02, 0.02, 0.01])
+
+
+def chain():
+    """Return poses (60, 3) along a corridor and back, and what the wheels count, with the robust kernel they have."""
+    out = np.column_stack([np.arange(30) * 0.8, np.zeros(30), np.zeros(30)])
+    truth = np.concatenate([out, np.add(out[::-1], [0.0, 0.2, np.pi])])
+    wheels = chained(truth, NOISE)
+    object.__setattr__(wheels, "kernel", OdometryNoiseConfig().kernel)
+    return truth, wheels
+
+
+def closures(pairs, truth, error):
+    """Return closures between pairs of keyframes whose second pose is wrong by an error (3,) in the map."""
+    i, j = np.array(pairs).T
+    z = se2.between(truth[i], truth[j] + error)
+    root = np.zeros((len(i), 3, 3)) + np.diag([40.0, 40.0, 200.0])
+    records = tuple(LoopClosure(int(a), int(b), t, root[0], 0.01, 0.8, "accepted", "") for a, b, t in zip(i, j, z, strict=True))
+    return RelativePoseEdges(i, j, z, root), records
+
+
+def scans(i, truth, along):
+    """Return scan edges from keyframes i to the next with a standard deviation along the corridor, m; inf: none."""
+    none, i = np.zeros((len(i), 3)), np.array(i)
+    root = np.zeros((len(i), 3, 3)) + np.diag([1.0 / along, 50.0, 500.0])
+    return ScanEdges(i, i + 1, se2.between(truth[i], truth[i + 1]), root, none, none, scan_indices(Calibration()))
+
+
+def moved(first, last):
+    truth, wheels = chain()
+    poses = truth.copy()
+    poses[first : last + 1, 0] += SLIDE
+    return Graph(poses, edges=(wheels,)), wheels, poses
+
+
+def test_a_stretch_between_a_jump_and_the_one_back_slid():
+    graph, wheels, _ = moved(35, 50)
+    rows, by = jumps(wheels, graph)
+    assert rows.tolist() == [34, 50]
+    np.testing.assert_allclose(by, [[SLIDE, 0.0], [-SLIDE, 0.0]], atol=1e-9)
+    ((first, last, size),) = slid(graph)
+    assert (first, last, size) == (35, 50, pytest.approx(SLIDE))
+    edges, _ = closures([(5, 40), (36, 49), (2, 57)], graph.poses, np.zeros(3))
+    np.testing.assert_allclose(moved_by(edges, graph), [SLIDE, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_wheel_that_slips_once_slides_nothing():
+    graph, wheels, _ = moved(35, KEYFRAMES)
+    assert jumps(wheels, graph)[0].tolist() == [34]
+    assert slid(graph) == []
+
+
+def test_jumps_that_scans_measure_are_the_odometry_s():
+    graph, wheels, poses = moved(35, 50)
+    for along, fixing in ((0.02, 1), (np.inf, 0)):
+        measured = graph.with_edges(wheels, scans([34, 50], poses, along))
+        assert scans_fixing(measured)[[34, 50]].tolist() == [fixing] * 2
+        assert len(jumps(wheels, measured)[0]) == 2 * (1 - fixing)
+
+
+def test_many_closures_of_a_place_that_looks_alike_are_overruled_by_the_odometry():
+    truth, wheels = chain()
+    true, known = closures([(k, 59 - k) for k in (0, 1, 2, 3, 26, 27, 28)], truth, np.zeros(3))
+    false, told = closures([(k, 59 - k) for k in range(8, 20)], truth, np.array([SLIDE, 0.0, 0.0]))
+    columns = ("i", "j", "T_i_j", "sqrt_information")
+    edges = RelativePoseEdges(*(np.concatenate([getattr(true, n), getattr(false, n)]) for n in columns))
+    found = Closures(edges, known + told)
+    graph = Graph(truth, edges=(wheels,))
+    solver, config = SolverConfig(), LoopClosureConfig()
+    torn, _ = _tightened(graph, found, config, solver)
+    assert np.abs(torn.poses[:, 0] - truth[:, 0]).max() > 0.8 * SLIDE
+    solved, left = reconcile(graph, found, config, solver)
+    assert np.hypot(*(solved.poses - truth)[:, :2].T).max() < 3.0 * 0.02 * np.sqrt(15.0)
+    assert [c.outcome for c in left.candidates] == ["accepted"] * len(known) + ["contradicts-graph"] * len(told)
+    assert len(left.edges) == len(known)

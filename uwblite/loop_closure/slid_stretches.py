@@ -1,0 +1,79 @@
+"""Stretches of the recording that closures slid along a corridor: the odometry would have to jump there, and back again.
+
+Doors and pillars repeat. Closures that take one for the next agree with each other, and a robust odometry gives way at the
+two ends of the stretch that they move. A wheel slips once; it does not make good for it metres later by the same way.
+"""
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from ..graph.graph import Graph
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+
+_JUMP = 0.5
+"""m; errors of one step of the odometry that are no noise."""
+_TORN = 10.0
+"""Standard deviations of the same."""
+_NEAR = 4
+"""Keyframes that a scan edge of the same visit spans, at most."""
+_CLEAR_PLACE, _CLEAR_HEADING = 0.05, 0.02
+"""Standard deviations, m and rad, up to which a scan edge fixes a pose in every direction; none does along a bare corridor."""
+_AGREES = 4.0
+"""Standard deviations within which a scan edge agrees with the map."""
+_MADE_GOOD = 0.3
+"""Part of a jump that may be left after the one that makes good for it."""
+
+
+def jumps(wheels: OdometryEdges, graph: Graph) -> tuple[Ints, Floats]:
+    """Return the steps (s,) at which the graph jumps from what the odometry counts and no scans measure it, and by what.
+
+    Returns
+    -------
+    Rows of the odometry's edges (s,), and jumps (s, 2), m, in the map frame.
+    """
+    away = se2.between(graph.poses[wheels.i], graph.poses[wheels.j])[:, :2] - wheels.corrected(graph)[:, :2]
+    off = np.abs(wheels.residuals(graph))[:, :2].max(axis=1, initial=0.0) > _TORN
+    rows = np.flatnonzero(off & (np.hypot(away[:, 0], away[:, 1]) > _JUMP) & (scans_fixing(graph)[wheels.i] == 0))
+    return rows, se2.rotate(graph.poses[wheels.i[rows], 2], away[rows])
+
+
+def scans_fixing(graph: Graph) -> Ints:
+    """Return how many scan edges of the same visit fix, in all directions, the step from each keyframe (k,) and agree."""
+    count = np.zeros(len(graph.poses) + 1, dtype=np.int64)
+    for edges in graph.edges:
+        if isinstance(edges, ScanEdges):
+            good = (np.abs(edges.i - edges.j) <= _NEAR) & _clear(edges)
+            good &= np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < _AGREES
+            np.add.at(count, np.minimum(edges.i, edges.j)[good], 1)
+            np.add.at(count, np.maximum(edges.i, edges.j)[good], -1)
+    return np.cumsum(count)[:-1]
+
+
+def _clear(edges: ScanEdges) -> Bools:
+    """Return which scan edges (e,) fix a pose in all directions."""
+    information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
+    units = np.array([_CLEAR_PLACE, _CLEAR_PLACE, _CLEAR_HEADING])
+    # With the limits as units, the least eigenvalue is 1 where the least certain direction has the limit as its sigma.
+    return np.asarray(np.linalg.eigvalsh(information * np.outer(units, units))[:, 0] > 1.0)
+
+
+def slid(graph: Graph) -> list[tuple[int, int, float]]:
+    """Return stretches: first and last keyframe, and the jump at both ends, m."""
+    found = []
+    for wheels in (e for e in graph.edges if isinstance(e, OdometryEdges)):
+        rows, by = jumps(wheels, graph)
+        size = np.hypot(by[:, 0], by[:, 1])
+        left = np.hypot(*(by[:-1] + by[1:]).T)
+        for k in np.flatnonzero(left < _MADE_GOOD * np.maximum(size[:-1], size[1:])).tolist():
+            found.append((int(wheels.j[rows[k]]), int(wheels.i[rows[k + 1]]), float(size[k])))
+    return found
+
+
+def moved_by(closures: RelativePoseEdges, graph: Graph) -> Floats:
+    """Return by how much (e,) a stretch slid that each closure ties to the rest, m; 0 = none did."""
+    by = np.zeros(len(closures))
+    for first, last, size in slid(graph):
+        inside = [(k >= first) & (k <= last) for k in (closures.i, closures.j)]
+        by[inside[0] != inside[1]] = size
+    return by
