@@ -53,6 +53,36 @@ def minute_log(room_log, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def short_log(room_log, tmp_path_factory):
+    """Path of its first 25 s, within which nothing closes."""
+    from uwblite.io.carmen import read_log, write_log
+
+    path = tmp_path_factory.mktemp("short") / "short.log.gz"
+    write_log(path, read_log(room_log).crop(0.0, 25.0))
+    return path
+
+
+@pytest.fixture(scope="session")
+def minute_map(minute_log, tmp_path_factory):
+    """Folder with the map of that minute, which no test may change; made once for all processes of a run."""
+    import fcntl
+    import shutil
+
+    from uwblite.cli import main
+
+    shared = tmp_path_factory.getbasetemp()
+    shared = shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared
+    with open(shared / "minute_map.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        folder = shared / "minute_map"
+        if not folder.exists():
+            folder.mkdir()
+            shutil.copy(minute_log, folder / "run.log.gz")
+            assert main(["map", str(folder / "run.log.gz"), "--out", str(folder / "map"), "-q"]) in (0, 3)
+    return folder / "map"
+
+
+@pytest.fixture(scope="session")
 def log(room_log):
     """That recording, read."""
     from uwblite.io.carmen import read_log

@@ -14,6 +14,7 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -35,7 +36,7 @@ def main() -> int:
             print("== mypy: SKIPPED; the annotations of numpy before 2.0 are too coarse for it")
     if not args.lint:
         steps += [("pytest", ["pytest", *_workers(pytest_args), *(["--slow"] if args.slow else []), *pytest_args])]
-    results = [(name, _run(name, command)) for name, command in steps]
+    results = _run_all(steps)
     failed = [name for name, code in results if code]
     print("checks: " + ("all passed" if not failed else "FAILED: " + ", ".join(failed)))
     return 1 if failed else 0
@@ -56,13 +57,31 @@ def _numpy_has_exact_types() -> bool:
     return subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def _run(name: str, command: list[str]) -> int:
-    print(f"== {name}", flush=True)
+def _run_all(steps: list[tuple[str, list[str]]]) -> list[tuple[str, int]]:
+    """Run the steps and return their exit codes; those before the last run beside it, and are shown when they end.
+
+    mypy works in one process and the tests wait for ports and files: together they use two cores better.
+    """
+    with ThreadPoolExecutor(1) as beside:
+        earlier = [(name, beside.submit(_run, name, command, quiet=True)) for name, command in steps[:-1]]
+        last = [(name, _run(name, command)) for name, command in steps[-1:]]
+        return [(name, code.result()) for name, code in earlier] + last
+
+
+def _run(name: str, command: list[str], *, quiet: bool = False) -> int:
+    """Run a module of this Python; quiet: show its output at its end."""
     began = time.monotonic()
+    if not quiet:
+        print(f"== {name}", flush=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": os.environ.get("OPENBLAS_NUM_THREADS", "1")}
-    code = subprocess.run([sys.executable, "-m", *command], cwd=ROOT, env=environment, check=False).returncode
-    print(f"== {name}: {'ok' if code == 0 else f'exit {code}'}, {time.monotonic() - began:.0f} s\n", flush=True)
-    return code
+    # Tests start Python some hundred times; compiling everything anew each time is a sixth of their work.
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if quiet else {}
+    done = subprocess.run([sys.executable, "-m", *command], cwd=ROOT, env=environment, check=False, **output)
+    shown = f"\n== {name}\n{done.stdout.decode(errors='replace')}" if quiet else ""
+    outcome = "ok" if done.returncode == 0 else f"exit {done.returncode}"
+    print(f"{shown}== {name}: {outcome}, {time.monotonic() - began:.0f} s\n", flush=True)
+    return done.returncode
 
 
 if __name__ == "__main__":

@@ -64,25 +64,24 @@ def test_every_odometry_stamp_has_a_pose(mapped):
     assert np.all(np.diff(stamps) > 0)
 
 
-def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(minute_log, tmp_path, capsys):
-    codes = [main(["map", str(minute_log), "--out", str(tmp_path / jobs), "--jobs", jobs, "-q"]) for jobs in "12"]
-    assert codes[0] == codes[1]
-    first, second = contents(tmp_path / "1"), contents(tmp_path / "2")
+def test_two_runs_give_the_same_bytes_whatever_the_number_of_workers(minute_map, tmp_path, capsys):
+    assert main(["map", str(minute_map.parent / "run.log.gz"), "--out", str(tmp_path / "2"), "--jobs", "2", "-q"]) in (0, 3)
+    first, second = contents(minute_map), contents(tmp_path / "2")
     assert {name for name in first if first[name] != second[name]} <= {"report.json"}
     one, two = (json.loads(c["report.json"]) for c in (first, second))
     one.pop("timings"), two.pop("timings")
     assert one == two
 
 
-def test_the_command_in_the_report_makes_the_same_map(minute_log, tmp_path, monkeypatch, capsys):
+def test_the_command_in_the_report_makes_the_same_map(short_log, tmp_path, monkeypatch, capsys):
     import shlex
     import shutil
 
-    code = main(["map", str(minute_log), "--out", str(tmp_path / "first"), "--resolution", "0.1", "--no-timings"])
+    code = main(["map", str(short_log), "--out", str(tmp_path / "first"), "--resolution", "0.1", "--no-timings"])
     first = contents(tmp_path / "first")
     words = shlex.split(json.loads(first["report.json"])["command"])
     monkeypatch.chdir(tmp_path)
-    shutil.copy(minute_log, tmp_path)
+    shutil.copy(short_log, tmp_path)
     (tmp_path / "config.toml").write_bytes(first["config.toml"])
     assert main(words[1:]) == code
     assert (tmp_path / "map_again" / "map.pgm").read_bytes() == first["map.pgm"]
@@ -137,8 +136,8 @@ def test_a_result_is_not_replaced_unasked(mapped, room_log, capsys):
 
 
 @pytest.mark.parametrize("without", ["uwb", "loops", "lidar"])
-def test_a_sensor_may_be_missing(minute_log, tmp_path, capsys, without):
-    code = main(["map", str(minute_log), "--out", str(tmp_path / "map"), "--without", without, "--json"])
+def test_a_sensor_may_be_missing(short_log, tmp_path, capsys, without):
+    code = main(["map", str(short_log), "--out", str(tmp_path / "map"), "--without", without, "--json"])
     assert code in (0, 3)
     summary = json.loads(capsys.readouterr().out)
     names = {Path(name).name for name in summary["files"]}
@@ -159,8 +158,8 @@ def test_mounting_and_settings_of_the_command_line_count(minute_log, tmp_path, c
     assert (tmp_path / "map" / "map_scale.png").exists()
 
 
-def test_a_dry_run_writes_nothing(minute_log, tmp_path, capsys):
-    assert main(["map", str(minute_log), "--out", str(tmp_path / "map"), "--dry-run"]) == 0
+def test_a_dry_run_writes_nothing(short_log, tmp_path, capsys):
+    assert main(["map", str(short_log), "--out", str(tmp_path / "map"), "--dry-run"]) == 0
     assert "expected cost" in capsys.readouterr().out
     assert not (tmp_path / "map").exists()
 
@@ -174,8 +173,8 @@ def test_check_of_the_sample(room_log, capsys):
     assert "SERIOUS" not in text
 
 
-def test_check_shows_programs_figures_and_cost(minute_log, capsys):
-    assert main(["check", str(minute_log), "--json", "--quick"]) == 0
+def test_check_shows_programs_figures_and_cost(short_log, capsys):
+    assert main(["check", str(short_log), "--json", "--quick"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["figures"]["lidar"]["beams"] == 682
     assert summary["expected cost of map"]["megabytes"] > 50
@@ -186,14 +185,14 @@ def test_check_exits_with_3_where_a_finding_spoils_the_map(minute_log, capsys):
     assert "mounted upright" in capsys.readouterr().out
 
 
-def test_walls_are_turned_along_the_axes_and_the_map_cropped(room_log, tmp_path, capsys):
+def test_walls_are_turned_along_the_axes_and_the_map_cropped(minute_log, room_log, tmp_path, capsys):
     folder = tmp_path / "map"
     words = ["--align", "walls", "--crop=-2,-1,3,3", "--without", "uwb"]
-    assert main(["map", str(room_log), "--out", str(folder), *words]) in (0, 3)
+    assert main(["map", str(minute_log), "--out", str(folder), *words]) in (0, 3)
     _, poses = read_tum(folder / "trajectory.tum")
     # The room's walls lie along the axes of its truth; the drive began at a known heading there.
     _, truth = read_tum(room_log.parent / "room" / "truth.tum")
-    turned = np.degrees(np.median(poses[:, 2] - truth[:, 2])) % 90.0
+    turned = np.degrees(np.median(poses[:, 2] - truth[: len(poses), 2])) % 90.0
     assert min(turned, 90.0 - turned) < 1.0
     assert np.allclose(poses[0, :2], 0.0, atol=1e-6)
     assert (folder / "map.pgm").read_bytes().startswith(b"P5\n100 80\n")
@@ -287,15 +286,15 @@ def test_a_second_map_lies_in_the_frame_of_the_first_and_names_what_was_moved(ma
         assert np.hypot(*np.subtract(found[name], position)) < 0.4, name
 
 
-def test_a_file_of_constraints_pins_the_map(minute_log, tmp_path, capsys):
+def test_a_file_of_constraints_pins_the_map(short_log, tmp_path, capsys):
     (tmp_path / "known.toml").write_text("[[pose]]\nstamp = 0\npose = [10, 20, 1.5707963]\nsigma = [0.001, 0.001, 0.001]\n")
     words = ["--constraints", str(tmp_path / "known.toml"), "--without", "lidar"]
-    assert main(["map", str(minute_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
+    assert main(["map", str(short_log), "--out", str(tmp_path / "map"), *words]) in (0, 3)
     _, poses = read_tum(tmp_path / "map" / "trajectory.tum")
     assert np.allclose(poses[0], (10, 20, np.pi / 2), atol=0.01)
     assert "--constraints" in json.loads((tmp_path / "map" / "report.json").read_text())["command"]
     (tmp_path / "known.toml").write_text("[[anchor]]\nid = 'FFFF'\nposition = [1, 2]\n")
-    assert main(["map", str(minute_log), "--out", str(tmp_path / "other"), *words]) == 1
+    assert main(["map", str(short_log), "--out", str(tmp_path / "other"), *words]) == 1
     assert "no ranges to anchor FFFF" in capsys.readouterr().err
 
 
@@ -314,7 +313,7 @@ def test_a_forbidden_closure_is_listed_as_such(room_log, tmp_path, capsys):
 
 def test_localize_finds_a_part_in_the_map(mapped, room_log, tmp_path, capsys):
     part = tmp_path / "part.log"
-    assert main(["convert", str(room_log), str(part), "--start", "120", "--end", "180"]) == 0
+    assert main(["convert", str(room_log), str(part), "--start", "120", "--end", "150"]) == 0
     words = ["--map", str(mapped[0]), "--out", str(tmp_path / "p.tum"), "--picture", str(tmp_path / "p.png")]
     before = contents(mapped[0])
     assert main(["localize", str(part), *words, "--covariance", str(tmp_path / "p.csv")]) == 0
@@ -378,7 +377,7 @@ def test_a_folder_of_localize_is_exchanged_as_a_whole(mapped, room_log, tmp_path
 
 def test_localize_fills_a_folder_but_never_the_map_s(mapped, room_log, tmp_path, capsys):
     part, out = tmp_path / "part.log", tmp_path / "there"
-    assert main(["convert", str(room_log), str(part), "--start", "150", "--end", "190"]) == 0
+    assert main(["convert", str(room_log), str(part), "--start", "150", "--end", "175"]) == 0
     before = contents(mapped[0])
     assert main(["localize", str(part), "--map", str(mapped[0]), "--out", str(mapped[0]), "--force"]) == 1
     assert "is the map itself" in capsys.readouterr().err

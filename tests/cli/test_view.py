@@ -1,5 +1,6 @@
 """`uwblite view` as a user starts it, and in Chromium: a closure is rejected with a click and the map made again."""
 
+import shutil
 
 import pytest
 from helpers.browser import CHROMIUM, Browser
@@ -10,12 +11,9 @@ from uwblite.io.constraints_file import parse_constraints
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory, room_log):
+def mapped(tmp_path_factory, minute_map):
     """A folder with a minute of the sample recording, and its map."""
-    folder = tmp_path_factory.mktemp("view")
-    assert main(["convert", str(room_log), str(folder / "run.log"), "--end", "70"]) == 0
-    assert main(["map", str(folder / "run.log"), "--out", str(folder / "map"), "-q"]) in (0, 3)
-    return folder
+    return shutil.copytree(minute_map.parent, tmp_path_factory.mktemp("view") / "minute")
 
 
 def test_it_reports_its_address_and_ends_with_ctrl_c(mapped):
@@ -29,10 +27,10 @@ def test_it_reports_its_address_and_ends_with_ctrl_c(mapped):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["{0}/run.log"], "holds no result; map it first: uwblite map"),
+        (["{0}/run.log.gz"], "holds no result; map it first: uwblite map"),
         (["{0}/map", "{0}/none.log"], "no such file"),
         (["{0}/map", "{0}/map/config.toml"], "is not the recording that the map was made of"),
-        (["{0}/map", "--constraints", "{0}/run.log"], "run.log"),
+        (["{0}/map", "--constraints", "{0}/run.log.gz"], "run.log.gz: not a text file"),
     ],
 )
 def test_what_cannot_be_shown_is_one_clear_line(mapped, capsys, words, message):

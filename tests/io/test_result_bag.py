@@ -14,14 +14,9 @@ AnyReader = pytest.importorskip("rosbags.highlevel", reason="rosbags is absent")
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory, room_log):
+def mapped(minute_map):
     """A map of a minute of the sample recording, and the recording."""
-    from uwblite.cli import main
-
-    folder = tmp_path_factory.mktemp("bag")
-    assert main(["convert", str(room_log), str(folder / "run.log"), "--end", "60"]) == 0
-    assert main(["map", str(folder / "run.log"), "--out", str(folder / "map"), "-q"]) in (0, 3)
-    return read_result(folder / "map"), read_log(folder / "run.log")
+    return read_result(minute_map), read_log(minute_map.parent / "run.log.gz")
 
 
 def messages(path):

@@ -21,7 +21,15 @@ from uwblite.io.result_text import RunRecord, anchors_csv, covariance_csv
 from uwblite.io.results import check_target, is_of_result, repair_result, write_result
 from uwblite.io.tum import read_tum
 
+SMALL_PICTURE = np.zeros((2, 3, 3), dtype=np.uint8)
+
 RECORD = RunRecord("uwblite map run.log --out map_again", "use_uwb = true\n", {"uwblite": "0.1.0"})
+
+@pytest.fixture
+def small_picture(monkeypatch):
+    """A picture of six pixels in every result: for tests of how files are exchanged, whatever is in them."""
+    monkeypatch.setattr(results, "picture", lambda result, caption: SMALL_PICTURE)
+
 
 def test_all_files_of_the_contract_are_written(tmp_path):
     names = write_result(tmp_path / "a" / "map", [small_log()], small_result(), RECORD)
@@ -48,6 +56,7 @@ def test_timings_are_the_only_difference_of_two_runs(tmp_path):
     assert first == second
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_report_json_holds_every_stage(tmp_path):
     write_result(tmp_path / "map", [small_log()], small_result(), RECORD)
     report = json.loads((tmp_path / "map" / "report.json").read_text())
@@ -86,6 +95,7 @@ def test_covariances_are_the_upper_triangle():
     assert len(lines) == 25
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_each_recording_has_its_trajectory(tmp_path):
     write_result(tmp_path / "map", [small_log()], small_result(each=2), RECORD)
     stamps, _ = read_tum(tmp_path / "map" / "trajectory_2.tum")
@@ -97,6 +107,7 @@ def test_each_recording_has_its_trajectory(tmp_path):
         assert [row["recording"] for row in rows] == ["1"] * 24 + ["2"] * 24
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_without_lidar_there_is_no_map_and_an_old_one_goes(tmp_path):
     folder = tmp_path / "map"
     write_result(folder, [small_log()], small_result(), replace(RECORD, scale_map=True))
@@ -106,6 +117,7 @@ def test_without_lidar_there_is_no_map_and_an_old_one_goes(tmp_path):
     assert set(contents(folder)) == (FILES - {"map.pgm", "map.yaml"}) | {"notes.txt"}
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_an_earlier_result_is_not_replaced_unasked(tmp_path):
     folder = tmp_path / "map"
     check_target(folder, force=False)
@@ -120,6 +132,7 @@ def test_an_earlier_result_is_not_replaced_unasked(tmp_path):
     check_target(tmp_path / "other", force=False)
 
 
+@pytest.mark.usefixtures("small_picture")
 @pytest.mark.parametrize("fresh", [True, False])
 def test_a_full_disk_leaves_the_previous_result(tmp_path, monkeypatch, fresh):
     folder = tmp_path / "map"
@@ -153,6 +166,7 @@ def killed_behind(what, folder):
     os._exit(0)
 
 
+@pytest.mark.usefixtures("small_picture")
 @pytest.mark.parametrize("what", ["write_png", "write_pyfg", "_write_trajectories", "render", "summary"])
 @pytest.mark.parametrize("fresh", [True, False])
 def test_a_killed_writer_leaves_the_previous_result(tmp_path, what, fresh):
@@ -168,6 +182,7 @@ def test_a_killed_writer_leaves_the_previous_result(tmp_path, what, fresh):
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 
+@pytest.mark.usefixtures("small_picture")
 @pytest.mark.parametrize("foreign", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_kill_at_any_step_leaves_one_result_whole(tmp_path, monkeypatch, foreign):
     """Before every step by which names change, the writer is killed; the next reader finds the old result or the new one."""
@@ -229,6 +244,7 @@ def files_of(folder):
     return {p.name: p.read_bytes() for p in Path(folder).iterdir() if p.is_file()}
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_a_result_in_use_by_others_keeps_its_folder(tmp_path, monkeypatch):
     folder = tmp_path / "map"
     write_result(folder, [small_log()], small_result(lidar=False), RECORD)
@@ -249,6 +265,7 @@ def test_a_result_in_use_by_others_keeps_its_folder(tmp_path, monkeypatch):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "map"]
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_a_system_that_cannot_exchange_folders_renames_files(tmp_path, monkeypatch):
     folder = tmp_path / "map"
     write_result(folder, [small_log()], small_result(), RECORD)
@@ -258,6 +275,7 @@ def test_a_system_that_cannot_exchange_folders_renames_files(tmp_path, monkeypat
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_every_file_is_on_the_disk_before_it_counts(tmp_path, monkeypatch):
     """Each file and its folder are synced after their last write, before the name of the folder changes."""
     synced, events = set(), []
@@ -281,11 +299,13 @@ def test_every_file_is_on_the_disk_before_it_counts(tmp_path, monkeypatch):
 
 FILE_LIMIT = """
 import resource, signal, sys
+import numpy as np
 sys.path.insert(0, {tests!r})
 from helpers.results import small_log, small_result
 from uwblite.io import results
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
+results.picture = lambda *_: np.zeros((2, 3, 3), dtype=np.uint8)
 try:
     results.write_result(sys.argv[1], [small_log()], small_result(evil="x"), results.RunRecord("c", "k"))
 except OSError:
@@ -293,6 +313,7 @@ except OSError:
 """
 
 
+@pytest.mark.usefixtures("small_picture")
 @pytest.mark.parametrize("limit", [0, 100, 3000, 9000])
 @pytest.mark.parametrize("foreign", [True, False])
 def test_running_out_of_space_leaves_the_previous_result(tmp_path, limit, foreign):
@@ -308,6 +329,7 @@ def test_running_out_of_space_leaves_the_previous_result(tmp_path, limit, foreig
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_nothing_is_written_outside_the_folder(tmp_path):
     hostile = small_log(name="../../../etc/passwd\0\n.log")
     write_result(tmp_path / "map", [hostile], small_result(evil="/../../x"), RECORD)
@@ -315,6 +337,7 @@ def test_nothing_is_written_outside_the_folder(tmp_path):
     assert set(contents(tmp_path / "map")) == FILES
 
 
+@pytest.mark.usefixtures("small_picture")
 def test_times_of_closures_keep_their_microseconds(tmp_path):
     result = small_result()
     late = replace(result, keyframe_stamps=1.7e9 + np.arange(len(result.keyframe_stamps)) * 0.123457)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import exponnorm, norm
 
 from uwblite.radio.nlos_mixture import RangeMixture, _mean_detour, fit, shortest_half
 
@@ -21,6 +20,8 @@ shapes = st.builds(
 
 def density(mixture, errors):
     """Return the density by scipy's distributions."""
+    from scipy.stats import exponnorm, norm
+
     core = norm.pdf(errors, mixture.centre, mixture.sigma)
     late = exponnorm.pdf(errors, mixture.detour / mixture.sigma, mixture.centre, mixture.sigma)
     return (1 - mixture.tail - mixture.wild) * core + mixture.tail * late + mixture.wild / mixture.width
@@ -35,6 +36,8 @@ def draw(rng, n, tail=0.0, detour=0.3, wild=0.0, centre=0.1, sigma=0.07):
 
 @given(shapes)
 def test_the_probability_of_the_core_is_bayes(mixture):
+    from scipy.stats import norm
+
     errors = mixture.centre + mixture.sigma * np.linspace(-5, 40, 181)
     core = (1 - mixture.tail - mixture.wild) * norm.pdf(errors, mixture.centre, mixture.sigma)
     total = density(mixture, errors)

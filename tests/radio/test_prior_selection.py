@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted import ranges, wander
-from scipy.stats import multivariate_normal
 
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
 from uwblite.graph.graph import Graph, PriorEdges
@@ -35,6 +34,8 @@ def test_marginal_likelihood_is_the_integral_over_the_unknowns(seed):
     mean = covariance @ a.T @ y / noise**2
 
     def direct(width):
+        from scipy.stats import multivariate_normal
+
         return multivariate_normal.logpdf(y, np.zeros(7), a @ np.diag(width**2) @ a.T + noise**2 * np.eye(7))
 
     assert log_marginal_likelihood(mean, covariance, before, after) == pytest.approx(direct(after) - direct(before), abs=1e-8)

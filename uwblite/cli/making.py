@@ -114,12 +114,12 @@ def settings(args: argparse.Namespace) -> "MappingConfig":
 def known(args: argparse.Namespace) -> "Constraints":
     from ..constraints import Constraints
     from ..io.constraints_file import parse_constraints, read_anchors
-    from .options import read_text
+    from ..io.source import read_settings
 
     earlier = read_anchors(args.anchors_from) if args.anchors_from else Constraints()
     if not args.constraints:
         return earlier
-    return earlier + parse_constraints(read_text(args.constraints), args.constraints)
+    return earlier + parse_constraints(read_settings(args.constraints), args.constraints)
 
 
 def repeat_command(args: argparse.Namespace) -> str:

@@ -30,31 +30,18 @@ def effective_config(args: argparse.Namespace) -> "MappingConfig":
     """
     from ..config import merge, override, parse_toml
     from ..errors import ConfigError, UsageError
+    from ..io.source import read_settings
     from ..pipeline.mapping_config import MappingConfig, preset
 
     # The user's mounting of the laser overrides what the scans show.
     given = ["detect_laser_flip=false"] if getattr(args, "laser_flipped", False) else []
-    text = read_text(args.config) if args.config else ""
+    text = read_settings(args.config) if args.config else ""
     try:
         config = preset(args.preset) if args.preset else MappingConfig()
         config = merge(config, parse_toml(text, args.config))
         return override(config, [*given, *args.set])
     except ConfigError as error:
         raise UsageError(str(error)) from None
-
-
-def read_text(path: str) -> str:
-    """Return the text of a small file of settings; anything else is one clear error."""
-    from ..errors import FormatError
-    from ..io.source import read_bounded
-
-    try:
-        return read_bounded(path, _LARGEST_SETTINGS).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise FormatError("not a text file (UTF-8)", path) from None
-
-
-_LARGEST_SETTINGS = 1 << 20
 
 
 def add_mounting_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,9 +68,10 @@ def add_bag_arguments(parser: argparse.ArgumentParser) -> None:
 def bag_choices(args: argparse.Namespace) -> "tuple[BagTopics, tuple[UwbMapping, ...]]":
     """Return the topics and mappings that the command line names."""
     from ..io.bag_topics import BagTopics
+    from ..io.source import read_settings
     from ..io.uwb_mapping import parse_mappings
 
-    mappings = parse_mappings(read_text(args.uwb_mapping), args.uwb_mapping) if args.uwb_mapping else ()
+    mappings = parse_mappings(read_settings(args.uwb_mapping), args.uwb_mapping) if args.uwb_mapping else ()
     return BagTopics(args.odometry_topic, args.scan_topic, tuple(args.uwb_topic), args.imu_topic, args.base_frame), mappings
 
 

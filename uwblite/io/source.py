@@ -192,6 +192,23 @@ def read_bounded(name: str, most: int) -> bytes:
     return data
 
 
+_LARGEST_SETTINGS = 1 << 20
+"""Bytes of a file that a user writes by hand."""
+
+
+def read_settings(name: str) -> str:
+    """Return the text of a small file that a user writes: settings, mappings, constraints.
+
+    Raises
+    ------
+    FormatError : it cannot be read, is too large or no text.
+    """
+    try:
+        return read_bounded(name, _LARGEST_SETTINGS).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise FormatError("not a text file (UTF-8)", name) from None
+
+
 def _checked_start(data: bytes, path: str) -> bytes:
     """Refuse binary data; drop a UTF-8 byte order mark."""
     if b"\0" in data[:4096]:

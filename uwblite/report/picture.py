@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats
 from ..grid.geometry import GridGeometry, central_box
 from ..grid.occupancy_grid import OccupancyGrid
 from .canvas import Canvas, Colour
@@ -173,7 +173,7 @@ def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, sc
         row = (height - 1 - np.arange(height)) // each - first_row
         col = np.arange(width) // each - first_col
         rows, cols = (row >= 0) & (row < geometry.rows), (col >= 0) & (col < geometry.cols)
-        image[np.ix_(rows, cols)] = colours[np.ix_(row[rows], col[cols])]
+        image[_span_of(rows), _span_of(cols)] = colours.take(col[cols], axis=1).take(row[rows], axis=0)
         return
     together = round(1.0 / pixels)
     row, col = (first_row + np.arange(geometry.rows)) // together, (first_col + np.arange(geometry.cols)) // together
@@ -187,6 +187,12 @@ def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, sc
     cells = np.where(darkest[:, :, :1] < PAPER[0] - 20, darkest, brightest)
     seen_rows, seen_cols = (rows >= 0) & (rows < height), (cols >= 0) & (cols < width)
     image[np.ix_(height - 1 - rows[seen_rows], cols[seen_cols])] = cells[np.ix_(seen_rows, seen_cols)]
+
+
+def _span_of(inside: Bools) -> slice:
+    """Return the slice of the elements that are true; they lie side by side."""
+    places = np.flatnonzero(inside)
+    return slice(places[0], places[-1] + 1) if len(places) else slice(0, 0)
 
 
 def _draw_anchor(canvas: Canvas, anchor: PictureAnchor, pixel: Callable[[Floats], Floats]) -> None:

@@ -12,6 +12,7 @@ from ..constraints import Constraints
 from ..errors import ConfigError, UwbliteError
 from ..io.files import write_text
 from ..io.results import is_of_result
+from ..io.source import read_settings
 from ..io.stored_result import StoredResult, read_result
 from .edits import edits_text, parse_edits, with_anchor, with_closure
 from .page import page
@@ -61,7 +62,7 @@ class App:
     def load(self) -> None:
         """Read the constraints file, where there is one."""
         if self.constraints.is_file():
-            self.own, self.edits = parse_edits(self.constraints.read_text(encoding="utf-8"), str(self.constraints))
+            self.own, self.edits = parse_edits(read_settings(str(self.constraints)), str(self.constraints))
 
     def handle(self, method: str, target: str, headers: dict[str, str], body: bytes = b"") -> Response:
         """Answer a request.
