@@ -9,6 +9,7 @@ from helpers.planted_graphs import lawn, loop
 
 from uwblite.cli import main
 from uwblite.cli.formats import write_graph
+from uwblite.graph.solver import optimize
 from uwblite.io.graph_file import GraphFile
 
 
@@ -34,6 +35,21 @@ def test_incremental_reaches_the_minimum_that_all_at_once_misses(tmp_path, capsy
     assert found["chi2_per_dof"] == pytest.approx(1.0, abs=0.1)
     assert main(["optimize", path, "--from-odometry", "--json"]) in (0, 3)
     assert json.loads(capsys.readouterr().out)["chi2_per_dof"] > 2.0
+
+
+def test_headings_from_anywhere_end_in_the_certified_minimum(tmp_path, capsys):
+    graph = loop(3, n=400, anchors=0)[0]
+    rng = np.random.default_rng(3)
+    poses = graph.poses + rng.normal(scale=[3.0, 3.0, 1.5], size=graph.poses.shape) * (np.arange(400) > 0)[:, None]
+    bent = replace(graph, poses=poses, edges=graph.edges[:2])
+    best = optimize(replace(graph, edges=graph.edges[:2]))[1].chi2
+    assert optimize(bent)[1].chi2 > 2.0 * best
+    found = figures(capsys, written(tmp_path / "bent.g2o", bent))
+    assert found["chi2"] == pytest.approx(best, rel=1e-6)
+    assert found["certificate"] == "global minimum"
+    assert best - 2e-3 < found["chi2_lower_bound"] <= best
+    wrong = figures(capsys, str(tmp_path / "bent.g2o"), "--kernel", "huber")
+    assert wrong["certificate"] == "none: the robust kernel huber has no relaxation"
 
 
 def test_robust_names_the_false_ranges_and_leaves_them_out(tmp_path, capsys):

@@ -1,0 +1,39 @@
+"""Starts of pose graphs from their relative poses alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.planted_graphs import loop, random_poses, relative_edges
+
+from uwblite import se2
+from uwblite.graph.chordal_start import chordal_start
+from uwblite.graph.graph import Graph
+from uwblite.graph.solver import optimize
+
+
+def test_without_noise_the_start_is_the_truth():
+    rng = np.random.default_rng(0)
+    truth = random_poses(rng, 40)
+    i, j = rng.integers(0, 40, (2, 200))
+    edges = relative_edges(truth, i[i != j], j[i != j], [0.1, 0.2, 0.05])
+    fixed = np.isin(np.arange(40), [0, 7])
+    start = chordal_start(Graph(np.where(fixed[:, None], truth, 0.0), edges=(edges,), fixed_poses=fixed))
+    np.testing.assert_allclose(se2.between(truth, start.poses), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_headings_end_in_the_same_minimum(seed):
+    graph = loop(seed, n=400, anchors=0)[0]
+    graph = replace(graph, edges=graph.edges[:2])
+    rng = np.random.default_rng(seed)
+    anywhere = random_poses(rng, len(graph.poses), 100.0)
+    anywhere[0] = graph.poses[0]
+    best = optimize(graph)[1].chi2
+    assert optimize(chordal_start(replace(graph, poses=anywhere)))[1].chi2 == pytest.approx(best, rel=1e-6)
+
+
+def test_a_chain_and_an_open_pose_have_none():
+    graph = loop(0)[0]
+    assert chordal_start(replace(graph, edges=graph.edges[:1])) is None
+    assert chordal_start(replace(graph, poses=np.append(graph.poses, np.zeros((1, 3)), axis=0))) is None
