@@ -9,7 +9,7 @@ from helpers.room_recording import recording, two_rounds
 from uwblite import se2
 from uwblite.checks.recording import diagnose
 from uwblite.graph.graph import UnknownKey
-from uwblite.map_result import CalibrationEstimate
+from uwblite.map_result import CalibrationEstimate, Notice
 from uwblite.sensor_log import LogNotes, Odometry, SensorLog, SensorMounting
 
 PER_RANGE = ("stamps", "anchor", "ranges", "quality")
@@ -156,6 +156,16 @@ def test_what_the_radio_reports_of_the_wheels(sound):
     assert_named(sound, "warning", "the wheels are off against the radio by +6.0%", calibration=(scale,))
     unsure = replace(scale, sigma=0.05)
     assert not [t for t in texts(sound, calibration=(unsure,)) if "wheels are off" in t]
+
+
+def test_what_a_trial_map_doubts_or_refuses_is_serious_and_said_once(sound):
+    doubt = Notice("scales", "the ranges are 0.80 times the distances on the map", {})
+    assert_named(sound, "serious", doubt.text, doubts=(doubt,))
+    assert_named(sound, "serious", "nothing to map", refused="nothing to map")
+    still = with_poses(sound, np.repeat(sound.odometry.poses[:1], len(sound.odometry.stamps), axis=0))
+    (found,) = [f for f in diagnose(still.without(lidar=True)).findings if "hardly moves" in f.what]
+    again = diagnose(still.without(lidar=True), doubts=(Notice("hardly-moving", found.what, {}),)).findings
+    assert sum(f.what == found.what for f in again) == 1
 
 
 def test_findings_are_ranked_and_json_ready(sound):

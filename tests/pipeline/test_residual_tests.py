@@ -14,7 +14,7 @@ from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.mapping import build_map
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.residual_tests import check_odometry_jumps, check_odometry_steps
+from uwblite.pipeline.residual_tests import check_odometry_jumps, check_odometry_steps, check_slips
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +122,22 @@ def test_a_jump_that_only_closures_make_is_a_doubt(placed, measured):
     )
     assert [n.kind for n in stages.doubts] == ([] if placed or measured else ["odometry-jumps"])
     assert all(n.figures["at"] == 39.0 and abs(n.figures["metres"] - 3.0) < 1e-6 for n in stages.doubts)
+
+
+@pytest.mark.parametrize(("way", "kind"), [(3.0, "doubt"), (0.4, "warning"), (0.05, None)])
+@pytest.mark.parametrize("lidar", [False, True])
+def test_a_single_step_far_off_is_named_unless_the_lidar_measures_it(way, kind, lidar):
+    truth = np.column_stack([np.arange(40) * 0.3, np.zeros(40), np.zeros(40)])
+    wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
+    wheels.motion[20, 0] += way
+    i, none = np.arange(39), np.zeros((39, 3))
+    root = np.tile(np.eye(3), (39, 1, 1))
+    ties = ScanEdges(i, i + 1, se2.between(truth[:-1], truth[1:]), root, none, none, scan_indices(Calibration()))
+    stages = Stages(None, None)
+    check_slips(
+        SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,) if lidar else ()), placed=np.array([True])),
+        SimpleNamespace(recordings=SimpleNamespace(stamps=np.arange(40.0)), stages=stages),
+    )
+    said = [("doubt", n) for n in stages.doubts] + [("warning", n) for n in stages.warnings]
+    assert [rank for rank, _ in said] == ([] if lidar or kind is None else [kind])
+    assert all(n.figures["way"] == pytest.approx(way, abs=0.05) for _, n in said)

@@ -75,6 +75,19 @@ def test_a_robot_that_stands_has_no_lost_wheels(sound):
     assert done.screening.remarks == ()
 
 
+def test_scans_of_a_single_column_do_not_move_a_robot_that_stands(sound):
+    """About one round thing a robot may turn or stand alike: that is no reason to replace the wheels."""
+    rng, scans = np.random.default_rng(3), sound.scans
+    angles = scans.angle_min + scans.angle_increment * np.arange(scans.ranges.shape[1])
+    off = 2.0 * np.sin(angles - 0.2)
+    column = 2.0 * np.cos(angles - 0.2) - np.sqrt(np.maximum(0.35**2 - off**2, 0.0))
+    seen = (np.abs(off) < 0.35) & (np.cos(angles - 0.2) > 0.0)
+    readings = np.where(seen, column + rng.normal(0.0, 0.02, scans.ranges.shape), np.inf).astype(np.float32)
+    rest = with_poses(sound, np.repeat(sound.odometry.poses[:1], len(sound.odometry.stamps), axis=0))
+    alone = replace(rest, scans=replace(scans, ranges=readings)).without(uwb=True)
+    assert "wheels-stand-still" not in kinds(screen(alone))
+
+
 def test_one_reading_far_off_is_left_out(sound):
     poses = sound.odometry.poses.copy()
     poses[1000, :2] += 3000.0

@@ -17,7 +17,7 @@ class Finding:
     rank: str
     """One of RANKS."""
     topic: str
-    """'log', 'odometry', 'radio' or 'lidar'."""
+    """'log', 'odometry', 'radio', 'lidar' or 'map'."""
     what: str
     """What was found, with figures and units."""
     advice: str

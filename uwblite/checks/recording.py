@@ -43,15 +43,16 @@ def diagnose(
     anchors: tuple[AnchorEstimate, ...] = (),
     calibration: tuple[CalibrationEstimate, ...] = (),
     doubts: tuple[Notice, ...] = (),
+    refused: str = "",
 ) -> Diagnosis:
     """Examine a recording.
 
     Parameters
     ----------
     log : the recording.
-    anchors, calibration : from a map of wheels and radio alone, where there is one: it shows the wheels' scale,
-        the delay of the radio and the bias of each anchor.
-    doubts : of that map; where there is a lidar, those of the ranges themselves.
+    anchors, calibration, doubts : of a trial map, where there is one: it shows the wheels' scale, the delay of the radio and
+        the bias of each anchor, and whether the sensors agree.
+    refused : why no trial map could be made; empty where it was, or was not tried.
     """
     found = Findings()
     _check_notes(log, found)
@@ -65,13 +66,12 @@ def diagnose(
         figures["radio calibration"] = check_calibration(anchors, calibration, found)
     if log.scans is None or len(log.scans.stamps) == 0:
         found.note("lidar", "there are no laser scans", "there will be a trajectory and anchors, but no map")
-        _check_doubts(doubts, found)
     else:
         figures["lidar"] = check_scans(log, found)
         _check_overlap(log, "lidar", log.scans.stamps, found)
-        _check_doubts(tuple(doubt for doubt in doubts if doubt.kind == "range-scatter"), found)
     if log.ranges is not None and len(log.ranges.stamps):
         _check_overlap(log, "radio", log.ranges.stamps, found)
+    _check_trial(doubts, refused, found)
     return Diagnosis(found.ranked(), figures)
 
 
@@ -99,12 +99,12 @@ def _check_screening(log: SensorLog, found: Findings) -> None:
             found.warning("log", remark.text, "a map repairs it so; the files stay as they are")
 
 
-def _check_doubts(doubts: tuple[Notice, ...], found: Findings) -> None:
-    """What a map from wheels and radio doubts, but for what the screening said."""
+def _check_trial(doubts: tuple[Notice, ...], refused: str, found: Findings) -> None:
+    """What a trial map doubts, or why there is none, but for what the screening said."""
     said = {finding.what for finding in found.ranked()}
-    for doubt in doubts:
-        if doubt.text not in said:
-            found.serious("radio", doubt.text, "a map from wheels and radio alone is doubted for it")
+    for text in [doubt.text for doubt in doubts] + ([refused] if refused else []):
+        if text not in said:
+            found.serious("map", text, "no map is made before that is fixed" if refused else "a map is doubted for it")
 
 
 def _check_notes(log: SensorLog, found: Findings) -> None:

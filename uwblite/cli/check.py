@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    text = "make no trial maps: no scales and biases, a coarser estimate of the time"
+    text = "make no trial map: no scales and biases, no doubts of a map, a coarser estimate of the time"
     parser.add_argument("--quick", action="store_true", help=text)
     add_mounting_arguments(parser)
     add_bag_arguments(parser)
@@ -37,34 +37,27 @@ def run(args: argparse.Namespace) -> int:
     from .options import apply_mounting, bag_choices
 
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
-    diagnosis, problem = (diagnose(log), "") if args.quick else examined(log)
+    diagnosis = diagnose(log) if args.quick else examined(log)
     cost = expected_cost(log, trial=not args.quick)
     if args.json:
-        console.say_json(summary_json(args.log, diagnosis, cost, problem))
+        console.say_json(summary_json(args.log, diagnosis, cost))
     else:
-        for line in report_lines(args.log, diagnosis, cost, problem):
+        for line in report_lines(args.log, diagnosis, cost):
             console.say(line)
     return 3 if diagnosis.serious else 0
 
 
-def examined(log: "SensorLog") -> tuple["Diagnosis", str]:
-    """Diagnose a recording with a map from wheels and radio alone: it shows scales, clocks, biases and ranges that are none.
-
-    Returns
-    -------
-    The diagnosis, and why that map could not be made; empty where it was, or where there are no ranges.
-    """
+def examined(log: "SensorLog") -> "Diagnosis":
+    """Diagnose a recording by a trial map as well: what `uwblite map` will doubt or refuse, this finds serious."""
     from ..checks.recording import diagnose
     from ..errors import UwbliteError
     from ..mapping import build_map
 
-    if log.ranges is None or len(log.ranges.stamps) == 0:
-        return diagnose(log), ""
     try:
-        trial = build_map(log.without(lidar=True))
+        trial = build_map(log)
     except UwbliteError as error:
-        return diagnose(log), str(error)
-    return diagnose(log, anchors=trial.anchors, calibration=trial.calibration, doubts=trial.doubts), ""
+        return diagnose(log, refused=str(error))
+    return diagnose(log, anchors=trial.anchors, calibration=trial.calibration, doubts=trial.doubts)
 
 
 def expected_cost(log: "SensorLog", *, trial: bool = True) -> dict[str, float]:
@@ -101,7 +94,7 @@ def expected_cost(log: "SensorLog", *, trial: bool = True) -> dict[str, float]:
     }
 
 
-def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float], problem: str) -> dict[str, Any]:
+def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> dict[str, Any]:
     """Return the findings and figures for programs."""
     import dataclasses
 
@@ -109,20 +102,17 @@ def summary_json(name: str, diagnosis: "Diagnosis", cost: dict[str, float], prob
         "log": name,
         "findings": [dataclasses.asdict(f) for f in diagnosis.findings],
         "figures": diagnosis.figures,
-        "trial map": problem or "ok",
         "expected cost of map": cost,
         "exit_code": 3 if diagnosis.serious else 0,
     }
 
 
-def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float], problem: str) -> list[str]:
+def report_lines(name: str, diagnosis: "Diagnosis", cost: dict[str, float]) -> list[str]:
     """Return the findings and figures as lines of text."""
     lines = [f"{name}: {_counts(diagnosis.figures)}", ""]
     for finding in diagnosis.findings:
         lines.append(f"{finding.rank.upper():<8} {finding.topic}: {finding.what}")
         lines += [f"         -> {finding.advice}"] if finding.advice else []
-    if problem:
-        lines += ["NOTE     radio: no trial map from wheels and radio alone", f"         -> {problem}"]
     if not diagnosis.findings:
         lines.append("nothing to complain about")
     lines += ["", *_anchor_lines(diagnosis.figures), *_calibration_lines(diagnosis.figures)]

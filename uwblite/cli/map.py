@@ -179,9 +179,9 @@ def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
     diagnosis = diagnose(log)
     cost = check.expected_cost(log)
     if args.json:
-        console.say_json(check.summary_json(log.notes.source, diagnosis, cost, ""))
+        console.say_json(check.summary_json(log.notes.source, diagnosis, cost))
     else:
-        for line in check.report_lines(log.notes.source, diagnosis, cost, ""):
+        for line in check.report_lines(log.notes.source, diagnosis, cost):
             console.say(line)
     return 3 if diagnosis.serious else 0
 

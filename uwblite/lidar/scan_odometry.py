@@ -60,6 +60,21 @@ def scan_steps(
     return np.concatenate(steps), np.concatenate(shares)
 
 
+def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
+    """Return the mean square distance (e,), m^2, at which pairs of scans match at given motions T_first_second (e, 3).
+
+    Points without a match count as one at the gate.
+    """
+    config = CloudConfig()
+    chosen, where = np.unique(np.concatenate([first, second]), return_inverse=True)
+    i, j = np.split(where.reshape(-1), 2)
+    built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
+    raster = cloud_rasters.rasterize(built, config.raster, _FIRST_GATE)
+    points = scan_matching.pair_points(built, j, _POINTS)
+    found = scan_matching.match(built, raster, i, motion, points, _FIRST_GATE, _FIRST_GATE)
+    return (found.squared + _FIRST_GATE**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
+
+
 def _block(
     scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, guess: Floats, searches: int
 ) -> tuple[Floats, Floats]:

@@ -14,6 +14,7 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..odometry.attached import OUTSIDE
 from .estimate import Estimate, Task
+from .half_tests import check_halves
 from .residual_tests import check_residuals
 from .turn_checks import check_turn_scales
 
@@ -47,6 +48,7 @@ def judge(
         check_residuals(estimate, table["residual"], task)
     else:
         check_residuals(estimate, np.zeros(0), task)
+    check_halves(estimate, task)
     check_handedness(estimate, task)
     check_turn_scales(estimate, task)
     check_fit(task)

@@ -22,6 +22,8 @@ _NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
 _SUDDEN = 5.0
 """Standard deviations that a step of sound wheels hardly ever exceeds."""
+_JUMP, _CARRIED = 20.0, 0.5
+"""Standard deviations that a step of wheels on the floor never exceeds, and the size, m or rad, from which it is no slip."""
 _WINDOW, _MOST = 10, 0.6
 """Steps in a row, and the share of them that must be off."""
 _MEASURED_BREAK = 0.15
@@ -50,6 +52,7 @@ def check_residuals(estimate: Estimate, residuals: Floats, task: Task) -> None:
     check_range_scatter(estimate, residuals, task)
     check_odometry_steps(estimate, task)
     check_odometry_jumps(estimate, task)
+    check_slips(estimate, task)
     check_scales(estimate, task)
     check_support(estimate, task)
 
@@ -94,6 +97,36 @@ def check_odometry_steps(estimate: Estimate, task: Task) -> None:
     if stretch is not None:
         a, b = (float(stamps[wheels.i[k]] - stamps[0]) for k in stretch)
         say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
+
+
+def check_slips(estimate: Estimate, task: Task) -> None:
+    """Find single steps of the odometry that are far off by the ranges, where no lidar measures them instead.
+
+    A robust kernel lets one step take up what many were wrong by, and the map looks as if the robot had been carried.
+    """
+    wheels, graph, stamps = estimate.odometry, estimate.graph, task.recordings.stamps
+    if not len(wheels) or not estimate.placed.any():
+        return
+    whitened = wheels.residuals(graph)
+    off = np.abs(np.einsum("eij,ej->ei", np.linalg.inv(wheels.sqrt_information), whitened))
+    far = (np.abs(whitened).max(axis=1) > _JUMP) & (1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK)
+    far &= ~np.isin(wheels.i, _measured_by_lidar(graph))
+    at = np.flatnonzero(far)
+    if len(at):
+        when = ", ".join(f"{stamps[wheels.i[k]] - stamps[0]:.0f}" for k in at[:5])
+        way, turn = float(np.hypot(off[at, 0], off[at, 1]).max()), float(off[at, 2].max())
+        text = (
+            f"at t = {when}{' ...' if len(at) > 5 else ''} s the odometry is off by up to {way:.2f} m and {turn:.2f} rad "
+            "by the ranges: wheels that slip or stand still, or a robot that was carried"
+        )
+        say = task.stages.doubt if max(way, turn) > _CARRIED else task.stages.warn
+        say("odometry-slips", text, way=way, turn=turn)
+
+
+def _measured_by_lidar(graph: Graph) -> Ints:
+    """Return the keyframes whose step to the next one the lidar measures."""
+    scans = [edges for edges in graph.edges if isinstance(edges, ScanEdges)]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.minimum(e.i, e.j)[np.abs(e.i - e.j) == 1] for e in scans)])
 
 
 def _stretch(off: Bools) -> tuple[int, int] | None:
@@ -151,14 +184,14 @@ def _fixed_by_neighbours(graph: Graph) -> Bools:
 
 def check_scales(estimate: Estimate, task: Task) -> None:
     """Compare the lengths that odometry, lidar and radio measure."""
-    if not task.recordings.have_scans:
-        return
-    calibration = estimate.graph.calibration
+    calibration, lidar = estimate.graph.calibration, task.recordings.have_scans
     place = calibration.index(RANGE_SCALE)
     scale = 1.0 + (float(calibration.values[place]) if place >= 0 else 0.0)
     if estimate.placed.any() and abs(scale - 1.0) > _SCALE:
-        text = f"the ranges are {scale:.2f} times those in the lidar's map: one of the two has a wrong unit or scale"
-        task.stages.doubt("scales", text, ranges_by_lidar=scale)
+        text = f"the ranges are {scale:.2f} times the distances on the map: " + (
+            "lidar or radio has a wrong unit" if lidar else "a radio measures time of flight, so the wheels' ways are wrong"
+        )
+        task.stages.doubt("scales", text, range_scale=scale)
     screenings = [recording.log.screening for recording in task.recordings.each]
     ratios = np.array([s.lidar_by_wheels for s in screenings if s is not None])
     off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _WAYS)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of, sigma_of_median, spread_about_median
-from ..lidar.scan_odometry import scan_steps
+from ..lidar.scan_odometry import misfits, scan_steps
 from ..sensor_log import LaserScans, Odometry, OdometryBreaks, Remark, SensorLog
 
 _PAIRS = 250
@@ -139,9 +139,24 @@ def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
     found = []
     for a, b in standing(log.odometry):
         own = pairs.measured & (pairs.start >= a) & (pairs.end <= b)
-        if own.sum() >= 3 and np.mean(moving[own]) > _MOST:
+        if own.sum() < 3 or np.mean(moving[own]) <= _MOST:
+            continue
+        if np.mean(_not_at_rest(log, pairs.rows(own & moving))) * np.mean(moving[own]) > _MOST:
             found.append((a, b))
     return found
+
+
+def _not_at_rest(log: SensorLog, pairs: Pairs) -> Bools:
+    """Return which pairs (e,) match clearly worse if the robot stood: about a single column it may turn as well."""
+    assert log.scans is not None
+    middle = log.scans.middles
+    first, second = (np.searchsorted(middle, t) for t in (pairs.start, pairs.end))
+    moving, rest = (misfits(log.scans, log.mounting, first, second, m) for m in (pairs.lidar, 0.0 * pairs.lidar))
+    return rest > _WORSE_AT_REST * moving
+
+
+_WORSE_AT_REST = 2.0
+"""Factor between the mean square distances of matches if the robot stood and as it moved, from which it did not stand."""
 
 
 def disagreeing(pairs: Pairs, start: float) -> list[Remark]:

@@ -1,0 +1,156 @@
+"""Faults of the lidar."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from uwblite.sensor_log import LaserScans
+
+from .case import Case, Fault, Rng, shifted, with_scans
+
+
+def repeated_scan(start: float) -> Fault:
+    """The lidar repeats one scan from a share of the recording on."""
+
+    def change(scans: LaserScans) -> LaserScans:
+        first, readings = int(start * len(scans.stamps)), scans.ranges.copy()
+        readings[first:] = readings[first]
+        return replace(scans, ranges=readings)
+
+    return lambda case, rng: with_scans(case, change)
+
+
+def laser_factor(factor: float) -> Fault:
+    """Scale all readings and the lidar's largest range."""
+    return lambda case, rng: with_scans(
+        case, lambda s: replace(s, ranges=(s.ranges * factor).astype(np.float32), range_max=s.range_max * factor)
+    )
+
+
+def wide_claim(case: Case, rng: Rng) -> Case:
+    """The driver claims twice the field of view."""
+    return with_scans(case, lambda s: replace(s, angle_min=2.0 * s.angle_min, angle_increment=2.0 * s.angle_increment))
+
+
+def mirrored_laser(case: Case, rng: Rng) -> Case:
+    """Beams in the wrong order."""
+    return with_scans(case, lambda s: replace(s, ranges=s.ranges[:, ::-1].copy()))
+
+
+def noise_scans(case: Case, rng: Rng) -> Case:
+    """Readings that have nothing to do with any place."""
+    return with_scans(
+        case, lambda s: replace(s, ranges=rng.uniform(0.1, s.range_max, s.ranges.shape).astype(np.float32))
+    )
+
+
+def late_half(case: Case, rng: Rng) -> Case:
+    """Every other scan is stamped an hour late."""
+    return shifted(case, lambda t: 3600.0 * (np.arange(len(t)) % 2), "lidar")
+
+
+def turned_laser(case: Case, rng: Rng) -> Case:
+    """The lidar is mounted a quarter turn away from what stands in the log."""
+    return with_scans(case, lambda s: replace(s, angle_min=s.angle_min + 0.5 * np.pi))
+
+
+def reversed_scans(case: Case, rng: Rng) -> Case:
+    """The scans stand in the log in reversed order."""
+    return with_scans(case, lambda s: replace(s, ranges=s.ranges[::-1].copy()))
+
+
+def covered_beams(case: Case, rng: Rng) -> Case:
+    """A cable hangs before a third of the beams from half-way on."""
+
+    def change(s: LaserScans) -> LaserScans:
+        readings, beams = s.ranges.copy(), s.ranges.shape[1] // 3
+        late = s.stamps >= case.middle
+        readings[late, beams : 2 * beams] = rng.normal(0.25, 0.005, (int(late.sum()), beams)).astype(np.float32)
+        return replace(s, ranges=readings)
+
+    return with_scans(case, change)
+
+
+def offset_laser(case: Case, rng: Rng) -> Case:
+    """The lidar measures 0.3 m too much, always."""
+    return with_scans(case, lambda s: replace(s, ranges=np.where(s.ranges < s.range_max, s.ranges + np.float32(0.3), s.ranges)))
+
+
+def turned_by(angle: float) -> Fault:
+    """The lidar is mounted away from what stands in the log, rad."""
+    return lambda case, rng: with_scans(case, lambda s: replace(s, angle_min=s.angle_min + angle))
+
+
+def knocked(angle: float) -> Fault:
+    """Half-way the lidar is knocked and from then on looks elsewhere, rad."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        def change(s: LaserScans) -> LaserScans:
+            beams = round(angle / abs(s.angle_increment))
+            readings, later = s.ranges.copy(), s.stamps >= case.middle
+            readings[later] = np.nan
+            readings[later, : readings.shape[1] - beams] = s.ranges[later, beams:]
+            return replace(s, ranges=readings)
+
+        return with_scans(case, change)
+
+    return fault
+
+
+def scans_lost_in_bursts(case: Case, rng: Rng) -> Case:
+    """Half of the scans are lost, 5 s at a time."""
+
+    def change(s: LaserScans) -> LaserScans:
+        kept = (s.stamps - s.stamps[0]) % 10.0 < 5.0
+        return replace(s, stamps=s.stamps[kept], ranges=s.ranges[kept])
+
+    return with_scans(case, change)
+
+
+def companion(case: Case, rng: Rng) -> Case:
+    """A person walks in front of the robot all the time, on two legs, 0.6 to 0.9 m ahead."""
+
+    def change(s: LaserScans) -> LaserScans:
+        angles = s.angle_min + s.angle_increment * np.arange(s.ranges.shape[1])
+        readings = s.ranges.copy()
+        for side in (-1.0, 1.0):
+            away = 0.75 + 0.15 * np.sin(2.0 * np.pi * s.stamps / 1.1) * side
+            bearing = side * 0.15 / away + 0.1 * np.sin(2.0 * np.pi * s.stamps / 7.0)
+            hit = np.abs(angles - bearing[:, None]) < 0.06 / away[:, None]
+            legs = away[:, None] + rng.normal(0.0, 0.01, readings.shape)
+            readings = np.where(hit, legs, readings).astype(np.float32)
+        return replace(s, ranges=readings)
+
+    return with_scans(case, change)
+
+
+def dirty_window(case: Case, rng: Rng) -> Case:
+    """From half-way on nothing beyond 1.5 m comes back."""
+
+    def change(s: LaserScans) -> LaserScans:
+        lost = (s.stamps >= case.middle)[:, None] & (s.ranges > 1.5)
+        return replace(s, ranges=np.where(lost, np.float32(np.inf), s.ranges))
+
+    return with_scans(case, change)
+
+
+def blind_half(case: Case, rng: Rng) -> Case:
+    """From half-way on half of the beams report an error."""
+
+    def change(s: LaserScans) -> LaserScans:
+        readings = s.ranges.copy()
+        readings[s.stamps >= case.middle, : readings.shape[1] // 2] = np.nan
+        return replace(s, ranges=readings)
+
+    return with_scans(case, change)
+
+
+def shuffled_beams(case: Case, rng: Rng) -> Case:
+    """Every scan begins at another beam: the driver loses the start of the turn."""
+
+    def change(s: LaserScans) -> LaserScans:
+        begin = rng.integers(0, s.ranges.shape[1], len(s.stamps))
+        column = (np.arange(s.ranges.shape[1]) + begin[:, None]) % s.ranges.shape[1]
+        return replace(s, ranges=np.take_along_axis(s.ranges, column, axis=1))
+
+    return with_scans(case, change)

@@ -1,0 +1,181 @@
+"""Faults of the radio and its anchors."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from uwblite import se2
+from uwblite.sensor_log import UwbRanges
+
+from .case import Case, Fault, Floats, Rng, rows, shifted, with_ranges
+
+
+def constant_ranges(case: Case, rng: Rng) -> Case:
+    """Every range is the same."""
+    return with_ranges(case, lambda r: replace(r, ranges=np.full(len(r.ranges), 4.2)))
+
+
+def random_ranges(case: Case, rng: Rng) -> Case:
+    """Ranges that have nothing to do with any distance."""
+    return with_ranges(case, lambda r: replace(r, ranges=rng.uniform(0.5, 15.0, len(r.ranges))))
+
+
+def range_factor(factor: float) -> Fault:
+    """Scale all ranges."""
+    return lambda case, rng: with_ranges(case, lambda r: replace(r, ranges=r.ranges * factor))
+
+
+def rotated_ids(case: Case, rng: Rng) -> Case:
+    """From half-way on every anchor answers to the next one's name."""
+    ids = list(case.anchors)
+    following = {a: ids[(k + 1) % len(ids)] for k, a in enumerate(ids)}
+
+    def change(r: UwbRanges) -> UwbRanges:
+        to = np.array([r.anchor_ids.index(following[a]) if following[a] in r.anchor_ids else 0 for a in r.anchor_ids])
+        return replace(r, anchor=np.where(r.stamps >= case.middle, to[r.anchor], r.anchor))
+
+    places = {name: [*case.anchors[name], case.anchors[source][0]] for source, name in following.items()}
+    return replace(with_ranges(case, change), anchors=places)
+
+
+def shuffled_ids(case: Case, rng: Rng) -> Case:
+    """From half-way on the names are drawn again for every range."""
+    return with_ranges(
+        case,
+        lambda r: replace(
+            r, anchor=np.where(r.stamps >= case.middle, rng.integers(0, len(r.anchor_ids), len(r.anchor)), r.anchor)
+        ),
+    )
+
+
+def moved_anchor(case: Case, rng: Rng) -> Case:
+    """One anchor is put 3 m away half-way."""
+    return case if case.log.ranges is None else elsewhere(case, {case.log.ranges.anchor_ids[0]: np.array([1.8, 2.4])})
+
+
+def elsewhere(case: Case, by: dict[str, Floats]) -> Case:
+    """Return the case with anchors moved half-way by so much (2,), m."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        ranges = r.ranges.copy()
+        for name in set(by) & set(r.anchor_ids):
+            moved = (r.anchor == r.anchor_ids.index(name)) & (r.stamps >= case.middle)
+            longer = _longer(case, r, case.anchors[name][0], by[name])
+            ranges[moved] = np.maximum(ranges + longer, 0.05)[moved]
+        return replace(r, ranges=ranges)
+
+    places = {name: [*places, places[-1] + by[name]] if name in by else places for name, places in case.anchors.items()}
+    return replace(with_ranges(case, change), anchors=places)
+
+
+def _longer(case: Case, r: UwbRanges, place: Floats, shift: Floats) -> Floats:
+    """Return by how much the true distance (m,) of each range changes where its anchor is moved from its place, m."""
+    base = se2.interpolate_trajectory(case.log.odometry.stamps, case.truth, r.stamps)
+    tag = se2.transform(base, np.broadcast_to(case.log.mounting.tag_position[:2], (len(base), 2)))
+    return np.hypot(*(place + shift - tag).T) - np.hypot(*(place - tag).T)
+
+
+def stuck_anchor(case: Case, rng: Rng) -> Case:
+    """One anchor answers with its last range from half-way on, but for the last digit."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        own = np.flatnonzero((r.anchor == 0) & (r.stamps >= case.middle))
+        ranges = r.ranges.copy()
+        ranges[own] = ranges[own[0]] + rng.integers(-1, 2, len(own)) * 0.01
+        return replace(r, ranges=ranges)
+
+    return with_ranges(case, change)
+
+
+def one_name_for_two(case: Case, rng: Rng) -> Case:
+    """Two anchors answer to one name throughout."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        anchor = np.where(r.anchor == 1, 0, r.anchor)
+        used, anchor = np.unique(anchor, return_inverse=True)
+        return replace(r, anchor=anchor.astype(np.int64), anchor_ids=tuple(r.anchor_ids[k] for k in used))
+
+    return with_ranges(case, change)
+
+
+def one_radio_clock_fast(case: Case, rng: Rng) -> Case:
+    """The radio's clock runs fast by 2 %."""
+    first = float(case.log.odometry.stamps[0])
+    return shifted(case, lambda t: 0.02 * (t - first), "radio")
+
+
+def round_trip(case: Case, rng: Rng) -> Case:
+    """One anchor's firmware reports the way there and back."""
+    return with_ranges(case, lambda r: replace(r, ranges=np.where(r.anchor == 0, 2.0 * r.ranges, r.ranges)))
+
+
+def swapped_tag(case: Case, rng: Rng) -> Case:
+    """Half-way the tag is replaced by another one: it hangs 0.3 m to the left and measures 0.4 m too much."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        base = se2.interpolate_trajectory(case.log.odometry.stamps, case.truth, r.stamps)
+        tag = np.broadcast_to(case.log.mounting.tag_position[:2], (len(base), 2))
+        place = np.array([case.anchors[name][0] for name in r.anchor_ids])[r.anchor]
+        old, new = (np.hypot(*(place - se2.transform(base, np.add(tag, [0.0, left]))).T) for left in (0.0, 0.3))
+        return replace(r, ranges=np.where(r.stamps >= case.middle, r.ranges + new - old + 0.4, r.ranges))
+
+    return with_ranges(case, change)
+
+
+def now_and_then(metres: float) -> Fault:
+    """One anchor is too long by so much in three of ten ranges."""
+    return lambda case, rng: with_ranges(
+        case, lambda r: replace(r, ranges=r.ranges + metres * ((r.anchor == 0) & (rng.random(len(r.ranges)) < 0.3)))
+    )
+
+
+def dying_battery(case: Case, rng: Rng) -> Case:
+    """The noise of one anchor grows to 3 m, and more and more of its ranges are missing."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        age = (r.stamps - r.stamps[0]) / np.ptp(r.stamps) * (r.anchor == 0)
+        noisy = np.abs(r.ranges + 3.0 * age**2 * rng.standard_normal(len(age)))
+        return rows(replace(r, ranges=noisy), rng.random(len(age)) >= 0.8 * age)
+
+    return with_ranges(case, change)
+
+
+def rounded(step: float) -> Fault:
+    """Ranges are rounded, m."""
+    return lambda case, rng: with_ranges(case, lambda r: replace(r, ranges=np.round(r.ranges / step) * step))
+
+
+def moved_anchors(case: Case, rng: Rng) -> Case:
+    """Half-way all anchors are put elsewhere, each 2 m away."""
+    return elsewhere(case, {name: 2.0 * np.array([np.cos(n), np.sin(n)]) for n, name in enumerate(case.anchors)})
+
+
+def carried_anchor(case: Case, rng: Rng) -> Case:
+    """One anchor rides on a cart that drives to and fro all the time: it has no place."""
+    if case.log.ranges is None:
+        return case
+    name = case.log.ranges.anchor_ids[0]
+
+    def change(r: UwbRanges) -> UwbRanges:
+        swing = np.column_stack([2.0 * np.sin(2.0 * np.pi * r.stamps / 80.0), 1.5 * np.cos(2.0 * np.pi * r.stamps / 50.0)])
+        longer = _longer(case, r, case.anchors[name][0], swing)
+        return replace(r, ranges=np.where(r.anchor == 0, np.maximum(r.ranges + longer, 0.05), r.ranges))
+
+    return replace(with_ranges(case, change), anchors={n: p for n, p in case.anchors.items() if n != name})
+
+
+def missed(share: float) -> Fault:
+    """A share of the ranges is 0: the radio has missed its partner."""
+    return lambda case, rng: with_ranges(
+        case, lambda r: replace(r, ranges=np.where(rng.random(len(r.ranges)) < share, 0.0, r.ranges))
+    )
+
+
+def late_echo(case: Case, rng: Rng) -> Case:
+    """A metal shelf is put up before two anchors half-way: from then on all of their ranges are 0.8 to 2 m too long."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        hidden = (r.anchor < 2) & (r.stamps >= case.middle)
+        return replace(r, ranges=r.ranges + hidden * rng.uniform(0.8, 2.0, len(r.ranges)))
+
+    return with_ranges(case, change)

@@ -1,0 +1,166 @@
+"""Faults of wheels, odometry and of those who move the robot."""
+
+
+import numpy as np
+
+from uwblite import se2
+
+from .case import Case, Fault, Floats, Rng, chained, kept, shifted, with_odometry
+
+
+def frozen_wheels(start: float, seconds: float) -> Fault:
+    """Wheels that repeat their last reading; start as a share of the recording, then they go on from where they froze."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        def change(stamps: Floats, poses: Floats) -> Floats:
+            begin = stamps[0] + start * (stamps[-1] - stamps[0])
+            still = (stamps >= begin) & (stamps < begin + seconds)
+            steps = se2.between(poses[:-1], poses[1:])
+            steps[still[1:]] = 0.0
+            return chained(poses[0], steps)
+
+        return with_odometry(case, change)
+
+    return fault
+
+
+def reset(case: Case, rng: Rng) -> Case:
+    """The base restarts half-way and counts from zero."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        later = stamps >= case.middle
+        poses[later] = se2.between(np.broadcast_to(poses[later][0], poses[later].shape), poses[later])
+        return poses
+
+    return with_odometry(case, change)
+
+
+def glitch(case: Case, rng: Rng) -> Case:
+    """A single reading is 3 km off."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        poses[len(poses) // 2, :2] += 3000.0
+        return poses
+
+    return with_odometry(case, change)
+
+
+def rescaled(x: float, y: float, theta: float) -> Fault:
+    """Multiply the odometry."""
+    return lambda case, rng: with_odometry(case, lambda stamps, poses: poses * np.array([x, y, theta]))
+
+
+def redriven(way: float, turn: float) -> Fault:
+    """Let the wheels count other ways and turns: the path follows the wrong heading, as a base computes it."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps = se2.between(poses[:-1], poses[1:])
+        half = 0.5 * steps[:, 2]
+        forward = steps[:, 0] * np.cos(half) + steps[:, 1] * np.sin(half)
+        turned = turn * steps[:, 2]
+        along = way * forward[:, None] * np.column_stack([np.cos(0.5 * turned), np.sin(0.5 * turned)])
+        return chained(poses[0], np.column_stack([along, turned]))
+
+    return lambda case, rng: with_odometry(case, change)
+
+
+def carried(seconds: float, gap: float) -> Fault:
+    """The robot is picked up half-way and put down where it would have been `seconds` later; the log pauses for a gap, s."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        begin, end = case.middle, case.middle + seconds
+        poses, stamps = case.log.odometry.poses, case.log.odometry.stamps
+        before, after = np.searchsorted(stamps, [begin, end])
+        put_down = se2.compose(poses[before - 1], se2.inverse(poses[after]))
+        case = with_odometry(case, lambda t, p: np.where((t >= end)[:, None], se2.compose(put_down, p), p))
+        case = kept(case, lambda t: (t < begin) | (t >= end))
+        return shifted(case, lambda t: np.where(t >= end, gap - seconds, 0.0))
+
+    return fault
+
+
+def slipping_wheel(case: Case, rng: Rng) -> Case:
+    """One wheel spins on a smooth patch: for 6 s three times over, the wheels count a turn and way that are not."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, span = se2.between(poses[:-1], poses[1:]), np.diff(stamps)
+        for share in (0.3, 0.55, 0.8):
+            begin = stamps[0] + share * (stamps[-1] - stamps[0])
+            on = (stamps[1:] >= begin) & (stamps[1:] < begin + 6.0)
+            steps[on] += np.column_stack([0.05 * span[on], np.zeros(on.sum()), 0.25 * span[on]])
+        return chained(poses[0], steps)
+
+    return with_odometry(case, change)
+
+
+def other_wheels(factor: float) -> Fault:
+    """From half-way on the wheels have another radius: a tyre was changed, or a load presses it flat."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        def change(stamps: Floats, poses: Floats) -> Floats:
+            steps = se2.between(poses[:-1], poses[1:])
+            steps[stamps[1:] >= case.middle, :2] *= factor
+            return chained(poses[0], steps)
+
+        return with_odometry(case, change)
+
+    return fault
+
+
+def spinning_wheels(case: Case, rng: Rng) -> Case:
+    """Half-way both wheels spin against an obstacle for 20 s and count 4 m that are none."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, span = se2.between(poses[:-1], poses[1:]), np.diff(stamps)
+        on = (stamps[1:] >= case.middle) & (stamps[1:] < case.middle + 20.0)
+        steps[on, 0] += 0.2 * span[on]
+        return chained(poses[0], steps)
+
+    return with_odometry(case, change)
+
+
+def drifting_heading(rate: float) -> Fault:
+    """The heading drifts ever faster, up to a rate, rad/s: a gyro that warms up."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, span = se2.between(poses[:-1], poses[1:]), np.diff(stamps)
+        steps[:, 2] += rate * span * (stamps[1:] - stamps[0]) / np.ptp(stamps)
+        return chained(poses[0], steps)
+
+    return lambda case, rng: with_odometry(case, change)
+
+
+def stuck_heading(case: Case, rng: Rng) -> Case:
+    """From half-way on the heading stays what it was; the positions follow it, as a base computes them."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps = se2.between(poses[:-1], poses[1:])
+        steps[stamps[1:] >= case.middle, 2] = 0.0
+        return chained(poses[0], steps)
+
+    return with_odometry(case, change)
+
+
+def one_dead_wheel(case: Case, rng: Rng) -> Case:
+    """From half-way on the left wheel of a track of 0.3 m counts nothing."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, track = se2.between(poses[:-1], poses[1:]), 0.3
+        dead = stamps[1:] >= case.middle
+        right = steps[dead, 0] + 0.5 * track * steps[dead, 2]
+        steps[dead] = np.column_stack([0.5 * right, np.zeros(len(right)), right / track])
+        return chained(poses[0], steps)
+
+    return with_odometry(case, change)
+
+
+def exchanged_axes(case: Case, rng: Rng) -> Case:
+    """x stands where y should, and y where x should."""
+    return with_odometry(case, lambda stamps, poses: poses[:, [1, 0, 2]])
+
+
+def coarse(way: float, turn: float) -> Fault:
+    """Positions and heading are rounded to so many metres and radians."""
+    return lambda case, rng: with_odometry(
+        case, lambda stamps, poses: np.round(poses / [way, way, turn]) * [way, way, turn]
+    )

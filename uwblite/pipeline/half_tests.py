@@ -1,0 +1,85 @@
+"""Do the halves of a recording agree on the wheels? A change on the way hides where ranges alone hold the trajectory.
+
+A heading that stands still from some moment on, or a tyre that was changed, can be explained by wrong values of the
+wheels' calibration, constant over the whole recording, and bent anchors, with hardly larger residuals. So both halves are
+estimated once more, each with a calibration of its own, from the joint estimate. Where a lidar measures the motion from
+scan to scan, such a change is seen directly (screening/wheel_motion.py).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Floats
+from ..graph.calibration import RANGE_SCALE
+from ..graph.graph import Graph, PriorEdges
+from ..graph.marginals import marginals
+from ..graph.solver import optimize
+from .estimate import Estimate, Task
+from .recordings import Recording
+
+_CHANGES = {"odometry_scale": 0.1, "heading_scale": 0.2, "heading_per_metre": 0.05}
+"""Differences between halves that no sound base has: of lengths, of turns, and of turns per metre, rad/m."""
+_SIGMAS = 4.0
+"""Standard deviations of the difference that it must exceed."""
+_LEAST_STEPS, _LEAST_RANGES = 30, 40
+"""Steps and ranges of a half without which it decides nothing."""
+_FEW = 8
+"""Ranges to an anchor with which a half can estimate it."""
+
+
+def check_halves(estimate: Estimate, task: Task) -> None:
+    """Doubt a map of a recording without lidar whose halves need different wheels."""
+    for recording in task.recordings.each:
+        if recording.has_scans or estimate.ranges is None:
+            continue
+        rows, middle = recording.rows, (recording.rows.start + recording.rows.stop) // 2
+        halves = [_calibration(estimate, recording, slice(*ends), task) for ends in ((rows.start, middle), (middle, rows.stop))]
+        if halves[0] is None or halves[1] is None:
+            continue
+        _compare(halves[0], halves[1], task)
+
+
+def _compare(one: Floats, other: Floats, task: Task) -> None:
+    """Doubt where values and standard deviations (3, 2) of two halves differ."""
+    difference, sigma = np.abs(one[:, 0] - other[:, 0]), np.hypot(one[:, 1], other[:, 1])
+    for k, (kind, most) in enumerate(_CHANGES.items()):
+        if difference[k] > max(most, _SIGMAS * sigma[k]):
+            text = (
+                f"the halves of the recording need different wheels ({kind} {one[k, 0]:+.3f} and {other[k, 0]:+.3f}, where the "
+                f"difference is known to {sigma[k]:.3f}): wheels, gyro or ranges changed on the way"
+            )
+            task.stages.doubt("halves-disagree", text, first=float(one[k, 0]), second=float(other[k, 0]), sigma=float(sigma[k]))
+
+
+def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Task) -> Floats | None:
+    """Return values and standard deviations (3, 2) of the wheels by some keyframes; None where these are too few."""
+    graph, wheels, ranges = estimate.graph, estimate.odometry, estimate.ranges
+    places = [graph.calibration.index(kind, recording=recording.number) for kind in _CHANGES]
+    if ranges is None or min(places) < 0:
+        return None
+    steps = np.flatnonzero((wheels.i >= rows.start) & (wheels.j < rows.stop))
+    own = (ranges.pose >= rows.start) & (ranges.pose < rows.stop) & (np.asarray(ranges.weights) > 0.0)
+    unseen = np.bincount(ranges.anchor[own], minlength=len(graph.anchors)) < _FEW
+    heard = np.flatnonzero(own & ~unseen[ranges.anchor])
+    if len(steps) < _LEAST_STEPS or len(heard) < _LEAST_RANGES:
+        return None
+    fixed = np.ones(len(graph.poses), dtype=bool)
+    fixed[rows.start + 1 : rows.stop] = False
+    priors = tuple(_loose(e, places[0]) for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration")
+    known = np.zeros(len(graph.calibration.values), dtype=bool) | np.asarray(graph.fixed_calibration, dtype=bool)
+    known |= graph.calibration.of_kinds(RANGE_SCALE)
+    known[places] = False
+    alone = Graph(graph.poses, graph.anchors, priors, graph.calibration, fixed, unseen, known)
+    solved = optimize(alone.with_edges(wheels.rows(steps), ranges.rows(heard)), task.config.solver)[0]
+    return np.column_stack([solved.calibration.values[places], marginals(solved).calibration[places]])
+
+
+def _loose(priors: PriorEdges, place: int) -> PriorEdges:
+    """Return priors of the calibration that leave the unit of the wheels' ways to the data."""
+    factor = np.where(priors.index == place, 1.0 / _LOOSER, 1.0)
+    return replace(priors, sqrt_information=factor[:, None, None] * priors.sqrt_information)
+
+
+_LOOSER = 20.0
+"""Factor on the prior standard deviation of that unit: what changed on the way is of any size."""
