@@ -2,11 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 from emulators.faults import FaultyLine, parse_fault
+from emulators.simulated_world import nearest
 from emulators.wires import PtyWire
 from emulators.world import LogWorld, RoomWorld, WorldClock
 from helpers.driver_harness import ROOT
+from simulation import laser
 
 from uwblite.drivers.scip_driver import ScipDriver
 from uwblite.drivers.session import Session
@@ -125,3 +128,11 @@ def test_steps_that_the_unit_does_not_have_are_refused_at_once():
     session.feed(asked_again, 1.4)
     with pytest.raises(ProtocolError, match=r"44\.\.725"):
         session.feed(b"II\n00P\n\n", 1.5)
+
+
+def test_rays_end_where_the_simulators_do():
+    rng = np.random.default_rng(1)
+    walls, columns = rng.uniform(-5.0, 5.0, (9, 4)), np.column_stack([rng.uniform(-5.0, 5.0, (4, 2)), rng.uniform(0.1, 0.5, 4)])
+    origins, angles = rng.uniform(-1.0, 1.0, (200, 2)), rng.uniform(-4.0, 4.0, 200)
+    assert nearest(origins, angles, walls, columns) == pytest.approx(laser.cast(origins, angles, walls, columns, np.inf)[0])
+    assert np.isinf(nearest(origins, angles, walls[:0], columns[:0])).all()

@@ -10,9 +10,15 @@ import time
 
 import pytest
 from compare_recording import compare
+from emulators.dwm_device import DwmDevice, DwmOptions
+from emulators.kobuki_device import KobukiDevice
+from emulators.scip_device import ScipDevice, ScipOptions
+from emulators.world import RoomWorld, WorldClock
+from helpers import virtual_recording
 from helpers.driver_harness import ROOT
 
 from uwblite.cli import main
+from uwblite.drivers.devices import open_device
 
 WITHOUT_NUMPY = "import sys; sys.modules['numpy'] = sys.modules['scipy'] = None; from uwblite.cli import main; sys.exit(main())"
 
@@ -257,14 +263,24 @@ def test_devices_names_an_anchor_and_a_dead_port(bench, capsys, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_minute_at_full_rates(bench, tmp_path):
-    start, arguments, truth = bench
-    emulator = start("--lidar-skew", "1e-4", "--kobuki-skew=-5e-5", "--kobuki-clock", "30000", "--lidar-clock", "16747216")
-    code, _, err = finish(record(arguments, tmp_path / "run.log", "--duration", "60"))
-    emulator.terminate()
-    emulator.wait()
-    assert code == 0, err
-    for name, row in compare(tmp_path / "run.log", truth).items():
+def test_a_minute_at_full_rates(tmp_path):
+    """In simulated time: crystals that are wrong, and clocks that wrap within the minute."""
+    world, clock, sent = RoomWorld(), WorldClock(), []
+
+    def truth(name):
+        return lambda at, *content: sent.append([name, at, content[0]])
+
+    lidar = ScipOptions(clock_start=16747216, clock_skew=1e-4)
+    base = KobukiDevice(world.poses(), clock, clock_start=30000, clock_skew=-5e-5, on_packet=truth("odometry"))
+    devices = [
+        ("lidar", open_device("lidar", "port")[0], ScipDevice(world.scans(), clock, lidar, truth("lidar"))),
+        ("uwb", open_device("uwb", "port")[0], DwmDevice(world.epochs(), clock, DwmOptions(), truth("uwb"))),
+        ("odometry", open_device("odometry", "kobuki:port")[0], base),
+    ]
+    recorder = virtual_recording.record(tmp_path / "run.log", devices, 62.0, begin=lambda now: clock.start(now + 1.5))
+    assert recorder.doubts() == []
+    (tmp_path / "truth.jsonl").write_text("".join(json.dumps(row) + "\n" for row in sent))
+    for name, row in compare(tmp_path / "run.log", tmp_path / "truth.jsonl").items():
         check_row(name, row)
         assert row["sent"] > (2900 if name == "odometry" else 580)
         assert row["p95_ms"] < 5.0

@@ -11,6 +11,8 @@ from helpers.virtual_recording import record
 
 from uwblite.cli import main
 from uwblite.drivers.devices import open_device
+from uwblite.drivers.events import Note
+from uwblite.drivers.link import Link
 from uwblite.io.carmen import read_log
 
 
@@ -56,6 +58,13 @@ def test_messages_and_facts_are_numbered_and_the_first_of_a_kind_is_read_as_ever
     assert "no scans of ROBOTLASER3; it has ROBOTLASER1, ROBOTLASER2" in capsys.readouterr().err
     assert main(["check", str(tmp_path / "run.log"), "--scan-topic", "/scan"]) == 1
     assert "scans are not read from '/scan'" in capsys.readouterr().err
+
+
+def test_a_drivers_note_names_the_device_of_its_number():
+    session, url = open_device("lidar", "port")
+    for number, name in ((1, "lidar"), (2, "lidar2")):
+        note = Link("lidar", url, session, number).named(Note("error", "lidar-silent", "lidar: no answer from a lidar"))
+        assert (note.name, note.text) == (f"{name}-silent", f"{name}: no answer from a lidar")
 
 
 def test_more_than_a_log_keeps_apart_is_refused(tmp_path, capsys):

@@ -20,18 +20,19 @@ MINUTES, LEAD = 1.0, 3.0
 """min of driving, s of standing before."""
 BASES = {"kobuki": KobukiDevice, "create2": Create2Device, "line": TickLineDevice}
 OPTIONS = {
+    "rplidar-standard": "?standard=1",
     "line": "?columns=t,left,right&time_unit=0.001&tick=0.0001&wheel_base=0.30",
     "uwb-line": "?columns=t,id,range,quality&prefix=UWB&unit=0.001&time_unit=0.001",
 }
 TOGETHER = [
     ("ld06", "linktrack", "create2"), ("lds01", "makerfabs", "line"), ("rplidar", "makerfabs-at", "kobuki"),
-    ("ydlidar-x2", "dwm3001", "line"), ("ydlidar-x4", "bu03", "kobuki"), ("ld06", "uwb-line", "kobuki"),
+    ("ydlidar-x2", "dwm3001", "line"), ("ydlidar-x4", "bu03", "kobuki"), ("rplidar-standard", "uwb-line", "kobuki"),
     ("lds01", "bu01", "create2"),
 ]  # fmt: skip
 
 
 def session(sensor, name):
-    return open_device(sensor, f"{name}:port{OPTIONS.get(name, '')}")[0]
+    return open_device(sensor, f"{name.removesuffix('-standard')}:port{OPTIONS.get(name, '')}")[0]
 
 
 @pytest.mark.slow

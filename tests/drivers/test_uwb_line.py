@@ -145,3 +145,14 @@ def test_ranges_of_other_tags_are_left_out_and_that_is_reported():
     actions = session.feed((line.format(3, 50) + line.format(3, 100) + line.format(4, 200) + line.format(3, 300)).encode(), 1.0)
     assert [r.range for a in actions if isinstance(a, RangeEpoch) for r in a.readings] == [1.0, 3.0]
     assert [a.name for a in actions if isinstance(a, Note)] == ["uwb-other-tag"]
+
+
+@pytest.mark.parametrize("name", ["dwm3001", "makerfabs-at"])
+def test_rounds_that_are_numbered_are_missed(name):
+    """Seven rounds lost in the middle; a digit damaged; the board switched off and on."""
+    epoch = next(RoomWorld().epochs())
+    numbers = [1, 2, 3, 11, 12, 13, 74, 15, 16, 0, 1, 2] if name == "dwm3001" else [250, 251, 3, 4, 5, 6]
+    session = open_device("uwb", f"{name}:port")[0]
+    session.start(0.0)
+    actions = [a for n in [0, *numbers] for a in session.feed(BOARDS[name](epoch, n, 0), 0.1 * n)]
+    assert [a.count for a in actions if isinstance(a, Lost)] == [7]

@@ -3,9 +3,10 @@
 import math
 
 import pytest
-from helpers.driver_harness import feed_whole
+from helpers.driver_harness import feed_whole, good
 
 from uwblite.drivers.events import Corrupt
+from uwblite.drivers.slamtec import Reply
 from uwblite.drivers.sweep import Samples
 from uwblite.drivers.ydlidar import YdLidarProtocol, _correction
 
@@ -30,3 +31,11 @@ def test_the_protocols_example():
 @pytest.mark.parametrize(("mm", "degrees"), [(1000.0, -6.7622), (8000.0, -7.8374)])
 def test_the_corrections_that_the_protocol_computes(mm, degrees):
     assert _correction(mm) * 360 == pytest.approx(degrees, abs=1e-3)
+
+
+def test_a_reply_that_breaks_off_does_not_swallow_the_next_one():
+    """Replies have no check: whole or byte by byte, the second one counts."""
+    stream = bytes.fromhex("a55a1400000004 a55a0500004081") + bytes(20)
+    whole, single = make(), make()
+    events = [event for k in range(len(stream)) for event in single.feed(stream[k : k + 1], 1.0)]
+    assert good(whole.feed(stream, 1.0)) == good(events) == [Reply(1.0, 0x81, b"")]

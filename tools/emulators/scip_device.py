@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 from .hokuyo import NAMES, Unit
 from .world import Feed, Scan, WorldClock
@@ -17,6 +18,7 @@ def checksum(text: bytes) -> bytes:
     return bytes([(sum(text) & 0x3F) + 0x30])
 
 
+@lru_cache(1 << 14)
 def encode(value: int, width: int) -> bytes:
     """Code a number in characters of six bits."""
     return bytes(((value >> 6 * i) & 0x3F) + 0x30 for i in reversed(range(width)))

@@ -64,7 +64,7 @@ class SimulatedWorld(RoomWorld):
         origin = pose[:, :2] + np.stack([c * x - s * y, s * x + c * y], axis=1)
         walls, columns = self._things_near(float(at[0]), origin[0])
         angles = pose[:, 2] + theta - 2 * np.pi * np.asarray(bearings)
-        seen, _, _ = laser.cast(origin, angles, walls, columns, self._reach)
+        seen = nearest(origin, angles, walls, columns)
         seen = seen + self._sigma * self._random.standard_normal(len(seen))
         return [round(1000 * r) if r < self._reach else 0 for r in seen.tolist()]
 
@@ -76,3 +76,24 @@ class SimulatedWorld(RoomWorld):
             walls, columns = plan.walls[w], plan.columns[c]
             self._near = time, walls, columns
         return walls, columns
+
+
+def nearest(origins: np.ndarray, angles: np.ndarray, walls: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) at which rays end, inf = nowhere: `laser.cast` for a few rays, with all walls at once.
+
+    Parameters
+    ----------
+    origins, angles : (n, 2) and (n,) of the rays. walls, columns : (w, 4) and (c, 3), as in `laser.cast`.
+    """
+    (dx, dy), (ox, oy) = (np.stack([np.cos(angles), np.sin(angles)])[:, :, None], origins.T[:, :, None])
+    ex, ey = walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]
+    ax, ay = walls[:, 0] - ox, walls[:, 1] - oy
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cross = dx * ey - dy * ex
+        t, u = (ax * ey - ay * ex) / cross, (ax * dy - ay * dx) / cross
+    ends = np.where((t > 0.0) & (u >= 0.0) & (u <= 1.0), t, np.inf)
+    bx, by = columns[:, 0] - ox, columns[:, 1] - oy
+    depth2 = columns[:, 2] ** 2 - (bx * dy - by * dx) ** 2
+    t = bx * dx + by * dy - np.sqrt(np.maximum(depth2, 0.0))
+    round_ends = np.where((depth2 > 0.0) & (t > 0.0), t, np.inf)
+    return np.minimum(ends.min(axis=1, initial=np.inf), round_ends.min(axis=1, initial=np.inf))

@@ -72,7 +72,7 @@ class SpinningDevice:
         times, places = [], []
         for i in range(self.GROUP):
             time = due - (self.GROUP - 1 - i) / self.RATE
-            step = self.speed * (1.0 + self._wobble * math.sin(2 * math.pi * time / 7.0)) / self.RATE
+            step = self._step(time)
             self._place += step
             if self._place >= 1.0:
                 self._place -= 1.0
@@ -81,6 +81,10 @@ class SpinningDevice:
             places.append(self._place)
         self._sent += self.GROUP
         return times, places
+
+    def _step(self, time: float) -> float:
+        """Return how far the motor turns from one reading to the next, turns."""
+        return self.speed * (1.0 + self._wobble * math.sin(2 * math.pi * time / 7.0)) / self.RATE
 
     def look(self, times: list[float], bearings: list[float]) -> list[int]:
         """Return what is seen, mm, 0 = nothing."""
@@ -255,11 +259,19 @@ class RpLidarDevice(SlamtecDevice):
         """Begin a stream; standard scan has half the rate."""
         self.RATE, self.GROUP = (4000.0, 32) if self.mode == "express" else (2000.0, 1)
         self._first = True
+        self._ahead: list[int] = []
+
+    def _look_ahead(self, due: float, place: float) -> int:
+        """Return what a reading sees; the world is asked for several at once, over which the motor runs evenly."""
+        if not self._ahead:
+            step, together = self._step(due), range(32)
+            self._ahead = self.look([due + i / self.RATE for i in together], [(place + i * step) % 1.0 for i in together])[::-1]
+        return self._ahead.pop()
 
     def encode(self, due: float, times: list[float], places: list[float]) -> bytes:
         """Return a capsule of 84 bytes or a node of 5."""
         if self.mode == "standard":
-            (mm,), angle = self.look(times, places), round(places[0] * 23040) % 23040
+            mm, angle = self._look_ahead(due, places[0]), round(places[0] * 23040) % 23040
             start = places[0] < self.speed / self.RATE
             return struct.pack("<BHH", (0 if not mm else 188) | (1 if start else 2), angle << 1 | 1, 4 * mm)
         # Near readings point a little elsewhere; the offset is told in 1/8 degree, six bits.

@@ -167,8 +167,8 @@ class FrameReader:
 class PacketReader(FrameReader):
     """Frames that prove themselves by a check; a protocol derives from this and defines `size_at` and `decode`.
 
-    A head in noise may claim more bytes than ever come. Where a whole frame stands behind a head that still waits, that
-    head was noise.
+    A head in noise may claim more bytes than ever come. Where a whole frame stands behind a head that still waits, or inside
+    a frame that has no check, that head was noise.
     """
 
     smallest = 1
@@ -178,13 +178,18 @@ class PacketReader(FrameReader):
         """Return the size of the good frame that begins at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
         raise NotImplementedError
 
+    def is_checked(self, lead: int) -> bool:
+        """Return whether frames that begin with this byte have a check."""
+        return True
+
     def measure(self, at: int) -> int:
         """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
         buffer = self.held.data
         size, behind = self.size_at(buffer, at), at + 1
-        while size == 0 and behind + self.smallest <= len(buffer):
+        end = len(buffer) if size == 0 else at + size if size > 0 and not self.is_checked(buffer[at]) else at
+        while behind + self.smallest <= end:
             found = self.size_at(buffer, behind)
-            if found > 0:
+            if found > 0 and behind + found <= end:
                 return at - behind
             behind += max(1, -found)
         return size

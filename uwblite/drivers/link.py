@@ -1,8 +1,9 @@
 """One device of a recording: its port, its session, and what it did."""
 
+import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ..errors import DeviceError
 from .events import Note, Send, SetBaud, SetDtr
@@ -187,6 +188,12 @@ class Link:
         """Return what a fact about this device is called in the log: ``laser_serial``, ``laser2_serial`` ..."""
         kind, _, rest = name.partition("_")
         return name if self.number == 1 else f"{kind}{self.number}_{rest}"
+
+    def named(self, note: Note) -> Note:
+        """Return a driver's note, which names the sensor alone, with the name of this device."""
+        sensor = self.name.removesuffix(str(self.number))
+        name, text = (re.sub(f"^{sensor}(?=[-:])", self.name, words) for words in (note.name, note.text))
+        return replace(note, name=name, text=text)
 
     def update_rate(self, now: float) -> None:
         """Refresh `rate`, messages per second over the last two seconds."""

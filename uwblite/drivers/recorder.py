@@ -154,7 +154,7 @@ class Recorder:
                 counts.lost += action.count
                 link.new_lost += action.count
             elif isinstance(action, Note):
-                self._note(link, action)
+                self._note(link, link.named(action))
             elif isinstance(action, Param):
                 self.param(link.param_name(action.name), action.value)
             elif isinstance(action, Reopen):

@@ -90,6 +90,10 @@ class RpLidarProtocol(PacketReader):
         """Take bytes that arrived at `stamp` s and return the events they complete."""
         return [event for event in super().feed(data, stamp) if event is not None]
 
+    def is_checked(self, lead: int) -> bool:
+        """Return whether frames that begin with this byte have a check; replies have none."""
+        return lead != SYNC
+
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
         if buffer[at] == SYNC and (size := reply_size(buffer, at, KINDS)) >= 0:

@@ -10,12 +10,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..errors import ConfigError
-from .events import Action, Corrupt, Note, RangeEpoch, RangeReading
+from .events import Action, Corrupt, Lost, Note, RangeEpoch, RangeReading
 from .session import Identity
 from .text_lines import Line, LineDriver, columns_of, number_of
 
 MOST_RANGE = 1000.0
 """m; no UWB radio reaches further."""
+MOST_LEAP, NEAR = 100_000, 3
+"""Rounds that may be lost together; rounds within which the next one must follow a leap, as a damaged digit leaps too."""
 NAME = re.compile(r"[A-Za-z0-9_.:-]{1,32}")
 
 
@@ -28,6 +30,10 @@ class Ranges:
     """The board's own time, its own unit; None = not sent."""
     tag: str = ""
     """Who measured, where the line contains it."""
+    round: int | None = None
+    """Number of the ranging round; None = not sent."""
+    modulus: int = 0
+    """It wraps there; 0 = it does not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +52,15 @@ Parse = Callable[[str], Ranges | Refused | str | None]
 _NO_RANGE = re.compile(r"\b(TDOA|PDOA|AOA|POS|position|azimuth|le_us)\b", re.IGNORECASE)
 
 
-def _each(pattern: str, unit: float) -> Parse:
-    """Return what reads every match of a pattern with the groups id and range."""
-    form = re.compile(pattern)
+def _each(pattern: str, unit: float, number: str = "$^") -> Parse:
+    """Return what reads every match of a pattern with the groups id and range, and the number of the round."""
+    form, numbered = re.compile(pattern), re.compile(number)
 
     def parse(line: str) -> Ranges | Refused | str | None:
         found = tuple(reading(m["id"], float(m["range"]) * unit) for m in form.finditer(line))
         if found:
-            return Ranges(found)
+            stated = numbered.search(line)
+            return Ranges(found, round=int(stated[1]) if stated else None)
         return Refused("positions or angles") if _NO_RANGE.search(line) else None
 
     return parse
@@ -61,7 +68,7 @@ def _each(pattern: str, unit: float) -> Parse:
 
 _NUMBERS = r"((?:-?\d+)?(?:,(?:-?\d+)?)*)"
 _AT_RANGE = re.compile(
-    rf"AT\+RANGE=tid:(\d+),\s*mask:[0-9A-Fa-f]+,\s*seq:\s*\d+,\s*range:\s*\({_NUMBERS}\)(?:.*?ancid:\s*\({_NUMBERS}\))?"
+    rf"AT\+RANGE=tid:(\d+),\s*mask:[0-9A-Fa-f]+,\s*seq:\s*(\d{{1,3}}),\s*range:\s*\({_NUMBERS}\)(?:.*?ancid:\s*\({_NUMBERS}\))?"
 )
 
 
@@ -72,12 +79,13 @@ def _at_range(line: str) -> Ranges | str | None:
     match = _AT_RANGE.search(line)
     if match is None:
         return "damaged list of ranges"
-    centimetres = match[2].split(",")
-    names = match[3].split(",") if match[3] else [str(i) for i in range(len(centimetres))]
+    centimetres = match[3].split(",")
+    names = match[4].split(",") if match[4] else [str(i) for i in range(len(centimetres))]
     if len(names) != len(centimetres):
         return "as many ranges as anchors were expected"
     pairs = [(name, int(text)) for name, text in zip(names, centimetres, strict=True) if name and text]
-    return Ranges(tuple(reading(name, cm / 100) for name, cm in pairs if cm > 0 and int(name) >= 0), tag=match[1])
+    found = tuple(reading(name, cm / 100) for name, cm in pairs if cm > 0 and int(name) >= 0)
+    return Ranges(found, tag=match[1], round=int(match[2]), modulus=256)
 
 
 BOARDS: dict[str, Parse] = {
@@ -91,7 +99,7 @@ BOARDS: dict[str, Parse] = {
     # [mac_address=0x0001, status="SUCCESS", distance[cm]=245];
     "dwm3001": _each(
         r'(?:"Addr"\s*:\s*"|mac_address=)0x(?P<id>[0-9A-Fa-f]{4})"?\s*,\s*"?[Ss]tatus"?\s*[:=]\s*"(?:Ok|SUCCESS)"\s*,'
-        r'\s*(?:"D_cm"\s*:|distance\[cm\]=)\s*(?P<range>-?\d+)', 0.01,
+        r'\s*(?:"D_cm"\s*:|distance\[cm\]=)\s*(?P<range>-?\d+)', 0.01, r'(?:"Block"\s*:|block_index=)\s*(\d{1,9})\b',
     ),
 }  # fmt: skip
 
@@ -181,7 +189,8 @@ class UwbLineDriver(LineDriver):
 
     def __init__(self, parse: Parse, title: str, baud: int = 115200, time_unit: float = 1.0, tag: str = "") -> None:
         super().__init__(within_reach(parse), title, baud, time_unit)
-        self._tag = tag
+        self._tag, self._leap = tag, 0
+        self._round: int | None = None
 
     def take(self, event: Line) -> list[Action]:
         """Turn a line into ranges."""
@@ -193,12 +202,22 @@ class UwbLineDriver(LineDriver):
             text = f"uwb: ranges of tag {content.tag} besides those of tag {self._tag} are left out; tag=ID chooses"
             return self.say_once(Note("warning", "uwb-other-tag", text))
         self._tag, self.ready = content.tag or self._tag, True
+        missed: list[Action] = [Lost(event.stamp, count)] if (count := self._missed(content)) else []
         if not content.readings:
-            return []
+            return missed
         if self.leaps(content.time, event.stamp):
             return [Corrupt(b"", "line whose time leaps")]
         stamp, _, lost = self.timed(content.time, event.stamp)
-        return [*lost, RangeEpoch(stamp, content.readings)]
+        return [*missed, *lost, RangeEpoch(stamp, content.readings)]
+
+    def _missed(self, line: Ranges) -> int:
+        """Return how many rounds were missed before the line before this one, by their numbers; 0 where the board restarted."""
+        if line.round is None:
+            return 0
+        step = 1 if self._round is None else line.round - self._round
+        step = step % line.modulus if line.modulus else step
+        leap, self._leap, self._round = self._leap, step - 1 if 1 < step <= MOST_LEAP else 0, line.round
+        return leap if 0 < step <= NEAR else 0
 
     def identity(self) -> Identity:
         """Say who answered."""

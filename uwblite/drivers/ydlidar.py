@@ -18,7 +18,7 @@ from operator import xor
 from .events import Action, Send
 from .framing import PacketReader, to_next
 from .session import Script
-from .slamtec import SYNC, Reply, SlamtecDriver, answers, decode_reply, reply_size, request
+from .slamtec import DESCRIPTOR, SYNC, Reply, SlamtecDriver, answers, decode_reply, reply_size, request
 from .spinning import SpinningDriver
 from .sweep import Fan, Samples
 
@@ -48,11 +48,15 @@ class YdLidarProtocol(PacketReader):
     rate : readings per second.
     """
 
-    smallest = HEADER
+    smallest = DESCRIPTOR
 
     def __init__(self, rate: float) -> None:
         super().__init__()
         self._period = 1.0 / rate
+
+    def is_checked(self, lead: int) -> bool:
+        """Return whether frames that begin with this byte have a check; replies have none."""
+        return lead != SYNC
 
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the packet or reply at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
