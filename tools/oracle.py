@@ -1,13 +1,13 @@
 """What the measurements of a simulated drive allow: least squares with true associations and true noise, from the truth.
 
-Poses, anchors, walls, columns, the wheels' calibration, the anchors' biases and the antennas' patterns are all unknown.
-Known are which surface each ray hit, which steps slipped, which ranges were shadowed, and how all errors are
-distributed: the multipath of an anchor as a Gaussian process over the floor. The maximum-likelihood optimum is found by
-Gauss-Newton from the truth; its covariance is the Cramer-Rao bound.
+Poses, anchors, walls, columns, the paint of surfaces, the wheels' calibration, the anchors' biases and the antennas' patterns
+are all unknown. Known are which surface each ray hit, which steps slipped, which ranges were shadowed by what, and how all
+errors are distributed: the multipath of an anchor, and what patches of floor add to steps, as Gaussian processes over the
+floor. The maximum-likelihood optimum is found by Gauss-Newton from the truth; its covariance is the Cramer-Rao bound.
 
     residuals   wheels   log of the step against the calibrated step, (x, y, theta)
-                wall     n . (R p + t) - d            n, d of the wall; p a point in the base frame
-                column   |R p + t - c| - radius
+                wall     n . (R (p - paint r) + t) - d    n, d of the wall; p a point in the base frame, r the ray's direction
+                column   |R (p - paint r) + t - c| - radius
                 range    scale |tag - anchor| + bias + patterns - range, white noise + Gaussian process
 """
 
@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
-from simulation import radio
-from simulation.recording import Recording
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from simulation import radio, real_rooms
+from simulation.recording import Recording, hidden_ranges
 
 from uwblite import se2
 from uwblite.evaluation.trajectory import align
@@ -37,6 +37,10 @@ _SETTLED = 1e-5
 """m and rad; the largest step at which the search ends."""
 _AT_ONCE = 200_000
 """Rays linearised at once."""
+_ANY_PLACE = 10.0
+"""m and rad; prior standard deviation of a surface, for those that a single ray hit."""
+_GRAZING = 0.3
+"""Cosine of incidence below which a ray at a column tells the place of its edge, not of its surface; it is left out."""
 _SLIP = 0.5
 """m and rad; standard deviation of a step during a slip."""
 _ROUNDING = 2e-4
@@ -85,6 +89,8 @@ class _Layout:
         begin += 2 * anchors
         self.surfaces = begin + np.arange(2 * surfaces).reshape(-1, 2)
         begin += 2 * surfaces
+        self.paint = begin + np.arange(surfaces)
+        begin += surfaces
         self.wheels = begin + np.arange(_WHEELS)
         begin += _WHEELS
         self.bias = begin + np.arange(anchors)
@@ -97,7 +103,7 @@ class Oracle:
     """The least-squares problem of one recording."""
 
     def __init__(self, recording: Recording, log: SensorLog, lidar: bool = True) -> None:
-        self.recording, self.log = recording, log
+        self.recording, self.log, self.rooms = recording, log, recording.settings.rooms
         self.frames = keyframes.select(log.odometry, KeyframeConfig())
         self.truth = self._at(self.frames.stamps)
         self.rays = self._rays() if lidar and len(recording.scans) else None
@@ -166,6 +172,7 @@ class Oracle:
             sparse_part = sparse_part + jacobian.T @ jacobian
             gradient += jacobian.T @ residual
         matrix = sparse_part.toarray()
+        matrix[self.layout.surfaces, self.layout.surfaces] += _ANY_PLACE**-2
         if self.rays is not None:
             self._add_rays(matrix, gradient)
         if self.has_ranges:
@@ -185,7 +192,6 @@ class Oracle:
         along = se2.rotate(0.5 * turn, frames.motion[:, :2]) * (1.0 + s)
         z = np.concatenate([along, (frames.motion[:, 2] + turn)[:, None]], axis=1)
         error = self._step_error(z, poses)
-        whitening = self._wheel_whitening()
         columns = np.concatenate(
             [layout.poses[:-1], layout.poses[1:], np.broadcast_to(layout.wheels, (len(z), _WHEELS))], axis=1
         )
@@ -200,18 +206,20 @@ class Oracle:
         jacobian[:, :, 6] = -np.concatenate([z[:, :2] / (1.0 + s), np.zeros((len(z), 1))], axis=1)
         for c, turned in ((7, frames.motion[:, 2]), (8, frames.length)):
             jacobian[:, :, c] = -np.concatenate([0.5 * turned[:, None] * ahead, turned[:, None]], axis=1)
-        white = np.einsum("eij,ejc->eic", whitening, jacobian)
-        rows = self._rows(np.repeat(columns, 3, axis=0), white.reshape(-1, 9))
-        return rows, np.einsum("eij,ej->ei", whitening, error).ravel()
+        rows = self._rows(np.repeat(columns, 3, axis=0), jacobian.reshape(-1, 9))
+        whitening = self._wheel_whitening()
+        return sparse.csr_matrix(whitening @ rows), whitening @ error.ravel()
 
     def _step_error(self, z: Floats, poses: Floats) -> Floats:
         return _between_error(z, poses[:-1], poses[1:])
 
-    def _wheel_whitening(self) -> Floats:
-        """Return L (e, 3, 3) with L^T L the information of each step: a heading that errs in mid-step errs sideways too."""
-        frames, truth = self.frames, self.recording.calibration["odometry"]
+    def _wheel_whitening(self) -> sparse.csr_matrix | Floats:
+        """Return L (3e, 3e) with L^T L the information of all steps: a heading that errs in mid-step errs sideways too."""
+        frames, truth, rooms = self.frames, self.recording.calibration["odometry"], self.rooms
         length, turned = frames.path, frames.turned
         heading = truth["heading_noise_travel"] ** 2 * length + truth["heading_noise_turn"] ** 2 * turned
+        if rooms is not None:
+            heading = heading + rooms.bump_turn**2 * length / rooms.bump_every
         covariance = np.zeros((len(length), 3, 3))
         covariance[:, 0, 0] = truth["distance_noise"] ** 2 * length
         covariance[:, 1, 1] = heading * length**2 / 3.0
@@ -226,16 +234,37 @@ class Oracle:
         half = np.zeros((len(length), 3, 3))
         c, s = np.cos(0.5 * frames.motion[:, 2]), np.sin(0.5 * frames.motion[:, 2])
         half[:, 0, 0], half[:, 0, 1], half[:, 1, 0], half[:, 1, 1], half[:, 2, 2] = c, s, -s, c, 1.0
-        return np.linalg.inv(np.linalg.cholesky(covariance)) @ half
+        along = sparse.block_diag(half, format="csr")
+        if rooms is None:
+            return sparse.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), format="csr") @ along
+        whole = sparse.block_diag(covariance).toarray() + self._floor_covariance()
+        return np.asarray(solve_triangular(np.linalg.cholesky(whole), along.toarray(), lower=True))
+
+    def _floor_covariance(self) -> Floats:
+        """Return the covariance (3e, 3e) of what patches of floor add to way and turn of the steps."""
+        rooms, length = self.rooms, self.frames.path
+        assert rooms is not None
+        middle = 0.5 * (self.truth[1:, :2] + self.truth[:-1, :2])
+        alike = _alike(middle, rooms.patch_length) * np.outer(length, length)
+        way, turn = np.zeros((3, len(length))), np.zeros((3, len(length)))
+        way[0], turn[1], turn[2] = rooms.patch_way, 0.5 * rooms.patch_turn * length, rooms.patch_turn
+        effects = [np.einsum("ie,jf,ef->eifj", part, part, alike) for part in (way, turn)]
+        return np.asarray((effects[0] + effects[1]).reshape(alike.shape[0] * 3, -1))
 
     def _priors(self) -> tuple[sparse.csr_matrix, Floats]:
         """Return what is known of the scalars beforehand: the distributions they were drawn from."""
         layout, model = self.layout, self.recording.settings.radio
-        pattern = model.antenna_sd * np.sqrt(0.5 / 3.0)
-        which = np.concatenate([layout.wheels, layout.bias, layout.patterns.ravel()])
+        pattern = self._antenna_sd() * np.sqrt(0.5 / 3.0)
+        paint = self.recording.settings.laser.surface_sd if self.rooms is None else self.rooms.paint_sd
+        which = np.concatenate([layout.wheels, layout.bias, layout.patterns.ravel(), layout.paint])
         bias = np.full(len(layout.bias), max(model.bias_sd, 1e-4))
-        sd = np.concatenate([[0.05, 0.05, 0.02], bias, np.full(layout.patterns.size, max(pattern, 1e-6))])
+        patterns = np.full(layout.patterns.size, max(pattern, 1e-6))
+        sd = np.concatenate([[0.05, 0.05, 0.02], bias, patterns, np.full(len(layout.paint), max(paint, 1e-6))])
         return self._rows(which[:, None], 1.0 / sd[:, None]), self.x[which] / sd
+
+    def _antenna_sd(self) -> float:
+        """Return the standard deviation of what the direction in which an antenna is hit adds to a range, m."""
+        return self.recording.settings.radio.antenna_sd if self.rooms is None else self.rooms.antenna_sd
 
     def _add_rays(self, matrix: Floats, gradient: Floats) -> None:
         rays, layout = self.rays, self.layout
@@ -244,26 +273,30 @@ class Oracle:
         for first in range(0, len(rays.pose), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             own = poses[rays.pose[part]]
-            arm = se2.rotate(own[:, 2], rays.points[part])
-            at, direction = own[:, :2] + arm, se2.rotate(own[:, 2], rays.directions[part])
+            direction = se2.rotate(own[:, 2], rays.directions[part])
+            arm = se2.rotate(own[:, 2], rays.points[part]) - self.x[layout.paint[place[part]], None] * direction
+            at = own[:, :2] + arm
             surface = self.x[layout.surfaces[place[part]]]
             wall = rays.surface[part] < len(self.walls)
             normal = np.stack([np.cos(surface[:, 0]), np.sin(surface[:, 0])], axis=1)
-            away = at - surface
-            reach = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
-            radius = self.recording.plan.columns[np.maximum(rays.surface[part] - len(self.walls), 0), 2] if len(
-                self.recording.plan.columns
-            ) else np.zeros(len(wall))
-            residual = np.where(wall, (normal * at).sum(axis=1) - surface[:, 1], reach - radius)
-            normal = np.where(wall[:, None], normal, away / reach[:, None])
+            flat = (normal * at).sum(axis=1) - surface[:, 1]
+            column = np.maximum(rays.surface[part] - len(self.walls), 0)
+            radius = np.append(self.recording.plan.columns[:, 2], 1.0)[column]
+            shift, outwards = _to_circle(at - surface, direction, radius)
+            normal = np.where(wall[:, None], normal, outwards)
+            incidence = (normal * direction).sum(axis=1)
+            residual = np.where(wall, flat, -shift * incidence)
             # A grazing ray errs along the wall; what the estimator could at best know of it is kept finite.
-            sd = rays.sd[part] * np.maximum(np.abs((normal * direction).sum(axis=1)), 0.05)
-            rows = np.empty((len(wall), 5))
+            sd = rays.sd[part] * np.maximum(np.abs(incidence), 0.05)
+            sd = np.where(wall | (np.abs(incidence) > _GRAZING), sd, np.inf)
+            rows = np.empty((len(wall), 6))
             rows[:, :2] = normal
             rows[:, 2] = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
             rows[:, 3] = np.where(wall, normal[:, 0] * at[:, 1] - normal[:, 1] * at[:, 0], -normal[:, 0])
             rows[:, 4] = np.where(wall, -1.0, -normal[:, 1])
-            columns = np.concatenate([layout.poses[rays.pose[part]], layout.surfaces[place[part]]], axis=1)
+            rows[:, 5] = -incidence
+            paint = layout.paint[place[part]][:, None]
+            columns = np.concatenate([layout.poses[rays.pose[part]], layout.surfaces[place[part]], paint], axis=1)
             jacobian = self._rows(columns, rows / sd[:, None])
             product = (jacobian.T @ jacobian).tocoo()
             matrix[product.row, product.col] += product.data
@@ -300,7 +333,7 @@ class Oracle:
                 np.broadcast_to(body, (len(unit), _PATTERN)), world,
             ], axis=1,
         )
-        mean, spread, sound = self._excess(log.ranges.stamps, number, log.ranges.ranges)
+        mean, spread, sound = self._excess(number)
         for anchor in range(self.anchors):
             rows = np.flatnonzero((number == anchor) & sound)
             if not len(rows):
@@ -315,26 +348,40 @@ class Oracle:
 
     def _covariance(self, tag: Floats) -> Floats:
         """Return the covariance (m, m) of the multipath of one anchor at these places."""
-        model = self.recording.settings.radio
-        squared = ((tag[:, None] - tag[None]) ** 2).sum(axis=2)
-        return np.asarray(model.multipath_sd**2 * np.exp(-0.5 * squared / model.multipath_length**2))
+        return np.asarray(sum(sd**2 * _alike(tag, length) for sd, length in self._fields()))
 
-    def _excess(self, stamps: Floats, number: Ints, stated: Floats) -> tuple[Floats, Floats, Bools]:
+    def _fields(self) -> tuple[tuple[float, float], ...]:
+        """Return standard deviation and length, m, of each range error that stays with the place."""
+        model = self.recording.settings.radio
+        return ((model.multipath_sd, model.multipath_length),) if self.rooms is None else self.rooms.range_fields
+
+    def _excess(self, number: Ints) -> tuple[Floats, Floats, Bools]:
         """Return the mean and the spread of what obstacles add to each range, and which ranges are sound at all."""
-        r, model = self.recording, self.recording.settings.radio
-        pose = self._at(stamps - r.settings.uwb_delay)
+        r, rooms, log = self.recording, self.rooms, self.log
+        assert log.ranges is not None
+        model, stated = r.settings.radio, log.ranges.ranges
+        pose = self._at(log.ranges.stamps - r.settings.uwb_delay)
         tag = se2.transform(pose, np.asarray(r.settings.tag))
-        shadow = np.zeros(len(stamps))
+        hidden = hidden_ranges(r)
+        shadow = 0.5 * hidden
         for anchor, place in enumerate(r.anchors):
             own = number == anchor
-            shadow[own] = r.plan.opacity * radio.crossings(tag[own], place, r.plan.walls, r.plan.columns)
+            shadow[own] += r.plan.opacity * radio.crossings(tag[own], place, r.plan.walls, r.plan.columns)
         heavy = np.isin(number + 1, r.settings.nlos_anchors) if r.settings.nlos_anchors else np.ones(len(number), dtype=bool)
         level = np.where(heavy, radio.NLOS_LEVELS[r.settings.nlos][0], radio.NLOS_LEVELS["normal"][0])
         mean = level * np.minimum(shadow, 2.0)
+        variance = (0.8 * mean) ** 2
+        way = r.anchors[number] - tag
+        if rooms is not None:
+            behind = np.angle(np.exp(1j * (np.arctan2(way[:, 1], way[:, 0]) - pose[:, 2] - np.pi)))
+            body = real_rooms.body_delay(rooms, behind)
+            person = rooms.person_excess * hidden
+            mean, variance = mean + body + person, variance + (real_rooms.BODY_SPREAD * body) ** 2 + person**2
         height = r.settings.anchor_height - r.settings.tag_height
-        true = model.scale * np.hypot(np.hypot(*(r.anchors[number] - tag).T), height) + mean
-        usual = np.hypot(np.hypot(model.noise_sd, model.multipath_sd), np.hypot(model.antenna_sd, model.bias_sd))
-        return mean, 0.8 * mean, np.abs(stated - true) < 4.0 * usual + 4.0 * mean
+        true = model.scale * np.hypot(np.hypot(*way.T), height) + mean
+        parts = [model.noise_sd, self._antenna_sd(), model.bias_sd, *(sd for sd, _ in self._fields())]
+        usual = float(np.linalg.norm(parts))
+        return mean, np.sqrt(variance), np.abs(stated - true) < 4.0 * usual + 5.0 * np.sqrt(variance)
 
     def _figures(self, factor: tuple[Floats, bool]) -> OracleFigures:
         layout, poses = self.layout, self.poses()
@@ -368,6 +415,23 @@ class Oracle:
 
 def _between_error(z: Floats, first: Floats, second: Floats) -> Floats:
     return se2.between(z, se2.between(first, second))
+
+
+def _alike(places: Floats, length: float) -> Floats:
+    """Return the correlation (m, m) of a smooth field between places (m, 2), see simulation.fields."""
+    squared = ((places[:, None] - places[None]) ** 2).sum(axis=2)
+    return np.asarray(np.exp(-0.5 * squared / length**2))
+
+
+def _to_circle(points: Floats, direction: Floats, radius: Floats) -> tuple[Floats, Floats]:
+    """Return how far (m,) points (m, 2) are from a circle about 0 along their rays, and the normals (m, 2) there.
+
+    Along the ray, since beyond its tangent the distance to the circle is no longer proportional to the error of a ray.
+    """
+    along = (points * direction).sum(axis=1)
+    inside = radius**2 - (points**2).sum(axis=1) + along**2
+    shift = -along - np.sqrt(np.maximum(inside, 0.0))
+    return shift, (points + shift[:, None] * direction) / radius[:, None]
 
 
 def _harmonics(angle: Floats) -> Floats:

@@ -77,7 +77,8 @@ def test_incidence_of_a_slanting_wall():
 def test_laser_noise_has_the_stated_size(distance, sd):
     model, n = laser.LaserModel(), 20_000
     true = np.full((n // 100, 100), distance)
-    output = laser.disturb(true, np.ones_like(true), np.zeros(true.shape, int), model, np.zeros(1), np.random.default_rng(3))
+    surface, rng = np.zeros(true.shape, int), np.random.default_rng(3)
+    output, _ = laser.disturb(true, np.ones_like(true), surface, model, np.zeros(1), rng)
     good = output[(output >= 20) & (output < 5600)] / 1000.0
     assert np.std(good) == pytest.approx(sd, rel=4.0 / np.sqrt(2 * n))
     assert np.mean(good) == pytest.approx(distance, abs=4.0 * sd / np.sqrt(n))
@@ -88,7 +89,7 @@ def test_lost_rays_are_codes_or_the_maximum():
     model = laser.LaserModel()
     nothing = np.full((50, 200), np.inf)
     unseen, rng = np.full(nothing.shape, -1), np.random.default_rng(4)
-    output = laser.disturb(nothing, np.ones_like(nothing), unseen, model, np.zeros(1), rng)
+    output, _ = laser.disturb(nothing, np.ones_like(nothing), unseen, model, np.zeros(1), rng)
     assert np.all((output < 20) | (output == 5600))
     assert np.mean(output < 20) == pytest.approx(model.error_codes, abs=4 * np.sqrt(0.09 / output.size))
 
@@ -99,7 +100,7 @@ def test_oblique_walls_answer_less():
     shares = []
     for degrees in (0.0, 70.0, 85.0):
         cosine = np.full((1, n), np.cos(np.deg2rad(degrees)))
-        output = laser.disturb(true, cosine, np.zeros((1, n), int), model, np.zeros(1), np.random.default_rng(5))
+        output, _ = laser.disturb(true, cosine, np.zeros((1, n), int), model, np.zeros(1), np.random.default_rng(5))
         shares.append(np.mean((output >= 20) & (output < 5600)))
     assert shares[0] > 0.97 > 0.8 > shares[2]
     assert shares[0] >= shares[1] > shares[2]
@@ -334,6 +335,14 @@ def test_the_oracle_is_near_the_truth_and_its_bound_reports_how_near():
     assert 0.4 * without.bound_ate < without.ate < 2.0 * without.bound_ate
     assert 0.3 * without.bound_anchors < without.anchors < 2.0 * without.bound_anchors
     assert with_lidar.bound_ate < 0.5 * without.bound_ate
+
+
+@pytest.mark.slow
+def test_the_oracle_knows_the_errors_of_real_rooms():
+    made = simulate(Settings(world="hall", seed=1, minutes=3.0, scan_rate=2.0, uwb_rate=2.0, rooms=RealRooms()))
+    found = oracle.solve(made, as_read(made).log)
+    assert found.ate < 2.0 * found.bound_ate
+    assert found.anchors < 2.0 * found.bound_anchors
 
 
 def test_real_rooms_change_every_sensor_and_nothing_changes_without_them(room):

@@ -91,8 +91,11 @@ def near(walls: Floats, columns: Floats, centre: Floats, reach: float) -> tuple[
 
 def disturb(
     true: Floats, cosine: Floats, surface: NDArray[np.int64], model: LaserModel, colour: Floats, rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Return the reported distances, mm, of whole scans (k, beams): noise, mixed pixels, lost rays, error codes."""
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the reported distances, mm, of whole scans (k, beams), and which are of two surfaces at once.
+
+    There are noise, mixed pixels, lost rays and error codes.
+    """
     seen = np.isfinite(true)
     range_ = np.where(seen, true, model.max_range)
     jump = np.zeros_like(seen)
@@ -114,4 +117,4 @@ def disturb(
     lost |= ~seen | (stated >= model.max_range) | (stated < model.min_range)
     code = rng.random(true.shape) < model.error_codes
     codes = np.where(code, rng.integers(0, 20, true.shape), round(model.max_range * 1000))
-    return np.where(lost, codes, np.rint(stated * 1000)).astype(np.int64)
+    return np.where(lost, codes, np.rint(stated * 1000)).astype(np.int64), both

@@ -92,9 +92,22 @@ def own_body(rooms: RealRooms, behind: Floats, rng: Rng) -> tuple[Floats, Bools]
 
     The excess grows smoothly towards the middle of the shadow, and is the same whenever the angle is.
     """
-    depth = np.maximum(np.cos(np.clip(behind / rooms.body_half_angle, -1.0, 1.0) * 0.5 * np.pi), 0.0)
-    late = 1.0 + 0.3 * rng.standard_normal(len(behind))
-    return rooms.body_excess * 1.6 * depth * np.maximum(late, 0.0), rng.random(len(behind)) < rooms.body_loss * depth
+    late = 1.0 + BODY_SPREAD * rng.standard_normal(len(behind))
+    lost = rng.random(len(behind)) < rooms.body_loss * _body_depth(rooms, behind)
+    return body_delay(rooms, behind) * np.maximum(late, 0.0), lost
+
+
+BODY_SPREAD = 0.3
+"""Relative standard deviation of the robot's own shadow."""
+
+
+def body_delay(rooms: RealRooms, behind: Floats) -> Floats:
+    """Return the mean excess (n,), m, of ranges by the angle from straight behind the robot (n,), rad."""
+    return np.asarray(rooms.body_excess * 1.6 * _body_depth(rooms, behind))
+
+
+def _body_depth(rooms: RealRooms, behind: Floats) -> Floats:
+    return np.maximum(np.cos(np.clip(behind / rooms.body_half_angle, -1.0, 1.0) * 0.5 * np.pi), 0.0)
 
 
 def person_errors(rooms: RealRooms, hidden: Bools, rng: Rng) -> Floats:

@@ -224,6 +224,20 @@ def _bodies(crowd: list[drive.Motion], times: Floats, robot: Floats, legs: bool 
     return np.concatenate([xy, radius[..., None]], axis=2)
 
 
+def hidden_ranges(recording: Recording) -> NDArray[np.bool_]:
+    """Return which ranges (m,) lead through a person."""
+    settings, times = recording.settings, recording.range_stamps - recording.settings.uwb_delay
+    crowd = people(settings, recording.plan, 60.0 * (settings.minutes or recording.plan.minutes))
+    pose = np.stack([np.interp(times, recording.stamps, recording.truth[:, k]) for k in range(3)], axis=1)
+    bodies, hidden = _bodies(crowd, times, pose), np.zeros(len(times), dtype=bool)
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    tag = pose[:, :2] + np.stack([c * settings.tag[0] - s * settings.tag[1], s * settings.tag[0] + c * settings.tag[1]], axis=1)
+    for anchor, place in enumerate(recording.anchors):
+        own = recording.range_anchors == anchor
+        hidden[own] = radio.crossings(tag[own], place, np.empty((0, 4)), bodies[own]) > 0
+    return hidden
+
+
 def _course(walk: drive.Motion, times: Floats) -> Floats:
     """Return the direction (n,) in which a person walks, rad."""
     ahead = walk.at(times + 0.5)[:, :2] - walk.at(times - 0.5)[:, :2]
@@ -305,9 +319,9 @@ def swept(
         true = np.where(real_rooms.unseen_glass(rooms, scene.glass, surface, cosine), np.inf, true)
         surface = np.where(np.isfinite(true), surface, -1)
         true = true + rooms.warm_up[0] * np.exp(-stamps[:, None] / rooms.warm_up[1])
-    stated = laser.disturb(true, cosine, surface, model, scene.colour, rng)
+    stated, mixed = laser.disturb(true, cosine, surface, model, scene.colour, rng)
     most = 5.0 * np.maximum(model.near_sd, model.far_sd * true) + 3.0 * model.surface_sd
-    own = (np.abs(0.001 * stated - true) < most) & (surface < len(plan.walls) + len(plan.columns))
+    own = (np.abs(0.001 * stated - true) < most) & ~mixed & (surface < len(plan.walls) + len(plan.columns))
     return stated, np.where(own, surface, -1)
 
 
