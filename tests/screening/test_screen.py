@@ -8,7 +8,7 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.screening.screen import screen
+from uwblite.screening.screen import _made_up_stamps, screen
 from uwblite.se2 import chain as chained
 from uwblite.sensor_log import LogNotes, Odometry, UwbRanges
 
@@ -252,3 +252,21 @@ def test_readings_that_come_in_bursts_are_spread_over_the_time_since_the_burst_b
     off = done.odometry.stamps - sound.odometry.stamps
     assert np.abs(off[40:-40] - np.median(off)).max() < 0.051
     assert np.all(np.diff(done.odometry.stamps) > 0.0)
+
+
+def test_a_recording_without_stamps_is_refused_in_words_that_say_how_to_mend_it(sound):
+    timeless = replace(sound, odometry=Odometry(np.zeros_like(sound.odometry.stamps), sound.odometry.poses))
+    with pytest.raises(DataError, match=r"no stamps: all \d+ of the odometry are of t = 0 s; write the time of each"):
+        screen(timeless)
+
+
+@pytest.mark.parametrize(
+    ("period", "jitter", "made_up"), [(1.0, 0.0, True), (0.5, 0.0, True), (0.1, 0.0, False), (1.0, 0.01, False)]
+)
+def test_stamps_that_somebody_counted_are_named(sound, period, jitter, made_up):
+    """A simulation's lidar of 10 Hz is as even, and a slow lidar with a clock of its own is not."""
+    rng = np.random.default_rng(0)
+    counts = len(sound.odometry.stamps), len(sound.scans.stamps)
+    odometry, scans = (period * np.arange(n) + jitter * rng.random(n) for n in counts)
+    log = replace(sound, odometry=Odometry(odometry, sound.odometry.poses), scans=replace(sound.scans, stamps=scans))
+    assert [r.kind for r in _made_up_stamps(log)] == ["made-up-stamps"] * made_up
