@@ -3,7 +3,7 @@
 Surveyed anchors and pinned poses are given in the user's own frame. ``constraint_edges`` brings a first estimate there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -117,15 +117,8 @@ class Constraints:
     def __add__(self, other: "Constraints") -> "Constraints":
         """Return both together; of one anchor's places the other's counts."""
         named = {a.id for a in other.anchors}
-        return Constraints(
-            tuple(a for a in self.anchors if a.id not in named) + other.anchors,
-            self.poses + other.poses,
-            self.distances + other.distances,
-            self.closures + other.closures,
-            self.forbidden + other.forbidden,
-            self.landmarks + other.landmarks,
-            self.landmark_distances + other.landmark_distances,
-        )
+        left = replace(self, anchors=tuple(a for a in self.anchors if a.id not in named))
+        return Constraints(*(getattr(left, f.name) + getattr(other, f.name) for f in fields(Constraints)))
 
     @property
     def places(self) -> bool:
