@@ -176,9 +176,8 @@ def bench_icp(repeats: int) -> None:
 
     from uwblite import se2
     from uwblite.lidar.cloud_rasters import rasterize
-    from uwblite.lidar.clouds import stacked
+    from uwblite.lidar.clouds import joined, make_cloud
     from uwblite.lidar.pair_alignment import align_pairs
-    from uwblite.lidar.point_cloud import make_cloud
     from uwblite.lidar.scan_matching import pair_points
 
     first, second = np.array([0]), np.array([1])
@@ -186,7 +185,7 @@ def bench_icp(repeats: int) -> None:
     def prepare(target, source, truth):
         """Return what align_pairs asks for; both views look from the middle of the hall."""
         clouds = [make_cloud(target, np.zeros(2)), make_cloud(source, se2.inverse(truth)[:2])]
-        return stacked(clouds), rasterize(stacked(clouds[:1]), 0.1, 0.5), pair_points(stacked(clouds), second, len(source))
+        return joined(clouds), rasterize(joined(clouds[:1]), 0.1, 0.5), pair_points(joined(clouds), second, len(source))
 
     def align(prepared, guess):
         clouds, raster, points = prepared

@@ -3,8 +3,7 @@
 import numpy as np
 
 from uwblite import se2
-from uwblite.lidar.clouds import Clouds
-from uwblite.lidar.point_cloud import PointCloud, make_cloud
+from uwblite.lidar.clouds import Clouds, make_cloud
 
 ROOM = np.array(
     [[0, 0, 6, 0], [6, 0, 6, 4.2], [6, 4.2, 3.5, 4.2], [3.5, 4.2, 3.5, 5], [3.5, 5, 0, 5], [0, 5, 0, 0], [2, 2, 2.5, 2.3]],
@@ -29,7 +28,7 @@ def views(walls, truth, rng, spacing=0.05, noise=NOISE):
     return target, se2.transform(se2.inverse(truth), wall_points(walls, rng, spacing, noise))
 
 
-def pair(walls, truth, rng, centre, spacing=0.05, noise=NOISE) -> tuple[PointCloud, PointCloud]:
+def pair(walls, truth, rng, centre, spacing=0.05, noise=NOISE) -> tuple[Clouds, Clouds]:
     """Return the clouds of two views, both seen from the same place, the centre."""
     target, source = views(walls, truth, rng, spacing, noise)
     return make_cloud(target, np.asarray(centre)), make_cloud(source, se2.transform(se2.inverse(truth), np.asarray(centre)))

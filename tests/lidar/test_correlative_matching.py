@@ -1,6 +1,5 @@
 """Planted poses found from metres away, scores against brute force, ambiguity named."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,10 +7,9 @@ from helpers.registration_worlds import CORRIDOR, ROOM, pair, wall_points
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.clouds import stacked
+from uwblite.lidar.clouds import joined, make_cloud
 from uwblite.lidar.correlative_matching import CorrelativeConfig, _target_field, score_grid, search
 from uwblite.lidar.pair_alignment import align_pairs
-from uwblite.lidar.point_cloud import make_cloud
 from uwblite.lidar.scan_matching import pair_points
 
 CENTRE = (3.0, 1.5)
@@ -38,15 +36,13 @@ def test_scores_equal_brute_force(oriented):
     rng = np.random.default_rng(0)
     truth = np.array([0.4, 0.3, 0.2])
     target, source = pair(ROOM, truth, rng, CENTRE, spacing=0.2)
-    if not oriented:
-        target, source = (replace(cloud, oriented=False) for cloud in (target, source))
     config = CorrelativeConfig(resolution=0.1, angle_step=0.05, spread=0.1)
     guess = truth + np.array([0.13, -0.07, 0.01])
-    scores, headings, shift_x, shift_y = score_grid(target, source, guess, (0.6, 0.5, 0.1), config)
+    scores, headings, shift_x, shift_y = score_grid(target, source, guess, (0.6, 0.5, 0.1), config, oriented)
     assert scores.shape == (5, 11, 13)
     field, origin = _target_field(target, config, oriented)
     for k, heading in enumerate(headings):
-        cells = np.floor((se2.transform([*guess[:2], heading], source.centers) - origin) / config.resolution).astype(int)
+        cells = np.floor((se2.transform([*guess[:2], heading], source.points) - origin) / config.resolution).astype(int)
         normals = se2.rotate(heading, source.normals)
         for i, dy in enumerate(shift_y):
             for j, dx in enumerate(shift_x):
@@ -56,7 +52,7 @@ def test_scores_equal_brute_force(oriented):
                 each = value.real * normals[inside].any(axis=1)
                 if oriented:
                     each = value.real * normals[inside, 0] + value.imag * normals[inside, 1]
-                assert scores[k, i, j] == pytest.approx(each.sum() / len(source), abs=1e-5)
+                assert scores[k, i, j] == pytest.approx(each.sum() / len(source.points), abs=1e-5)
 
 
 def test_the_field_is_the_likelihood_of_the_nearest_point():
@@ -66,7 +62,7 @@ def test_the_field_is_the_likelihood_of_the_nearest_point():
     field, origin = _target_field(target, config, oriented=False)
     rows, columns = np.indices(field.shape)
     centres = origin + (np.stack([columns, rows], axis=-1).reshape(-1, 2) + 0.5) * config.resolution
-    lines = target.centers[target.normals.any(axis=1)]
+    lines = target.points[target.normals.any(axis=1)]
     distance = np.hypot(*(centres[:, None] - lines[None]).transpose(2, 0, 1)).min(axis=1)
     expected = np.exp(-0.5 * (distance / config.spread) ** 2)
     # The table of nearest points is right to a cell; beyond its reach of four cells the field is zero.
@@ -88,8 +84,8 @@ def test_planted_poses_are_found_from_metres_and_tens_of_degrees(seed):
     assert found.scores[0] > 0.5
     assert rivalry(found) < 0.9
     assert (np.diff(found.scores) <= 0.0).all()
-    clouds, i, j = stacked([target, source]), np.array([0]), np.array([1])
-    points = pair_points(clouds, j, len(source))
+    clouds, i, j = joined([target, source]), np.array([0]), np.array([1])
+    points = pair_points(clouds, j, len(source.points))
     aligned = align_pairs(clouds, rasterize(clouds, 0.1, 0.5), i, j, found.poses[:1], points, 0.5, 0.15)
     assert np.hypot(*se2.between(aligned.pose[0], truth)[:2]) < 0.015
 
@@ -110,7 +106,7 @@ def test_equal_rooms_are_both_found():
     box = np.array([[0, 0, 3, 0], [3, 0, 3, 2], [3, 2, 0, 2], [0, 2, 0, 0]], dtype=float)
     target = make_cloud(np.vstack([wall_points(box, rng), wall_points(box + np.array([4.0, 0.0, 4.0, 0.0]), rng)]), None)
     source = make_cloud(wall_points(box, rng), None)
-    found = search(target, source, np.array([2.0, 0.0, 0.0]), (2.5, 1.0, 0.2))
+    found = search(target, source, np.array([2.0, 0.0, 0.0]), (2.5, 1.0, 0.2), oriented=False)
     assert rivalry(found) > 0.9
     np.testing.assert_allclose(np.sort(found.poses[:2, 0]), [0.0, 4.0], atol=0.2)
 

@@ -6,7 +6,7 @@ import scipy.linalg
 from helpers.registration_worlds import CORRIDOR, ROOM, pair
 
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.clouds import stacked
+from uwblite.lidar.clouds import joined
 from uwblite.lidar.degeneracy import relative_eigen
 from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points
 
@@ -14,8 +14,8 @@ CENTRE = (3.0, 1.5)
 
 
 def matched(target, source, pose):
-    clouds, i, j = stacked([target, source]), np.array([0]), np.array([1])
-    points = pair_points(clouds, j, len(source))
+    clouds, i, j = joined([target, source]), np.array([0]), np.array([1])
+    points = pair_points(clouds, j, len(source.points))
     return match(clouds, rasterize(clouds, 0.05, 0.3), i, np.asarray(pose)[None], points, 0.3, 0.15)
 
 

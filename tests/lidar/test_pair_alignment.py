@@ -7,9 +7,8 @@ from helpers.laser_walks import ROOM, scanned
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.clouds import stacked
+from uwblite.lidar.clouds import joined, make_cloud, two_sided
 from uwblite.lidar.pair_alignment import align_pairs
-from uwblite.lidar.point_cloud import make_cloud, two_sided
 from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points
 
 TRUTH = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9], [-0.6, 0.2, -2.0]])
@@ -64,8 +63,8 @@ MOTION, CENTRE = np.array([0.8, -0.5, 0.6]), (3.0, 1.5)
 
 def aligned(target, source, guesses):
     """Align one pair of clouds from several guesses (g, 3)."""
-    clouds, i = stacked([target, source]), np.zeros(len(guesses), dtype=np.int64)
-    points = pair_points(clouds, i + 1, len(source))
+    clouds, i = joined([target, source]), np.zeros(len(guesses), dtype=np.int64)
+    points = pair_points(clouds, i + 1, len(source.points))
     return align_pairs(clouds, rasterize(clouds, 0.05, 0.8), i, i + 1, guesses, points, 0.8, 0.15, 30)
 
 

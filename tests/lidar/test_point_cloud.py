@@ -6,14 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from uwblite import se2
 from uwblite.lidar.point_cloud import (
     estimate_normals,
-    make_cloud,
     make_tree,
     radius_outlier_filter,
     statistical_outlier_filter,
-    two_sided,
 )
 
 clouds = hnp.arrays(
@@ -102,32 +99,3 @@ def test_variance_of_normals_is_what_the_scatter_makes_it():
         predicted.append(lines.normal_variance[6])
     # 400 draws know a variance to about 7 %.
     assert np.mean(predicted) == pytest.approx(np.var(angles), rel=0.25)
-
-
-def test_normals_point_to_the_viewpoint_in_any_frame():
-    rng = np.random.default_rng(3)
-    wall = np.stack([np.arange(0.0, 2.0, 0.04), rng.normal(0.0, 0.005, 50)], axis=-1)
-    for side in (1.0, -1.0):
-        pose = np.array([3.0, -2.0, 2.5])
-        cloud = make_cloud(se2.transform(pose, wall), se2.transform(pose, np.array([1.0, side])))
-        assert cloud.oriented
-        assert (se2.rotate(-pose[2], cloud.normals)[:, 1] * side > 0.9).all()
-
-
-def test_a_two_sided_cloud_has_each_point_with_either_normal():
-    cloud = make_cloud(np.random.default_rng(5).uniform(0.0, 3.0, (100, 2)), np.ones(2))
-    both = two_sided(cloud)
-    assert len(both) == 200
-    assert not both.oriented
-    for half, sign in ((slice(0, 100), 1.0), (slice(100, 200), -1.0)):
-        np.testing.assert_array_equal(both.centers[half], cloud.centers)
-        np.testing.assert_array_equal(both.normals[half], sign * cloud.normals)
-        np.testing.assert_array_equal(both.normal_variance[half], cloud.normal_variance)
-
-
-@pytest.mark.parametrize("n", [0, 1, 2])
-def test_tiny_clouds_have_no_lines(n):
-    cloud = make_cloud(np.zeros((n, 2)))
-    assert len(cloud) == n
-    assert (cloud.normals == 0.0).all()
-    assert (cloud.normal_variance == 0.0).all()

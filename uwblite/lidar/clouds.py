@@ -16,7 +16,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..config import setting
 from ..odometry.attached import ScanPoints
-from .point_cloud import Lines, PointCloud, estimate_normals, make_tree
+from .point_cloud import Lines, estimate_normals, make_tree
 
 _BLOCK = 32
 """Keyframes whose neighbourhoods are looked up at once; bounds the memory."""
@@ -115,19 +115,14 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     )
 
 
-def joined(parts: Sequence[Clouds]) -> Clouds:
-    """Return the clouds of blocks of keyframes, one after the other, as one."""
+def joined(parts: Sequence[Clouds], kind: type[np.floating] = np.float32) -> Clouds:
+    """Return the clouds of several parts, one after the other, as one, in single precision or another kind."""
     starts = np.cumsum([0] + [len(p) for p in parts])
     counts = np.concatenate([p.counts for p in parts] or [np.zeros(0, dtype=np.int64)])
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     size = int(offsets[-1])
-    whole = Clouds(
-        offsets,
-        np.empty((size, 2), dtype=np.float32, order="F"),
-        np.empty((size, 2), dtype=np.float32, order="F"),
-        np.empty(size, dtype=np.int32),
-        np.empty(size, dtype=np.float32),
-    )
+    points, normals = (np.empty((size, 2), dtype=kind, order="F") for _ in range(2))
+    whole = Clouds(offsets, points, normals, np.empty(size, dtype=np.int32), np.empty(size, dtype=kind))
     for part, first in zip(parts, starts.tolist(), strict=False):
         rows = slice(int(offsets[first]), int(offsets[first]) + len(part.points))
         whole.points[rows], whole.normals[rows], whole.normal_variance[rows] = part.points, part.normals, part.normal_variance
@@ -135,16 +130,38 @@ def joined(parts: Sequence[Clouds]) -> Clouds:
     return whole
 
 
-def stacked(parts: Sequence[PointCloud]) -> Clouds:
-    """Return single clouds, each in its own frame, as one array."""
-    counts = [len(p) for p in parts]
-    return Clouds(
-        np.cumsum([0, *counts]),
-        np.concatenate([p.centers for p in parts]),
-        np.concatenate([p.normals for p in parts]),
-        np.repeat(np.arange(len(parts), dtype=np.int32), counts),
-        np.concatenate([p.normal_variance for p in parts]),
-    )
+def make_cloud(points: Floats, viewpoints: Floats | None = None, normal_radius: float = 0.25) -> Clouds:
+    """Return one cloud of single points: a line is fitted to the surroundings of each.
+
+    Parameters
+    ----------
+    points : (n, 2), m; of an even density.
+    viewpoints : (n, 2) or (2,), where the sensor stood when it saw each point, m, same frame, towards which normals are
+        turned. None: not known; the side to which a normal points then means nothing.
+    normal_radius : neighbourhood of the lines, m; a few times the distance between points.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+    lines = estimate_normals(points, make_tree(points), normal_radius)
+    straight = lines.linearity >= _STRAIGHT
+    normals = np.where(straight[:, None], lines.normals, 0.0)
+    if viewpoints is not None:
+        away = np.einsum("ni,ni->n", viewpoints - points, normals) < 0.0
+        normals = np.where(away[:, None], -normals, normals)
+    return _one(lines.centers, normals, np.where(straight, lines.normal_variance, 0.0))
+
+
+_STRAIGHT = 0.6
+"""Least linearity of a line through single points."""
+
+
+def two_sided(cloud: Clouds) -> Clouds:
+    """Return one cloud with every point twice, once with either normal: of a source seen from an unknown side one matches."""
+    normals = np.concatenate([cloud.normals, -cloud.normals])
+    return _one(np.tile(cloud.points, (2, 1)), normals, np.tile(cloud.normal_variance, 2))
+
+
+def _one(points: Floats, normals: Floats, variance: Floats) -> Clouds:
+    return Clouds(np.array([0, len(points)]), points, normals, np.zeros(len(points), dtype=np.int32), variance)
 
 
 def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:

@@ -12,10 +12,9 @@ from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
 from . import cloud_rasters, clouds, scan_matching
 from .cloud_rasters import CloudRasters
-from .clouds import CloudConfig, Clouds
+from .clouds import CloudConfig, Clouds, make_cloud
 from .correlative_matching import CorrelativeConfig, search
 from .pair_alignment import align_pairs
-from .point_cloud import make_cloud
 
 _FIRST_GATE, _LAST_GATE = 0.4, 0.12
 """Farthest match in the first and last iteration, m."""

@@ -18,10 +18,9 @@ from ..constraints import Constraints
 from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..lidar.cloud_rasters import rasterize
-from ..lidar.clouds import stacked
+from ..lidar.clouds import Clouds, joined, make_cloud, two_sided
 from ..lidar.correlative_matching import CorrelativeConfig, search
 from ..lidar.pair_alignment import align_pairs
-from ..lidar.point_cloud import PointCloud, make_cloud, two_sided
 from ..lidar.scan_matching import nondegenerate_step, pair_points
 from ..map_result import MapResult, Notice, StageSummary
 from ..mapping import MappingConfig, Progress, build_map
@@ -148,14 +147,14 @@ class _Fit:
     reason: str
 
 
-def _fits(earlier: PointCloud, new: PointCloud, guesses: Floats) -> list[_Fit]:
+def _fits(earlier: Clouds, new: Clouds, guesses: Floats) -> list[_Fit]:
     """Align the new walls with the earlier ones from several guesses (g, 3); the best fit comes first.
 
     A grid does not contain from which side a wall was seen: the new walls enter with either normal, of which one matches.
     """
     sides, target = two_sided(new), np.zeros(len(guesses), dtype=np.int64)
-    clouds, raster = stacked([earlier, sides]), rasterize(stacked([earlier]), _RASTER, REACH)
-    points = pair_points(clouds, target + 1, len(sides))
+    clouds, raster = joined([earlier, sides], np.float64), rasterize(earlier, _RASTER, REACH)
+    points = pair_points(clouds, target + 1, len(sides.points))
     found = align_pairs(clouds, raster, target, target + 1, guesses, points, REACH, _GATE, _ITERATIONS)
     steps = np.abs(nondegenerate_step(found.factors)[0]).max(axis=1)
     figures = (found.pose, 2.0 * found.share, found.rms, found.factors.matched, steps)
@@ -172,13 +171,14 @@ def _fit(pose: Floats, overlap: float, rmse: float, matches: int, step: float) -
     return _Fit(pose, float(overlap), float(rmse), reason == "step below tolerance", reason)
 
 
-def _anywhere(earlier: PointCloud, local: PointCloud) -> Floats:
+def _anywhere(earlier: Clouds, local: Clouds) -> Floats:
     """Return poses (c, 3) of the new walls, about their middle, at which they may lie in the earlier map."""
-    if not len(earlier) or not len(local):
+    if not len(earlier.points) or not len(local.points):
         return np.zeros((1, 3))
-    low, high = earlier.centers.min(axis=0), earlier.centers.max(axis=0)
+    low, high = earlier.points.min(axis=0), earlier.points.max(axis=0)
     width, depth = ((high - low) / 2.0).tolist()
-    poses = search(earlier, local, np.array([*(low + high) / 2.0, 0.0]), (width, depth, np.pi), _EVERYWHERE).poses
+    middle, window = np.array([*(low + high) / 2.0, 0.0]), (width, depth, np.pi)
+    poses = search(earlier, local, middle, window, _EVERYWHERE, oriented=False).poses
     return poses if len(poses) else np.zeros((1, 3))
 
 

@@ -15,8 +15,7 @@ from ..arrays import Bools, Floats, Ints
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from ..lidar.cloud_rasters import rasterize
-from ..lidar.clouds import stacked
-from ..lidar.point_cloud import make_cloud
+from ..lidar.clouds import make_cloud
 
 REACH = 0.5
 """m; a wall farther away is no neighbour."""
@@ -188,10 +187,10 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     cloud = make_cloud(occupied, normal_radius=max(_NORMAL_RADIUS, 3.0 * grid.geometry.resolution))
     extent = np.ptp(occupied, axis=0) + 2.0 * REACH
     cell = max(grid.geometry.resolution, float(np.sqrt(extent[0] * extent[1] / _MOST_CELLS)))
-    raster = rasterize(stacked([cloud]), cell, REACH)
+    raster = rasterize(cloud, cell, REACH)
     shape = (int(raster.shape[0, 0]), int(raster.shape[0, 1]))
     bare = Walls(
-        grid.geometry, states, cloud.centers, cloud.normals, np.zeros(len(cloud), bool), cell, raster.origin[0],
+        grid.geometry, states, *cloud.cloud(0), np.zeros(len(cloud.points), bool), cell, raster.origin[0],
         raster.nearest.reshape(shape) if raster.nearest.size else np.zeros((0, 0), np.int32),
     )  # fmt: skip
     return _facing_free_space(bare)

@@ -13,11 +13,10 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..lidar.cloud_rasters import rasterize
-from ..lidar.clouds import Clouds
+from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
 from ..lidar.free_space import FreeSpace
 from ..lidar.pair_alignment import Aligned, align_pairs
-from ..lidar.point_cloud import PointCloud, make_cloud
 from ..lidar.scan_matching import PairFactors, match, pair_points
 from ..lidar.visibility import violates_free_space
 from .candidates import Candidates
@@ -112,7 +111,7 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
     """Return places to start matching from: candidate (g,) and pose (g, 3); several for those that are searched for."""
     candidates, config = batch.candidates, batch.config
     rows, guesses = [], []
-    prepared: dict[int, PointCloud] = {}
+    prepared: dict[int, Clouds] = {}
     for k, searched in enumerate((candidates.spread > config.direct).tolist()):
         poses = candidates.guess[k : k + 1]
         if searched:
@@ -139,7 +138,7 @@ def _best_places(row: Ints, tries: Aligned, candidates: int) -> tuple[Ints, Floa
     return best, second
 
 
-def _prepare(clouds: Clouds, k: int, prepared: dict[int, PointCloud]) -> PointCloud:
+def _prepare(clouds: Clouds, k: int, prepared: dict[int, Clouds]) -> Clouds:
     """Return one sub-map's cloud ready for the search; its normals point to the side it was seen from."""
     if k not in prepared:
         points, normals = clouds.cloud(k)
