@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import lawn, relative_edges
+from helpers.planted_graphs import lawn, plain_ranges, relative_edges
 
 from uwblite import se2
 from uwblite.errors import ConfigError
@@ -10,7 +10,7 @@ from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
-from uwblite.radio.incremental import IncrementalConfig, _Incremental, optimize_incrementally
+from uwblite.radio.incremental import IncrementalConfig, _by_time, _Incremental, optimize_incrementally
 
 
 def rms(a, b):
@@ -122,7 +122,8 @@ def _with_wrong_anchor(joined_at, wrong=5, n=400):
     graph, truth, anchors = lawn(1, n=n)
     state = _Incremental(graph, IncrementalConfig(probation=250))
     places = anchors.copy()
-    places[wrong] += [6.0, -4.0]
+    if wrong is not None:
+        places[wrong] += [6.0, -4.0]
     state.graph = replace(graph, poses=truth, anchors=places)
     state.joined[:], state.joined_at[:] = True, 0
     for anchor, when in joined_at.items():
@@ -139,10 +140,12 @@ def test_an_anchor_in_a_wrong_place_leaves(joined_at, left):
     state = _with_wrong_anchor(joined_at)
     part = state._solve(200, 400)
     assert not part.fits
+    # One that has no place yet does not join because others leave.
+    state.joined[12], state.joined_at[12] = False, len(state.guess)
     found = state._without_outliers(part, 200, 400)
     assert found.fits
-    assert set(np.flatnonzero(~state.joined)) == left
-    assert set(np.flatnonzero(state.joined_at == len(state.guess))) == left
+    assert set(np.flatnonzero(~state.joined)) == left | {12}
+    assert set(np.flatnonzero(state.joined_at == len(state.guess))) == left | {12}
 
 
 def test_nobody_leaves_where_that_does_not_help():
@@ -151,3 +154,58 @@ def test_nobody_leaves_where_that_does_not_help():
     part = state._solve(200, 400)
     assert state._without_outliers(part, 200, 400) is part
     assert state.joined.all()
+
+
+def _one_anchor(curved, ranged=60, n=100):
+    """Return the state of a path, straight or curved, with ranges to one anchor from its first poses."""
+    turn = np.full(n - 1, 0.02 if curved else 0.0)
+    truth = se2.chain(np.zeros(3), np.column_stack([np.full(n - 1, 0.5), np.zeros(n - 1), turn]))
+    anchor, each = np.array([[14.0, 6.0]]), np.arange(n - 1)
+    odometry = relative_edges(truth, each, each + 1, [0.02, 0.01, 0.01], np.random.default_rng(0))
+    distance = np.hypot(*(truth[:ranged, :2] - anchor).T)
+    ranges = plain_ranges(np.arange(ranged), np.zeros(ranged, dtype=int), distance, 0.1)
+    return _Incremental(Graph(truth, np.zeros((1, 2)), (odometry, ranges)), IncrementalConfig())
+
+
+def test_an_anchor_with_a_mirror_image_joins_at_the_end_only():
+    straight, curved = _one_anchor(False), _one_anchor(True)
+    for state in (straight, curved):
+        state._search(60)
+    assert (straight.joined[0], curved.joined[0]) == (False, True)
+    assert curved.joined_at[0] == 60
+    np.testing.assert_allclose(curved.graph.anchors[0], [14.0, 6.0], atol=0.05)
+    straight._search(100)
+    assert straight.joined[0]
+    np.testing.assert_allclose(np.abs(straight.graph.anchors[0]), [14.0, 6.0], atol=0.05)
+
+
+def test_an_anchor_is_searched_once_there_are_ranges_and_again_with_a_fifth_more():
+    state = _one_anchor(False)
+    tried = []
+    for now in (19, 20, 23, 24, 28, 29):
+        state._search(now)
+        tried.append(int(state.tried[0]))
+    assert tried == [0, 20, 20, 24, 24, 29]
+
+
+def test_a_place_that_is_not_certain_does_not_join_yet():
+    state = _one_anchor(True)
+    state.config = replace(state.config, max_position_sigma=1e-6)
+    state._search(60)
+    assert state.tried[0] == 60
+    assert not state.joined[0]
+
+
+def test_who_is_outlying_is_a_matter_of_the_share_over_all_kinds_of_ranges():
+    state = _with_wrong_anchor({}, wrong=None)
+    odometry, ranges = state.graph.edges
+    own = np.flatnonzero((ranges.anchor == 5) & (ranges.pose >= 200) & (ranges.pose < 400))
+    for share, outlying in ((0.1, set()), (0.5, {5})):
+        bent = ranges.ranges.copy()
+        bent[own[: int(share * len(own))]] += 3.0
+        part = replace(ranges, ranges=bent)
+        # Sound ranges of a second kind to the others: of anchor 5 all stand in the first.
+        halves = [part.rows(np.flatnonzero((part.anchor == 5) | (part.pose % 2 == k))) for k in (0, 1)]
+        halves[1] = halves[1].rows(np.flatnonzero(halves[1].anchor != 5))
+        state.kinds = [_by_time(edges, state.graph) for edges in (odometry, *halves)]
+        assert set(np.flatnonzero(state._outlying(200, 400))) == outlying
