@@ -261,12 +261,13 @@ def test_a_recording_without_stamps_is_refused_in_words_that_say_how_to_mend_it(
 
 
 @pytest.mark.parametrize(
-    ("period", "jitter", "made_up"), [(1.0, 0.0, True), (0.5, 0.0, True), (0.1, 0.0, False), (1.0, 0.01, False)]
+    ("period", "jitter", "faster", "made_up"),
+    [(1.0, 0.0, 1, True), (0.5, 0.0, 1, True), (0.1, 0.0, 1, False), (1.0, 0.01, 1, False), (1.0, 0.0, 5, False)],
 )
-def test_stamps_that_somebody_counted_are_named(sound, period, jitter, made_up):
-    """A simulation's lidar of 10 Hz is as even, and a slow lidar with a clock of its own is not."""
+def test_stamps_that_somebody_counted_are_named(sound, period, jitter, faster, made_up):
+    """A simulation's lidar of 10 Hz is as even, and a slow lidar with a clock of its own, or with faster odometry, is not."""
     rng = np.random.default_rng(0)
     counts = len(sound.odometry.stamps), len(sound.scans.stamps)
     odometry, scans = (period * np.arange(n) + jitter * rng.random(n) for n in counts)
-    log = replace(sound, odometry=Odometry(odometry, sound.odometry.poses), scans=replace(sound.scans, stamps=scans))
+    log = replace(sound, odometry=Odometry(odometry / faster, sound.odometry.poses), scans=replace(sound.scans, stamps=scans))
     assert [r.kind for r in _made_up_stamps(log)] == ["made-up-stamps"] * made_up

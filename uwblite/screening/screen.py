@@ -109,7 +109,7 @@ def _made_up_stamps(log: SensorLog) -> list[Remark]:
     if log.scans is None or len(log.scans.stamps) < _FEW_STAMPS or len(log.odometry.stamps) < _FEW_STAMPS:
         return []
     steps = np.diff(log.scans.stamps), np.diff(log.odometry.stamps)
-    period = float(np.median(steps[0]))
+    period = min(float(np.median(s)) for s in steps)
     if period < _COARSE or any(np.ptp(s) > _SAME_STEP for s in steps):
         return []
     text = (
