@@ -47,6 +47,8 @@ def test_a_click_rejects_a_closure_and_maps_again(mapped, tmp_path, width, dark)
         browser.open(served.address)
         browser.until("document.querySelector('section svg line.closure')")
         assert browser.run("document.documentElement.scrollWidth") <= width
+        marks = browser.run("['.start', '.end', '.anchor text'].map(k => document.querySelectorAll('section svg ' + k).length)")
+        assert marks == [1, 1, 4]
         rejected = browser.run("document.querySelector('line.closure').dataset.closure")
         browser.run("document.querySelector('line.closure').dispatchEvent(new MouseEvent('click'))")
         browser.run("document.querySelector('[data-wish=reject]').click()")

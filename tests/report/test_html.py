@@ -64,7 +64,8 @@ def test_everything_that_belongs_in_it_is_there():
     text = page()
     words = " ".join(Page(text).words)
     for wanted in (
-        "uwblite map run.log --out map/", "5C0B", "+0.460", "mirror-ambiguous", "overlap too small", "1 of 3 candidates kept",
+        "uwblite map run.log --out map/", "5C0B", "+0.460", "mirror-ambiguous", "overlap too small",
+        "1 of 3 candidates accepted",
         "odometry_scale", "\u22121.20", "the robot hardly turns", "0.800", "anchor 91A3 may be mirrored",
     ):  # fmt: skip
         assert wanted in words, wanted

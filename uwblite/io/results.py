@@ -168,7 +168,7 @@ def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> t
     facts = [
         ("recording", "{duration:.0f} s, {travelled:.1f} m, {ranges} ranges, {scans} scans".format(**sums)),
         ("map", "" if grid is None else _size(grid)),
-        ("graph", f"{len(result.keyframe_stamps)} keyframes, {kept} of {len(result.closures)} loop closures kept"),
+        ("graph", f"{len(result.keyframe_stamps)} keyframes, {kept} of {len(result.closures)} loop closures accepted"),
         *(("sha256", log.notes.sha256) for log in logs),
         ("settings", record.preset or "defaults"),
         ("made by", ", ".join(f"{name} {version}" for name, version in record.versions.items())),

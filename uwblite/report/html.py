@@ -147,11 +147,12 @@ def _closure_table(result: MapResult) -> str:
     kept, rejected = shown_closures(result)
     count = sum(c.accepted for c in result.closures)
     outcomes = Counter(OUTCOMES[c.outcome] for c in result.closures if not c.accepted)
-    text = f"<p>{count} of {len(result.closures)} candidates kept.</p>" if result.closures else ""
+    text = f"<p>{count} of {len(result.closures)} candidates accepted.</p>" if result.closures else ""
     if outcomes:
         text += _table(("rejected because", "candidates"), [(why, str(n)) for why, n in outcomes.most_common()], "")
+    state = {True: "accepted", False: "rejected"}
     rows = [
-        (f"{c.i}\u2013{c.j}", "kept" if c.accepted else "rejected", f"{c.fitness:.3f}", f"{100 * c.overlap:.0f} %", c.reason)
+        (f"{c.i}\u2013{c.j}", state[bool(c.accepted)], f"{c.fitness:.3f}", f"{100 * c.overlap:.0f} %", c.reason)
         for c in [*kept, *rejected]
     ]
     listing = _table(("keyframes", "", "fitness, m", "overlap", "why"), rows, "No loop closure was looked for or found.")

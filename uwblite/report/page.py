@@ -32,6 +32,7 @@ table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.9rem
 th,td{text-align:left;padding:.2rem .6rem;border-bottom:1px solid var(--line);vertical-align:top}
 td{white-space:nowrap}td.words{white-space:normal;min-width:15rem}
 .key{display:inline-block;width:1.1rem;height:.25rem;border-radius:.1rem;vertical-align:middle;background:@path@}
+.key.path1{background:@path1@}.key.path2{background:@path2@}.key.path3{background:@path3@}
 .key-kept{background:@accepted@}.key-rejected{background:@rejected@}.key-anchors{background:@anchor@}.key-grid{background:#888}
 summary{cursor:pointer;padding:.4rem 0}
 .facts td{white-space:normal}.facts th{font-weight:500;color:var(--dim);white-space:nowrap}.facts td{overflow-wrap:anywhere}

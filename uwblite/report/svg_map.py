@@ -71,11 +71,8 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     for recording in np.unique(result.recording):
         path = result.trajectory[result.recording == recording, :2]
         parts.append(f'<polyline class="s{int(recording) % 4}" points="{_coordinates(path[thin(len(path), MOST_POINTS)])}"/>')
-    start = result.trajectory[0]
-    parts.append(
-        f'<circle class="start" cx="{start[0]:.3f}" cy="{-start[1]:.3f}" r="{size / 150:.3f}"><title>start</title></circle>'
-    )
-    parts += [_end_mark(result, recording, size) for recording in np.unique(result.recording).tolist()]
+    recordings = np.unique(result.recording).tolist()
+    parts += [_end_marks(result, recording, size) for recording in recordings]
     parts.append("</g>")
     parts.append('<g class="anchors">' + "".join(_anchor_mark(a, size) for a in result.anchors) + "</g>")
     bar = round_length(size / 5.0)
@@ -85,19 +82,24 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
         f'<g class="bar"><path d="M{x + size / 40:.3f} {y + height - size / 40:.3f}h{bar:g}"/>'
         f'<text x="{x + size / 40:.3f}" y="{y + height - size / 25:.3f}">{bar:g} m</text></g></svg>'
     )
-    layers = (("grid", "map"), ("trajectory", "trajectory"), ("anchors", "anchors, 2\u03c3"), ("kept", "closures kept"))
+    layers = (("grid", "map"), ("trajectory", "trajectory"), ("anchors", "anchors, 2\u03c3"), ("kept", "closures accepted"))
     boxes = "".join(_switch(name, text, True) for name, text in layers) + _switch("rejected", "closures rejected", False)
     names = (("zoom-in", "+", "zoom in"), ("zoom-out", "\u2212", "zoom out"), ("zoom-all", "all", "all of the map"))
     buttons = " ".join(f'<button id="{name}" aria-label="{label}">{text}</button>' for name, text, label in names)
     words = "Green: start; ring: end. Wheel or pinch zooms, dragging moves; point at things for details."
-    hint = f'<p class=hint><output id="place"></output>{words}</p>'
+    paths = "".join(f'<i class="key path{r % 4}"></i> recording {r + 1} ' for r in recordings if len(recordings) > 1)
+    hint = f'<p class=hint><output id="place"></output>{paths}{words}</p>'
     return f"<div class=controls>{boxes}<span class=buttons>{buttons}</span></div><div class=mapbox>{svg}</div>{hint}"
 
 
-def _end_mark(result: MapResult, recording: int, size: float) -> str:
-    """Return the ring where a recording ends."""
-    x, y = result.trajectory[result.recording == recording][-1, :2].tolist()
-    return f'<circle class="end s{recording % 4}" cx="{x:.3f}" cy="{-y:.3f}" r="{size / 150:.3f}"><title>end</title></circle>'
+def _end_marks(result: MapResult, recording: int, size: float) -> str:
+    """Return the disc where a recording starts and the ring where it ends."""
+    places = result.trajectory[result.recording == recording][[0, -1], :2].tolist()
+    kinds = (("start", "start"), (f"end s{recording % 4}", "end"))
+    return "".join(
+        f'<circle class="{kind}" cx="{x:.3f}" cy="{-y:.3f}" r="{size / 150:.3f}"><title>{title}</title></circle>'
+        for (x, y), (kind, title) in zip(places, kinds, strict=True)
+    )
 
 
 def _switch(name: str, text: str, on: bool) -> str:

@@ -30,11 +30,16 @@ border-radius:.4rem;background:var(--card);color:inherit;cursor:pointer;min-heig
 background:var(--accent);border-color:var(--accent);color:#fff}button:disabled{opacity:.5;cursor:default}
 @media (prefers-color-scheme:dark){button.main{color:#10151c}}.detail{min-height:5.2rem;padding:.5rem 0;
 border-top:1px solid var(--line);margin-top:.6rem}.row{display:flex;flex-wrap:wrap;gap:.5rem;align-items:center}
-.faint{color:var(--faint)}.doubt{background:var(--warn);border-radius:.3rem;padding:.4rem .6rem;margin:.4rem 0}a{
+.anchor text{fill:var(--anchor);paint-order:stroke;stroke:#fff;stroke-width:.15em;font-weight:600}.anchor.pinned text{
+fill:var(--force)}.start{fill:var(--force)}.end{fill:#fff;stroke:var(--path);stroke-width:2;vector-effect:non-scaling-stroke}
+.end.p1{stroke:@path1@}.end.p2{stroke:@path2@}.end.p3{stroke:@path3@}@media (prefers-color-scheme:dark){.anchor text{
+stroke:#000}}.faint{color:var(--faint)}.doubt{background:var(--warn);border-radius:.3rem;padding:.4rem .6rem;margin:.4rem 0}a{
 color:var(--accent)}table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.15rem .5rem .15rem 0;
 font-weight:400}th{color:var(--faint)}.list{max-height:16rem;overflow:auto;border-top:1px solid var(--line);
 margin-top:.5rem}.list button{min-height:0;padding:.1rem .5rem}.key{display:inline-block;width:1.2rem;
-border-top:3px solid;vertical-align:middle}input{font:inherit;width:6rem;padding:.25rem;border:1px solid var(--line);
+border-top:3px solid;vertical-align:middle}.key.p1{color:@path1@}.key.p2{color:@path2@}.key.p3{color:@path3@}.key.disc{
+width:.7rem;height:.7rem;border:0;border-radius:50%;background:currentColor}.key.anchors{width:0;border:.4rem solid transparent;
+border-top:0;border-bottom:.7rem solid}input{font:inherit;width:6rem;padding:.25rem;border:1px solid var(--line);
 border-radius:.3rem;background:var(--card);color:inherit}
 """
 
@@ -87,10 +92,14 @@ function card(run, number) {
   const svg = picture(run, number, detail);
   const rejected = el("input", {type: "checkbox", style: "width:auto", onchange: e => svg.classList.toggle("hideno",
     !e.target.checked)});
-  const key = (name, text) => el("span", {}, el("i", {class: "key", style: "color:var(--" + name + ")"}), " " + text);
+  const key = (name, text, form = "") => el("span", {}, el("i", {class: "key " + form, style: "color:var(--" + name + ")"}),
+    " " + text);
+  const paths = run.paths.length < 2 ? [key("path", "path")] : run.paths.slice(0, 4).map((_, k) => el("span", {}, el("i",
+    {class: "key p" + k, ...(k ? {} : {style: "color:var(--path)"})}), " recording " + (k + 1)));
   const node = el("section", {}, el("h2", {}, run.name), el("div", {class: "faint"}, facts));
   for (const text of run.doubts) node.append(el("div", {class: "doubt"}, "Doubt: " + text));
-  node.append(svg, el("div", {class: "row faint"}, key("path", "path"), key("accepted", "accepted"),
+  node.append(svg, el("div", {class: "row faint"}, ...paths, key("force", "start", "disc"),
+    ...(run.anchors.length ? [key("anchor", "anchor", "anchors")] : []), key("accepted", "closure accepted"),
     el("label", {}, rejected, " ", key("rejected", "rejected")), key("force", "forced, pinned"), key("ban",
       "rejected by you")));
   node.append(detail, el("div", {class: "row"},
@@ -116,6 +125,10 @@ function picture(run, number, detail) {
     width: run.image.width, height: run.image.height, preserveAspectRatio: "none"}));
   run.paths.forEach((path, k) => svg.append(shape("polyline", {class: "path p" + k % 4,
     points: path.map(p => p[0] + "," + -p[1]).join(" ")})));
+  run.paths.forEach((path, k) => {
+    const mark = (at, name) => shape("circle", {cx: at[0], cy: -at[1], r: size / 110, class: name});
+    if (path.length) svg.append(mark(path[0], "start"), mark(path[path.length - 1], "end p" + k % 4));
+  });
   for (const c of run.closures.slice().reverse()) {
     const [a, b] = c.places, line = {x1: a[0], y1: -a[1], x2: b[0], y2: -b[1]};
     const mark = " " + (c.accepted || c.wish !== "leave" ? "" : "no") + " " + c.wish;
@@ -127,9 +140,10 @@ function picture(run, number, detail) {
   }
   for (const a of run.anchors) {
     if (!a.place) continue;
-    const node = shape("circle", {cx: a.place[0], cy: -a.place[1], r: size / 80, class: "anchor" + (a.pinned
-      ? " pinned" : ""), "data-anchor": a.id});
-    node.append(Object.assign(shape("title", {}), {textContent: "anchor " + a.id}));
+    const node = shape("g", {transform: "translate(" + a.place[0] + " " + -a.place[1] + ") scale(" + size / 60 + ")",
+      class: "anchor" + (a.pinned ? " pinned" : ""), "data-anchor": a.id});
+    node.append(Object.assign(shape("title", {}), {textContent: "anchor " + a.id}), shape("path", {d: "M0-1L.9.6H-.9z"}),
+      Object.assign(shape("text", {x: 1.2, y: .5, "font-size": 1.6}), {textContent: a.id}));
     node.addEventListener("click", () => choose(number, detail, d => tellAnchor(d, run, number, a.id), null));
     svg.append(node);
   }
