@@ -9,8 +9,8 @@ from uwblite import se2
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.stored_result import StoredAnchor
+from uwblite.localization import Localizer, Scanner
 from uwblite.localization.known_map import known_map
-from uwblite.localization.localizer import Localizer, Scanner
 from uwblite.sensor_log import SensorMounting
 
 CELL = 0.05

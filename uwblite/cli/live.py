@@ -13,8 +13,8 @@ from .serving import LOCAL, page_address, serving
 if TYPE_CHECKING:
     from ..io.carmen_live import Measured
     from ..io.stored_result import StoredResult
+    from ..localization import Localizer, LocalizerState
     from ..localization.known_map import KnownMap
-    from ..localization.localizer import Localizer, LocalizerState
 
 DEVICES = ("odometry", "lidar", "uwb", "gyro")
 
@@ -111,7 +111,7 @@ class Tracker:
         return isinstance(measured, LiveScan) or measured.order - self._early[0].order > _NO_LIDAR
 
     def _begin(self) -> None:
-        from ..localization.localizer import Localizer
+        from ..localization import Localizer
 
         self.localizer = Localizer(self.known, mounted(self.reader.mounting, self.args))
         early, self._early = self._early, []
@@ -120,7 +120,7 @@ class Tracker:
 
     def _use(self, measured: "Measured") -> None:
         from ..io.carmen_live import LiveOdometry, LiveRange
-        from ..localization.localizer import Localizer, Scanner
+        from ..localization import Localizer, Scanner
 
         assert self.localizer is not None
         if isinstance(measured, LiveOdometry):

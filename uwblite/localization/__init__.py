@@ -1,5 +1,6 @@
 """Where a robot is in a map that is there already, while it drives: from an unknown start, and how sure that is."""
 
-from .localizer import Localizer, LocalizerState, Scanner
+from .localizer import Localizer
+from .records import LocalizerState, Scanner
 
 __all__ = ["Localizer", "LocalizerState", "Scanner"]

@@ -8,62 +8,23 @@ and map fall apart, the pose counts as lost, and the search begins again with wh
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import se2
 from ..arrays import Floats
-from ..odometry.attached import beam_origins
 from ..radio.trilateration import TrilaterationConfig, usable
 from ..sensor_log import SensorMounting
-from . import hypotheses, search
+from . import hypotheses, search, verdict
 from .hypotheses import Hypotheses, RangeFacts
 from .known_map import KnownMap
 from .odometer import Odometer
+from .records import LocalizerState, Scanner
+from .sensing import TRACK_RAYS, Range, Scan, scan_rays
 from .walls import Rays
 from .window import RAYS, Ranges, Window, WindowLook, WindowRange, way_of
-
-
-@dataclass(frozen=True, slots=True)
-class Scanner:
-    """Geometry of a lidar, with the field names of sensor_msgs/LaserScan."""
-
-    angle_min: float
-    """rad."""
-    angle_increment: float
-    """rad."""
-    time_increment: float = 0.0
-    """s between rays."""
-    range_min: float = 0.02
-    range_max: float = 30.0
-    """m."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LocalizerState:
-    """Where the robot is, as far as is known."""
-
-    stamp: float
-    """s, of the last odometry."""
-    pose: Floats
-    """(3,) T_map_base, of the likeliest hypothesis; nan where there is none."""
-    covariance: Floats
-    """(3, 3) m, m, rad; map frame; of all hypotheses together while there are several."""
-    quality: float
-    """0..1: how likely this pose is against all others, times how well the last measurements agree with the map there."""
-    odometry: Floats
-    """(3,) T_odom_base at the same time, as the wheels have it: pose * odometry^-1 is T_map_odom."""
-    lost: bool
-    """The pose is not known; what stands in `pose` is the best guess."""
-    reason: str = ""
-    """Why it is not known, for people."""
-    alternatives: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """(k, 3) other poses that are possible, the likeliest first."""
-    moved_anchors: tuple[str, ...] = ()
-    """Anchors whose ranges have long disagreed with the pose that all else agrees on."""
-
 
 _SIGMA_MAP = (0.02, 0.02, 0.005)
 """m, m, rad; what the map itself is off by: its errors are alike in neighbouring scans, and no filter averages them."""
@@ -78,21 +39,14 @@ _LOOK_BACK = 4.0
 """m driven, of whose scans places are compared."""
 _SEARCH_LOOKS = 2.5
 """m driven, of whose scans the search makes one cloud."""
-_CERTAIN = 6.0
-"""Log-likelihood by which a place must be better than any other: 400 : 1."""
 _FORGET = -14.0
 """Log-weight below which a hypothesis goes."""
-_SIGMA_FOUND = (0.25, 0.1)
-"""m and rad; a pose that is less sure is not found yet."""
 _FIT_SOUND, _FIT_LOST = -0.3, -0.7
 """Mean log-likelihood of the last scans' rays from which nothing is doubtful, and below which the pose is lost."""
-_RANGES_FOUND, _RANGES_LOST = 0.5, 0.25
-"""Share of the ranges that must agree with a start; mean weight of ranges below which the pose is lost."""
+_RANGES_LOST = 0.25
+"""Mean weight of ranges below which the pose is lost."""
 _CONFIRM, _CONFIRM_ALONE = 0.5, 2.0
 """m driven between two searches that agree; the second where scans or ranges are alone."""
-_FIT_BESIDE_RANGES, _FIT_ALONE = -0.7, -0.25
-"""Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.15, with people
-close by -0.5; rooms that are alike in part reach -0.3."""
 _FORGETTING, _FORGETTING_RANGES = 0.1, 0.2
 """Share of a new scan, and of a new range, in the mean of the last ones: a second of scans, two rounds of four ranges."""
 _SEEN = 0.5
@@ -108,28 +62,6 @@ _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent."""
 _UNSEEN_SPEED = 0.3
 """m/s and rad/s; how fast a robot may move while its odometry is silent."""
-_CLEAR = 3.0
-"""m; up to here a ray that saw nothing would have seen a wall, as grid.max_clear_distance."""
-_TRACK_RAYS = 180
-"""Rays of a scan that are matched."""
-
-
-@dataclass(frozen=True, slots=True)
-class _WaitingRange:
-    """A range that the odometry has not reached."""
-
-    anchor: int
-    metres: float
-    tag: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _WaitingScan:
-    """A scan that the odometry has not reached."""
-
-    stamp: float
-    readings: Floats
-    scanner: Scanner
 
 
 class Localizer:
@@ -147,7 +79,7 @@ class Localizer:
 
     def __init__(self, known: KnownMap, mounting: SensorMounting | None = None, scanner: Scanner | None = None) -> None:
         self.known, self.mounting, self.scanner = known, mounting or SensorMounting(), scanner
-        self._mount = se2.compose(known.laser_correction, self.mounting.T_base_laser)
+        self._laser = replace(self.mounting, T_base_laser=se2.compose(known.laser_correction, self.mounting.T_base_laser))
         self._odometer = Odometer()
         self._bank = hypotheses.none(len(known.anchors.ids))
         self._field = None if known.walls is None else search.field_of(known.walls)
@@ -156,7 +88,7 @@ class Localizer:
         heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
         self._square = np.square(heights) + known.anchors.rise
         self._window = Window()
-        self._waiting: list[tuple[float, int, _WaitingRange | _WaitingScan]] = []
+        self._waiting: list[tuple[float, int, Range | Scan]] = []
         self._arrived = 0
         self._way = self._scan_way = self._search_way = 0.0
         self._search_stamp = -np.inf
@@ -191,7 +123,7 @@ class Localizer:
         good = usable(values, TrilaterationConfig())
         for name, value in zip(np.asarray(anchor_ids)[good].tolist(), values[good].tolist(), strict=True):
             if name in self._names:
-                self._wait(stamp, _WaitingRange(self._names[name], value, tag))
+                self._wait(stamp, Range(self._names[name], value, tag))
             else:
                 self.strangers[name] = self.strangers.get(name, 0) + 1
         self._work_off()
@@ -209,7 +141,7 @@ class Localizer:
         if self.scanner is not None and self.known.walls is not None:
             readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
             end = stamp + self.known.laser_delay + self.scanner.time_increment * max(len(readings) - 1, 0)
-            self._wait(end, _WaitingScan(stamp + self.known.laser_delay, readings, self.scanner))
+            self._wait(end, Scan(stamp + self.known.laser_delay, readings, self.scanner))
         self._work_off()
         return self.state()
 
@@ -232,7 +164,7 @@ class Localizer:
         if not self._certain:
             off = se2.between(np.zeros(3), bank.poses - bank.poses[best])
             covariance = np.einsum("h,hij->ij", share, bank.pose_covariances + off[:, :, None] * off[:, None, :])
-        fit = np.exp(self._fit - _FIT_SOUND) if self._sees() else self._ranges_fit / _RANGES_FOUND
+        fit = np.exp(self._fit - _FIT_SOUND) if self._sees() else self._ranges_fit / verdict.RANGES_FOUND
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
         reason = "" if self._certain else self._reason
         pose, covariance = bank.poses[best].copy(), covariance + np.diag(np.square(_SIGMA_MAP))
@@ -250,7 +182,7 @@ class Localizer:
 
     # ---- measurements, in the order of their times
 
-    def _wait(self, until: float, entry: "_WaitingRange | _WaitingScan") -> None:
+    def _wait(self, until: float, entry: Range | Scan) -> None:
         if np.isfinite(until):
             self._waiting.append((until, self._arrived, entry))
             self._arrived += 1
@@ -264,7 +196,7 @@ class Localizer:
         due = sorted((w for w in self._waiting if w[0] <= now), key=lambda w: w[:2])
         self._waiting = [w for w in self._waiting if w[0] > now]
         for until, _, entry in due:
-            if isinstance(entry, _WaitingScan):
+            if isinstance(entry, Scan):
                 self._use_scan(entry)
             else:
                 self._use_range(entry, until)
@@ -279,7 +211,7 @@ class Localizer:
             self._odometer.add(latest - 0.1, self._odometer.pose.copy())
             self._bank = hypotheses.moved(self._bank, np.zeros(3), _UNSEEN_SPEED * min(gap, 3.0))
 
-    def _use_range(self, entry: _WaitingRange, stamp: float) -> None:
+    def _use_range(self, entry: Range, stamp: float) -> None:
         anchors, tags, anchor = self.known.anchors, self.mounting.tags, entry.anchor
         fact = RangeFacts(
             anchor, anchors.positions[anchor], entry.metres - float(anchors.bias[anchor]), float(self._square[anchor]),
@@ -299,8 +231,8 @@ class Localizer:
         if best > _SOUND_WEIGHT:
             self._sound = max(self._sound, stamp)
 
-    def _use_scan(self, entry: _WaitingScan) -> None:
-        rays = self._rays(entry.stamp, entry.readings, entry.scanner)
+    def _use_scan(self, entry: Scan) -> None:
+        rays = scan_rays(self._odometer, self._laser, entry)
         if self._window.wants_look(self._way) and len(rays.hit):
             self._window.add_look(WindowLook(_every(rays, RAYS), self._odometer.pose.copy(), self._way, self._odometer.stamp))
             self._window.forget(self._way)
@@ -316,30 +248,12 @@ class Localizer:
         if len(self._bank) > 1:
             self._bank = hypotheses.weighed(self._bank, _SCAN_EVIDENCE * min(driven, 1.0) * found.log_likelihood)
         best = int(np.argmax(self._bank.log_weight))
-        informative = bool(found.known[best] >= _FEW_ENDS)
+        informative = bool(found.known[best] >= verdict.FEW_ENDS)
         self._seen += _FORGETTING * (informative - self._seen)
         if informative:
             self._fit += _FORGETTING * (float(found.log_likelihood[best]) - self._fit)
             if found.log_likelihood[best] > _FIT_SOUND:
                 self._sound = max(self._sound, self._odometer.stamp)
-
-    def _rays(self, stamp: float, readings: Floats, scanner: Scanner) -> Rays:
-        """Return thinned rays in the present frame of the base, each moved by the odometry at its own time."""
-        count = len(readings)
-        hit = (readings >= scanner.range_min) & (readings <= scanner.range_max)
-        empty = (np.isposinf(readings) | (readings > scanner.range_max)) & ~hit
-        ray = np.flatnonzero(hit | empty)
-        ray = ray[:: max(1, -(-len(ray) // _TRACK_RAYS))]
-        ends = self._odometer.at(np.array([stamp, stamp + scanner.time_increment * max(count - 1, 0)]))
-        first = se2.between(self._odometer.pose, ends[:1])
-        sweep = se2.between(ends[:1], ends[1:])
-        mounting = SensorMounting(T_base_laser=self._mount)
-        laser = beam_origins(first, sweep, np.zeros(len(ray), np.int64), ray / max(count - 1, 1), mounting)
-        sign = -1.0 if self.mounting.laser_flipped else 1.0
-        bearing = laser[:, 2] + sign * (scanner.angle_min + scanner.angle_increment * ray)
-        reach = np.where(hit[ray], readings[ray], min(_CLEAR, scanner.range_max))
-        ends_of = laser[:, :2] + reach[:, None] * np.stack(se2.cos_sin(bearing), axis=1)
-        return Rays(ends_of, laser[:, :2], hit[ray])
 
     # ---- the start, and what ends in one
 
@@ -372,7 +286,7 @@ class Localizer:
         found = search.places(self._field, self.known.walls, recent, ranges, self._bounds)
         self._bank = self._with_places(found.poses, ranges, recent)
         if not len(self._bank):
-            self._reason = _too_little(rays, ranges)
+            self._reason = verdict.too_little(rays, ranges)
             return
         weight = search.range_likelihood(self._bank.poses, ranges)
         fit, known = np.zeros(len(self._bank)), np.zeros(len(self._bank))
@@ -382,13 +296,13 @@ class Localizer:
             fit, known = agreement.log_likelihood, agreement.known
         self._bank = hypotheses.weighed(Hypotheses(self._bank.mean, self._bank.covariance, np.zeros(len(weight))), weight)
         best = int(np.argmax(self._bank.log_weight))
-        if known[best] < _FEW_ENDS and len(ranges):
+        if known[best] < verdict.FEW_ENDS and len(ranges):
             self._bank = hypotheses.placed(self._bank, best, *search.range_moments(self._bank.poses[best], ranges))
         pose = self._bank.poses[best].copy()
-        fitting = _agreeing(pose, ranges)
-        self._reason = self._doubt(best, found.complete, float(fit[best]), float(known[best]), fitting)
+        fitting = verdict.agreeing(pose, ranges)
+        self._reason = verdict.doubt(self._bank, best, found.complete, float(fit[best]), float(known[best]), fitting)
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
-        self._decide(pose, _CONFIRM if fitting.enough and known[best] >= _FEW_ENDS else _CONFIRM_ALONE)
+        self._decide(pose, _CONFIRM if fitting.enough and known[best] >= verdict.FEW_ENDS else _CONFIRM_ALONE)
 
     def _with_places(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
         """Return the hypotheses with new ones where none is near."""
@@ -396,35 +310,15 @@ class Localizer:
             poses = poses[hypotheses.apart(pose, poses)]
         if not len(poses):
             return self._bank
-        scans = self.known.walls is not None and rays.hit.sum() >= _FEW_ENDS
+        scans = self.known.walls is not None and rays.hit.sum() >= verdict.FEW_ENDS
         covariances = np.tile(np.diag(np.square(_SIGMA_SCAN)), (len(poses), 1, 1))
         if not scans:
             hessian, _ = search.range_factors(poses, ranges)
             covariances = np.linalg.inv(hessian + np.diag([0.01, 0.01, 0.1])) + np.diag(np.square(_SIGMA_FLOOR))
         fresh = hypotheses.started(poses, covariances, len(self.known.anchors.ids))
         if scans and self.known.walls is not None:
-            fresh = hypotheses.matched(fresh, self.known.walls, _every(rays, _TRACK_RAYS), 1.0)
+            fresh = hypotheses.matched(fresh, self.known.walls, _every(rays, TRACK_RAYS), 1.0)
         return hypotheses.joined(self._bank, fresh)
-
-    def _doubt(self, best: int, complete: bool, fit: float, ends: float, fitting: "_RangeFit") -> str:
-        """Return why the best hypothesis is not certain yet; "" = it is."""
-        bank = self._bank
-        sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
-        rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
-        if not complete:
-            return "too many places are as likely; drive on"
-        if ends < _ENOUGH_ENDS and not fitting.enough:
-            return "too little was measured yet; drive on"
-        if ends >= _ENOUGH_ENDS and fit < (_FIT_BESIDE_RANGES if fitting.enough else _FIT_ALONE):
-            return "the scans fit the walls nowhere well; is this the right map?"
-        if fitting.count >= _ENOUGH_RANGES and fitting.share < _RANGES_FOUND:
-            return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
-        if len(rivals) and rivals.max() > -_CERTAIN:
-            count = 1 + int((rivals > -_CERTAIN).sum())
-            return f"{count} places are as likely; drive on, around a corner or past another anchor"
-        if max(sigma[0], sigma[1]) > _SIGMA_FOUND[0] or sigma[2] > _SIGMA_FOUND[1]:
-            return "place or heading is not sure yet; drive on"
-        return ""
 
     def _decide(self, pose: Floats, confirm: float) -> None:
         """Take the best hypothesis for the truth where two searches, some way apart, came to it without a doubt."""
@@ -448,10 +342,6 @@ class Localizer:
         self._reason = "found; a little more driving will confirm it"
 
 
-_FEW_ENDS = 12
-"""Rays' ends in known space from which a scan counts."""
-_ENOUGH_ENDS, _ENOUGH_RANGES = 40, 6
-"""Rays' ends, or ranges to two anchors, that a start needs."""
 _SIGMA_SCAN = (0.2, 0.2, 0.06)
 """m, m, rad; of a place that the search found by scans."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
@@ -460,36 +350,9 @@ _MOVED = (0.2, 20.0)
 """Mean weight below which, after so many ranges, an anchor counts as moved."""
 
 
-@dataclass(frozen=True, slots=True)
-class _RangeFit:
-    """How the window's ranges agree with a pose."""
-
-    count: int
-    share: float
-    """Of the ranges that agree, 0..1."""
-    enough: bool
-    """As many to as many anchors as a start needs agree."""
-
-
-def _agreeing(pose: Floats, ranges: Ranges) -> _RangeFit:
-    if not len(ranges):
-        return _RangeFit(0, 0.0, False)
-    agree = np.abs(search.range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
-    enough = len(np.unique(ranges.anchor[agree])) >= 2 and int(agree.sum()) >= _ENOUGH_RANGES
-    return _RangeFit(len(ranges), float(agree.mean()), bool(enough))
-
-
 def _every(rays: Rays, count: int) -> Rays:
     """Return at most so many rays, evenly spread."""
     return rays.rows(np.unique(np.linspace(0, len(rays.hit) - 1, count).astype(np.int64)))
-
-
-def _too_little(rays: Rays, ranges: Ranges) -> str:
-    if not len(rays.hit) and not len(ranges):
-        return "no range to an anchor of the map and no scan has come in"
-    if not len(rays.hit) and len(np.unique(ranges.anchor)) < 2:
-        return "only one of the map's anchors is in reach; two or more are needed, or a lidar"
-    return "too many places are as likely; drive on"
 
 
 _RADIO_REACH = 15.0

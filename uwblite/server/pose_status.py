@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..localization.localizer import LocalizerState
+from ..localization.records import LocalizerState
 
 _EVERY = 0.2
 """s between states that are shown."""

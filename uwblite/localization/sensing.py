@@ -1,0 +1,60 @@
+"""Measurements as they come in: those that wait for the odometry, and scans as rays in the frame of the base."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats
+from ..odometry.attached import beam_origins
+from ..sensor_log import SensorMounting
+from .odometer import Odometer
+from .records import Scanner
+from .walls import Rays
+
+_CLEAR = 3.0
+"""m; up to here a ray that saw nothing would have seen a wall, as grid.max_clear_distance."""
+TRACK_RAYS = 180
+"""Rays of a scan that are matched."""
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """A range that the odometry has not reached."""
+
+    anchor: int
+    metres: float
+    tag: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """A scan that the odometry has not reached."""
+
+    stamp: float
+    readings: Floats
+    scanner: Scanner
+
+
+def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
+    """Return thinned rays in the present frame of the base, each moved by the odometry at its own time.
+
+    Parameters
+    ----------
+    mounting : of the laser, with what the map corrects of it.
+    """
+    stamp, readings, scanner = scan.stamp, scan.readings, scan.scanner
+    count = len(readings)
+    hit = (readings >= scanner.range_min) & (readings <= scanner.range_max)
+    empty = (np.isposinf(readings) | (readings > scanner.range_max)) & ~hit
+    ray = np.flatnonzero(hit | empty)
+    ray = ray[:: max(1, -(-len(ray) // TRACK_RAYS))]
+    ends = odometer.at(np.array([stamp, stamp + scanner.time_increment * max(count - 1, 0)]))
+    first = se2.between(odometer.pose, ends[:1])
+    sweep = se2.between(ends[:1], ends[1:])
+    laser = beam_origins(first, sweep, np.zeros(len(ray), np.int64), ray / max(count - 1, 1), mounting)
+    sign = -1.0 if mounting.laser_flipped else 1.0
+    bearing = laser[:, 2] + sign * (scanner.angle_min + scanner.angle_increment * ray)
+    reach = np.where(hit[ray], readings[ray], min(_CLEAR, scanner.range_max))
+    ends_of = laser[:, :2] + reach[:, None] * np.stack(se2.cos_sin(bearing), axis=1)
+    return Rays(ends_of, laser[:, :2], hit[ray])

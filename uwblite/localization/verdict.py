@@ -1,0 +1,78 @@
+"""Whether a start is certain: what must have been measured, and how much likelier it must be than every other place."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats
+from . import hypotheses, search
+from .hypotheses import Hypotheses
+from .walls import Rays
+from .window import Ranges
+
+CERTAIN = 6.0
+"""Log-likelihood by which a place must be better than any other: 400 : 1."""
+SIGMA_FOUND = (0.25, 0.1)
+"""m and rad; a pose that is less sure is not found yet."""
+FIT_BESIDE_RANGES, FIT_ALONE = -0.7, -0.25
+"""Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.15, with people
+close by -0.5; rooms that are alike in part reach -0.3."""
+RANGES_FOUND = 0.5
+"""Share of the ranges that must agree with a start."""
+FEW_ENDS = 12
+"""Rays' ends in known space from which a scan counts."""
+ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
+"""Rays' ends, or ranges to two anchors, that a start needs."""
+
+
+def doubt(bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, fitting: "RangeFit") -> str:
+    """Return why the best hypothesis is not certain yet; "" = it is.
+
+    Parameters
+    ----------
+    complete : the search left no place out. fit : mean log-likelihood of the rays at the best hypothesis.
+    ends : rays' ends in known space. fitting : how the ranges agree there.
+    """
+    sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
+    rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
+    if not complete:
+        return "too many places are as likely; drive on"
+    if ends < ENOUGH_ENDS and not fitting.enough:
+        return "too little was measured yet; drive on"
+    if ends >= ENOUGH_ENDS and fit < (FIT_BESIDE_RANGES if fitting.enough else FIT_ALONE):
+        return "the scans fit the walls nowhere well; is this the right map?"
+    if fitting.count >= ENOUGH_RANGES and fitting.share < RANGES_FOUND:
+        return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
+    if len(rivals) and rivals.max() > -CERTAIN:
+        count = 1 + int((rivals > -CERTAIN).sum())
+        return f"{count} places are as likely; drive on, around a corner or past another anchor"
+    if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
+        return "place or heading is not sure yet; drive on"
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class RangeFit:
+    """How the window's ranges agree with a pose."""
+
+    count: int
+    share: float
+    """Of the ranges that agree, 0..1."""
+    enough: bool
+    """As many to as many anchors as a start needs agree."""
+
+
+def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
+    if not len(ranges):
+        return RangeFit(0, 0.0, False)
+    agree = np.abs(search.range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
+    enough = len(np.unique(ranges.anchor[agree])) >= 2 and int(agree.sum()) >= ENOUGH_RANGES
+    return RangeFit(len(ranges), float(agree.mean()), bool(enough))
+
+
+def too_little(rays: Rays, ranges: Ranges) -> str:
+    if not len(rays.hit) and not len(ranges):
+        return "no range to an anchor of the map and no scan has come in"
+    if not len(rays.hit) and len(np.unique(ranges.anchor)) < 2:
+        return "only one of the map's anchors is in reach; two or more are needed, or a lidar"
+    return "too many places are as likely; drive on"
