@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,7 @@ from .options import add_bag_arguments, add_mounting_arguments, add_settings_arg
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ..grid.occupancy_grid import OccupancyGrid
+    from ..io.stored_result import StoredResult
     from ..localization.localize import Localization
 
 HELP = "find the trajectory of a new recording in an existing map, by its anchors and walls"
@@ -26,10 +25,11 @@ examples:
   ssh robot cat run.log | uwblite localize - --live --map map/
   uwblite localize --live --map map/ --odometry kobuki:/dev/kobuki --lidar /dev/ttyACM1 --uwb /dev/ttyACM0
 
-The start pose need not be known: the anchors' ids tie the recording to the map. Where fewer than two of them are in reach,
-the walls are sought in the whole map; without lidar, the anchors alone say it to a decimetre or two. The map is not changed.
+The start pose need not be known: ranges and scans are searched for in the whole map, as with --live; then the recording is
+tracked forwards and backwards and both are averaged. Without lidar the anchors say it to a decimetre. The map is not changed.
 With --live, a line a tenth of a second: stamp, pose, covariance, quality (0..1), lost, and why; see docs/navigation.md.
-exit code 3: written, but the walls do not fit, or an anchor was moved; the reasons are named
+exit code 3: written, but doubted: the walls do not fit, or much of it is not located; the reasons are named
+exit code 1: found nowhere for certain; nothing is written
 """
 
 
@@ -58,10 +58,9 @@ def run(args: argparse.Namespace) -> int:
         return run_live(args)
     if not args.log or not args.out:
         raise UsageError("localize needs a recording and --out, or --live; see uwblite localize --help")
-    from ..io.constraints_file import read_anchors
-    from ..io.map_server import read_map
     from ..io.result_text import json_lines
-    from ..io.results import repair_result
+    from ..io.stored_result import read_result
+    from ..localization.known_map import from_result
     from ..localization.localize import localize
     from . import console
     from .formats import read_recording, refuse_existing
@@ -70,26 +69,25 @@ def run(args: argparse.Namespace) -> int:
     files = _files(args)
     refuse_existing(args.force, *files.values())
     config = effective_config(args)
-    repair_result(args.map)
-    yaml = os.path.join(args.map, "map.yaml")
-    grid = read_map(yaml) if os.path.exists(yaml) else None
-    anchors = read_anchors(os.path.join(args.map, "anchors.csv"), least=1 if grid is None else 0)
+    earlier = read_result(args.map)
+    known = from_result(earlier)
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
+    log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
     progress = console.Progress()
     try:
-        found = localize(log, anchors, grid, config, progress=progress, clock=time.perf_counter)
+        found = localize(log, known, turn_laser=config.detect_laser_flip, progress=progress)
     finally:
         progress.close()
     summary = _summary(found, list(files.values()))
     about = {"source": log.notes.source, "sha256": log.notes.sha256, "map": args.map}
-    picture = _picture(found, grid, os.path.basename(args.log)) if "picture" in files else None
+    picture = _picture(found, earlier, os.path.basename(args.log)) if "picture" in files else None
     with _together(files, args.out) as places:
         _write(places, found, picture, json_lines(about | summary))
     if args.json:
         console.say_json(summary)
     else:
         _say(found, list(files.values()))
-    return 3 if found.result.doubts else 0
+    return 3 if found.doubts else 0
 
 
 @contextmanager
@@ -112,9 +110,9 @@ def _write(places: dict[str, str], found: "Localization", picture: Any, report: 
     from ..io.result_text import covariance_csv
     from ..io.tum import write_tum
 
-    write_tum(places["trajectory"], found.result.stamps, found.result.trajectory)
+    write_tum(places["trajectory"], found.stamps, found.trajectory)
     if "covariance" in places:
-        write_text(places["covariance"], covariance_csv(found.result))
+        write_text(places["covariance"], covariance_csv(found.stamps, found.covariances))
     if "picture" in places:
         write_png(places["picture"], picture)
     if "report" in places:
@@ -143,27 +141,25 @@ def _files(args: argparse.Namespace) -> dict[str, str]:
     return own | {what: name for what in ("covariance", "picture") if (name := getattr(args, what))}
 
 
-def _picture(found: "Localization", grid: "OccupancyGrid | None", caption: str) -> Any:
+def _picture(found: "Localization", earlier: "StoredResult", caption: str) -> Any:
     from ..report.picture import PictureAnchor, draw_map
 
-    anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in found.result.anchors]
-    return draw_map(grid, found.result.trajectory, anchors=anchors, caption=caption)
+    anchors = [PictureAnchor(a.id, a.position, a.covariance) for a in earlier.anchors]
+    return draw_map(earlier.grid, found.trajectory, anchors=anchors, caption=caption)
 
 
 def _summary(found: "Localization", files: list[str]) -> dict[str, Any]:
     """Return what was found, ready for JSON."""
     from ..io.result_text import notices
 
-    result = found.result
-    x, y, theta = found.correction.tolist()
     return {
         "files": files,
-        "poses": len(result.stamps),
-        "correction_by_walls": {"x": x, "y": y, "theta": theta},
+        "poses": len(found.stamps),
+        "located": found.located,
         "overlap": found.overlap if found.overlap == found.overlap else None,
-        "warnings": notices(result.warnings),
-        "doubts": notices(result.doubts),
-        "exit_code": 3 if result.doubts else 0,
+        "warnings": notices(found.warnings),
+        "doubts": notices(found.doubts),
+        "exit_code": 3 if found.doubts else 0,
     }
 
 
@@ -171,19 +167,16 @@ def _say(found: "Localization", files: list[str]) -> None:
     from . import console
     from .wording import signed
 
-    result = found.result
-    x, y, theta = found.correction.tolist()
-    start = result.trajectory[0]
-    console.say(f"{len(result.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m")
+    start = found.trajectory[0]
+    sigma = sorted((c[0, 0] + c[1, 1]) ** 0.5 for c in found.covariances)[len(found.covariances) // 2]
+    console.say(f"{len(found.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m")
+    console.say(f"{100 * found.located:.0f} % of the recording is located, typically to ±{sigma:.2f} m")
     if found.overlap == found.overlap:
-        console.say(
-            f"{100 * found.overlap:.0f} % of the walls lie on those of the map; the path was moved by"
-            f" x {signed(x, 3, plus=True)} m, y {signed(y, 3, plus=True)} m, {signed(theta, 4, plus=True)} rad"
-        )
+        console.say(f"{100 * found.overlap:.0f} % of what the lidar saw in known space lies on the walls of the map")
     else:
         console.say("no walls to compare: the position rests on the anchors")
-    for text in result.warnings:
+    for text in found.warnings:
         console.say(f"warning: {text}")
-    for text in result.doubts:
+    for text in found.doubts:
         console.say(f"DOUBT: {text}")
     console.say("files: " + " ".join(files))

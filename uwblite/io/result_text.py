@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats, Ints
 from ..map_result import MapResult, Notice
 from ..report.printable import encodable
 from ..sensor_log import LogNotes, SensorLog
@@ -48,12 +49,17 @@ def _decimal(value: float, digits: int = 6) -> str:
     return f"{value + 0.0:.{digits}f}" if np.isfinite(value) else ""
 
 
-def covariance_csv(result: MapResult) -> str:
-    """Return stamp and covariance (upper triangle; m^2, m rad, rad^2; map frame) and recording of every keyframe as CSV."""
+def covariance_csv(stamps: Floats, covariances: Floats, recordings: Ints | None = None) -> str:
+    """Return stamp and covariance (upper triangle; m^2, m rad, rad^2; map frame) and recording of every pose as CSV.
+
+    Parameters
+    ----------
+    stamps : (n,) s. covariances : (n, 3, 3). recordings : (n,) of each pose, from 0; None = there is one.
+    """
     lines = ["stamp,xx,xy,xtheta,yy,ytheta,thetatheta,recording"]
     upper = np.triu_indices(3)
-    rows = (result.keyframe_stamps.tolist(), result.keyframe_covariances, result.keyframe_recording.tolist())
-    for stamp, matrix, recording in zip(*rows, strict=True):
+    owners = [0] * len(stamps) if recordings is None else recordings.tolist()
+    for stamp, matrix, recording in zip(stamps.tolist(), covariances, owners, strict=True):
         lines.append(f"{stamp:.6f}," + ",".join(f"{v:.6e}" for v in matrix[upper].tolist()) + f",{recording + 1}")
     return "\n".join(lines) + "\n"
 

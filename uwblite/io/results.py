@@ -96,7 +96,8 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
     """
     with replacing_folder(folder, is_of_result) as waiting:
         _write_trajectories(waiting, result)
-        write_text(waiting / "trajectory_covariance.csv", covariance_csv(result))
+        frames = (result.keyframe_stamps, result.keyframe_covariances, result.keyframe_recording)
+        write_text(waiting / "trajectory_covariance.csv", covariance_csv(*frames))
         write_text(waiting / "anchors.csv", anchors_csv(result))
         grid_png = None
         if result.grid is not None:

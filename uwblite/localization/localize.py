@@ -1,59 +1,51 @@
-"""Where a robot drove within a map that is there already: its anchors give the frame, its walls the last centimetres.
+"""Where a robot drove within a map that is there already: the live localiser, forwards and backwards over a recording.
 
-The new recording is mapped on its own, with the earlier map's anchors as known places, so that it needs no start pose
-and has the accuracy of a whole map within itself; then its walls are laid over the earlier ones as one piece. Both maps
-widen a wall alike, so that their difference is free of it. Where fewer than two of the map's anchors are in reach, the
-walls are sought in the whole map, whatever way they lie. The earlier map is not changed.
+The start pose need not be known; the map is not changed. What both passes know is averaged (passes); poses that neither knows
+are left out. Where the scans fit the map's walls nowhere, the place has changed or is another one: the anchors alone then say
+where the robot was, and the result is doubted.
 """
 
 from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Floats
-from ..constraints import Constraints
-from ..errors import DataError
-from ..grid.occupancy_grid import OccupancyGrid
-from ..lidar.cloud_rasters import rasterize
-from ..lidar.clouds import Clouds, joined, make_cloud, two_sided
-from ..lidar.correlative_matching import CorrelativeConfig, search
-from ..lidar.pair_alignment import align_pairs
-from ..lidar.scan_matching import nondegenerate_step, pair_points
-from ..map_result import MapResult, Notice, StageSummary
-from ..mapping import MappingConfig, Progress, build_map
-from ..pipeline import map_frame
+from ..errors import Cancelled, DataError
+from ..map_result import Notice
+from ..screening.screen import screen
 from ..sensor_log import SensorLog
+from .known_map import KnownMap
+from .passes import Pass, pose_rows, run_pass, smoothed
 
 LEAST_OVERLAP = 0.4
-"""Share of the new walls that must lie on earlier ones; the rest may be new, or not seen before."""
-REACH = 1.5
-"""Standard deviation of a position by anchors alone, m."""
+"""Share of the rays' ends in known space that must lie on walls of the map; the rest may be people, or what was moved."""
+LEAST_LOCATED = 0.8
+"""Share of the poses that must be known, and on which both passes must agree."""
+Progress = Callable[[str, int, int], object]
+"""Called with what is done, steps done, steps; what returns False stops the work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Localization:
     """A recording within an earlier map."""
 
-    result: MapResult
-    """As of a map of its own, in the earlier map's frame."""
-    correction: Floats
-    """(3,) what the walls moved it by from where the anchors had it; m, m, rad."""
+    stamps: Floats
+    """(n,) s, of the poses that are known."""
+    trajectory: Floats
+    """(n, 3) T_map_base; m, m, rad."""
+    covariances: Floats
+    """(n, 3, 3) m, m, rad; map frame; the map's own errors are in them."""
+    located: float
+    """Share of the recording's poses that are known, 0..1."""
     overlap: float
-    """Share of the new walls that lie on earlier ones; nan without walls to compare."""
+    """Share of the rays' ends that lie on walls of the map, of those in its known space; nan without walls to compare."""
+    warnings: tuple[Notice, ...]
+    doubts: tuple[Notice, ...]
 
 
 def localize(
-    log: SensorLog,
-    anchors: Constraints,
-    grid: OccupancyGrid | None,
-    config: MappingConfig | None = None,
-    *,
-    progress: Progress | None = None,
-    executor: Executor | None = None,
-    clock: Callable[[], float] | None = None,
+    log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progress: Progress | None = None
 ) -> Localization:
     """Find the trajectory of a recording in an earlier map.
 
@@ -61,152 +53,99 @@ def localize(
     ----------
     log : the recording, with ranges to at least two of the map's anchors, or with lidar in a place that no other part of
         the map looks like.
-    anchors : the earlier map's anchors, see io.constraints_file.read_anchors.
-    grid : the earlier map; None = anchors only.
-    config : settings; None = defaults.
-    progress, executor, clock : as for build_map.
+    known : the earlier map.
+    turn_laser : take the laser as mounted the way that its scans show, see screening.screen.
+    progress : called with what is done.
 
     Raises
     ------
-    DataError : the recording has ranges to fewer than two of the map's anchors, and there are no walls to compare.
+    DataError : the recording has ranges to fewer than two of the map's anchors, and there are no walls to compare; or it is
+        found nowhere in the map for certain.
+    Cancelled : progress returned False.
     """
+    _refuse_nothing_in_common(log, known)
+    log = screen(log, turn_laser)
+    rows = pose_rows(log)
+    passes = _both(log, known, rows, progress)
+    doubts = []
+    if _lost(passes) and known.walls is not None and len(_shared(log, known)) >= 2:
+        doubts.append(_walls_differ(passes[0].reason))
+        passes = _both(log, replace(known, walls=None), rows, progress)
+    if _lost(passes):
+        raise DataError(f"the recording is found nowhere in the map for certain: {passes[0].reason}")
+    found = smoothed(*passes)
+    there = np.isfinite(found.poses).all(axis=1)
+    ends = passes[0].ends + passes[1].ends
+    overlap = float(ends[0] / ends[1]) if ends[1] else float("nan")
+    located, agreed = float(there.mean()), 1.0 - float(found.contradicting[there].mean())
+    warnings, more = _notices(log, known, passes, located, agreed, overlap)
+    return Localization(
+        log.odometry.stamps[rows][there], found.poses[there], found.covariances[there], located, overlap,
+        warnings, (*doubts, *more),
+    )  # fmt: skip
+
+
+def _both(log: SensorLog, known: KnownMap, rows: np.ndarray, progress: Progress | None) -> tuple[Pass, Pass]:
+    def reporter(name: str) -> Callable[[int, int], None]:
+        def report(done: int, total: int) -> None:
+            if progress is not None and progress(name, done, total) is False:
+                raise Cancelled(f"stopped by the caller during {name}")
+
+        return report
+
+    return (
+        run_pass(log, known, rows, False, reporter("localising forwards")),
+        run_pass(log, known, rows, True, reporter("localising backwards")),
+    )
+
+
+def _lost(passes: tuple[Pass, Pass]) -> bool:
+    return not any(np.isfinite(p.poses).any() for p in passes)
+
+
+def _shared(log: SensorLog, known: KnownMap) -> list[str]:
     measured = set(log.ranges.anchor_ids) if log.ranges is not None else set()
-    shared = [a.id for a in anchors.anchors if a.id in measured]
-    alone = len(shared) < 2
-    if alone and (grid is None or log.scans is None):
+    return [name for name in known.anchors.ids if name in measured]
+
+
+def _refuse_nothing_in_common(log: SensorLog, known: KnownMap) -> None:
+    shared = _shared(log, known)
+    if len(shared) < 2 and (known.walls is None or log.scans is None):
         raise DataError(
-            f"the recording has ranges to {len(shared)} of the map's anchors ({', '.join(a.id for a in anchors.anchors)}); "
+            f"the recording has ranges to {len(shared)} of the map's anchors ({', '.join(known.anchors.ids)}); "
             "two or more are needed to find it in the map, or lidar in both"
         )
-    config = replace(config or MappingConfig(), align="odometry", crop=None)
-    known = Constraints() if alone else anchors
-    result = build_map(log, config, constraints=known, progress=progress, executor=executor, clock=clock)
-    if grid is None or result.grid is None:
-        return Localization(result, np.zeros(3), float("nan"))
-    if alone:
-        text = f"it has ranges to {len(shared)} of the map's anchors: its place is from the walls alone"
-        notice = Notice("few-common-anchors", text, {"anchors": len(shared)})
-        result = replace(result, warnings=(*result.warnings, notice))
-    return _laid_over(result, grid, anywhere=alone)
 
 
-def _laid_over(result: MapResult, grid: OccupancyGrid, *, anywhere: bool) -> Localization:
-    """Lay the new walls over the earlier ones and move everything along."""
-    assert result.grid is not None
-    earlier, new = grid.occupied_points(), result.grid.occupied_points()
-    # The iteration's frame is the middle of the new walls: there a turn and a shift are independent.
-    middle = np.array([*new.mean(axis=0), 0.0]) if len(new) else np.zeros(3)
-    there, here = make_cloud(earlier), make_cloud(se2.transform(se2.inverse(middle), new))
-    fits = _fits(there, here, _anywhere(there, here) if anywhere else middle[None])
-    found = fits[0]
-    figures = {"overlap": round(found.overlap, 4), "rmse": round(found.rmse, 4), "reason": found.reason}
-    if not found.converged or found.overlap < LEAST_OVERLAP:
-        doubt = Notice(
-            "walls-differ",
-            f"the walls do not lie on those of the map (overlap {found.overlap:.0%}, {found.reason}): the place has changed, "
-            f"or it is another; the position {'is not known' if anywhere else 'rests on the anchors alone'}",
-            {"overlap": round(found.overlap, 4)},
-        )
-        stages = (*result.stages, StageSummary("walls", 0.0, figures))
-        return Localization(replace(result, doubts=(*result.doubts, doubt), stages=stages), np.zeros(3), found.overlap)
-    rival = max((fit.overlap for fit in fits[1:] if _elsewhere(fit, found)), default=0.0)
-    if rival > _UNIQUE * found.overlap:
-        text = f"the walls fit elsewhere in the map about as well (overlap {rival:.0%} against {found.overlap:.0%})"
-        doubt = Notice("ambiguous-place", text, {"overlap": round(found.overlap, 4), "rival": round(rival, 4)})
-        result = replace(result, doubts=(*result.doubts, doubt))
-    motion = se2.compose(found.pose, se2.inverse(middle))
-    figures["shift"] = [round(v, 4) for v in motion.tolist()]
-    return Localization(_moved(result, motion, StageSummary("walls", 0.0, figures)), motion, found.overlap)
+def _notices(
+    log: SensorLog, known: KnownMap, passes: tuple[Pass, Pass], located: float, agreed: float, overlap: float
+) -> tuple[tuple[Notice, ...], tuple[Notice, ...]]:
+    """Return warnings and doubts."""
+    remarks = () if log.screening is None else log.screening.remarks
+    warnings = [Notice(r.kind, r.text) for r in remarks if not r.doubt]
+    doubts = [Notice(r.kind, r.text) for r in remarks if r.doubt]
+    shared = len(_shared(log, known))
+    if shared < 2:
+        text = f"it has ranges to {shared} of the map's anchors: its place is from the walls alone"
+        warnings.append(Notice("few-common-anchors", text, {"anchors": shared}))
+    for name in sorted({n for p in passes for n in p.moved_anchors}):
+        text = f"anchor {name} does not stand where the map has it: it was moved; its ranges were left out"
+        warnings.append(Notice("moved-anchor", text, {"anchor": name}))
+    if overlap < LEAST_OVERLAP:
+        doubts.append(_walls_differ(f"overlap {overlap:.0%}"))
+    if located < 1.0:
+        reason = passes[0].reason or passes[1].reason or "measurements and map fell apart meanwhile"
+        text = f"{1.0 - located:.0%} of the recording is not located and left out: {reason}"
+        (doubts if located < LEAST_LOCATED else warnings).append(Notice("not-located", text, {"located": round(located, 4)}))
+    if agreed < LEAST_LOCATED:
+        text = f"forwards and backwards the recording is found at different places for {1.0 - agreed:.0%} of its poses"
+        doubts.append(Notice("ambiguous-place", text, {"agreed": round(agreed, 4)}))
+    return tuple(warnings), tuple(doubts)
 
 
-_GATE = 0.15
-"""m; walls farther apart do not lie on one another."""
-_CONVERGED = 0.005
-"""m and rad; the last step of an alignment that has converged, a tenth of a cell."""
-_LEAST_MATCHES = 10
-_ITERATIONS = 40
-_RASTER = 0.1
-"""m; cell of the table of nearest wall points."""
-_UNIQUE = 0.85
-"""A second place whose overlap is this share of the first's makes the first doubtful."""
-_EVERYWHERE = CorrelativeConfig(resolution=0.25, angle_step=0.05, spread=0.25, candidates=8, separation=1.0)
-"""Coarse: the alignment that follows reaches farther than a step."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
-    """Where the new walls came to lie."""
-
-    pose: Floats
-    """(3,) of the new walls, about their middle, in the earlier map."""
-    overlap: float
-    """Share of the new walls that lie on earlier ones, 0..1."""
-    rmse: float
-    """m, of the distances across the matched walls."""
-    converged: bool
-    reason: str
-
-
-def _fits(earlier: Clouds, new: Clouds, guesses: Floats) -> list[_Fit]:
-    """Align the new walls with the earlier ones from several guesses (g, 3); the best fit comes first.
-
-    A grid does not contain from which side a wall was seen: the new walls enter with either normal, of which one matches.
-    """
-    sides, target = two_sided(new), np.zeros(len(guesses), dtype=np.int64)
-    clouds, raster = joined([earlier, sides], np.float64), rasterize(earlier, _RASTER, REACH)
-    points = pair_points(clouds, target + 1, len(sides.points))
-    found = align_pairs(clouds, raster, target, target + 1, guesses, points, REACH, _GATE, _ITERATIONS)
-    steps = np.abs(nondegenerate_step(found.factors)[0]).max(axis=1)
-    figures = (found.pose, 2.0 * found.share, found.rms, found.factors.matched, steps)
-    fits = [_fit(*values) for values in zip(*figures, strict=True)]
-    return sorted(fits, key=lambda fit: (-fit.converged, -fit.overlap))
-
-
-def _fit(pose: Floats, overlap: float, rmse: float, matches: int, step: float) -> _Fit:
-    reason = "step below tolerance"
-    if matches < _LEAST_MATCHES:
-        reason = f"no overlap: {matches} wall points have a partner"
-    elif step > _CONVERGED:
-        reason = f"stopped after {_ITERATIONS} iterations, still moving"
-    return _Fit(pose, float(overlap), float(rmse), reason == "step below tolerance", reason)
-
-
-def _anywhere(earlier: Clouds, local: Clouds) -> Floats:
-    """Return poses (c, 3) of the new walls, about their middle, at which they may lie in the earlier map."""
-    if not len(earlier.points) or not len(local.points):
-        return np.zeros((1, 3))
-    low, high = earlier.points.min(axis=0), earlier.points.max(axis=0)
-    width, depth = ((high - low) / 2.0).tolist()
-    middle, window = np.array([*(low + high) / 2.0, 0.0]), (width, depth, np.pi)
-    poses = search(earlier, local, middle, window, _EVERYWHERE, oriented=False).poses
-    return poses if len(poses) else np.zeros((1, 3))
-
-
-def _elsewhere(one: _Fit, other: _Fit) -> bool:
-    x, y, theta = se2.between(one.pose, other.pose).tolist()
-    return bool(one.converged and (np.hypot(x, y) > 0.5 or abs(theta) > 0.1))
-
-
-def _moved(result: MapResult, motion: Floats, stage: StageSummary) -> MapResult:
-    """Return the result in a frame moved by T_new_old; its grid, drawn in the old one, is left out."""
-    turn = np.eye(3)
-    turn[:2, :2] = se2.rotate(motion[2], np.eye(2)).T
-    covariances = turn @ result.keyframe_covariances @ turn.T
-    anchors = tuple(
-        replace(
-            a,
-            position=se2.transform(motion, a.position),
-            covariance=turn[:2, :2] @ a.covariance @ turn[:2, :2].T,
-            alternative=None if a.alternative is None else se2.transform(motion, a.alternative),
-        )
-        for a in result.anchors
-    )
-    return replace(
-        result,
-        trajectory=se2.compose(motion, result.trajectory),
-        keyframe_covariances=covariances,
-        graph=map_frame.moved(result.graph, motion),
-        anchors=anchors,
-        grid=None,
-        stages=(*result.stages, stage),
+def _walls_differ(why: str) -> Notice:
+    return Notice(
+        "walls-differ",
+        f"the walls do not lie on those of the map ({why}): the place has changed, or it is another; the position rests on "
+        "the anchors alone",
     )

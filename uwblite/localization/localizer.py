@@ -8,7 +8,7 @@ and map fall apart, the pose counts as lost, and the search begins again with wh
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,8 +26,8 @@ from .sensing import TRACK_RAYS, Range, Scan, scan_rays
 from .walls import Rays
 from .window import RAYS, Ranges, Window, WindowLook, WindowRange, way_of
 
-_SIGMA_MAP = (0.02, 0.02, 0.005)
-"""m, m, rad; what the map itself is off by: its errors are alike in neighbouring scans, and no filter averages them."""
+MAP_COVARIANCE = np.diag(np.square((0.02, 0.02, 0.005)))
+"""m^2, rad^2; what the map itself is off by: its errors are alike in neighbouring scans, and no filter averages them."""
 _FRESH_WAY = 0.1
 """m; a scan taken so far from the last one errs independently of it; a nearer one in proportion."""
 _LEAST_FRESH = 0.1
@@ -54,6 +54,9 @@ _SEEN = 0.5
 _SOUND_WEIGHT = 0.5
 """Weight from which a range speaks for the pose; what was measured since the last one, or the last scan that fits, begins the
 search of a robot that is lost."""
+_RANGES_SOUND, _RECENT = 0.5, 5.0
+"""Mean weight of ranges, the last of them s ago, from which they speak for a pose that scans contradict: it is given up only
+for a better one. Rooms that the map holds in part look like that, and people around the robot."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 1.0
 """m driven and s between two searches."""
 _MOST = 40
@@ -62,6 +65,24 @@ _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent."""
 _UNSEEN_SPEED = 0.3
 """m/s and rad/s; how fast a robot may move while its odometry is silent."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Comparison:
+    """Places in the map, and how well each explains what was measured."""
+
+    bank: Hypotheses
+    """The present hypotheses first."""
+    complete: bool
+    """No place that is as good was left out."""
+    weight: Floats
+    """(h,) log-likelihood."""
+    fit: Floats
+    """(h,) mean log-likelihood of the rays."""
+    known: Floats
+    """(h,) rays' ends in known space."""
+    rays: Rays
+    ranges: Ranges
 
 
 class Localizer:
@@ -95,11 +116,13 @@ class Localizer:
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
         self._fit, self._seen, self._ranges_fit = 0.0, 0.0, 1.0
-        self._sound = -np.inf
+        self._sound = self._ranged = -np.inf
         self._trust = np.full((len(known.anchors.ids), 2), (1.0, 0.0))
         self._reason = "nothing has been measured yet"
         self.strangers: dict[str, int] = {}
         """Ranges to anchors that the map does not know, by id."""
+        self.ends = np.zeros(2)
+        """Of rays on walls, and in known space, while the pose was known."""
 
     # ---- what comes in
 
@@ -140,7 +163,9 @@ class Localizer:
         self.scanner = scanner or self.scanner
         if self.scanner is not None and self.known.walls is not None:
             readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
-            end = stamp + self.known.laser_delay + self.scanner.time_increment * max(len(readings) - 1, 0)
+            begin = stamp + self.known.laser_delay
+            # A recording that is played backwards has its last ray first.
+            end = max(begin, begin + self.scanner.time_increment * max(len(readings) - 1, 0))
             self._wait(end, Scan(stamp + self.known.laser_delay, readings, self.scanner))
         self._work_off()
         return self.state()
@@ -167,7 +192,7 @@ class Localizer:
         fit = np.exp(self._fit - _FIT_SOUND) if self._sees() else self._ranges_fit / verdict.RANGES_FOUND
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
         reason = "" if self._certain else self._reason
-        pose, covariance = bank.poses[best].copy(), covariance + np.diag(np.square(_SIGMA_MAP))
+        pose, covariance = bank.poses[best].copy(), covariance + MAP_COVARIANCE
         return LocalizerState(
             stamp, pose, covariance, quality, odometry, not self._certain, reason, bank.poses[order[1:]], self._moved()
         )
@@ -228,6 +253,7 @@ class Localizer:
         best = float(weight[int(np.argmax(bank.log_weight))])
         self._trust[anchor] += (_FORGETTING * (best - self._trust[anchor, 0]), 1.0)
         self._ranges_fit += _FORGETTING_RANGES * (best - self._ranges_fit)
+        self._ranged = max(self._ranged, stamp)
         if best > _SOUND_WEIGHT:
             self._sound = max(self._sound, stamp)
 
@@ -242,67 +268,99 @@ class Localizer:
         driven = self._way - self._scan_way
         self._scan_way = self._way
         least = _LEAST_FRESH if driven > 1e-3 else _STANDING_FRESH
-        self._bank = hypotheses.matched(self._bank, walls, rays, float(np.clip(driven / _FRESH_WAY, least, 1.0)))
+        before = self._bank
+        self._bank = hypotheses.matched(before, walls, rays, float(np.clip(driven / _FRESH_WAY, least, 1.0)))
         few = _every(rays, RAYS)
         found = walls.agreement(self._bank.poses, few)
+        if self._certain and found.fit[0] < _FIT_LOST:
+            # What does not agree as a whole must not move the pose: walls that the map does not hold lie near others.
+            self._bank = before
         if len(self._bank) > 1:
             self._bank = hypotheses.weighed(self._bank, _SCAN_EVIDENCE * min(driven, 1.0) * found.log_likelihood)
         best = int(np.argmax(self._bank.log_weight))
         informative = bool(found.known[best] >= verdict.FEW_ENDS)
+        if self._certain:
+            self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
         self._seen += _FORGETTING * (informative - self._seen)
         if informative:
-            self._fit += _FORGETTING * (float(found.log_likelihood[best]) - self._fit)
-            if found.log_likelihood[best] > _FIT_SOUND:
+            self._fit += _FORGETTING * (float(found.fit[best]) - self._fit)
+            if found.fit[best] > _FIT_SOUND:
                 self._sound = max(self._sound, self._odometer.stamp)
 
     # ---- the start, and what ends in one
 
     def _search_or_check(self) -> None:
         if self._certain:
-            if self._sees() and self._fit < _FIT_LOST:
-                self._lose("the scans do not fit the walls any more")
-            elif self._ranges_fit < _RANGES_LOST and not (self._seen > _SEEN and self._fit > _FIT_SOUND):
-                self._lose("the ranges do not fit the anchors any more")
-            else:
+            why = self._doubted()
+            if not why:
                 return
+            self._lose(why)
+        if self._due():
+            self._search()
+
+    def _due(self) -> bool:
+        """Return whether it is time for another search, and remember it."""
         now = self._odometer.stamp
         if self._way - self._search_way < _SEARCH_WAY and now - self._search_stamp < _SEARCH_TIME:
-            return
+            return False
         self._search_way, self._search_stamp = self._way, now
-        self._search()
+        return True
+
+    def _doubted(self) -> str:
+        """Return why the pose counts as lost; "" = it does not."""
+        if self._sees() and self._fit < _FIT_LOST:
+            vouched = self._ranges_fit > _RANGES_SOUND and self._odometer.stamp - self._ranged < _RECENT
+            if not vouched or (self._due() and self._elsewhere()):
+                return "the scans do not fit the walls any more"
+        elif self._ranges_fit < _RANGES_LOST and not (self._seen > _SEEN and self._fit > _FIT_SOUND):
+            return "the ranges do not fit the anchors any more"
+        return ""
+
+    def _elsewhere(self) -> bool:
+        """Return whether another place explains better what was measured since the pose was last sound."""
+        found = self._compared(self._window.since(self._sound))
+        rivals = found.weight[hypotheses.apart(self._bank.poses[0], found.bank.poses)]
+        return found.complete and bool(rivals.max(initial=-np.inf) > found.weight[0] + verdict.CERTAIN)
 
     def _lose(self, why: str) -> None:
         self._certain, self._confirmed, self._reason = False, None, why
-        self._window.begin(self._sound)
+        self._window = self._window.since(self._sound)
         self._trust[:] = (1.0, 0.0)
         self._search_way, self._search_stamp = self._way, self._odometer.stamp
 
-    def _search(self) -> None:
-        """Look for the robot in the whole map, weight all hypotheses again, and decide."""
-        odom = self._odometer.pose
-        ranges = self._window.ranges_since(odom, self._way)
-        rays, ago = self._window.seen(odom, self._way, _LOOK_BACK)
+    def _compared(self, window: Window) -> _Comparison:
+        """Search the whole map for what a window holds, and weight what is found together with the present hypotheses."""
+        odom, walls = self._odometer.pose, self.known.walls
+        ranges = window.ranges_since(odom, self._way)
+        rays, ago = window.seen(odom, self._way, _LOOK_BACK)
         recent = rays.rows(ago <= _SEARCH_LOOKS)
-        found = search.places(self._field, self.known.walls, recent, ranges, self._bounds)
-        self._bank = self._with_places(found.poses, ranges, recent)
-        if not len(self._bank):
-            self._reason = verdict.too_little(rays, ranges)
-            return
-        weight = search.range_likelihood(self._bank.poses, ranges)
-        fit, known = np.zeros(len(self._bank)), np.zeros(len(self._bank))
-        if self.known.walls is not None and len(rays.hit):
-            agreement = self.known.walls.agreement(self._bank.poses, rays)
+        found = search.places(self._field, walls, recent, ranges, self._bounds)
+        bank = self._with_places(found.poses, ranges, recent)
+        weight = search.range_likelihood(bank.poses, ranges)
+        fit, known = np.zeros(len(bank)), np.zeros(len(bank))
+        if walls is not None and len(rays.hit):
+            agreement = walls.agreement(bank.poses, rays)
             weight += _SCAN_EVIDENCE * (1.0 + float(ago.max())) * agreement.log_likelihood
             fit, known = agreement.log_likelihood, agreement.known
-        self._bank = hypotheses.weighed(Hypotheses(self._bank.mean, self._bank.covariance, np.zeros(len(weight))), weight)
+        return _Comparison(bank, found.complete, weight, fit, known, rays, ranges)
+
+    def _search(self) -> None:
+        """Look for the robot in the whole map, weight all hypotheses again, and decide."""
+        found = self._compared(self._window)
+        if not len(found.bank):
+            self._bank, self._reason = found.bank, verdict.too_little(found.rays, found.ranges)
+            return
+        level = Hypotheses(found.bank.mean, found.bank.covariance, np.zeros(len(found.bank)))
+        self._bank = hypotheses.weighed(level, found.weight)
         best = int(np.argmax(self._bank.log_weight))
-        if known[best] < verdict.FEW_ENDS and len(ranges):
+        fit, known, ranges = float(found.fit[best]), float(found.known[best]), found.ranges
+        if known < verdict.FEW_ENDS and len(ranges):
             self._bank = hypotheses.placed(self._bank, best, *search.range_moments(self._bank.poses[best], ranges))
         pose = self._bank.poses[best].copy()
         fitting = verdict.agreeing(pose, ranges)
-        self._reason = verdict.doubt(self._bank, best, found.complete, float(fit[best]), float(known[best]), fitting)
+        self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting)
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
-        self._decide(pose, _CONFIRM if fitting.enough and known[best] >= verdict.FEW_ENDS else _CONFIRM_ALONE)
+        self._decide(pose, _CONFIRM if fitting.enough and known >= verdict.FEW_ENDS else _CONFIRM_ALONE)
 
     def _with_places(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
         """Return the hypotheses with new ones where none is near."""

@@ -56,6 +56,8 @@ class Agreement:
 
     log_likelihood: Floats
     """(h,) mean over the rays; 0 = all as the map has it."""
+    fit: Floats
+    """(h,) the same over the rays that the map can judge: not those that end in unknown space."""
     on_wall: Floats
     """(h,) share of the rays' ends, 0..1, that lie on a wall, of those in known space."""
     known: Floats
@@ -166,7 +168,11 @@ class Walls:
         ends = rays.hit & ~unknown
         known = ends.sum(axis=1).astype(np.float64)
         share = (ends & (on_wall > 0.3)).sum(axis=1) / np.maximum(known, 1.0)
-        return Agreement(value.mean(axis=1) if x.shape[1] else np.zeros(len(poses)), share, known)
+        if not x.shape[1]:
+            return Agreement(np.zeros(len(poses)), np.zeros(len(poses)), share, known)
+        judged = ~unknown | ~rays.hit | passed
+        fit = (value * judged).sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
+        return Agreement(value.mean(axis=1), fit, share, known)
 
 
 _ON_WALL = 0.1

@@ -79,10 +79,9 @@ class Window:
     ranges: list[WindowRange] = field(default_factory=list)
     looks: list[WindowLook] = field(default_factory=list)
 
-    def begin(self, stamp: float) -> None:
-        """Forget what was measured up to a time, s."""
-        self.ranges = [r for r in self.ranges if r.stamp > stamp]
-        self.looks = [k for k in self.looks if k.stamp > stamp]
+    def since(self, stamp: float) -> "Window":
+        """Return a window of what was measured after a time, s."""
+        return Window([r for r in self.ranges if r.stamp > stamp], [k for k in self.looks if k.stamp > stamp])
 
     def forget(self, way: float, length: float = LENGTH) -> None:
         """Forget what was measured more than a length ago, m, by the odometer."""
