@@ -52,6 +52,16 @@ def test_headings_from_anywhere_end_in_the_certified_minimum(tmp_path, capsys):
     assert wrong["certificate"] == "none: the robust kernel huber has no relaxation"
 
 
+@pytest.mark.parametrize("seed", [1, 6, 12])
+def test_anchors_that_start_far_away_end_in_the_minimum_from_the_truth(tmp_path, capsys, seed):
+    graph, truth, where = loop(seed, anchors=4)
+    best = optimize(replace(graph, poses=truth, anchors=where))[1].chi2
+    rng = np.random.default_rng(seed)
+    far = replace(graph, anchors=where + rng.normal(scale=100.0, size=where.shape))
+    assert optimize(far)[1].chi2 > 1.01 * best
+    assert figures(capsys, written(tmp_path / "far.pyfg", far))["chi2"] == pytest.approx(best, rel=1e-5)
+
+
 def test_robust_names_the_false_ranges_and_leaves_them_out(tmp_path, capsys):
     graph = loop(3, n=200)[0]
     rng = np.random.default_rng(3)

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from ..errors import ConfigError
     from ..graph.chordal_start import chordal_start
     from ..graph.solver import SolverConfig
-    from ..radio.anchor_starts import place_anchors
+    from ..radio.anchor_starts import place_anchors, search_anchors
     from ..radio.chain_starts import place_chains
     from . import console
     from .formats import graph_format, read_graph, refuse_existing, write_graph
@@ -76,14 +76,16 @@ def run(args: argparse.Namespace) -> int:
         solutions = []
         for start in starts:
             graph, lost = place_anchors(start)
-            solutions.append((*solve(graph), lost))
-        solved, summary, outliers, lost = min(solutions, key=lambda solution: (sum(solution[2].values()), solution[1].chi2))
+            solutions.append((*solve(graph), lost, graph))
+        best = min(solutions, key=lambda solution: (sum(solution[2].values()), solution[1].chi2))
+        solved, summary, outliers, lost, start = best
         known = _certificate(solved, summary, args.robust)
-        again = None if known.is_global or args.robust or args.incremental else chordal_start(solved)
-        if again is not None:
-            other, its_summary, _ = solve(again)
-            if its_summary.chi2 < (1.0 - config.relative_decrease) * summary.chi2:
-                solved, summary, known = other, its_summary, _certificate(other, its_summary, args.robust)
+        others = () if known.is_global or args.robust or args.incremental else (chordal_start(solved), search_anchors(start))
+        for other in others:
+            found = None if other is None else solve(other)
+            if found is not None and found[1].chi2 < (1.0 - config.relative_decrease) * summary.chi2:
+                solved, summary, _ = found
+                known = _certificate(solved, summary, args.robust)
     finally:
         progress.close()
     solved_file = dataclasses.replace(file, graph=solved)

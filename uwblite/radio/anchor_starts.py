@@ -32,6 +32,34 @@ def place_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> tu
     return replace(graph, anchors=anchors, fixed_anchors=fixed, edges=edges), tuple(lost)
 
 
+def search_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> Graph | None:
+    """Return the graph with anchors put where their ranges alone cost less from these poses, None where none does.
+
+    An anchor that starts far away, or on the wrong side of a path, can end in a local minimum and bend the path there; the
+    search of trilateration sees over the hills between.
+    """
+    anchors, fixed = graph.anchors.copy(), graph.fixed_anchors
+    for anchor in range(len(anchors)):
+        if fixed is not None and fixed[anchor]:
+            continue
+        own = replace(graph, edges=tuple(e.rows(e.anchor == anchor) for e in graph.edges if isinstance(e, RangeEdges)))
+        found = trilaterate(*_distances_to(own, anchor), config or TrilaterationConfig())
+        places = [graph.anchors[anchor], *(h.position for h in found)]
+        costs = [_moved(own, anchor, place).chi2() for place in places]
+        anchors[anchor] = places[int(np.argmin([(1.0 - _CLEARLY) * costs[0], *costs[1:]]))]
+    return None if np.array_equal(anchors, graph.anchors) else replace(graph, anchors=anchors)
+
+
+_CLEARLY = 0.02
+"""Share of its cost by which another place of an anchor must be better; on noise alone minima differ by less."""
+
+
+def _moved(graph: Graph, anchor: int, place: Floats) -> Graph:
+    anchors = graph.anchors.copy()
+    anchors[anchor] = place
+    return replace(graph, anchors=anchors)
+
+
 def _distances_to(graph: Graph, anchor: int) -> tuple[Floats, Floats]:
     """Return positions (m, 2) of the tag and ranges (m,) of one anchor, m."""
     positions, ranges = [np.zeros((0, 2))], [np.zeros(0)]
