@@ -10,7 +10,7 @@ from uwblite.radio.anchor_starts import search_anchors
 
 def test_anchors_far_away_are_put_where_their_ranges_cost_less():
     graph, truth, where = loop(0)
-    far = replace(graph, poses=truth, anchors=where + [[60.0, -80.0], [0.0, 0.0], [0.0, 50.0]])
+    far = replace(graph, poses=truth, anchors=where + np.array([[60.0, -80.0], [0.0, 0.0], [0.0, 50.0]]))
     found = search_anchors(far).anchors
     # Ranges of 0.1 m from all around; the second stands where it was.
     np.testing.assert_allclose(found, where, atol=0.2)
