@@ -128,6 +128,16 @@ def test_a_mounting_that_gravity_contradicts_is_named(tmp_path):
     assert any("imu_link is tilted otherwise" in warning for warning in log.notes.warnings)
 
 
+def test_messages_that_no_gyro_sends_are_left_out_and_counted(tmp_path):
+    rows = [message for k in range(len(STAMPS)) for message in (wheels(k), imu(k, UPRIGHT))]
+    for at, value in ((101, np.nan), (201, 1e300), (301, 1.7e308)):
+        rows[at][3]["angular_velocity"] = xyz([0.0, 0.0, value])
+    bags.write_bag_of(tmp_path / "bag", rows, {}, 2)
+    log = read_bag(tmp_path / "bag")
+    assert worst(log)[0] < 0.02
+    assert any("3 messages of the IMU" in warning for warning in log.notes.warnings)
+
+
 def test_messages_that_tell_nothing_are_not_used(tmp_path):
     log = read_bag(bag(tmp_path / "bag", leave_out=("angular_velocity", "orientation")))
     assert log.gyro is None

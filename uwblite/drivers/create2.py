@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from .clock import ClockMap
 from .events import Action, Corrupt, Lost, Note, OdometryPose, Pose, Send
-from .framing import PacketReader, to_next
+from .framing import FixedPackets
 from .odometer import WheelOdometer
 from .session import Driver, Identity, Script, Wait
 
@@ -34,7 +34,6 @@ MAX_BLIND = MODULUS / 2 * TICK / MAX_SPEED
 """s after which an encoder may have turned by half its range unseen."""
 HEAD, PACKETS = 0x13, bytes((7, 43, 44, 22))
 LAYOUT = struct.Struct(">BB BB BH BH BH B".replace(" ", ""))
-LENGTH = LAYOUT.size - 3
 START, STREAM, PAUSE, RESUME = b"\x80", bytes((0x94, len(PACKETS))) + PACKETS, b"\x96\x00", b"\x96\x01"
 SILENCE = 1.0
 """s without a frame after which the stream is asked for again."""
@@ -61,22 +60,14 @@ class Encoders:
     """V."""
 
 
-class Create2Protocol(PacketReader):
+class Create2Protocol(FixedPackets):
     """Bytes of the robot in, Encoders and Corrupt out."""
 
-    smallest = LAYOUT.size
+    head, size = bytes((HEAD, LAYOUT.size - 3, PACKETS[0])), LAYOUT.size
 
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        if buffer[at] != HEAD:
-            return to_next(buffer, at, HEAD)
-        frame = buffer[at : at + LAYOUT.size]
-        marks = {0: HEAD, 1: LENGTH, 2: PACKETS[0], 4: PACKETS[1], 7: PACKETS[2], 10: PACKETS[3]}
-        if any(frame[place] != byte for place, byte in marks.items() if place < len(frame)):
-            return -1
-        if len(frame) < LAYOUT.size:
-            return 0
-        return LAYOUT.size if sum(frame) & 0xFF == 0 else -1
+    def is_good(self, packet: bytearray) -> bool:
+        """Return whether the sum is right, and the packets are those that were asked for."""
+        return sum(packet) & 0xFF == 0 and bytes(packet[place] for place in (2, 4, 7, 10)) == PACKETS
 
     def decode(self, frame: bytes, stamp: float) -> Encoders:
         """Decode a frame."""

@@ -195,6 +195,34 @@ class PacketReader(FrameReader):
         return size
 
 
+class FixedPackets(PacketReader):
+    """Packets of one size behind one head; a protocol derives from this and defines `is_good` and `decode`."""
+
+    head = b"\x00"
+    """First bytes of every packet."""
+    size = 1
+    """Bytes of a packet."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.smallest = self.size
+
+    def is_good(self, packet: bytearray) -> bool:
+        """Return whether a whole packet with the right head has a right check, and holds what the device can send."""
+        raise NotImplementedError
+
+    def size_at(self, buffer: bytearray, at: int) -> int:
+        """Return the size of the good packet at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
+        if buffer[at] != self.head[0]:
+            return to_next(buffer, at, self.head[0])
+        packet = buffer[at : at + self.size]
+        if packet[: len(self.head)] != self.head[: len(packet)]:
+            return -1
+        if len(packet) < self.size:
+            return 0
+        return self.size if self.is_good(packet) else -1
+
+
 def to_next(buffer: bytearray, at: int, *firsts: int) -> int:
     """Return -n, the distance from `at` to the next byte after it that can begin a frame, for `size_at`."""
     found = [place for first in firsts if (place := buffer.find(first, at + 1)) >= 0]

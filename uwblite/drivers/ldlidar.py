@@ -13,12 +13,11 @@ import math
 import struct
 
 from .clock import DeviceClock
-from .framing import PacketReader, to_next
+from .framing import FixedPackets
 from .spinning import SpinningDriver
 from .sweep import Fan, Samples
 
 BAUD = 230400
-HEAD = b"\x54\x2c"
 SIZE, READINGS = 47, 12
 CLOCK_MODULUS, CLOCK_TICK = 30000, 1e-3
 RATE = 4500.0
@@ -48,21 +47,14 @@ def crc8(data: bytes | bytearray) -> int:
     return crc
 
 
-class LdLidarProtocol(PacketReader):
+class LdLidarProtocol(FixedPackets):
     """Bytes of the lidar in, Samples and Corrupt out."""
 
-    smallest = SIZE
+    head, size = b"\x54\x2c", SIZE
 
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the packet at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        if buffer[at] != HEAD[0]:
-            return to_next(buffer, at, HEAD[0])
-        packet = buffer[at : at + SIZE]
-        if packet[:2] != HEAD[: len(packet)]:
-            return -1
-        if len(packet) < SIZE:
-            return 0
-        return SIZE if crc8(packet[:-1]) == packet[-1] and _is_sound(packet) else -1
+    def is_good(self, packet: bytearray) -> bool:
+        """Return whether the CRC is right, and the angles are angles."""
+        return crc8(packet[:-1]) == packet[-1] and _is_sound(packet)
 
     def decode(self, frame: bytes, stamp: float) -> Samples:
         """Decode a packet."""

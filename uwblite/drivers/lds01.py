@@ -14,15 +14,14 @@ import math
 import struct
 
 from .events import Action, Corrupt, Send, corrupt
-from .framing import PacketReader, to_next
+from .framing import FixedPackets
 from .session import Script
 from .spinning import SpinningDriver
 from .sweep import Fan, Samples
 
 BAUD = 230400
 START, STOP = b"b", b"e"
-HEAD, FIRST, PACKETS = 0xFA, 0xA0, 60
-SIZE, READINGS = 42, 6
+FIRST, PACKETS, READINGS = 0xA0, 60, 6
 DEGREE = 1.0 / 360.0
 """Turns."""
 FAN = Fan(360, 0.12, 3.5)
@@ -30,24 +29,18 @@ TRUST = 2 * PACKETS
 """Packets with equal last bytes and another sum than the known ones, after which equality is enough: two turns."""
 
 
-class Lds01Protocol(PacketReader):
+class Lds01Protocol(FixedPackets):
     """Bytes of the lidar in, Samples and Corrupt out."""
 
-    smallest = SIZE
+    head, size = b"\xfa", 42
 
     def __init__(self) -> None:
         super().__init__()
         self._other_sums = 0
 
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the packet at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        if buffer[at] != HEAD:
-            return to_next(buffer, at, HEAD)
-        if at + 1 < len(buffer) and not FIRST <= buffer[at + 1] < FIRST + PACKETS:
-            return -1
-        if at + SIZE > len(buffer):
-            return 0
-        return SIZE if buffer[at + SIZE - 1] == buffer[at + SIZE - 2] else -1
+    def is_good(self, packet: bytearray) -> bool:
+        """Return whether it is one of a turn's packets, and ends in two equal bytes."""
+        return FIRST <= packet[1] < FIRST + PACKETS and packet[-1] == packet[-2]
 
     def decode(self, frame: bytes, stamp: float) -> Samples | Corrupt:
         """Decode a packet."""

@@ -15,12 +15,11 @@ from typing import Any
 
 from .clock import DeviceClock
 from .events import Action, Lost, Note, RangeEpoch, RangeReading
-from .framing import PacketReader, to_next
+from .framing import FixedPackets, PacketReader, to_next
 from .session import Driver
 
 ANCHORS = 8
-LINKTRACK_BAUD, LINKTRACK_SIZE = 921600, 128
-LINKTRACK_HEAD = b"\x55\x01"
+LINKTRACK_BAUD = 921600
 BU03_BAUD, BU03_SIZE, BU03_SHORT, BU03_HEAD, BU03_END = 115200, 37, 35, b"\xaa\x25\x01", 0x55
 MUCH = 50
 """Frames in a row without a range after which it is reported."""
@@ -37,21 +36,14 @@ class TagFrame:
     readings: tuple[RangeReading, ...]
 
 
-class LinkTrackProtocol(PacketReader):
+class LinkTrackProtocol(FixedPackets):
     """Bytes of the tag in, TagFrame and Corrupt out."""
 
-    noise, smallest = "no tag frame", LINKTRACK_SIZE
+    noise, head, size = "no tag frame", b"\x55\x01", 128
 
-    def size_at(self, buffer: bytearray, at: int) -> int:
-        """Return the size of the frame at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        if buffer[at] != LINKTRACK_HEAD[0]:
-            return to_next(buffer, at, LINKTRACK_HEAD[0])
-        frame = buffer[at : at + LINKTRACK_SIZE]
-        if frame[:2] != LINKTRACK_HEAD[: len(frame)]:
-            return -1
-        if len(frame) < LINKTRACK_SIZE:
-            return 0
-        return LINKTRACK_SIZE if sum(frame[:-1]) & 0xFF == frame[-1] else -1
+    def is_good(self, packet: bytearray) -> bool:
+        """Return whether the sum is right."""
+        return sum(packet[:-1]) & 0xFF == packet[-1]
 
     def decode(self, frame: bytes, stamp: float) -> TagFrame:
         """Decode a frame."""

@@ -14,9 +14,11 @@ from ..sensor_log import Gyro
 from .bag_frames import Frames, rotation
 
 GRAVITY, SLACK = (9.81, 1.0), 0.2
-"""Mean acceleration of a resting or driving robot, m/s^2 or in units of it, and the share by which it may differ."""
+"""Usual acceleration of a resting or driving robot, m/s^2 or in units of it, and the share by which it may differ."""
 TILT = np.radians(20.0)
 """rad between the measured vertical and that of the transforms from which on one of them is wrong."""
+MOST_RATE = 2500.0
+"""rad/s; the full scale of gyros is 2,000 degrees/s, and some drivers send degrees."""
 _FIELDS = ("angular_velocity", "linear_acceleration", "orientation")
 
 
@@ -36,6 +38,7 @@ class ImuReadings:
             axes = ("x", "y", "z", "w") if name == "orientation" else ("x", "y", "z")
             self._rows.extend(np.nan if absent else getattr(value, axis) for axis in axes)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def gyro(self, frames: Frames, base: str, warnings: list[str]) -> Gyro | None:
         """Return the heading; None, and a warning, where the messages tell none.
 
@@ -51,30 +54,33 @@ class ImuReadings:
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         stamps, rates, turns = rows[:, 0], rows[:, 1:4], rows[:, 7:11]
         turned = np.abs(rates).sum(axis=1)
-        if (usable := _finite(rates) & np.isfinite(stamps)).any() and turned[usable].any():
+        if (usable := turned < MOST_RATE).any() and turned[usable].any():
+            if missing := len(usable) - np.count_nonzero(usable):
+                warnings.append(f"{missing} messages of the IMU hold no angular velocity that a robot has; they are left out")
             rate = rates[usable] @ self._vertical(rows[:, 4:7], frames, base, warnings)
             steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(stamps[usable])
             return Gyro(stamps[usable], np.concatenate([[0.0], np.cumsum(steps)]))
-        if (usable := _finite(turns) & np.isfinite(stamps) & (np.abs(turns).sum(axis=1) > 0.5)).any():
+        if (usable := np.abs(np.linalg.norm(turns, axis=1) - 1.0) < 0.1).any():
             return Gyro(stamps[usable], _headings(turns[usable]))
         warnings.append("the messages of the IMU hold neither angular velocities nor orientations; they are not used")
         return None
 
     def _vertical(self, acceleration: Floats, frames: Frames, base: str, warnings: list[str]) -> Floats:
         """Return which way is up, (3,) in the sensor's frame, length 1."""
-        mean = np.mean(acceleration[_finite(acceleration)], axis=0) if _finite(acceleration).any() else np.zeros(3)
-        size = float(np.linalg.norm(mean))
-        felt = any(abs(size / one - 1.0) < SLACK for one in GRAVITY)
+        felt = acceleration[_finite(acceleration)]
+        usual = np.median(felt, axis=0) if len(felt) else np.zeros(3)
+        size = float(np.linalg.norm(usual))
+        heavy = any(abs(size / one - 1.0) < SLACK for one in GRAVITY)
         pose = frames.pose(base, self.frame)
-        if pose is None and not felt:
+        if pose is None and not heavy:
             warnings.append(
                 f"no transform from {base} to {self.frame or 'the IMU'}, and its accelerations show no gravity: its z axis is"
                 " taken to point up; --imu-topic none maps without it"
             )
         stated = np.array([0.0, 0.0, 1.0]) if pose is None else pose[2, :3]
-        if not felt:
+        if not heavy:
             return stated
-        up = mean / size
+        up = usual / size
         if pose is None:
             return up
         up = up if up @ stated >= 0.0 else -up  # some drivers send the acceleration of gravity, which points down
