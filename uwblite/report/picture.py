@@ -89,12 +89,7 @@ def draw_map(
         ends = np.concatenate([pixel(closures[:, :2]), pixel(closures[:, 2:])], axis=1)
         canvas.lines(ends, 1.3, ACCEPTED, 0.75)
     for number, track in enumerate(map(pixel, tracks)):
-        colour = PATHS[number % len(PATHS)]
-        canvas.polyline(track, 2.2, colour, 0.85)
-        canvas.discs(track[:1], 7.0, FLOOR)
-        canvas.discs(track[:1], 5.5, START)
-        canvas.discs(track[-1:], 7.0, colour)
-        canvas.discs(track[-1:], 4.0, FLOOR)
+        _draw_track(canvas, track, PATHS[number % len(PATHS)])
     for anchor in placed:
         _draw_anchor(canvas, anchor, pixel)
     draw_foot(image, height, scale, caption, keys)
@@ -193,6 +188,15 @@ def _span_of(inside: Bools) -> slice:
     """Return the slice of the elements that are true; they lie side by side."""
     places = np.flatnonzero(inside)
     return slice(places[0], places[-1] + 1) if len(places) else slice(0, 0)
+
+
+def _draw_track(canvas: Canvas, track: Floats, colour: Colour) -> None:
+    """Draw a path (n, 2), pixels, with a disc at its start and a ring at its end."""
+    canvas.polyline(track, 2.2, colour, 0.85)
+    canvas.discs(track[:1], 7.0, FLOOR)
+    canvas.discs(track[:1], 5.5, START)
+    canvas.discs(track[-1:], 7.0, colour)
+    canvas.discs(track[-1:], 4.0, FLOOR)
 
 
 def _draw_anchor(canvas: Canvas, anchor: PictureAnchor, pixel: Callable[[Floats], Floats]) -> None:

@@ -31,9 +31,10 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS
 
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+    def __init__(self, address: tuple[str, int], page: Page) -> None:
+        self.page, self.lock = page, threading.Lock()
         self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        super().__init__(address, handler)
+        super().__init__(address, _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False):
@@ -54,6 +55,56 @@ class _Server(ThreadingHTTPServer):
         """Say nothing: a client that leaves is no error of ours."""
 
 
+class _Handler(BaseHTTPRequestHandler):
+    """Answers requests by the server's page, one at a time."""
+
+    server: _Server
+    protocol_version = "HTTP/1.1"
+    timeout = _PATIENCE
+
+    def do_GET(self) -> None:
+        self._answer(b"")
+
+    def do_POST(self) -> None:
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit()) or len(length) > 9 or int(length) > MOST_BYTES:
+            self.close_connection = True
+            self._send(Response(413, "text/plain", b"too long"))
+            return
+        self._answer(self.rfile.read(int(length)))
+
+    do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
+
+    def _answer(self, body: bytes) -> None:
+        headers = {name.lower(): value for name, value in self.headers.items()}
+        with self.server.lock:
+            response = self.server.page.handle(self.command, self.path, headers, body)
+        self._send(response)
+
+    def _send(self, response: Response) -> None:
+        self.send_response(response.status)
+        self.send_header("Content-Type", response.kind)
+        if response.stream is None:
+            self.send_header("Content-Length", str(len(response.body)))
+        else:
+            self.send_header("Connection", "close")
+            self.close_connection = True
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Referrer-Policy", "no-referrer")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.send_header("Content-Security-Policy", _REPORT if response.framed else _PAGE)
+        self.end_headers()
+        if self.command == "HEAD":
+            return
+        self.wfile.write(response.body)
+        for piece in response.stream() if response.stream is not None else ():
+            self.wfile.write(piece)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing: the page itself shows what went wrong."""
+
+
 def server_for(
     page: Page, port: int = 0, host: str = LOOPBACK, names: tuple[str, ...] = ()
 ) -> ThreadingHTTPServer:  # fmt: skip
@@ -70,55 +121,7 @@ def server_for(
     ------
     OSError : the port is taken, or the address is none of this computer's.
     """
-    lock = threading.Lock()
-
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-        timeout = _PATIENCE
-
-        def do_GET(self) -> None:
-            self._answer(b"")
-
-        def do_POST(self) -> None:
-            length = self.headers.get("Content-Length", "")
-            if not (length.isascii() and length.isdigit()) or len(length) > 9 or int(length) > MOST_BYTES:
-                self.close_connection = True
-                self._send(Response(413, "text/plain", b"too long"))
-                return
-            self._answer(self.rfile.read(int(length)))
-
-        do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
-
-        def _answer(self, body: bytes) -> None:
-            headers = {name.lower(): value for name, value in self.headers.items()}
-            with lock:
-                response = page.handle(self.command, self.path, headers, body)
-            self._send(response)
-
-        def _send(self, response: Response) -> None:
-            self.send_response(response.status)
-            self.send_header("Content-Type", response.kind)
-            if response.stream is None:
-                self.send_header("Content-Length", str(len(response.body)))
-            else:
-                self.send_header("Connection", "close")
-                self.close_connection = True
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("X-Content-Type-Options", "nosniff")
-            self.send_header("Referrer-Policy", "no-referrer")
-            self.send_header("Cross-Origin-Resource-Policy", "same-origin")
-            self.send_header("Content-Security-Policy", _REPORT if response.framed else _PAGE)
-            self.end_headers()
-            if self.command == "HEAD":
-                return
-            self.wfile.write(response.body)
-            for piece in response.stream() if response.stream is not None else ():
-                self.wfile.write(piece)
-
-        def log_message(self, format: str, *args: Any) -> None:
-            """Say nothing: the page itself shows what went wrong."""
-
-    server = _Server((host, port), Handler)
+    server = _Server((host, port), page)
     page.names = None if host in (LOOPBACK, "localhost") else names
     page.host = f"{host}:{server.server_address[1]}"
     return server
