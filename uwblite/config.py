@@ -33,14 +33,13 @@ def setting(
     above: float | None = None,
     minimum: float | None = None,
     maximum: float | None = None,
-    below: float | None = None,
     advanced: bool = False,
 ) -> Any:
-    """Return a dataclass field with a default and a permitted range: above < value < below, minimum <= value <= maximum.
+    """Return a dataclass field with a default and a permitted range: above < value, minimum <= value <= maximum.
 
     An advanced setting is for experiments and presets; lists for users leave it out where it has its default.
     """
-    limits = {"above": above, "minimum": minimum, "maximum": maximum, "below": below}
+    limits = {"above": above, "minimum": minimum, "maximum": maximum}
     limits = {k: v for k, v in limits.items() if v is not None}
     return dataclasses.field(default=default, metadata={_ADVANCED: advanced, **({_RANGE: limits} if limits else {})})
 
@@ -215,7 +214,6 @@ def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]
             v > limits.get("above", -math.inf) or "above" not in limits,
             v >= limits.get("minimum", -math.inf),
             v <= limits.get("maximum", math.inf),
-            v < limits.get("below", math.inf) or "below" not in limits,
         )
         if not all(inside):
             raise ConfigError(f"{'.'.join(where)} = {_shown(v)} is out of range; it must be {range_text(limits)}")
@@ -224,7 +222,7 @@ def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]
 
 def range_text(limits: Mapping[str, float]) -> str:
     """Return a permitted range in words, such as '> 0 and <= 1'."""
-    signs = {"above": ">", "minimum": ">=", "maximum": "<=", "below": "<"}
+    signs = {"above": ">", "minimum": ">=", "maximum": "<="}
     return " and ".join(f"{signs[k]} {v:g}" for k, v in limits.items())
 
 

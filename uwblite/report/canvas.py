@@ -52,10 +52,10 @@ class Canvas:
             points = points if len(points) > 1 else np.repeat(points, 2, axis=0)
             self.lines(np.concatenate([points[:-1], points[1:]], axis=1), width, colour, opacity)
 
-    def discs(self, centres: Floats, radius: float, colour: Colour, opacity: float = 1.0) -> None:
+    def discs(self, centres: Floats, radius: float, colour: Colour) -> None:
         """Draw filled discs around centres (n, 2)."""
         centres = centres[np.isfinite(centres).all(axis=1)]
-        self._dab(centres[:, 0], centres[:, 1], radius, colour, opacity)
+        self._dab(centres[:, 0], centres[:, 1], radius, colour, 1.0)
 
     def polygon(self, points: Floats, colour: Colour, opacity: float = 1.0) -> None:
         """Fill a convex polygon (n, 2), corners in either order."""

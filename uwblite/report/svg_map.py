@@ -29,9 +29,9 @@ def thin(n: int, most: int) -> Ints:
     return np.unique(np.append(np.arange(0, n, max(1, -(-n // most))), n - 1)) if n else np.zeros(0, dtype=np.int64)
 
 
-def _coordinates(points: Floats, digits: int = 3) -> str:
+def _coordinates(points: Floats) -> str:
     """Return points (n, 2) as SVG coordinates, y upwards turned into y downwards."""
-    return " ".join(f"{x:.{digits}f},{-y:.{digits}f}" for x, y in points.tolist())
+    return " ".join(f"{x:.3f},{-y:.3f}" for x, y in points.tolist())
 
 
 def _extent(result: MapResult) -> tuple[float, float, float, float]:
