@@ -63,3 +63,6 @@ def test_a_scale_that_single_turns_made_is_replaced_and_a_map_with_it_doubted(us
     assert [n.kind for n in stages.warnings] == ["turn-scale"]
     assert [n.kind for n in stages.doubts] == ["turn-scale"]
     assert stages.doubts[0].figures["by_all"] == used
+    figures = stages.warnings[0].figures
+    assert (figures["name"], figures["by_steps"]) == ("heading_scale", value)
+    assert 0.0 < figures["sigma"] < 0.02

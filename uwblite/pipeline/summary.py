@@ -38,7 +38,10 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
     anchors = _with_times(anchors, ranges)
     listed = {u.key: u for recording in recordings.each for u in _unknowns(recording, task.config.calibration)}
-    calibrated = tuple(_calibration(k, listed[key], graph, covariance) for k, key in enumerate(graph.calibration.keys))
+    by_steps = {n.figures["name"]: n.figures["sigma"] for n in stages.warnings if n.kind == "turn-scale"}
+    calibrated = tuple(
+        _calibration(k, listed[key], graph, covariance, by_steps.get(key.label)) for k, key in enumerate(graph.calibration.keys)
+    )
     table = {} if ranges is None else {
         "stamp": ranges.stamps, "anchor": ranges.anchor.astype(np.float64), "range": ranges.ranges,
         "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
@@ -130,8 +133,13 @@ def _count(name: str, recordings: Recordings) -> int:
     return sum(int(np.sum(ranges.anchor == k)) for ranges, k in measured if ranges is not None)
 
 
-def _calibration(k: int, unknown: Unknown, graph: Graph, covariance: Marginals) -> CalibrationEstimate:
+def _calibration(
+    k: int, unknown: Unknown, graph: Graph, covariance: Marginals, by_steps: float | None
+) -> CalibrationEstimate:
+    """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (turn_checks)."""
     value, fixed = float(graph.calibration.values[k]), graph.fixed_calibration
+    if by_steps is not None:
+        return CalibrationEstimate(unknown.key, value, by_steps, unknown.unit, unknown.meaning, "estimated")
     if fixed is not None and fixed[k]:
         why = "this recording has no measurement of it" if value == 0.0 else "fixed"
         return CalibrationEstimate(unknown.key, value, unknown.sigma, unknown.unit, unknown.meaning, "prior", why)

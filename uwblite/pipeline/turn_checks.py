@@ -27,7 +27,7 @@ def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
                 "turn-scale",
                 f"from step to step the lidar turns {_shown(found)} times as much as the odometry, but the whole fits best "
                 f"with {1.0 + used:.2f}: single turns of the odometry are wrong; the steps' scale is used",
-                by_steps=found.value, sigma=found.sigma, by_all=used,
+                name=graph.calibration.keys[index].label, by_steps=found.value, sigma=found.sigma, by_all=used,
             )  # fmt: skip
             values[index], fixed[index] = found.value, True
     return replace(estimate, graph=replace(graph.updated(graph.poses, graph.anchors, values), fixed_calibration=fixed))
