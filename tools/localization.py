@@ -9,8 +9,9 @@
 A map is made of one simulated recording, a second recording of another drive by another robot, from another day, is played
 against it, in rooms with the errors of real ones (simulation/real_rooms.py): patches of floor and bumps, a radio whose errors
 stay with places and directions, glass, people who walk about, an operator who stops.
-Starts: so many moments of the second recording, nothing known; a start that is found more than 0.5 m or 0.3 rad
-off the truth is a wrong one. Errors are in the map's frame as it lies over the building: the map's own errors are in them.
+Starts: so many moments of the second recording at which the robot is within the map, nothing known; a start that is found more
+than 0.5 m or 0.3 rad off the truth is a wrong one. Errors are in the map's frame as it lies over the building: the map's own
+errors are in them.
 """
 
 import argparse
@@ -27,6 +28,7 @@ from scipy.stats import chi2
 from trials import ROOT, Trial, table, write_section
 
 from uwblite import se2
+from uwblite.grid.occupancy_grid import FREE
 from uwblite.localization import Localizer, LocalizerState, Scanner
 from uwblite.localization.known_map import KnownMap
 
@@ -83,6 +85,11 @@ class Bench:
         poses = se2.interpolate_trajectory(self.trial.stamps, self.trial.poses, stamps)
         return se2.compose(se2.inverse(self.T_truth_map), poses)
 
+    def mapped(self, stamps: np.ndarray) -> np.ndarray:
+        """Return at which times (n,) the robot is where the map has free space."""
+        walls, (x, y) = self.known.walls, self.truth(stamps)[:, :2].T
+        return np.ones(len(stamps), bool) if walls is None else walls.state_at(x, y) == FREE
+
     def errors(self, states: list[LocalizerState]) -> np.ndarray:
         """Return the errors (n, 2) of states, m and rad."""
         off = se2.between(self.truth(np.array([s.stamp for s in states])), np.array([s.pose for s in states]))
@@ -137,7 +144,7 @@ class Track:
     worst: float
     """m."""
     lost: float
-    """Share of the time after the start in which it was lost."""
+    """Share of the time after the start in which it was lost; as all of this, where the robot is within the map."""
     per_scan: float
     """ms of processor time, with the ranges and the odometry between the scans."""
     slowest: float
@@ -159,6 +166,7 @@ def track(on: Bench, seconds: float, uwb: bool = True, lidar: bool = True) -> Tr
         scans += kind == 2
         if kind == 0:
             states.append(state)
+    states = [s for s, inside in zip(states, on.mapped(np.array([s.stamp for s in states])), strict=True) if inside]
     lost = np.array([s.lost for s in states])
     per_scan, slowest = 1e3 * sum(spent) / scans if scans else np.nan, 1e3 * max(spent)
     if lost.all():
@@ -224,7 +232,9 @@ KINDS = {"all sensors": (True, True), "without lidar": (True, False), "without U
 def start_row(on: Bench, name: str, count: int) -> list[object]:
     """Return the row of many starts."""
     begin, end = on.trial.log.odometry.stamps[[0, -1]].tolist()
-    moments = np.linspace(begin + 3.0, end - 75.0, count)
+    moments = np.linspace(begin + 3.0, end - 75.0, 20 * count)
+    moments = moments[on.mapped(moments)]
+    moments = moments[np.linspace(0, len(moments) - 1, count).astype(int)]
     found = [start(on, float(t), *KINDS[name]) for t in moments]
     ways = np.array([s.way for s in found])
     within = np.isfinite(ways)

@@ -50,6 +50,10 @@ SPEED, TURN, LOOK = 0.25, 0.8, 0.35
 """m/s, rad/s, m of pure pursuit."""
 MOST_SECONDS, MOST_LOST = 240.0, 60.0
 """s for a goal, and of being lost before it is given up."""
+IN_VAIN = 3
+"""Searches in vain after which a robot is left where it is: the goals that remain count as not reached."""
+ROOMY = 1.0
+"""m from obstacles and unknown space where a robot begins."""
 NEAREST, FARTHEST = 2.0, 12.0
 """m between one goal and the next."""
 
@@ -233,11 +237,18 @@ def driven(ground: Ground, place: Place, goals: int, dead_reckoning: bool, seed:
     assert ground.result.grid is not None
     planner = make_planner(ground.result.grid, RADIUS + MARGIN)
     rng = np.random.default_rng(seed)
-    start = np.asarray(PLANS[place.world]().start)
-    robot = Robot(place, seed, start + np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)]))
+    places = _free_places(planner)
+    origin = se2.transform(se2.inverse(ground.T_truth_map), np.asarray(PLANS[place.world]().start)[:2])
+    roomy = places[planner.clearance.at(places)[0] >= ROOMY**2]
+    here = roomy[np.argmin(np.hypot(*(roomy - origin).T))]
+    start = np.array([*se2.transform(ground.T_truth_map, here), rng.uniform(-3.0, 3.0)])
+    robot = Robot(place, seed, start)
     driver, tally = Driver(robot, planner, ground.T_truth_map, None if dead_reckoning else ground.known), Tally()
-    for goal in _goals(ground, planner, start[:2], rng, goals):
+    for goal in _goals(places, here, rng, goals):
         before = tally.touched
+        if tally.lost - tally.recovered == IN_VAIN:
+            tally.goals += 1
+            continue
         driver.go(goal, tally)
         if tally.touched > before:
             # Somebody puts it back to where it may stand, which it is not told.
@@ -245,14 +256,8 @@ def driven(ground: Ground, place: Place, goals: int, dead_reckoning: bool, seed:
     return tally
 
 
-def _goals(
-    ground: Ground, planner: Planner, start: np.ndarray, rng: np.random.Generator, count: int
-) -> Iterator[np.ndarray]:
-    """Yield goals (2,) in the map that can be reached, each NEAREST to FARTHEST m from the one before."""
-    rows, cols = np.divmod(planner.nodes, planner.clearance.geometry.cols)
-    places = planner.clearance.geometry.centre_of(rows, cols)
-    here = se2.transform(se2.inverse(ground.T_truth_map), start)
-    places = places[_reachable(planner, here)]
+def _goals(places: np.ndarray, here: np.ndarray, rng: np.random.Generator, count: int) -> Iterator[np.ndarray]:
+    """Yield goals (2,) among places (n, 2), each NEAREST to FARTHEST m from the one before."""
     for _ in range(count):
         away = np.hypot(*(places - here).T)
         some = np.flatnonzero((away >= NEAREST) & (away <= FARTHEST))
@@ -260,15 +265,14 @@ def _goals(
         yield here
 
 
-def _reachable(planner: Planner, here: np.ndarray) -> np.ndarray:
-    """Return the nodes that can be reached from a place."""
+def _free_places(planner: Planner) -> np.ndarray:
+    """Return the places (n, 2), m, map frame, of the largest part of the map in which the robot can drive about."""
     from scipy.sparse.csgraph import connected_components
 
     _, label = connected_components(planner.graph, directed=False)
     g = planner.clearance.geometry
     rows, cols = np.divmod(planner.nodes, g.cols)
-    near = int(np.argmin(np.hypot(*(g.centre_of(rows, cols) - here).T)))
-    return np.flatnonzero(label == label[near])
+    return g.centre_of(rows, cols)[label == np.bincount(label).argmax()]
 
 
 VARIANTS = (

@@ -118,8 +118,8 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0) -> Hypotheses:
     way = float(np.hypot(*d))
     mean = bank.mean.copy()
     s, g, m = bank.mean[:, WHEELS].T
-    shift = se2.rotate(mean[:, 2] + 0.5 * (g * turn + m * way), np.outer(1.0 + s, d))
-    along = se2.rotate(mean[:, 2], np.broadcast_to(d, shift.shape))
+    along = se2.rotate(mean[:, 2] + 0.5 * (g * turn + m * way), np.broadcast_to(d, (len(mean), 2)))
+    shift = (1.0 + s)[:, None] * along
     n = mean.shape[1]
     f = np.broadcast_to(np.eye(n), (len(mean), n, n)).copy()
     across = np.stack([-shift[:, 1], shift[:, 0]], axis=1)

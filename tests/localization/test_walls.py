@@ -1,0 +1,50 @@
+"""Scans against walls: the factors by numeric derivatives, and what unknown space counts for."""
+
+import dataclasses
+
+import numpy as np
+from helpers.localization_room import ODD, cast, grid_of
+
+from uwblite import se2
+from uwblite.localization.walls import Rays, walls_of
+
+POSE = np.array([3.0, 2.5, 0.6])
+
+
+def rays_from(pose):
+    readings = cast(pose)
+    angles = np.linspace(-np.pi / 2, np.pi / 2, len(readings))
+    ends = np.minimum(readings, 8.0)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return Rays(ends, np.zeros_like(ends), np.isfinite(readings))
+
+
+def test_factors_are_the_numeric_gradient_of_the_kernel_s_cost():
+    walls, rays = walls_of(grid_of(ODD)), rays_from(POSE)
+    start, scale, gate = POSE + np.array([0.03, -0.04, 0.01]), 0.1, 0.4
+    x, y = se2.transform(start, rays.ends[rays.hit]).T
+    near = walls.nearest_at(x, y)
+    normals, points = walls.normals[near], walls.points[near]
+    facing = (normals * (start[:2] - np.column_stack([x, y]))).sum(axis=1) > 0
+    good = (near >= 0) & (np.hypot(*(np.column_stack([x, y]) - points).T) <= gate) & (np.hypot(*normals.T) > 0.7)
+    good &= facing | ~walls.one_sided[near]
+
+    def cost(pose):
+        off = se2.transform(pose, rays.ends[rays.hit]) - points
+        r = (normals * off).sum(axis=1)[good]
+        return 0.5 * np.sum(r**2 / (1.0 + np.square(r / scale)))
+
+    gradient = [(cost(start + s) - cost(start - s)) / 2e-6 for s in np.eye(3) * 1e-6]
+    hessian, found, weight = walls.factors(start[None], rays, gate, scale)
+    np.testing.assert_allclose(found[0], gradient, rtol=1e-4, atol=1e-6)
+    assert np.linalg.eigvalsh(hessian[0]).min() > 0
+    assert 0 < weight[0] <= good.sum()
+
+
+def test_ends_in_unknown_space_count_for_nothing_in_the_fit():
+    grid, rays = grid_of(ODD), rays_from(POSE)
+    right = grid.geometry.centre_of(*np.indices(grid.log_odds.shape))[..., 0] > 4.0
+    cut = dataclasses.replace(grid, log_odds=np.where(right, 0.0, grid.log_odds).astype(np.float32))
+    whole, half = (walls_of(g).agreement(POSE[None], rays) for g in (grid, cut))
+    assert half.known[0] < whole.known[0]
+    assert half.log_likelihood[0] < whole.log_likelihood[0] - 0.2
+    np.testing.assert_allclose(half.fit, whole.fit, atol=0.1)
