@@ -193,7 +193,7 @@ def outcomes(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
 
 def checked(log: SensorLog) -> bool:
     """Return whether `uwblite check` finds anything serious."""
-    return bool(examined(log).serious)
+    return bool(examined(log)[0].serious)
 
 
 def clean_cases(worlds: Sequence[str], minutes: float, seed: int) -> dict[str, Case]:

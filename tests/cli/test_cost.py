@@ -1,11 +1,12 @@
 """The estimate of time and memory: positive, growing with everything it depends on, scaled by the work itself."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from uwblite.cli import cost
+from uwblite.cli import check, cost
 from uwblite.sensor_log import Odometry, SensorLog
 
 
@@ -59,10 +60,27 @@ def test_the_estimate_is_that_of_a_computer_whose_time_grows_with_the_work(log, 
 
     monkeypatch.setattr("uwblite.mapping.build_map", build_map)
     monkeypatch.setattr(cost.time, "perf_counter", lambda: clock[0])
-    expected = cost._SECONDS_AT_LEAST + 0.1 + slow * cost.work_seconds(log)
+    expected = cost.SECONDS_AT_LEAST + 0.1 + slow * cost.work_seconds(log)
     assert cost.expected_seconds(log) == pytest.approx(expected, rel=1e-6)
 
 
 def test_what_cannot_be_mapped_costs_as_the_model_reports():
     still = SensorLog(Odometry(np.array([0.0]), np.zeros((1, 3))))
-    assert cost.expected_seconds(still) == pytest.approx(cost._SECONDS_AT_LEAST)
+    assert cost.expected_seconds(still) == pytest.approx(cost.SECONDS_AT_LEAST)
+
+
+@pytest.mark.parametrize("slow", [0.2, 30.0])
+def test_check_expects_what_its_own_trial_map_took(log, monkeypatch, slow):
+    """The work itself, the whole of it: no part that happens to be easy is taken for the rest."""
+    clock = [0.0]
+
+    def build_map(part):
+        clock[0] += slow
+        return SimpleNamespace(anchors=(), calibration=(), doubts=())
+
+    monkeypatch.setattr("uwblite.mapping.build_map", build_map)
+    monkeypatch.setattr(check.time, "perf_counter", lambda: clock[0])
+    _, seconds = check.examined(log)
+    assert seconds == pytest.approx(cost.SECONDS_AT_LEAST + slow)
+    assert check.expected_cost(log, seconds)["seconds"] == pytest.approx(seconds, abs=0.05)
+    assert clock[0] == slow

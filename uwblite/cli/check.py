@@ -1,6 +1,7 @@
 """`uwblite check`: is a recording fit to be mapped, and what is to be done about it."""
 
 import argparse
+import time
 from typing import TYPE_CHECKING, Any
 
 from .options import add_bag_arguments, add_mounting_arguments
@@ -33,12 +34,13 @@ def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from ..checks.recording import diagnose
     from . import console
+    from .cost import model_seconds
     from .formats import read_recording
     from .options import apply_mounting, bag_choices
 
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
-    diagnosis = diagnose(log) if args.quick else examined(log)
-    cost = expected_cost(log, trial=not args.quick)
+    diagnosis, seconds = (diagnose(log), model_seconds(log)) if args.quick else examined(log)
+    cost = expected_cost(log, seconds)
     if args.json:
         console.say_json(summary_json(args.log, diagnosis, cost))
     else:
@@ -47,31 +49,39 @@ def run(args: argparse.Namespace) -> int:
     return 3 if diagnosis.serious else 0
 
 
-def examined(log: "SensorLog") -> "Diagnosis":
-    """Diagnose a recording by a trial map as well: what `uwblite map` will doubt or refuse, this finds serious."""
+def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
+    """Diagnose a recording by a trial map as well: what `uwblite map` will doubt or refuse, this finds serious.
+
+    Returns
+    -------
+    The findings, and the seconds that `uwblite map` will take here: those of the trial, and what every run takes.
+    """
     from ..checks.recording import diagnose
     from ..errors import UwbliteError
     from ..mapping import build_map
+    from .cost import SECONDS_AT_LEAST
 
+    began = time.perf_counter()
     try:
         trial = build_map(log)
     except UwbliteError as error:
-        return diagnose(log, refused=str(error))
-    return diagnose(log, anchors=trial.anchors, calibration=trial.calibration, doubts=trial.doubts)
+        return diagnose(log, refused=str(error)), SECONDS_AT_LEAST
+    seconds = SECONDS_AT_LEAST + time.perf_counter() - began
+    return diagnose(log, anchors=trial.anchors, calibration=trial.calibration, doubts=trial.doubts), seconds
 
 
-def expected_cost(log: "SensorLog", *, trial: bool = True) -> dict[str, float]:
+def expected_cost(log: "SensorLog", seconds: float | None = None) -> dict[str, float]:
     """Return the time and memory that `uwblite map` is expected to need on this computer, and the size of the map.
 
-    They are those of the recording as a map repairs it; empty where it refuses the recording. Without a trial the time is
-    that of a model, for the computer of docs/performance.md.
+    They are those of the recording as a map repairs it; empty where it refuses the recording. Where no time is given the
+    beginning of the recording is mapped to find it.
     """
     import numpy as np
 
     from ..errors import DataError
     from ..mapping import MappingConfig
     from ..screening.screen import screen
-    from .cost import expected_megabytes, expected_seconds, model_seconds
+    from .cost import expected_megabytes, expected_seconds
 
     try:
         log = screen(log)
@@ -86,7 +96,7 @@ def expected_cost(log: "SensorLog", *, trial: bool = True) -> dict[str, float]:
     beams = 0 if log.scans is None else log.scans.ranges.shape[1]
     path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
     return {
-        "seconds": round(expected_seconds(log) if trial else model_seconds(log), 1),
+        "seconds": round(expected_seconds(log) if seconds is None else seconds, 1),
         "megabytes": round(expected_megabytes(path, scans, beams, cells), 0),
         "map width m": round(float(size[0]), 1) if cells else 0.0,
         "map height m": round(float(size[1]), 1) if cells else 0.0,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ..sensor_log import SensorLog
 
-_SECONDS_AT_LEAST = 0.5
+SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files; on the computer of docs/performance.md, as the figures below."""
 _SECONDS_PER_METRE = 0.06
 """Of driving, with lidar: matching of clouds, graph."""
@@ -39,7 +39,7 @@ def work_seconds(log: "SensorLog") -> float:
 
 def model_seconds(log: "SensorLog") -> float:
     """Return the wall time of a map on the computer of docs/performance.md, s."""
-    return _SECONDS_AT_LEAST + work_seconds(log)
+    return SECONDS_AT_LEAST + work_seconds(log)
 
 
 def expected_seconds(log: "SensorLog") -> float:
@@ -58,7 +58,7 @@ def expected_seconds(log: "SensorLog") -> float:
     if long > 1.5 * short:
         # A computer that is busy with other things may give the shorter one the worse time.
         slowness = max((second - first) / (long - short), _LEAST_SLOPE * slowness)
-    return _SECONDS_AT_LEAST + max(second - slowness * long, 0.0) + slowness * whole
+    return SECONDS_AT_LEAST + max(second - slowness * long, 0.0) + slowness * whole
 
 
 def _seconds_of(log: "SensorLog") -> float | None:
