@@ -3,7 +3,7 @@
 import math
 import struct
 from collections.abc import Mapping
-from functools import reduce
+from functools import cache, reduce
 from operator import xor
 from types import MappingProxyType
 
@@ -116,10 +116,16 @@ def ld_packet(speed: int, start: int, readings: bytes, end: int, ms: int) -> byt
     body = b"\x54\x2c" + struct.pack("<HH", speed, start) + readings + struct.pack("<HH", end, ms)
     crc = 0
     for byte in body:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x4D if crc & 0x80 else crc << 1) & 0xFF
+        crc = _shifted(crc ^ byte)
     return body + bytes([crc])
+
+
+@cache
+def _shifted(crc: int) -> int:
+    """Return the CRC after the eight bits of a byte."""
+    for _ in range(8):
+        crc = (crc << 1 ^ 0x4D if crc & 0x80 else crc << 1) & 0xFF
+    return crc
 
 
 class Lds01Device(SpinningDevice):
