@@ -156,5 +156,6 @@ def test_topics_of_what_is_no_bag_are_refused(tmp_path, capsys, verb, room_log):
     more = {"map": ["--out", f"{tmp_path}/m"], "localize": ["--map", str(tmp_path), "--out", f"{tmp_path}/l"], "check": []}
     (tmp_path / "anchors.csv").write_text("id,x,y,sigma_x,sigma_y\nA,0,0,1,1\n")
     words = more.get(verb, [f"{tmp_path}/x.log"])
-    assert main([verb, str(room_log), *words, "--scan-topic", "/scan"]) == 1
-    assert "is no ROS bag" in capsys.readouterr().err
+    for option, why in (("--odometry-topic", "is no ROS bag"), ("--scan-topic", "scans are not read from '/scan'; choose")):
+        assert main([verb, str(room_log), *words, option, "/scan"]) == 1
+        assert why in capsys.readouterr().err
