@@ -24,7 +24,8 @@ from scipy.sparse.linalg import splu
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from .graph import Graph, PriorEdges
+from .components import floating_components
+from .graph import Graph
 from .solver import SolverConfig, optimize
 from .tangent_forms import TangentForm, outside
 from .unknowns import free_unknowns
@@ -85,9 +86,9 @@ def _reduction(graph: Graph, form: TangentForm) -> tuple[Ints, sparse.csr_matrix
 
     What is fixed turns with the map.
     """
-    kinds = free_unknowns(graph)
-    if all(kinds[name].all() for name in ("poses", "anchors")) and not any(isinstance(e, PriorEdges) for e in graph.edges):
-        kinds["poses"][0] = False
+    kinds, floating = free_unknowns(graph), floating_components(graph)
+    # The place of a part that floats costs nothing; one of its poses is as good where it is as elsewhere.
+    kinds["poses"][floating[floating >= 0]] = False
     is_free = np.concatenate([kinds["poses"], kinds["anchors"], kinds["poses"], [False]])
     free, fixed = np.flatnonzero(is_free), np.flatnonzero(~is_free)
     rows, columns = np.concatenate([free, fixed]), np.minimum(np.arange(len(is_free)), len(free))

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import FormatError
+from ..graph.components import floating_components
 from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.graph import Graph, PriorEdges
 from ..graph.point_edges import LandmarkEdges
@@ -57,7 +58,13 @@ class GraphFile:
             raise content.error(f"pose {pose_ids[lost[0]]} is not connected to the first one ({len(lost)} such poses)")
         graph = replace(graph, poses=poses)
         nowhere = [name for name, xy in zip(anchor_ids, graph.anchors, strict=True) if np.isnan(xy[0])]
-        warnings = (f"no position is given of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}",) if nowhere else ()
+        warnings: tuple[str, ...] = (
+            (f"no position is given of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}",) if nowhere else ()
+        )
+        floating = np.flatnonzero(floating_components(graph) > 0)
+        if len(floating):
+            named = f"pose {pose_ids[floating[0]]} is not connected to the first one ({len(floating)} such poses)"
+            warnings += (f"{named}: they keep to their own edges, and where they stand says nothing",)
         return GraphFile(graph, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())), warnings)
 
 
