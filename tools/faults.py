@@ -225,7 +225,7 @@ def shown(outcome: Outcome) -> list[object]:
     stated = "; ".join(outcome.stated)
     return [
         outcome.world, outcome.name, outcome.sensors, outcome.ate, outcome.anchor, outcome.exit_code, outcome.check,
-        outcome.verdict, stated if len(stated) < 300 else stated[:297] + "...", f"{outcome.seconds:.0f}",
+        outcome.verdict, stated if len(stated) < 160 else stated[:157] + "...", f"{outcome.seconds:.0f}",
     ]  # fmt: skip
 
 

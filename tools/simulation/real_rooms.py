@@ -1,21 +1,25 @@
 """What real rooms do to sensors beyond noise: errors that stay with a place, a wall, a direction or a floor.
 
-Averaging never removes them: who comes to the place again meets them again. The figures, each with its source:
+Averaging never removes them: who comes to the place again meets them again. The figures and where they are from; "assumed"
+is what no source that could be read gives a figure for.
 
-Radio. The delay of a DW1000's antenna changes with direction by 10 to 20 cm, and with the received level by -11 to +8 cm
-(Decawave APS011, section 3; Qorvo's forum, "Range error due to antenna angle/orientation"); an antenna null loses the first
-path and takes a later one, always too long. Multipath stays alike over parts of a wavelength (5 cm at 6.5 GHz; what a
-moving tag averages is left out) up to the size of a room. A body in the way delays by 0.1 to 0.5 m and loses ranges (Otim
-et al., Effects of the body wearable sensor position, Electronics 8, 2019; Kilic et al., WPNC 2012). A few ranges are wrong by
-metres, also too short (Qorvo's forum, "Strange ranging errors indoors": always the same 29 m, in one ray of 10 cm).
+Radio. The range error of a DW1000 changes with the received level from -11.0 to +8.1 cm at 64 MHz PRF (Decawave APS011,
+table 2, as quoted in Qorvo's forum, topic 1872), and the same topic reports up to 80 cm over the antenna's angles; 6 cm by
+direction is assumed on the careful side of that. An antenna null loses the first path and takes a later one, always too
+long. Lengths of multipath: assumed, from parts of a room to its size (over parts of a wavelength, 5 cm at 6.5 GHz, a moving
+tag averages). A body: mean ranging errors of 20 cm at the best place on a body and more at others (Otim et al., Impact of
+body wearable sensor positions on UWB ranging, 2019), up to metres (Otim et al., Electronics 8(11):1351, 2019); Kilic et al.
+(WPNC 2012) find the direct path weakened but hardly a range error at 3 to 5.5 GHz, so the excess here, 12 cm for the robot
+and 30 cm for a person, is between these. A few ranges wrong by metres: users' reports; their share is assumed.
 
-Wheels. A bump of 10 mm under one wheel turns a base by about half a degree (Borenstein and Feng 1996, UMBmark's test of
-non-systematic errors: ten bumps make 3 to 8 degrees); the nap of a carpet and cross slopes drag a base sideways for as long
-as it is on them.
+Wheels. Bumps and floors are what Borenstein and Feng (IEEE Trans. Robotics and Automation 12(6), 1996) call non-systematic
+errors, and test with bumps of a centimetre under one wheel; 0.6 degrees for each is assumed. So is the size of patches of
+carpet and of cross slopes; their turn is set so that odometry alone is as far off as in the paper.
 
-Lidar. A URG-04LX errs by up to 2 to 4 cm with the brightness and material of a surface, loses dark and shiny surfaces seen
-at an angle, and drifts by about 1 cm while it warms up (Kneip et al., ICRA 2009; Okubo et al., SPIE 7332, 2009); at edges it
-reads distances between the two surfaces; glass is seen from straight ahead only.
+Lidar. For a URG-04LX, accuracy "depends strongly on colour, brightness and material", with time drift after switching on
+and faulty readings of dark surfaces and at high angles on shiny ones (Kneip et al., ICRA 2009, abstract; Okubo, Ye and
+Borenstein, SPIE 7332, 2009, also on mixed pixels); its data sheet allows 1 cm up to 1 m and 1 % beyond. 1.2 cm by surface
+and 1 cm of warming up are of that size, assumed; glass is seen from straight ahead only.
 """
 
 from dataclasses import dataclass
