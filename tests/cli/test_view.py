@@ -55,6 +55,9 @@ def test_a_click_rejects_a_closure_and_maps_again(mapped, tmp_path, width, dark)
         browser.until("document.querySelector('line.closure.reject')")
         assert browser.run("document.querySelector('line.closure.reject').dataset.closure") == rejected
         assert len(parse_constraints((mapped / "map_constraints.toml").read_text()).forbidden) == 1
+        assert browser.complaints == []
+        if width < 1280:  # what the button does is the same everywhere
+            return
         before = browser.run("document.querySelectorAll('section').length")
         browser.run("document.querySelector('button.map').click()")
         browser.until(f"document.querySelectorAll('section').length > {before}", patience=180)

@@ -492,7 +492,9 @@ def test_memory_is_bounded_whatever_the_file_claims(tmp_path):
     assert peak < 40e6
 
 
-@pytest.mark.parametrize("filling", [b"\n", b"A", b"ODOM 0 0 0 0 0 0 1.0 h 1\n", b"# c\n"])
+@pytest.mark.parametrize(
+    "filling", [b"\n", b"A", b"ODOM 0 0 0 0 0 0 1.0 h 1\n", pytest.param(b"# c\n", marks=pytest.mark.slow)]
+)
 def test_what_is_packed_to_fill_the_memory_is_refused(tmp_path, filling):
     with gzip.open(tmp_path / "a.log.gz", "wb", compresslevel=1) as stream:
         for _ in range(24):

@@ -109,6 +109,7 @@ def test_blanks_in_ids_become_underscores(tmp_path):
     assert ranges.anchor.tolist() == [1, 0, 1]
 
 
+@pytest.mark.slow
 def test_tables_of_millions_of_rows_take_little_more_memory_than_their_numbers(tmp_path):
     rows = 60_000
     (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n" + "1,0,0,0\n" * rows)

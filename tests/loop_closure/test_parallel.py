@@ -43,7 +43,8 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-@pytest.mark.parametrize("several", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("several", [False, True])
 def test_a_map_is_the_same_for_any_number_of_jobs(minutes, tmp_path, several):
     written = []
     for jobs in (1, 3):
