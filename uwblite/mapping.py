@@ -22,6 +22,7 @@ from .pipeline import (
     landmark_ties,
     lidar_stages,
     map_frame,
+    mirror_images,
     moved_anchors,
     radio_stages,
     scan_selection,
@@ -113,4 +114,5 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     if given.landmark_distances:
         yield landmark_ties.tie_landmarks
     yield final_stages.final_optimisation
+    yield mirror_images.find_mirror_images
     yield map_frame.align_axes

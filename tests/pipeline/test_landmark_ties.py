@@ -135,7 +135,8 @@ def test_a_measured_distance_calibrates_the_wheels(wrong_wheels):
     assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=0.015)
     scale = next(c for c in after.calibration if c.name == "odometry_scale")
     assert scale.value == pytest.approx(1 / SCALE - 1, abs=2 * scale.sigma)
-    assert scale.sigma < 0.01
+    # Well below the prior of 0.02; errors of the floor, alike over ten steps, double what single steps would leave.
+    assert scale.sigma < 0.6 * 0.02
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..lidar.joint_refinement import with_fewer_pairs, with_surface_errors
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
+from ..odometry.wheels import with_floor_errors
 from . import plausibility
 from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
@@ -27,7 +28,7 @@ _SHOWN = 0.7
 def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> MapResult:
     """Gather the result of a run; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
-    covariance = marginals(with_surface_errors(with_fewer_pairs(graph)))
+    covariance = marginals(with_floor_errors(with_surface_errors(with_fewer_pairs(graph))))
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
     if ranges is not None and estimate.placed.any():

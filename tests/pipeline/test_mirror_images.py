@@ -1,0 +1,71 @@
+"""A straight path leaves an anchor its mirror image; a bend in it, or a range that decides, does not."""
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from uwblite.graph.graph import Graph
+from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.solver import SolverConfig
+from uwblite.pipeline.mirror_images import find_mirror_images
+
+ANCHOR = np.array([4.0, 3.0])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the stage asks of an estimate."""
+
+    graph: Graph
+    ranges: RangeEdges
+    bootstrap: SimpleNamespace
+    placed: np.ndarray
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    placed: np.ndarray
+    ambiguous: np.ndarray
+    hypotheses: tuple
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    position: np.ndarray
+
+
+def estimate(bend, believed=ANCHOR):
+    """An anchor heard with 0.1 m of noise along 10 m that end `bend` metres off the straight line."""
+    x = np.linspace(0.0, 10.0, 60)
+    tags = np.column_stack([x, np.where(x > 6.0, (x - 6.0) / 4.0 * bend, 0.0)])
+    count, none = len(x), np.zeros((len(x), 2))
+    noise = np.random.default_rng(5).normal(0.0, 0.1, count)
+    edges = RangeEdges(
+        np.arange(count), np.zeros(count, dtype=np.int64), np.hypot(*(tags - ANCHOR).T) + noise, np.full(count, 0.1), none,
+        np.zeros(count), none, np.zeros(2), np.zeros(count), np.full((count, 6), -1),
+    )  # fmt: skip
+    graph = Graph(np.column_stack([tags, np.zeros(count)]), np.array([believed]))
+    found = Bootstrap(np.array([True]), np.array([False]), ((Hypothesis(np.array(believed)),),))
+    return Estimate(graph, edges, found, found.placed)
+
+
+TASK = SimpleNamespace(config=SimpleNamespace(solver=SolverConfig()))
+
+
+@pytest.mark.parametrize(("bend", "ambiguous"), [(0.0, True), (0.05, True), (1.0, False), (3.0, False)])
+def test_the_path_decides(bend, ambiguous):
+    done = find_mirror_images(estimate(bend), TASK)
+    assert done.bootstrap.ambiguous.tolist() == [ambiguous]
+    if ambiguous:
+        assert np.hypot(*(done.bootstrap.hypotheses[0][1].position - ANCHOR * (1, -1))) < 0.3
+    assert np.array_equal(done.graph.anchors, [ANCHOR])
+
+
+def test_what_the_bootstrap_took_for_ambiguous_is_decided_along_the_final_path():
+    before = estimate(3.0)
+    unsure = replace(
+        before.bootstrap, ambiguous=np.array([True]), hypotheses=((Hypothesis(ANCHOR), Hypothesis(ANCHOR * (1, -1))),)
+    )
+    assert not find_mirror_images(replace(before, bootstrap=unsure), TASK).bootstrap.ambiguous.any()

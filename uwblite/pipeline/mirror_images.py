@@ -1,0 +1,91 @@
+"""Has an anchor a second place that explains its ranges? A path that is nearly straight leaves its mirror image.
+
+The bootstrap asks this of ranges along odometry that drifts. Here it is asked once more along the final trajectory and with
+the ranges' final noise, which counts how alike neighbouring errors are: a curve, other anchors or the lidar decide then.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Bools, Floats
+from ..graph.calibration import BIAS, HEIGHT
+from ..graph.graph import Graph, PriorEdges
+from ..graph.range_edges import RangeEdges
+from ..graph.solver import optimize
+from .estimate import Estimate, Task
+
+_CLEAR = 30.0
+"""Difference of chi2 between two places from which on the worse one is excluded. By chance alone 9 would do, but
+poses that are off by decimetres, which chi2 does not count, brought it to 11; the wrong side of a bent path, to hundreds."""
+_APART = 0.5
+"""Places nearer to each other than this are the same, m."""
+
+
+def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
+    """Return the estimate with anchors ambiguous whose mirror image explains their ranges about as well, and no others."""
+    ranges, found = estimate.ranges, estimate.bootstrap
+    if ranges is None or found is None:
+        return estimate
+    free = found.placed & (np.bincount(ranges.anchor[_alive(ranges)], minlength=len(found.placed)) > 0)
+    if estimate.graph.fixed_anchors is not None:
+        free &= ~np.asarray(estimate.graph.fixed_anchors)
+    if not free.any():
+        return estimate
+    starts = (estimate.graph.anchors, _images(estimate, ranges))
+    here, there = (_settled(estimate, ranges, free, start, task) for start in starts)
+    apart = np.hypot(*(there.anchors - here.anchors).T)
+    as_well = (apart > _APART) & (_costs(there, ranges) - _costs(here, ranges) < _CLEAR)
+    ambiguous = np.where(free, as_well, found.ambiguous)
+    hypotheses = list(found.hypotheses)
+    for k in np.flatnonzero(free & ambiguous).tolist():
+        if hypotheses[k]:
+            hypotheses[k] = (hypotheses[k][0], replace(hypotheses[k][0], position=there.anchors[k]))
+    return replace(estimate, bootstrap=replace(found, ambiguous=ambiguous, hypotheses=tuple(hypotheses)))
+
+
+def _images(estimate: Estimate, ranges: RangeEdges) -> Floats:
+    """Return the other place (a, 2) of each anchor to be tried, m: mirrored at the line that fits the tag's places best."""
+    assert estimate.bootstrap is not None
+    anchors, tags = estimate.graph.anchors.copy(), ranges.tag_positions(estimate.graph.poses)
+    for k in np.flatnonzero(estimate.placed).tolist():
+        own = tags[_alive(ranges) & (ranges.anchor == k)]
+        known = estimate.bootstrap.hypotheses[k]
+        if estimate.bootstrap.ambiguous[k] and len(known) > 1:
+            anchors[k] = known[1].position
+        elif len(own) > 2:
+            across = np.linalg.eigh(np.cov(own.T))[1][:, 0]
+            anchors[k] -= 2.0 * across * float(across @ (anchors[k] - own.mean(axis=0)))
+    return anchors
+
+
+def _settled(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Floats, task: Task) -> Graph:
+    """Return the graph with the free anchors (a,), biases and heights at their best near a start (a, 2), the poses fixed."""
+    graph = estimate.graph
+    own = graph.calibration.of_kinds(BIAS, HEIGHT)
+    fixed = np.zeros(len(own), dtype=bool) if graph.fixed_calibration is None else np.asarray(graph.fixed_calibration)
+    priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block != "poses")
+    alone = Graph(
+        graph.poses, anchors, priors, graph.calibration, np.ones(len(graph.poses), dtype=bool), ~free, fixed | ~own
+    )
+    return optimize(alone.with_edges(ranges), task.config.solver)[0]
+
+
+def _costs(graph: Graph, ranges: RangeEdges) -> Floats:
+    """Return the cost (a,) of each anchor's ranges, and of the priors of its bias and height."""
+    squared = ranges.residuals(graph)[:, 0] ** 2
+    each = np.where(_alive(ranges), ranges.kernel.rho(squared), 0.0)
+    costs: Floats = np.bincount(ranges.anchor, each, len(graph.anchors)).astype(np.float64)
+    of_unknown = np.zeros(len(graph.calibration.values))
+    for priors in graph.edges:
+        if isinstance(priors, PriorEdges) and priors.block == "calibration":
+            np.add.at(of_unknown, priors.index, np.sum(priors.residuals(graph) ** 2, axis=1))
+    for k in range(len(graph.anchors)):
+        used = np.unique(ranges.calibration[ranges.anchor == k][:, 1:3])
+        costs[k] += float(of_unknown[used[used >= 0]].sum())
+    return costs
+
+
+def _alive(ranges: RangeEdges) -> Bools:
+    """Return which ranges (m,) count."""
+    return np.ones(len(ranges), dtype=bool) if ranges.weights is None else np.asarray(ranges.weights) > 0.0
