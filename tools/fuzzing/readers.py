@@ -63,18 +63,18 @@ def _settings(text: str, path: str) -> object:
 
 
 def _log(readings: int = 40) -> bytes:
-    """Return a recording of a drive along a wall with two anchors, as large as it takes to be mapped."""
-    rng = np.random.default_rng(1)
+    """Return a recording of a drive along a wall with three anchors, as large as it takes to be mapped."""
+    rng, anchors = np.random.default_rng(1), (("91A3", 3.0, 6.0), ("5C0B", 3.0, 4.0), ("0D27", 6.0, -3.0))
     lines = [LOG.decode()]
     for k in range(readings):
-        t, x = 4.0 + 0.25 * k, 1.5 + 0.1 * k
+        t, x, (name, *place) = 4.0 + 0.25 * k, 1.5 + 0.1 * k, anchors[k % 3]
+        distance = np.hypot(x - place[0], 0.3 * np.sin(x) - place[1])
         lines.append(f"ODOM {x:.3f} {0.3 * np.sin(x):.3f} {0.3 * np.cos(x):.3f} 0.4 0 0 {t:.2f} h {t:.2f}\n")
-        name, distance = ("5C0B", np.hypot(x - 3, 4)) if k % 2 else ("91A3", np.hypot(x - 3, 6))
         lines.append(f"UWB {name} {distance + rng.normal(0, 0.1):.2f} 90 {t:.2f} h {t:.2f}\n")
         if k % 2:
             rays = " ".join(f"{r:.3f}" for r in rng.uniform(1.0, 5.7, 12))
-            place = f"{x:.3f} 0 0 {x:.3f} 0 0 0 0 0 0 0 {t:.2f} h {t:.2f}"
-            lines.append(f"ROBOTLASER1 2 -1.5 3.0 0.27 5.6 0.01 0 12 {rays} 0 {place}\n")
+            pose = f"{x:.3f} 0 0 {x:.3f} 0 0 0 0 0 0 0 {t:.2f} h {t:.2f}"
+            lines.append(f"ROBOTLASER1 2 -1.5 3.0 0.27 5.6 0.01 0 12 {rays} 0 {pose}\n")
     return "".join(lines).encode()
 
 

@@ -57,4 +57,4 @@ anchor_format = "{:04X}"
 only = { tag = 3 }
 '''
 TABLE = b'name,x,y,radius,neighbours\nC1,2.1,1.7,0.15,"C2 C3"\n# remark\nC2,4.9,2.4,0.2,\n'
-ANCHORS = b"id,x,y,sigma_x,sigma_y,status\n5C0B,1,2,0.1,0.1,ok\n91A3,3,4,,,ok\n"
+ANCHORS = b"id,x,y,sigma_x,sigma_y,status\n5C0B,3,4,0.1,0.1,ok\n91A3,3,6,,,ok\n0D27,6,-3,0.1,0.1,ok\n"

@@ -320,7 +320,8 @@ def swept(
         surface = np.where(np.isfinite(true), surface, -1)
         true = true + rooms.warm_up[0] * np.exp(-stamps[:, None] / rooms.warm_up[1])
     stated, mixed = laser.disturb(true, cosine, surface, model, scene.colour, rng)
-    most = 5.0 * np.maximum(model.near_sd, model.far_sd * true) + 3.0 * model.surface_sd
+    far = model.far_sd * np.where(np.isfinite(true), true, 0.0)
+    most = 5.0 * np.maximum(model.near_sd, far) + 3.0 * model.surface_sd
     own = (np.abs(0.001 * stated - true) < most) & ~mixed & (surface < len(plan.walls) + len(plan.columns))
     return stated, np.where(own, surface, -1)
 
