@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -73,3 +74,15 @@ def test_a_result_of_map_is_planned_in_with_its_anchors(tmp_path, monkeypatch, c
 def test_wrong_words_are_usage_errors(rooms, capsys, bad):
     assert main([*rooms, "--from", "3,1", "--to", "3,3", *bad.split()]) == 2
     assert "error" in capsys.readouterr().err
+
+
+def test_a_start_in_unknown_space_is_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_map(tmp_path, grid_of("\n".join(["." * 40] * 20 + ["?" * 40] * 20)))
+    words = ["plan", "--map", "map.yaml", "--radius", "0.2", "--from", "2,1", "--to", "2,3"]
+    assert main(words) == 0
+    # A metre to the first free row, the radius and at most three cells beyond.
+    stated = float(re.search(r"the first (\S+) m leave it", capsys.readouterr().out)[1])
+    assert 1.2 <= stated < 1.5
+    assert main([*words, "--force", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["leaving"] == pytest.approx(stated, abs=0.005)

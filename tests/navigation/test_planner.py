@@ -146,6 +146,33 @@ def test_a_robot_too_near_to_a_wall_may_leave_and_one_inside_of_it_not():
         planner.plan(np.array([50.0, 1.0]), [np.array([1.0, 0.7])])
 
 
+def test_a_robot_in_unknown_space_leaves_it_and_keeps_clear_of_what_is_known():
+    text = "\n".join(["." * 40] * 16 + ["?" * 10 + "#" * 20 + "?" * 10] + ["?" * 40] * 16)
+    grid = grid_of(text)
+    planner, priced = make_planner(grid, 0.2), make_planner(grid, 0.2, unknown="price")
+    start, goal = np.array([1.45, 0.85]), np.array([2.0, 2.7])
+    path = planner.plan(start, [goal])
+    known = grid.states() == OCCUPIED
+    assert distance_to_squares(grid, known, path.poses[:, :2]).min() >= 0.2
+    inside = path.clearances < planner.clearance.radius
+    assert inside[0]
+    assert np.all(np.diff(inside.astype(int)) <= 0)
+    # Around the nearer end of the wall, at the price of unknown space, and as short as that way can be.
+    assert path.poses[:, 0].min() < 0.9
+    assert path.length < 1.1 * priced.plan(start, [goal]).length
+    with pytest.raises(NoPathError, match="no way to"):
+        planner.plan(goal, [start])
+    with pytest.raises(NoPathError, match="has an obstacle there"):
+        planner.plan(np.array([2.0, 1.65]), [goal])
+
+
+def test_a_robot_that_unknown_space_and_walls_shut_in_cannot_leave():
+    text = "\n".join(["." * 30] * 14 + ["." * 10 + "#" * 10 + "." * 10] + ["." * 10 + "#????????#" + "." * 10] * 8
+                     + ["." * 10 + "#" * 10 + "." * 10])  # fmt: skip
+    with pytest.raises(NoPathError, match=r"no way leads from the start .* out of unknown space"):
+        make_planner(grid_of(text), 0.2).plan(np.array([1.5, 0.5]), [np.array([0.5, 2.0])])
+
+
 def test_standing_still_is_a_path():
     path = make_planner(grid_of("\n".join(["." * 20] * 20)), 0.1).plan(np.array([1.0, 1.0, 0.5]), [np.array([1.0, 1.0])])
     assert path.length == path.cost == 0.0

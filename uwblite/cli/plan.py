@@ -68,6 +68,9 @@ def run(args: argparse.Namespace) -> int:
         return 0
     steps, least = len(path.poses) - 1, path.clearances.min()
     console.say(f"{path.length:.2f} m in {steps} steps, never nearer than {least:.2f} m to a wall")
+    if (leaving := _leaving(path, args.radius)) > 0.0:
+        where = "in unknown space, or nearer to a wall than the radius"
+        console.say(f"warning: the start is {where}; the first {leaving:.2f} m leave it")
     console.say(f"files: {table} {picture}")
     return 0
 
@@ -86,6 +89,12 @@ def _read(folder: str) -> "tuple[OccupancyGrid, tuple[StoredAnchor, ...]]":
     return result.grid, result.anchors
 
 
+def _leaving(path: "PlannedPath", radius: float) -> float:
+    """Return the length of the way at the beginning that keeps no clearance, m."""
+    kept = path.clearances >= radius
+    return float(path.distances[kept.argmax() if kept.any() else -1])
+
+
 def _table(path: "PlannedPath") -> str:
     """Return the path as CSV; m, m, rad, m from the start, m from the nearest obstacle."""
     rows = zip(path.poses.tolist(), path.distances.tolist(), path.clearances.tolist(), strict=True)
@@ -100,5 +109,6 @@ def _figures(args: argparse.Namespace, path: "PlannedPath") -> dict[str, Any]:
         "length": path.length,
         "cost": path.cost,
         "least_clearance": path.clearances.min(),
+        "leaving": _leaving(path, args.radius),
         "poses": path.poses,
     }

@@ -44,6 +44,8 @@ class ClearanceMap:
     """(rows, cols) factor of a metre through the cell: 1, or UNKNOWN_PRICE."""
     radius: float
     """Of the robot, m."""
+    refused: bool = True
+    """Unknown cells are obstacles."""
 
     def passable(self) -> Bools:
         """Return in which cells' centres (rows, cols) the robot may stand, so that every step to a neighbour is safe too."""
@@ -95,7 +97,7 @@ def clearance_map(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse"
     refused = unknown == "refuse"
     obstacles = (states == OCCUPIED) | (dark & refused)
     price = np.where(dark & (not refused), np.float32(UNKNOWN_PRICE), np.float32(1.0))
-    return ClearanceMap(grid.geometry, _squared_distances(obstacles, grid.geometry.resolution), price, radius)
+    return ClearanceMap(grid.geometry, _squared_distances(obstacles, grid.geometry.resolution), price, radius, refused)
 
 
 def _squared_distances(obstacles: Bools, resolution: float) -> NDArray[np.float32]:

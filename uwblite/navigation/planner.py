@@ -62,6 +62,8 @@ class Planner:
     """(rows, cols) number of a cell's node; -1 where the robot may not stand."""
     graph: csr_matrix
     """(n, n) costs of the steps between neighbouring cells, in metres of open space; symmetric."""
+    grid: OccupancyGrid
+    """What it was made of."""
 
     def plan(self, start: Floats, goals: Sequence[Floats], *, step: float = 0.1) -> PlannedPath:
         """Find the cheapest path.
@@ -86,36 +88,54 @@ class Planner:
 
     def _leg(self, start: Floats, goal: Floats) -> Floats:
         """Return the corners (k, 2) of the path between two places, the first of which is left out."""
-        first, clear = self._entrance(start)
-        last = self._beside(goal)
+        way, first = self._entrance(start)
+        cells = self._search(first, self._beside(goal), goal)
+        line = smoothed(self.clearance, np.concatenate([way[-1:], self._places(cells)[len(way) > 1 :], goal[None]]))
+        return np.concatenate([way, line[1:]])[1:]
+
+    def _search(self, first: int, last: int, goal: Floats) -> Ints:
+        """Return the nodes (k,) of the cheapest path to the last, which is beside the goal; -1 = none is."""
         # Most goals are found by a search no farther than this, and what it finds is the cheapest path of all.
-        limit = (1.0 + NEAR_COST) * float(np.hypot(*(goal - start)))
+        limit = (1.0 + NEAR_COST) * float(np.hypot(*np.subtract(goal, self._places(np.array([first]))[0])))
         costs, before = dijkstra(self.graph, indices=first, return_predecessors=True, limit=limit)
         if last < 0 or not np.isfinite(costs[last]):
             costs, before = dijkstra(self.graph, indices=first, return_predecessors=True)
         if last < 0 or not np.isfinite(costs[last]):
             raise self._no_path(goal, np.isfinite(costs))
-        line = np.concatenate([self._places(walk_back(before, first, last)), goal[None]])
-        if not clear:
-            return smoothed(self.clearance, line)
-        return smoothed(self.clearance, np.concatenate([start[None], line]))[1:]
+        return walk_back(before, first, last)
 
-    def _entrance(self, start: Floats) -> tuple[int, bool]:
-        """Return the node at which a path from a place begins, and whether the way there keeps the clearance.
+    def _entrance(self, start: Floats) -> tuple[Floats, int]:
+        """Return the corners (k, 2) of the way from a place to the first node, which keeps no clearance, and that node.
 
-        A robot that stands nearer to an obstacle than its radius, by the map, may leave straight for the nearest place
-        where it may stand, but not through an obstacle.
+        Where the way keeps it, only the place itself is returned. A robot that stands nearer to an obstacle than its radius,
+        by the map, may leave straight for the nearest place where it may stand, but not through an obstacle. One that stands
+        in unknown space, into which it drove by itself, leaves it by the cheapest way that keeps clear of known obstacles.
         """
         if (node := self._beside(start)) >= 0:
-            return node, True
+            return start[None], node
         nodes, places = self._around(start, self.clearance.radius + 2.0 * self.clearance.geometry.resolution)
         free = ~along_lines(self.clearance, np.broadcast_to(start, places.shape), places).crossing
-        if not free.any():
-            raise NoPathError(
-                f"the robot cannot stand at the start {_place(start)}: the map has an obstacle or unknown space there; "
-                "check the place, or plan with a smaller radius"
-            )
-        return int(nodes[free][np.argmin(np.hypot(*(places[free] - start).T))]), False
+        if free.any():
+            near = int(np.argmin(np.where(free, np.hypot(*(places - start).T), np.inf)))
+            return np.stack([start, places[near]]), int(nodes[near])
+        if self.clearance.refused:
+            return self._out_of_unknown(start)
+        raise NoPathError(
+            f"the robot cannot stand at the start {_place(start)}: the map has an obstacle there, or ends; "
+            "check the place, or plan with a smaller radius"
+        )
+
+    def _out_of_unknown(self, start: Floats) -> tuple[Floats, int]:
+        """Return the corners (k, 2) of the cheapest way from a place to a node where the robot may stand, and the node."""
+        priced = make_planner(self.grid, self.clearance.radius, unknown="price")
+        way, first = priced._entrance(start)
+        costs, before = dijkstra(priced.graph, indices=first, return_predecessors=True)
+        costs[self.node_of.ravel()[priced.nodes] < 0] = np.inf
+        last = int(np.argmin(costs))
+        if not np.isfinite(costs[last]):
+            raise NoPathError(f"no way leads from the start {_place(start)} out of unknown space")
+        line = smoothed(priced.clearance, np.concatenate([way[-1:], priced._places(walk_back(before, first, last))]))
+        return np.concatenate([way, line[1:]]), int(self.node_of.ravel()[priced.nodes[last]])
 
     def _beside(self, place: Floats) -> int:
         """Return the nearest node to which a straight line keeps the clearance; -1 where there is none."""
@@ -163,7 +183,7 @@ def make_planner(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse")
         raise NoPathError(f"a robot with a radius of {radius:g} m may stand nowhere in this map")
     node_of = np.full(passable.shape, -1, dtype=np.int32)
     node_of.ravel()[nodes] = np.arange(len(nodes), dtype=np.int32)
-    return Planner(clearance, nodes, node_of, _step_graph(clearance, nodes, node_of))
+    return Planner(clearance, nodes, node_of, _step_graph(clearance, nodes, node_of), grid)
 
 
 def _step_graph(clearance: ClearanceMap, nodes: Ints, node_of: NDArray[np.int32]) -> csr_matrix:
