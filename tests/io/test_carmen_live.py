@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from uwblite.io.carmen import read_log
-from uwblite.io.carmen_live import LiveOdometry, LiveRange, LiveReader, LiveScan
+from uwblite.io.carmen_live import LiveGyro, LiveOdometry, LiveRange, LiveReader, LiveScan
 
 READINGS = " ".join(f"{1.0 + 0.01 * k:.3f}" for k in range(9)) + " 5.600"
 TEXT = (
     "# CARMEN Logfile\nPARAM laser_time_increment 0.001 0 h 0\nPARAM uwb_tag_offset_x 0.2 0 h 0\n"
     "ODOM 0 0 0 0 0 0 1.0 h 1.0\nUWB A 2.500 100 1.1 h 1.1\n"
     f"ROBOTLASER1 0 -1.0 1.8 0.2 5.6 0.01 0 10 {READINGS} 0 0.3 0 0 0.2 0 0 0 0 0 0 0 1.15 h 1.15\n"
+    "GYRO 0.75 0.1 1.18 h 1.18\n"
     "ODOM 0.1 0 0.01 0 0 0 1.2 h 1.2\nODOM broken\nUWB2 B 3.5 90 1.3 h 1.3\nODOM 0.2 0 0.02 0 0 0 1.4 h 1.4\n"
 ).encode()
 
@@ -30,6 +31,7 @@ def test_pieces_of_any_size_give_what_the_whole_log_gives(tmp_path, size):
     np.testing.assert_array_equal([m.stamp for m in odometry], log.odometry.stamps)
     ranges = [(m.stamp, m.anchor_id, m.range, m.tag) for m in found if isinstance(m, LiveRange)]
     assert ranges == [(1.1, "A", 2.5, 0), (1.3, "B", 3.5, 1)]
+    assert [(m.stamp, m.heading) for m in found if isinstance(m, LiveGyro)] == [(1.18, 0.75)]
     (scan,) = (m for m in found if isinstance(m, LiveScan))
     np.testing.assert_array_equal(scan.scans.ranges, log.scans.ranges)
     assert (scan.scans.angle_min, scan.scans.time_increment) == (log.scans.angle_min, log.scans.time_increment)

@@ -119,12 +119,15 @@ class Tracker:
             self._use(measured)
 
     def _use(self, measured: "Measured") -> None:
-        from ..io.carmen_live import LiveOdometry, LiveRange
+        from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange
         from ..localization import Localizer, Scanner
 
         assert self.localizer is not None
         if isinstance(measured, LiveOdometry):
             self.state = self.localizer.add_odometry(measured.stamp, *measured.pose.tolist())
+        elif isinstance(measured, LiveGyro):
+            self.localizer.add_gyro(measured.stamp, measured.heading)
+            return
         elif isinstance(measured, LiveRange):
             self.state = self.localizer.add_ranges(measured.stamp, [measured.anchor_id], [measured.range], measured.tag)
         else:
@@ -150,12 +153,13 @@ class Tracker:
 
     def _watch(self, measured: "Measured") -> None:
         """Say once when a sensor that was there, or should be, falls silent."""
-        from ..io.carmen_live import LiveOdometry, LiveRange
+        from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange
 
-        kind = "odometry" if isinstance(measured, LiveOdometry) else "uwb" if isinstance(measured, LiveRange) else "lidar"
+        kinds = {LiveOdometry: "odometry", LiveRange: "uwb", LiveGyro: "gyro"}
+        kind = kinds.get(type(measured), "lidar")
         if not self._seen:
-            self._seen = dict.fromkeys(_SENSORS, measured.order)
-        self._seen[kind] = max(self._seen[kind], measured.order)
+            self._seen = {name: measured.order for name in _SENSORS if name != "gyro"}
+        self._seen[kind] = max(self._seen.get(kind, measured.order), measured.order)
         if kind in self._silent:
             self._silent.discard(kind)
             console.note(f"uwblite: {kind} is back")
@@ -188,8 +192,9 @@ _SENSORS = {
     "odometry": "the pose is held and becomes unsure",
     "lidar": "the pose rests on ranges and odometry",
     "uwb": "the pose rests on scans and odometry",
+    "gyro": "directions are the wheels' own",
 }
-"""And what it means that one is silent."""
+"""And what it means that one is silent; a gyro is missed only where one was heard."""
 
 
 @contextmanager

@@ -44,7 +44,17 @@ class LiveScan:
     order: float
 
 
-Measured = LiveOdometry | LiveRange | LiveScan
+@dataclass(frozen=True, slots=True)
+class LiveGyro:
+    """One reading of a gyro."""
+
+    stamp: float
+    heading: float
+    """rad; from any zero, its bias in it."""
+    order: float
+
+
+Measured = LiveOdometry | LiveRange | LiveScan | LiveGyro
 
 _MOST_PENDING = 1 << 20
 """Bytes of a line without an end."""
@@ -87,12 +97,16 @@ class LiveReader:
         self._reader, self.broken = reader, self.broken + reader.broken
         if b"COMMENT continued in " in lines:
             self.continued = lines.rpartition(b"COMMENT continued in ")[2].split(b"\n")[0].strip().decode("utf-8", "replace")
-        found: list[Measured] = [*self._poses(reader), *self._ranges(reader), *self._scans(reader)]
+        found: list[Measured] = [*self._poses(reader), *self._ranges(reader), *self._scans(reader), *self._turns(reader)]
         return sorted(found, key=lambda measured: measured.order)
 
     def _poses(self, reader: LogReader) -> list[LiveOdometry]:
         rows = np.array(reader.odometry).reshape(-1, 4)
         return [LiveOdometry(float(row[0]), row[1:], float(row[0])) for row in rows]
+
+    def _turns(self, reader: LogReader) -> list[LiveGyro]:
+        rows = np.array(reader.gyro).reshape(-1, 2).tolist()
+        return [LiveGyro(stamp, heading, stamp) for stamp, heading in rows]
 
     def _ranges(self, reader: LogReader) -> list[LiveRange]:
         names = {number: name.decode() for name, number in reader.uwb_ids.items()}

@@ -18,6 +18,7 @@ from ..arrays import Floats
 from ..radio.trilateration import TrilaterationConfig, usable
 from ..sensor_log import SensorMounting
 from . import hypotheses, search, verdict
+from .gyro_turns import GyroTurns
 from .hypotheses import Hypotheses, RangeFacts
 from .known_map import KnownMap
 from .odometer import Odometer
@@ -101,7 +102,8 @@ class Localizer:
     def __init__(self, known: KnownMap, mounting: SensorMounting | None = None, scanner: Scanner | None = None) -> None:
         self.known, self.mounting, self.scanner = known, mounting or SensorMounting(), scanner
         self._laser = replace(self.mounting, T_base_laser=se2.compose(known.laser_correction, self.mounting.T_base_laser))
-        self._odometer = Odometer()
+        self._odometer, self._turns = Odometer(), GyroTurns()
+        self._wheels = np.full(3, np.nan)
         self._bank = hypotheses.none(len(known.anchors.ids))
         self._field = None if known.walls is None else search.field_of(known.walls)
         self._bounds = _bounds(known)
@@ -128,11 +130,22 @@ class Localizer:
 
     def add_odometry(self, stamp: float, x: float, y: float, theta: float) -> LocalizerState:
         """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
-        step = self._odometer.add(stamp, np.array([x, y, theta], dtype=np.float64))
+        wheels = np.array([x, y, theta], dtype=np.float64)
+        step = self._odometer.add(stamp, self._turns.turned(stamp, wheels))
+        if self._odometer.stamp == stamp:
+            self._wheels = wheels
         if step is not None:
             self._bank = hypotheses.moved(self._bank, step)
             self._way += way_of(step)
         self._work_off()
+        return self.state()
+
+    def add_gyro(self, stamp: float, heading: float) -> LocalizerState:
+        """Take the heading of a gyro from any zero, bias and all; s, on the odometry's clock, rad.
+
+        From when its bias is known on, the steps of the wheels turn as it does.
+        """
+        self._turns.add(stamp, heading)
         return self.state()
 
     def add_ranges(self, stamp: float, anchor_ids: Sequence[str], metres: ArrayLike, tag: int = 0) -> LocalizerState:
@@ -176,7 +189,7 @@ class Localizer:
         """Return the pose at the time of the last odometry."""
         bank = self._bank
         stamp = self._odometer.stamp
-        odometry = self._odometer.pose.copy() if len(self._odometer) else np.full(3, np.nan)
+        odometry = self._wheels.copy()
         if not len(bank):
             nothing = np.full((3, 3), np.nan)
             nowhere = np.full(3, np.nan)

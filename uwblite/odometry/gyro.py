@@ -74,14 +74,14 @@ def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     if gyro is None or len(gyro.stamps) < 2 or len(odometry.stamps) < 2:
         return log, []
     steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
-    factor, why = _reading(gyro, odometry)
+    factor, why = reading_of(gyro, odometry)
     if not factor:
         return log, [Remark("gyro", why)]
     gyro = Gyro(gyro.stamps, factor * gyro.heading)
     covered = _covered(gyro, odometry.stamps)
     if not covered.any():
         return log, [Remark("gyro", "the gyro was silent while the wheels were read: their heading is taken")]
-    bias, standing = _bias(gyro, odometry)
+    bias, standing = bias_of(gyro, odometry)
     heading = np.interp(odometry.stamps, gyro.stamps, gyro.heading) - bias * (odometry.stamps - odometry.stamps[0])
     turn = np.where(covered, np.diff(heading), steps[:, 2])
     shift = se2.rotate(0.5 * (turn - steps[:, 2]), steps[:, :2])
@@ -103,7 +103,7 @@ def _covered(gyro: Gyro, stamps: Floats) -> Bools:
     return np.asarray(inside[:-1] & inside[1:] & (gaps[behind[1:]] == gaps[before[:-1]]))
 
 
-def _bias(gyro: Gyro, odometry: Odometry) -> tuple[float, bool]:
+def bias_of(gyro: Gyro, odometry: Odometry) -> tuple[float, bool]:
     """Return the gyro's bias, rad/s, and whether it is from rests."""
     turned, by_wheels, way = _changes(gyro, odometry, 1.0)
     rests = (way < STANDING[0]) & (np.abs(by_wheels) < STANDING[1])
@@ -113,7 +113,7 @@ def _bias(gyro: Gyro, odometry: Odometry) -> tuple[float, bool]:
     return (float(np.median(turned - by_wheels)) / WINDOW if len(turned) else 0.0), False
 
 
-def _reading(gyro: Gyro, odometry: Odometry) -> tuple[float, str]:
+def reading_of(gyro: Gyro, odometry: Odometry) -> tuple[float, str]:
     """Return by what the gyro's heading is to be multiplied, and why; 0 where it is not that of this robot."""
     turned, by_wheels, _ = _changes(gyro, odometry, WINDOW)
     if len(turned) < 4:
