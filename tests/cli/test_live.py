@@ -1,15 +1,22 @@
 """`uwblite localize --live`: lines of JSON on stdout, warnings on stderr, and usage errors."""
 
+import dataclasses
 import json
 import os
 import socket
 
 import numpy as np
 import pytest
+from emulators.dwm_device import DwmDevice, DwmOptions
+from emulators.kobuki_device import GyroLineDevice, KobukiDevice
+from emulators.scip_device import ScipDevice, ScipOptions
+from emulators.world import RoomWorld, WorldClock
 from helpers.localization_room import ANCHORS, ROUND, SCANNER, cast, grid_of, known, path
+from helpers.virtual_recording import live_devices
 
 from uwblite import se2
 from uwblite.cli import main
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.map_server import write_map
 
 
@@ -37,6 +44,90 @@ def room(tmp_path_factory):
     log = folder / "run.log"
     log.write_text("\n".join(lines) + "\n")
     return folder, log, poses
+
+
+@pytest.fixture
+def circle(tmp_path):
+    """A map of the emulated room, and the devices of a robot that drives a circle in it."""
+    x1, y1, x2, y2 = RoomWorld.WALLS
+    grid = grid_of([(x + 4.0, y + 3.0, u + 4.0, v + 3.0) for x, y, u, v in
+                    ((x1, y1, x2, y1), (x2, y1, x2, y2), (x2, y2, x1, y2), (x1, y2, x1, y1))])  # fmt: skip
+    geometry = dataclasses.replace(grid.geometry, origin=grid.geometry.origin - [4.0, 3.0])
+    write_map(tmp_path, OccupancyGrid(geometry, grid.log_odds))
+    rows = "".join(f"{name:04X},{x},{y},0.01,0.01,0.0,0.05,ok\n" for name, x, y in RoomWorld.ANCHORS)
+    (tmp_path / "anchors.csv").write_text("id,x,y,sigma_x,sigma_y,bias,residual_rms,status\n" + rows)
+    (tmp_path / "trajectory.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    world, clock = RoomWorld(), WorldClock()
+    devices = {
+        "base": KobukiDevice(world.poses(), clock),
+        "lidar": ScipDevice(world.scans(), clock, ScipOptions()),
+        "uwb": DwmDevice(world.epochs(), clock, DwmOptions()),
+        "gyro": GyroLineDevice(world.poses(), clock),
+    }
+    return tmp_path, devices, world, clock
+
+
+GYRO = "line:gyro?columns=t,turn_rate&time_unit=0.001&angle_unit=0.017453292519943295"
+PORTS = {
+    "base": ["--odometry", "kobuki:base"],
+    "lidar": ["--lidar", "lidar"],
+    "uwb": ["--uwb", "uwb"],
+    "gyro": ["--gyro", GYRO],
+}
+
+
+def driven(circle, seconds, names, capsys):
+    """Return the exit code, the lines, stderr and where the robot was at the time of each line, with devices by name."""
+    folder, devices, world, clock = circle
+    words = [word for name in names for word in PORTS[name]]
+    with live_devices({name: devices[name] for name in names}, seconds, begin=lambda now: clock.start(now + 0.5)):
+        code = main(["localize", "--live", "--map", str(folder), "--rate", "2", *words])
+    out, err = capsys.readouterr()
+    found = lines_of(out)
+    truth = [world.pose(line["stamp"] - 1000.5) for line in found]
+    return code, found, err, np.array([[p.x, p.y, p.theta] for p in truth])
+
+
+@pytest.mark.slow
+def test_devices_on_serial_ports_say_where_the_robot_is(circle, capsys):
+    """The recorder, the drivers and the localiser together, in simulated time."""
+    code, found, err, truth = driven(circle, 20.0, ("base", "lidar", "uwb", "gyro"), capsys)
+    assert code == 0, err
+    assert found[0]["lost"]
+    sure = [k for k, line in enumerate(found) if not line["lost"]]
+    assert found[sure[0]]["stamp"] < 1015.0
+    assert sure == list(range(sure[0], len(found)))
+    off = np.array([found[k]["pose"] for k in sure]) - truth[sure]
+    # Walls one cell thick, and 20 ms of the base.
+    assert np.hypot(*off[:, :2].T).max() < 0.06
+    assert np.abs(se2.wrap_angle(off[:, 2])).max() < 0.03
+    assert "nothing from" not in err
+
+
+@pytest.mark.slow
+def test_a_silent_lidar_is_named_and_ranges_go_on(circle, capsys):
+    circle[1]["lidar"] = Mute()
+    code, found, err, truth = driven(circle, 45.0, ("base", "lidar", "uwb"), capsys)
+    assert "nothing from lidar for 5 s; the pose rests on ranges and odometry" in err
+    assert "Traceback" not in err
+    assert code == 0, found[-1]
+    assert np.hypot(*(np.array(found[-1]["pose"]) - truth[-1])[:2]) < 0.3
+
+
+class Mute:
+    """A device that is plugged in and says nothing."""
+
+    def power_up(self, now):
+        pass
+
+    def advance(self, now):
+        return b""
+
+    def receive(self, data, now):
+        return b""
+
+    def next_time(self, now):
+        return float("inf")
 
 
 def lines_of(text):

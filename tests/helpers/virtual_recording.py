@@ -1,5 +1,6 @@
 """`uwblite record` in simulated time: the real recorder and sessions against emulated devices, without ports or waiting."""
 
+from contextlib import contextmanager
 from unittest import mock
 
 from uwblite.drivers import link as link_module
@@ -92,6 +93,43 @@ class VirtualSelector:
 
     def close(self):
         pass
+
+
+@contextmanager
+def live_devices(devices, seconds, *, begin=None):
+    """Let `uwblite localize --live` find emulated devices behind its ports, in simulated time.
+
+    Parameters
+    ----------
+    devices : what stands behind each port, by its name.
+    seconds : after which somebody stops it.
+    begin : called with the clock's time at the start.
+    """
+    from uwblite.cli import live_devices as module
+
+    clock, ports = VirtualTime(), {}
+    real = Recorder.run
+
+    def open_port(url, _baud):
+        ports[url] = VirtualPort(devices[url], clock)
+        return ports[url]
+
+    def recorder(links, log, **words):
+        made = Recorder(links, log, **(words | {"monotonic": clock, "wall_offset": 0.0, "open_port": open_port}))
+        made._selector = VirtualSelector(clock, ports)
+        if begin:
+            begin(clock.now)
+        return made
+
+    def run(self, *, duration, stopping):
+        real(self, duration=seconds, stopping=stopping)
+
+    with (
+        mock.patch.object(module, "Recorder", recorder),
+        mock.patch.object(Recorder, "run", run),
+        mock.patch.object(link_module, "Opening", OpenedAtOnce),
+    ):
+        yield
 
 
 def record(path, devices, seconds, *, laser=(0.0, 0.0, 0.0), more_lasers=(), params=(), begin=None):
