@@ -4,6 +4,7 @@
 """
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -76,12 +77,30 @@ def build(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: 
     clouds : one per keyframe. poses : (k, 3) T_map_base. path : (k,) m. recording : (k,).
     """
     first, last = cut(path, recording, config.epsilon)
-    reference = (first + last - 1) // 2
+    return of_pieces(clouds, poses, first, last, (first + last - 1) // 2, config)
+
+
+def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Submaps:
+    """Merge the clouds of pieces that begin with the keyframes first (s,) and end before last (s,), and filter them.
+
+    Parameters
+    ----------
+    reference : (s,) keyframes in whose frames the points stand.
+    """
     parts = []
-    for block in range(0, len(first), _AT_ONCE):
-        own = slice(block, block + _AT_ONCE)
-        parts.append(_built(clouds, poses, first[own], last[own], reference[own], config))
+    for rows in _together(first, last):
+        parts.append(_built(clouds, poses, first[rows], last[rows], reference[rows], config))
     return Submaps(first, last, reference, joined(parts))
+
+
+def _together(first: Ints, last: Ints) -> Iterator[slice]:
+    """Yield the pieces that are merged at once: each begins where the one before ends."""
+    gap = np.append(np.flatnonzero(first[1:] != last[:-1]) + 1, len(first))
+    start = 0
+    while start < len(first):
+        end = min(int(gap[np.searchsorted(gap, start, "right")]), start + _AT_ONCE)
+        yield slice(start, end)
+        start = end
 
 
 def _built(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: Ints, config: SubmapConfig) -> Clouds:

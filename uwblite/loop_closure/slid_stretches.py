@@ -19,6 +19,8 @@ _NEAR = 4
 """Keyframes that a scan edge of the same visit spans, at most."""
 _CLEAR_PLACE, _CLEAR_HEADING = 0.05, 0.02
 """Standard deviations, m and rad, up to which a scan edge fixes a pose in every direction; none does along a bare corridor."""
+_ALL = 3
+"""Directions of a pose."""
 _AGREES = 4.0
 """Standard deviations within which a scan edge agrees with the map."""
 _MADE_GOOD = 0.3
@@ -43,19 +45,37 @@ def scans_fixing(graph: Graph) -> Ints:
     count = np.zeros(len(graph.poses) + 1, dtype=np.int64)
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
-            good = (np.abs(edges.i - edges.j) <= _NEAR) & _clear(edges)
-            good &= np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < _AGREES
+            good = (np.abs(edges.i - edges.j) <= _NEAR) & (_fixed(edges) == _ALL) & _agrees(edges, graph)
             np.add.at(count, np.minimum(edges.i, edges.j)[good], 1)
             np.add.at(count, np.maximum(edges.i, edges.j)[good], -1)
     return np.cumsum(count)[:-1]
 
 
-def _clear(edges: ScanEdges) -> Bools:
-    """Return which scan edges (e,) fix a pose in all directions."""
+def directions_held(graph: Graph) -> Ints:
+    """Return in how many directions, 0 to 3, the best scan edge of the same visit fixes the step from each keyframe (k,)."""
+    held = np.zeros(len(graph.poses), dtype=np.int64)
+    for edges in graph.edges:
+        if isinstance(edges, ScanEdges):
+            first, span = np.minimum(edges.i, edges.j), np.abs(edges.i - edges.j)
+            agrees = (span <= _NEAR) & _agrees(edges, graph)
+            fixed = _fixed(edges)
+            for k in range(_NEAR):
+                over = agrees & (span > k)
+                np.maximum.at(held, first[over] + k, fixed[over])
+    return held
+
+
+def _agrees(edges: ScanEdges, graph: Graph) -> Bools:
+    """Return which scan edges (e,) agree with the map."""
+    return np.asarray(np.abs(edges.residuals(graph)).max(axis=1, initial=0.0) < _AGREES)
+
+
+def _fixed(edges: ScanEdges) -> Ints:
+    """Return in how many directions, 0 to 3, scan edges (e,) fix a pose."""
     information = np.swapaxes(edges.sqrt_information, 1, 2) @ edges.sqrt_information
     units = np.array([_CLEAR_PLACE, _CLEAR_PLACE, _CLEAR_HEADING])
-    # With the limits as units, the least eigenvalue is 1 where the least certain direction has the limit as its sigma.
-    return np.asarray(np.linalg.eigvalsh(information * np.outer(units, units))[:, 0] > 1.0)
+    # With the limits as units, an eigenvalue is over 1 where its direction has a sigma under the limit.
+    return np.asarray(np.sum(np.linalg.eigvalsh(information * np.outer(units, units)) > 1.0, axis=1))
 
 
 def slid(graph: Graph) -> list[tuple[int, int, float]]:

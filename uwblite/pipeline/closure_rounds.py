@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
+from ..graph.pose_edges import OdometryEdges
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
 from ..loop_closure import candidates as closure_candidates
-from ..loop_closure import closures, paper_method, verification
+from ..loop_closure import closures, loose_links, paper_method, verification
 from ..loop_closure.closures import Closures
 from .estimate import Estimate, Task
 from .progress import Stage, solver_figures
@@ -17,7 +19,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     config, recordings, scans = task.config, task.recordings, estimate.scans
     assert scans is not None
     base = estimate.graph.with_edges(*estimate.odometry_and_ranges, *estimate.steps_and_closures)
-    found = closures.no_closures()
+    base, found, estimate = _with_loose_links_tied(base, estimate, task)
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
     with_ranges = estimate.ranges is not None
@@ -47,6 +49,39 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
         if (tied or len(new.edges) <= 0.05 * len(found.edges)) and not unsearched:
             break
     return replace(estimate, closures=found).with_estimates_of(base)
+
+
+def _with_loose_links_tied(base: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Closures, Estimate]:
+    """Match both sides of each link that no scan measures once more; solve with the matches that hold.
+
+    Where these contradict the odometry it counts for little from then on: if it stood still, no match would win against it.
+    """
+    recordings, scans, rules, wheels = task.recordings, estimate.scans, task.config.loop_closure, estimate.odometry
+    assert scans is not None
+    links = loose_links.loose_links(wheels, base)
+    if not len(links):
+        return base, closures.no_closures(), estimate
+    candidates, pieces = loose_links.propose(
+        base, scans.clouds, wheels, links, recordings.of_keyframe, rules, task.config.submaps
+    )
+    free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
+    found = verification.find(candidates, pieces, rules, task.config.correlative, None, free, task.executor)
+    found = _without_forbidden(found, task)
+    spanned = loose_links.spanned(wheels, found.edges)
+    solved, found = verification.reconcile(
+        _with_odometry(base, wheels, loose_links.loosened(wheels, spanned, rules)), found, rules, task.config.solver
+    )
+    wrong = loose_links.spanned(wheels, found.edges) & loose_links.contradicted(wheels, solved)
+    after = loose_links.loosened(wheels, wrong, rules)
+    task.stages.end(
+        "loose links", links=len(links), candidates=len(found.candidates), kept=len(found.edges), loosened=int(wrong.sum())
+    )
+    return _with_odometry(base.with_estimates_of(solved), wheels, after), found, replace(estimate, odometry=after)
+
+
+def _with_odometry(graph: Graph, wheels: OdometryEdges, others: OdometryEdges) -> Graph:
+    """Return a graph with other edges of the odometry in place of its own."""
+    return replace(graph, edges=tuple(others if edges is wheels else edges for edges in graph.edges))
 
 
 def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:

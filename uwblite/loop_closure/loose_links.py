@@ -1,0 +1,111 @@
+"""Links of the chain that no scan measures: the clouds next to each, once more against several of the other side.
+
+A cloud seen in a fast turn, behind people or over a gap in the scans may match neither neighbour; the chain then rests on one
+step of the odometry there, and all that stands before it turns with that step.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Ints
+from ..graph.graph import Graph
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
+from ..lidar import submaps
+from ..lidar.clouds import Clouds
+from ..lidar.submaps import SubmapConfig, Submaps
+from .candidates import Candidates
+from .closures import LoopClosureConfig
+from .slid_stretches import directions_held
+
+_LEAST_HELD = 2
+"""Directions that scans fix in a sound link: a bare corridor leaves the way along it to the odometry."""
+_VIEWS = 6
+"""Keyframes of one side that make its sub-map."""
+_SINGLE = 3
+"""Keyframes of the other side that are each laid onto it: with more, the robot has turned to what neither has in common."""
+_LEAST_POINTS = 30
+"""Clouds with fewer points are not matched."""
+_DISTANCE = 1.2
+"""Half-width of the search, m: an odometry that stands still while the robot turns fast is not wrong by more in one step."""
+_EXCEPTIONS, _SHARE = 5, 0.02
+"""Links, and share of all steps, up to which they are exceptions; a lidar that loses more sees too little for a search."""
+_FAR = 10.0
+"""Standard deviations from which a match contradicts the odometry."""
+
+
+def loose_links(wheels: OdometryEdges, graph: Graph) -> Ints:
+    """Return the steps of the odometry (l,) that scan edges do not fix; none where these are no exceptions.
+
+    Parameters
+    ----------
+    graph : holds the scan edges.
+    """
+    links = np.flatnonzero(directions_held(graph)[wheels.i] < _LEAST_HELD)
+    return links if len(links) <= max(_EXCEPTIONS, _SHARE * len(wheels)) else links[:0]
+
+
+def spanned(wheels: OdometryEdges, ties: RelativePoseEdges) -> Bools:
+    """Return which steps of the odometry (e,) ties between the two sides of links span."""
+    low, high = np.minimum(ties.i, ties.j), np.maximum(ties.i, ties.j)
+    return np.any((wheels.i[:, None] >= low) & (wheels.j[:, None] <= high), axis=1)
+
+
+def contradicted(wheels: OdometryEdges, graph: Graph) -> Bools:
+    """Return which steps of the odometry (e,) a graph is far from."""
+    return np.asarray(np.abs(wheels.residuals(graph)).max(axis=1, initial=0.0) > _FAR)
+
+
+def loosened(wheels: OdometryEdges, steps: Bools, config: LoopClosureConfig) -> OdometryEdges:
+    """Return the odometry with some steps (e,) as uncertain as wheels that slip."""
+    root = wheels.sqrt_information.copy()
+    root[steps] = np.diag(1.0 / np.array([config.slip, config.slip, config.slip_angle]))
+    return replace(wheels, sqrt_information=root)
+
+
+def propose(
+    graph: Graph,
+    clouds: Clouds,
+    wheels: OdometryEdges,
+    links: Ints,
+    recording: Ints,
+    config: LoopClosureConfig,
+    merging: SubmapConfig,
+) -> tuple[Candidates, Submaps]:
+    """Return candidates that tie the two sides of links (l,), and the pieces of the recording that are matched for them.
+
+    Parameters
+    ----------
+    clouds : one per keyframe. recording : (k,). merging : how several clouds become one.
+    """
+    first, last, reference = _pieces(wheels.i[links], wheels.j[links], clouds, recording)
+    made = submaps.of_pieces(clouds, graph.poses, first.reshape(-1), last.reshape(-1), reference.reshape(-1), merging)
+    target = 2 * np.arange(len(first))
+    guess = se2.between(graph.poses[reference[:, 0]], graph.poses[reference[:, 1]])
+    covariance = np.tile(np.diag([config.slip**2, config.slip**2, config.slip_angle**2]), (len(target), 1, 1))
+    return Candidates(target, target + 1, guess, covariance, np.full(len(target), _DISTANCE), False), made
+
+
+def _pieces(before: Ints, after: Ints, clouds: Clouds, recording: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return what is matched across links from keyframes before (l,) to after (l,): several clouds and a single one.
+
+    Returns
+    -------
+    First keyframe (c, 2), one past the last and reference keyframe of both pieces of each candidate.
+    """
+    start = np.searchsorted(recording, recording[before])
+    end = np.searchsorted(recording, recording[before], "right")
+    # A sub-map that reached over another link would be broken itself.
+    sound, until = start.copy(), end.copy()
+    sound[1:] = np.maximum(sound[1:], after[:-1])
+    until[:-1] = np.minimum(until[:-1], before[1:] + 1)
+    parts = []
+    for n in range(_SINGLE):
+        behind, ahead = before - n, after + n
+        onto = np.maximum(before + 1 - _VIEWS, sound), before + 1, before, ahead, ahead + 1, ahead
+        back = after, np.minimum(after + _VIEWS, until), after, behind, behind + 1, behind
+        parts += [np.stack(onto, axis=1)[ahead < end], np.stack(back, axis=1)[behind >= start]]
+    pieces = np.concatenate(parts).reshape(-1, 2, 3)
+    pieces = pieces[clouds.counts[pieces[:, 1, 2]] >= _LEAST_POINTS]
+    return pieces[..., 0], pieces[..., 1], pieces[..., 2]
