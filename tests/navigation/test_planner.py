@@ -5,7 +5,7 @@ import heapq
 import numpy as np
 import pytest
 from helpers.planning_worlds import distance_to_squares, grid_of, random_grid
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwblite.grid.occupancy_grid import OCCUPIED
 from uwblite.navigation.planner import STEPS, NoPathError, make_planner
@@ -79,6 +79,22 @@ def test_laws_of_a_path(seed):
         steps = dijkstra(planner.graph, indices=planner._beside(start))[planner._beside(goal)]
         assert path.cost <= steps * 1.005 + 1e-3
         assert planner.plan(goal, [start]).cost == pytest.approx(path.cost, rel=0.02, abs=1e-3)
+
+
+@pytest.mark.parametrize("detour", [(0.0, 0.0), (0.01, 0.3), (0.5, 2.0)])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_search_between_start_and_goal_finds_what_one_through_the_whole_map_does(monkeypatch, seed, detour):
+    monkeypatch.setattr("uwblite.navigation.planner._DETOUR", detour)
+    grid = random_grid(seed, rows=60, cols=80, boxes=20)
+    grid.log_odds[20:30, 20:26] = 0.0
+    planner = make_planner(grid, RADIUS, unknown="price")
+    label = connected_components(planner.graph)[1]
+    nodes = np.flatnonzero(label == np.bincount(label).argmax())
+    for first, last in np.random.default_rng(seed).choice(nodes, (20, 2)).tolist():
+        cells = planner._search(first, last, planner._places(np.array([last]))[0])
+        assert (cells[0], cells[-1]) == (first, last)
+        cost = np.asarray(planner.graph[cells[:-1], cells[1:]]).sum()
+        assert cost == pytest.approx(dijkstra(planner.graph, indices=first)[last], abs=1e-9)
 
 
 def test_open_space_is_crossed_in_a_straight_line():
