@@ -204,7 +204,8 @@ class Driver:
             if not len(path):
                 try:
                     path = self.planner.plan(pose, [goal], step=0.05).poses[:, :2]
-                except UwbliteError:
+                except UwbliteError as why:
+                    print(f"goal {tally.goals} is given up: {why}", file=sys.stderr, flush=True)
                     return
             rest = float(np.hypot(*(goal - pose[:2])))
             if rest < 0.03:
