@@ -53,7 +53,7 @@ def test_a_robot_that_stands_at_first_is_waited_for(log):
 @pytest.mark.parametrize("slow", [0.2, 1.0, 30.0])
 def test_the_estimate_is_that_of_a_computer_whose_time_grows_with_the_work(log, monkeypatch, slow):
     """A map that takes a + b w seconds for work w, and a clock that says so: the estimate is a + b w of the whole."""
-    clock = [0.0]
+    clock, log = [0.0], of_length(log, 40.0)
 
     def build_map(part):
         clock[0] += 0.1 + slow * cost.work_seconds(part)

@@ -71,6 +71,7 @@ def test_a_moved_anchor_is_named_and_does_not_pull(log, earlier):
     assert np.sqrt(np.mean(errors(found, earlier) ** 2)) < 0.025
 
 
+@pytest.mark.slow
 def test_a_changed_place_is_doubted(log, earlier):
     rng = np.random.default_rng(1)
     other = dataclasses.replace(earlier.grid, log_odds=np.where(rng.uniform(size=earlier.grid.log_odds.shape) < 0.01, 5, -5.0))
