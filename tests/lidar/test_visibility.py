@@ -54,6 +54,24 @@ def test_one_visit_has_nothing_to_compare_with(drive):
     assert free_space_violation(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.int64)) == (0.0, 0)
 
 
+def test_one_keyframe_compared_with_many_is_one_visit(drive):
+    """A person who stood before that one keyframe stands in all comparisons."""
+    truth, path, clouds = drive
+    again = next(k for k in range(len(truth) - 1, 0, -1) if np.sum(near(truth, k) & (path < path[k] - 10.0)) > 4)
+    poses = truth + 1000.0 * np.outer(np.arange(len(truth)), (1, 0, 0))
+    kept = near(truth, again) & (path < path[again] - 10.0)
+    kept &= path < path[np.argmax(kept)] + 5.0
+    kept[again] = True
+    poses[kept] = truth[kept]
+    share, visits = free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.int64))
+    assert visits == 1
+    assert share < 0.05
+
+
+def near(poses, k):
+    return np.hypot(*(poses[:, :2] - poses[k, :2]).T) < 1.5
+
+
 def test_recordings_are_visits_of_their_own(drive):
     truth, path, clouds = drive
     recording = (np.arange(len(truth)) >= len(truth) // 2).astype(np.int64)

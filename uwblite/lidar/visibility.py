@@ -115,18 +115,21 @@ def free_space_violation(clouds: Clouds, poses: Floats, path: Floats, recording:
 
     Returns
     -------
-    share : of the points that the other visit could see, 0..1. visits : views of one keyframe on what another saw.
+    share : of the points that the other visit could see, 0..1.
+    visits : different keyframes on the smaller side of the comparisons, earlier or later. One keyframe that is compared with
+        many has seen the person who stood there in all of them.
     """
     i, j = _revisits(poses, path, recording)
     nearest = nearest_by_bearing(clouds)
-    through, seen, visits = 0.0, 0.0, 0
+    through, seen, compared = 0.0, 0.0, []
     for a, b in zip([*i.tolist(), *j.tolist()], [*j.tolist(), *i.tolist()], strict=True):
         points = se2.transform(se2.between(poses[a], poses[b]), clouds.cloud(b)[0])
         share, visible = contradiction(free_space(np.zeros((1, 3)), nearest[a : a + 1]), points, _MARGIN)
         if visible * len(points) >= _COMMON:
             through += share * visible * len(points)
             seen += visible * len(points)
-            visits += 1
+            compared.append((min(a, b), max(a, b)))
+    visits = min((len(set(side)) for side in zip(*compared, strict=True)), default=0)
     return through / max(seen, 1.0), visits
 
 

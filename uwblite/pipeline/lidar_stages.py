@@ -248,5 +248,5 @@ def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
 
 _VIOLATION = 0.05
 """Share of points in free space from which visits do not show the same place; people, glass and doors leave half of it."""
-_ENOUGH_VISITS = 10
-"""Views of another visit from which their free-space violation counts."""
+_ENOUGH_VISITS = 5
+"""Keyframes of either visit from which their free-space violation counts."""
