@@ -74,6 +74,7 @@ def test_closed_standard_input_is_one_line(folder):
     assert b"standard input is closed" in output
 
 
+@pytest.mark.slow
 def test_names_that_are_no_text_reach_no_terminal_and_spoil_no_result(folder):
     name = os.fsdecode(HOSTILE)
     for command in ('$UWBLITE check "$NAME" --quick', '$UWBLITE map "$NAME" --out "$OUT" --force', '$UWBLITE check "$NAME.x"'):
