@@ -34,7 +34,7 @@ def test_closed_standard_input_is_an_error(monkeypatch, stdin):
         open_input("-")
 
 
-@pytest.mark.parametrize(("name", "outputs"), [("none", "No such file"), (".", "Is a directory"), ("a\0b", "null byte")])
+@pytest.mark.parametrize(("name", "outputs"), [("none", "No such file"), (".", "Is a directory"), ("a\0b", "embedded null")])
 def test_what_cannot_be_opened_is_named(tmp_path, name, outputs):
     with pytest.raises(FormatError, match=f"cannot be opened: .*{outputs}"):
         open_input(str(tmp_path / name))
