@@ -3,7 +3,7 @@
 
     python tools/localization.py                          hall, lab and warehouse: half an hour
     python tools/localization.py --only lab --starts 10   a part of it
-    python tools/localization.py --keep /tmp/grounds      maps and recordings are kept there and used again
+    python tools/localization.py --keep grounds            maps and recordings are kept there and used again
     python tools/localization.py --print                  nothing written
 
 A map is made of one simulated recording, a second recording of another drive by another robot, from another day, is played

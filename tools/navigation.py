@@ -3,7 +3,7 @@
 
     python tools/navigation.py                      lab, hall, warehouse and arena, 20 goals each
     python tools/navigation.py --only lab --goals 5 --print
-    python tools/navigation.py --keep /tmp/grounds  maps and recordings are kept there and used again
+    python tools/navigation.py --keep grounds       maps and recordings are kept there and used again
 
 The robot plans in the map of a recording, follows by pure pursuit where it believes to be, and is told nothing else: its wheels
 err as the recording's do, people walk about, it begins at an unknown place, and where it is lost it turns on the spot until it

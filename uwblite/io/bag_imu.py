@@ -8,10 +8,11 @@ from array import array
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..arrays import Bools, Floats
 from ..sensor_log import Gyro
-from .bag_frames import Frames, rotation
+from .bag_frames import Frames
 
 GRAVITY, SLACK = (9.81, 1.0), 0.2
 """Usual acceleration of a resting or driving robot, m/s^2 or in units of it, and the share by which it may differ."""
@@ -97,6 +98,6 @@ def _finite(rows: Floats) -> Bools:
 
 def _headings(turns: Floats) -> Floats:
     """Return the turn about the vertical since the first orientation (n,), rad, unwrapped; quaternions (n, 4) x y z w."""
-    matrices = np.stack([rotation(*turn) for turn in turns.tolist()])
+    matrices = Rotation.from_quat(turns).as_matrix()
     since = matrices @ matrices[0].T
     return np.unwrap(np.arctan2(since[:, 1, 0] - since[:, 0, 1], since[:, 0, 0] + since[:, 1, 1]))

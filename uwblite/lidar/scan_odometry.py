@@ -15,6 +15,7 @@ from .cloud_rasters import CloudRasters
 from .clouds import CloudConfig, Clouds, make_cloud
 from .correlative_matching import CorrelativeConfig, search
 from .pair_alignment import align_pairs
+from .scan_matching import PairPoints
 
 _FIRST_GATE, _LAST_GATE = 0.4, 0.12
 """Farthest match in the first and last iteration, m."""
@@ -64,25 +65,28 @@ def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: In
 
     Points without a match count as one at the gate.
     """
+    built, raster, i, _, points = _pairs(scans, mounting, first, second)
+    found = scan_matching.match(built, raster, i, motion, points, _FIRST_GATE, _FIRST_GATE)
+    return (found.squared + _FIRST_GATE**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
+
+
+def _pairs(
+    scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints
+) -> tuple[Clouds, CloudRasters, Ints, Ints, PairPoints]:
+    """Return the clouds of pairs of scans, their rasters, which clouds each pair (e,) is of, and the points to be matched."""
     config = CloudConfig()
     chosen, where = np.unique(np.concatenate([first, second]), return_inverse=True)
     i, j = np.split(where.reshape(-1), 2)
     built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
     raster = cloud_rasters.rasterize(built, config.raster, _FIRST_GATE)
     points = scan_matching.pair_points(built, j, _POINTS)
-    found = scan_matching.match(built, raster, i, motion, points, _FIRST_GATE, _FIRST_GATE)
-    return (found.squared + _FIRST_GATE**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
+    return built, raster, i, j, points
 
 
 def _block(
     scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, guess: Floats, searches: int
 ) -> tuple[Floats, Floats]:
-    config = CloudConfig()
-    chosen, where = np.unique(np.concatenate([first, second]), return_inverse=True)
-    i, j = np.split(where.reshape(-1), 2)
-    built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
-    raster = cloud_rasters.rasterize(built, config.raster, _FIRST_GATE)
-    points = scan_matching.pair_points(built, j, _POINTS)
+    built, raster, i, j, points = _pairs(scans, mounting, first, second)
     aligned = align_pairs(built, raster, i, j, guess, points, _FIRST_GATE, _LAST_GATE)
     enough = aligned.factors.asked >= _LEAST_POINTS
     pose, share = aligned.pose.copy(), np.where(enough, aligned.share, 0.0)
