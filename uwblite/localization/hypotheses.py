@@ -247,6 +247,14 @@ def weighed(bank: Hypotheses, log_likelihood: Floats) -> Hypotheses:
     return replace(bank, log_weight=weight - weight.max(initial=-np.inf) if len(weight) else weight)
 
 
+def mixture(bank: Hypotheses, which: int) -> tuple[Floats, Floats]:
+    """Return the probability (h,) of each hypothesis and the covariance (3, 3) of all poses about one of them."""
+    share = np.exp(bank.log_weight)
+    share /= share.sum()
+    off = se2.between(np.zeros(3), bank.poses - bank.poses[which])
+    return share, np.einsum("h,hij->ij", share, bank.pose_covariances + off[:, :, None] * off[:, None, :])
+
+
 def apart(one: Floats, others: Floats) -> Bools:
     """Return which poses (h, 3) are another place than a pose (3,): half a metre or 0.3 rad away."""
     off = se2.between(one, others)

@@ -32,8 +32,15 @@ class Scan:
     """A scan that the odometry has not reached."""
 
     stamp: float
+    """s, of the first ray, on the odometry's clock."""
     readings: Floats
+    """(b,) m."""
     scanner: Scanner
+
+    @property
+    def end(self) -> float:
+        """s, of the last ray; of the first one in a recording that is played backwards."""
+        return max(self.stamp, self.stamp + self.scanner.time_increment * max(len(self.readings) - 1, 0))
 
 
 def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:

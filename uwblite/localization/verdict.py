@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats
-from . import hypotheses, search
+from . import hypotheses
 from .hypotheses import Hypotheses
+from .range_likelihood import range_errors
 from .walls import Rays
 from .window import Ranges
 
@@ -65,7 +66,7 @@ class RangeFit:
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
     if not len(ranges):
         return RangeFit(0, 0.0, False)
-    agree = np.abs(search.range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
+    agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
     enough = len(np.unique(ranges.anchor[agree])) >= 2 and int(agree.sum()) >= ENOUGH_RANGES
     return RangeFit(len(ranges), float(agree.mean()), bool(enough))
 

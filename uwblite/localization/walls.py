@@ -49,6 +49,10 @@ class Rays:
         """Return some of the rays."""
         return Rays(self.ends[which], self.origins[which], self.hit[which])
 
+    def spread(self, count: int) -> "Rays":
+        """Return at most so many rays, evenly spread."""
+        return self.rows(np.unique(np.linspace(0, len(self.hit) - 1, count).astype(np.int64)))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Agreement:

@@ -1,0 +1,107 @@
+"""Places in the map against one another: how well each explains what was measured during the last metres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats
+from . import hypotheses, range_likelihood, search, verdict
+from .hypotheses import Hypotheses
+from .known_map import KnownMap
+from .sensing import TRACK_RAYS
+from .walls import Rays
+from .window import Ranges, Window
+
+SCAN_EVIDENCE = 15.0
+"""Rays per metre of driving that count as independent when places are compared."""
+_LOOK_BACK = 4.0
+"""m driven, of whose scans places are compared."""
+_SEARCH_LOOKS = 2.5
+"""m driven, of whose scans the search makes one cloud."""
+_SIGMA_SCAN = (0.2, 0.2, 0.06)
+"""m, m, rad; of a place that the search found by scans."""
+_SIGMA_FLOOR = (0.1, 0.1, 0.03)
+"""m, m, rad; drift within the window, on top of what ranges say of a place."""
+_RADIO_REACH = 15.0
+"""m beyond the outermost anchors; where a robot may be in a map without a grid."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """Places in the map, and how well each explains what was measured."""
+
+    bank: Hypotheses
+    """The present hypotheses first."""
+    complete: bool
+    """No place that is as good was left out."""
+    weight: Floats
+    """(h,) log-likelihood."""
+    fit: Floats
+    """(h,) mean log-likelihood of the rays."""
+    known: Floats
+    """(h,) rays' ends in known space."""
+    rays: Rays
+    ranges: Ranges
+
+    @property
+    def hypotheses(self) -> Hypotheses:
+        """All places, weighted by this alone."""
+        return hypotheses.weighed(Hypotheses(self.bank.mean, self.bank.covariance, np.zeros(len(self.bank))), self.weight)
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether another place explains what was measured better than the first hypothesis."""
+        rivals = self.weight[hypotheses.apart(self.bank.poses[0], self.bank.poses)]
+        return self.complete and bool(rivals.max(initial=-np.inf) > self.weight[0] + verdict.CERTAIN)
+
+
+class PlaceSearch:
+    """The whole map, ready to be searched."""
+
+    def __init__(self, known: KnownMap) -> None:
+        self.walls, self.anchors = known.walls, len(known.anchors.ids)
+        self._field = None if known.walls is None else search.field_of(known.walls)
+        self._bounds = _bounds(known)
+
+    def compared(self, bank: Hypotheses, window: Window, odom: Floats, way: float) -> Comparison:
+        """Search the whole map for what a window holds, and weight what is found together with the present hypotheses.
+
+        Parameters
+        ----------
+        odom : (3,) present pose in the odometry frame. way : the odometer now, m.
+        """
+        ranges = window.ranges_since(odom, way)
+        rays, ago = window.seen(odom, way, _LOOK_BACK)
+        recent = rays.rows(ago <= _SEARCH_LOOKS)
+        found = search.places(self._field, self.walls, recent, ranges, self._bounds)
+        bank = self._with_places(bank, found.poses, ranges, recent)
+        weight = range_likelihood.range_likelihood(bank.poses, ranges)
+        fit, known = np.zeros(len(bank)), np.zeros(len(bank))
+        if self.walls is not None and len(rays.hit):
+            agreement = self.walls.agreement(bank.poses, rays)
+            weight += SCAN_EVIDENCE * (1.0 + float(ago.max())) * agreement.log_likelihood
+            fit, known = agreement.log_likelihood, agreement.known
+        return Comparison(bank, found.complete, weight, fit, known, rays, ranges)
+
+    def _with_places(self, bank: Hypotheses, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
+        """Return the hypotheses with new ones where none is near."""
+        for pose in bank.poses:
+            poses = poses[hypotheses.apart(pose, poses)]
+        if not len(poses):
+            return bank
+        scans = self.walls is not None and rays.hit.sum() >= verdict.FEW_ENDS
+        covariances = np.tile(np.diag(np.square(_SIGMA_SCAN)), (len(poses), 1, 1))
+        if not scans:
+            hessian, _ = range_likelihood.range_factors(poses, ranges)
+            covariances = np.linalg.inv(hessian + np.diag([0.01, 0.01, 0.1])) + np.diag(np.square(_SIGMA_FLOOR))
+        fresh = hypotheses.started(poses, covariances, self.anchors)
+        if scans and self.walls is not None:
+            fresh = hypotheses.matched(fresh, self.walls, rays.spread(TRACK_RAYS), 1.0)
+        return hypotheses.joined(bank, fresh)
+
+
+def _bounds(known: KnownMap) -> tuple[Floats, Floats]:
+    """Return the corners (2,) of the area in which the robot may be, m."""
+    if known.walls is not None:
+        return known.walls.geometry.origin, known.walls.geometry.corner
+    return known.anchors.positions.min(axis=0) - _RADIO_REACH, known.anchors.positions.max(axis=0) + _RADIO_REACH

@@ -1,0 +1,85 @@
+"""How likely a window's ranges are at poses of the map, and what they say of the pose."""
+
+import numpy as np
+from scipy.special import ndtr
+
+from .. import se2
+from ..arrays import Floats, Ints
+from .window import Ranges
+
+_INDEPENDENT = 0.5
+"""Share of the window's ranges that are worth a new one: they are a quarter of a metre apart, and their errors are alike
+over 1.5 m in part."""
+_LATTICE, _LATTICE_STEPS = (1.5, 1.5, 0.6), (8, 8, 4)
+"""m, m, rad about a pose, and steps to either side: several times what a start may be off by."""
+
+
+def chosen(ranges: Ranges, which: Ints) -> Ranges:
+    """Return some of the ranges."""
+    return Ranges(*(getattr(ranges, n)[which] for n in ("anchor", "places", "tags", "values", "sigma")))
+
+
+def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
+    """Return errors (h, m), m, measured minus expected, offsets (h, m, 2) from the anchors and lever arms (h, m, 2)."""
+    lever = se2.rotate(poses[:, None, 2], ranges.tags[None])
+    offset = poses[:, None, :2] + lever - ranges.places
+    return ranges.values - np.hypot(offset[..., 0], offset[..., 1]), offset, lever
+
+
+def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Floats:
+    """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; detours and nonsense happen.
+
+    Ranges to one anchor err alike, see _INDEPENDENT.
+
+    Parameters
+    ----------
+    wider : added to every sigma, m: the poses are those of a grid.
+    """
+    if not len(ranges):
+        return np.zeros(len(poses))
+    error, sigma = range_errors(poses, ranges)[0], ranges.sigma + wider
+    z = error / sigma
+    late = 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z)
+    return _INDEPENDENT * np.log(0.7 * np.exp(-0.5 * z**2) + late + 0.02).sum(axis=1)
+
+
+def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:
+    """Return poses (h, 3) moved to where the ranges agree best nearby: Gauss-Newton with a Cauchy kernel."""
+    poses = poses.copy()
+    for _ in range(8):
+        hessian, gradient = range_factors(poses, ranges)
+        step = -np.linalg.solve(hessian + np.diag([1e-3, 1e-3, 1e-2]), gradient[:, :, None])[:, :, 0]
+        length = np.maximum(np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2]))
+        poses += step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-9))[:, None]
+    poses[:, 2] = se2.wrap_angle(poses[:, 2])
+    return poses
+
+
+def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return the mean (3,) and covariance (3, 3) of the pose by the ranges alone, about a pose (3,) where they agree best.
+
+    Detours leave the likelihood flat where its curvature, with every range that is late left out, promises a sharp peak: the
+    moments are summed over a lattice of poses.
+    """
+    axes = [np.linspace(-reach, reach, 2 * count + 1) for reach, count in zip(_LATTICE, _LATTICE_STEPS, strict=True)]
+    off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    weight = range_likelihood(pose + off, ranges)
+    weight = np.exp(weight - weight.max())
+    weight /= weight.sum()
+    mean = weight @ off
+    steps = np.array([axis[1] - axis[0] for axis in axes])
+    off -= mean
+    # Each point of the lattice stands for a cell: the cell's own variance besides.
+    covariance = (off * weight[:, None]).T @ off + np.diag(steps**2 / 12.0)
+    return np.concatenate([pose[:2] + mean[:2], [se2.wrap_angle(pose[2] + mean[2])]]), covariance
+
+
+def range_factors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return the quadratic form (h, 3, 3) and gradient (h, 3) of the whitened range errors at poses (h, 3)."""
+    error, offset, lever = range_errors(poses, ranges)
+    distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 0.05)
+    unit = offset / distance[..., None]
+    jacobian = np.concatenate([unit, (unit[..., 1] * lever[..., 0] - unit[..., 0] * lever[..., 1])[..., None]], axis=-1)
+    weight = _INDEPENDENT / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
+    weighted = jacobian * weight[..., None]
+    return weighted.transpose(0, 2, 1) @ jacobian, -np.einsum("hmk,hm->hk", weighted, error)

@@ -1,0 +1,89 @@
+"""How well the last measurements agree with the tracked pose: from that, whether it is lost, and which anchors have moved."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+
+FIT_SOUND = -0.3
+"""Mean log-likelihood of the last scans' rays from which nothing is doubtful."""
+FIT_LOST = -0.7
+"""The same, below which the pose is lost."""
+_RANGES_LOST = 0.25
+"""Mean weight of ranges below which the pose is lost."""
+_FORGETTING, _FORGETTING_RANGES = 0.1, 0.2
+"""Share of a new scan, and of a new range, in the mean of the last ones: a second of scans, two rounds of four ranges."""
+_SEEN = 0.5
+"""Share of the last scans that must have met known space for their fit to speak for a pose that ranges contradict."""
+_SOUND_WEIGHT = 0.5
+"""Weight from which a range speaks for the pose; what was measured since the last one, or the last scan that fits, begins the
+search of a robot that is lost."""
+_RANGES_SOUND, _RECENT = 0.5, 5.0
+"""Mean weight of ranges, the last of them s ago, from which they speak for a pose that scans contradict: it is given up only
+for a better one. Rooms that the map holds in part look like that, and people around the robot."""
+_MOVED = (0.2, 20.0)
+"""Mean weight below which, after so many ranges, an anchor counts as moved."""
+
+
+@dataclass(slots=True, eq=False)
+class RunningFit:
+    """Means of the last measurements, each forgotten in proportion to what follows."""
+
+    trust: Floats
+    """(a, 2) of each anchor: mean weight of its ranges, and how many there were."""
+    fit: float = 0.0
+    """Mean log-likelihood of the rays of scans that met known space."""
+    seen: float = 0.0
+    """Share of scans that met known space."""
+    ranges: float = 1.0
+    """Mean weight of ranges."""
+    sound: float = -np.inf
+    """s, of the last measurement that spoke for the pose."""
+    ranged: float = -np.inf
+    """s, of the last range."""
+
+    def restart(self, sees: bool) -> None:
+        """Begin with full agreement: the pose was found now."""
+        self.fit, self.seen, self.ranges = 0.0, 1.0 if sees else 0.0, 1.0
+        self.forget_anchors()
+
+    def forget_anchors(self) -> None:
+        """Trust all anchors again."""
+        self.trust[:] = (1.0, 0.0)
+
+    def add_range(self, anchor: int, weight: float, stamp: float) -> None:
+        """Take the weight, 0..1, of a range at the pose."""
+        self.trust[anchor] += (_FORGETTING * (weight - self.trust[anchor, 0]), 1.0)
+        self.ranges += _FORGETTING_RANGES * (weight - self.ranges)
+        self.ranged = max(self.ranged, stamp)
+        if weight > _SOUND_WEIGHT:
+            self.sound = max(self.sound, stamp)
+
+    def add_scan(self, fit: float, informative: bool, stamp: float) -> None:
+        """Take the mean log-likelihood of a scan's rays at the pose; informative: enough of them met known space."""
+        self.seen += _FORGETTING * (informative - self.seen)
+        if informative:
+            self.fit += _FORGETTING * (fit - self.fit)
+            if fit > FIT_SOUND:
+                self.sound = max(self.sound, stamp)
+
+    def scans_contradict(self) -> bool:
+        return self.fit < FIT_LOST
+
+    def ranges_contradict(self) -> bool:
+        """Return whether the ranges contradict the pose, and no scans speak for it."""
+        return self.ranges < _RANGES_LOST and not (self.seen > _SEEN and self.fit > FIT_SOUND)
+
+    def ranges_vouch(self, now: float) -> bool:
+        """Return whether recent ranges speak for the pose."""
+        return self.ranges > _RANGES_SOUND and now - self.ranged < _RECENT
+
+    def moved_anchors(self) -> Ints:
+        """Return the anchors that most ranges have long disagreed with."""
+        return np.flatnonzero((self.trust[:, 0] < _MOVED[0]) & (self.trust[:, 1] >= _MOVED[1]))
+
+
+def full_agreement(anchors: int) -> RunningFit:
+    """Return the state before anything was measured."""
+    return RunningFit(np.tile((1.0, 0.0), (anchors, 1)))
