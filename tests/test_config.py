@@ -10,7 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.config import field_docs, from_dict, leaves, merge, override, parse_toml, setting, to_dict, to_toml, toml_value
+from uwblite.config import (
+    differences,
+    field_docs,
+    from_dict,
+    leaves,
+    merge,
+    override,
+    parse_toml,
+    setting,
+    to_dict,
+    to_toml,
+    toml_value,
+)
 from uwblite.errors import ConfigError
 from uwblite.pipeline.mapping_config import MappingConfig
 
@@ -173,3 +185,11 @@ def test_a_message_that_quotes_a_broken_file_stays_short():
     with pytest.raises(ConfigError, match=r"unknown setting 'AAA.* \.\.\. A*'; `uwblite config` lists all settings$") as caught:
         merge(MappingConfig(), {"A" * 100_000: 1})
     assert len(str(caught.value)) < 1000
+
+
+def test_differences_are_what_override_makes_of_the_base():
+    base = MappingConfig()
+    assert differences(base, base) == []
+    changed = override(base, ["use_loops=false", "grid.resolution=0.1", "crop=[0, 0, 12, 8]"])
+    assert sorted(differences(changed, base)) == ["crop=[0.0, 0.0, 12.0, 8.0]", "grid.resolution=0.1", "use_loops=false"]
+    assert override(base, differences(changed, base)) == changed

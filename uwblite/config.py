@@ -107,6 +107,12 @@ def leaves(cls: type) -> Iterator[tuple[str, Any]]:
     yield from _flatten("", to_dict(cls()))
 
 
+def differences(config: Any, base: Any) -> list[str]:
+    """Return the settings that differ from those of a base, as `override` takes them."""
+    theirs = dict(_flatten("", to_dict(base)))
+    return [f"{name}={toml_value(v)}" for name, v in _flatten("", to_dict(config)) if v != theirs.get(name)]
+
+
 def _flatten(prefix: str, data: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     for name, value in data.items():
         if isinstance(value, Mapping) and value:

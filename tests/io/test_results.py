@@ -346,3 +346,17 @@ def test_times_of_closures_keep_their_microseconds(tmp_path):
     for closure in json.loads((tmp_path / "map" / "report.json").read_text())["closures"]:
         for end in "ij":
             assert abs(closure[f"stamp_{end}"] - late.keyframe_stamps[closure[end]]) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("preset", "changed", "line"),
+    [
+        ("", (), "defaults"),
+        ("", ("use_loops=false",), "defaults with use_loops=false"),
+        ("paper", ("a=1", "b=2"), "paper with a=1, b=2"),
+    ],
+)
+def test_the_report_names_the_settings_that_were_changed(tmp_path, preset, changed, line):
+    write_result(tmp_path / "map", [small_log()], small_result(), RunRecord("c", "", preset=preset, changed=changed))
+    assert f"<td>{line}</td>" in (tmp_path / "map" / "report.html").read_text()
+    assert json.loads((tmp_path / "map" / "report.json").read_text())["changed_settings"] == list(changed)

@@ -84,7 +84,7 @@ def test_marked_ranges_are_those_that_disagree():
     drawn = sum(figure.count("M") for figure in re.findall(r'class="(?:los|nlos)" d="([^"]*)"', text))
     assert drawn == len(result.range_table["stamp"])
     joint = page(each=2)
-    assert "one recording after another" in joint
+    assert "<span>last recording</span>" in joint
     xs = [float(x) for x in re.findall(r"M([\d.]+) [\d.]+h0", joint)]
     assert (min(xs), max(xs)) == (0.0, 1000.0)
 

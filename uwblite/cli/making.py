@@ -54,9 +54,11 @@ def make(
     reading : time that it took to read them, s.
     progress, executor : see `build_map`.
     """
+    from ..config import differences
     from ..io.result_text import RunRecord
     from ..io.results import write_result
-    from ..mapping import build_map
+    from ..mapping import MappingConfig, build_map
+    from ..pipeline.mapping_config import preset
     from ..pipeline.scan_selection import prepared
 
     config, constraints = settings(args), known(args)
@@ -72,6 +74,7 @@ def make(
         versions=versions(),
         given=given_files(args),
         preset=args.preset or "",
+        changed=tuple(differences(config, preset(args.preset) if args.preset else MappingConfig())),
         seconds=0.0 if args.no_timings else reading + time.perf_counter() - began,
         reading_seconds=reading,
         peak_rss_bytes=peak_memory(),

@@ -34,6 +34,8 @@ class RunRecord:
     given: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the files that are named beside recordings and settings, by the name of their option."""
     preset: str = ""
+    changed: tuple[str, ...] = ()
+    """Settings that differ from the preset's, as --set takes them."""
     seconds: float = 0.0
     """Wall time of the whole run; 0 = not to be recorded."""
     reading_seconds: float = 0.0
@@ -42,6 +44,11 @@ class RunRecord:
     """Show the stages' seconds in report.html too; it then differs from run to run."""
     scale_map: bool = False
     """Write the map as probabilities too: map_scale.png and its YAML."""
+
+
+def settings_line(preset: str, changed: Sequence[str]) -> str:
+    """Return in one line which settings a map was made with."""
+    return " with ".join(filter(None, (preset or "defaults", ", ".join(changed))))
 
 
 def _decimal(value: float, digits: int = 6) -> str:
@@ -111,6 +118,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "versions": record.versions,
         "command": record.command,
         "preset": record.preset,
+        "changed_settings": list(record.changed),
         "config_sha256": hashlib.sha256(record.config.encode()).hexdigest(),
         "given": record.given,
         "inputs": [_input_entry(log.notes) for log in logs],

@@ -38,7 +38,17 @@ from .g2o import write_g2o
 from .map_server import trinary_image, write_map
 from .png import encode_png, write_png
 from .pyfg import write_pyfg
-from .result_text import RunRecord, anchors_csv, base_name, covariance_csv, json_lines, recording_figures, stamps_csv, summary
+from .result_text import (
+    RunRecord,
+    anchors_csv,
+    base_name,
+    covariance_csv,
+    json_lines,
+    recording_figures,
+    settings_line,
+    stamps_csv,
+    summary,
+)
 from .tum import write_tum
 
 _CONTRACT = re.compile(
@@ -171,7 +181,7 @@ def _facts(logs: Sequence[SensorLog], result: MapResult, record: RunRecord) -> t
         ("map", "" if grid is None else _size(grid)),
         ("graph", f"{len(result.keyframe_stamps)} keyframes, {kept} of {len(result.closures)} loop closures accepted"),
         *(("sha256", log.notes.sha256) for log in logs),
-        ("settings", record.preset or "defaults"),
+        ("settings", settings_line(record.preset, record.changed)),
         ("made by", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
     ]
     return tuple((name, value) for name, value in facts if value)

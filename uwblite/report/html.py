@@ -178,6 +178,8 @@ def _words(name: str) -> str:
 
 
 def _figure(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, dict):
@@ -193,16 +195,16 @@ def _residuals(result: MapResult) -> str:
     # The clocks of several recordings have nothing in common: their ranges are drawn one after another.
     time = np.arange(len(table["stamp"]), dtype=np.float64) if several else table["stamp"] - table["stamp"].min()
     span = max(float(time.max()), 1e-9)
-    along = "one recording after another" if several else f"{span:.0f} s"
+    ends = ("first recording", "last recording") if several else ("0 s", f"{span:.0f} s")
     parts = [
         "<p class=hint>Expected minus measured range over time; <span class=nlos-text>marked</span>: does not agree with the"
-        " map, as where something blocks the line of sight (NLOS).</p>"
+        " map, as where something blocks the line of sight (NLOS). What lies beyond the scale is drawn at its edge.</p>"
     ]
     for index, anchor in enumerate(result.anchors):
         mine = np.flatnonzero(table["anchor"] == index)
         mine = mine[np.isfinite(table["residual"][mine])]
         if len(mine):
-            parts.append(_residual_plot(anchor.id, table, mine[thin(len(mine), MOST_RESIDUALS)], time / span, along))
+            parts.append(_residual_plot(anchor.id, table, mine[thin(len(mine), MOST_RESIDUALS)], time / span, ends))
     return "".join(parts)
 
 
@@ -210,7 +212,7 @@ def _dots(x: Floats, y: Floats) -> str:
     return "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _residual_plot(anchor_id: str, table: dict[str, Floats], which: Ints, time: Floats, along: str) -> str:
+def _residual_plot(anchor_id: str, table: dict[str, Floats], which: Ints, time: Floats, ends: tuple[str, str]) -> str:
     residual, good = table["residual"][which], table["agrees"][which] > 0
     inner = float(np.quantile(np.abs(residual[good]), 0.99)) if good.any() else 0.0
     limit = max(2.0 * inner, 0.1)
@@ -219,10 +221,11 @@ def _residual_plot(anchor_id: str, table: dict[str, Floats], which: Ints, time: 
     dots = "".join(
         f'<path class="{name}" d="{_dots(x[sel], y[sel])}"/>' for name, sel in (("los", good), ("nlos", ~good)) if sel.any()
     )
+    scale = "".join(f"<span>{number(value, 2, True)} m</span>" for value in (limit, -limit))
+    marked = f"<span class=hint>{100 * float(np.mean(~good)):.0f} % marked</span>"
     return (
-        f"<figure><figcaption>{escape(anchor_id)} <span class=hint>axis \u00b1{limit:.2f} m, {escape(along)};"
-        f" {100 * float(np.mean(~good)):.0f} % marked</span></figcaption>"
-        f'<svg class="residuals" viewBox="0 0 1000 120" preserveAspectRatio="none" role="img"'
-        f' aria-label="residuals of {escape(anchor_id)}">'
-        f'<path class="axis" d="M0 60H1000"/>{dots}</svg></figure>'
+        f"<figure><figcaption>{escape(anchor_id)} {marked}</figcaption><div class=plot><div class=scale>{scale}</div>"
+        '<svg class="residuals" viewBox="0 0 1000 120" preserveAspectRatio="none" role="img"'
+        f' aria-label="residuals of {escape(anchor_id)}"><path class="axis" d="M0 60H1000"/>{dots}</svg></div>'
+        f"<div class=ends>{''.join(f'<span>{end}</span>' for end in ends)}</div></figure>"
     )

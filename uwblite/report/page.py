@@ -65,7 +65,10 @@ stroke:#fff;stroke-width:calc(var(--s)*4px)}
 #place{font-variant-numeric:tabular-nums;float:right;color:var(--fg)}
 .hidden{display:none}
 figure{margin:.6rem 0}figcaption{font-weight:600}
-.residuals{display:block;width:100%;height:7rem;border:1px solid var(--line);border-radius:.3rem}
+.plot{display:flex;gap:.4rem}.ends{display:flex;justify-content:space-between;margin-left:4.9rem}
+.scale{display:flex;flex-direction:column;justify-content:space-between;width:4.5rem;text-align:right}
+.scale,.ends{font-size:.75rem;color:var(--dim);font-variant-numeric:tabular-nums}
+.residuals{display:block;flex:1;min-width:0;height:7rem;border:1px solid var(--line);border-radius:.3rem}
 .residuals path{fill:none;stroke-width:3;stroke-linecap:round;vector-effect:non-scaling-stroke}
 .residuals .axis{stroke:var(--line);stroke-width:1}.residuals .los{stroke:var(--path)}.residuals .nlos{stroke:var(--nlos)}
 @media (max-width:40rem){main{padding:.6rem}body{font-size:15px}}

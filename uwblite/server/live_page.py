@@ -7,24 +7,23 @@ by server-sent events and connects again by itself.
 import html
 
 from ..report.page import coloured
+from . import drawing
 
 _STYLE = """
 :root{--paper:#f6f7f9;--card:#fff;--ink:#1f2733;--faint:#6b7482;--line:#d8dde4;--path:@path@;--anchor:@anchor@;
 --robot:@start@;--warn:#fff4e0;--good:#e7f5e9;--bad:#fde4e1}
 @media (prefers-color-scheme:dark){:root{--paper:#14181e;--card:#1d232b;--ink:#e4e8ee;--faint:#98a2b0;--line:#36404c;
---path:@path-dark@;--anchor:@anchor-dark@;--robot:@start-dark@;--warn:#3a2f1a;--good:#17301b;--bad:#451c19}
-image{filter:invert(1) hue-rotate(180deg) brightness(.85)}}
+--path:@path-dark@;--anchor:@anchor-dark@;--robot:@start-dark@;--warn:#3a2f1a;--good:#17301b;--bad:#451c19}}
 *{box-sizing:border-box}body{margin:0;background:var(--paper);color:var(--ink);font:16px/1.45 system-ui,sans-serif}
 header{position:sticky;top:0;z-index:2;padding:.5rem 1rem;background:var(--card);border-bottom:1px solid var(--line)}
-h1{font-size:1.05rem;margin:0}h2{font-size:1rem;margin:0 0 .3rem}.faint{color:var(--faint);font-size:.9rem}
+h1{font-size:1.05rem;margin:0}h2{font-size:1rem;margin:0 0 .3rem}.faint{font-size:.9rem}
 main{display:grid;gap:.8rem;padding:.8rem;grid-template-columns:repeat(auto-fit,minmax(min(100%,24rem),1fr))}
 section{overflow-x:auto;background:var(--card);border:1px solid var(--line);border-radius:.5rem;padding:.7rem;min-width:0;
-overflow-wrap:anywhere}svg{display:block;width:100%;max-height:80vh;background:#cdcdcd;border-radius:.3rem}
-@media (prefers-color-scheme:dark){svg{background:#262d36}}image{image-rendering:pixelated}
+overflow-wrap:anywhere}svg{max-height:80vh}
 .path,.trail{fill:none;stroke:var(--path);stroke-width:2;vector-effect:non-scaling-stroke}.trail{stroke:var(--robot)}
 .p1{stroke:@path1@}.p2{stroke:@path2@}.p3{stroke:@path3@}.robot{fill:var(--robot);stroke:#fff;stroke-width:1;
-vector-effect:non-scaling-stroke}.lost{fill-opacity:.35}.anchor{fill:var(--anchor)}.sigma{fill:var(--anchor);fill-opacity:.15;
-stroke:var(--anchor);vector-effect:non-scaling-stroke}text{fill:var(--anchor);font-family:system-ui,sans-serif}
+vector-effect:non-scaling-stroke}.lost{fill-opacity:.35}.sigma{fill:var(--anchor);fill-opacity:.15;
+stroke:var(--anchor);vector-effect:non-scaling-stroke}
 ol{margin:0;padding-left:1.3rem}li{margin:.2rem 0}li:first-child{font-weight:600}.advice{background:var(--warn)}
 .fine{background:var(--good)}.late{background:var(--bad)}
 @media (min-width:60rem){main{grid-template-columns:2fr 1fr}.picture{grid-column:1;grid-row:1/span 9}}
@@ -35,21 +34,8 @@ th{color:var(--faint)}
 """
 
 _SCRIPT = r"""
-"use strict";
-const NS = "http://www.w3.org/2000/svg", at = id => document.getElementById(id);
+const at = id => document.getElementById(id);
 let map = null, now = null, shown = null;
-function el(name, attrs = {}, ...children) {
-  const node = document.createElement(name);
-  for (const [k, v] of Object.entries(attrs)) node.setAttribute(k, v);
-  node.append(...children);
-  return node;
-}
-function shape(name, attrs, text = "") {
-  const node = document.createElementNS(NS, name);
-  for (const [k, v] of Object.entries(attrs)) node.setAttribute(k, v);
-  node.textContent = text;
-  return node;
-}
 const line = points => points.map(p => p[0] + "," + -p[1]).join(" ");
 function arrow(pose, r, name) {
   return shape("path", {class: name, d: `M${r} 0L${-.7 * r} ${.7 * r}L${-.3 * r} 0L${-.7 * r} ${-.7 * r}Z`,
@@ -82,10 +68,12 @@ function drawMap() {
   map.paths.forEach((path, k) => layer.append(shape("polyline", {class: "path p" + k % 4, points: line(path)})));
   for (const a of placed) {
     if (a.covariance) layer.append(ellipse(a));
-    layer.append(shape("circle", {class: "anchor", cx: a.place[0], cy: -a.place[1], r: size / 90}));
-    layer.append(shape("text", {x: a.place[0] + size / 60, y: -a.place[1], "font-size": size / 35}, a.id));
+    layer.append(anchorMark(a.id, a.place, size));
   }
+  layer.append(scaleBar(x0 + size / 40, -y0 - size / 40, size));
   svg.replaceChildren(layer, shape("g", {id: "robot"}));
+  at("legend").replaceChildren(key("path", "path"), key("robot", "robot", "disc"),
+    ...(placed.length ? [key("anchor", "anchor, 2σ", "anchors")] : []));
   at("facts").textContent = map.accepted + " of " + map.candidates + " loop closures accepted";
   at("notes").replaceChildren(...map.doubts.map(t => el("li", {}, "Doubt: " + t)), ...map.warnings.map(t => el("li", {}, t)));
   at("notes").parentNode.hidden = !map.doubts.length && !map.warnings.length;
@@ -123,8 +111,9 @@ function status() {
   box.replaceChildren(list.length ? el("ol", {}, ...list.map(t => el("li", {}, t)))
     : el("div", {}, now.fine || "Nothing to do: go on driving."));
   const sensors = now.sensors || [];
-  at("sensors").replaceChildren(...rows(["sensor", "messages", "per second", "silent"], sensors.map(s =>
-    [s.late, s.name, s.count, s.rate, s.late ? s.silent + " s" : ""])));
+  const silent = sensors.some(s => s.late);
+  at("sensors").replaceChildren(...rows(["sensor", "messages", "per second", ...(silent ? ["silent"] : [])], sensors.map(s =>
+    [s.late, s.name, s.count, s.rate, ...(silent ? [s.late ? s.silent + " s" : ""] : [])])));
   at("sensors").parentNode.hidden = !sensors.length;
   drawRobot();
   anchors();
@@ -142,13 +131,14 @@ def live_page(title: str) -> str:
     name = html.escape(title)
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>{name}</title><link rel=icon href=data:,><style>{coloured(_STYLE)}</style></head><body>"
+        f"<title>{name}</title><link rel=icon href=data:,><style>{coloured(drawing.STYLE + _STYLE)}</style></head><body>"
         f'<header><h1>{name}</h1><div id="summary" class="faint" role="status">loading ...</div>'
         '<div id="lost" class="late" hidden>No connection; the page tries again by itself.</div></header><main>'
         '<section id="advice" aria-live="polite"></section><section class="picture">'
-        '<svg id="map" role="img" aria-label="map"></svg><div id="facts" class="faint">There is no map yet.</div></section>'
+        '<svg id="map" role="img" aria-label="map"></svg><div id="legend" class="row faint"></div>'
+        '<div id="facts" class="faint">There is no map yet.</div></section>'
         '<section hidden><h2>Sensors</h2><table id="sensors"></table></section>'
         '<section hidden><h2>Anchors</h2><table id="anchors"></table></section>'
         '<section hidden><h2>Of the latest map</h2><ul id="notes"></ul></section>'
-        f"</main><script>{_SCRIPT}</script></body></html>"
+        f"</main><script>{drawing.SCRIPT}{_SCRIPT}</script></body></html>"
     )

@@ -4,61 +4,45 @@ The script builds everything with text nodes, so that no name out of a recording
 """
 
 from ..report.page import coloured
+from . import drawing
 
 _STYLE = """
 :root{--paper:#f6f7f9;--card:#fff;--ink:#1f2733;--faint:#6b7482;--line:#d8dde4;--accent:#2563eb;--path:@path@;
 --accepted:@accepted@;--rejected:@rejected@;--anchor:@anchor@;--force:@start@;--ban:@anchor@;--warn:#fff4e0}
 @media (prefers-color-scheme:dark){:root{--paper:#14181e;--card:#1d232b;--ink:#e4e8ee;--faint:#98a2b0;--line:#36404c;
 --accent:#7aa5ff;--path:@path-dark@;--accepted:@accepted-dark@;--rejected:@rejected-dark@;--anchor:@anchor-dark@;--force:@start-dark@;--ban:@anchor-dark@;
---warn:#3a2f1a}image{filter:invert(1) hue-rotate(180deg) brightness(.85)}}*{box-sizing:border-box}body{margin:0;
+--warn:#3a2f1a}}*{box-sizing:border-box}body{margin:0;
 background:var(--paper);color:var(--ink);font:15px/1.45 system-ui,sans-serif}header{position:sticky;top:0;z-index:2;
 display:flex;flex-wrap:wrap;gap:.6rem 1rem;align-items:center;padding:.6rem 1rem;background:var(--card);
 border-bottom:1px solid var(--line)}h1{font-size:1.1rem;margin:0}h2{font-size:1rem;margin:0 0 .3rem}#say{
 color:var(--faint);flex:1 1 12rem}main{display:grid;gap:1rem;padding:1rem;
 grid-template-columns:repeat(auto-fit,minmax(min(100%,26rem),1fr))}section{background:var(--card);
-border:1px solid var(--line);border-radius:.5rem;padding:.8rem;min-width:0}svg{display:block;width:100%;
-max-height:62vh;background:#cdcdcd;border-radius:.3rem;touch-action:none}@media (prefers-color-scheme:dark){svg{
-background:#262d36}}image{image-rendering:pixelated}.path{fill:none;stroke:var(--path);stroke-width:2;
+border:1px solid var(--line);border-radius:.5rem;padding:.8rem;min-width:0}svg{
+max-height:62vh;touch-action:none}.path{fill:none;stroke:var(--path);stroke-width:2;
 vector-effect:non-scaling-stroke}.p1{stroke:@path1@}.p2{stroke:@path2@}.p3{stroke:@path3@}.closure{
 stroke:var(--accepted);stroke-width:1.6;vector-effect:non-scaling-stroke;cursor:pointer}.closure.no{
 stroke:var(--rejected);stroke-dasharray:4 3}.closure.force{stroke:var(--force);stroke-width:3}.closure.reject{
 stroke:var(--ban);stroke-width:3;stroke-dasharray:2 4}.hit{stroke:transparent;stroke-width:12;
 vector-effect:non-scaling-stroke;cursor:pointer}line.chosen{stroke-width:5}circle.chosen{stroke:var(--ink);
-stroke-width:2;vector-effect:non-scaling-stroke}.hideno .no{display:none}.anchor{fill:var(--anchor);cursor:pointer}
+stroke-width:2;vector-effect:non-scaling-stroke}.hideno .no{display:none}.anchor{cursor:pointer}
 .anchor.pinned{fill:var(--force)}button{font:inherit;padding:.35rem .8rem;border:1px solid var(--line);
 border-radius:.4rem;background:var(--card);color:inherit;cursor:pointer;min-height:2.4rem}button.main{
 background:var(--accent);border-color:var(--accent);color:#fff}button:disabled{opacity:.5;cursor:default}
 @media (prefers-color-scheme:dark){button.main{color:#10151c}}.detail{min-height:5.2rem;padding:.5rem 0;
-border-top:1px solid var(--line);margin-top:.6rem}.row{display:flex;flex-wrap:wrap;gap:.5rem;align-items:center}
-.anchor text{fill:var(--anchor);paint-order:stroke;stroke:#fff;stroke-width:.15em;font-weight:600}.anchor.pinned text{
-fill:var(--force)}.start{fill:var(--force)}.end{fill:#fff;stroke:var(--path);stroke-width:2;vector-effect:non-scaling-stroke}
-.end.p1{stroke:@path1@}.end.p2{stroke:@path2@}.end.p3{stroke:@path3@}@media (prefers-color-scheme:dark){.anchor text{
-stroke:#000}}.faint{color:var(--faint)}.doubt{background:var(--warn);border-radius:.3rem;padding:.4rem .6rem;margin:.4rem 0}a{
+border-top:1px solid var(--line);margin-top:.6rem}
+.start,.end{pointer-events:none}.start{fill:var(--force)}.end{fill:#fff;stroke:var(--path);stroke-width:2;
+vector-effect:non-scaling-stroke}.end.p1{stroke:@path1@}.end.p2{stroke:@path2@}.end.p3{stroke:@path3@}
+.doubt{background:var(--warn);border-radius:.3rem;padding:.4rem .6rem;margin:.4rem 0}a{
 color:var(--accent)}table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.15rem .5rem .15rem 0;
 font-weight:400}th{color:var(--faint)}.list{max-height:16rem;overflow:auto;border-top:1px solid var(--line);
-margin-top:.5rem}.list button{min-height:0;padding:.1rem .5rem}.key{display:inline-block;width:1.2rem;
-border-top:3px solid;vertical-align:middle}.key.p1{color:@path1@}.key.p2{color:@path2@}.key.p3{color:@path3@}.key.disc{
-width:.7rem;height:.7rem;border:0;border-radius:50%;background:currentColor}.key.anchors{width:0;border:.4rem solid transparent;
-border-top:0;border-bottom:.7rem solid}input{font:inherit;width:6rem;padding:.25rem;border:1px solid var(--line);
+margin-top:.5rem}.list button{min-height:0;padding:.1rem .5rem}.key.p1{color:@path1@}
+.key.p2{color:@path2@}.key.p3{color:@path3@}input{font:inherit;width:6rem;padding:.25rem;border:1px solid var(--line);
 border-radius:.3rem;background:var(--card);color:inherit}
 """
 
 _SCRIPT = r"""
-"use strict";
-const NS = "http://www.w3.org/2000/svg", say = document.getElementById("say"), main = document.querySelector("main");
+const say = document.getElementById("say"), main = document.querySelector("main");
 let state = null, chosen = null, timer = 0;
-function el(name, attrs = {}, ...children) {
-  const node = document.createElement(name);
-  for (const [k, v] of Object.entries(attrs)) k.startsWith("on") ? node.addEventListener(k.slice(2),
-    v) : node.setAttribute(k, v);
-  node.append(...children);
-  return node;
-}
-function shape(name, attrs) {
-  const node = document.createElementNS(NS, name);
-  for (const [k, v] of Object.entries(attrs)) node.setAttribute(k, v);
-  return node;
-}
 async function ask(path, wish) {
   const options = wish ? {method: "POST", body: JSON.stringify(wish),
     headers: {"Content-Type": "application/json", "X-Token": document.body.dataset.token}} : {};
@@ -87,18 +71,16 @@ function show() {
 }
 function card(run, number) {
   const detail = el("div", {class: "detail"}), busy = state.job && state.job.code === null;
-  const facts = [run.recordings.join(", "), run.preset, run.accepted + " of " + run.candidates + " closures accepted",
+  const facts = [run.recordings.join(", "), run.settings, run.accepted + " of " + run.candidates + " closures accepted",
     run.anchors.length + " anchors"].filter(Boolean).join(" · ");
   const svg = picture(run, number, detail);
   const rejected = el("input", {type: "checkbox", style: "width:auto", onchange: e => svg.classList.toggle("hideno",
     !e.target.checked)});
-  const key = (name, text, form = "") => el("span", {}, el("i", {class: "key " + form, style: "color:var(--" + name + ")"}),
-    " " + text);
   const paths = run.paths.length < 2 ? [key("path", "path")] : run.paths.slice(0, 4).map((_, k) => el("span", {}, el("i",
     {class: "key p" + k, ...(k ? {} : {style: "color:var(--path)"})}), " recording " + (k + 1)));
   const node = el("section", {}, el("h2", {}, run.name), el("div", {class: "faint"}, facts));
   for (const text of run.doubts) node.append(el("div", {class: "doubt"}, "Doubt: " + text));
-  node.append(svg, el("div", {class: "row faint"}, ...paths, key("force", "start", "disc"),
+  node.append(svg, el("div", {class: "row faint"}, ...paths, key("force", "start", "disc"), key("path", "end", "ring"),
     ...(run.anchors.length ? [key("anchor", "anchor", "anchors")] : []), key("accepted", "closure accepted"),
     el("label", {}, rejected, " ", key("rejected", "rejected")), key("force", "forced, pinned"), key("ban",
       "rejected by you")));
@@ -125,10 +107,6 @@ function picture(run, number, detail) {
     width: run.image.width, height: run.image.height, preserveAspectRatio: "none"}));
   run.paths.forEach((path, k) => svg.append(shape("polyline", {class: "path p" + k % 4,
     points: path.map(p => p[0] + "," + -p[1]).join(" ")})));
-  run.paths.forEach((path, k) => {
-    const mark = (at, name) => shape("circle", {cx: at[0], cy: -at[1], r: size / 110, class: name});
-    if (path.length) svg.append(mark(path[0], "start"), mark(path[path.length - 1], "end p" + k % 4));
-  });
   for (const c of run.closures.slice().reverse()) {
     const [a, b] = c.places, line = {x1: a[0], y1: -a[1], x2: b[0], y2: -b[1]};
     const mark = " " + (c.accepted || c.wish !== "leave" ? "" : "no") + " " + c.wish;
@@ -138,15 +116,19 @@ function picture(run, number, detail) {
     for (const node of [drawn, hit]) node.addEventListener("click", open);
     svg.append(drawn, hit);
   }
+  run.paths.forEach((path, k) => {
+    const mark = (at, name) => shape("circle", {cx: at[0], cy: -at[1], r: size / 110, class: name});
+    if (path.length) svg.append(mark(path[0], "start"), mark(path[path.length - 1], "end p" + k % 4));
+  });
   for (const a of run.anchors) {
     if (!a.place) continue;
-    const node = shape("g", {transform: "translate(" + a.place[0] + " " + -a.place[1] + ") scale(" + size / 60 + ")",
-      class: "anchor" + (a.pinned ? " pinned" : ""), "data-anchor": a.id});
-    node.append(Object.assign(shape("title", {}), {textContent: "anchor " + a.id}), shape("path", {d: "M0-1L.9.6H-.9z"}),
-      Object.assign(shape("text", {x: 1.2, y: .5, "font-size": 1.6}), {textContent: a.id}));
+    const node = anchorMark(a.id, a.place, size);
+    node.classList.toggle("pinned", Boolean(a.pinned));
+    node.dataset.anchor = a.id;
     node.addEventListener("click", () => choose(number, detail, d => tellAnchor(d, run, number, a.id), null));
     svg.append(node);
   }
+  svg.append(scaleBar(x0 + size / 40, -y0 - size / 40, size));
   return svg;
 }
 function choose(number, detail, tell, mark) {
@@ -202,7 +184,7 @@ def page(token: str) -> str:
     """Return the page; the token lets its own posts in, and no other page's."""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>uwblite view</title><link rel=icon href=data:,><style>{coloured(_STYLE)}</style></head>"
+        f"<title>uwblite view</title><link rel=icon href=data:,><style>{coloured(drawing.STYLE + _STYLE)}</style></head>"
         f'<body data-token="{token}"><header><h1>uwblite view</h1><span id="say" role="status">loading ...</span></header>'
-        f"<main></main><script>{_SCRIPT}</script></body></html>"
+        f"<main></main><script>{drawing.SCRIPT}{_SCRIPT}</script></body></html>"
     )

@@ -9,6 +9,7 @@ import numpy as np
 from ..constraints import Constraints
 from ..io.map_server import trinary_image
 from ..io.png import encode_png
+from ..io.result_text import settings_line
 from ..io.stored_result import StoredResult
 from .advice import text_of
 from .edits import wish_for
@@ -45,7 +46,7 @@ def described(run: Run, edits: Constraints) -> dict[str, Any]:
         "doubts": [text_of(d) for d in report.get("doubts") or ()],
         "warnings": [text_of(w) for w in report.get("warnings") or ()],
         "recordings": [os.path.basename(str(i.get("source", ""))) for i in report.get("inputs") or ()],
-        "preset": report.get("preset") or "defaults",
+        "settings": settings_line(report.get("preset") or "", report.get("changed_settings") or ()),
         "accepted": sum(c.accepted for c in result.closures),
         "candidates": len(result.closures),
         "seconds": (report.get("timings") or {}).get("total"),
