@@ -211,7 +211,7 @@ def vendored(tmp_path_factory):
 USE = """
 from acme._x import uwblite
 from acme._x.uwblite.cli import main
-from acme._x.uwblite.config import field_docs
+from acme._x.uwblite.io.settings_toml import field_docs
 from acme._x.uwblite.odometry.keyframes import KeyframeConfig
 assert field_docs(KeyframeConfig)["distance"]
 assert not [m for m in sys.modules if m.split(".")[0] == "uwblite"]

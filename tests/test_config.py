@@ -3,92 +3,18 @@
 import dataclasses
 import math
 import re
-import tomllib
-from typing import Literal
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from helpers.example_settings import Outer
 
-from uwblite.config import (
-    differences,
-    field_docs,
-    from_dict,
-    leaves,
-    merge,
-    override,
-    parse_toml,
-    setting,
-    to_dict,
-    to_toml,
-    toml_value,
-)
+from uwblite.config import from_dict, leaves, merge, override, parse_toml, to_dict
 from uwblite.errors import ConfigError
 from uwblite.pipeline.mapping_config import MappingConfig
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Inner:
-    """A stage of the walk."""
-
-    max_iterations: int = setting(300, minimum=1, maximum=10_000)
-    """Most rounds of matching."""
-    distance: float = setting(0.1, above=0.0)
-    """Outlier distance, m. Larger: wider basin,
-    more false matches."""
-    kernel: Literal["none", "huber"] = "none"
-    """Robust kernel."""
-    pose: tuple[float, float, float] = (0.0, -1.0, 0.5)
-    """A pose: m, m, rad."""
-    optional: float | None = None
-    """Height, m."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Outer:
-    """All settings."""
-
-    icp: Inner = Inner()
-    """Matching."""
-    robust: bool = True
-    """Whether to be."""
-    name: str = "a"
-    offset: float = -1.0
-    """May be negative, for its default is."""
-    weights: tuple[float, ...] = (1.0, 2.0)
-    heights: dict[str, float] = dataclasses.field(default_factory=dict)
-
-
-def test_defaults_survive_dict_and_toml():
+def test_defaults_survive_dict():
     assert from_dict(Outer, to_dict(Outer())) == Outer()
-    assert from_dict(Outer, parse_toml(to_toml(Outer()))) == Outer()
-    assert from_dict(Outer, parse_toml(to_toml(Outer(), comments=True, header="two\nlines"))) == Outer()
     assert from_dict(Outer, {}) == Outer()
-
-
-numbers = st.floats(allow_nan=False)
-
-
-@given(
-    st.builds(
-        Outer,
-        icp=st.builds(
-            Inner,
-            max_iterations=st.integers(1, 10_000),
-            distance=st.floats(min_value=1e-300, allow_infinity=True),
-            kernel=st.sampled_from(["none", "huber"]),
-            pose=st.tuples(numbers, numbers, numbers),
-            optional=st.none() | st.floats(0, 1e9),
-        ),
-        robust=st.booleans(),
-        name=st.text().filter(lambda s: not any(0xD800 <= ord(c) < 0xE000 for c in s)),
-        offset=numbers,
-        weights=st.lists(numbers).map(tuple),
-        heights=st.dictionaries(st.text(st.characters(codec="utf-8")), numbers),
-    )
-)
-def test_any_settings_survive_toml(config):
-    assert from_dict(Outer, parse_toml(to_toml(config, comments=True))) == config
 
 
 def test_values_are_converted_to_the_type_of_the_field():
@@ -161,35 +87,13 @@ def test_toml_that_is_none_is_one_clear_error():
         parse_toml("a = " + "[" * 100_000, "deep.toml")
 
 
-def test_docstrings_under_the_fields_become_comments():
-    assert field_docs(Inner)["distance"] == "Outlier distance, m. Larger: wider basin, more false matches."
-    text = to_toml(Outer(), comments=True)
-    assert "# Outlier distance, m. Larger: wider basin, more false matches. (> 0)\ndistance = 0.1" in text
-    assert "# Robust kernel. (none, huber)" in text
-    assert '# Height, m. (or "none")\noptional = "none"' in text
-    assert "# A stage of the walk.\n[icp]" in text
-
-
 def test_leaves_name_every_setting():
     names = [name for name, _ in leaves(Outer)]
     assert names[0] == "icp.max_iterations"
     assert "heights" in names
 
 
-@given(st.text(st.characters(codec="utf-8")))
-def test_any_text_survives_toml(text):
-    assert tomllib.loads(f"x = {toml_value(text)}")["x"] == text
-
-
 def test_a_message_that_quotes_a_broken_file_stays_short():
     with pytest.raises(ConfigError, match=r"unknown setting 'AAA.* \.\.\. A*'; `uwblite config` lists all settings$") as caught:
         merge(MappingConfig(), {"A" * 100_000: 1})
     assert len(str(caught.value)) < 1000
-
-
-def test_differences_are_what_override_makes_of_the_base():
-    base = MappingConfig()
-    assert differences(base, base) == []
-    changed = override(base, ["use_loops=false", "grid.resolution=0.1", "crop=[0, 0, 12, 8]"])
-    assert sorted(differences(changed, base)) == ["crop=[0.0, 0.0, 12.0, 8.0]", "grid.resolution=0.1", "use_loops=false"]
-    assert override(base, differences(changed, base)) == changed

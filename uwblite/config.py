@@ -5,17 +5,15 @@ meaning, when to change it). Fields are bool, int, float, str, a Literal of stri
 these or None, or another settings class. A number whose default is not negative must not be negative; ``setting`` says
 other ranges. TOML has no null: None is written "none".
 
-Laws: ``from_dict(type(c), to_dict(c))`` and ``from_dict(type(c), parse_toml(to_toml(c)))`` give a c of equal values.
+Laws: ``from_dict(type(c), to_dict(c))`` and ``from_dict(type(c), parse_toml(to_toml(c)))`` give a c of equal values;
+``to_toml`` stands in io/settings_toml.py.
 """
 
-import ast
 import dataclasses
 import math
-import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
-from itertools import pairwise
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
@@ -23,8 +21,8 @@ from .errors import ConfigError
 
 Settings = TypeVar("Settings")
 
-_RANGE = "uwblite range"
-_ADVANCED = "uwblite advanced"
+RANGE, ADVANCED = "uwblite range", "uwblite advanced"
+"""In the metadata of a field: its permitted range, and that it is for experiments."""
 
 
 def setting(
@@ -41,7 +39,7 @@ def setting(
     """
     limits = {"above": above, "minimum": minimum, "maximum": maximum}
     limits = {k: v for k, v in limits.items() if v is not None}
-    return dataclasses.field(default=default, metadata={_ADVANCED: advanced, **({_RANGE: limits} if limits else {})})
+    return dataclasses.field(default=default, metadata={ADVANCED: advanced, **({RANGE: limits} if limits else {})})
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -104,19 +102,14 @@ def parse_toml(text: str, path: str = "") -> dict[str, Any]:
 
 def leaves(cls: type) -> Iterator[tuple[str, Any]]:
     """Yield the dotted name and default of every setting of a class, nested ones included."""
-    yield from _flatten("", to_dict(cls()))
+    yield from flat(to_dict(cls()))
 
 
-def differences(config: Any, base: Any) -> list[str]:
-    """Return the settings that differ from those of a base, as `override` takes them."""
-    theirs = dict(_flatten("", to_dict(base)))
-    return [f"{name}={toml_value(v)}" for name, v in _flatten("", to_dict(config)) if v != theirs.get(name)]
-
-
-def _flatten(prefix: str, data: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def flat(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and value of every setting of nested dicts."""
     for name, value in data.items():
         if isinstance(value, Mapping) and value:
-            yield from _flatten(f"{prefix}{name}.", value)
+            yield from flat(value, f"{prefix}{name}.")
         else:
             yield prefix + name, value
 
@@ -207,7 +200,7 @@ def _convert_tuple(value: Any, args: tuple[Any, ...], where: tuple[str, ...]) ->
 def _limits(field: "dataclasses.Field[Any]") -> Mapping[str, float]:
     default = field.default
     quantity = isinstance(default, int | float) and not isinstance(default, bool) and default >= 0
-    return field.metadata.get(_RANGE, {"minimum": 0.0} if quantity else {})
+    return field.metadata.get(RANGE, {"minimum": 0.0} if quantity else {})
 
 
 def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]) -> Any:
@@ -238,115 +231,3 @@ _TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", 
 def _shown(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def field_docs(cls: type) -> dict[str, str]:
-    """Return the docstring under each field of a settings class, by name; empty where the source is not at hand.
-
-    `inspect` asks the module's loader where there is no file, so that the source is found in a zip too.
-    """
-    import inspect
-
-    try:
-        tree = ast.parse(inspect.getsource(sys.modules[cls.__module__]))
-    except OSError:
-        return {}
-    body = next((node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls.__name__), [])
-    docs = {}
-    for node, below in pairwise([*body, ast.Pass()]):
-        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
-            continue
-        constant = below.value if isinstance(below, ast.Expr) else None
-        text = constant.value if isinstance(constant, ast.Constant) else None
-        docs[node.target.id] = " ".join(text.split()) if isinstance(text, str) else ""
-    return docs
-
-
-def to_toml(config: Any, *, comments: bool = False, header: str = "", advanced: bool = True) -> str:
-    """Return the settings as TOML, with the meaning of each setting as a comment where asked for.
-
-    Parameters
-    ----------
-    config : settings.
-    comments : write each field's docstring, permitted range and choices above it.
-    header : text for the first lines, written as comments.
-    advanced : also write advanced settings that have their defaults.
-    """
-    lines = [f"# {line}".rstrip() for line in header.splitlines()]
-    _write_table(lines, config, (), comments, advanced)
-    return "\n".join(lines).strip("\n") + "\n"
-
-
-def shown_fields(config: Any, advanced: bool = False) -> "list[dataclasses.Field[Any]]":
-    """Return the fields to list for a user: without advanced ones that have their defaults, unless these are asked for."""
-
-    def shown(f: "dataclasses.Field[Any]") -> bool:
-        value = getattr(config, f.name)
-        if f.metadata.get(_ADVANCED) and not advanced:
-            return bool(value != f.default)
-        return not dataclasses.is_dataclass(value) or bool(shown_fields(value, advanced))
-
-    return [f for f in dataclasses.fields(config) if shown(f)]
-
-
-def _write_table(lines: list[str], config: Any, path: tuple[str, ...], comments: bool, advanced: bool) -> None:
-    docs = field_docs(type(config)) if comments else {}
-    hints = get_type_hints(type(config))
-    tables = []
-    if path:
-        text = _wrapped((type(config).__doc__ or "").strip().split("\n\n")[0]) if comments else []
-        lines += ["", *text, f"[{'.'.join(path)}]"]
-    for f in shown_fields(config, advanced):
-        value = getattr(config, f.name)
-        if dataclasses.is_dataclass(value):
-            tables.append((f.name, value))
-            continue
-        if comments:
-            lines += _wrapped(" ".join(filter(None, (docs.get(f.name, ""), permitted(f, hints[f.name])))))
-        lines.append(f"{f.name} = {toml_value(value)}")
-    for name, value in tables:
-        _write_table(lines, value, (*path, name), comments, advanced)
-
-
-def permitted(field: "dataclasses.Field[Any]", hint: Any) -> str:
-    """Return what values a field takes beyond its type, in brackets; empty where there is none."""
-    parts = []
-    literal = next((h for h in (hint, *get_args(hint)) if get_origin(h) is Literal), None)
-    if literal is not None:
-        parts.append(", ".join(map(str, get_args(literal))))
-    if field.metadata.get(_RANGE):
-        parts.append(range_text(field.metadata[_RANGE]))
-    if NoneType in get_args(hint):
-        parts.append('or "none"')
-    return f"({'; '.join(parts)})" if parts else ""
-
-
-def _wrapped(text: str) -> list[str]:
-    from textwrap import wrap
-
-    return [f"# {line}" for line in wrap(" ".join(text.split()), 116)]
-
-
-def toml_value(value: Any) -> str:
-    """Return a plain value as TOML; None becomes the text "none"."""
-    if value is None:
-        return '"none"'
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float):
-        return repr(value)
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, str):
-        return _toml_text(value)
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(toml_value(v) for v in value) + "]"
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_toml_text(str(k))} = {toml_value(v)}" for k, v in value.items()) + " }" if value else "{}"
-    raise ConfigError(f"cannot write a {type(value).__name__} as TOML")
-
-
-def _toml_text(text: str) -> str:
-    escapes = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\r": "\\r", "\t": "\\t", "\b": "\\b", "\f": "\\f"}
-    safe = (escapes.get(c, c if c.isprintable() else f"\\U{ord(c):08X}") for c in text)
-    return '"' + "".join(safe) + '"'

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from uwblite.cli import main
-from uwblite.config import merge, parse_toml, to_toml
+from uwblite.config import merge, parse_toml
 from uwblite.errors import UwbliteError
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
@@ -25,6 +25,7 @@ from uwblite.io.log_tail import LogTail
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png
 from uwblite.io.pyfg import read_pyfg
+from uwblite.io.settings_toml import to_toml
 from uwblite.io.tum import read_tum
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.mapping import MappingConfig

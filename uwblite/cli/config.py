@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
-    from ..config import to_toml
+    from ..io.settings_toml import to_toml
     from . import console
     from .options import effective_config
 

@@ -54,9 +54,9 @@ def make(
     reading : time that it took to read them, s.
     progress, executor : see `build_map`.
     """
-    from ..config import differences
     from ..io.result_text import RunRecord
     from ..io.results import write_result
+    from ..io.settings_toml import differences
     from ..mapping import MappingConfig, build_map
     from ..pipeline.mapping_config import preset
     from ..pipeline.scan_selection import prepared
@@ -87,7 +87,7 @@ def make(
 
 def config_text(config: "MappingConfig") -> str:
     """Return the config.toml of a result."""
-    from ..config import to_toml
+    from ..io.settings_toml import to_toml
 
     return to_toml(config, header="settings in force; `uwblite config` explains them")
 

@@ -23,11 +23,12 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Floats
-from ..config import from_dict, parse_toml, setting, to_toml
+from ..config import from_dict, parse_toml, setting
 from ..errors import ConfigError, FormatError
 from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .files import replacing
 from .folders import replacing_folder
+from .settings_toml import to_toml
 from .source import open_source
 
 
