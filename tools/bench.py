@@ -97,8 +97,8 @@ def bench_stages(repeats: int) -> None:
     """Time the stages of one iteration."""
     import numpy as np
 
+    from uwblite.graph.graph import linearize
     from uwblite.graph.normal_equations import NormalEquations
-    from uwblite.graph.solver import linearize
 
     head("Stages of the optimiser, ms", "graph", "analyse (once)", "linearise", "fill", "factorise", "solve")
     for name, graph in (graphs_to_optimise(False) | graphs_to_optimise(True)).items():

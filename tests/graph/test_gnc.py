@@ -7,7 +7,7 @@ from helpers.planted_graphs import loop, relative_edges
 
 from uwblite import se2
 from uwblite.errors import ConfigError
-from uwblite.graph.gnc import GncConfig, optimize_gnc, truncated_weight
+from uwblite.graph.gnc import optimize_gnc, truncated_weight
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import optimize
@@ -111,11 +111,8 @@ def test_results_are_the_same_every_time():
     assert first.poses.tobytes() == second.poses.tobytes()
 
 
-def test_settings_are_checked():
+def test_thresholds_are_checked():
     graph, _, _ = loop(0)
     for wrong in ({3: 4.0}, {-1: 4.0}, {0: 0.0}):
         with pytest.raises(ConfigError, match="threshold"):
             optimize_gnc(graph, wrong)
-    for name, value in (("mu_factor", 1.0), ("steps_per_mu", 0), ("reach", 0.5)):
-        with pytest.raises(ConfigError, match=name):
-            GncConfig(**{name: value})

@@ -6,10 +6,10 @@ from helpers.planted_graphs import dense_system, relative_edges
 
 from uwblite import se2
 from uwblite.errors import SolverError
-from uwblite.graph.graph import Graph
+from uwblite.graph.graph import Graph, linearize
 from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.schwarz_cg import TwoLevelFactor
-from uwblite.graph.solver import linearize, optimize
+from uwblite.graph.solver import optimize
 
 
 def tied(n, each=5, seed=0, is_fixed=()):

@@ -7,12 +7,12 @@ from scipy.optimize import least_squares
 
 from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
-from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights, linearize
 from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
-from uwblite.graph.solver import SolverConfig, edge_weights, linearize, optimize
+from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.graph.unknowns import moved, moved_along
 from uwblite.io.g2o import read_g2o
 

@@ -104,7 +104,7 @@ def loop(seed=0, n=60, anchors=3, noise=True):
 
 def dense_system(graph):
     """Return H, g and the numbers of the free scalars, assembled edge by edge from the Jacobians."""
-    from uwblite.graph.solver import edge_weights
+    from uwblite.graph.graph import edge_weights
     from uwblite.graph.unknowns import free_unknowns
 
     widths, number, size = {"poses": 3, "anchors": 2, "calibration": 1}, {}, 0

@@ -5,12 +5,12 @@ import pytest
 from helpers.planted_graphs import lawn, plain_ranges, relative_edges
 
 from uwblite import se2
-from uwblite.errors import ConfigError
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
-from uwblite.radio.incremental import IncrementalConfig, _by_time, _Incremental, optimize_incrementally
+from uwblite.radio import incremental
+from uwblite.radio.incremental import _by_time, _Incremental, optimize_incrementally
 
 
 def rms(a, b):
@@ -111,16 +111,15 @@ def test_results_are_the_same_every_time():
     assert first.poses.tobytes() == second.poses.tobytes()
 
 
-@pytest.mark.parametrize("wrong", [{"piece": 0}, {"window": 0}, {"widening": 1}, {"min_ranges": 0}, {"resolve_factor": 1.0}])
-def test_settings_are_checked(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        IncrementalConfig(**wrong)
+@pytest.fixture
+def short_probation(monkeypatch):
+    monkeypatch.setattr(incremental, "_PROBATION", 250)
 
 
 def _with_wrong_anchor(joined_at, wrong=5, n=400):
     """Return the state of a path driven so far, all anchors joined at pose 0 but for some, and one of them in a wrong place."""
     graph, truth, anchors = lawn(1, n=n)
-    state = _Incremental(graph, IncrementalConfig(probation=250))
+    state = _Incremental(graph)
     places = anchors.copy()
     if wrong is not None:
         places[wrong] += [6.0, -4.0]
@@ -131,6 +130,7 @@ def _with_wrong_anchor(joined_at, wrong=5, n=400):
     return state
 
 
+@pytest.mark.usefixtures("short_probation")
 @pytest.mark.parametrize(
     ("joined_at", "left"),
     [({}, {5}), ({5: 160, 9: 390}, {5, 9}), ({9: 390}, {5})],
@@ -148,6 +148,7 @@ def test_an_anchor_in_a_wrong_place_leaves(joined_at, left):
     assert set(np.flatnonzero(state.joined_at == len(state.guess))) == left | {12}
 
 
+@pytest.mark.usefixtures("short_probation")
 def test_nobody_leaves_where_that_does_not_help():
     state = _with_wrong_anchor({})
     state.usual = 1e-3
@@ -164,7 +165,7 @@ def _one_anchor(curved, ranged=60, n=100):
     odometry = relative_edges(truth, each, each + 1, [0.02, 0.01, 0.01], np.random.default_rng(0))
     distance = np.hypot(*(truth[:ranged, :2] - anchor).T)
     ranges = plain_ranges(np.arange(ranged), np.zeros(ranged, dtype=int), distance, 0.1)
-    return _Incremental(Graph(truth, np.zeros((1, 2)), (odometry, ranges)), IncrementalConfig())
+    return _Incremental(Graph(truth, np.zeros((1, 2)), (odometry, ranges)))
 
 
 def test_an_anchor_with_a_mirror_image_joins_at_the_end_only():
@@ -188,9 +189,9 @@ def test_an_anchor_is_searched_once_there_are_ranges_and_again_with_a_fifth_more
     assert tried == [0, 20, 20, 24, 24, 29]
 
 
-def test_a_place_that_is_not_certain_does_not_join_yet():
+def test_a_place_that_is_not_certain_does_not_join_yet(monkeypatch):
+    monkeypatch.setattr(incremental, "_MAX_POSITION_SIGMA", 1e-6)
     state = _one_anchor(True)
-    state.config = replace(state.config, max_position_sigma=1e-6)
     state._search(60)
     assert state.tried[0] == 60
     assert not state.joined[0]

@@ -115,16 +115,16 @@ def _solve(
     import dataclasses
 
     if args.incremental:
-        from ..radio.incremental import IncrementalConfig, optimize_incrementally
+        from ..radio.incremental import optimize_incrementally
 
-        return *optimize_incrementally(graph, IncrementalConfig(solver=config), progress), {}
+        return *optimize_incrementally(graph, config, progress), {}
     if not args.robust:
         from ..graph.solver import optimize
 
         return *optimize(graph, config, progress), {}
-    from ..graph.gnc import GncConfig, optimize_gnc
+    from ..graph.gnc import optimize_gnc
 
-    solved, summary, weights = optimize_gnc(graph, _thresholds(graph), GncConfig(solver=config), progress)
+    solved, summary, weights = optimize_gnc(graph, _thresholds(graph), config, progress)
     outliers: dict[str, int] = {}
     for k, weight in weights.items():
         name = type(graph.edges[k]).__name__

@@ -13,19 +13,19 @@ its minimum. (K. Ni, D. Steedly, F. Dellaert, Tectonic SAM, ICRA 2007; A. Cunnin
 2010.) A group of parts is again a part: districts condense what their buildings send.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Floats, Ints
 from .factorization import superlu
 from .graph import Graph
+from .normal_equations import NormalEquations, filled
 from .partition import Part
-from .solver import edge_weights, linearize
-from .unknowns import WIDTHS, Unknowns, free_unknowns, moved
+from .unknowns import Unknowns, moved
 
 _SETTLED = 1e-9
 """m and rad; a round that moves nothing by more is the last."""
@@ -75,14 +75,15 @@ def solve_condensed(shared: Graph, parts: Sequence[Part]) -> Solution:
     ----------
     shared : shared unknowns, and the edges among them that are no part's.
     """
-    unknowns = _numbered(free_unknowns(shared))
     damping, chi2, sent = _FIRST_DAMPING, _total(shared, parts), tuple[int, ...]()
     rounds = 0
     while rounds < _MOST_ROUNDS:
         rounds += 1
+        normal = filled(shared, subtrees=True)
+        unknowns = normal.unknowns
         interiors = [_Interior(part, unknowns, damping) for part in parts]
         sent = tuple(interior.condensed.size for interior in interiors)
-        step = _shared_step(shared, unknowns, [interior.condensed for interior in interiors], damping)
+        step = _shared_step(normal, [interior.condensed for interior in interiors], damping)
         tried = [interior.moved(step) for interior in interiors]
         trial = moved(shared, unknowns, step)
         cost = _total(trial, tried)
@@ -106,39 +107,32 @@ class _Interior:
     """A part while one step is found: it keeps the factor of its interior, and sends `condensed`."""
 
     def __init__(self, part: Part, shared: Unknowns, damping: float) -> None:
-        self._part = part
-        own = _numbered({name: mask & (part.shared[name] < 0) for name, mask in free_unknowns(part.graph).items()})
-        place = {name: np.append(shared.number[name], _NOWHERE[name], axis=0)[k] for name, k in part.shared.items()}
-        n, used = own.size, np.unique(np.concatenate([p[p >= 0] for p in place.values()]))
-        # Shared unknowns stand behind the part's own, in the order of their numbers among all shared ones.
-        number = {k: np.where(place[k] >= 0, n + np.searchsorted(used, place[k]), own.number[k]) for k in place}
-        self._unknowns = Unknowns(number, n + len(used))
-        J, r = _jacobian(part.graph, self._unknowns)
-        H, g = (J.T @ J).tocsc(), J.T @ r
-        diagonal = H.diagonal()
-        inside = H[:n, :n] + sparse.diags(_damped(diagonal[:n], damping))
-        across = H[:n, n:].toarray()
-        solved = superlu(inside.tocsc(), "MMD_AT_PLUS_A").solve(np.column_stack([across, g[:n]]))
+        self._part, normal = part, filled(part.graph, subtrees=True)
+        self._unknowns, H, g = normal.unknowns, normal.matrix, normal.gradient
+        number = normal.unknowns.number
+        self._own = _scalars(number[name][k < 0] for name, k in part.shared.items())
+        used = _scalars(shared.number[name][k[k >= 0]] for name, k in part.shared.items())
+        order = np.argsort(used)
+        self._shared = _scalars(number[name][k >= 0] for name, k in part.shared.items())[order]
+        inside = H[self._own][:, self._own] + sparse.diags(_damped(normal.diagonal[self._own], damping))
+        across = H[self._own][:, self._shared].toarray()
+        solved = superlu(inside.tocsc(), "MMD_AT_PLUS_A").solve(np.column_stack([across, g[self._own]]))
         self._follow, self._alone = solved[:, :-1], solved[:, -1]
-        corner, vector = H[n:, n:].toarray() - across.T @ self._follow, g[n:] - across.T @ self._alone
-        self.condensed = Condensed(used, corner, vector, diagonal[n:])
+        corner = H[self._shared][:, self._shared].toarray() - across.T @ self._follow
+        vector = g[self._shared] - across.T @ self._alone
+        self.condensed = Condensed(used[order], corner, vector, normal.diagonal[self._shared])
 
     def moved(self, step: Floats) -> Part:
         """Return the part moved by a step of all shared unknowns, its interior following."""
         of_shared = step[self.condensed.numbers]
-        whole = np.concatenate([-self._alone - self._follow @ of_shared, of_shared])
+        whole = np.empty(self._unknowns.size)
+        whole[self._own], whole[self._shared] = -self._alone - self._follow @ of_shared, of_shared
         return replace(self._part, graph=moved(self._part.graph, self._unknowns, whole))
 
 
-_NOWHERE = {name: np.full((1, width), -1) for name, width in WIDTHS.items()}
-"""Numbers of scalars that are not unknown, by block."""
-
-
-def _shared_step(shared: Graph, unknowns: Unknowns, condensed: list[Condensed], damping: float) -> Floats:
+def _shared_step(normal: NormalEquations, condensed: list[Condensed], damping: float) -> Floats:
     """Return the step of all shared scalars from what the parts sent and the edges that are no part's."""
-    J, r = _jacobian(shared, unknowns)
-    H, g = J.T @ J, J.T @ r
-    diagonal = H.diagonal()
+    H, g, diagonal = normal.matrix, normal.gradient, normal.diagonal
     for sent in condensed:
         g[sent.numbers] += sent.vector
         diagonal[sent.numbers] += sent.diagonal
@@ -154,35 +148,10 @@ def _damped(diagonal: Floats, damping: float) -> Floats:
     return damping * np.where(diagonal > 0, diagonal, 1.0)
 
 
-def _numbered(masks: dict[str, Bools]) -> Unknowns:
-    """Number the scalars of the unknowns that masks name, block after block."""
-    number, size = {}, 0
-    for name, mask in masks.items():
-        each = np.full((len(mask), WIDTHS[name]), -1)
-        each[mask] = size + np.arange(mask.sum() * WIDTHS[name]).reshape(-1, WIDTHS[name])
-        number[name], size = each, size + int(mask.sum()) * WIDTHS[name]
-    return Unknowns(number, size)
-
-
-def _jacobian(graph: Graph, unknowns: Unknowns) -> tuple[sparse.csr_matrix, Floats]:
-    """Return Jacobian (d, size) and residuals (d,) of all edges, their weights in them."""
-    rows, columns, values, residuals, first = [_NONE], [_NONE], [np.zeros(0)], [np.zeros(0)], 0
-    for edges, lin in zip(graph.edges, linearize(graph), strict=True):
-        root = np.sqrt(edge_weights(edges, graph))
-        row = first + np.arange(lin.residuals.size).reshape(lin.residuals.shape)
-        for name, index, jacobian in lin.blocks:
-            column = np.broadcast_to(unknowns.number[name][index][:, None, :], jacobian.shape)
-            free = column >= 0
-            rows.append(np.broadcast_to(row[:, :, None], jacobian.shape)[free])
-            columns.append(column[free])
-            values.append((jacobian * root[:, None, None])[free])
-        residuals.append((lin.residuals * root[:, None]).ravel())
-        first += lin.residuals.size
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    return sparse.csr_matrix(entries, shape=(first, unknowns.size)), np.concatenate(residuals)
-
-
-_NONE = np.zeros(0, dtype=np.int64)
+def _scalars(numbers: Iterable[Ints]) -> Ints:
+    """Return all numbers of free scalars."""
+    every = np.concatenate([n.ravel() for n in numbers])
+    return every[every >= 0]
 
 
 def _total(shared: Graph, parts: Sequence[Part]) -> float:

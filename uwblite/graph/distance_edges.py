@@ -25,9 +25,6 @@ class AnchorDistanceEdges(EdgeTable):
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
-    def __len__(self) -> int:
-        return len(self.i)
-
     def _offset(self, graph: Graph) -> tuple[Floats, Floats]:
         offset = graph.anchors[self.i] - graph.anchors[self.j]
         return offset, np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-6)
@@ -65,9 +62,6 @@ class PointDistanceEdges(EdgeTable):
     """(e,) m."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
-
-    def __len__(self) -> int:
-        return len(self.i)
 
     def _arms(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
         """Return both points as seen from their poses, turned into the map (e, 2), their offset (e, 2) and distance (e,)."""

@@ -13,38 +13,22 @@ trusts every edge, and one or two Gauss-Newton steps per mu are enough, since th
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import Floats
 from ..errors import ConfigError
-from .graph import Edges, Graph, Linearization
+from .graph import Edges, Graph, Linearization, linearize
 from .normal_equations import NormalEquations
+from .problem_checks import check
 from .robust import SQUARED
-from .solver import Progress, SolverConfig, SolverSummary, check, linearize, minimise
+from .solver import Progress, SolverConfig, SolverSummary, minimise
 
-
-@dataclass(frozen=True, slots=True)
-class GncConfig:
-    """How fast to become strict."""
-
-    mu_factor: float = 2.0
-    """Factor on mu from step to step."""
-    steps_per_mu: int = 1
-    """Linear systems solved per mu."""
-    reach: float = 100.0
-    """Residual, in thresholds, beyond which an edge starts with weight 0; it may still come back."""
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    """Of the last optimisation, with the weights decided."""
-
-    def __post_init__(self) -> None:
-        if not self.mu_factor > 1.0:
-            raise ConfigError(f"mu_factor must be above 1, not {self.mu_factor}")
-        if self.steps_per_mu < 1:
-            raise ConfigError(f"steps_per_mu must be at least 1, not {self.steps_per_mu}")
-        if not self.reach > 1.0:
-            raise ConfigError(f"reach must be above 1, not {self.reach}")
+_MU_FACTOR = 2.0
+"""Factor on mu from step to step; one linear system is solved for each."""
+_REACH = 100.0
+"""Residual, in thresholds, beyond which an edge starts with weight 0; it may still come back."""
 
 
 def truncated_weight(squared: Floats, mu: float) -> Floats:
@@ -54,7 +38,7 @@ def truncated_weight(squared: Floats, mu: float) -> Floats:
 
 
 def optimize_gnc(
-    graph: Graph, thresholds: Mapping[int, float], config: GncConfig = GncConfig(), progress: Progress | None = None
+    graph: Graph, thresholds: Mapping[int, float], solver: SolverConfig = SolverConfig(), progress: Progress | None = None
 ) -> tuple[Graph, SolverSummary, dict[int, Floats]]:
     """Optimise a graph and find the outliers among chosen kinds of edges.
 
@@ -63,6 +47,7 @@ def optimize_gnc(
     graph : estimates to start from and edges; a kind's own weights stay as factors, its kernel is not used.
     thresholds : by position in ``graph.edges``, the whitened norm, in standard deviations, above which an edge is an
         outlier: the root of a chi-square quantile, 3 for ranges, 4 for poses.
+    solver : of the last optimisation, with the weights decided.
     progress : called with (done, most) after every step, `most` being an estimate.
 
     Returns
@@ -77,20 +62,20 @@ def optimize_gnc(
     linearized = linearize(plain)
     normal = NormalEquations(plain, linearized)
     worst = max((float(np.max(s)) for s in _squared(plain, thresholds).values() if len(s)), default=0.0)
-    mu = 1.0 / max(2.0 * min(worst, config.reach**2) - 1.0, 1e-3)
-    few = replace(config.solver, max_iterations=config.steps_per_mu)
-    most = max(1, int(np.ceil(np.log(_STRICT / mu) / np.log(config.mu_factor))))
+    mu = 1.0 / max(2.0 * min(worst, _REACH**2) - 1.0, 1e-3)
+    few = replace(solver, max_iterations=1)
+    most = max(1, int(np.ceil(np.log(_STRICT / mu) / np.log(_MU_FACTOR))))
     current = plain
     for step in range(most):
         weights = {k: truncated_weight(s, mu) for k, s in _squared(current, thresholds).items()}
         current, _ = minimise(*_weighted(current, plain, weights), normal, few)
         if progress is not None:
             progress(step + 1, most + 1)
-        mu *= config.mu_factor
+        mu *= _MU_FACTOR
         if all(np.all((w == 0.0) | (w == 1.0)) for w in weights.values()):
             break
     weights = {k: (s < 1.0).astype(np.float64) for k, s in _squared(current, thresholds).items()}
-    current, summary = minimise(*_weighted(current, plain, weights), normal, config.solver)
+    current, summary = minimise(*_weighted(current, plain, weights), normal, solver)
     if progress is not None:
         progress(most + 1, most + 1)
     return current, summary, weights

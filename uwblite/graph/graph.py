@@ -41,6 +41,11 @@ class EdgeTable:
     __slots__ = ()
     SHARED: ClassVar[tuple[str, ...]] = ()
     """Names of the arrays that all edges share."""
+    FIRST: ClassVar[str] = "i"
+    """Name of an array with a row per edge."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, self.FIRST))
 
     def rows(self, which: Ints | Bools) -> Self:
         """Return some of the edges."""
@@ -157,6 +162,22 @@ def edge_cost(edges: Edges, residuals: Floats) -> float:
     return float(np.sum(rho if edges.weights is None else rho * edges.weights))
 
 
+def kernel_weights(edges: Edges, residuals: Floats) -> Floats:
+    """Return each edge's share (e,) in the normal equations at whitened residuals (e, d): its own weight times the kernel's."""
+    kernel = edges.kernel.weight(np.einsum("ed,ed->e", residuals, residuals))
+    return kernel if edges.weights is None else kernel * edges.weights
+
+
+def edge_weights(edges: Edges, graph: Graph) -> Floats:
+    """Return the same (e,) at the estimates of a graph."""
+    return kernel_weights(edges, edges.residuals(graph))
+
+
+def linearize(graph: Graph) -> list[Linearization]:
+    """Linearise every kind of edges."""
+    return [edges.linearize(graph) for edges in graph.edges]
+
+
 def whiten(sqrt_information: Floats, values: Floats) -> Floats:
     """Return values (e, 3, ...) or vectors (e, d) times each edge's square root of information (e, d, d)."""
     return np.einsum("eij,ej...->ei...", sqrt_information, values)
@@ -176,13 +197,11 @@ class PriorEdges(EdgeTable):
     """(e, k, k) L with information = L^T L."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
+    FIRST: ClassVar[str] = "index"
 
     def __post_init__(self) -> None:
         if self.block not in ("poses", "anchors", "calibration"):
             raise DataError(f"a prior on {self.block!r}: it must be on poses, anchors or calibration")
-
-    def __len__(self) -> int:
-        return len(self.index)
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, k)."""

@@ -11,9 +11,8 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
 from .graph import Graph
-from .normal_equations import NormalEquations
+from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
-from .solver import edge_weights, linearize
 
 _AT_ONCE = 300
 """Right-hand sides solved together: bounds the memory."""
@@ -112,7 +111,7 @@ class JointCovariance:
 def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
     """Return the end of the factor with these poses last: their places among the unknowns (k, 3), -1 = fixed, and what it
     takes to read it: where the block begins, L2 (n, n), the diagonal of D2 (n,), and each unknown's row in them (n,)."""
-    normal = _filled(graph, last=poses)
+    normal = filled(graph, last=poses)
     factor, number = _factor(normal), normal.unknowns.number["poses"]
     # Behind the chosen poses stand only anchors and calibration.
     first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
@@ -128,14 +127,6 @@ def _relative(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross:
     mixed = by_i @ cross @ by_j.transpose(0, 2, 1)
     own = by_i @ of_i @ by_i.transpose(0, 2, 1) + by_j @ of_j @ by_j.transpose(0, 2, 1)
     return own + mixed + mixed.transpose(0, 2, 1)
-
-
-def _filled(graph: Graph, subtrees: bool = False, last: Ints | None = None) -> NormalEquations:
-    """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations."""
-    linearized = linearize(graph)
-    normal = NormalEquations(graph, linearized, subtrees, last)
-    normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
-    return normal
 
 
 def _factor(normal: NormalEquations) -> SuperLU:
@@ -154,7 +145,7 @@ def _factor(normal: NormalEquations) -> SuperLU:
 
 def marginals(graph: Graph) -> Marginals:
     """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand."""
-    return Marginals(graph, _filled(graph, subtrees=True))
+    return Marginals(graph, filled(graph, subtrees=True))
 
 
 def calibration_covariance(graph: Graph) -> Floats:
@@ -164,7 +155,7 @@ def calibration_covariance(graph: Graph) -> Floats:
     ------
     SolverError : the measurements leave a direction open.
     """
-    normal = _filled(graph)
+    normal = filled(graph)
     number = normal.unknowns.number["calibration"][:, 0]
     free = np.flatnonzero(number >= 0)
     right = np.zeros((normal.unknowns.size, len(free)))

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from ..arrays import Floats, Ints
 from .factorization import Factor, choose_ordering
-from .graph import Graph, Linearization
-from .matrix_layout import Blocks, IterativeLayout, Layout, make_layout
+from .graph import Graph, Linearization, edge_weights, linearize
+from .matrix_layout import Blocks, IterativeLayout, Layout, SparseLayout, make_layout
 from .schwarz_cg import cut
 from .unknowns import WIDTHS, Unknowns, free_unknowns
 
@@ -212,6 +213,12 @@ class NormalEquations:
         """The diagonal of H."""
         return self.values[self._diagonal]
 
+    @property
+    def matrix(self) -> sparse.csc_matrix:
+        """H, where the order is that of the selected inverse."""
+        assert isinstance(self._layout, SparseLayout)
+        return self._layout.matrix(self.values)
+
     def factor(self, damping: Floats) -> Factor:
         """Factorise H + diag(damping).
 
@@ -222,6 +229,14 @@ class NormalEquations:
         values = self.values.copy()
         values[self._diagonal] += damping
         return self._layout.factor(values)
+
+
+def filled(graph: Graph, subtrees: bool = False, last: Ints | None = None) -> NormalEquations:
+    """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations."""
+    linearized = linearize(graph)
+    normal = NormalEquations(graph, linearized, subtrees, last)
+    normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
+    return normal
 
 
 def _parts(edges: int) -> list[slice]:

@@ -7,8 +7,7 @@ import numpy as np
 
 from ..arrays import Ints
 from .distance_edges import AnchorDistanceEdges
-from .graph import Calibration, Edges, Graph, PriorEdges
-from .solver import linearize
+from .graph import Calibration, Edges, Graph, PriorEdges, linearize
 from .unknowns import free_unknowns
 
 

@@ -1,6 +1,7 @@
 """Landmarks seen from poses as points: a kind of edge that other people's graphs hold (g2o EDGE_SE2_XY)."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,9 +25,7 @@ class LandmarkEdges(EdgeTable):
     """(e, 2, 2) L with information = L^T L."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
-
-    def __len__(self) -> int:
-        return len(self.pose)
+    FIRST: ClassVar[str] = "pose"
 
     def _seen(self, graph: Graph) -> Floats:
         poses = graph.poses[self.pose]

@@ -61,9 +61,6 @@ class RelativePoseEdges(EdgeTable):
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
-    def __len__(self) -> int:
-        return len(self.i)
-
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
         return whiten(self.sqrt_information, se2.between(self.T_i_j, se2.between(graph.poses[self.i], graph.poses[self.j])))
@@ -101,9 +98,6 @@ class OdometryEdges(EdgeTable):
     """(e, 4) indices of s, k, b (rad/m), g (rad/s) in the calibration block; -1 = not an unknown (taken as 0)."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
-
-    def __len__(self) -> int:
-        return len(self.i)
 
     def corrected(self, graph: Graph) -> Floats:
         """Return the motion (e, 3) with the present calibration applied."""
@@ -183,9 +177,6 @@ class ScanEdges(EdgeTable):
     weights: Floats | None = None
 
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
-
-    def __len__(self) -> int:
-        return len(self.i)
 
     def _sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, Floats]:
         """Return S (e, 3), and the heading (e,) of the base at the true time of the cloud."""

@@ -49,13 +49,11 @@ class RangeEdges(EdgeTable):
     -1 = not an unknown (taken as 0)."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
+    FIRST: ClassVar[str] = "pose"
     stamps: Floats = field(default_factory=lambda: np.zeros(0))
     """(e,) s, where known; not used by the graph."""
 
     SHARED: ClassVar[tuple[str, ...]] = ("tag",)
-
-    def __len__(self) -> int:
-        return len(self.pose)
 
     def tag_positions(self, poses: Floats) -> Floats:
         """Return where the tag was at each range (e, 2), map frame, by its nominal position on the base."""

@@ -43,9 +43,10 @@ from ..arrays import Bools, Floats
 from ..config import setting
 from ..errors import ConfigError, SolverError
 from .factorization import Factor
-from .graph import Edges, Graph, Linearization, edge_cost
+from .graph import Edges, Graph, Linearization, edge_cost, kernel_weights, linearize
 from .normal_equations import NormalEquations
-from .unknowns import Unknowns, free_unknowns, moved, moved_along
+from .problem_checks import check, independent_residuals, what_is_not_finite
+from .unknowns import Unknowns, moved, moved_along
 
 Progress = Callable[[int, int], None]
 """Called as progress(iterations done, most iterations)."""
@@ -97,18 +98,8 @@ class SolverSummary:
         return self.chi2 / self.dof if self.dof > 0 else float("nan")
 
 
-def edge_weights(edges: Edges, graph: Graph) -> Floats:
-    """Return each edge's share (e,) in the normal equations at these estimates: its own weight times the kernel's."""
-    return _weights(edges, edges.residuals(graph))
-
-
-def _weights(edges: Edges, residuals: Floats) -> Floats:
-    kernel = edges.kernel.weight(np.einsum("ed,ed->e", residuals, residuals))
-    return kernel if edges.weights is None else kernel * edges.weights
-
-
 def _or_none(edges: Edges, residuals: Floats) -> Floats | None:
-    return None if edges.weights is None and edges.kernel.name == "none" else _weights(edges, residuals)
+    return None if edges.weights is None and edges.kernel.name == "none" else kernel_weights(edges, residuals)
 
 
 def optimize(
@@ -141,7 +132,7 @@ def minimise(
     """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
     chi2 = chi2_initial = _cost(graph, linearized)
     if not np.isfinite(chi2):
-        raise SolverError(_what_is_not_finite(graph, linearized))
+        raise SolverError(what_is_not_finite(graph, linearized))
     damping, growth, last_decrease = config.initial_damping, 2.0, np.inf
     history: list[float] = []
     to_come = _extrapolated if all(edges.kernel.name == "none" for edges in graph.edges) else _as_much_again
@@ -197,7 +188,7 @@ def minimise(
         iterations=len(history),
         chi2_initial=chi2_initial,
         chi2=chi2,
-        dof=_independent_residuals(graph, linearized or linearize(graph)) - normal.unknowns.size,
+        dof=independent_residuals(graph, linearized or linearize(graph)) - normal.unknowns.size,
         chi2_history=np.array(history),
     )
 
@@ -279,48 +270,5 @@ def _linked(poses: int, linearized: list[Linearization]) -> Bools:
     return linked
 
 
-def linearize(graph: Graph) -> list[Linearization]:
-    """Linearise every kind of edges."""
-    return [edges.linearize(graph) for edges in graph.edges]
-
-
 def _cost(graph: Graph, linearized: list[Linearization]) -> float:
     return sum(edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True))
-
-
-def check(graph: Graph) -> None:
-    """Raise SolverError where nothing is free, nothing is measured, or a starting value is not finite."""
-    if not any(mask.any() for mask in free_unknowns(graph).values()):
-        raise SolverError("nothing to optimise: every pose, anchor and calibration value is fixed")
-    if not sum(len(edges) for edges in graph.edges):
-        raise SolverError("nothing to optimise: the graph has no edges")
-    for name, values in (
-        ("poses", graph.poses),
-        ("anchors", graph.anchors),
-        ("calibration", graph.calibration.values[:, None]),
-    ):
-        bad = np.nonzero(~np.isfinite(values).all(axis=1))[0]
-        if len(bad):
-            raise SolverError(f"starting values are not finite: {name}[{bad[0]}] = {values[bad[0]]} ({len(bad)} in all)")
-
-
-def _what_is_not_finite(graph: Graph, linearized: list[Linearization]) -> str:
-    for edges, lin in zip(graph.edges, linearized, strict=True):
-        bad = np.nonzero(~np.isfinite(lin.residuals).all(axis=1))[0]
-        if len(bad):
-            kind = type(edges).__name__
-            return f"residuals are not finite: edge {bad[0]} of {kind} ({len(bad)} in all); remove such measurements"
-    return "the cost is not finite although every residual is: weights or residuals are too large"
-
-
-def _independent_residuals(graph: Graph, linearized: list[Linearization]) -> int:
-    """Count the residuals of edges in use; an edge whose information is singular counts by its rank."""
-    total = 0
-    for edges, lin in zip(graph.edges, linearized, strict=True):
-        used = slice(None) if edges.weights is None else edges.weights > 0
-        jacobians = np.concatenate([jac for _, _, jac in lin.blocks], axis=2)[used]
-        gram = jacobians @ jacobians.transpose(0, 2, 1)
-        total += gram.shape[0] * gram.shape[1]
-        doubtful = gram[np.abs(np.linalg.det(gram)) <= 1e-12 * np.prod(np.einsum("eii->ei", gram), axis=1)]
-        total -= int(np.sum(gram.shape[1] - np.linalg.matrix_rank(doubtful, hermitian=True)))
-    return total

@@ -16,11 +16,12 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..config import setting
 from ..graph.calibration import scan_indices
-from ..graph.graph import Graph
+from ..graph.graph import Graph, linearize
 from ..graph.normal_equations import NormalEquations
 from ..graph.pose_edges import ScanEdges
+from ..graph.problem_checks import check
 from ..graph.robust import Kernel
-from ..graph.solver import SolverConfig, SolverSummary, check, linearize, minimise
+from ..graph.solver import SolverConfig, SolverSummary, minimise
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import PairFactors, match, measured, pair_points

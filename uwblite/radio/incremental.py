@@ -14,72 +14,58 @@ the anchors most of whose ranges a robust kernel calls outliers, and with more a
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..errors import ConfigError
 from ..graph.graph import Edges, Graph, PriorEdges
+from ..graph.problem_checks import check
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
-from ..graph.solver import Progress, SolverConfig, SolverSummary, check, optimize
+from ..graph.solver import Progress, SolverConfig, SolverSummary, optimize
 from ..graph.unknowns import free_unknowns
 from .trilateration import TrilaterationConfig, ambiguous, trilaterate
 
-
-@dataclass(frozen=True, slots=True)
-class IncrementalConfig:
-    """How poses are added."""
-
-    piece: int = 100
-    """Poses added at once; over so many the guess may not bend by more than about a radian."""
-    window: int = 400
-    """Poses optimised after each piece, older ones fixed."""
-    widening: int = 4
-    """Factor on the window where it does not fit."""
-    resolve_factor: float = 1.5
-    """Everything is optimised again when there are so many times the poses."""
-    significance: float = 5.0
-    """Standard deviations by which chi2 may exceed the usual."""
-    probation: int = 400
-    """Poses after which an anchor that joined is no longer the first to be left out."""
-    min_ranges: int = 20
-    """Ranges before an anchor is searched."""
-    max_position_sigma: float = 0.5
-    """An anchor less certain than this does not join yet, m."""
-    drift: float = 0.1
-    """Assumed error of the path over the ranges an anchor is searched from, m."""
-    outlier: float = 4.0
-    """Standard deviations beyond which a range is an outlier."""
-    outlier_share: float = 0.3
-    """An anchor with a larger share of outliers leaves."""
-    search: TrilaterationConfig = field(default_factory=lambda: TrilaterationConfig(ambiguity=0.7))
-    """How anchors are searched; stricter than usual, since another try comes soon."""
-    step: SolverConfig = field(default_factory=lambda: SolverConfig(max_iterations=30, relative_decrease=1e-4))
-    """Of the optimisations on the way."""
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    """Of the last optimisation."""
-
-    def __post_init__(self) -> None:
-        for name, least in (("piece", 1), ("window", 1), ("widening", 2), ("min_ranges", 1)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name} must be at least {least}, not {getattr(self, name)}")
-        if not self.resolve_factor > 1.0:
-            raise ConfigError(f"resolve_factor must be above 1, not {self.resolve_factor}")
+_PIECE = 100
+"""Poses added at once; over so many the guess may not bend by more than about a radian."""
+_WINDOW = 400
+"""Poses optimised after each piece, older ones fixed."""
+_WIDENING = 4
+"""Factor on the window where it does not fit."""
+_RESOLVE_FACTOR = 1.5
+"""Everything is optimised again when there are so many times the poses."""
+_SIGNIFICANCE = 5.0
+"""Standard deviations by which chi2 may exceed the usual."""
+_PROBATION = 400
+"""Poses after which an anchor that joined is no longer the first to be left out."""
+_MIN_RANGES = 20
+"""Ranges before an anchor is searched."""
+_MAX_POSITION_SIGMA = 0.5
+"""An anchor less certain than this does not join yet, m."""
+_DRIFT = 0.1
+"""Assumed error of the path over the ranges an anchor is searched from, m."""
+_OUTLIER = 4.0
+"""Standard deviations beyond which a range is an outlier."""
+_OUTLIER_SHARE = 0.3
+"""An anchor with a larger share of outliers leaves."""
+_SEARCH = TrilaterationConfig(ambiguity=0.7)
+"""How anchors are searched; stricter than usual, since another try comes soon."""
+_STEP = SolverConfig(max_iterations=30, relative_decrease=1e-4)
+"""Of the optimisations on the way."""
 
 
 def optimize_incrementally(
-    graph: Graph, config: IncrementalConfig = IncrementalConfig(), progress: Progress | None = None
+    graph: Graph, solver: SolverConfig = SolverConfig(), progress: Progress | None = None
 ) -> tuple[Graph, SolverSummary]:
     """Optimise a graph whose poses stand in the order of time and are guessed by dead reckoning.
 
     Parameters
     ----------
     graph : its guess of the anchors is used only for those that are fixed, have a prior, or are in no range edges.
-    config : settings.
+    solver : of the last optimisation.
     progress : called with (poses done, poses) after every piece.
 
     Raises
@@ -87,11 +73,11 @@ def optimize_incrementally(
     SolverError : nothing is free, nothing is measured, or a starting value is not finite.
     """
     check(graph)
-    state = _Incremental(graph, config)
+    state = _Incremental(graph)
     for done in state.run():
         if progress is not None:
             progress(done, len(graph.poses))
-    return optimize(state.graph, config.solver)
+    return optimize(state.graph, solver)
 
 
 class _Kind(NamedTuple):
@@ -122,8 +108,8 @@ class _Part(NamedTuple):
 class _Incremental:
     """What is known so far: `graph` with the poses done, and which anchors have joined."""
 
-    def __init__(self, graph: Graph, config: IncrementalConfig) -> None:
-        self.graph, self.guess, self.config = graph, graph.poses, config
+    def __init__(self, graph: Graph) -> None:
+        self.graph, self.guess = graph, graph.poses
         self.kinds = [_by_time(edges, graph) for edges in graph.edges]
         self.free = free_unknowns(graph)
         count = len(graph.anchors)
@@ -155,9 +141,9 @@ class _Incremental:
         """Add poses up to the whole path, yielding the number done."""
         done, whole = 0, 0
         while done < len(self.guess):
-            now = min(done + self.config.piece, len(self.guess))
+            now = min(done + _PIECE, len(self.guess))
             self._lay_on(done, now)
-            everything = now == len(self.guess) or now >= self.config.resolve_factor * whole
+            everything = now == len(self.guess) or now >= _RESOLVE_FACTOR * whole
             part = self._fit(now, everything)
             self.graph = replace(
                 self.graph,
@@ -185,7 +171,7 @@ class _Incremental:
 
     def _fit(self, now: int, everything: bool) -> _Part:
         """Optimise the last part, or as much more as it takes to fit."""
-        window = now if everything else self.config.window
+        window = now if everything else _WINDOW
         while True:
             low = max(0, now - window)
             part = self._solve(low, now)
@@ -193,11 +179,11 @@ class _Incremental:
                 part = self._without_outliers(part, low, now)
             if part.fits or low == 0:
                 return part
-            window *= self.config.widening
+            window *= _WIDENING
 
     def _without_outliers(self, part: _Part, low: int, now: int) -> _Part:
         """Return the part as it fits without some anchors, which then leave; or as it is."""
-        fresh = self.joined & self.ranged & (self.joined_at >= now - self.config.probation)
+        fresh = self.joined & self.ranged & (self.joined_at >= now - _PROBATION)
         for accused in (fresh, None):
             if accused is None:
                 accused = self._outlying(low, now)
@@ -211,14 +197,14 @@ class _Incremental:
 
     def _outlying(self, low: int, now: int) -> Bools:
         """Return the anchors most of whose ranges disagree with the rest, by a robust optimisation."""
-        robust = self._solve(low, now, kernel=Kernel("geman-mcclure", self.config.outlier + 1.0)).graph
+        robust = self._solve(low, now, kernel=Kernel("geman-mcclure", _OUTLIER + 1.0)).graph
         measured, outliers = np.zeros(len(self.joined)), np.zeros(len(self.joined))
         for edges in robust.edges:
             if isinstance(edges, RangeEdges):
-                off = np.abs(edges.residuals(robust)[:, 0]) > self.config.outlier
+                off = np.abs(edges.residuals(robust)[:, 0]) > _OUTLIER
                 measured += np.bincount(edges.anchor, minlength=len(measured))
                 outliers += np.bincount(edges.anchor, off, len(measured))
-        return self.ranged & (outliers > self.config.outlier_share * np.maximum(measured, 1.0))
+        return self.ranged & (outliers > _OUTLIER_SHARE * np.maximum(measured, 1.0))
 
     def _solve(self, low: int, now: int, without: Bools | None = None, kernel: Kernel | None = None) -> _Part:
         """Optimise poses low..now - 1 and the anchors that joined since; older ones hold them."""
@@ -234,9 +220,9 @@ class _Incremental:
         )
         if not part.edges or not any(mask.any() for mask in free_unknowns(part).values()):
             return _Part(part, True, float("nan"))
-        solved, summary = optimize(part, self.config.step)
+        solved, summary = optimize(part, _STEP)
         scatter = np.sqrt(2.0 / max(summary.dof, 1))
-        most = self.usual * (1.0 + self.config.significance * scatter)
+        most = self.usual * (1.0 + _SIGNIFICANCE * scatter)
         return _Part(solved, not summary.chi2_per_dof > most, summary.chi2_per_dof)
 
     def _edges(self, low: int, now: int, use: Bools, kernel: Kernel | None) -> Iterator[Edges]:
@@ -251,17 +237,17 @@ class _Incremental:
 
     def _search(self, now: int) -> None:
         """Place the anchors that the ranges so far make clear; at the end also those that stay doubtful."""
-        last, config = now == len(self.guess), self.config
+        last = now == len(self.guess)
         anchors = self.graph.anchors.copy()
         for anchor in np.nonzero(~self.joined)[0]:
             measured = self._measured(int(anchor), now)
             count = sum(len(edges) for edges in measured)
-            if not last and (count < config.min_ranges or count < 1.2 * self.tried[anchor]):
+            if not last and (count < _MIN_RANGES or count < 1.2 * self.tried[anchor]):
                 continue
             self.tried[anchor] = count
-            found = trilaterate(*self._distances(measured), config.search, config.drift)
-            clear = bool(found) and not ambiguous(found, config.search)
-            if found and (last or (clear and found[0].position_sigma < config.max_position_sigma)):
+            found = trilaterate(*self._distances(measured), _SEARCH, _DRIFT)
+            clear = bool(found) and not ambiguous(found, _SEARCH)
+            if found and (last or (clear and found[0].position_sigma < _MAX_POSITION_SIGMA)):
                 anchors[anchor] = found[0].position
                 self.joined[anchor], self.joined_at[anchor] = True, now
         self.graph = replace(self.graph, anchors=anchors)

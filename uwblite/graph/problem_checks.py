@@ -1,0 +1,46 @@
+"""Whether a least-squares problem is one: something free, something measured, all of it finite; and its degrees of freedom."""
+
+import numpy as np
+
+from ..errors import SolverError
+from .graph import Graph, Linearization
+from .unknowns import free_unknowns
+
+
+def check(graph: Graph) -> None:
+    """Raise SolverError where nothing is free, nothing is measured, or a starting value is not finite."""
+    if not any(mask.any() for mask in free_unknowns(graph).values()):
+        raise SolverError("nothing to optimise: every pose, anchor and calibration value is fixed")
+    if not sum(len(edges) for edges in graph.edges):
+        raise SolverError("nothing to optimise: the graph has no edges")
+    for name, values in (
+        ("poses", graph.poses),
+        ("anchors", graph.anchors),
+        ("calibration", graph.calibration.values[:, None]),
+    ):
+        bad = np.nonzero(~np.isfinite(values).all(axis=1))[0]
+        if len(bad):
+            raise SolverError(f"starting values are not finite: {name}[{bad[0]}] = {values[bad[0]]} ({len(bad)} in all)")
+
+
+def what_is_not_finite(graph: Graph, linearized: list[Linearization]) -> str:
+    """Return which residuals make the cost of a graph one that is not finite."""
+    for edges, lin in zip(graph.edges, linearized, strict=True):
+        bad = np.nonzero(~np.isfinite(lin.residuals).all(axis=1))[0]
+        if len(bad):
+            kind = type(edges).__name__
+            return f"residuals are not finite: edge {bad[0]} of {kind} ({len(bad)} in all); remove such measurements"
+    return "the cost is not finite although every residual is: weights or residuals are too large"
+
+
+def independent_residuals(graph: Graph, linearized: list[Linearization]) -> int:
+    """Count the residuals of edges in use; an edge whose information is singular counts by its rank."""
+    total = 0
+    for edges, lin in zip(graph.edges, linearized, strict=True):
+        used = slice(None) if edges.weights is None else edges.weights > 0
+        jacobians = np.concatenate([jac for _, _, jac in lin.blocks], axis=2)[used]
+        gram = jacobians @ jacobians.transpose(0, 2, 1)
+        total += gram.shape[0] * gram.shape[1]
+        doubtful = gram[np.abs(np.linalg.det(gram)) <= 1e-12 * np.prod(np.einsum("eii->ei", gram), axis=1)]
+        total -= int(np.sum(gram.shape[1] - np.linalg.matrix_rank(doubtful, hermitian=True)))
+    return total
