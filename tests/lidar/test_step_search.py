@@ -11,6 +11,16 @@ PATH = np.array([[-1.0 + 0.3 * k, 0.5 + 0.05 * k, 0.05 * k] for k in range(6)])
 STEPS = se2.between(PATH[:-1], PATH[1:])
 
 
+def _bays():
+    """Yield walls (x, width, y, other y) of a corridor along x with equal bays, 0.4 m of 0.8 m deep by 0.2 m."""
+    for x in np.arange(-10.0, 10.0, 0.8):
+        for y, out in ((2.0, 0.2), (-1.0, -0.2)):
+            yield x, 0.4, y, y
+            yield x + 0.4, 0.4, y + out, y + out
+            yield x + 0.4, 0.0, y, y + out
+            yield x + 0.8, 0.0, y + out, y
+
+
 def searched(walls, wrong, *, reach=8.0):
     """Search for the last step of a path through walls, the odometry's guess of it being off by a pose (3,)."""
     clouds = scanned(PATH, walls, 0.01, reach=reach)
@@ -34,8 +44,19 @@ def test_a_right_guess_stands_in_no_free_space_and_a_wrong_one_does():
     assert searched(HALL, (0.5, -0.4, 0.3)).contradicts
 
 
-def test_along_a_corridor_nothing_is_clear():
-    found = searched(CORRIDOR, (0.5, 0.0, 0.0), reach=5.0)
+def test_along_a_corridor_all_places_are_one_and_the_walls_fix_the_rest():
+    found = searched(CORRIDOR, (0.5, 0.2, 0.15), reach=5.0)
+    assert found.clear
+    _, across, turn = se2.compose(PATH[4], found.pose) - se2.compose(PATH[4], STEPS[4])
+    # The corridor runs along x; how far is the odometry's to say.
+    assert abs(across) < 0.02
+    assert abs(turn) < 0.01
+
+
+def test_two_distinct_places_alike_are_not_clear():
+    """A corridor with a bay every 0.8 m: the next bay fits as well as the true one."""
+    bays = np.array([[x, y, x + w, y2] for x, w, y, y2 in _bays()])
+    found = searched(bays, (0.4, 0.0, 0.0), reach=5.0)
     assert not found.clear
     assert found.second > found.score - 0.08
 

@@ -3,10 +3,11 @@
 The neighbouring cloud alone shows too little after a fast turn or a gap; the last few together show what was in view
 before. Every pose that the window allows is scored (see raster_search), matching descends from the best few and from the
 guesses, and free space decides between them: of two scans in their true places hardly any surface of the one stands where
-the other looked through. A step for which two distinct places score alike is ambiguous and counts as not found.
+the other looked through. A step for which two distinct places score alike is ambiguous and counts as not found. Places along
+a bare wall are one place: the match says nothing of that direction, and fixes the others.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -15,9 +16,9 @@ from ..arrays import Bools, Floats, Ints
 from .cloud_rasters import rasterize
 from .clouds import Clouds
 from .free_space import free_space
-from .pair_alignment import align_pairs
+from .pair_alignment import Aligned, align_pairs
 from .raster_search import Window, best_poses
-from .scan_matching import pair_points
+from .scan_matching import PairFactors, measured, pair_points
 from .visibility import nearest_by_bearing, violates_free_space
 
 _VIEWS = 6
@@ -39,6 +40,10 @@ _CELL, _REACH = 0.1, 0.5
 """Cell of the raster of nearest points and distance up to which a point is near, m."""
 _DISTINCT = 0.15
 """Places farther apart than this, m or rad, are distinct."""
+_MATCH_VARIANCE = 0.03**2 * 8.0
+"""Variance of one match, m^2; eight together weigh as one."""
+_SAME = 3.0
+"""Standard deviations up to which a match cannot tell two places apart."""
 _MARGIN = 0.08
 """By how much the score of a place must exceed that of every distinct one."""
 _THROUGH = 0.12
@@ -102,7 +107,12 @@ class StepSearch:
         through = self._through(k, tried.pose)
         score = tried.share - through
         best = int(np.argmax(score))
-        second = float(score[_apart(tried.pose[best], tried.pose)].max(initial=-1.0))
+        measurably = _measurably(best, tried)
+        # Along a bare wall the odometry alone says how far.
+        alike = np.flatnonzero(~measurably & (score >= score[best] - _MARGIN))
+        best = int(alike[np.argmin(np.hypot(*(tried.pose[alike] - motion)[:, :2].T))])
+        distinct = _apart(tried.pose[best], tried.pose) & measurably
+        second = float(score[distinct].max(initial=-1.0))
         near = np.flatnonzero(~_apart(motion, tried.pose))
         there = through[near[np.argmax(score[near])]] if len(near) else self._through(k, motion[None])[0]
         return FoundStep(tried.pose[best], float(score[best]), second, float(there))
@@ -118,6 +128,14 @@ def _apart(pose: Floats, others: Floats) -> Bools:
     """Return which other poses (c, 3) are distinct from one."""
     off = se2.between(pose, others)
     return np.asarray((np.hypot(off[:, 0], off[:, 1]) > _DISTINCT) | (np.abs(off[:, 2]) > _DISTINCT))
+
+
+def _measurably(best: int, tried: Aligned) -> Bools:
+    """Return which places (c,) differ from the best one in a direction that its match measures."""
+    factors = PairFactors(*(getattr(tried.factors, f.name)[best : best + 1] for f in fields(PairFactors)))
+    z, sqrt_information = measured(factors, tried.pose[best : best + 1], np.full(1, _MATCH_VARIANCE))
+    off = se2.between(z[0], tried.pose) @ sqrt_information[0].T
+    return np.asarray(np.sqrt(np.sum(off**2, axis=1)) > _SAME)
 
 
 def _chained(steps: Floats, views: Ints) -> Floats:
