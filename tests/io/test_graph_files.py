@@ -17,7 +17,7 @@ from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import optimize
 from uwblite.io.g2o import read_g2o, write_g2o
 from uwblite.io.graph_chains import chained_poses
-from uwblite.io.graph_file import plain_edges, root
+from uwblite.io.plain_edges import plain_edges, root
 from uwblite.io.pyfg import read_pyfg, write_pyfg
 
 FORMATS = [
@@ -137,7 +137,6 @@ def test_calibration_and_lever_arms_are_worked_in(tmp_path, seed):
     squared = np.sum(relative_edges.residuals(back) ** 2, axis=1)
     assert squared[:8].sum() == pytest.approx(odometry, rel=1e-7)
     assert np.sum(range_edges.residuals(back) ** 2) == pytest.approx(ranges, rel=1e-9)
-    plain = plain_edges(graph)
     # Scan edges between sensors become edges between bases: zero residual stays zero, and small ones to first order.
     scans = graph.edges[1]
     calibration = graph.calibration.values
@@ -146,8 +145,8 @@ def test_calibration_and_lever_arms_are_worked_in(tmp_path, seed):
     true = se2.between(se2.compose(graph.poses[scans.i], place[0]), se2.compose(graph.poses[scans.j], place[1]))
     small = 1e-5 * np.random.default_rng(seed).normal(size=(8, 3))
     exact = replace(scans, T_i_j=se2.compose(true, small))
-    plain = plain_edges(Graph(graph.poses, graph.anchors, (exact,), graph.calibration))
-    base = RelativePoseEdges(plain.i, plain.j, plain.T_i_j, root(plain.information))
+    plain = plain_edges(Graph(graph.poses, graph.anchors, (exact,), graph.calibration))["relative"]
+    base = RelativePoseEdges(*plain.ends, plain.value, root(plain.information))
     here, there = (np.sum(e.residuals(graph) ** 2, axis=1) for e in (exact, base))
     np.testing.assert_allclose(there, here, rtol=1e-3)
 

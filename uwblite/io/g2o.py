@@ -26,7 +26,8 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, PlainEdges, assembled, plain_edges, read_matrices, told_places, upper_triangle
+from .graph_file import GraphFile, assembled, measurements, told_places
+from .plain_edges import ENDS, measured, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
@@ -43,7 +44,10 @@ _LAYOUTS = {
     "VERTEX2": Layout(1, 3, places=3),
     "EDGE2": Layout(2, 9, places=3),
 }
-_NONE = np.zeros(0, dtype=np.int64)
+_TAGS = {
+    "relative": "EDGE_SE2", "sighting": "EDGE_SE2_XY", "pose_prior": "EDGE_PRIOR_SE2", "landmark_prior": "EDGE_PRIOR_XY",
+    "range": "EDGE_RANGE_SE2_XY", "pose_range": "EDGE_RANGE_SE2",
+}  # fmt: skip
 _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 """Where dx dy dtheta I11 I12 I13 I22 I23 I33 stand among the numbers of an EDGE2."""
 _SPATIAL = ("VERTEX_SE3", "EDGE_SE3", "VERTEX_TRACKXYZ", "VERTEX3", "EDGE3")
@@ -84,26 +88,10 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     _check(content, pose_ids, landmark_ids, pose_of[steps.names], steps.lines, ranged)
     _check(content, pose_ids, landmark_ids, pose_of[meetings.names], meetings.lines, meetings)
 
-    def matrices(of: Records, size: int, first: int) -> Floats:
-        return read_matrices(of.numbers[:, first:], size, of.lines, content.path, "information")
-
-    plain = PlainEdges(
-        pose_of[steps.names[:, 0]],
-        pose_of[steps.names[:, 1]],
-        steps.numbers[:, :3],
-        matrices(steps, 3, 3),
-        (pose_of[seen.names[:, 0]], landmark_of[seen.names[:, 1]], seen.numbers[:, :2], matrices(seen, 2, 2)),
-        (
-            pose_of[ranged.names[:, 0]],
-            landmark_of[ranged.names[:, 1]],
-            ranged.numbers[:, 0],
-            1.0 / np.sqrt(ranged.numbers[:, 1]),
-        ),
-        (pose_of[pinned.names[:, 0]], pinned.numbers[:, :3], matrices(pinned, 3, 3)),
-        (landmark_of[surveyed.names[:, 0]], surveyed.numbers[:, :2], matrices(surveyed, 2, 2)),
-        (*pose_of[meetings.names.T], meetings.numbers[:, 0], 1.0 / np.sqrt(meetings.numbers[:, 1])),
-        (_NONE, _NONE, np.zeros(0), np.zeros(0)),
-    )
+    index = {"pose": pose_of, "landmark": landmark_of}
+    lines = {kind: records[tag] for kind, tag in _TAGS.items()} | {"relative": steps}
+    plain = {kind: measurements(of, kind, index, content, "information") for kind, of in lines.items()}
+    plain["landmark_range"] = measured("landmark_range")
     poses = told_places(vertices, pose_of, len(pose_ids), content, from_odometry)
     anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
     fixed = records["FIX"].names[:, 0]
@@ -130,7 +118,7 @@ def write_g2o(
     gtsam stops reading edges at the first line whose tag it does not know, and SE-Sync knows poses and edges between
     them alone: these stand first, and the first pose, which readers hold of themselves, is named only where more is
     fixed or poses are known beforehand. Poses are vertices 0..n-1 and anchors follow. Calibration and lever arms are
-    worked in at the present estimate (see graph_file.plain_edges); robust kernels are not written.
+    worked in at the present estimate (see plain_edges); robust kernels are not written.
 
     Parameters
     ----------
@@ -166,23 +154,18 @@ def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:
     plain, n = plain_edges(graph), len(graph.poses)
     placed = np.isfinite(graph.anchors).all(axis=1)
     yield from _rows("VERTEX_SE2", [number[:n]], graph.poses)
-    yield from _rows("EDGE_SE2", [number[plain.i], number[plain.j]], plain.T_i_j, upper_triangle(plain.information))
-    yield from _rows("VERTEX_XY", [number[n:][placed]], graph.anchors[placed])
-    pose, anchor, position, information = plain.sightings
-    yield from _rows("EDGE_SE2_XY", [number[pose], number[n + anchor]], position, upper_triangle(information))
-    pose, value, information = plain.pose_priors
-    yield from _rows("EDGE_PRIOR_SE2", [number[pose]], value, upper_triangle(information))
-    anchor, value, information = plain.landmark_priors
-    yield from _rows("EDGE_PRIOR_XY", [number[n + anchor]], value, upper_triangle(information))
-    if ranges:
-        pose, anchor, distance, sigma = plain.ranges
-        yield from _rows("EDGE_RANGE_SE2_XY", [number[pose], number[n + anchor]], np.stack([distance, 1.0 / sigma**2], axis=1))
-        i, j, distance, sigma = plain.pose_ranges
-        yield from _rows("EDGE_RANGE_SE2", [number[i], number[j]], np.stack([distance, 1.0 / sigma**2], axis=1))
+    first = {"pose": 0, "landmark": n}
+    for kind, tag in _TAGS.items():
+        if kind == "sighting":
+            yield from _rows("VERTEX_XY", [number[n:][placed]], graph.anchors[placed])
+        if ranges or "range" not in kind:
+            m = plain[kind]
+            ends = [number[first[end] + index] for end, index in zip(ENDS[kind], m.ends, strict=True)]
+            yield from _rows(tag, ends, m.value, upper_triangle(m.information))
     fixed = np.zeros(1, dtype=np.int64) if graph.fixed_poses is None else np.flatnonzero(graph.fixed_poses)
     if graph.fixed_anchors is not None:
         fixed = np.concatenate([fixed, n + np.flatnonzero(graph.fixed_anchors & placed)])
-    if fixed.tolist() != [0] or len(plain.pose_priors[0]):
+    if fixed.tolist() != [0] or len(plain["pose_prior"].value):
         yield from _rows("FIX", [number[fixed]], np.zeros((len(fixed), 0)))
 
 

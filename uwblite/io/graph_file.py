@@ -1,8 +1,6 @@
 """Pose graphs between files and the Graph type: what g2o, TORO and PyFG have in common."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -15,9 +13,10 @@ from ..graph.components import floating_components
 from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.graph import Graph, PriorEdges
 from ..graph.point_edges import LandmarkEdges
-from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
+from ..graph.pose_edges import RelativePoseEdges
 from ..graph.range_edges import RangeEdges
 from .graph_chains import chained_poses
+from .plain_edges import ENDS, WIDTHS, Measured, root, turned
 from .records import RecordFile, Records
 
 _NONE = np.zeros(0, dtype=np.int64)
@@ -96,157 +95,12 @@ def _tied(graph: Graph, chains: Ints) -> Bools:
     return np.asarray(label[:count] == label[0], dtype=np.bool_)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlainEdges:
-    """A graph's measurements as the text formats can say them: between poses and landmarks, nothing calibrated."""
-
-    i: Ints
-    j: Ints
-    T_i_j: Floats
-    """(e, 3) pose j in pose i."""
-    information: Floats
-    """(e, 3, 3)."""
-    sightings: tuple[Ints, Ints, Floats, Floats]
-    """pose (s,), landmark (s,), position (s, 2), information (s, 2, 2)."""
-    ranges: tuple[Ints, Ints, Floats, Floats]
-    """pose (r,), landmark (r,), range (r,) m, sigma (r,) m."""
-    pose_priors: tuple[Ints, Floats, Floats]
-    """pose (p,), value (p, 3), information (p, 3, 3) in the chart e = Z^-1 X."""
-    landmark_priors: tuple[Ints, Floats, Floats]
-    """landmark (p,), value (p, 2), information (p, 2, 2)."""
-    pose_ranges: tuple[Ints, Ints, Floats, Floats]
-    """pose (r,), pose (r,), range (r,) m, sigma (r,) m."""
-    landmark_ranges: tuple[Ints, Ints, Floats, Floats]
-    """landmark (r,), landmark (r,), range (r,) m, sigma (r,) m."""
-
-
-def plain_edges(graph: Graph) -> PlainEdges:
-    """Return a graph's measurements with calibration and lever arms worked in at the present estimate.
-
-    Odometry and scan edges become measurements between the poses of the base. A range becomes the range from the pose
-    itself that leaves the same residual at the present estimate. Weights scale the information; robust kernels and
-    priors on calibration have no place in the formats and are left out. Where nothing is calibrated and lever arms are
-    zero nothing changes, so that chi2 stays what it was. Ranges to anchors without a position are left out. Directions that
-    an edge does not measure get an information too small to matter (see `definite`).
-    """
-    relative: list[tuple[Ints, Ints, Floats, Floats]] = []
-    sightings: list[tuple[Ints, Ints, Floats, Floats]] = []
-    ranges: list[tuple[Ints, Ints, Floats, Floats]] = []
-    priors: dict[str, list[tuple[Ints, Floats, Floats]]] = {"poses": [], "anchors": []}
-    between_poses: list[tuple[Ints, Ints, Floats, Floats]] = []
-    between_landmarks: list[tuple[Ints, Ints, Floats, Floats]] = []
-    for edges in graph.edges:
-        weights = np.ones(len(edges)) if edges.weights is None else edges.weights
-        on = weights > 0
-        scale = np.sqrt(weights[on])
-        if isinstance(edges, RangeEdges):
-            on &= np.isfinite(graph.anchors[edges.anchor]).all(axis=1)
-            scale = np.sqrt(weights[on])
-            left = edges.residuals(graph)[on, 0] * edges.sigma[on]
-            apart = np.hypot(*(graph.poses[edges.pose[on], :2] - graph.anchors[edges.anchor[on]]).T)
-            ranges.append((edges.pose[on], edges.anchor[on], apart - left, edges.sigma[on] / scale))
-        elif isinstance(edges, PointDistanceEdges):
-            left = edges.residuals(graph)[on, 0] * edges.sigma[on]
-            apart = np.hypot(*(graph.poses[edges.i[on], :2] - graph.poses[edges.j[on], :2]).T)
-            between_poses.append((edges.i[on], edges.j[on], apart - left, edges.sigma[on] / scale))
-        elif isinstance(edges, AnchorDistanceEdges):
-            between_landmarks.append((edges.i[on], edges.j[on], edges.distance[on], edges.sigma[on] / scale))
-        elif isinstance(edges, LandmarkEdges):
-            L = edges.sqrt_information[on] * scale[:, None, None]
-            sightings.append((edges.pose[on], edges.anchor[on], edges.position[on], _squared(L)))
-        elif isinstance(edges, PriorEdges):
-            if edges.block in priors:
-                L = edges.sqrt_information[on] * scale[:, None, None]
-                if edges.block == "poses":
-                    L = L @ _turned(edges.value[on, 2])
-                priors[edges.block].append((edges.index[on], edges.value[on], _squared(L)))
-        elif isinstance(edges, RelativePoseEdges | OdometryEdges | ScanEdges):
-            T, L = _between_bases(edges, graph)
-            relative.append((edges.i[on], edges.j[on], T[on], _squared(L[on] * scale[:, None, None])))
-    none, no_information = _NONE, np.zeros((0, 3, 3))
-    i, j, T, information = _stacked(relative, (none, none, np.zeros((0, 3)), no_information))
-    return PlainEdges(
-        i,
-        j,
-        T,
-        definite(information),
-        _definite(_stacked(sightings, (none, none, np.zeros((0, 2)), np.zeros((0, 2, 2))))),
-        _stacked(ranges, (none, none, np.zeros(0), np.zeros(0))),
-        _definite(_stacked(priors["poses"], (none, np.zeros((0, 3)), no_information))),
-        _definite(_stacked(priors["anchors"], (none, np.zeros((0, 2)), np.zeros((0, 2, 2))))),
-        _stacked(between_poses, (none, none, np.zeros(0), np.zeros(0))),
-        _stacked(between_landmarks, (none, none, np.zeros(0), np.zeros(0))),
-    )
-
-
-def _between_bases(edges: RelativePoseEdges | OdometryEdges | ScanEdges, graph: Graph) -> tuple[Floats, Floats]:
-    """Return the measured pose of base j in base i (e, 3) and the square root of its information (e, 3, 3)."""
-    if isinstance(edges, RelativePoseEdges):
-        return edges.T_i_j, edges.sqrt_information
-    if isinstance(edges, OdometryEdges):
-        return edges.corrected(graph), edges.sqrt_information / edges.own_scale(graph)[:, None, :]
-    # S = X o A, so Z' = A_i Z A_j^-1 and, to first order, e' = A_j e A_j^-1 = M e.
-    calibration = np.append(graph.calibration.values, 0.0)
-    correction, delay = calibration[edges.calibration[:3]], calibration[edges.calibration[3]]
-    A_i, A_j = (se2.compose(se2.exp(twist * (delay - edges.made_with)), correction) for twist in (edges.twist_i, edges.twist_j))
-    T = se2.compose(se2.compose(A_i, edges.T_i_j), se2.inverse(A_j))
-    M = _turned(A_j[:, 2])
-    M[:, 0, 2], M[:, 1, 2] = A_j[:, 1], -A_j[:, 0]
-    return T, edges.sqrt_information @ np.linalg.inv(M)
-
-
-def _turned(theta: Floats) -> Floats:
-    """Return blockdiag(R(theta), 1), (e, 3, 3)."""
-    turned = np.zeros((len(theta), 3, 3))
-    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(theta)
-    turned[:, 1, 0] = np.sin(theta)
-    turned[:, 0, 1] = -turned[:, 1, 0]
-    turned[:, 2, 2] = 1.0
-    return turned
-
-
-def _squared(L: Floats) -> Floats:
-    return np.swapaxes(L, 1, 2) @ L
-
-
-def _stacked(parts: Sequence[tuple[Any, ...]], empty: tuple[Any, ...]) -> Any:
-    """Return the columns of all parts, one behind the other; empty ones where there is no part."""
-    return tuple(np.concatenate(column) for column in zip(empty, *parts, strict=True))
-
-
-def _definite(columns: Any) -> Any:
-    """Return columns whose last one is information matrices."""
-    return (*columns[:-1], definite(columns[-1]))
-
-
 def symmetric(upper: Floats, size: int) -> Floats:
     """Return symmetric matrices (e, size, size) from their upper triangles row by row (e, size (size + 1) / 2)."""
     row, col = np.triu_indices(size)
     matrices = np.empty((len(upper), size, size))
     matrices[:, row, col] = matrices[:, col, row] = upper
     return matrices
-
-
-def upper_triangle(matrices: Floats) -> Floats:
-    """Return the upper triangles row by row (e, size (size + 1) / 2) of matrices (e, size, size)."""
-    row, col = np.triu_indices(matrices.shape[1])
-    return matrices[:, row, col]
-
-
-_FLATTEST = 1e-8
-"""Least eigenvalue of an information matrix in a file, relative to its largest. A direction that was not measured has none,
-but readers invert the matrix or take its Cholesky factor, which breaks down without an error (gtsam)."""
-
-
-def definite(information: Floats) -> Floats:
-    """Return information matrices (e, k, k), those that are singular to working precision made positive definite."""
-    if len(information) == 0:
-        return information
-    values, vectors = np.linalg.eigh(information)
-    least = np.maximum(_FLATTEST * values[:, -1:], np.finfo(np.float64).tiny)
-    flat = values[:, 0] < least[:, 0]
-    raised = (vectors * np.maximum(values, least)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    return np.where(flat[:, None, None], raised, information)
 
 
 def told_places(vertices: Records, index_of: Ints, count: int, content: RecordFile, forget: bool) -> Floats:
@@ -283,21 +137,26 @@ def read_matrices(upper: Floats, size: int, lines: Ints, path: str, what: str) -
     return matrices
 
 
-def root(information: Floats) -> Floats:
-    """Return L (e, k, k) with information = L^T L; singular matrices are allowed."""
-    try:
-        return np.swapaxes(np.linalg.cholesky(information), 1, 2)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(information)
-        return np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
+def measurements(of: Records, kind: str, index: dict[str, Ints], content: RecordFile, what: str) -> Measured:
+    """Return the measurements of one kind that lines hold: names, values, and the upper triangle of a matrix.
+
+    Parameters
+    ----------
+    index : place of each name of the file among poses, and among landmarks. what : the kind of matrix.
+    """
+    k = WIDTHS.get(kind, 1)
+    ends = tuple(index[end][of.names[:, n]] for n, end in enumerate(ENDS[kind]))
+    return Measured(ends, of.numbers[:, :k], read_matrices(of.numbers[:, k:], k, of.lines, content.path, what))
 
 
-def assembled(plain: PlainEdges, poses: Floats, anchors: Floats, fixed: Ints = _NONE, fixed_anchors: Ints = _NONE) -> Graph:
+def assembled(
+    plain: dict[str, Measured], poses: Floats, anchors: Floats, fixed: Ints = _NONE, fixed_anchors: Ints = _NONE
+) -> Graph:
     """Return the graph of measurements, with a start for whatever the file gives no position of.
 
     Parameters
     ----------
-    plain : measurements.
+    plain : measurements by kind.
     poses : (n, 3) given poses, nan where the file gives none; these are reached from the others along edges.
     anchors : (a, 2) given landmarks; nan where none is given; these are placed by the first edge that sees them.
     fixed, fixed_anchors : indices of what is fixed. Nothing named and no prior on a pose: the first pose is fixed.
@@ -306,20 +165,26 @@ def assembled(plain: PlainEdges, poses: Floats, anchors: Floats, fixed: Ints = _
     -------
     Graph; poses and anchors that nothing leads to stay nan.
     """
-    poses = chained_poses(poses, plain.i, plain.j, plain.T_i_j)
-    pose, anchor, position, seen = plain.sightings
+    (i, j), T_i_j, _ = plain["relative"]
+    poses = chained_poses(poses, i, j, T_i_j)
+    (pose, anchor), position, _ = plain["sighting"]
     placed = np.full_like(anchors, np.nan)
     placed[anchor[::-1]] = se2.transform(poses[pose], position)[::-1]
     anchors = np.where(np.isnan(anchors), placed, anchors)
-    prior, value, strength = plain.pose_priors
+    (seer, seen), (one, other), (first, second) = (plain[kind].ends for kind in _DISTANCES)
+    L = {kind: root(m.information) for kind, m in plain.items()}
+    ranges = {kind: (plain[kind].value[:, 0], 1.0 / L[kind][:, 0, 0]) for kind in _DISTANCES}
+    (prior,), value, _ = plain["pose_prior"]
+    (known,), place, _ = plain["landmark_prior"]
+    nowhere = np.zeros((len(ranges["pose_range"][0]), 2))
     edges = (
-        RelativePoseEdges(plain.i, plain.j, plain.T_i_j, root(plain.information)),
-        LandmarkEdges(pose, anchor, position, root(seen)),
-        _ranges_from_poses(*plain.ranges),
-        _ranges_between_poses(*plain.pose_ranges),
-        AnchorDistanceEdges(*plain.landmark_ranges),
-        PriorEdges("poses", prior, value, root(strength) @ _turned(-value[:, 2])),
-        PriorEdges("anchors", plain.landmark_priors[0], plain.landmark_priors[1], root(plain.landmark_priors[2])),
+        RelativePoseEdges(i, j, T_i_j, L["relative"]),
+        LandmarkEdges(pose, anchor, position, L["sighting"]),
+        _ranges_from_poses(seer, seen, *ranges["range"]),
+        PointDistanceEdges(one, other, nowhere, nowhere, *ranges["pose_range"]),
+        AnchorDistanceEdges(first, second, *ranges["landmark_range"]),
+        PriorEdges("poses", prior, value, L["pose_prior"] @ turned(-value[:, 2])),
+        PriorEdges("anchors", known, place, L["landmark_prior"]),
     )
     fixed_pose = np.isin(np.arange(len(poses)), fixed)
     given = len(fixed) or len(prior) or len(fixed_anchors) > 1
@@ -332,13 +197,11 @@ def assembled(plain: PlainEdges, poses: Floats, anchors: Floats, fixed: Ints = _
     )
 
 
+_DISTANCES = ("range", "pose_range", "landmark_range")
+
+
 def _ranges_from_poses(pose: Ints, anchor: Ints, ranges: Floats, sigma: Floats) -> RangeEdges:
     """Return range edges without lever arms and calibration."""
     n, flat = len(pose), np.zeros((len(pose), 2))
     none = np.full((n, 6), -1, dtype=np.int64)
     return RangeEdges(pose, anchor, ranges, sigma, flat, np.zeros(n), flat, np.zeros(2), np.zeros(n), none)
-
-
-def _ranges_between_poses(i: Ints, j: Ints, ranges: Floats, sigma: Floats) -> PointDistanceEdges:
-    none = np.zeros((len(i), 2))
-    return PointDistanceEdges(i, j, none, none, ranges, sigma)

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, PlainEdges, assembled, plain_edges, read_matrices, told_places, upper_triangle
+from .graph_file import GraphFile, assembled, measurements, told_places
+from .plain_edges import ENDS, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
 
@@ -37,6 +38,11 @@ _LAYOUTS = {
     "EDGE_SE2_XY": Layout(2, 5, stamped=True, places=2),
     "EDGE_RANGE": Layout(2, 2, stamped=True, places=1),
 }
+_TAGS = {
+    "pose_prior": "VERTEX_SE2:PRIOR", "landmark_prior": "VERTEX_XY:PRIOR", "relative": "EDGE_SE2", "sighting": "EDGE_SE2_XY",
+    "range": "EDGE_RANGE", "pose_range": "EDGE_RANGE", "landmark_range": "EDGE_RANGE",
+}  # fmt: skip
+"""In the order of the file."""
 _SPATIAL = ("VERTEX_SE3", "VERTEX_XYZ", "EDGE_SE3")
 _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
 
@@ -83,24 +89,13 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
         if wrong.any():
             raise content.error(problem, int(of.lines[int(np.argmax(wrong))]))
 
-    def matrices(of: Records, size: int, first: int) -> Floats:
-        return _inverse(read_matrices(of.numbers[:, first:], size, of.lines, content.path, "covariance"), of, content)
-
-    def lengths(of: Records) -> tuple[Floats, Floats]:
-        return of.numbers[:, 0], np.sqrt(of.numbers[:, 1])
-
-    plain = PlainEdges(
-        ends[:, 0],
-        ends[:, 1],
-        steps.numbers[:, :3],
-        matrices(steps, 3, 3),
-        (pose_of[seen.names[:, 0]], landmark_of[seen.names[:, 1]], seen.numbers[:, :2], matrices(seen, 2, 2)),
-        (pose_of[ranged.names[:, 0]], landmark_of[ranged.names[:, 1]], *lengths(ranged)),
-        (pose_of[pinned.names[:, 0]], pinned.numbers[:, :3], matrices(pinned, 3, 3)),
-        (landmark_of[surveyed.names[:, 0]], surveyed.numbers[:, :2], matrices(surveyed, 2, 2)),
-        (*pose_of[meetings.names.T], *lengths(meetings)),
-        (*landmark_of[surveys.names.T], *lengths(surveys)),
-    )
+    index = {"pose": pose_of, "landmark": landmark_of}
+    lines = {"relative": steps, "sighting": seen, "pose_prior": pinned, "landmark_prior": surveyed, "range": ranged}
+    lines |= {"pose_range": meetings, "landmark_range": surveys}
+    plain = {}
+    for kind, of in lines.items():
+        found = measurements(of, kind, index, content, "covariance")
+        plain[kind] = found._replace(information=_inverse(found.information, of, content))
     poses = told_places(records["VERTEX_SE2"], pose_of, len(pose_ids), content, from_odometry)
     anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
@@ -119,7 +114,7 @@ def write_pyfg(
 ) -> None:
     """Write a graph with its ranges; poses are A0, A1, ... and anchors L0, L1, ... in the order of the graph.
 
-    Calibration and lever arms are worked in at the present estimate (see graph_file.plain_edges); robust kernels
+    Calibration and lever arms are worked in at the present estimate (see plain_edges); robust kernels
     are not written. The vertices hold the estimate.
 
     Parameters
@@ -158,22 +153,14 @@ def _lines(graph: Graph, stamps: Floats, poses: NDArray[np.str_], anchors: NDArr
     placed = np.isfinite(graph.anchors).all(axis=1)
     yield from _rows("VERTEX_SE2", stamps, [poses], graph.poses)
     yield from _rows("VERTEX_XY", None, [anchors[placed]], graph.anchors[placed])
-    pose, value, information = plain.pose_priors
-    yield from _rows("VERTEX_SE2:PRIOR", stamps[pose], [poses[pose]], value, _covariances(information))
-    anchor, value, information = plain.landmark_priors
-    when = np.full(len(anchor), stamps[first])
-    yield from _rows("VERTEX_XY:PRIOR", when, [anchors[anchor]], value, _covariances(information))
-    ends = [poses[plain.i], poses[plain.j]]
-    yield from _rows("EDGE_SE2", stamps[plain.j], ends, plain.T_i_j, _covariances(plain.information))
-    pose, anchor, position, information = plain.sightings
-    yield from _rows("EDGE_SE2_XY", stamps[pose], [poses[pose], anchors[anchor]], position, _covariances(information))
-    pose, anchor, distance, sigma = plain.ranges
-    yield from _rows("EDGE_RANGE", stamps[pose], [poses[pose], anchors[anchor]], np.stack([distance, sigma**2], axis=1))
-    i, j, distance, sigma = plain.pose_ranges
-    yield from _rows("EDGE_RANGE", stamps[i], [poses[i], poses[j]], np.stack([distance, sigma**2], axis=1))
-    i, j, distance, sigma = plain.landmark_ranges
-    when = np.full(len(i), stamps[first])
-    yield from _rows("EDGE_RANGE", when, [anchors[i], anchors[j]], np.stack([distance, sigma**2], axis=1))
+    names = {"pose": poses, "landmark": anchors}
+    for kind, tag in _TAGS.items():
+        m = plain[kind]
+        ends = [names[end][index] for end, index in zip(ENDS[kind], m.ends, strict=True)]
+        # A step is of the time of its end, a range of that of its first pose, what has none of that of the pose that is fixed.
+        at = [index for end, index in zip(ENDS[kind], m.ends, strict=True) if end == "pose"]
+        when = stamps[at[-1 if kind == "relative" else 0]] if at else np.full(len(m.value), stamps[first])
+        yield from _rows(tag, when, ends, m.value, _covariances(m.information))
 
 
 def _rows(tag: str, stamps: Floats | None, names: list[NDArray[np.str_]], *columns: Floats) -> Iterator[str]:
@@ -229,7 +216,5 @@ def _kinds_of_ranges(ranged: Records, pose_of: Ints, landmark_of: Ints) -> tuple
     names[swapped] = names[swapped, ::-1]
     first, second = pose_of[names[:, 0]] >= 0, pose_of[names[:, 1]] >= 0
     kinds = (first & ~second, first & second, ~first)
-    mixed, meetings, surveys = (
-        Records(ranged.lines[k], ranged.stamps[k], names[k], ranged.numbers[k]) for k in kinds
-    )
+    mixed, meetings, surveys = (Records(ranged.lines[k], ranged.stamps[k], names[k], ranged.numbers[k]) for k in kinds)
     return mixed, meetings, surveys
