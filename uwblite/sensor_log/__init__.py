@@ -1,0 +1,13 @@
+"""What was measured: one recording as arrays.
+
+Every array is time-ordered. Times are seconds of one clock (the log's ipc_timestamp); lengths metres; angles radians.
+"""
+
+from .notes import LogNotes, OdometryBreaks, Remark, Screening
+from .recording import MOST_ANCHORS, MOST_METRES, MOST_SECONDS, SensorLog, fault_of_id, one_word
+from .sensors import Gyro, LaserScans, Odometry, SensorMounting, UwbRanges
+
+__all__ = [
+    "MOST_ANCHORS", "MOST_METRES", "MOST_SECONDS", "Gyro", "LaserScans", "LogNotes", "Odometry", "OdometryBreaks", "Remark",
+    "Screening", "SensorLog", "SensorMounting", "UwbRanges", "fault_of_id", "one_word",
+]  # fmt: skip

@@ -1,0 +1,133 @@
+"""What each sensor measured, and where it sits on the base."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Bools, Floats, Ints
+from ..errors import DataError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Wheel odometry: poses of the base in the drifting odom frame."""
+
+    stamps: Floats
+    """(n,) s, non-decreasing."""
+    poses: Floats
+    """(n, 3) x, y, theta of T_odom_base; m, m, rad."""
+
+    def rows(self, which: slice | Ints | Bools) -> "Odometry":
+        """Return some of the readings."""
+        return Odometry(self.stamps[which], self.poses[which])
+
+    @property
+    def travelled(self) -> Floats:
+        """(n,) m, distance since the first stamp."""
+        return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T))])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UwbRanges:
+    """Distances between the tag on the robot and fixed anchors."""
+
+    stamps: Floats
+    """(m,) s, non-decreasing."""
+    anchor: Ints
+    """(m,) index into anchor_ids."""
+    ranges: Floats
+    """(m,) m, as the radio reported them: zeros, spikes and biases included."""
+    quality: Floats
+    """(m,) 0..100 as the radio reported it; 100 where it reports none."""
+    anchor_ids: tuple[str, ...]
+    """Names of the anchors, sorted; each has at least one range."""
+    tag: Ints | None = None
+    """(m,) which of the robot's tags measured, an index into SensorMounting.tags; None = all the first."""
+
+    def require_one_tag(self, place: str) -> None:
+        """Raise DataError where the ranges of several tags would lose whose they are."""
+        if self.tag is not None:
+            raise DataError(f"{place} does not keep the ranges of several tags apart; convert to a .log, which does")
+
+    def rows(self, which: slice | Ints | Bools) -> "UwbRanges":
+        """Return some of the ranges, with the anchors that they are to."""
+        used, anchor = np.unique(self.anchor[which], return_inverse=True)
+        ids = tuple(self.anchor_ids[k] for k in used)
+        tag = None if self.tag is None else self.tag[which]
+        return UwbRanges(self.stamps[which], anchor.astype(np.int64), self.ranges[which], self.quality[which], ids, tag)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gyro:
+    """The heading of a gyro, from an arbitrary zero, with its bias."""
+
+    stamps: Floats
+    """(g,) s, non-decreasing."""
+    heading: Floats
+    """(g,) rad, counter-clockwise, unwrapped."""
+
+    def rows(self, which: slice | Ints | Bools) -> "Gyro":
+        """Return some of the readings."""
+        return Gyro(self.stamps[which], self.heading[which])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserScans:
+    """2D scans with the field names of sensor_msgs/LaserScan; all scans share one geometry."""
+
+    stamps: Floats
+    """(k,) s, time of the first ray, non-decreasing."""
+    ranges: NDArray[np.float32]
+    """(k, b) m; +inf = nothing seen up to range_max, nan = invalid (REP-117)."""
+    angle_min: float
+    """Angle of ray 0 in the laser frame, rad, counter-clockwise."""
+    angle_increment: float
+    """Angle between rays, rad."""
+    time_increment: float
+    """Time between rays, s (0: the scan is a snapshot)."""
+    range_min: float
+    range_max: float
+    """m; a reading outside [range_min, range_max] is not an obstacle."""
+
+    @property
+    def angles(self) -> Floats:
+        """(b,) angle of each ray in the laser frame, rad."""
+        return np.asarray(self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1]), dtype=np.float64)
+
+    @property
+    def middles(self) -> Floats:
+        """(k,) s, time of the ray in the middle of each scan."""
+        return self.stamps + 0.5 * self.time_increment * self.ranges.shape[1]
+
+    def rows(self, which: slice | Ints | Bools) -> "LaserScans":
+        """Return some of the scans."""
+        return replace(self, stamps=self.stamps[which], ranges=self.ranges[which])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorMounting:
+    """Where the sensors sit on the base."""
+
+    T_base_laser: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) x, y, theta of the laser on the base."""
+    laser_flipped: bool = False
+    """Laser mounted upside down: its rays run clockwise."""
+    tag_position: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) x, y, z of the tag on the base; z is the height above the floor."""
+    anchor_height: float | None = None
+    """Height of the anchors above the floor, m; None = not given (taken as the tag's height)."""
+    anchor_heights: dict[str, float] = field(default_factory=dict)
+    """Heights of single anchors above the floor, m, by id; they win over anchor_height."""
+    more_tags: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(t, 3) x, y, z of further tags on the base."""
+
+    @property
+    def tags(self) -> Floats:
+        """(1 + t, 3) x, y, z of all tags on the base, m."""
+        return np.concatenate([self.tag_position[None], self.more_tags])
+
+    def height_difference(self, anchor_id: str) -> float | None:
+        """Height of an anchor above the tag, m; None where none is given."""
+        height = self.anchor_heights.get(anchor_id, self.anchor_height)
+        return None if height is None else height - float(self.tag_position[2])
