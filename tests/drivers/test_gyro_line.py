@@ -15,6 +15,12 @@ from uwblite.errors import ConfigError
 DEGREES = "angle_unit=0.017453292519943295"
 
 
+def test_a_rate_that_leaps_away_and_back_turns_nothing():
+    stated, actions = headings("line:x?columns=turn_rate", ["0", *["0.01"] * 50, "8.01", *["0.01"] * 50])
+    assert [a.why for a in actions if isinstance(a, Corrupt)] == ["line that leaps away and back"]
+    assert stated[-1].heading < 0.03
+
+
 def headings(spec, lines, period=0.02):
     session = open_device("gyro", spec)[0]
     session.start(0.0)
@@ -39,7 +45,7 @@ def test_rates_are_integrated_by_the_gyros_own_time():
 
 
 def test_headings_are_unwrapped_and_may_count_clockwise():
-    stated, _ = headings(f"line:x?columns=theta&angle_unit={-math.radians(1)}", ["0", "170", "179", "-179", "-90", "10"])
+    stated, _ = headings(f"line:x?columns=theta&angle_unit={-math.radians(1)}", ["0", "170", "179", "-179", "-90", "10"], 0.2)
     assert [round(-math.degrees(h.heading)) for h in stated] == [170, 179, 181, 270, 370]
 
 
@@ -63,7 +69,7 @@ def test_a_digit_that_is_lost_from_the_time_costs_its_own_reading_only():
         for event in driver.parse(f"{time},0.1\n".encode(), 50 + 0.01 * k):
             actions += driver.take(event)
     assert [a.count for a in actions if isinstance(a, Lost)] == [1, 1]
-    assert [a.why for a in actions if isinstance(a, Corrupt)] == ["line whose time leaps"] * 2
+    assert [a.why for a in actions if isinstance(a, Corrupt)] == ["line that leaps away and back"] * 2
     stamps = [a.stamp for a in actions if isinstance(a, GyroHeading)]
     assert len(stamps) == 1498
     assert max(abs(s - t) for s, t in zip(stamps[-500:], [50 + 0.01 * k for k in range(1000, 1500)], strict=True)) < 0.002

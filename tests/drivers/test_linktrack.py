@@ -9,7 +9,8 @@ from helpers.driver_harness import check_transcript, feed_whole, good
 
 from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, Note
-from uwblite.drivers.linktrack import MUCH, Bu03Protocol, LinkTrackProtocol
+from uwblite.drivers.linktrack import Bu03Protocol, LinkTrackProtocol
+from uwblite.drivers.uwb_driver import MUCH
 
 PROTOCOLS = {"linktrack": LinkTrackProtocol, "bu03": Bu03Protocol}
 RNG = random.Random(4)
@@ -31,7 +32,7 @@ def test_bytes_that_a_user_shows():
     ranges = bytes.fromhex("aa2501 ee070000 d8040000" + "00000000" * 6)
     for end in (b"\x5e\x55", ranges[:2]):  # firmware that ends a frame, and that begins the next one at once
         (event,) = feed_whole(Bu03Protocol, ranges + end)
-        assert [(r.anchor_id, r.range) for r in event.readings] == [("0", 2.03), ("1", 1.24)]
+        assert [(r.anchor_id, r.range) for r in event.content.readings] == [("0", 2.03), ("1", 1.24)]
     assert not good(feed_whole(Bu03Protocol, ranges + b"\x5e\x00"))
 
 
@@ -40,8 +41,8 @@ def test_negative_ranges_and_absent_anchors_are_none():
     frame[22:25], frame[25:28] = (-10).to_bytes(3, "little", signed=True), b"\0\0\0"
     frame[127] = sum(frame[:-1]) & 0xFF
     (event,) = feed_whole(LinkTrackProtocol, bytes(frame))
-    assert "0" not in [r.anchor_id for r in event.readings]
-    assert "1" not in [r.anchor_id for r in event.readings]
+    assert "0" not in [r.anchor_id for r in event.content.readings]
+    assert "1" not in [r.anchor_id for r in event.content.readings]
 
 
 def test_every_single_damaged_byte_is_noticed():

@@ -43,7 +43,7 @@ def test_lines_that_do_not_fit_are_corrupt(line):
 def test_prefix_and_skipped_columns():
     spec = parse_format({"columns": "-,t,x,y,theta", "prefix": "ODO ", "time_unit": "0.001", "angle_unit": "0.0174532925"})
     (sample,) = protocol(spec).feed(b"[info] started\n#ODO 77 2500 1.0 2.0 90\n", 3.0)
-    (pose,) = OdometryLineDriver(spec).take(sample)
+    (pose,) = OdometryLineDriver(spec).measured(sample)
     assert (pose.x, pose.y) == (1.0, 2.0)
     assert pose.theta == pytest.approx(math.pi / 2)
     assert sample.content["t"] * spec.time_unit == pytest.approx(2.5)
@@ -57,7 +57,7 @@ def test_ticks_follow_a_circle_and_wrap():
         angle = 2 * math.pi * k / 2000
         left, right = round(angle * 0.85 / 1e-4) % 65536, round(angle * 1.15 / 1e-4) % 65536
         for sample in good(protocol(spec).feed(f"{0.05 * k},{left},{right}\n".encode(), 0.05 * k)):
-            (pose,) = driver.take(sample)
+            (pose,) = driver.measured(sample)
     assert math.hypot(pose.x, pose.y) < 0.002
     assert abs(pose.theta) < 0.001
 

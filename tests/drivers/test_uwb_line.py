@@ -39,6 +39,16 @@ REAL_LINES = {
         '[mac_address=0x0001, status="SUCCESS", distance[cm]=71]}',
         [("0001", 0.71)],
     ),
+    "dwm3001 with diagnosis": (
+        'SESSION_INFO_NTF: {session_handle=1, sequence_number=0, block_index=0, n_measurements=1 [mac_address=0x0001, '
+        'status="SUCCESS", distance[cm]=91, loc_az_pdoa=65.35, loc_az=24.90, rmt_el=13.59, RSSI[dBm]=-66.5]}',
+        [("0001", 0.91)],
+    ),
+    "dwm3001 first row": (' [mac_address=0x0001, status="SUCCESS", distance[cm]=245];', [("0001", 2.45)]),
+    "dwm3001 last row": (' [mac_address=0x0004, status="RX_TIMEOUT"]}', []),
+    "dwm3001 head": ("SESSION_INFO_NTF: {session_handle=1, sequence_number=1, block_index=1, n_measurements=4", []),
+    "bu01 in one line": ("an1:1.24m an3:2.50m", [("1", 1.24), ("3", 2.5)]),
+    "makerfabs on ESP32 in colour": ("\x1b[0;32mfrom: 84\t Range: 0.55 m\t RX power: -inf dBm\x1b[0m", [("84", 0.55)]),
 }  # fmt: skip
 """As users show them (sources in firmware_notes)."""
 
@@ -55,6 +65,23 @@ def test_older_at_firmware_reports_rssi_and_no_ids():
     (line,) = LineProtocol(FORMS["makerfabs-at"]).feed(text.encode() + b"\n", 1.0)
     assert [(r.anchor_id, r.range) for r in line.content.readings] == [("2", 0.3)]
     assert line.content.tag == "1"
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("makerfabs", "from: 1782 Range: 3.2"),
+        ("makerfabs", "from: 1782\t Range: 3.21 m\t RX powor: -65.10 dBm"),
+        ("makerfabs-at", "AT+RANGE=tid:7,mask:0F,seq:128,range:(997,1321"),
+        ("bu01", "am1:1.24m"),
+        ("bu01", "an1:1.24"),
+        ("dwm3001", '{"Block":3948, "results":[{"Addr":"0x0001","Status":"Ok","D_cm":7 1}]}'),
+        ("dwm3001", '{"Block":3948, "results":[{"Addr":"0x00G1","Status":"Ok","D_cm":71}]}'),
+        ("dwm3001", '[mac_address=0x0001, status="SUCCESS", distance[cm]=2'),
+    ],
+)
+def test_lines_that_are_not_whole_are_damage(name, line):
+    assert isinstance(FORMS[name](line), str)
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -142,9 +169,11 @@ def test_ranges_of_other_tags_are_left_out_and_that_is_reported():
     session = open_device("uwb", "makerfabs-at:port")[0]
     session.start(0.0)
     line = "AT+RANGE=tid:{},mask:01,seq:1,range:({},0,0,0,0,0,0,0)\n"
-    actions = session.feed((line.format(3, 50) + line.format(3, 100) + line.format(4, 200) + line.format(3, 300)).encode(), 1.0)
-    assert [r.range for a in actions if isinstance(a, RangeEpoch) for r in a.readings] == [1.0, 3.0]
+    rounds = [(3, 50), (4, 200), (3, 100), (3, 101), (4, 201), (13, 300), (3, 102), (4, 203), (3, 104)]
+    actions = [action for k, row in enumerate(rounds) for action in session.feed(line.format(*row).encode(), 0.1 * k)]
+    assert [r.range for a in actions if isinstance(a, RangeEpoch) for r in a.readings] == [1.0, 1.01, 1.02, 1.04]
     assert [a.name for a in actions if isinstance(a, Note)] == ["uwb-other-tag"]
+    assert [a.why for a in actions if isinstance(a, Corrupt)] == ["line of a tag that was seen once"] * 2  # the first 4, and 13
 
 
 @pytest.mark.parametrize("name", ["dwm3001", "makerfabs-at"])

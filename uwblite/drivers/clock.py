@@ -46,7 +46,7 @@ class Unwrapper:
     """
 
     def __init__(self, modulus: int, tick: float) -> None:
-        self._modulus, self._tick = modulus, tick
+        self.modulus, self.tick = modulus, tick
         self._tolerance = min(60.0, modulus * tick / 4) if modulus else 60.0
         self._total: float | None = None
         self._count, self._now = 0.0, 0.0
@@ -67,15 +67,15 @@ class Unwrapper:
         if self._total is None:
             self._total, reset = count, False
         else:
-            elapsed = (now - self._now) / self._tick
+            elapsed = (now - self._now) / self.tick
             step = count - self._count
-            if self._modulus:
-                step %= self._modulus
-                step += self._modulus * round((elapsed - step) / self._modulus)
-            reset = step * self._tick < -BACKWARD or abs(step - elapsed) * self._tick > self._tolerance
+            if self.modulus:
+                step %= self.modulus
+                step += self.modulus * round((elapsed - step) / self.modulus)
+            reset = step * self.tick < -BACKWARD or abs(step - elapsed) * self.tick > self._tolerance
             self._total = count if reset else self._total + step
         self._count, self._now = count, now
-        return self._total * self._tick, reset
+        return self._total * self.tick, reset
 
 
 class ClockMap:
@@ -246,12 +246,24 @@ class DeviceClock:
         self._arrival, self._last = arrival, device
         self._map.add(device, arrival)
         if not self._expected:
+            trusted = self.proven
             self._check_rate(device, arrival, reset=reset)
+            if self.proven and not trusted:  # damaged times of a clock that was not known yet would stay in the map
+                self._map = ClockMap()
+                self._map.add(device, arrival)
         self._learn_latency()
         stamp, spread = self._map.host(device) - self.latency, self.tied + self._half + 2 * self._map.excess
         if not self.proven or self.rate is not None:
             stamp = arrival
         return Reading(stamp, elapsed, missing, reset, spread)
+
+    def lateness(self, count: float, arrival: float) -> float | None:
+        """Return how much later than the quickest frame one comes, s; below 0 = earlier; None = it cannot be said.
+
+        Only for clocks that do not wrap, once they have kept pace with the host's.
+        """
+        known = self.proven and self.rate is None and self._last is not None and not self._unwrapper.modulus
+        return arrival - self._map.host(count * self._unwrapper.tick) if known else None
 
     def _begin_again(self) -> None:
         self._map, self._last, self._tie = ClockMap(), None, None

@@ -10,6 +10,7 @@ from functools import partial
 from urllib.parse import parse_qsl, urlencode
 
 from ..errors import ConfigError
+from .clock import DeviceClock
 from .create2 import Create2Driver
 from .dwm1001_driver import Dwm1001Driver
 from .events import Pose
@@ -17,12 +18,14 @@ from .gyro_line import GyroLineDriver, gyro_format
 from .kobuki import KobukiDriver
 from .ldlidar import LdLidarDriver
 from .lds01 import Lds01Driver
-from .linktrack import BU03_BAUD, LINKTRACK_BAUD, Bu03Protocol, LinkTrackProtocol, TagFrameDriver
+from .linktrack import BU03_BAUD, LINKTRACK_BAUD, Bu03Protocol, LinkTrackProtocol
 from .odometry_line import OdometryLineDriver, parse_format
 from .rplidar import RpLidarDriver
 from .scip_driver import ScipDriver
 from .session import Driver, Session
-from .uwb_line import BOARDS, Parse, UwbLineDriver, by_columns, parse_columns
+from .text_lines import LineProtocol
+from .uwb_driver import UwbDriver
+from .uwb_line import BOARDS, Parse, by_columns, parse_columns, within_reach
 from .ydlidar import YdLidarX2Driver, YdLidarX4Driver
 
 BAUD = 1200, 4_000_000
@@ -145,12 +148,15 @@ def _gyro_line(options: Options, _setup: Setup) -> Driver:
 
 
 def _board(parse: Parse, title: str, options: Options) -> Driver:
-    baud, unit = options.whole("baud", UwbLineDriver.baud, *BAUD), options.number("time_unit", 1.0, 1e-12, 1e6)
-    return UwbLineDriver(parse, title, baud, unit, options.text("tag"))
+    baud, unit = options.whole("baud", 115200, *BAUD), options.number("time_unit", 1.0, 1e-12, 1e6)
+    clock = DeviceClock(unit, proven=False)
+    return UwbDriver(LineProtocol(within_reach(parse)), title, baud, clock, unit, options.text("tag"))
 
 
 def _tag_frames(protocol: type[LinkTrackProtocol | Bu03Protocol], title: str, usual: int) -> Callable[[Options, Setup], Driver]:
-    return lambda options, _setup: TagFrameDriver(protocol(), title, options.whole("baud", usual, *BAUD))
+    return lambda options, _setup: UwbDriver(
+        protocol(), title, options.whole("baud", usual, *BAUD), DeviceClock(1e-3, 1 << 32), 1e-3
+    )  # fmt: skip
 
 
 def _printing_board(name: str, title: str) -> DeviceKind:

@@ -5,9 +5,9 @@ Two ways to read it. *TLV* (default): status until a fix is ready, then the fix 
 that died, is brought round.
 """
 
-import math
 from typing import Any
 
+from .continuity import LinkHealth, RangeGuard
 from .dwm1001 import BAUD, QUERIES, STATUS_GET, TlvProtocol
 from .dwm1001_advice import advise, not_joined
 from .dwm1001_blocks import NodeConfig, Status, UpdateRate, Value, short_id
@@ -34,8 +34,6 @@ QUIET = 0.15, 0.35
 """s: lines may still come at first; after that, a stream that was stopped must be silent."""
 ANSWERS = {"ver_get": "hardware", "nodeid_get": "node_id", "panid_get": "pan_id"}
 """The value that completes the answer to a query."""
-DISTRUST, LEAP = 5.0, 0.25
-"""s for which a stream counts as damaged; m by which a range may change from one line to the next meanwhile."""
 SHORTEST_PERIOD = 0.1
 """s between fixes at the highest rate."""
 
@@ -60,10 +58,10 @@ class Dwm1001Driver(Driver):
         self.joined: bool | None = None
         self._shell, self._stream = shell, stream
         self._poller: FixPoller | None = None
-        self._ranges: dict[str, float] = {}
-        """m, the last range of each anchor in the stream."""
-        self._damaged, self._last_line = -math.inf, 0.0
-        """s, when the stream was damaged; when its last line came."""
+        self._health = LinkHealth()
+        self._guard = RangeGuard(self._health)
+        self._last_line = 0.0
+        """s, when the last line of the stream came."""
         self._missed = False
         self.begin()
 
@@ -96,7 +94,7 @@ class Dwm1001Driver(Driver):
 
     def stop(self) -> list[Action]:
         """Return what ends a stream; polling ends by itself."""
-        return [Send(b"lec\r")] if self._streaming else []
+        return [*self._guard.finish(), *([Send(b"lec\r")] if self._streaming else [])]
 
     def script(self) -> Script[None]:
         """Find the module, learn who it is, and read fixes; begin again when it falls silent."""
@@ -198,28 +196,20 @@ class Dwm1001Driver(Driver):
             until = self.now + max(1.0, 3 * self.period)
             while (event := (yield Wait(until))) is not None:
                 if isinstance(event, Corrupt):
-                    self._damaged, self._missed = self.now, True
+                    self._missed = True
+                    self._health.damage(self.now)
                 elif isinstance(event, RangeLine):
                     until, tries = self.now + max(3.0, 3 * self.period), 4
                     yield from self._take_line(event)
         self._streaming = False
 
     def _take_line(self, line: RangeLine) -> Script[None]:
-        """Log a line. It has no sum: where others were damaged, a range that leaps or a new anchor must come twice."""
-        doubted = {
-            r.anchor_id for r in line.readings
-            if self.now - self._damaged < DISTRUST and abs(r.range - self._ranges.get(r.anchor_id, math.inf)) > LEAP
-        }  # fmt: skip
-        self._ranges.update((r.anchor_id, r.range) for r in line.readings)
+        """Log a line. It has no sum: a range that leaps or a new anchor must come again."""
         gap = round((line.stamp - self._last_line) / self.period) - 1 if self._last_line else 0
         if gap > 0 and self._missed:
             yield Lost(line.stamp, gap)
         self._last_line, self._missed = line.stamp, False
-        if doubted:
-            yield Corrupt(b"", "range that leaps on a damaged line")
-        readings = tuple(r for r in line.readings if r.anchor_id not in doubted)
-        if readings:
-            yield RangeEpoch(line.stamp, readings)
+        yield from self._guard.take(RangeEpoch(line.stamp, line.readings), self.now)
 
     # ---- TLV
 

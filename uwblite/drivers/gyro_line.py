@@ -3,12 +3,15 @@
 import math
 
 from ..errors import ConfigError
+from .clock import DeviceClock
 from .events import Action, Corrupt, GyroHeading
-from .odometry_line import LineFormat, values_by
-from .text_lines import Line, LineDriver
+from .odometry_line import LEAP_TURN, LEAST_STEP, LineFormat, values_by
+from .text_lines import Line, LineDriver, LineProtocol
 
 MAX_STEP = 0.25
 """s between two readings over which a rate is not integrated: what the robot did meanwhile is not known."""
+LEAP_RATE, LEAP_ACCELERATION = 1.0, 50.0
+"""rad/s by which two readings may differ by vibration, and rad/s^2 that no robot reaches: more is a damaged digit."""
 
 
 def gyro_format(columns: str, time_unit: float, angle_unit: float, prefix: str) -> LineFormat:
@@ -43,7 +46,9 @@ class GyroLineDriver(LineDriver):
     """
 
     def __init__(self, line_format: LineFormat, baud: int = 115200) -> None:
-        super().__init__(values_by(line_format), "gyro that prints lines", baud, line_format.time_unit)
+        unit = line_format.time_unit
+        clock = DeviceClock(unit, proven=False)
+        super().__init__(LineProtocol(values_by(line_format)), "gyro that prints lines", baud, clock, unit)
         self._angle_unit, self._heading = line_format.angle_unit, 0.0
         self._last: tuple[float, float] | None = None
 
@@ -52,12 +57,22 @@ class GyroLineDriver(LineDriver):
         super().begin()
         self._last = None
 
-    def take(self, event: Line) -> list[Action]:
+    def time_of(self, content: dict[str, float]) -> float | None:
+        """Return the gyro's time in a line, its own unit; None = there is none."""
+        return content.get("t")
+
+    def follows(self, before: Line, after: Line) -> bool:
+        """Return whether a robot can have turned so meanwhile."""
+        step = {name: (after.content[name] - before.content[name]) * self._angle_unit for name in after.content}
+        seconds = max(after.stamp - before.stamp, 0.0)
+        rate, turn = step.get("turn_rate", 0.0), math.remainder(step.get("theta", 0.0), 2 * math.pi)
+        smooth = abs(rate) <= LEAP_RATE + LEAP_ACCELERATION * seconds and abs(turn) <= LEAP_TURN * max(seconds, LEAST_STEP)
+        return smooth and super().follows(before, after)
+
+    def measured(self, line: Line) -> list[Action]:
         """Turn a line into a heading."""
-        self.ready, values = True, event.content
-        if self.leaps(values.get("t"), event.stamp):
-            return [Corrupt(b"", "line whose time leaps")]
-        stamp, elapsed, actions = self.timed(values.get("t"), event.stamp)
+        self.ready, values = True, line.content
+        stamp, elapsed, actions = self.timed(line)
         if elapsed == 0:
             return [Corrupt(b"", "line sent twice")]
         rate = values.get("turn_rate", 0.0) * self._angle_unit

@@ -142,13 +142,7 @@ class Link:
             self.port.set_dtr(action.on)
 
     def finish(self) -> str:
-        """Let the device fall quiet and close the port; return why it was never open, "" where it was."""
-        try:
-            for action in self.session.stop() if self.port is not None else ():
-                if isinstance(action, Send | SetDtr):
-                    self.send(action)
-        except DeviceError:
-            pass  # it was pulled at the very end
+        """Close the port; return why it was never open, "" where it was."""
         if self.port is not None:
             self.port.close()
             self.port = None

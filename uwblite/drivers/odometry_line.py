@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import ConfigError
+from .clock import DeviceClock
 from .events import Action, Corrupt, Note, OdometryPose, Pose
 from .odometer import WheelOdometer, wrapped
-from .text_lines import LEAP_TIME, Line, LineDriver, columns_of, number_of
+from .text_lines import Line, LineDriver, LineProtocol, columns_of, number_of
 
 LEAP_SPEED, LEAP_TURN = 3.0, 10.0
 """m/s and rad/s that no base of this kind reaches: a line that asks for more is damaged, or the base restarted."""
@@ -128,46 +129,34 @@ class OdometryLineDriver(LineDriver):
     """
 
     def __init__(self, line_format: LineFormat, baud: int = 115200, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        super().__init__(values_by(line_format), "base that prints lines", baud, line_format.time_unit)
+        unit = line_format.time_unit
+        clock = DeviceClock(unit, proven=False)
+        super().__init__(LineProtocol(values_by(line_format)), "base that prints lines", baud, clock, unit)
         self._format = line_format
         self._odometer = WheelOdometer(line_format.tick, line_format.wheel_base, line_format.tick_modulus, start)
-        self._last: Line | None = None
-        self._doubtful: Line | None = None
 
-    def begin(self) -> None:
-        """Forget half a line."""
-        super().begin()
-        self._doubtful = None
+    def time_of(self, content: dict[str, float]) -> float | None:
+        """Return the base's time in a line, its own unit; None = there is none."""
+        return content.get("t")
 
-    def take(self, event: Line) -> list[Action]:
-        """Turn a line into a pose. Lines have no sum: one that leaps counts only if the next one goes on from it."""
-        self.ready = True
-        doubtful, self._doubtful = self._doubtful, None
-        if self._last is None or self._follows(self._last, event):
-            dropped: list[Action] = [Corrupt(b"", "line that leaps away and back")] if doubtful else []
-            return dropped + self._pose(event)
-        if doubtful and self._follows(doubtful, event):
-            return self._pose(doubtful) + self._pose(event)
-        self._doubtful = event
-        return [Corrupt(b"", "line that leaps away and back")] if doubtful else []
-
-    def _follows(self, before: Line, after: Line) -> bool:
+    def follows(self, before: Line, after: Line) -> bool:
         """Return whether a base can have moved so, and its clock have gone on so."""
-        spec, clock, old, new = self._format, self.clock, before.content, after.content
-        waited = max(after.stamp - before.stamp, 0.0)
-        elapsed = (new["t"] - old["t"]) * spec.time_unit if "t" in new else waited
-        if clock.proven and clock.rate is None and not -1e-9 <= elapsed <= waited + LEAP_TIME:
+        if not super().follows(before, after):
             return False
-        seconds = max(elapsed if clock.proven else waited, LEAST_STEP)
+        spec, clock, old, new = self._format, self.clock, before.content, after.content
+        seconds = max(after.stamp - before.stamp, LEAST_STEP)
+        if "t" in new and clock.proven and clock.rate is None:
+            seconds = max((new["t"] - old["t"]) * spec.time_unit, LEAST_STEP)
         step = {name: new[name] - old[name] for name in new}
         ways = [abs(wrapped(step[name], spec.tick_modulus)) * spec.tick for name in ("left", "right") if name in new]
         ways += [abs(step[name] * spec.length_unit) for name in ("x", "y") if name in new]
         turn = abs(math.remainder(step.get("theta", 0.0) * spec.angle_unit, 2 * math.pi))
         return max(ways) <= LEAP_SPEED * seconds and turn <= LEAP_TURN * seconds
 
-    def _pose(self, event: Line) -> list[Action]:
-        self._last, values, unit = event, event.content, self._format
-        stamp, elapsed, actions = self.timed(values.get("t"), event.stamp)
+    def measured(self, line: Line) -> list[Action]:
+        """Turn a line into a pose."""
+        self.ready, values, unit = True, line.content, self._format
+        stamp, elapsed, actions = self.timed(line)
         if elapsed == 0:
             return [Corrupt(b"", "line sent twice")]
         if self.clock.rate is not None:

@@ -297,6 +297,7 @@ class Recorder:
 
     def _finish(self) -> None:
         for link in self.links:
+            self._do(link, link.session.stop(), self.end)
             never = link.finish()
             if never:
                 self._note(link, Note("error", f"{link.name}-cannot-open", never))

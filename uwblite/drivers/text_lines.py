@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from .clock import DeviceClock
+from .continuity import WITNESSES, Continuity, LinkHealth
 from .events import Action, Corrupt, Lost, corrupt
 from .framing import LineReader
-from .session import Driver, Script, Wait
+from .session import ByteProtocol, Driver, Script, Wait
 
-LEAP_TIME = 1.0
-"""s by which the device's clock may run ahead of the arrivals between two lines."""
+EARLY = 0.02
+"""s by which a line may come earlier than any before: the quickest way is known to that after a few lines."""
+LATE = 0.05
+"""s by which a line may come later than the quickest, on a damaged link; a busy computer, on a sound one, by any time."""
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
@@ -56,6 +59,9 @@ _MOST = 1e18
 """Nanoseconds since 1970 are below."""
 
 
+_COLOUR = re.compile(rb"\x1b\[[\d;]*m")
+
+
 class LineProtocol:
     """Bytes in, Line and Corrupt out. Holds at most one line.
 
@@ -79,62 +85,83 @@ class LineProtocol:
         for line in self._lines.feed(data, stamp):
             if isinstance(line, Corrupt):
                 events.append(line)
-            elif line.data.strip() and not line.cut:
-                content = self._parse(line.data.strip().decode("ascii", "replace"))
+            elif (text := _COLOUR.sub(b"", line.data).strip()) and not line.cut:
+                content = self._content(text)
                 if isinstance(content, str):
-                    events.append(corrupt(line.data.strip(), content))
+                    events.append(corrupt(text, content))
                 elif content is not None:
                     events.append(Line(line.stamp_at(0), content))
         return events
 
+    def _content(self, line: bytes) -> Any:
+        try:
+            text = line.decode()
+        except UnicodeDecodeError:
+            text = "\0"
+        return self._parse(text) if text.replace("\t", " ").isprintable() else "line with characters that nobody prints"
+
 
 class LineDriver(Driver):
-    """A device that prints lines, perhaps with its own time in them. Nothing is ever sent.
+    """A device that is only listened to, perhaps with its own time in what it sends. Nothing is ever sent.
 
     Parameters
     ----------
-    parse : a line -> its content. title : of the device, for people. baud : bit/s.
-    time_unit : s per unit of its time.
+    protocol : bytes to Line.
+    title : of the device, for people. baud : bit/s.
+    clock : of the device. unit : s per unit of its time.
     """
 
-    def __init__(self, parse: Callable[[str], Any], title: str, baud: int, time_unit: float) -> None:
-        super().__init__(LineProtocol(parse), title)
-        self.baud, self.clock = baud, DeviceClock(time_unit, proven=False)
-        self._unit = time_unit
-        self._before: tuple[float, float] | None = None
-        """Time of the device, its own unit, and arrival, s, of the last line that was accepted."""
-        self._doubted = False
+    first_is_whole = False
+    """The first line cannot be the end of one that began before the port was opened."""
+
+    def __init__(self, protocol: ByteProtocol, title: str, baud: int, clock: DeviceClock, unit: float) -> None:
+        super().__init__(protocol, title)
+        self.baud, self.clock, self.health = baud, clock, LinkHealth()
+        self._unit = unit
+        self._series = Continuity(self.follows)
 
     def script(self) -> Script[None]:
         """Pass over the first line, of which the port may have shown only the end; then listen."""
-        yield Wait(None)
-        yield from super().script()
+        if not self.first_is_whole:
+            yield Wait(None)
+        while True:
+            event = yield Wait(None)
+            if isinstance(event, Corrupt):
+                self.health.damage(self.now)
+            else:
+                yield from self.take(event)
 
-    def leaps(self, time: float | None, arrival: float) -> bool:
-        """Return whether a line's time leaps: lines have no sum, and a digit that is lost makes another number.
+    def take(self, event: Line) -> list[Action]:
+        """Turn a line into what was measured. One that leaps counts only if the next one goes on from it."""
+        passed, dropped = self._series.take(event, WITNESSES[self.health.is_damaged(event.stamp)])
+        given_up: list[Action] = [Corrupt(b"", "line that leaps away and back")] * len(dropped)
+        return [*given_up, *(action for line in passed for action in self.measured(line))]
 
-        Of two in a row the second one counts: the device began again.
+    def measured(self, line: Line) -> list[Action]:
+        """Return what a line means that goes on from the one before."""
+        raise NotImplementedError
 
-        Parameters
-        ----------
-        time : of the device, its own unit; None = the line has none. arrival : s, host clock.
-        """
-        before, known = self._before, self.clock.proven and self.clock.rate is None
-        if time is not None and before is not None and known:
-            elapsed, waited = (time - before[0]) * self._unit, max(arrival - before[1], 0.0)
-            self._doubted = not self._doubted and not -1e-9 <= elapsed <= waited + LEAP_TIME
-        if time is not None and not self._doubted:
-            self._before = time, arrival
-        return self._doubted
+    def time_of(self, content: Any) -> float | None:
+        """Return the device's time in a line, its own unit; None = there is none."""
+        raise NotImplementedError
 
-    def timed(self, time: float | None, arrival: float) -> tuple[float, float | None, list[Action]]:
-        """Return the stamp of a line, s, the time since the one before by the device, s, and what is missing in between.
+    def follows(self, before: Line, after: Line) -> bool:
+        """Return whether the device's clock can have gone on so: a digit that is lost makes another number."""
+        t0, t1 = self.time_of(before.content), self.time_of(after.content)
+        if t0 is None or t1 is None or (late := self.clock.lateness(t1, after.stamp)) is None:
+            return True
+        usual = self.clock.lateness(t0, before.stamp) or 0.0
+        most = max(LATE, usual + EARLY) if self.health.is_damaged(after.stamp) else math.inf
+        return (t1 - t0) * self._unit >= -1e-9 and min(usual, 0.0) - EARLY <= late <= most
 
-        Parameters
-        ----------
-        time : of the device, its own unit; None = the line has none. arrival : s, host clock.
-        """
+    def timed(self, line: Line) -> tuple[float, float | None, list[Action]]:
+        """Return the stamp of a line, s, the time since the one before by the device, s, and what is missing in between."""
+        time = self.time_of(line.content)
         if time is None:
-            return arrival, None, []
-        reading = self.clock.read(time, arrival)
+            return line.stamp, None, []
+        reading = self.clock.read(time, line.stamp)
         return reading.stamp, reading.elapsed, [Lost(reading.stamp, reading.missing)] if reading.missing else []
+
+    def stop(self) -> list[Action]:
+        """Return Corrupt for lines that nothing confirmed."""
+        return [Corrupt(b"", "line that nothing confirmed")] * len(self._series.waiting)

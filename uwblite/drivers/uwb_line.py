@@ -1,23 +1,21 @@
-"""UWB boards that print ranges as text lines: any of them by columns, some by name. Sans-I/O.
+"""UWB boards that print ranges as text lines: any of them by columns, some by name; `uwb_driver` reads them. Sans-I/O.
 
 Every line may hold several readings. Only two-way ranges from this tag to anchors are taken: positions, time differences
 and angles are not ranges, and the ranges that an anchor prints of many tags are not of this robot. Sources: examples of
 Makerfabs (DW1000 library, AT firmware), users' programs for the BU01, Qorvo's CLI for the DWM3001CDK as users show it.
 """
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..errors import ConfigError
-from .events import Action, Corrupt, Lost, Note, RangeEpoch, RangeReading
-from .session import Identity
-from .text_lines import Line, LineDriver, columns_of, number_of
+from .events import RangeReading
+from .text_lines import columns_of, number_of
 
 MOST_RANGE = 1000.0
 """m; no UWB radio reaches further."""
-MOST_LEAP, NEAR = 100_000, 3
-"""Rounds that may be lost together; rounds within which the next one must follow a leap, as a damaged digit leaps too."""
 NAME = re.compile(r"[A-Za-z0-9_.:-]{1,32}")
 
 
@@ -50,17 +48,27 @@ Parse = Callable[[str], Ranges | Refused | str | None]
 # ---- boards with a form of their own
 
 _NO_RANGE = re.compile(r"\b(TDOA|PDOA|AOA|POS|position|azimuth|le_us)\b", re.IGNORECASE)
+DAMAGED = "line of ranges cut or garbled"
 
 
-def _each(pattern: str, unit: float, number: str = "$^") -> Parse:
-    """Return what reads every match of a pattern with the groups id and range, and the number of the round."""
-    form, numbered = re.compile(pattern), re.compile(number)
+def _each(whole: str, row: str, part: str, unit: float = 1.0, number: str = "$^") -> Parse:
+    """Return what reads lines of one form, all of it or nothing.
+
+    Parameters
+    ----------
+    whole : form of a line. row : of each range in it, with a group for the anchor and one for the range, empty = none.
+    part : what such lines alone hold: another line that has it was one of them.
+    unit : m per unit of range. number : of the round, where the line states it.
+    """
+    whole_form, row_form, part_form, number_form = (re.compile(form) for form in (whole, row, part, number))
 
     def parse(line: str) -> Ranges | Refused | str | None:
-        found = tuple(reading(m["id"], float(m["range"]) * unit) for m in form.finditer(line))
-        if found:
-            stated = numbered.search(line)
+        if whole_form.fullmatch(line):
+            stated = number_form.search(line)
+            found = tuple(reading(anchor, float(reach) * unit) for anchor, reach in row_form.findall(line) if reach)
             return Ranges(found, round=int(stated[1]) if stated else None)
+        if part_form.search(line):
+            return DAMAGED
         return Refused("positions or angles") if _NO_RANGE.search(line) else None
 
     return parse
@@ -68,17 +76,17 @@ def _each(pattern: str, unit: float, number: str = "$^") -> Parse:
 
 _NUMBERS = r"((?:-?\d+)?(?:,(?:-?\d+)?)*)"
 _AT_RANGE = re.compile(
-    rf"AT\+RANGE=tid:(\d+),\s*mask:[0-9A-Fa-f]+,\s*seq:\s*(\d{{1,3}}),\s*range:\s*\({_NUMBERS}\)(?:.*?ancid:\s*\({_NUMBERS}\))?"
+    rf"AT\+RANGE=tid:(\d+),\s*mask:[0-9A-Fa-f]+,\s*seq:\s*(\d{{1,3}}),\s*range:\s*\({_NUMBERS}\)"
+    rf"(?:,\s*rssi:\s*\([-\d.,\s]*\))?(?:,\s*ancid:\s*\({_NUMBERS}\))?(?:,\s*rssi:\s*\([-\d.,\s]*\))?"
 )
+_AT_PART = re.compile(r"AT.RANGE|tid:|mask:|seq:|ancid|range:")
 
 
 def _at_range(line: str) -> Ranges | str | None:
     """Read the lists of Makerfabs' AT firmware; a range of 0 is none, without ancid the places in the list are the ids."""
-    if "AT+RANGE" not in line:
-        return None
-    match = _AT_RANGE.search(line)
+    match = _AT_RANGE.fullmatch(line)
     if match is None:
-        return "damaged list of ranges"
+        return DAMAGED if _AT_PART.search(line) else None
     centimetres = match[3].split(",")
     names = match[4].split(",") if match[4] else [str(i) for i in range(len(centimetres))]
     if len(names) != len(centimetres):
@@ -88,19 +96,42 @@ def _at_range(line: str) -> Ranges | str | None:
     return Ranges(found, tag=match[1], round=int(match[2]), modulus=256)
 
 
+_SESSION_ROW = r'\[mac_address=0x([0-9A-Fa-f]{4}), status="[A-Z_]+"(?:, distance\[cm\]=(-?\d+))?(?:, [\w\[\]]+=-?[\d.]+)*\]'
+_session = _each(
+    rf"(?:SESSION_INFO_NTF: \{{[\w=, ]+)?(?:{_SESSION_ROW}[;}}\s]*)*", _SESSION_ROW,
+    "SESSION|session_|mac_addr|status=|distance", 0.01, r"block_index=(\d{1,9})\b",
+)  # fmt: skip
+
+
+def _dwm3001(line: str) -> Ranges | Refused | str | None:
+    """Read both forms of Qorvo's CLI."""
+    if '"results' not in line and '"Addr"' not in line:
+        return _session(line)
+    try:
+        told = json.loads(line)
+        rows = [(str(row["Addr"]), row.get("D_cm") if row["Status"] == "Ok" else None) for row in told["results"]]
+        number = int(told["Block"])
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return DAMAGED
+    if not all(re.fullmatch("0x[0-9A-Fa-f]{4}", name) and (cm is None or type(cm) is int) for name, cm in rows):
+        return DAMAGED
+    return Ranges(tuple(reading(name[2:], cm / 100) for name, cm in rows if cm is not None), round=number)
+
+
 BOARDS: dict[str, Parse] = {
-    # from: 1782	 Range: 3.21 m	 RX power: -65.10 dBm
-    "makerfabs": _each(r"from:\s*(?P<id>[0-9A-Fa-f]{1,4})\s+Range:\s*(?P<range>-?\d+\.?\d*)\s*m\b", 1.0),
+    # from: 1782\t Range: 3.21 m\t RX power: -65.10 dBm
+    "makerfabs": _each(
+        r"from:\s*[0-9A-Fa-f]{1,4}\s+Range:\s*-?\d+\.\d+\s*m(?:\s+RX power:\s*(?:-?\d+\.\d+|-?inf|nan|ovf)\s*dBm)?",
+        r"from:\s*([0-9A-Fa-f]{1,4})\s+Range:\s*(-?\d+\.\d+)", "from:|Range:|RX power|dBm",
+    ),
     # AT+RANGE=tid:0,mask:0F,seq:182,range:(232,401,518,633,0,0,0,0),ancid:(0,1,2,3,-1,-1,-1,-1)
     "makerfabs-at": _at_range,
     # an0:1.23m
-    "bu01": _each(r"\ban(?P<id>\d+):(?P<range>\d+\.\d+)m", 1.0),
+    "bu01": _each(r"(?:an\d:\d{1,3}\.\d\dm[\s,;]*)+", r"an(\d):(\d{1,3}\.\d\d)m", r"an.?:|\d\.\d\dm|\d:\d+\.\d\d"),
     # {"Block":27, "results":[{"Addr":"0x0001","Status":"Ok","D_cm":245,"CFO_100ppm":87},{"Addr":"0x0002","Status":"Err"}]}
-    # [mac_address=0x0001, status="SUCCESS", distance[cm]=245];
-    "dwm3001": _each(
-        r'(?:"Addr"\s*:\s*"|mac_address=)0x(?P<id>[0-9A-Fa-f]{4})"?\s*,\s*"?[Ss]tatus"?\s*[:=]\s*"(?:Ok|SUCCESS)"\s*,'
-        r'\s*(?:"D_cm"\s*:|distance\[cm\]=)\s*(?P<range>-?\d+)', 0.01, r'(?:"Block"\s*:|block_index=)\s*(\d{1,9})\b',
-    ),
+    # SESSION_INFO_NTF: {session_handle=1, sequence_number=39, block_index=39, n_measurements=2
+    #  [mac_address=0x0001, status="SUCCESS", distance[cm]=245];      on lines of their own, or all on one
+    "dwm3001": _dwm3001,
 }  # fmt: skip
 
 
@@ -173,52 +204,3 @@ def by_columns(form: LineColumns) -> Parse:
         return Ranges(tuple(reading(k, v * form.unit, quality) for k, v in found), numbers.get("t"), values.get("tag", ""))
 
     return parse
-
-
-class UwbLineDriver(LineDriver):
-    """A UWB tag that prints lines. Nothing is ever sent.
-
-    Parameters
-    ----------
-    parse : a line -> its content.
-    title : of the board, for people.
-    baud : bit/s.
-    time_unit : s per unit of column t.
-    tag : the tag whose ranges to take, where lines name several; "" = the first that is seen.
-    """
-
-    def __init__(self, parse: Parse, title: str, baud: int = 115200, time_unit: float = 1.0, tag: str = "") -> None:
-        super().__init__(within_reach(parse), title, baud, time_unit)
-        self._tag, self._leap = tag, 0
-        self._round: int | None = None
-
-    def take(self, event: Line) -> list[Action]:
-        """Turn a line into ranges."""
-        content = event.content
-        if isinstance(content, Refused):
-            text = f"uwb: it prints {content.what}, which are no ranges: set it to two-way ranging, and to print distances"
-            return self.say_once(Note("error", "uwb-no-ranges", text))
-        if content.tag and content.tag != (self._tag or content.tag):
-            text = f"uwb: ranges of tag {content.tag} besides those of tag {self._tag} are left out; tag=ID chooses"
-            return self.say_once(Note("warning", "uwb-other-tag", text))
-        self._tag, self.ready = content.tag or self._tag, True
-        missed: list[Action] = [Lost(event.stamp, count)] if (count := self._missed(content)) else []
-        if not content.readings:
-            return missed
-        if self.leaps(content.time, event.stamp):
-            return [Corrupt(b"", "line whose time leaps")]
-        stamp, _, lost = self.timed(content.time, event.stamp)
-        return [*missed, *lost, RangeEpoch(stamp, content.readings)]
-
-    def _missed(self, line: Ranges) -> int:
-        """Return how many rounds were missed before the line before this one, by their numbers; 0 where the board restarted."""
-        if line.round is None:
-            return 0
-        step = 1 if self._round is None else line.round - self._round
-        step = step % line.modulus if line.modulus else step
-        leap, self._leap, self._round = self._leap, step - 1 if 1 < step <= MOST_LEAP else 0, line.round
-        return leap if 0 < step <= NEAR else 0
-
-    def identity(self) -> Identity:
-        """Say who answered."""
-        return Identity(self.title, (("tag", self._tag),) if self._tag else ())

@@ -48,16 +48,20 @@ def why_broken(error: ValueError) -> str:
     return text if len(text) <= 100 else text[:97] + "..."
 
 
+_CONFIRMED = 0.5
+"""s; a recorder may hold a range back until the next one confirms it."""
+
+
 def time_order(
     stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None
 ) -> NDArray[np.int64]:
-    """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when it is not the order given.
+    """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when some come late.
 
     Parameters
     ----------
     set_back : takes by how much the clock was set back at most, s, by what.
     """
-    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps)))
+    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps) - _CONFIRMED))
     if late:
         warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
         if set_back is not None:

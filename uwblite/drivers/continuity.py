@@ -1,0 +1,162 @@
+"""What stands in for a check sum: a reading that goes on from the one before passes, one that leaps waits for others.
+
+A changed bit makes another digit of a digit, and nothing in a line without a sum shows it. Two readings that agree by
+chance are rare, so a leap counts only when the next readings go on from it; a leap away and back is damage. What is left is
+what a sum would find and this cannot: a wrong reading that lies as near to the one before as a right one could.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from .events import Action, Corrupt, RangeEpoch, RangeReading
+
+DISTRUST = 20.0
+"""s for which a link counts as damaged after bytes that were no line or frame."""
+WITNESSES, STRANGERS = (1, 2), (1, 5)
+"""Readings that must agree with one that leaps, and with the first of an anchor: on a clean link, and on a damaged one."""
+SPREAD = 0.3, 0.15
+"""m by which two ranges of one anchor may differ at rest: on a clean link an outlier is more likely the radio's."""
+SPEED = 1.5
+"""m/s; robots for indoors are slower."""
+MOST_GAP, STALE = 0.2, 1.0
+"""s, on a damaged link: ranges that lie further apart are compared as if they were so close; and they are not compared at
+all, unless that is less than three times the least that lay between two ranges of an anchor lately."""
+MOST_LEAPS, SMOOTH = 0.3, 0.1
+"""Share of ranges that may leap on a clean link; where more do, as long as that is not known, and until bytes are damaged,
+the board's ranges scatter and nothing is given up. And the share by which each range changes that figure."""
+MOST_ANCHORS = 256
+"""That are remembered."""
+FORGET = 10.0
+"""s after which an anchor that was seen too seldom is given up."""
+
+Item = TypeVar("Item")
+
+
+class Continuity(Generic[Item]):
+    """A series of readings without a sum.
+
+    Parameters
+    ----------
+    follows : (earlier, later) -> whether one can go on from the other.
+    """
+
+    def __init__(self, follows: Callable[[Item, Item], bool]) -> None:
+        self._follows = follows
+        self.last: Item | None = None
+        """The latest that passed."""
+        self.waiting: list[Item] = []
+        """Those that leapt and go on from each other."""
+
+    def leaps(self, item: Item) -> bool:
+        """Return whether a reading does not go on from the last one; the first one does."""
+        return self.last is not None and not self._follows(self.last, item)
+
+    def take(self, item: Item, witnesses: int) -> tuple[list[Item], list[Item]]:
+        """Take the next reading; return those that pass now, in their order, and those that are given up.
+
+        Parameters
+        ----------
+        witnesses : how many must agree with one that leaps; 0 = it passes.
+        """
+        if witnesses == 0:
+            passed, dropped = [*self.waiting, item], []
+        elif self.last is not None and not self.leaps(item):
+            passed, dropped, self.waiting = [item], self.waiting, []
+        elif self.waiting and self._follows(self.waiting[-1], item):
+            passed, dropped = [*self.waiting, item], []
+            if len(self.waiting) < witnesses:
+                passed, self.waiting = [], passed
+        else:
+            passed, dropped, self.waiting = [], self.waiting, [item]
+        if passed:
+            self.last, self.waiting = item, []
+        return passed, dropped
+
+
+class LinkHealth:
+    """Whether bytes were damaged lately."""
+
+    def __init__(self) -> None:
+        self._damaged = -math.inf
+
+    def damage(self, now: float) -> None:
+        """Note bytes that were no line or frame, at time `now`, s."""
+        self._damaged = now
+
+    def is_damaged(self, now: float) -> bool:
+        """Return whether that was within DISTRUST before `now`, s."""
+        return now - self._damaged < DISTRUST
+
+
+Ranged = tuple[RangeEpoch, RangeReading]
+
+
+class RangeGuard:
+    """Ranges that no sum protects: one that leaps from those of its anchor, and a new anchor, must be seen again.
+
+    Parameters
+    ----------
+    health : of the link.
+    """
+
+    def __init__(self, health: LinkHealth) -> None:
+        self._health, self._damaged, self._leaps = health, False, 1.0
+        self._intervals: deque[float] = deque(maxlen=50)
+        """s, between two ranges of one anchor."""
+        self._anchors: dict[str, Continuity[Ranged]] = {}
+
+    def take(self, epoch: RangeEpoch, now: float) -> list[Action]:
+        """Return the rounds whose ranges pass now, each with its own stamp, and Corrupt for ranges that are given up."""
+        self._damaged = self._health.is_damaged(now)
+        passed: list[Ranged] = []
+        given_up = self._forgotten(epoch.stamp)
+        for reading in epoch.readings:
+            series = self._anchors.setdefault(reading.anchor_id, Continuity(self._follows))
+            before, witnesses = series.last, STRANGERS if series.last is None else WITNESSES
+            if before is not None and not self._damaged:
+                self._leaps += SMOOTH * (series.leaps((epoch, reading)) - self._leaps)
+            through, dropped = series.take((epoch, reading), witnesses[self._damaged] if self._is_strict else 0)
+            if before is not None and through:
+                self._intervals.append(through[-1][0].stamp - before[0].stamp)
+            passed, given_up = passed + through, given_up + dropped
+        return self._sorted_out(passed, given_up)
+
+    @property
+    def _is_strict(self) -> bool:
+        return self._damaged or self._leaps < MOST_LEAPS
+
+    def finish(self) -> list[Action]:
+        """Return what still waits at the end: ranges, or Corrupt."""
+        return self._sorted_out([], self._forgotten(math.inf))
+
+    def _sorted_out(self, passed: list[Ranged], given_up: list[Ranged]) -> list[Action]:
+        if not self._is_strict:
+            passed, given_up = passed + given_up, []
+        rounds: dict[float, list[Ranged]] = {}
+        for item in sorted(passed, key=lambda item: item[0].stamp):
+            rounds.setdefault(item[0].stamp, []).append(item)
+        return [*[Corrupt(b"", "range that leaps away and back, or of an anchor seen once")] * len(given_up), *(
+            RangeEpoch(stamp, tuple([reading for _, reading in items]), items[0][0].spread)
+            for stamp, items in rounds.items()
+        )]  # fmt: skip
+
+    def _follows(self, before: Ranged, after: Ranged) -> bool:
+        seconds = max(after[0].stamp - before[0].stamp, 0.0)
+        if self._damaged and seconds > max(STALE, 3 * min(self._intervals, default=0.0)):
+            return False
+        reach = SPREAD[self._damaged] + SPEED * (min(seconds, MOST_GAP) if self._damaged else seconds)
+        return abs(after[1].range - before[1].range) <= reach
+
+    def _forgotten(self, stamp: float) -> list[Ranged]:
+        """Return what has waited for too long."""
+        found: list[Ranged] = []
+        for name, series in list(self._anchors.items()):
+            if series.waiting and stamp - series.waiting[-1][0].stamp > FORGET:
+                found, series.waiting = found + series.waiting, []
+                if series.last is None:
+                    del self._anchors[name]
+        while len(self._anchors) > MOST_ANCHORS:
+            found += self._anchors.pop(next(iter(self._anchors))).waiting
+        return found
