@@ -107,11 +107,11 @@ INGREDIENTS: dict[str, tuple[str, ...]] = {
     "errors steady by direction": ("ranges.steady=0",),
     "marginal likelihood for the radio's priors": ("calibration.range_scale_sound=0.15", "calibration.range_bias_sound=0.8"),
     "robust kernels of wheels and ranges": ("odometry.kernel.name=none", "ranges.kernel.name=none"),
-    "tracking": ("scan_to_scan.on=false",),
+    "scan-to-scan matching": ("scan_to_scan.on=false",),
     "loop closures of sub-maps": ("loop_closure.rounds=0",),
     "joint refinement": ("refinement.rounds=0",),
     "pairs chosen again": ("refinement.selections=1",),
-    "second scan per key pose": ("keyframes.scans=1",),
+    "second scan per keyframe": ("keyframes.scans=1",),
     "corners": ("clouds.linearity=0.85",),
     "deskewing": ("deskew",),
 }
@@ -402,7 +402,7 @@ def injection(args: argparse.Namespace) -> str:
     text = table(["seed", "clean", "with 30 % false", "ratio"], rows)
     return (
         "## False measurements\n\nHall, 8 min: 30 % false closures, anywhere and of the true ones' weight, and 30 % of the "
-        f"ranges replaced\nby nonsense, then graduated non-convexity (`uwblite.graph.gnc`); ATE of the key poses, m.\n\n{text}"
+        f"ranges replaced\nby nonsense, then graduated non-convexity (`uwblite.graph.gnc`); ATE of the keyframes, m.\n\n{text}"
     )
 
 
@@ -439,11 +439,7 @@ def solved(graph: Graph, trial: Trial, stamps: np.ndarray) -> float:
     return math.sqrt(float(np.mean(np.sum((laid - truth) ** 2, axis=1))))
 
 
-HEAD = """\
-# Accuracy
-
-Measured by `tools/accuracy.py` and `tools/consistency.py`, which write this page; do not edit. Lengths in metres.
-"""
+HEAD = "# Accuracy\n\nLengths in metres. The tables are written by tools; do not edit them.\n"
 
 
 def main(argv: list[str] | None = None) -> int:

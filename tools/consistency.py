@@ -55,7 +55,7 @@ class Consistency:
 
     name: str
     poses: Floats
-    """(k,) NEES of the key poses but the first; 3 expected."""
+    """(k,) NEES of the keyframes but the first; 3 expected."""
     position: Floats
     """(k,) of x and y alone; 2."""
     heading: Floats
