@@ -1,4 +1,4 @@
-"""The house: who may import whom, what library code must not do, and that the package works wherever it is put."""
+"""The structure: who may import whom, what library code must not do, and that the package works wherever it is put."""
 
 import ast
 import shutil

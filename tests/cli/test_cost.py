@@ -1,4 +1,4 @@
-"""The estimate of time and memory: positive, growing with everything it depends on, scaled by the work itself."""
+"""The estimate of time and memory: positive, growing with everything it depends on, from the work itself."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from uwblite.cli import check, cost
-from uwblite.sensor_log import Odometry, SensorLog
+from uwblite.cli.stage_shares import Overall
+from uwblite.config import override
+from uwblite.errors import Cancelled, DataError
+from uwblite.mapping import MappingConfig, Stage
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog
 
 
 def of_length(log, seconds):
@@ -35,38 +39,55 @@ def test_without_lidar_it_takes_less_memory():
     assert cost.expected_megabytes(300.0, 0, 0, 0) < 0.5 * cost.expected_megabytes(300.0, 9000, 682, 300_000)
 
 
-def test_a_beginning_has_the_work_that_was_asked_for(log):
-    for seconds in (0.1, 0.5):
-        assert cost.work_seconds(cost.beginning(log, seconds)) == pytest.approx(seconds, rel=0.1)
-    short = of_length(log, 5.0)
-    assert cost.beginning(short, 10.0) is short
+def begun(monkeypatch, stages, refused=None):
+    """Replace the map by stages (name, s) that report ten steps each, on a clock of their own."""
+    clock = [0.0]
 
-
-def test_a_robot_that_stands_at_first_is_waited_for(log):
-    """The beginning is counted in work, not in time."""
-    stamps = np.concatenate([log.odometry.stamps[0] - 600.0 + np.arange(6000) * 0.1, log.odometry.stamps])
-    poses = np.concatenate([np.tile(log.odometry.poses[0], (6000, 1)), log.odometry.poses])
-    late = dataclasses.replace(log, odometry=Odometry(stamps, poses))
-    assert cost.work_seconds(cost.beginning(late, 0.5)) == pytest.approx(0.5, rel=0.1)
-
-
-@pytest.mark.parametrize("slow", [0.2, 1.0, 30.0])
-def test_the_estimate_is_that_of_a_computer_whose_time_grows_with_the_work(log, monkeypatch, slow):
-    """A map that takes a + b w seconds for work w, and a clock that says so: the estimate is a + b w of the whole."""
-    clock, log = [0.0], of_length(log, 40.0)
-
-    def build_map(part):
-        clock[0] += 0.1 + slow * cost.work_seconds(part)
+    def build_map(part, config=None, *, progress):
+        for name, seconds in stages:
+            for step in range(1, 11):
+                clock[0] += seconds / 10
+                if progress(Stage(name), step, 10) is False:
+                    raise Cancelled("stopped")
+        if refused:
+            raise DataError(refused)
 
     monkeypatch.setattr("uwblite.mapping.build_map", build_map)
     monkeypatch.setattr(cost.time, "perf_counter", lambda: clock[0])
-    expected = cost.SECONDS_AT_LEAST + 0.1 + slow * cost.work_seconds(log)
-    assert cost.expected_seconds(log) == pytest.approx(expected, rel=1e-6)
+    return clock
 
 
-def test_what_cannot_be_mapped_costs_as_the_model_reports():
-    still = SensorLog(Odometry(np.array([0.0]), np.zeros((1, 3))))
-    assert cost.expected_seconds(still) == pytest.approx(cost.SECONDS_AT_LEAST)
+def usual(seconds, lidar=True):
+    """Return the stages of a map of so many seconds that takes what maps usually take in each."""
+    shares = Overall(lidar=lidar)._shares
+    return [(name, seconds * share / sum(s for _, s in shares)) for name, share in shares]
+
+
+@pytest.mark.parametrize("lidar", [True, False])
+@pytest.mark.parametrize("seconds", [0.5, 30.0, 300.0])
+def test_the_time_of_a_usual_map_is_known_after_a_part_of_it(log, monkeypatch, seconds, lidar):
+    clock = begun(monkeypatch, usual(seconds, lidar))
+    assert cost.expected_seconds(log.without(lidar=not lidar)) == pytest.approx(cost.SECONDS_AT_LEAST + seconds, rel=1e-6)
+    longest_step = max(s for _, s in usual(seconds, lidar)) / 10
+    assert clock[0] <= min(seconds, cost._TRIAL_SECONDS + longest_step) + 1e-9
+
+
+def test_a_stage_that_takes_longer_than_usual_makes_the_estimate_longer(log, monkeypatch):
+    """Wherever along the recording the difficult part lies: the stages go over all of it."""
+    stages = [(name, 4.0 * s if name == "scan-to-scan matching" else s) for name, s in usual(8.0)]
+    begun(monkeypatch, stages)
+    assert cost.expected_seconds(log) == pytest.approx(sum(s for _, s in stages), rel=0.5)
+
+
+def test_without_the_lidar_by_the_settings_the_stages_are_those_of_the_radio(log, monkeypatch):
+    begun(monkeypatch, usual(30.0, lidar=False))
+    config = override(MappingConfig(), ["use_lidar=false"])
+    assert cost.expected_seconds(log, config) == pytest.approx(cost.SECONDS_AT_LEAST + 30.0, rel=1e-6)
+
+
+def test_what_a_map_refuses_costs_what_the_model_expects(log, monkeypatch):
+    begun(monkeypatch, [("keyframes", 0.1)], refused="nothing")
+    assert cost.expected_seconds(log) == cost.model_seconds(log)
 
 
 @pytest.mark.parametrize("slow", [0.2, 30.0])
@@ -84,3 +105,12 @@ def test_check_expects_what_its_own_trial_map_took(log, monkeypatch, slow):
     assert seconds == pytest.approx(cost.SECONDS_AT_LEAST + slow)
     assert check.expected_cost(log, seconds)["seconds"] == pytest.approx(seconds, abs=0.05)
     assert clock[0] == slow
+
+
+def test_the_map_is_as_large_as_what_was_seen(log):
+    """A robot turns by a quarter on the spot and sees 1 m to its right, nothing ahead, 2 m to its left."""
+    odometry = Odometry(np.array([0.0, 1.0]), np.array([[5.0, 5.0, 0.0], [5.0, 5.0, np.pi / 2]]))
+    ranges = np.tile(np.array([1.0, np.inf, 2.0], dtype=np.float32), (2, 1))
+    scans = LaserScans(np.array([0.0, 1.0]), ranges, -np.pi / 2, np.pi / 2, 0.0, 0.1, 5.0)
+    assert cost.seen_size(SensorLog(odometry, scans=scans)) == pytest.approx([3.0, 3.0])
+    assert np.array_equal(cost.seen_size(log.without(lidar=True)), np.ptp(log.odometry.poses[:, :2], axis=0))

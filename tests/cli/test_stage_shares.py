@@ -5,14 +5,14 @@ import itertools
 import pytest
 
 from uwblite.cli import console
-from uwblite.cli.stage_shares import _SHARES, Overall
+from uwblite.cli.stage_shares import Overall
 from uwblite.mapping import Stage, build_map
 
 
 @pytest.mark.parametrize("lidar", [True, False])
 def test_every_stage_of_a_map_is_known_and_the_share_only_rises(log, lidar):
-    overall, shares, strangers = Overall(), [0.0], set()
-    known = {name for name, _ in _SHARES}
+    overall, shares, strangers = Overall(lidar=lidar), [0.0], set()
+    known = {name for name, _ in overall._shares}
     first = log.odometry.stamps[0]
 
     def progress(stage, done, total):

@@ -9,6 +9,7 @@ from .wording import signed
 
 if TYPE_CHECKING:
     from ..checks.recording import Diagnosis
+    from ..mapping import MappingConfig
     from ..sensor_log import SensorLog
 
 HELP = "say what is wrong with a recording and what to do about it, before mapping it"
@@ -70,33 +71,34 @@ def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
     return diagnose(log, anchors=trial.anchors, calibration=trial.calibration, doubts=trial.doubts), seconds
 
 
-def expected_cost(log: "SensorLog", seconds: float | None = None) -> dict[str, float]:
+def expected_cost(
+    log: "SensorLog", seconds: float | None = None, config: "MappingConfig | None" = None
+) -> dict[str, float]:
     """Return the time and memory that `uwblite map` is expected to need on this computer, and the size of the map.
 
-    They are those of the recording as a map repairs it; empty where it refuses the recording. Where no time is given the
-    beginning of the recording is mapped to find it.
+    They are those of the recording as a map repairs it; empty where it refuses the recording. Where no time is given, the map
+    is begun to find it.
     """
     import numpy as np
 
     from ..errors import DataError
     from ..mapping import MappingConfig
     from ..screening.screen import screen
-    from .cost import expected_megabytes, expected_seconds
+    from .cost import expected_megabytes, expected_seconds, seen_size
 
     try:
         log = screen(log)
     except DataError:
         return {}
 
-    resolution = MappingConfig().grid.resolution
-    reach = 0.0 if log.scans is None else min(log.scans.range_max, 30.0)
-    size = np.ptp(log.odometry.poses[:, :2], axis=0) + 2.0 * reach
+    resolution = (config or MappingConfig()).grid.resolution
+    size = seen_size(log)
     cells = 0 if log.scans is None else int(np.prod(size / resolution))
     scans = 0 if log.scans is None else len(log.scans.stamps)
     beams = 0 if log.scans is None else log.scans.ranges.shape[1]
     path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
     return {
-        "seconds": round(expected_seconds(log) if seconds is None else seconds, 1),
+        "seconds": round(expected_seconds(log, config) if seconds is None else seconds, 1),
         "megabytes": round(expected_megabytes(path, scans, beams, cells), 0),
         "map width m": round(float(size[0]), 1) if cells else 0.0,
         "map height m": round(float(size[1]), 1) if cells else 0.0,

@@ -1,29 +1,30 @@
-"""What `uwblite map` will cost on this computer: a model of the work, scaled by mapping the beginning of the recording."""
+"""What `uwblite map` will cost on this computer: the map itself is begun, and the rest of the time follows from its share."""
 
 import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ..arrays import Floats
+    from ..mapping import MappingConfig, Stage
     from ..sensor_log import SensorLog
 
 SECONDS_AT_LEAST = 0.5
 """Starting, reading settings, writing files; on the computer of docs/performance.md, as the figures below."""
 _SECONDS_PER_METRE = 0.06
 """Of driving, with lidar: matching of clouds, graph."""
-_SECONDS_PER_METRE_WITHOUT_LIDAR = 0.001
-_SECONDS_PER_RANGE = 3e-4
+_SECONDS_PER_METRE_WITHOUT_LIDAR = 0.0005
+_SECONDS_PER_RANGE, _SECONDS_PER_RANGE_WITHOUT_LIDAR = 3e-4, 8e-4
+"""Without lidar ranges alone hold the trajectory, and an optimisation takes more steps."""
 _SECONDS_PER_READING = 2e-7
 """Of the laser: parsing and tracing."""
 _BYTES_PER_READING = 2.0
 _BYTES_PER_METRE = 0.45e6
 _BYTES_PER_CELL = 20.0
 _BYTES_AT_LEAST = 70e6
-_TRIAL_SECONDS = 0.6
-"""Of work by the model: so much of the recording's beginning is mapped to see how fast this computer is."""
-_LEAST_SLOPE = 0.3
-"""Of the time for a piece of work, the least share that grows with it."""
-_HALVINGS = 12
-"""Of the recording's duration, to find a part of it."""
+_SCANS_LOOKED_AT = 500
+"""At most, for the size of the map."""
+_TRIAL_SECONDS = 3.0
+"""After so long the map that was begun is given up. The stage that it is in ends its step first."""
 
 
 def work_seconds(log: "SensorLog") -> float:
@@ -33,8 +34,9 @@ def work_seconds(log: "SensorLog") -> float:
     path = float(np.hypot(*np.diff(log.odometry.poses[:, :2], axis=0).T).sum())
     ranges = 0 if log.ranges is None else len(log.ranges.stamps)
     readings = 0 if log.scans is None else log.scans.ranges.size
-    per_metre = _SECONDS_PER_METRE if readings else _SECONDS_PER_METRE_WITHOUT_LIDAR
-    return per_metre * path + _SECONDS_PER_RANGE * ranges + _SECONDS_PER_READING * readings
+    if not readings:
+        return _SECONDS_PER_METRE_WITHOUT_LIDAR * path + _SECONDS_PER_RANGE_WITHOUT_LIDAR * ranges
+    return _SECONDS_PER_METRE * path + _SECONDS_PER_RANGE * ranges + _SECONDS_PER_READING * readings
 
 
 def model_seconds(log: "SensorLog") -> float:
@@ -42,48 +44,50 @@ def model_seconds(log: "SensorLog") -> float:
     return SECONDS_AT_LEAST + work_seconds(log)
 
 
-def expected_seconds(log: "SensorLog") -> float:
+def expected_seconds(log: "SensorLog", config: "MappingConfig | None" = None) -> float:
     """Return the expected wall time of a map on this computer, s.
 
-    A short and a longer beginning of the recording are mapped: their difference gives the speed, what remains of the
-    shorter one is what every map takes. The trial is the work itself, so that versions of numpy and scipy, BLAS and what
-    the recording holds change it as they change the map. What cannot be mapped gets the model's own speed.
+    The map is begun. If it ends within a few seconds, its time is known; if not, the time so far is divided by the share
+    of the work that usually lies before the point reached (stage_shares.py). So what the recording holds, anywhere along
+    it, the settings, and the computer with its numpy and scipy count as they count in the map. What cannot be mapped gets
+    the model's time.
     """
-    whole = work_seconds(log)
-    parts = [beginning(log, share * _TRIAL_SECONDS) for share in (0.25, 1.0)]
-    (short, first), (long, second) = ((work_seconds(part), _seconds_of(part)) for part in parts)
-    if first is None or second is None or long <= 0.0:
-        return model_seconds(log)
-    slowness = second / long
-    if long > 1.5 * short:
-        # A computer that is busy with other things may give the shorter one the worse time.
-        slowness = max((second - first) / (long - short), _LEAST_SLOPE * slowness)
-    return SECONDS_AT_LEAST + max(second - slowness * long, 0.0) + slowness * whole
-
-
-def _seconds_of(log: "SensorLog") -> float | None:
-    """Return the time that a map takes, s; None where there can be none."""
-    from ..errors import UwbliteError
+    from ..errors import Cancelled, UwbliteError
     from ..mapping import build_map
+    from .stage_shares import Overall
 
+    overall = Overall(lidar=log.scans is not None and (config is None or config.use_lidar))
     began = time.perf_counter()
+
+    def progress(stage: "Stage", done: int, total: int) -> bool:
+        return overall.take(stage, done, total) <= 0.0 or time.perf_counter() - began < _TRIAL_SECONDS
+
     try:
-        build_map(log)
+        build_map(log, config, progress=progress)
+    except Cancelled:
+        return SECONDS_AT_LEAST + (time.perf_counter() - began) / overall.share
     except UwbliteError:
-        return None
-    return time.perf_counter() - began
+        return model_seconds(log)
+    return SECONDS_AT_LEAST + time.perf_counter() - began
 
 
-def beginning(log: "SensorLog", seconds: float) -> "SensorLog":
-    """Return the first part of a recording that is so many seconds of work by the model, or all of a short one."""
-    if work_seconds(log) <= seconds:
-        return log
-    first, last = log.odometry.stamps[[0, -1]].tolist()
-    low, high = 0.0, last - first
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if work_seconds(log.crop(first, first + middle)) < seconds else (low, middle)
-    return log.crop(first, first + high)
+def seen_size(log: "SensorLog") -> "Floats":
+    """Return the size (2,) of what the scans saw and the robot drove through, by the odometry alone, m."""
+    import numpy as np
+
+    from .. import se2
+
+    points = [log.odometry.poses[:, :2]]
+    if log.scans is not None:
+        scans = log.scans.rows(slice(None, None, -(-len(log.scans.stamps) // _SCANS_LOOKED_AT) or 1))
+        bases = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps)
+        lasers = se2.compose(bases, log.mounting.T_base_laser)
+        hit = (scans.ranges >= scans.range_min) & (scans.ranges <= scans.range_max)
+        rows, beams = np.nonzero(hit)
+        bearing = lasers[rows, 2] + scans.angles[beams]
+        rays = scans.ranges[rows, beams][:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        points.append(lasers[rows, :2] + rays)
+    return np.asarray(np.ptp(np.concatenate(points), axis=0))
 
 
 def expected_megabytes(path: float, scans: int, beams: int, cells: int) -> float:

@@ -147,7 +147,8 @@ def _make_shown(args: argparse.Namespace, logs: "list[SensorLog]", reading: floa
     from .making import make
     from .stage_shares import Overall
 
-    progress, overall = console.Progress(), Overall()
+    lidar = "lidar" not in args.without and any(log.scans is not None for log in logs)
+    progress, overall = console.Progress(), Overall(lidar=lidar)
 
     def report(stage: "Stage", done: int, total: int) -> None:
         if stage.detail:
@@ -175,9 +176,10 @@ def _report_reader_warnings(logs: list["SensorLog"]) -> None:
 def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
     from ..checks.recording import diagnose
     from . import check, console
+    from .making import settings
 
     diagnosis = diagnose(log)
-    cost = check.expected_cost(log)
+    cost = check.expected_cost(log, config=settings(args))
     if args.json:
         console.say_json(check.summary_json(log.notes.source, diagnosis, cost))
     else:
