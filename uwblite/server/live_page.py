@@ -29,7 +29,7 @@ ol{margin:0;padding-left:1.3rem}li{margin:.2rem 0}li:first-child{font-weight:600
 @media (min-width:60rem){main{grid-template-columns:2fr 1fr}.picture{grid-column:1;grid-row:1/span 9}}
 table{border-collapse:collapse;width:100%;
 font-size:.85rem;overflow-wrap:normal;font-variant-numeric:tabular-nums}
-td,th{text-align:left;padding:.15rem .5rem .15rem 0;font-weight:400}
+td,th{text-align:left;padding:.15rem .5rem .15rem 0;font-weight:400;white-space:nowrap}
 th{color:var(--faint)}
 """
 
