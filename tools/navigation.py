@@ -5,10 +5,10 @@
     python tools/navigation.py --only lab --goals 5 --print
     python tools/navigation.py --keep grounds       maps and recordings are kept there and used again
 
-The robot plans in the map of a recording, follows by pure pursuit where it believes to be, and is told nothing else: its wheels
+The robot plans in the map of a recording, follows by pure pursuit from its estimated pose, and gets nothing else: its wheels
 err as the recording's do, people walk about, it begins at an unknown place, and where it is lost it turns on the spot until it
 is found. A goal is reached within 0.10 m of the truth; what it touches and how near it comes to obstacles is measured in the
-true building. With the map of the defaults, that of the paper's settings, and by dead reckoning from a start that is told.
+true building. With the map of the defaults, that of the paper's settings, and by dead reckoning from a given start.
 """
 
 import argparse
@@ -147,11 +147,11 @@ class Tally:
 
 
 class Driver:
-    """Follows planned paths by a pose that it is told.
+    """Follows planned paths by a given pose.
 
     Parameters
     ----------
-    known : the map; None = dead reckoning from a pose in the map that is told.
+    known : the map; None = dead reckoning from a given pose in the map.
     """
 
     def __init__(self, robot: Robot, planner: Planner, T_truth_map: np.ndarray, known: KnownMap | None) -> None:
@@ -252,7 +252,7 @@ def driven(ground: Ground, place: Place, goals: int, dead_reckoning: bool, seed:
             continue
         driver.go(goal, tally)
         if tally.touched > before:
-            # Somebody puts it back to where it may stand, which it is not told.
+            # Somebody puts it back to where it may stand; the estimator gets no word of it.
             robot.put(start.copy())
     return tally
 

@@ -33,14 +33,14 @@ Bools = NDArray[np.bool_]
 
 _ROUNDS = 8
 """Gauss-Newton steps, at most."""
-_SETTLED = 1e-5
+_CONVERGED = 1e-5
 """m and rad; the largest step at which the search ends."""
 _AT_ONCE = 200_000
 """Rays linearised at once."""
 _ANY_PLACE = 10.0
 """m and rad; prior standard deviation of a surface, for those that a single ray hit."""
 _GRAZING = 0.3
-"""Cosine of incidence below which a ray at a column tells the place of its edge, not of its surface; it is left out."""
+"""Cosine of incidence below which a ray at a column shows the place of its edge, not of its surface; it is left out."""
 _SLIP = 0.5
 """m and rad; standard deviation of a step during a slip."""
 _ROUNDING = 2e-4
@@ -158,7 +158,7 @@ class Oracle:
             factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
             step = -cho_solve(factor, gradient, check_finite=False)
             self.x += step
-            if np.abs(step).max() < _SETTLED:
+            if np.abs(step).max() < _CONVERGED:
                 break
         return self._figures(factor)
 

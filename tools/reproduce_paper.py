@@ -62,7 +62,7 @@ class Run:
     changes: tuple[str, ...] = ()
     """Settings, as for --set."""
     nodes: tuple[int, ...] = ()
-    """Anchors heard, from 1; empty = all."""
+    """Anchors used, from 1; empty = all."""
     picture: str = ""
     """File to draw the map into."""
 
@@ -231,7 +231,7 @@ def grids(results: Results) -> str:
     return text
 
 
-STAGES = {"first": "first estimate and optimisation", "loop": "loop closure", "second": "second optimisation"}
+STAGES = {"first": "bootstrap and first optimisation", "loop": "loop closure", "second": "second optimisation"}
 
 
 def table_5(results: Results, seed: str) -> str:
@@ -277,8 +277,8 @@ def differences(results: Results, seeds: Sequence[str]) -> str:
     near = sizes["9"] <= 1.1 * sizes[least]
     lines.append(verdict("Preset paper: sub-maps of 9 m are best or within a tenth of it", near, listed(sizes)))
     rounds = {k[1]: f.drawn for k, f in results.items() if k[0] == "IV" and k[2] == "paper"}
-    settled = abs(rounds["300"] - min(rounds.values())) <= 0.1 * rounds["300"]
-    lines.append(verdict("Preset paper: 300 iterations suffice", settled, listed(rounds)))
+    converged = abs(rounds["300"] - min(rounds.values())) <= 0.1 * rounds["300"]
+    lines.append(verdict("Preset paper: 300 iterations suffice", converged, listed(rounds)))
     return "\n".join(lines)
 
 
@@ -315,7 +315,7 @@ def document(results: Results, args: argparse.Namespace) -> str:
         "## What reproduces\n\n" + differences(results, seeds) + "\n" + NOTES,
         "## Table I: methods\n\nHall: mean of the recordings.\n\n" + table_1(results, seeds),
         "## Table II: which UWB nodes\n\nHall, heavy NLOS on nodes 3 and 4.\n\n" + by_row(results, "II", "nodes"),
-        "## Table III: size of sub-maps\n\nSub-maps of 0 m are single key poses; the paper's preset then tries the best four "
+        "## Table III: size of sub-maps\n\nSub-maps of 0 m are single keyframes; the paper's preset then tries the best four "
         "partners of each only.\n\n" + by_row(results, "III", "epsilon, m"),
         "## Table IV: iterations\n\nOf ICP, preset paper:\n\n" + by_row(results, "IV", "iterations", ("paper",))
         + "\nOf the joint refinement, which has that place in the defaults:\n\n"

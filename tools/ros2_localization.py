@@ -48,11 +48,11 @@ def fixes(lines: Iterable[str]) -> Iterable[Fix]:
     lost = True
     for number, line in enumerate(lines, 1):
         try:
-            told = json.loads(line)
-            was, lost = lost, bool(told["lost"])
+            record = json.loads(line)
+            was, lost = lost, bool(record["lost"])
             if not lost:
-                pose, odometry = (tuple(float(v) for v in told[name]) for name in ("pose", "odometry"))
-                yield Fix(float(told["stamp"]), pose, told["covariance"], map_odom(pose, odometry), was)
+                pose, odometry = (tuple(float(v) for v in record[name]) for name in ("pose", "odometry"))
+                yield Fix(float(record["stamp"]), pose, record["covariance"], map_odom(pose, odometry), was)
         except (ValueError, KeyError, TypeError) as error:
             print(f"ros2_localization: line {number} is none of uwblite localize --live ({error})", file=sys.stderr)
 

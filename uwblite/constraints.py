@@ -1,6 +1,6 @@
 """What the user gives beforehand: surveyed anchors, pinned poses, distances, closures that must or must not be.
 
-Surveyed anchors and pinned poses are given in the user's own frame. ``constraint_edges`` brings a first estimate there.
+Surveyed anchors and pinned poses are given in the user's own frame. ``constraint_edges`` brings the first estimate there.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -54,7 +54,7 @@ class GivenDistance:
 
 @dataclass(frozen=True, slots=True)
 class GivenLandmark:
-    """Something that the lidar sees, by its place in the map as it comes out without distances to it."""
+    """A landmark in the scans, by its place in the map as it comes out without distances to it."""
 
     name: str = ""
     """Any."""

@@ -23,7 +23,7 @@ def simulate(
     Returns
     -------
     actions : all but Send, each with the time it was made.
-    reopens : how often the session asked for the port to be opened anew.
+    reopens : how often the session asked for the port to be opened again.
     """
     session = session if isinstance(session, Session) else Session(session)
     now, end = start, start + seconds

@@ -280,7 +280,7 @@ class RpLidarDevice(SlamtecDevice):
             mm, angle = self._look_ahead(due, places[0]), round(places[0] * 23040) % 23040
             start = places[0] < self.speed / self.RATE
             return struct.pack("<BHH", (0 if not mm else 188) | (1 if start else 2), angle << 1 | 1, 4 * mm)
-        # Near readings point a little elsewhere; the offset is told in 1/8 degree, six bits.
+        # Near readings point a little elsewhere; the offset is sent in 1/8 degree, six bits.
         mm = self.look(times, places)
         offsets = [min(63, round(8 * 1500 / value)) if value > 100 else 0 for value in mm]
         mm = self.look(times, [p - o / 2880 for p, o in zip(places, offsets, strict=True)])

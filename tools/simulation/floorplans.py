@@ -42,7 +42,7 @@ class FloorPlan:
     anchor_ids: tuple[str, ...] = ANCHOR_IDS
     """Names of the anchors, at least as many as there are."""
     radio_range: float = np.inf
-    """Distance from which on no anchor is heard in this place, m; a radio may reach less."""
+    """Distance beyond which no anchor is in reach in this place, m; a radio may reach less."""
 
 
 def box(x: float, y: float, width: float, depth: float) -> list[list[float]]:

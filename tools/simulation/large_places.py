@@ -51,7 +51,7 @@ def tunnel() -> FloorPlan:
 
 
 def site() -> FloorPlan:
-    """150 x 100 m: four halls, a corridor between them, a yard; sixteen anchors, of which three to five are heard at a time."""
+    """150 x 100 m: four halls, a corridor between them, a yard; sixteen anchors, three to five in reach at a time."""
     walls = box(0, 0, 150, 100)
     walls += wall(0, 48, 100, 48, (12.0, 44.0, 82.0)) + wall(0, 51, 100, 51, (20.0, 52.0, 74.0))
     walls += wall(60, 0, 60, 48, (15.0,)) + wall(60, 51, 60, 100, (33.0,))

@@ -388,11 +388,11 @@ def ranged(
         if (rooms := settings.rooms) is not None:
             hidden = radio.crossings(tag, place, np.empty((0, 4)), bodies) > 0
             behind = np.angle(np.exp(1j * (bearing - pose[:, 2] - np.pi)))
-            body, unheard = real_rooms.own_body(rooms, behind, draw(300 + a))
+            body, blocked = real_rooms.own_body(rooms, behind, draw(300 + a))
             smooth = bias[a] + real_rooms.range_errors(rooms, there, tag) + rooms.antenna_sd * antenna + body
             smooth += real_rooms.person_errors(rooms, hidden, draw(400 + a))
             noise = noise + real_rooms.gross_errors(rooms, len(times), draw(500 + a))
-            lost = lost | unheard
+            lost = lost | blocked
         ranges[:, a] = model.scale * distance + smooth + extra + noise
         received[:, a] = ~lost & (rng.random(len(times)) >= model.loss) & (distance < min(model.max_range, plan.radio_range))
         effort[:, a] = distance + 6.0 * shadow

@@ -176,7 +176,7 @@ class Tracker:
             console.note(f"uwblite: {self.reader.broken} broken lines were left out")
         strangers = {} if self.localizer is None else self.localizer.strangers
         if strangers:
-            console.note(f"uwblite: ranges to anchors that the map does not know: {_counted(strangers)}")
+            console.note(f"uwblite: ranges to anchors that are not in the map: {_counted(strangers)}")
         if interrupted:
             return 130
         if self.state is None:
@@ -194,7 +194,7 @@ _SENSORS = {
     "uwb": "the pose rests on scans and odometry",
     "gyro": "directions are the wheels' own",
 }
-"""And what it means that one is silent; a gyro is missed only where one was heard."""
+"""And what it means that one is silent; a gyro is missed only where one sent before."""
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from itertools import pairwise
 from statistics import median
 
 MAX_SKEW = 1e-3
-"""Largest believable relative error of a crystal; anything above is a broken estimate."""
+"""Largest plausible relative error of a crystal; anything above is a broken estimate."""
 BACKWARD = 1.0
 """s; a scan may have begun before the last reading of the clock, more than that is another power-up."""
 LEAST_EXCESS = 1e-4

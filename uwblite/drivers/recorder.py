@@ -226,7 +226,7 @@ class Recorder:
             self.log.head.append(line)
 
     def note(self, note: Note) -> None:
-        """Write a Note as COMMENT and tell the caller."""
+        """Write a Note as COMMENT and report it to the caller."""
         self.comment(f"{note.level} {note.name}: {note.text}")
         self._on_note(self._now() - self.start, note)
 

@@ -108,9 +108,9 @@ def _dwm3001(line: str) -> Ranges | Refused | str | None:
     if '"results' not in line and '"Addr"' not in line:
         return _session(line)
     try:
-        told = json.loads(line)
-        rows = [(str(row["Addr"]), row.get("D_cm") if row["Status"] == "Ok" else None) for row in told["results"]]
-        number = int(told["Block"])
+        record = json.loads(line)
+        rows = [(str(row["Addr"]), row.get("D_cm") if row["Status"] == "Ok" else None) for row in record["results"]]
+        number = int(record["Block"])
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return DAMAGED
     if not all(re.fullmatch("0x[0-9A-Fa-f]{4}", name) and (cm is None or type(cm) is int) for name, cm in rows):

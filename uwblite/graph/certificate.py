@@ -8,7 +8,7 @@ headings z of magnitude 1 their sum is x^H M x + const, and with Lambda_k = Re(c
 has the estimate in its null space. Where S is positive semi-definite, no poses and anchors whatever cost less:
 F(x) >= x^H S x + F(estimate). Otherwise let eta be the smallest number with S + eta D >= 0, D = diag(1 on headings, 0 on
 places): no cost is below F(estimate) - eta times the number of headings. -eta is the smallest eigenvalue of the pencil
-(S, D). By Sylvester's law of inertia the signs of the pivots of S + eta D tell on which side of it a number lies.
+(S, D). By Sylvester's law of inertia the signs of the pivots of S + eta D show on which side of it a number lies.
 
 Without the tangents this is the Lagrangian dual of the chordal problem (D. Rosen, L. Carlone, A. Bandeira, J. Leonard,
 SE-Sync, IJRR 2019; complex: T. Fan, H. Wang, M. Rubenstein, T. Murphey, CPL-SLAM, T-RO 2020) and, with ranges, that of
@@ -53,7 +53,7 @@ class Certificate:
 
 
 def certify(graph: Graph) -> Certificate:
-    """Tell whether an optimised graph is the global minimum of its cost.
+    """Return whether an optimised graph is the global minimum of its cost.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ Marquardt needs of the part only the Schur complement
 
 which is what its machine sends: a dense matrix and a vector, however long the recording was. Sums of these, and the edges
 between parts, give the step of the shared unknowns, which is sent back; h_i = -H_ii^-1 (g_i + H_is h_s) follows where the
-part is. Every part is then linearised anew, round by round. These are the very steps of the whole graph, so that they end in
+part is. Every part is then linearised again, round by round. These are the very steps of the whole graph, so that they end in
 its minimum. (K. Ni, D. Steedly, F. Dellaert, Tectonic SAM, ICRA 2007; A. Cunningham, M. Paluri, F. Dellaert, DDF-SAM, IROS
 2010.) A group of parts is again a part: districts condense what their buildings send.
 """
@@ -27,7 +27,7 @@ from .normal_equations import NormalEquations, filled
 from .partition import Part
 from .unknowns import Unknowns, moved
 
-_SETTLED = 1e-9
+_CONVERGED = 1e-9
 """m and rad; a round that moves nothing by more is the last."""
 _FIRST_DAMPING, _FIRST_BRAKE = 1e-10, 1e-5
 """Damping as a share of the diagonal: at first, and at least after a step that failed."""
@@ -90,7 +90,7 @@ def solve_condensed(shared: Graph, parts: Sequence[Part]) -> Solution:
         if cost <= chi2:
             motion = max([_motion(shared, trial), *(_motion(a.graph, b.graph) for a, b in zip(parts, tried, strict=True))])
             shared, parts, chi2, damping = trial, tried, cost, damping * _EASED
-            if motion <= _SETTLED:
+            if motion <= _CONVERGED:
                 break
         elif chi2 - cost > -_ROUNDED * chi2:
             break

@@ -77,7 +77,7 @@ def _owner_of_edges(blocks: list[tuple[str, Ints]], owner: dict[str, Ints]) -> I
 
 
 def _taken(graph: Graph, members: dict[str, Ints], owners: list[Ints], part: int) -> Graph:
-    """Return the graph of some unknowns and of the edges that belong to a part, all numbered anew."""
+    """Return the graph of some unknowns and of the edges that belong to a part, all numbered from 0."""
     fixed, number = {}, {}
     for name, free in free_unknowns(graph).items():
         k = members[name]

@@ -38,7 +38,7 @@ def outside(graph: Graph) -> str:
         calibrated = isinstance(edges, RangeEdges) and bool(np.any(edges.calibration >= 0))
         calibrated |= isinstance(edges, PriorEdges) and edges.block == "calibration"
         if calibrated or not isinstance(edges, _BOUNDED):
-            return "calibration is unknown, which the relaxation does not know"
+            return "calibration is unknown, and the relaxation has no terms for it"
     return ""
 
 

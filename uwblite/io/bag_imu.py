@@ -41,7 +41,7 @@ class ImuReadings:
 
     @np.errstate(over="ignore", invalid="ignore")
     def gyro(self, frames: Frames, base: str, warnings: list[str]) -> Gyro | None:
-        """Return the heading; None, and a warning, where the messages tell none.
+        """Return the heading; None, and a warning, where the messages hold none.
 
         The angular velocity is integrated with the trapezoidal rule. Without it the orientation is taken, of which only
         changes matter: they are turns about the vertical however the sensor is mounted.

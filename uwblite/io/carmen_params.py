@@ -29,7 +29,7 @@ _NUMBERS = frozenset(
 _TAG = ("tag_offset_x", "tag_offset_y", "tag_height")
 _FURTHER_TAG = re.compile(r"uwb[2-9]_tag_(offset_x|offset_y|height)")
 _OF_LASER = ("laser_time_increment", "laser_range_min", "laser_flipped")
-"""What is told of the first lidar; of the second it is laser2_time_increment and so on."""
+"""Parameters of the first lidar; of the second it is laser2_time_increment and so on."""
 _FLIPPED = ("laser_flipped", "laser_front_laser_flipped", "laser_laser1_flipped", "robot_frontlaser_flipped")
 _TRUE = {b"1": True, b"on": True, b"true": True, b"yes": True, b"0": False, b"off": False, b"false": False, b"no": False}
 

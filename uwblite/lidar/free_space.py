@@ -1,4 +1,4 @@
-"""Free space seen from some places, and points that contradict it: would this pose see through a wall?
+"""Free space seen from some places, and points that contradict it.
 
 From one place it was free in every direction as far as the nearest surface. A point of another cloud, put into the map by a
 hypothetical pose, contradicts that where it lies well short of it; where it lies beyond, it was hidden and shows nothing.

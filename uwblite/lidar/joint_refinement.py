@@ -49,7 +49,7 @@ class RefinementConfig:
     first_gate: float = setting(0.5, advanced=True)
     """Farthest match in the first round, m."""
     later_gate: ClassVar[float] = 0.2
-    """Farthest match in the first round where the poses are good already: after tracking, and when pairs are chosen again."""
+    """Farthest match in the first round where poses are good already: after matching scan to scan, and in later selections."""
     last_gate: ClassVar[float] = 0.12
     """Farthest match in the last rounds, m."""
     shrink: ClassVar[float] = 0.7

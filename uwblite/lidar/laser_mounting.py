@@ -1,6 +1,6 @@
 """Turns measured by laser and by wheels, from scans a moment apart; no map is needed.
 
-When the robot turns left by a, everything the laser sees moves right by a. Matching two scans by a shift of beams
+When the robot turns left by a, everything in its scans moves right by a. Matching two scans by a shift of beams
 measures the turn; the wheels measure it too. From many such pairs follow whether the laser is mounted upside down (the
 sign), the clock offset (the lag at which both agree best) and the wheels' heading scale (the ratio).
 """

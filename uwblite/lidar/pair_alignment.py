@@ -12,7 +12,7 @@ from .scan_matching import PairFactors, PairPoints, match, nondegenerate_step
 
 _FARTHEST, _WIDEST = 0.3, 0.15
 """Longest step of one iteration, m and rad."""
-_SETTLED = 1e-4
+_CONVERGED = 1e-4
 """Steps below this end the descent, m or rad."""
 
 
@@ -56,7 +56,7 @@ def align_pairs(
         reach = np.maximum(np.hypot(step[:, 0], step[:, 1]) / _FARTHEST, np.abs(step[:, 2]) / _WIDEST)
         pose[moving] += step / np.maximum(reach, 1.0)[:, None]
         if gate <= last_gate:
-            moving = moving[np.abs(step).max(axis=1) >= _SETTLED]
+            moving = moving[np.abs(step).max(axis=1) >= _CONVERGED]
             if not len(moving):
                 break
         gate = max(0.8 * gate, last_gate)

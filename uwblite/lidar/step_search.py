@@ -43,7 +43,7 @@ _DISTINCT = 0.15
 _MATCH_VARIANCE = 0.03**2 * 8.0
 """Variance of one match, m^2; eight together weigh as one."""
 _SAME = 3.0
-"""Standard deviations up to which a match cannot tell two places apart."""
+"""Standard deviations up to which a match cannot separate two places."""
 _MARGIN = 0.08
 """By how much the score of a place must exceed that of every distinct one."""
 _THROUGH = 0.12

@@ -1,7 +1,7 @@
 """The turns of a gyro in place of the wheels', as both come in: distances from the wheels, directions from the gyro.
 
 What odometry.gyro does with a whole recording, done with the last minute: which way and in which unit the gyro counts is
-told by the wheels, its bias by the robot's rests, else by the wheels. Until both are known the wheels' own turns are taken.
+given by the wheels, its bias by the robot's rests, else by the wheels. Until both are known the wheels' own turns are taken.
 """
 
 from bisect import bisect_left

@@ -80,7 +80,7 @@ class Localizer:
         self._running = full_agreement(len(known.anchors.ids))
         self._reason = "nothing has been measured yet"
         self.strangers: dict[str, int] = {}
-        """Ranges to anchors that the map does not know, by id."""
+        """Ranges to anchors that are not in the map, by id."""
         self.ends = np.zeros(2)
         """Of rays on walls, and in known space, while the pose was known."""
 

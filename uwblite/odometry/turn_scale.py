@@ -23,7 +23,7 @@ _STRETCHES = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnScale:
-    """Relative error of the turns that one recording's wheels count, as the lidar sees it from step to step."""
+    """Relative error of the turns that one recording's wheels count, by the lidar from step to step."""
 
     value: float
     """Turn by the lidar / turn by the wheels - 1, 1: what ``heading_scale`` should be."""

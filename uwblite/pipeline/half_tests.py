@@ -1,4 +1,4 @@
-"""Do the halves of a recording agree on the wheels? A change on the way hides where ranges alone hold the trajectory.
+"""Do both halves of a recording give the same calibration of the wheels? A change hides where ranges alone hold the trajectory.
 
 A heading that stands still from some moment on, or a tyre that was changed, can be explained by wrong values of the
 wheels' calibration, constant over the whole recording, and bent anchors, with hardly larger residuals. So both halves are
@@ -61,8 +61,8 @@ def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Ta
     steps = np.flatnonzero((wheels.i >= rows.start) & (wheels.j < rows.stop))
     own = (ranges.pose >= rows.start) & (ranges.pose < rows.stop) & (np.asarray(ranges.weights) > 0.0)
     unseen = np.bincount(ranges.anchor[own], minlength=len(graph.anchors)) < _FEW
-    heard = np.flatnonzero(own & ~unseen[ranges.anchor])
-    if len(steps) < _LEAST_STEPS or len(heard) < _LEAST_RANGES:
+    used = np.flatnonzero(own & ~unseen[ranges.anchor])
+    if len(steps) < _LEAST_STEPS or len(used) < _LEAST_RANGES:
         return None
     fixed = np.ones(len(graph.poses), dtype=bool)
     fixed[rows.start + 1 : rows.stop] = False
@@ -71,7 +71,7 @@ def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Ta
     known |= graph.calibration.of_kinds(RANGE_SCALE)
     known[places] = False
     alone = Graph(graph.poses, graph.anchors, priors, graph.calibration, fixed, unseen, known)
-    solved = optimize(alone.with_edges(wheels.rows(steps), ranges.rows(heard)), task.config.solver)[0]
+    solved = optimize(alone.with_edges(wheels.rows(steps), ranges.rows(used)), task.config.solver)[0]
     return np.column_stack([solved.calibration.values[places], marginals(solved).calibration[places]])
 
 

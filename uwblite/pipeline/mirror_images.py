@@ -33,7 +33,7 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     if not free.any():
         return estimate
     starts = (estimate.graph.anchors, _images(estimate, ranges))
-    here, there = (_settled(estimate, ranges, free, start, task) for start in starts)
+    here, there = (_minimum(estimate, ranges, free, start, task) for start in starts)
     apart = np.hypot(*(there.anchors - here.anchors).T)
     as_well = (apart > _APART) & (_costs(there, ranges) - _costs(here, ranges) < _CLEAR)
     ambiguous = np.where(free, as_well, found.ambiguous)
@@ -59,7 +59,7 @@ def _images(estimate: Estimate, ranges: RangeEdges) -> Floats:
     return anchors
 
 
-def _settled(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Floats, task: Task) -> Graph:
+def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Floats, task: Task) -> Graph:
     """Return the graph with the free anchors (a,), biases and heights at their best near a start (a, 2), the poses fixed."""
     graph = estimate.graph
     own = graph.calibration.of_kinds(BIAS, HEIGHT)

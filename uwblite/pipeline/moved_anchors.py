@@ -20,7 +20,7 @@ _LEAST_MOVE = 0.25
 """An anchor that two recordings see nearer together than this was not moved, m."""
 _MOVED = 20.0
 """Squared Mahalanobis distance between two recordings' places of an anchor from which on it was moved (2 degrees of
-freedom; 5e-5 by chance, the rest for what the sigmas do not know)."""
+freedom; 5e-5 by chance, the rest for errors that the sigmas leave out)."""
 
 
 def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:

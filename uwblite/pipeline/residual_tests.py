@@ -35,7 +35,7 @@ _REDUNDANT = 2
 _MOVING = 0.05
 """m or rad; over a smaller step a lidar that sees the robot itself would agree, too."""
 _CONTRADICTED = ("free-space-violation", "contradicting-closures", "no-closure")
-"""Doubts that tell of a map whose scan edges may be wrong together."""
+"""Doubts about a map whose scan edges may be wrong together."""
 _WAYS = 0.15
 """Relative disagreement of lidar and wheels on ways from one scan to the next, which single scans show to some per cent."""
 _SCALE = 0.12
@@ -198,8 +198,8 @@ def check_scales(estimate: Estimate, task: Task) -> None:
     if len(off):
         outcome = "the ranges agree with the wheels" if estimate.placed.any() else "nothing shows which of the two is right"
         text = (
-            f"the lidar sees {off[0]:.2f} times the way that the wheels count, and {outcome}: the map has the lidar's scale; "
-            "check the units of both"
+            f"the lidar measures {off[0]:.2f} times the distance that the wheels count, and {outcome}: "
+            "the map has the lidar's scale; check the units of both"
         )
         task.stages.doubt("scales", text, lidar_by_wheels=float(off[0]))
 

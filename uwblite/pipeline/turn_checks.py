@@ -10,7 +10,7 @@ from .estimate import Estimate, Task
 
 
 def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
-    """Fix each scale of turns at what the lidar sees from step to step, where the scale of the whole estimate contradicts it.
+    """Fix each scale of turns at the lidar's from step to step, where the scale of the whole estimate contradicts it.
 
     A turn that the wheels missed, or a heading lost in a fast turn, then stays an error of its place. Where the steps ask for
     the larger correction, the estimate keeps its own, and the map is judged at the end: the lidar may be what is wrong.

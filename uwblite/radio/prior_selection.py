@@ -1,4 +1,4 @@
-"""How wide the priors of the radios' errors and of the units of length are: as wide as the recording asks for.
+"""How wide the priors of the radios' errors and of the units of length are: by the marginal likelihood of the recording.
 
 Most radios are sound: their clocks are right to parts of a million and the maker calibrated the antennas to a few
 centimetres. Some are not: scales 7 % off and biases of a metre and more are on record. A prior wide enough for those
@@ -11,7 +11,7 @@ wrong by any factor. Whether the wheels' unit is wrong is decided: the likelier 
 where nothing contradicts it, that all are right. The scale of the radios and their biases can be wrong by little or much:
 widths from sound to unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the
 marginal likelihood. A scale that is clearly off floats with the widest. So a scale stays where it is as long as the
-recording cannot tell, moves a part of the way where it leans to one side, and floats where the evidence is positive.
+recording cannot tell, moves a part of the way where it leans to one side, and floats where the posterior odds are clear.
 
 With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 

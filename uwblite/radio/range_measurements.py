@@ -1,4 +1,4 @@
-"""From keyframes to edges: what the wheels and the radio say, with the noise that makes them commensurate."""
+"""From keyframes to edges: what wheels and radio measured, with the noise that makes them commensurate."""
 
 from dataclasses import replace
 

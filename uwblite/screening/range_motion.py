@@ -28,7 +28,7 @@ _USABLE = (0.02, 200.0)
 
 
 def excess(log: SensorLog, start: float, end: float) -> float:
-    """Return by how much the ranges say that the robot moved between two times beyond what the wheels count, m; 0 = not at all.
+    """Return by how much the robot moved more between two times by the ranges than by the wheels, m; 0 = not at all.
 
     Parameters
     ----------

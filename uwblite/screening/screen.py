@@ -15,7 +15,7 @@ from .wheel_motion import Pairs
 _GAP = 2.0
 """Silence of the odometry that is a gap, s; or twenty periods, where that is longer."""
 _STANDS = (0.05, 0.05)
-"""Way, m, and turn, rad, below which the wheels say that the robot stood meanwhile."""
+"""Distance, m, and turn, rad, by the wheels, below which the robot stood meanwhile."""
 _SHORTEST_PATH = 2.0
 """A shorter path shows little of anything, m."""
 _ANYWHERE = (20.0, 20.0, 3.0)
