@@ -1,6 +1,9 @@
 """The log on disk: lines that other readers understand, appending after a crash, rotation."""
 
+import errno
 import math
+import os
+from unittest import mock
 
 import pytest
 
@@ -68,6 +71,8 @@ def test_last_state_ignores_the_broken_line(tmp_path):
     path = tmp_path / "run.log"
     path.write_text("ODOM 1 2 3 0 0 0 10.0 h 0.0\nUWB AA 1.0 100 12.5 h 2.0\nCOMMENT x y z w 99 h 1\nODOM 4 5 6 0 0 0 13.0 h 3")
     assert last_state(path) == (12.5, (1.0, 2.0, 3.0))
+    path.write_text("UWB2 AA 1.0 100 12.5 h 2.0\nGYRO 0.1 0.2 14.5 h 2.0\nPARAM x 1 99 h 0\n")
+    assert last_state(path)[0] == 14.5
     path.write_text("")
     assert last_state(path) == (None, (0.0, 0.0, 0.0))
 
@@ -92,10 +97,46 @@ def test_rotation_keeps_every_line_and_repeats_the_head(tmp_path):
     again.close()
 
 
-def test_a_disk_that_is_full_is_one_clear_error():
-    log = LogFile.__new__(LogFile)
-    log.path, log._interval, log._rotate = "/dev/full", 1.0, 0
-    with open("/dev/full", "wb", buffering=0) as full:
-        log._fd = full.fileno()
-        with pytest.raises(DataError, match="free some space"):
-            log.write(["x"])
+def test_a_disk_that_is_full_is_one_clear_error_and_leaves_whole_lines(tmp_path):
+    log = LogFile(tmp_path / "run.log", sync=60.0)
+    log.write(["ODOM 1"])
+    write = os.write
+
+    def half(fd, data):
+        if len(data) < 5:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(fd, data[:4])
+
+    with mock.patch.object(os, "write", half), pytest.raises(DataError, match="free some space"):
+        log.write(["ODOM 2"])
+    log.write(["ODOM 3"])
+    log.close()
+    assert (tmp_path / "run.log").read_text() == "ODOM 1\nODOM 3\n"
+
+
+def test_a_part_that_cannot_begin_is_one_clear_error(tmp_path):
+    log = LogFile(tmp_path / "run.log", rotate=10, sync=60.0)
+    (tmp_path / "run.2.log").mkdir()
+    with pytest.raises(DataError, match=r"run\.2\.log: cannot begin the next part"):
+        log.write(["ODOM 1 2 3 4"])
+    log.close()
+    assert "ODOM 1 2 3 4" in (tmp_path / "run.log").read_text()
+
+
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_a_log_that_is_deleted_is_written_anew(tmp_path, what):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    log = LogFile(folder / "run.log", sync=60.0)
+    log.write([f"ODOM {k}" for k in range(30_000)])
+    assert not log.restore()
+    (folder / "run.log").unlink()
+    if what == "folder":
+        folder.rmdir()
+    log.write(["ODOM between"])
+    assert log.restore()
+    assert log.free_bytes() > 0
+    log.write(["ODOM after"])
+    log.close()
+    lines = (folder / "run.log").read_text().splitlines()
+    assert lines == [*(f"ODOM {k}" for k in range(30_000)), "ODOM between", "ODOM after"]

@@ -13,6 +13,7 @@ from helpers.virtual_recording import VirtualTime
 
 from uwblite.drivers import link as link_module
 from uwblite.drivers.devices import DEVICES, open_device
+from uwblite.drivers.events import Corrupt
 from uwblite.drivers.link import Link
 from uwblite.drivers.log_file import LogFile
 from uwblite.drivers.recorder import Recorder
@@ -82,13 +83,13 @@ class OpenedAtOnce:
         pass
 
 
-def record(tmp_path, ports, seconds, open_one):
-    """Record in simulated time and return the recorder and the notes; `open_one` gets URL and clock."""
+def record(tmp_path, ports, seconds, open_one, wall=None):
+    """Record in simulated time and return the recorder and the notes; `open_one` and `wall` get (URL and) the clock."""
     links = [Link(name, spec, open_device(sensor, spec)[0]) for name, (sensor, spec) in ports.items()]
     log, notes, clock = LogFile(tmp_path / "run.log", sync=60.0), [], VirtualTime()
     recorder = Recorder(
         links, log, monotonic=clock, wall_offset=0.0, host="h", on_note=lambda t, n: notes.append((t, n)),
-        open_port=lambda url, baud: open_one(url, clock),
+        open_port=lambda url, baud: open_one(url, clock), wall=wall and (lambda: wall(clock())),
     )  # fmt: skip
     recorder._selector = Waiting(clock)
     recorder.begin([])
@@ -118,6 +119,70 @@ def test_ports_that_hang_while_they_are_opened_hold_up_nobody(tmp_path):
     assert counts.messages == len(stamps)
     assert counts.lost == 0
     assert any("no data at all" in doubt for doubt in recorder.doubts())
+
+
+@pytest.mark.parametrize("step", [7.0, -7200.0])
+def test_a_clock_that_is_set_meanwhile_moves_no_stamp_and_is_reported_once(tmp_path, step):
+    """A Raspberry Pi finds the network after five seconds."""
+    wall = lambda now: now + (step if now > 1005.0 else 0.0)  # noqa: E731
+    _, notes = record(tmp_path, {"odometry": BASE}, 12.0, lambda url, clock: TalkingPort(clock), wall)
+    stamps = stamps_of(tmp_path / "run.log")
+    assert max(b - a for a, b in itertools.pairwise(stamps)) < 3 * LINES
+    assert min(b - a for a, b in itertools.pairwise(stamps)) > -1e-3
+    (said,) = (note for _, note in notes if note.name == "clock-set")
+    assert f"{step:+.1f} s" in said.text
+
+
+def test_a_log_that_is_deleted_meanwhile_keeps_every_line(tmp_path):
+    deleted = []
+
+    class Deleting(TalkingPort):
+        def read(self):
+            if self._sent > 200 and not deleted:
+                deleted.append((tmp_path / "run.log").read_text())
+                (tmp_path / "run.log").unlink()
+            return super().read()
+
+    recorder, notes = record(tmp_path, {"odometry": BASE}, 10.0, lambda url, clock: Deleting(clock))
+    assert [note.name for _, note in notes].count("log-deleted") == 1
+    assert (tmp_path / "run.log").read_text().startswith(deleted[0])
+    assert len(stamps_of(tmp_path / "run.log")) == recorder.links[0].counts.messages > 450
+
+
+FOREIGN = {
+    "kobuki": b"54\x2c\x68" * 20, "line": b"\xaa\x55\x4d\x01\x0f" * 20, "gyro-line": b"UWB 1;2;3\n" * 10,
+    "tlv": b"1.0,2.0,3.0,4.0\n" * 8, "makerfabs": b"\x55\x01" * 60, "bu03": b"from: 1782\t Range: 3.21 m\r\n" * 4,
+    "linktrack": b"an0:1.23m\r\n" * 10, "ld06": b"\xfa\xa0" * 60, "lds01": b"\x54\x2c" * 60, "ydlidar-x2": bytes(100),
+}  # fmt: skip
+"""What another device, or NULs, would send."""
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_another_device_at_the_port_gives_no_data_and_that_is_reported(tmp_path, name):
+    class Other(TalkingPort):
+        def read(self):
+            return FOREIGN[name] if super().read() else b""
+
+    columns = {"line": "?columns=t,x,y,theta", "gyro-line": "?columns=t,turn_rate"}.get(name, "")
+    sensor = DEVICES[name].sensor
+    recorder, notes = record(
+        tmp_path, {sensor: (sensor, f"{name}:/dev/x{columns}")}, 6.0, lambda url, clock: Other(clock)
+    )  # fmt: skip
+    assert recorder.links[0].counts.messages == 0
+    assert {f"{sensor}-no-data", f"{sensor}-silent"} & {note.name for _, note in notes}
+    assert any("no data at all" in doubt for doubt in recorder.doubts())
+
+
+@pytest.mark.parametrize("name", ["line", "gyro-line", "shell", "makerfabs", "scip", "kobuki"])
+def test_a_line_that_never_ends_is_held_in_part_and_counted(name):
+    columns = {"line": "?columns=t,x,y,theta", "gyro-line": "?columns=t,turn_rate"}.get(name, "")
+    session = open_device(DEVICES[name].sensor, f"{name}:/dev/x{columns}")[0]
+    actions = session.start(0.0)
+    for k in range(200):
+        actions += session.feed(b"1" * 8192, 0.01 * k)
+    held = [b for a in actions if isinstance(a, Corrupt) for b in a.raw]
+    assert held or name == "shell"  # its start-up does not know yet what the module speaks
+    assert len(held) < 64 * 10_000
 
 
 def test_what_waited_in_a_port_has_no_time_and_is_dropped(tmp_path):

@@ -28,6 +28,10 @@ class LinesTo(LogFile):
             self.bytes += len(data)
             self._take(data)
 
+    def restore(self) -> bool:
+        """Return False: nothing can be deleted."""
+        return False
+
     def close(self) -> None:
         """Nothing is open."""
 

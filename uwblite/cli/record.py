@@ -121,13 +121,13 @@ def run(args: argparse.Namespace) -> int:
     watching = _Watching(args) if args.watch else None
     recorder = Recorder(
         links, log, monotonic=time.monotonic, wall_offset=offset, host=re.sub(r"\s+", "_", socket.gethostname()) or "host",
-        mounting=mounting, on_note=_show_note,
+        mounting=mounting, on_note=_show_note, wall=time.time,
     )  # fmt: skip
     endings = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {ending: signal.signal(ending, lambda n, _f: stopped.append(n)) for ending in endings}
     try:
         recorder.begin(_head(args, remark))
-        _suggest_names(links)
+        _use_lasting_names(links)
         recorder.run(duration=args.duration, stopping=lambda: bool(stopped), on_status=_status_line(recorder, watching))
     finally:
         log.close()
@@ -217,13 +217,15 @@ def _head(args: argparse.Namespace, remark: str) -> list[str]:
     return [f"recorded by uwblite {__version__}: {devices}", *([remark] if remark else [])]
 
 
-def _suggest_names(links: list["Link"]) -> None:
+def _use_lasting_names(links: list["Link"]) -> None:
+    """Open ports by names that stay when they are unplugged and plugged in again."""
     from ..drivers.ports import stable_name
 
     for link in links:
         better = stable_name(link.url)
         if better:
-            note(f"{link.name}: {link.url} may change its number; better {better}")
+            note(f"{link.name}: {link.url} may change its number; it is opened as {better}")
+            link.url = better
 
 
 def _show_note(seconds: float, message: "Note") -> None:

@@ -9,7 +9,6 @@ import contextlib
 import math
 import os
 import re
-import shutil
 import threading
 from pathlib import Path
 
@@ -17,7 +16,9 @@ from ..errors import DataError
 from .events import GyroHeading, LaserScan, OdometryPose, RangeEpoch
 
 _MILLIMETRES = tuple(f"{mm / 1000:.3f}" for mm in range(8192))
-TAIL = 1 << 18
+TAIL, _PIECE = 1 << 18, 1 << 20
+"""Bytes read to find the last state; copied at once."""
+_OURS = re.compile(r"ODOM|GYRO|(ROBOTLASER|UWB)\d?")
 
 
 def metre_text(value: float, limit: float) -> str:
@@ -149,23 +150,27 @@ class LogFile:
             if self._interval == 0:
                 os.fdatasync(self._fd)
         except OSError as error:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self._size)  # not half a line
             raise DataError(f"{self.path}: cannot write ({error.strerror}); free some space on the disk") from None
         self._size += len(data)
         self.bytes += len(data)
         self._dirty.set()
         if self._rotate and self._size >= self._rotate:
-            self._next_part()
+            try:
+                self._next_part()
+            except OSError as error:
+                raise DataError(f"{self._name(self.part + 1)}: cannot begin the next part ({error.strerror})") from None
 
     def _next_part(self) -> None:
-        following = self._name(self.part + 1)
-        os.write(self._fd, f"COMMENT continued in {following.name}\n".encode())
-        old, self._fd = self._fd, -1
+        following, old = self._name(self.part + 1), self._fd
+        self._fd = self._open(following)
+        os.write(old, f"COMMENT continued in {following.name}\n".encode())
         os.fdatasync(old)
         os.close(old)
-        self.part, self.path = self.part + 1, following
-        self._fd = self._open(following)
         head = "\n".join(self.head) + "\n" if self.head else ""
-        text = f"{head}COMMENT part {self.part}, continues {self._name(self.part - 1).name}\n"
+        text = f"{head}COMMENT part {self.part + 1}, continues {self.path.name}\n"
+        self.part, self.path = self.part + 1, following
         os.write(self._fd, text.encode("ascii", "replace"))
         self._size += len(text)
 
@@ -176,9 +181,31 @@ class LogFile:
                 with contextlib.suppress(OSError):
                     os.fdatasync(self._fd)
 
+    def restore(self) -> bool:
+        """Write the log anew where somebody deleted it, perhaps with its folder; return whether that was so.
+
+        Raises
+        ------
+        DataError : it cannot be written there any more.
+        """
+        if os.fstat(self._fd).st_nlink:
+            return False
+        deleted, size = self._fd, 0
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._fd = self._open(self.path)
+            while piece := os.pread(deleted, _PIECE, size):
+                size += os.write(self._fd, piece)
+        except OSError as error:
+            raise DataError(f"{self.path}: was deleted, and cannot be written anew ({error.strerror})") from None
+        os.close(deleted)
+        self._size += size
+        return True
+
     def free_bytes(self) -> int:
         """Return the space left on the disk."""
-        return shutil.disk_usage(self.path.parent).free
+        disk = os.fstatvfs(self._fd)
+        return disk.f_bavail * disk.f_frsize
 
     def close(self) -> None:
         """Sync and close."""
@@ -207,7 +234,7 @@ def last_state(path: Path) -> tuple[float | None, tuple[float, float, float]]:
     stamp, pose = None, (0.0, 0.0, 0.0)
     for line in lines:
         fields = line.split()
-        if not fields or fields[0] not in ("ODOM", "ROBOTLASER1", "UWB"):
+        if not fields or not _OURS.fullmatch(fields[0]):
             continue
         number = _number(fields[-3]) if len(fields) > 4 else None
         if number is not None:

@@ -35,6 +35,8 @@ OPENING = 0.02
 """s between looks while a port is being opened."""
 DAMAGE_REPORT = 5.0
 """s between COMMENT lines about loss and damage."""
+CLOCK_SET = 0.5
+"""s by which the computer's clock must be set to be reported."""
 POLL = 0.005
 """s between reads of a port that cannot be waited on."""
 
@@ -52,18 +54,21 @@ class Recorder:
     mounting : sensors on the base.
     on_note : called with (seconds since start, Note) for each thing a person must know.
     open_port : (url, baud) -> Port.
+    wall : s, the computer's clock, to report that it was set; stamps do not follow it.
     """
 
     def __init__(
         self, links: list[Link], log: LogFile, *, monotonic: Callable[[], float], wall_offset: float, host: str,
         mounting: Mounting | None = None, on_note: Callable[[float, Note], None] | None = None,
-        open_port: Callable[[str, int], Port] = open_port,
+        open_port: Callable[[str, int], Port] = open_port, wall: Callable[[], float] | None = None,
     ) -> None:  # fmt: skip
         self.links, self.log = links, log
         self._now, self._offset, self._host = monotonic, wall_offset, host
         self._mounting = mounting or Mounting()
         self._on_note = on_note or (lambda _t, _n: None)
-        self._open_port = open_port
+        self._open_port, self._wall = open_port, wall
+        self._set_by = 0.0
+        """s, by how much the computer's clock was set since the start."""
         self._selector = selectors.DefaultSelector()
         self._pose: OdometryPose | None = None
         self._params: dict[str, str] = {}
@@ -239,6 +244,10 @@ class Recorder:
     # ---- devices that come and go
 
     def _housekeeping(self, now: float) -> None:
+        if self.log.restore():
+            text = f"{self.log.path} was deleted; it is written anew, with all that was in it"
+            self.note(Note("warning", "log-deleted", text))
+        self._look_at_clock(now)
         for link in self.links:
             link.update_rate(now)
             if link.port is None:
@@ -249,6 +258,13 @@ class Recorder:
         if now >= self._damage_due:
             self._damage_due = now + DAMAGE_REPORT
             self._report_damage()
+
+    def _look_at_clock(self, now: float) -> None:
+        by = 0.0 if self._wall is None else self._wall() - now - self._offset - self._set_by
+        if abs(by) > CLOCK_SET:
+            self._set_by += by
+            text = f"this computer's clock was set by {by:+.1f} s, or it slept; the stamps of this log go on as before"
+            self.note(Note("warning", "clock-set", text))
 
     def _report_damage(self) -> None:
         hurt = [link for link in self.links if link.new_lost or link.new_corrupt]

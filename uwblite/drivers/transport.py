@@ -16,7 +16,8 @@ from urllib.parse import urlsplit
 
 from ..errors import ConfigError, DeviceError
 
-CHUNK = 65536
+CHUNK = 8192
+"""Bytes read at once: a device that floods its port holds up the others for milliseconds only."""
 CONNECT_TIMEOUT = 5.0
 """s for a TCP connection to come about."""
 WRITE_TIMEOUT = 1.0
@@ -250,7 +251,7 @@ class SerialPort:
         """Return what has arrived."""
         try:
             if not self._local:
-                return bytes(self._serial.read(self._serial.in_waiting))
+                return bytes(self._serial.read(min(self._serial.in_waiting, CHUNK)))
             data = os.read(self._serial.fileno(), CHUNK)
         except BlockingIOError:
             return b""
