@@ -36,6 +36,16 @@ def test_factors_are_the_numeric_gradient_of_the_kernel_s_cost():
     gradient = [(cost(start + s) - cost(start - s)) / 2e-6 for s in np.eye(3) * 1e-6]
     hessian, found, weight = walls.factors(start[None], rays, gate, scale)
     np.testing.assert_allclose(found[0], gradient, rtol=1e-4, atol=1e-6)
+    rate = rays.ends * [0.3, -0.2]
+    more = walls.factors(start[None], rays, gate, scale, (rate,))
+    np.testing.assert_allclose(more[0][0, :3, :3], hessian[0], rtol=1e-12)
+
+    def stretched(u):
+        off = se2.transform(start, rays.ends[rays.hit] + u * rate[rays.hit]) - points
+        r = (normals * off).sum(axis=1)[good]
+        return 0.5 * np.sum(r**2 / (1.0 + np.square(r / scale)))
+
+    np.testing.assert_allclose(more[1][0, 3], (stretched(1e-6) - stretched(-1e-6)) / 2e-6, rtol=1e-4, atol=1e-6)
     assert np.linalg.eigvalsh(hessian[0]).min() > 0
     assert 0 < weight[0] <= good.sum()
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Floats
 from . import hypotheses, range_likelihood, search, verdict
 from .hypotheses import Hypotheses
@@ -14,7 +15,7 @@ from .window import Ranges, Window
 
 SCAN_EVIDENCE = 15.0
 """Rays per metre of driving that count as independent when places are compared."""
-_LOOK_BACK = 4.0
+LOOK_BACK = 4.0
 """m driven, of whose scans places are compared."""
 _SEARCH_LOOKS = 2.5
 """m driven, of whose scans the search makes one cloud."""
@@ -41,6 +42,9 @@ class Comparison:
     known: Floats
     """(h,) rays' ends in known space."""
     rays: Rays
+    """Of the last metres, in the present frame of the base."""
+    looks: int
+    """Scans that they are of."""
     ranges: Ranges
 
     @property
@@ -56,24 +60,57 @@ class Comparison:
 
 
 class PlaceSearch:
-    """The whole map, ready to be searched."""
+    """The whole map, ready to be searched, a little at a time."""
 
     def __init__(self, known: KnownMap) -> None:
         self.walls, self.anchors = known.walls, len(known.anchors.ids)
         self._field = None if known.walls is None else search.field_of(known.walls)
         self._bounds = _bounds(known)
+        self._odom = np.zeros(3)
+        self._steps: search.Steps | None = None
 
-    def compared(self, bank: Hypotheses, window: Window, odom: Floats, way: float) -> Comparison:
-        """Search the whole map for what a window holds, and weight what is found together with the present hypotheses.
+    @property
+    def idle(self) -> bool:
+        """Whether no search is under way."""
+        return self._steps is None
+
+    def begin(self, window: Window, odom: Floats, way: float) -> None:
+        """Begin to search the whole map for what a window holds.
 
         Parameters
         ----------
         odom : (3,) present pose in the odometry frame. way : the odometer now, m.
         """
+        rays = window.seen(odom, way, _SEARCH_LOOKS)[0]
+        self._odom = odom.copy()
+        self._steps = search.places(self._field, rays, window.ranges_since(odom, way), self._bounds)
+
+    def drop(self) -> None:
+        """Leave a search that is under way."""
+        self._steps = None
+
+    def advance(self, odom: Floats) -> search.Places | None:
+        """Do a unit of the work; return where the robot is now, if the search has ended with it.
+
+        Parameters
+        ----------
+        odom : (3,) present pose in the odometry frame.
+        """
+        if self._steps is None:
+            return None
+        try:
+            next(self._steps)
+        except StopIteration as end:
+            self._steps = None
+            found: search.Places = end.value
+            return search.Places(se2.compose(found.poses, se2.between(self._odom, odom)), found.complete)
+        return None
+
+    def compared(self, found: search.Places, bank: Hypotheses, window: Window, odom: Floats, way: float) -> Comparison:
+        """Weight the places that a search found together with the present hypotheses by what a window holds."""
         ranges = window.ranges_since(odom, way)
-        rays, ago = window.seen(odom, way, _LOOK_BACK)
+        rays, ago = window.seen(odom, way, LOOK_BACK)
         recent = rays.rows(ago <= _SEARCH_LOOKS)
-        found = search.places(self._field, self.walls, recent, ranges, self._bounds)
         bank = self._with_places(bank, found.poses, ranges, recent)
         weight = range_likelihood.range_likelihood(bank.poses, ranges)
         fit, known = np.zeros(len(bank)), np.zeros(len(bank))
@@ -81,7 +118,7 @@ class PlaceSearch:
             agreement = self.walls.agreement(bank.poses, rays)
             weight += SCAN_EVIDENCE * (1.0 + float(ago.max())) * agreement.log_likelihood
             fit, known = agreement.log_likelihood, agreement.known
-        return Comparison(bank, found.complete, weight, fit, known, rays, ranges)
+        return Comparison(bank, found.complete, weight, fit, known, rays, len(np.unique(ago)), ranges)
 
     def _with_places(self, bank: Hypotheses, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
         """Return the hypotheses with new ones where none is near."""

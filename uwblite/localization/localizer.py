@@ -18,7 +18,7 @@ from ..arrays import Floats
 from ..radio.trilateration import TrilaterationConfig, usable
 from ..sensor_log import SensorMounting
 from . import hypotheses, verdict
-from .comparison import SCAN_EVIDENCE, Comparison, PlaceSearch
+from .comparison import LOOK_BACK, SCAN_EVIDENCE, Comparison, PlaceSearch
 from .gyro_turns import GyroTurns
 from .hypotheses import RangeFacts
 from .known_map import KnownMap
@@ -35,16 +35,17 @@ _FRESH_WAY = 0.1
 """m; a scan taken so far from the last one errs independently of it; a nearer one in proportion."""
 _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
 """Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
-_CONFIRM, _CONFIRM_ALONE = 0.5, 2.0
-"""m driven between two searches that agree; the second where scans or ranges are alone."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 1.0
 """m driven and s between two searches."""
+_UNIT_WAY = 1.0
+"""m driven between two comparisons of the map's unit with the sensors'."""
 _MOST, _FORGET = 40, -14.0
 """Hypotheses, and log-weight below which one goes."""
 _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent."""
 _UNSEEN_SPEED = 0.3
 """m/s and rad/s; how fast a robot may move while its odometry is silent."""
+_SCANS_DIFFER = "the scans do not fit the walls any more"
 
 
 class Localizer:
@@ -67,12 +68,14 @@ class Localizer:
         self._wheels = np.full(3, np.nan)
         self._bank = hypotheses.none(len(known.anchors.ids))
         self._places = PlaceSearch(known)
+        self._searched = Window()
+        """What the search that is under way goes by."""
         self._names = {name: k for k, name in enumerate(known.anchors.ids)}
         heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
         self._square = np.square(heights) + known.anchors.rise
         self._window = Window()
         self._waiting: list[tuple[float, Range | Scan]] = []
-        self._way = self._scan_way = self._search_way = 0.0
+        self._way = self._scan_way = self._search_way = self._unit_way = 0.0
         self._search_stamp = -np.inf
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
@@ -169,9 +172,10 @@ class Localizer:
 
     def _work_off(self) -> None:
         """Use the measurements that the odometry has reached."""
-        if not self._waiting or not len(self._odometer):
+        if not len(self._odometer):
             return
-        self._bridge_silence()
+        if self._waiting:
+            self._bridge_silence()
         now = self._odometer.stamp
         due = sorted((w for w in self._waiting if w[0] <= now), key=lambda w: w[0])
         self._waiting = [w for w in self._waiting if w[0] > now]
@@ -180,8 +184,7 @@ class Localizer:
                 self._use_scan(entry)
             else:
                 self._use_range(entry, until)
-        if due:
-            self._search_or_check()
+        self._search_or_check()
 
     def _bridge_silence(self) -> None:
         """Where the odometry has fallen silent, let the robot stand, and the pose become unsure."""
@@ -200,6 +203,7 @@ class Localizer:
         then = self._odometer.at(np.array([stamp]))[0]
         place = tags[min(max(entry.tag, 0), len(tags) - 1), :2]
         self._window.add_range(WindowRange(fact, then, place, self._way, stamp))
+        self._window.forget(self._way)
         if not len(self._bank):
             return
         arm = se2.transform(se2.between(self._odometer.pose, then), place)
@@ -211,7 +215,6 @@ class Localizer:
         rays = scan_rays(self._odometer, self._laser, entry)
         if self._window.wants_look(self._way) and len(rays.hit):
             self._window.add_look(WindowLook(rays.spread(RAYS), self._odometer.pose.copy(), self._way, self._odometer.stamp))
-            self._window.forget(self._way)
         walls = self.known.walls
         if not len(self._bank) or walls is None or not len(rays.hit):
             return
@@ -233,10 +236,20 @@ class Localizer:
     # ---- the start, and what ends in one
 
     def _search_or_check(self) -> None:
+        """Do a unit of a search that is under way, or begin one where it is time for it."""
         if self._certain and (why := self._doubted()):
             self._lose(why)
-        if not self._certain and self._due():
-            self._search()
+        odom = self._odometer.pose
+        if (found := self._places.advance(odom)) is not None:
+            compared = self._places.compared(found, self._bank, self._searched, odom, self._way)
+            if not self._certain:
+                self._decide_by(compared)
+            elif compared.elsewhere:
+                self._lose(_SCANS_DIFFER)
+        if self._places.idle and (not self._certain or self._running.scans_contradict()) and self._due():
+            # Of a pose that ranges vouch for, places are compared by what was measured since it was sound.
+            self._searched = self._window.since(self._running.sound) if self._certain else self._window
+            self._places.begin(self._searched, odom, self._way)
 
     def _due(self) -> bool:
         """Return whether it is time for another search, and remember it."""
@@ -247,28 +260,34 @@ class Localizer:
         return True
 
     def _doubted(self) -> str:
-        """Return why the pose counts as lost; "" = it does not."""
+        """Return why the pose counts as lost; "" = it does not.
+
+        One that ranges vouch for is given up only where another place explains better what was measured since.
+        """
+        if self._way - self._unit_way >= _UNIT_WAY:
+            self._unit_way = self._way
+            if why := self._other_unit():
+                return why
         if self._sees() and self._running.scans_contradict():
-            vouched = self._running.ranges_vouch(self._odometer.stamp)
-            # Vouched for, it is given up only where another place explains what was measured since.
-            if not vouched or (self._due() and self._compared(self._window.since(self._running.sound)).elsewhere):
-                return "the scans do not fit the walls any more"
-        elif self._running.ranges_contradict():
-            return "the ranges do not fit the anchors any more"
-        return ""
+            return "" if self._running.ranges_vouch(self._odometer.stamp) else _SCANS_DIFFER
+        return "the ranges do not fit the anchors any more" if self._running.ranges_contradict() else ""
+
+    def _other_unit(self) -> str:
+        """Return why the map's unit is another one than the sensors', by the last metres; "" = it is not."""
+        odom, way = self._odometer.pose, self._way
+        rays, ago = self._window.seen(odom, way, LOOK_BACK)
+        ranges = self._window.ranges_since(odom, way)
+        return verdict.other_unit(self.known.walls, self._bank.poses[0], rays, len(np.unique(ago)), ranges, False)
 
     def _lose(self, why: str) -> None:
         self._certain, self._confirmed, self._reason = False, None, why
         self._window = self._window.since(self._running.sound)
+        self._places.drop()
         self._running.forget_anchors()
         self._search_way, self._search_stamp = self._way, self._odometer.stamp
 
-    def _compared(self, window: Window) -> Comparison:
-        return self._places.compared(self._bank, window, self._odometer.pose, self._way)
-
-    def _search(self) -> None:
-        """Look for the robot in the whole map, weight all hypotheses again, and decide."""
-        found = self._compared(self._window)
+    def _decide_by(self, found: Comparison) -> None:
+        """Weight all hypotheses again by what a search found, and decide."""
         if not len(found.bank):
             self._bank, self._reason = found.bank, verdict.too_little(found.rays, found.ranges)
             return
@@ -279,12 +298,14 @@ class Localizer:
             self._bank = hypotheses.placed(self._bank, best, *range_moments(self._bank.poses[best], ranges))
         pose = self._bank.poses[best].copy()
         fitting = verdict.agreeing(pose, ranges)
-        self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting)
+        self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting) or verdict.other_unit(
+            self.known.walls, pose, found.rays, found.looks, ranges, True
+        )
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
-        self._decide(pose, _CONFIRM if fitting.enough and known >= verdict.FEW_ENDS else _CONFIRM_ALONE)
+        self._decide(pose, verdict.confirming_way(fit, known, fitting))
 
     def _decide(self, pose: Floats, confirm: float) -> None:
-        """Take the best hypothesis for the truth where two searches, some way apart, came to it without a doubt."""
+        """Take the best hypothesis for the truth where two searches, so many metres apart, came to it without a doubt."""
         if self._reason:
             self._confirmed = None
             return

@@ -6,8 +6,12 @@ walls' likelihood field, of which each level bounds the one below (W. Hess et al
 ICRA 2016); unlike there, all poses near the best score are kept, not the best alone: a place that looks like another one is
 not decided here. Where no wall is visible, headings and places are tried by the ranges alone. What is found is refined and
 weighed by everything that the window holds.
+
+The functions are generators that pause after every unit of work, a few thousand places: whoever has to keep pace with a lidar
+does some units between two scans.
 """
 
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,7 +98,11 @@ def field_of(walls: Walls) -> Field:
     return Field(cell, origin, tuple(levels), free, margin)
 
 
-def places(field: Field | None, walls: Walls | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Places:
+Steps = Generator[None, None, Places]
+"""A search under way; it pauses after every unit of work and returns what it found."""
+
+
+def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     """Search the map.
 
     Parameters
@@ -107,14 +115,14 @@ def places(field: Field | None, walls: Walls | None, rays: Rays, ranges: Ranges,
     Poses that explain the measurements about as well as the best one, at most MOST_PLACES, the best first; refined by ranges
     where no scan measures more.
     """
-    seen = _thinned(rays) if walls is not None else np.zeros((0, 2))
+    seen = np.zeros((0, 2)) if field is None else _thinned(rays)
     if field is not None and len(seen) >= _FEWEST_POINTS:
-        found = _by_scans(field, seen, ranges)
+        found = yield from _by_scans(field, seen, ranges)
         if len(found.poses) or not len(ranges):
             return found
     if len(np.unique(ranges.anchor)) < 2:
         return Places(np.zeros((0, 3)), False)
-    return _by_ranges(ranges, bounds)
+    return (yield from _by_ranges(ranges, bounds))
 
 
 def _thinned(rays: Rays) -> Floats:
@@ -126,7 +134,7 @@ def _thinned(rays: Rays) -> Floats:
     return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.int64))]] if len(chosen) else points[:0]
 
 
-def _by_scans(field: Field, points: Floats, ranges: Ranges) -> Places:
+def _by_scans(field: Field, points: Floats, ranges: Ranges) -> Steps:
     """Match points (p, 2) by branch and bound where the ranges allow it."""
     top = 2**_LEVELS
     rows, cols = _coarse_cells(field, top)
@@ -139,15 +147,15 @@ def _by_scans(field: Field, points: Floats, ranges: Ranges) -> Places:
     if not len(nodes):
         return Places(np.zeros((0, 3)), False)
     complete, least = True, 0.0
-    scores = _scored(field, _LEVELS, offsets, nodes)
+    scores = yield from _scored(field, _LEVELS, offsets, nodes)
     for level in range(_LEVELS, 0, -1):
-        least = max(least, _RIVAL * _dive(field, level, offsets, nodes, scores))
+        least = max(least, _RIVAL * (yield from _dive(field, level, offsets, nodes, scores)))
         kept = np.flatnonzero(scores >= least)
         if len(kept) > _MOST_NODES:
             complete = False
             kept = kept[np.argsort(-scores[kept], kind="stable")[:_MOST_NODES]]
         nodes = _children(nodes[kept], 2 ** (level - 1))
-        scores = _scored(field, level - 1, offsets, nodes)
+        scores = yield from _scored(field, level - 1, offsets, nodes)
     kept = np.flatnonzero(scores >= max(least, _RIVAL * scores.max(initial=0.0)))
     kept = kept[np.argsort(-scores[kept], kind="stable")]
     poses = np.column_stack([field.origin + (nodes[kept, :0:-1] + 0.5) * field.cell, se2.wrap_angle(headings[nodes[kept, 0]])])
@@ -170,7 +178,7 @@ def _offsets(field: Field, points: Floats, headings: Floats) -> Ints:
     return cells[..., 1] * field.free.shape[1] + cells[..., 0]
 
 
-def _scored(field: Field, level: int, offsets: Ints, nodes: Ints) -> Floats:
+def _scored(field: Field, level: int, offsets: Ints, nodes: Ints) -> Generator[None, None, Floats]:
     """Return the bounds (n,) of nodes: mean likelihood of the points, 0..1."""
     flat, wide = field.levels[level].reshape(-1), field.free.shape[1]
     scores = np.empty(len(nodes))
@@ -179,20 +187,21 @@ def _scored(field: Field, level: int, offsets: Ints, nodes: Ints) -> Floats:
         part = slice(start, start + _AT_ONCE)
         values = flat.take(offsets[nodes[part, 0]] + base[part, None], mode="clip")
         scores[part] = values.sum(axis=1, dtype=np.int64)
+        yield
     return np.asarray(scores / (255.0 * offsets.shape[1]))
 
 
 _AT_ONCE = 4096
-"""Nodes scored at once: what fits into a processor's cache."""
+"""Nodes scored at once, a unit of work of 2 ms: what fits into a processor's cache."""
 
 
-def _dive(field: Field, level: int, offsets: Ints, nodes: Ints, scores: Floats) -> float:
+def _dive(field: Field, level: int, offsets: Ints, nodes: Ints, scores: Floats) -> Generator[None, None, float]:
     """Return the score of a good pose, found by following the best nodes down: a lower bound of the best one's."""
     best = nodes[np.argsort(-scores, kind="stable")[:64]]
     found = np.zeros(0)
     for below in range(level - 1, -1, -1):
         best = _children(best, 2**below)
-        found = _scored(field, below, offsets, best)
+        found = yield from _scored(field, below, offsets, best)
         best = best[np.argsort(-found, kind="stable")[:64]]
     return float(found.max(initial=0.0))
 
@@ -221,7 +230,7 @@ def _allowed(centre: Floats, half: float, ranges: Ranges) -> Bools:
     return np.asarray(cost <= cost.min() + 0.1 * len(ranges))
 
 
-def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Places:
+def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     """Try places and headings by the ranges alone."""
     step = max(0.4, float(np.sqrt(np.prod(bounds[1] - bounds[0]) / 20_000)))
     axes = [np.arange(bounds[0][k], bounds[1][k] + step, step) for k in (0, 1)]
@@ -232,12 +241,19 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Places:
         return Places(np.zeros((0, 3)), False)
     poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
     pick = np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.int64))
-    cost = -range_likelihood(poses, chosen(ranges, pick), wider=0.6 * step)
+    few, cost = chosen(ranges, pick), np.empty(len(poses))
+    for start in range(0, len(poses), _RANGED_AT_ONCE):
+        part = slice(start, start + _RANGED_AT_ONCE)
+        cost[part] = -range_likelihood(poses[part], few, wider=0.6 * step)
+        yield
     order = np.argsort(cost, kind="stable")
-    order = order[cost[order] <= cost[order[0]] + _RANGE_RIVAL]
-    return _distinct(refined_by_ranges(_distinct(poses[order], True).poses, ranges), len(order) > 0)
+    order = order[cost[order] <= cost[order[:1]] + _RANGE_RIVAL]
+    tried = _distinct(poses[order[:_MOST_RIVALS]], True).poses
+    return _distinct(refined_by_ranges(tried, ranges), 0 < len(order) <= _MOST_RIVALS)
 
 
+_RANGED_AT_ONCE, _MOST_RIVALS = 1024, 4096
+"""Poses that are tried at once, a unit of work of 2 ms, and that may be as good before the search is not complete."""
 _RANGE_RIVAL = 12.0
 """Log-likelihood by which a place may be worse than the best one before it is refined."""
 

@@ -8,22 +8,30 @@ from ..arrays import Floats
 from . import hypotheses
 from .hypotheses import Hypotheses
 from .range_likelihood import range_errors
-from .walls import Rays
+from .scale import RANGE_LIMIT, SCAN_LIMIT, range_scale, scan_scale
+from .walls import Rays, Walls
 from .window import Ranges
 
 CERTAIN = 6.0
 """Log-likelihood by which a place must be better than any other: 400 : 1."""
 SIGMA_FOUND = (0.25, 0.1)
 """m and rad; a pose that is less sure is not found yet."""
-FIT_BESIDE_RANGES, FIT_ALONE = -0.7, -0.25
-"""Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.15, with people
-close by -0.5; rooms that are alike in part reach -0.3."""
-RANGES_FOUND = 0.5
-"""Share of the ranges that must agree with a start."""
+FIT_BESIDE_RANGES, FIT_ALONE = -0.5, -0.25
+"""Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.2, with people
+close by -0.5; rooms that are alike in part reach -0.3, other buildings beside ranges -0.35 to -0.7."""
+RANGES_FOUND, RANGES_ALONE = 0.5, 0.8
+"""Share of the ranges that must agree with a start, beside scans and alone: in the right place 0.9 to 1 alone, with anchors of
+another building 0.75 to 0.8."""
 FEW_ENDS = 12
 """Rays' ends in known space from which a scan counts."""
 ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
 """Rays' ends, or ranges to two anchors, that a start needs."""
+_FIT_CLEAR, _RANGES_CLEAR, _ANCHORS_CLEAR = -0.3, 0.75, 3
+"""Fit of the rays, share of the ranges and anchors from which they speak clearly for a place."""
+_CONFIRM, _CONFIRM_ALONE = 0.5, 2.0
+"""m driven between two searches that agree; the second where scans or ranges are alone."""
+_UNIT_KNOWN = 0.04
+"""Standard deviation of the map's unit by ranges alone, from which another one would have been noticed."""
 
 
 def doubt(bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, fitting: "RangeFit") -> str:
@@ -42,13 +50,34 @@ def doubt(bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, 
         return "too little was measured yet; drive on"
     if ends >= ENOUGH_ENDS and fit < (FIT_BESIDE_RANGES if fitting.enough else FIT_ALONE):
         return "the scans fit the walls nowhere well; is this the right map?"
-    if fitting.count >= ENOUGH_RANGES and fitting.share < RANGES_FOUND:
+    if fitting.count >= ENOUGH_RANGES and fitting.share < (RANGES_FOUND if ends >= ENOUGH_ENDS else RANGES_ALONE):
         return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
     if len(rivals) and rivals.max() > -CERTAIN:
         count = 1 + int((rivals > -CERTAIN).sum())
         return f"{count} places are as likely; drive on, around a corner or past another anchor"
     if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
         return "place or heading is not sure yet; drive on"
+    return ""
+
+
+def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges: Ranges, start: bool) -> str:
+    """Return how the distances of the map differ from the sensors' about a pose (3,); "" = they do not.
+
+    Parameters
+    ----------
+    rays : of the last metres, in the present frame of the base. looks : scans that they are of.
+    start : the place is not known yet.
+    """
+    compared = []
+    if walls is not None and int(rays.hit.sum()) >= ENOUGH_ENDS:
+        compared.append(("lidar", scan_scale(walls, pose, rays, looks), SCAN_LIMIT))
+    if len(ranges) >= ENOUGH_RANGES:
+        compared.append(("radio", range_scale(pose, ranges), RANGE_LIMIT))
+    for name, scale, limit in compared:
+        if scale.off(limit):
+            return f"distances in the map are {1.0 + scale.error:.2f} times those of the {name}; is this the right map?"
+    if start and compared and min(scale.sigma for _, scale, _ in compared) > _UNIT_KNOWN:
+        return "whether the map has the sensors' unit is not known yet; drive on"
     return ""
 
 
@@ -61,14 +90,26 @@ class RangeFit:
     """Of the ranges that agree, 0..1."""
     enough: bool
     """As many to as many anchors as a start needs agree."""
+    anchors: int
+    """To which ranges agree."""
+
+
+def confirming_way(fit: float, ends: float, fitting: RangeFit) -> float:
+    """Return how far a robot must drive, m, between two searches that agree.
+
+    Errors of scans and ranges have nothing in common: where both speak clearly for a place, each confirms the other.
+    """
+    if ends < ENOUGH_ENDS or fit < _FIT_CLEAR or not fitting.enough:
+        return _CONFIRM_ALONE
+    return 0.0 if fitting.anchors >= _ANCHORS_CLEAR and fitting.share >= _RANGES_CLEAR else _CONFIRM
 
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
     if not len(ranges):
-        return RangeFit(0, 0.0, False)
+        return RangeFit(0, 0.0, False, 0)
     agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
-    enough = len(np.unique(ranges.anchor[agree])) >= 2 and int(agree.sum()) >= ENOUGH_RANGES
-    return RangeFit(len(ranges), float(agree.mean()), bool(enough))
+    anchors = len(np.unique(ranges.anchor[agree]))
+    return RangeFit(len(ranges), float(agree.mean()), anchors >= 2 and int(agree.sum()) >= ENOUGH_RANGES, anchors)
 
 
 def too_little(rays: Rays, ranges: Ranges) -> str:

@@ -112,17 +112,20 @@ class Walls:
         q = self.points[near]
         return np.where(near >= 0, np.hypot(x - q[..., 0], y - q[..., 1]), np.inf)
 
-    def factors(self, poses: Floats, rays: Rays, gate: float, scale: float) -> tuple[Floats, Floats, Floats]:
+    def factors(
+        self, poses: Floats, rays: Rays, gate: float, scale: float, rates: tuple[Floats, ...] = ()
+    ) -> tuple[Floats, Floats, Floats]:
         """Return the quadratic form of the point-to-line distances about poses (h, 3).
 
         Parameters
         ----------
         gate : m; ends farther from a wall do not count. scale : m, width of the Geman-McClure kernel on the distance.
+        rates : (p, 2) each; how the ends move with k further unknowns, frame of the rays.
 
         Returns
         -------
-        hessian (h, 3, 3) : sum of w J^T J, J = (n, n . d(R p)/dtheta), as lidar.scan_matching.
-        gradient (h, 3) : sum of w J^T r. weight (h,) : sum of w.
+        hessian (h, 3 + k, 3 + k) : sum of w J^T J, J = (n, n . d(R p)/dtheta, n . R rate), as lidar.scan_matching.
+        gradient (h, 3 + k) : sum of w J^T r. weight (h,) : sum of w.
         """
         c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
         px, py = rays.ends[rays.hit].T
@@ -130,7 +133,8 @@ class Walls:
         x, y = rx + poses[:, :1], ry + poses[:, 1:2]
         near = self.nearest_at(x, y)
         if not len(self.points):
-            return np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3)), np.zeros(len(poses))
+            n = 3 + len(rates)
+            return np.zeros((len(poses), n, n)), np.zeros((len(poses), n)), np.zeros(len(poses))
         nx, ny = (self.normals[:, k].take(near) for k in (0, 1))
         dx, dy = x - self.points[:, 0].take(near), y - self.points[:, 1].take(near)
         ox, oy = rays.origins[rays.hit].T - rays.ends[rays.hit].T
@@ -139,7 +143,8 @@ class Walls:
         good &= (facing > 0.0) | ~self.one_sided.take(near)
         r = nx * dx + ny * dy
         w = good / np.square(1.0 + np.square(r / scale))
-        jacobian = np.stack([nx, ny, ny * rx - nx * ry], axis=1)
+        more = [nx * (c * u - s * v) + ny * (s * u + c * v) for u, v in (rate[rays.hit].T for rate in rates)]
+        jacobian = np.stack([nx, ny, ny * rx - nx * ry, *more], axis=1)
         weighted = jacobian * w[:, None]
         return weighted @ jacobian.transpose(0, 2, 1), np.einsum("hkp,hp->hk", weighted, r), w.sum(axis=1)
 

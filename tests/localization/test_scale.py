@@ -1,0 +1,74 @@
+"""Maps in another unit: the scale is measured from where the map fits best, and a pose in such a map is never certain."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.localization_room import ANCHORS, ODD, ROUND, cast, grid_of, known, path, robot
+
+from uwblite import se2
+from uwblite.localization.scale import SCAN_LIMIT, range_scale, scan_scale
+from uwblite.localization.walls import Rays, walls_of
+from uwblite.localization.window import Ranges
+
+POSES = np.array([[1.0, 2.5, 0.0], [2.0, 2.5, 0.4], [3.0, 2.6, 0.9]])
+
+
+def enlarged(room, factor):
+    """Return the room as a map in another unit: cells, walls and anchors."""
+    grid = grid_of(ODD)
+    g = grid.geometry
+    geometry = dataclasses.replace(g, resolution=g.resolution * factor, origin=g.origin * factor)
+    anchors = dataclasses.replace(room.anchors, positions=room.anchors.positions * factor)
+    return dataclasses.replace(room, anchors=anchors, walls=walls_of(dataclasses.replace(grid, geometry=geometry)))
+
+
+def rays_of(poses, way=1.0):
+    """Return the scans from poses (n, 3) in the frame of the last one; way: what the wheels make of a metre."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
+    ends, origins, hit = [], [], []
+    for pose in poses:
+        readings = cast(pose)
+        seen = np.isfinite(readings)
+        there = se2.between(poses[-1], pose) * [way, way, 1.0]
+        points = np.where(seen, readings, 0.0)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        ends.append(se2.transform(there, points))
+        origins.append(np.tile(there[:2], (len(points), 1)))
+        hit.append(seen)
+    return Rays(*(np.concatenate(v) for v in (ends, origins, hit)))
+
+
+@pytest.mark.parametrize("factor", [0.9, 0.97, 1.0, 1.05, 1.1])
+@pytest.mark.parametrize("way", [1.0, 1.04])
+def test_scans_tell_how_much_larger_the_map_is_whatever_the_wheels_count(factor, way):
+    walls = enlarged(known(), factor).walls
+    found = scan_scale(walls, POSES[-1] * [factor, factor, 1.0], rays_of(POSES, way), len(POSES))
+    # Half a cell at the mean distance of 3 m, either side.
+    assert abs(found.error - (factor - 1.0)) < 0.009
+    assert found.off(SCAN_LIMIT) == (abs(factor - 1.0) > 0.04)
+
+
+def ranges_at(poses, factor, moved=0.0):
+    """Return ranges without noise to all anchors of a map in another unit, of which one was moved."""
+    places = np.array(list(ANCHORS.values()))
+    tags = np.repeat(se2.between(poses[-1], poses)[:, :2], len(places), axis=0)
+    true = np.hypot(*(poses[:, None, :2] - places - [moved, 0.0] * (np.arange(4) == 1)[:, None]).reshape(-1, 2).T)
+    where = np.tile(places * factor, (len(poses), 1))
+    return Ranges(np.tile(np.arange(4), len(poses)), where, tags, true, np.full(len(true), 0.1))
+
+
+def test_ranges_tell_it_too_and_a_moved_anchor_is_no_other_unit():
+    poses = path(((1.0, 1.0), (6.0, 1.0), (6.0, 5.0), (2.0, 5.0)))[::5]
+    for factor in (0.9, 1.0, 1.1):
+        found = range_scale(poses[-1] * [factor, factor, 1.0], ranges_at(poses, factor))
+        # Constant errors of anchors of 0.12 m take a part of it.
+        assert abs(found.error - (factor - 1.0)) < 0.01
+    assert abs(range_scale(poses[-1], ranges_at(poses, 1.0, moved=-2.0)).error) < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+@pytest.mark.parametrize("scans", [True, False])
+def test_a_map_of_another_scale_is_never_certain(factor, scans):
+    drive = robot(enlarged(known(), factor))
+    assert all(s.lost for s in drive.along(path(ROUND), scans=scans))

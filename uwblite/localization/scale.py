@@ -1,0 +1,96 @@
+"""Whether sensors and map measure with the same metre.
+
+A map that was drawn, converted or measured in another unit still looks like the place: near every wall the pose follows the
+wall. What gives it away is that from the right place all distances are too long, or too short, by the same share. So the pose
+is matched once more together with two scales, one of the lidar's (or the radio's) distances and one of the way between the
+measurements, which belongs to the wheels and takes their error.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats
+from .range_likelihood import chosen, range_errors
+from .walls import Rays, Walls
+from .window import Ranges
+
+_PRIOR = (0.3, 0.3, 0.1, 0.1, 0.3)
+"""m, m, rad, 1, 1; of pose, way and distances."""
+_GATES = ((0.5, 0.3), (0.5, 0.3), (0.4, 0.2), (0.4, 0.15), (0.4, 0.15))
+"""m; gate and kernel width of each iteration, wide: in a map 5 % too large the far wall of a room of 5 m is off by 0.25 m."""
+_WALL_SIGMA, _PER_LOOK = 0.03, 20.0
+"""m, of a point about its wall, and points of a scan that err independently, as in hypotheses.matched."""
+_ANCHOR_SIGMA = 0.12
+"""m; what all ranges to one anchor are off by."""
+_ITERATIONS = 6
+SCAN_LIMIT, RANGE_LIMIT = 0.03, 0.05
+"""Relative error that is a lidar's or a map's own: data sheets allow 1 to 3 %; of radios besides what walls add."""
+_SURE = 4.0
+"""Standard deviations beyond the limit's nought from which it is one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """By how much the map's distances are longer than the sensor's."""
+
+    error: float
+    """Relative."""
+    sigma: float
+
+    def off(self, limit: float) -> bool:
+        """Return whether map and sensor are in different units for certain."""
+        return abs(self.error) > max(limit, _SURE * self.sigma)
+
+
+def scan_scale(walls: Walls, pose: Floats, rays: Rays, looks: int) -> Scale:
+    """Match the rays of several scans with pose, way and distances free.
+
+    Parameters
+    ----------
+    pose : (3,) about which they match. rays : in the present frame of the base. looks : scans they are of.
+    """
+    x, information = np.zeros(5), np.diag(1.0 / np.square(_PRIOR))
+    start, beam = np.append(pose, (0.0, 0.0)), rays.ends - rays.origins
+    hessian = information
+    for gate, width in _GATES:
+        origins = rays.origins * (1.0 + x[3])
+        scaled = Rays(origins + beam * (1.0 + x[4]), origins, rays.hit)
+        h, g, weight = walls.factors((start + x)[None, :3], scaled, gate, width, (rays.origins, beam))
+        share = min(_PER_LOOK * looks / max(float(weight[0]), 1e-9), 1.0) / _WALL_SIGMA**2
+        hessian = information + share * h[0]
+        x = x - np.linalg.solve(hessian, share * g[0] + information @ x)
+    return Scale(float(x[4]), float(np.sqrt(np.linalg.inv(hessian)[4, 4])))
+
+
+def range_scale(pose: Floats, ranges: Ranges) -> Scale:
+    """Fit pose, way and distances to the ranges, once with all anchors and once without the one that disagrees most.
+
+    Returns
+    -------
+    The smaller of both errors: an anchor that was moved makes no other metre.
+    """
+    whole, own = _fitted(pose, ranges)
+    odd = ranges.anchor == np.unique(ranges.anchor)[int(np.argmax(np.abs(own)))]
+    less = _fitted(pose, chosen(ranges, np.flatnonzero(~odd)))[0] if len(own) > 2 else whole
+    return min(whole, less, key=lambda s: abs(s.error) / s.sigma)
+
+
+def _fitted(pose: Floats, ranges: Ranges) -> tuple[Scale, Floats]:
+    """Return the scale and one constant error per anchor (a,), m, by Gauss-Newton with a Cauchy kernel."""
+    names, anchor = np.unique(ranges.anchor, return_inverse=True)
+    own = np.eye(len(names))[anchor]
+    information = np.diag(1.0 / np.square(np.append(_PRIOR, np.full(len(names), _ANCHOR_SIGMA))))
+    x, hessian = np.zeros(5 + len(names)), information
+    for _ in range(_ITERATIONS):
+        tags = ranges.tags * (1.0 + x[3])
+        now = Ranges(ranges.anchor, ranges.places, tags, ranges.values * (1.0 + x[4]) - own @ x[5:], ranges.sigma)
+        error, offset, lever = (v[0] for v in range_errors((pose + x[:3])[None], now))
+        unit = offset / np.maximum(np.hypot(*offset.T), 0.05)[:, None]
+        turned = unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1]
+        along = (unit * lever).sum(axis=1) / (1.0 + x[3])
+        jacobian = np.column_stack([unit, turned, along, -ranges.values, own])
+        weight = 1.0 / (1.0 + np.square(error / (2.0 * ranges.sigma))) / ranges.sigma**2
+        hessian = information + (jacobian * weight[:, None]).T @ jacobian
+        x = x - np.linalg.solve(hessian, information @ x - jacobian.T @ (weight * error))
+    return Scale(float(x[4]), float(np.sqrt(np.linalg.inv(hessian)[4, 4]))), x[5:]
