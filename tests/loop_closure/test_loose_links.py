@@ -15,7 +15,7 @@ from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig
 from uwblite.lidar.visibility import observed_free_space
 from uwblite.loop_closure.closures import LoopClosureConfig
-from uwblite.loop_closure.loose_links import contradicted, loose_links, loosened, propose, spanned
+from uwblite.loop_closure.loose_links import contradicted, loose_links, loosened, propose, spanned, untied_links
 from uwblite.loop_closure.verification import find, reconcile
 from uwblite.odometry.wheels import OdometryNoiseConfig
 
@@ -117,3 +117,16 @@ def test_pieces_stay_in_the_recording_of_their_link(walk):
     candidates, pieces = propose(graph, clouds, wheels, np.array([LINK]), recording, CONFIG, SubmapConfig())
     assert len(candidates.target) > 0
     assert pieces.last.max() <= LINK + 2
+
+
+@pytest.mark.parametrize("revisited", [False, True])
+def test_a_link_is_untied_until_scan_edges_of_another_visit_join_its_sides(walk, revisited):
+    truth, _, clouds = walk
+    graph, wheels = broken(truth, np.zeros(3))
+    again = scan_edges(truth, np.array([LINK - 5]))
+    j = again.i + 20
+    again = replace(again, j=j, T_i_j=se2.between(graph.poses[again.i], graph.poses[j]))
+    found = graph.with_edges(again) if revisited else graph
+    assert untied_links(wheels, found, clouds).tolist() == ([] if revisited else [LINK])
+    blind = replace(clouds, offsets=np.concatenate([clouds.offsets[: LINK + 1], clouds.offsets[LINK:-1]]))
+    assert untied_links(wheels, graph, blind).tolist() == []

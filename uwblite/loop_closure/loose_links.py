@@ -17,12 +17,12 @@ from ..lidar.clouds import Clouds
 from ..lidar.submaps import SubmapConfig, Submaps
 from .candidates import Candidates
 from .closures import LoopClosureConfig
-from .slid_stretches import directions_held
+from .slid_stretches import directions_held, tied_parts
 
 _LEAST_HELD = 2
 """Directions that scans fix in a sound link: a bare corridor leaves the way along it to the odometry."""
 _VIEWS = 6
-"""Keyframes of one side that make its sub-map."""
+"""Keyframes of one side that make its sub-map; fewer are no part of a map."""
 _SINGLE = 3
 """Keyframes of the other side that are each laid onto it: with more, the robot has turned to what neither has in common."""
 _LEAST_POINTS = 30
@@ -44,6 +44,21 @@ def loose_links(wheels: OdometryEdges, graph: Graph) -> Ints:
     """
     links = np.flatnonzero(directions_held(graph)[wheels.i] < _LEAST_HELD)
     return links if len(links) <= max(_EXCEPTIONS, _SHARE * len(wheels)) else links[:0]
+
+
+def untied_links(wheels: OdometryEdges, graph: Graph, clouds: Clouds) -> Ints:
+    """Return the steps of the odometry (l,) that alone hold two parts of a map together although clouds stand on both sides.
+
+    Parameters
+    ----------
+    graph : final; holds the scan edges of all visits. clouds : one per keyframe.
+    """
+    links = loose_links(wheels, graph)
+    part = tied_parts(wheels, graph, _LEAST_HELD)
+    size, i, j = np.bincount(part), wheels.i[links], wheels.j[links]
+    large = np.minimum(size[part[i]], size[part[j]]) >= _VIEWS
+    seen = np.minimum(clouds.counts[i], clouds.counts[j]) >= _LEAST_POINTS
+    return links[(part[i] != part[j]) & large & seen]
 
 
 def spanned(wheels: OdometryEdges, ties: RelativePoseEdges) -> Bools:

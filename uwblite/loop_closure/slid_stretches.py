@@ -5,6 +5,8 @@ two ends of the stretch that they move. A wheel slips once; it does not make goo
 """
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
@@ -63,6 +65,23 @@ def directions_held(graph: Graph) -> Ints:
                 over = agrees & (span > k)
                 np.maximum.at(held, first[over] + k, fixed[over])
     return held
+
+
+def tied_parts(wheels: OdometryEdges, graph: Graph, least: int) -> Ints:
+    """Return the part (k,) each keyframe belongs to: scan edges of any visits tie those of one in `least` directions or more.
+
+    Steps that such edges of the same visit hold together tie, too.
+    """
+    held = directions_held(graph)[wheels.i] >= least
+    i, j = [wheels.i[held]], [wheels.j[held]]
+    for edges in graph.edges:
+        if isinstance(edges, ScanEdges):
+            good = (_fixed(edges) >= least) & _agrees(edges, graph)
+            i.append(edges.i[good])
+            j.append(edges.j[good])
+    ends, size = (np.concatenate(i), np.concatenate(j)), len(graph.poses)
+    ties = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(size, size))
+    return np.asarray(connected_components(ties, directed=False)[1], dtype=np.int64)
 
 
 def _agrees(edges: ScanEdges, graph: Graph) -> Bools:
