@@ -5,8 +5,8 @@ import pytest
 from helpers.planted_graphs import dense_system, loop, relative_edges
 
 from uwblite import se2
-from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
-from uwblite.graph.marginals import JointCovariance, calibration_covariance, marginals
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights
+from uwblite.graph.marginals import CommonErrors, JointCovariance, calibration_covariance, marginals
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import optimize
 
@@ -163,3 +163,23 @@ def test_an_anchor_seen_from_one_place_is_uncertain_along_the_circle_only():
     along = np.array([-towards[1], towards[0]])
     assert towards @ found.anchors[0] @ towards == pytest.approx(0.1**2, rel=1e-3)
     assert along @ found.anchors[0] @ along > 1e3
+
+
+def test_common_errors_add_what_they_move_squared():
+    """Against a loop over edges with the dense inverse: each error moves the estimate by H^-1 sum J^T w s."""
+    graph, _ = calibrated(n=40)
+    edges, rng = graph.edges[1], np.random.default_rng(0)
+    edge, error = np.repeat(np.arange(len(edges)), 2), rng.integers(0, 40, 2 * len(edges))
+    shift = rng.normal(size=(len(edge), 3))
+    H, _, number = dense_system(graph)
+    weights, slopes = edge_weights(edges, graph), np.zeros((len(H) + 1, 40))
+    for name, index, jacobian in edges.linearize(graph).blocks:
+        for e, k, s in zip(edge, error, shift, strict=True):
+            slopes[number[name][index[e]], k] += weights[e] * jacobian[e].T @ s
+    moved = np.vstack([np.linalg.solve(H, slopes[:-1]), np.zeros((1, 40))])
+    before, after = marginals(graph), marginals(graph, [CommonErrors(edges, edge, error, shift)])
+    for name, one, other in (("poses", before.poses, after.poses), ("anchors", before.anchors, after.anchors)):
+        own = moved[number[name]]
+        np.testing.assert_allclose(other - one, own @ own.transpose(0, 2, 1), rtol=1e-6, atol=1e-12)
+    own = np.square(moved[number["calibration"][:, 0]]).sum(axis=1)
+    np.testing.assert_allclose(after.calibration**2 - before.calibration**2, own, rtol=1e-6, atol=1e-12)

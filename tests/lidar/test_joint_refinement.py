@@ -18,7 +18,6 @@ from uwblite.lidar.joint_refinement import (
     refine,
     surface_cells,
     with_fewer_pairs,
-    with_surface_errors,
 )
 
 CONFIG = RefinementConfig()
@@ -184,17 +183,3 @@ def test_fewer_pairs_inform_nearly_as_much():
     ratio = np.sqrt(marginals(fewer).poses[1:, [0, 1, 2], [0, 1, 2]] / marginals(whole).poses[1:, [0, 1, 2], [0, 1, 2]])
     assert np.all(np.median(ratio, axis=0) > 0.9)
     assert np.all(np.median(ratio, axis=0) < 1.7)
-
-
-def test_errors_of_surfaces_make_sigmas_larger_and_move_nothing():
-    """Scan edges alone tie these poses: twice their variance is twice the covariance, but for the kernel, which then trusts
-    far matches a little more; the wheels' edges stay as they are."""
-    truth, path, clouds = room(5, 0.01)
-    graph = Graph(truth).with_edges(chained(truth, NOISE))
-    result = refined(graph, clouds, path, selections=1)
-    alone, both = Graph(truth, edges=(result.edges,)), result.graph.with_edges(result.edges)
-    before, after = (np.einsum("kii->ki", marginals(g).poses[1:]) for g in (alone, with_surface_errors(alone)))
-    assert np.all(after > 1.9 * before)
-    assert np.all(after < 2.0001 * before)
-    assert with_surface_errors(both).edges[0] is both.edges[0]
-    assert with_surface_errors(both).poses is both.poses

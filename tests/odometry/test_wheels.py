@@ -4,18 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.laser_walks import chained
 from helpers.planted import drive, odometry, wander
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.graph.calibration import CalibrationConfig, block, unknowns
+from uwblite.graph.calibration import CalibrationConfig, block, scan_indices, unknowns
 from uwblite.graph.graph import Calibration, Graph
-from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.graph.solver import optimize
 from uwblite.odometry.keyframes import KeyframeConfig, select
-from uwblite.odometry.wheels import OdometryNoiseConfig, reestimate_wheel_noise, wheel_edges
+from uwblite.odometry.wheels import OdometryNoiseConfig, reestimate_wheel_noise, wheel_edges, with_floor_errors
 from uwblite.sensor_log import Odometry
 
 NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
@@ -119,3 +120,24 @@ def test_noise_does_not_draw_the_wheels_scale(calibration):
     reach = sigma[0] / np.sqrt((wheels.motion**2).sum(axis=0))
     assert solved.calibration.get("odometry_scale") == pytest.approx(scale, abs=4 * reach[0])
     assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])
+
+
+@pytest.mark.parametrize(("alike", "measured", "factor"), [(0.0, True, 1.0), (0.8, True, 2.0), (0.8, False, 1.0)])
+def test_floors_inflate_what_adds_up(alike, measured, factor):
+    """Half-and-half of white errors and of a floor alike over ten steps: the sum over ten steps from anywhere has about
+    0.36 + 0.64 * 10 * 2 / 3 = 4.6 times the variance of independent ones; nothing changes where no lidar saw it."""
+    rng, n = np.random.default_rng(3), 2000
+    floor = np.repeat(rng.standard_normal(n // 10), 10)
+    turn = 0.01 * (np.sqrt(1.0 - alike**2) * rng.standard_normal(n) + alike * floor)
+    steps = np.tile([0.3, 0.0, 0.0], (n, 1))
+    truth = np.column_stack([0.3 * np.arange(n + 1), np.zeros(n + 1), np.zeros(n + 1)])
+    wheels = chained(truth, (0.01, 0.01, 0.01))
+    wheels = replace(wheels, motion=steps + turn[:, None] * [0.0, 0.0, 1.0])
+    root, still = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+    seen = ScanEdges(np.arange(n), np.arange(1, n + 1), steps, root, still, still, scan_indices(Calibration()))
+    graph = Graph(truth).with_edges(wheels, *([seen] if measured else []))
+    inflated = with_floor_errors(graph)
+    assert inflated.poses is graph.poses
+    ratio = wheels.sqrt_information[0].diagonal() / inflated.edges[0].sqrt_information[0].diagonal()
+    np.testing.assert_allclose(ratio, [1.0, 1.0, factor], atol=0.25)
+    assert np.all(ratio >= 1.0)

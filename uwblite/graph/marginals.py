@@ -1,5 +1,7 @@
 """Marginal covariances of an optimised graph, from the sparse factor of its normal equations."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -10,14 +12,29 @@ from scipy.sparse.linalg import SuperLU
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .graph import Graph
+from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
 
+_COMMON_AT_ONCE = 32
+"""Common errors solved for together."""
 _AT_ONCE = 300
 """Right-hand sides solved together: bounds the memory."""
 _DEPENDENT = 1e-13
 """Pivot, as a share of its diagonal entry, below which a direction counts as measured by nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonErrors:
+    """Independent errors of unit variance, each of which many edges of one kind have in common."""
+
+    edges: Edges
+    edge: Ints
+    """(m,) edge."""
+    error: Ints
+    """(m,) number of the error that it meets."""
+    shift: Floats
+    """(m, d) change of the edge's whitened residual by that error."""
 
 
 class Marginals:
@@ -27,17 +44,41 @@ class Marginals:
     leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
     """
 
-    def __init__(self, graph: Graph, normal: NormalEquations) -> None:
+    def __init__(self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = ()) -> None:
         self._graph, self._unknowns = graph, normal.unknowns
         self._factor = _factor(normal)
         unseen = np.append(normal.diagonal <= 0, False)
         blocks = self._block_diagonal(unseen)
+        for errors in common:
+            self._consider(errors, blocks)
         self.poses = blocks["poses"]
         """(n, 3, 3) of x, y, theta, map frame, m and rad."""
         self.anchors = blocks["anchors"]
         """(a, 2, 2) m^2, map frame."""
         self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
         """(c,) standard deviations, unit by name."""
+
+    def _consider(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
+        """Add to the covariances what errors that nothing estimates make: H^-1 J^T W s of each, squared.
+
+        These are the consider parameters of Schmidt (Application of state-space methods to navigation problems, 1966).
+        """
+        numbers = self._unknowns.number
+        weights = edge_weights(common.edges, self._graph)[common.edge]
+        slopes = [
+            (numbers[name][index[common.edge]], np.einsum("mdk,md,m->mk", jacobian[common.edge], common.shift, weights))
+            for name, index, jacobian in common.edges.linearize(self._graph).blocks
+        ]
+        for first in range(0, int(common.error.max(initial=-1)) + 1, _COMMON_AT_ONCE):
+            some = (common.error >= first) & (common.error < first + _COMMON_AT_ONCE)
+            right = np.zeros((self._unknowns.size + 1, _COMMON_AT_ONCE))
+            for rows, values in slopes:
+                np.add.at(right, (rows[some], common.error[some, None] - first), values[some])
+            right[-1] = 0.0
+            right[:-1] = self._factor.solve(right[:-1])
+            for name, block in blocks.items():
+                moved = right[numbers[name]]
+                block += moved @ moved.transpose(0, 2, 1)
 
     def _block_diagonal(self, unseen: Bools) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
@@ -143,9 +184,12 @@ def _factor(normal: NormalEquations) -> SuperLU:
     return cast(SuperLU, normal.factor(np.where(seen, 1e-12 * diagonal, 1.0)))
 
 
-def marginals(graph: Graph) -> Marginals:
-    """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand."""
-    return Marginals(graph, filled(graph, subtrees=True))
+def marginals(graph: Graph, common: Sequence[CommonErrors] = ()) -> Marginals:
+    """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand.
+
+    Those of single unknowns contain what common errors add.
+    """
+    return Marginals(graph, filled(graph, subtrees=True), common)
 
 
 def calibration_covariance(graph: Graph) -> Floats:

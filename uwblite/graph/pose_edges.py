@@ -175,6 +175,9 @@ class ScanEdges(EdgeTable):
     """Delay with which the clouds were made, s."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
+    by_surface: Floats | None = None
+    """(e, 4, 3) change of e by an error of the ranges to surfaces that face each quarter of the map, m/m and rad/m; None = not
+    known. Only covariances take it into account (lidar/surface_errors.py)."""
 
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 

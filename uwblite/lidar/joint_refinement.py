@@ -234,24 +234,6 @@ def with_fewer_pairs(graph: Graph, most: int = 12000) -> Graph:
     return replace(graph, edges=tuple(_every_nth(e, most) if isinstance(e, ScanEdges) else e for e in graph.edges))
 
 
-def with_surface_errors(graph: Graph) -> Graph:
-    """Return the graph with its scan edges inflated by errors that stay with surfaces; poses stay where they are.
-
-    A lidar of this kind errs by 1 to 4 cm with paint, material and angle (Kneip et al. 2009), and all clouds that see a
-    wall from one side err alike: no residual shows it, and no number of pairs averages it out. It is taken to be as large
-    as the noise that the residuals show, so that variances double: in rooms that are simulated with such errors this brings
-    stated and true errors nearer to each other, not everywhere together (docs/accuracy.md).
-    """
-    factor = 1.0 / np.sqrt(_SURFACES)
-    scans = {n: e for n, e in enumerate(graph.edges) if isinstance(e, ScanEdges)}
-    inflated = {n: replace(e, sqrt_information=factor * e.sqrt_information) for n, e in scans.items()}
-    return replace(graph, edges=tuple(inflated.get(n, e) for n, e in enumerate(graph.edges)))
-
-
-_SURFACES = 2.0
-"""Variance of a scan edge with errors of surfaces, as a multiple of that by its residuals."""
-
-
 def _every_nth(edges: ScanEdges, most: int) -> ScanEdges:
     gap = np.abs(edges.i - edges.j)
     near, far = np.flatnonzero(gap <= _NEIGHBOURS), np.flatnonzero(gap > _NEIGHBOURS)

@@ -4,13 +4,13 @@ Nearest neighbours come from one raster per cloud. A pair's matches are condense
 pose (3 x 3), which is all that the graph needs to know of them.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
 from .degeneracy import relative_eigen
@@ -117,20 +117,7 @@ def _match(
     gate: float, scale: float,
 ) -> PairFactors:
     """Match pairs (e,) whose source points stand in a table (e, n): per-pair values are columns (e, 1)."""
-    c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
-    px, py = surface.x.take(row), surface.y.take(row)
-    rx, ry = c * px - s * py, s * px + c * py
-    x, y = rx + T_i_j[:, :1], ry + T_i_j[:, 1:2]
-    found = look_up(raster, i, x, y)
-    near = found >= 0
-    target = found + clouds.offsets[i, None]
-    target *= near
-    nx, ny = surface.nx.take(target), surface.ny.take(target)
-    dx, dy = x - surface.x.take(target), y - surface.y.take(target)
-    sx, sy = surface.nx.take(row), surface.ny.take(row)
-    facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
-    good = near & (dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING) & (row >= 0)
-    r = nx * dx + ny * dy
+    rx, ry, target, nx, ny, r, good = _looked_up(clouds, surface, raster, i, T_i_j, row, gate)
     root = good / (1.0 + np.square(r * (1.0 / scale)))
     weighted = np.empty((len(i), 4, row.shape[1]))
     wx, wy = np.multiply(root, nx, out=weighted[:, 0]), np.multiply(root, ny, out=weighted[:, 1])
@@ -153,6 +140,69 @@ def _match(
     )
 
 
+def _looked_up(
+    clouds: Clouds, surface: _Surface, raster: CloudRasters, i: Ints, T_i_j: Floats, row: NDArray[np.int32], gate: float
+) -> tuple[Floats, Floats, Ints, Floats, Floats, Floats, Bools]:
+    """Return (e, n) of source points: coordinates turned into the target's axes, the target's point and normal, the distance
+    r from its line, and whether it is a match."""
+    c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
+    px, py = surface.x.take(row), surface.y.take(row)
+    rx, ry = c * px - s * py, s * px + c * py
+    x, y = rx + T_i_j[:, :1], ry + T_i_j[:, 1:2]
+    found = look_up(raster, i, x, y)
+    near = found >= 0
+    target = found + clouds.offsets[i, None]
+    target *= near
+    nx, ny = surface.nx.take(target), surface.ny.take(target)
+    dx, dy = x - surface.x.take(target), y - surface.y.take(target)
+    sx, sy = surface.nx.take(row), surface.ny.take(row)
+    facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
+    good = near & (dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING) & (row >= 0)
+    return rx, ry, target, nx, ny, nx * dx + ny * dy, good
+
+
+def shifts_by_range_error(
+    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float, turn: Floats
+) -> Floats:
+    """Return by how much an error of all ranges to surfaces that face one way moves what pairs measure.
+
+    A range too long by c puts points c farther out along their rays. Seen from one place, that moves a wall by less where the
+    ray is oblique; from the next place it is another part of the wall that is moved less, and the pair comes out shifted and
+    turned: r changes by n . (R ray_p - ray_q) for each match. The ray is taken from the origin of the base: where exactly the
+    laser stands changes both rays alike.
+
+    Parameters
+    ----------
+    gate, scale, points : see match. turn : (e,) heading of cloud i in a frame that all pairs share, rad: the ways to face are
+        the quarters about its axes.
+
+    Returns
+    -------
+    (e, 4, 3) change of the error Z^-1 T_i_j by metre of the surfaces that face each quarter, m/m and rad/m; 0 along what the
+    scans cannot see.
+    """
+    surface = _Surface.of(clouds)
+    factors, slopes = match(clouds, raster, i, T_i_j, points, gate, scale), np.zeros((len(i), 4, 3))
+    at_once = max(_AT_ONCE // max(points.row.shape[1], 1), 1)
+    for first in range(0, len(i), at_once):
+        part = slice(first, first + at_once)
+        pose, row = T_i_j[part], points.row[part]
+        rx, ry, target, nx, ny, r, good = _looked_up(clouds, surface, raster, i[part], pose, row, gate)
+        qx, qy = surface.x.take(target), surface.y.take(target)
+        far_p, far_q = np.maximum(np.hypot(rx, ry), _NEAREST), np.maximum(np.hypot(qx, qy), _NEAREST)
+        by_range = nx * (rx / far_p - qx / far_q) + ny * (ry / far_p - qy / far_q)
+        weighted = good / np.square(1.0 + np.square(r * (1.0 / scale))) * by_range
+        quarter = np.floor((np.arctan2(ny, nx) + turn[part, None]) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
+        for k in range(4):
+            own = weighted * (quarter == k)
+            slopes[part, k] = np.stack([(own * nx).sum(1), (own * ny).sum(1), (own * (ny * rx - nx * ry)).sum(1)], axis=1)
+    moved = np.stack([nondegenerate_step(replace(factors, gradient=slopes[:, k]))[0] for k in range(4)], axis=1)
+    moved[..., :2] = se2.rotate(-T_i_j[:, None, 2], moved[..., :2])
+    return -moved
+
+
+_NEAREST = 0.05
+"""Least distance of a point whose ray has a direction, m."""
 _MEASURED = 2.0
 """Multiple of the spurious information that a direction must exceed to have been measured."""
 

@@ -12,6 +12,7 @@ from ..graph.unknowns import free_unknowns
 from ..grid import occupancy_grid as grids
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid, Sweeps
+from ..lidar.surface_errors import with_range_errors
 from .estimate import Estimate, Task
 from .map_frame import cropped
 from .progress import Stage
@@ -34,9 +35,22 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
         for _ in range(_LAPS):
             estimate = _solved(with_range_noise(estimate, task.config), task)
         estimate = _anchors_alone(estimate, task)
+    estimate = _with_range_errors(estimate, task)
     # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
     scans = estimate.scans if task.config.align == "walls" else None
     return replace(estimate, graph=estimate.problem, scans=scans, steps=None, joint=None)
+
+
+def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
+    """Return the estimate with what errors of ranges to surfaces do to its scan edges, for the covariances."""
+    scans = estimate.scans
+    if scans is None:
+        return estimate
+    joint, steps = (
+        edges if edges is None else with_range_errors(edges, estimate.graph, scans.clouds, scans.raster, task.config.refinement)
+        for edges in (estimate.joint, estimate.steps if estimate.joint is None else None)
+    )
+    return replace(estimate, joint=joint, steps=estimate.steps if steps is None else steps)
 
 
 _LAPS = 2

@@ -8,11 +8,15 @@ from ..arrays import Floats, spread_about_median
 from ..graph.calibration import CalibrationConfig, Unknown, unknowns
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
+from ..graph.pose_edges import ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
-from ..lidar.joint_refinement import with_fewer_pairs, with_surface_errors
+from ..lidar.joint_refinement import with_fewer_pairs
+from ..lidar.surface_errors import common_range_errors
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
 from ..odometry.wheels import with_floor_errors
+from ..radio.range_measurements import learn_noise
+from ..radio.range_noise import RangeNoiseConfig
 from . import plausibility
 from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
@@ -28,7 +32,8 @@ _SHOWN = 0.7
 def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> MapResult:
     """Gather the result of a run; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
-    covariance = marginals(with_floor_errors(with_surface_errors(with_fewer_pairs(graph))))
+    stated = with_floor_errors(_with_steady_errors(with_fewer_pairs(graph), len(estimate.anchor_ids), task.config.ranges))
+    covariance = marginals(stated, common_range_errors(stated))
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
     if ranges is not None and estimate.placed.any():
@@ -69,6 +74,19 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
         warnings=tuple(stages.warnings),
         doubts=tuple(stages.doubts),
     )
+
+
+def _with_steady_errors(graph: Graph, anchors: int, config: RangeNoiseConfig) -> Graph:
+    """Return the graph with ranges that count once what they err alike by direction and distance; poses stay where they are.
+
+    Where a lidar holds the poses, the final optimisation has done so. Where ranges alone do, the poses follow such errors as
+    the anchors do, and no residual shows it.
+    """
+    if config.steady == 0.0 or any(isinstance(e, ScanEdges) for e in graph.edges):
+        return graph
+    return replace(graph, edges=tuple(
+        learn_noise(e, graph, anchors, config, steady=True)[0] if isinstance(e, RangeEdges) else e for e in graph.edges
+    ))  # fmt: skip
 
 
 def _unknowns(recording: Recording, config: CalibrationConfig) -> tuple[Unknown, ...]:
