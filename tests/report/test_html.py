@@ -202,3 +202,11 @@ def test_kept_and_rejected_closures_are_distinguished():
     assert groups["kept"].count("<path") == 1
     assert "consistent with the others" in groups["kept"]
     assert groups["rejected"].count("<path") == 2
+
+
+def test_the_name_of_an_anchor_at_the_edge_has_room():
+    result = small_result()
+    far = replace(result.anchors[0], position=np.array([500.0, 0.0]))
+    text = render(replace(result, anchors=(far,)), title="run.log", command="uwblite", grid_png=None)
+    x, _, width, _ = map(float, re.search(r'id="map-view" viewBox="([^"]*)"', text)[1].split())
+    assert x + width > 500.0 + 0.1 * width

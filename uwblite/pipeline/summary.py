@@ -122,8 +122,9 @@ def _anchor(
     if found.ambiguous[k] and len(found.hypotheses[k]) > 1:
         status, alternative = "mirror-ambiguous", found.hypotheses[k][1].position
         reason = "the path past it is too straight: a mirrored place explains its ranges about as well"
-    elif used < 0.5:
-        status, reason = "distrusted", f"only {used:.0%} of its ranges agree with the map"
+    if used < 0.5:
+        few = f"only {used:.0%} of its ranges agree with the map"
+        status, reason = ("distrusted", few) if status == "ok" else (status, f"{few}; {reason}")
     return AnchorEstimate(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, spread_about_median(own), status, reason,
         alternative,

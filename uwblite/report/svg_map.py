@@ -12,6 +12,8 @@ from .printable import sigma_text
 
 MOST_POINTS = 4000
 """Points of one line drawn at most."""
+_NAME = 0.12
+"""Room to the right of an anchor for its name, as a share of the map's size on a phone."""
 MOST_CLOSURES = 1500
 """Rejected closures drawn and listed at most; accepted ones all are."""
 
@@ -44,7 +46,10 @@ def _extent(result: MapResult) -> tuple[float, float, float, float]:
     points = np.concatenate(parts)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
-    margin = 0.03 * float(np.max(high - low)) + 0.5
+    size = float(np.max(high - low))
+    names = [float(a.position[0]) + _NAME * size for a in result.anchors if np.isfinite(a.position).all()]
+    high = np.array([max([high[0], *names]), high[1]])
+    margin = 0.03 * size + 0.5
     return (
         float(low[0]) - margin,
         -float(high[1]) - margin,
@@ -86,7 +91,8 @@ def draw(result: MapResult, grid_png: bytes | None) -> str:
     boxes = "".join(_switch(name, text, True) for name, text in layers) + _switch("rejected", "closures rejected", False)
     names = (("zoom-in", "+", "zoom in"), ("zoom-out", "\u2212", "zoom out"), ("zoom-all", "all", "all of the map"))
     buttons = " ".join(f'<button id="{name}" aria-label="{label}">{text}</button>' for name, text, label in names)
-    words = "Green: start; ring: end. Wheel or pinch zooms, dragging moves; point at things for details."
+    unclear = "orange triangle: an anchor that is not certain; " if any(a.status != "ok" for a in result.anchors) else ""
+    words = f"Green: start; ring: end; {unclear}wheel or pinch zooms, dragging moves; point at things for details."
     paths = "".join(f'<i class="key path{r % 4}"></i> recording {r + 1} ' for r in recordings if len(recordings) > 1)
     hint = f'<p class=hint><output id="place"></output>{paths}{words}</p>'
     return f"<div class=controls>{boxes}<span class=buttons>{buttons}</span></div><div class=mapbox>{svg}</div>{hint}"

@@ -38,6 +38,10 @@ function anchorMark(id, place, size) {
     shape("text", {x: 1.2, y: .5, "font-size": 1.6}, id));
   return node;
 }
+function makeRoom(xs, ys, anchors) {  // for the names, to the right of their anchors
+  const size = Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys));
+  for (const a of anchors) if (a.place) xs.push(a.place[0] + .12 * size);
+}
 function scaleBar(x, y, size) {
   const power = 10 ** Math.floor(Math.log10(size / 5)), length = power * [5, 2, 1].find(n => n * power <= size / 5);
   const node = shape("g", {class: "bar"});

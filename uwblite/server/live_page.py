@@ -57,6 +57,7 @@ function drawMap() {
   if (map.image) points.push([map.image.x, map.image.y], [map.image.x + map.image.width, map.image.y + map.image.height]);
   if (!points.length) points.push([0, 0]);
   const xs = points.map(p => p[0]), ys = points.map(p => p[1]);
+  makeRoom(xs, ys, placed);
   const x0 = Math.min(...xs) - 1, x1 = Math.max(...xs) + 1, y0 = Math.min(...ys) - 1, y1 = Math.max(...ys) + 1;
   shown = [x0, y0, x1, y1];
   const size = Math.max(x1 - x0, y1 - y0);

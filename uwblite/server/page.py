@@ -98,6 +98,7 @@ function picture(run, number, detail) {
   const points = run.paths.flat().concat(run.anchors.filter(a => a.place).map(a => a.place));
   if (run.image) points.push([run.image.x, run.image.y], [run.image.x + run.image.width, run.image.y + run.image.height]);
   const xs = points.map(p => p[0]), ys = points.map(p => p[1]);
+  makeRoom(xs, ys, run.anchors);
   const x0 = Math.min(...xs) - .5, x1 = Math.max(...xs) + .5, y0 = Math.min(...ys) - .5, y1 = Math.max(...ys) + .5;
   const size = Math.max(x1 - x0, y1 - y0);
   const svg = shape("svg", {viewBox: [x0, -y1, x1 - x0, y1 - y0].join(" "), class: "hideno", role: "img",
