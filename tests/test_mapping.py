@@ -290,7 +290,7 @@ DELAY = (
     "name", ["kasdorf_2017-11-17-12-31-28", pytest.param("mines_exp1", marks=pytest.mark.xfail(reason=DELAY))]
 )
 def test_real_recordings_without_a_truth(shared_data, name):
-    """Nothing to compare with: the map must be of what was seen, and halves of the drive must agree with the whole."""
+    """Nothing to compare with: the map must be of what was seen, and halves of the recording must agree with the whole."""
     log = read_log(shared_data / name / "run.log.gz")
     result = build_map(log)
     assert np.isfinite(result.trajectory).all()

@@ -75,7 +75,7 @@ def mapped(place: Place, name: str = "default", keep: Path | None = None) -> Gro
 
 
 def played(place: Place, keep: Path | None = None) -> Trial:
-    """Return another drive by another robot, from another day, in the same building."""
+    """Return another path of another robot, from another day, in the same building."""
     with _folder(keep) as folder:
         settings = replace(place.settings, seed=place.seed + 1, minutes=PLAYED, scan_rate=10.0)
         return _recorded(settings, Path(folder) / place.name / "played")

@@ -6,7 +6,7 @@
     python tools/localization.py --keep grounds            maps and recordings are kept there and used again
     python tools/localization.py --print                  nothing written
 
-A map is made of one simulated recording, a second recording of another drive by another robot, from another day, is played
+A map is made of one simulated recording, a second recording of another path of another robot, from another day, is played
 against it, in rooms with the errors of real ones (simulation/real_rooms.py): patches of floor and bumps, a radio whose errors
 stay with places and directions, glass, people who walk about, an operator who stops.
 Starts: so many moments of the second recording at which the robot is within the map, nothing known; a start that is found more

@@ -440,5 +440,5 @@ def _harmonics(angle: Floats) -> Floats:
 
 
 def solve(recording: Recording, log: SensorLog, lidar: bool = True) -> OracleFigures:
-    """Return what the measurements of a drive allow."""
+    """Return what the measurements of a recording allow."""
     return Oracle(recording, log, lidar).solve()

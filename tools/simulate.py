@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--gzip", action="store_true", help="write run.log.gz")
     add = p.add_argument
     add("--seed", type=int, default=0)
-    add("--minutes", type=float, help="length of the drive; default: as usual for the world")
+    add("--minutes", type=float, help="length of the recording; default: as usual for the world")
     add("--speed", type=float, help="m/s (0.2)")
     add("--odometry-rate", type=float, help="Hz (20)")
     add("--odometry-scale", type=float, help="all odometry errors times this (1)")

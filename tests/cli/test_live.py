@@ -22,7 +22,7 @@ from uwblite.io.map_server import write_map
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """A map folder, a log of a drive through it, and where the robot was."""
+    """A map folder, a log of a path through it, and where the robot was."""
     folder = tmp_path_factory.mktemp("live")
     rows = "".join(f"{name},{x},{y},0.01,0.01,0.0,0.05,ok\n" for name, (x, y) in ANCHORS.items())
     (folder / "anchors.csv").write_text("id,x,y,sigma_x,sigma_y,bias,residual_rms,status\n" + rows)

@@ -190,7 +190,7 @@ def test_walls_are_turned_along_the_axes_and_the_map_cropped(minute_log, room_lo
     words = ["--align", "walls", "--crop=-2,-1,3,3", "--without", "uwb"]
     assert main(["map", str(minute_log), "--out", str(folder), *words]) in (0, 3)
     _, poses = read_tum(folder / "trajectory.tum")
-    # The room's walls lie along the axes of its truth; the drive began at a known heading there.
+    # The room's walls lie along the axes of its truth; the recording began at a known heading there.
     _, truth = read_tum(room_log.parent / "room" / "truth.tum")
     turned = np.degrees(np.median(poses[:, 2] - truth[: len(poses), 2])) % 90.0
     assert min(turned, 90.0 - turned) < 1.0

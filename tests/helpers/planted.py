@@ -18,7 +18,7 @@ def drive(twists, seconds, rate=20.0, start=(0.0, 0.0, 0.0)) -> tuple[np.ndarray
 
 
 def wander(rng, metres, speed=0.5, rate=10.0, half_width=5.0, start=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps and true poses of a drive between random goals in a square about the origin, turning smoothly."""
+    """Return stamps and true poses of a path between random goals in a square about the origin, turning smoothly."""
     x, y, theta = start
     goal, twists = rng.uniform(-half_width, half_width, 2), []
     for _ in range(int(metres / speed * rate)):

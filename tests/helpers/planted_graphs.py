@@ -127,7 +127,7 @@ def dense_system(graph):
 
 
 def lawn(seed, n=1500, side=60.0, drift=0.02):
-    """Return a long drive between random goals with 16 anchors, guessed by dead reckoning; the truth; the anchors."""
+    """Return a long path between random goals with 16 anchors, guessed by dead reckoning; the truth; the anchors."""
     rng = np.random.default_rng(seed)
     truth = np.zeros((n, 3))
     truth[0, :2] = goal = np.array([side / 2, side / 2])

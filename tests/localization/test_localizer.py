@@ -76,7 +76,7 @@ LINE = {"A": (0.5, 0.0), "B": (7.5, 0.0)}
 
 
 def test_mirror_images_of_a_straight_drive_stay_two_until_it_turns():
-    """Two anchors in a row with the drive: what lies left and right of them looks the same."""
+    """Two anchors in a row with the path: what lies left and right of them looks the same."""
     drive = robot(known(None, LINE), anchors=LINE)
     straight = path(((1.0, 2.0), (7.0, 2.0)))
     state = drive.along(straight, scans=False)[-1]

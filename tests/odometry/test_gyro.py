@@ -27,7 +27,7 @@ def gyro_of(stamps, truth, rng=None, bias=BIAS, noise=0.0, rate=100.0) -> Gyro:
 
 
 def rested(stamps, truth, seconds=6.0):
-    """Return the drive with a rest before it."""
+    """Return the recording with a rest before it."""
     rest = np.arange(0.0, seconds, stamps[1] - stamps[0])
     return np.concatenate([rest, stamps + seconds]), np.concatenate([np.repeat(truth[:1], len(rest), axis=0), truth])
 

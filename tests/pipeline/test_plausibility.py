@@ -21,7 +21,7 @@ LEVEL = SensorMounting(anchor_height=0.0)
 
 
 def run(seed=3, walls=None, scale=1.0, turn_scale=1.0, metres=80.0, radio_scale=1.0):
-    """Return stamps, truth and the recording of a drive among four anchors."""
+    """Return stamps, truth and the recording of a path among four anchors."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, metres)
     wheels = odometry(stamps, truth, rng, scale=scale, turn_scale=turn_scale, noise=0.01, turn_noise=0.01)

@@ -21,7 +21,7 @@ LEVEL = SensorMounting(anchor_height=0.0)
 
 
 def planted_run(seed=1, metres=150.0, sigma=0.04, **more):
-    """Return stamps, truth and the recording of a drive among four anchors."""
+    """Return stamps, truth and the recording of a path among four anchors."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, metres)
     wheels = odometry(stamps, truth, rng, scale=1.02, turn_scale=0.97, noise=0.01, turn_noise=0.01)

@@ -131,7 +131,7 @@ def reversed_in_time(wheels: Odometry, radio: UwbRanges) -> tuple[Odometry, UwbR
 
 @pytest.mark.parametrize("seed", [31, pytest.param(32, marks=pytest.mark.slow)])
 def test_the_result_does_not_depend_on_where_the_run_starts(seed):
-    """Forwards, backwards and without its first third, the same drive gives the same places."""
+    """Forwards, backwards and without its first third, the same recording gives the same places."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, 150.0)
     places = places_around(rng, 4)

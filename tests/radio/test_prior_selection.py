@@ -47,7 +47,7 @@ def test_the_prior_in_use_is_the_measure_of_others():
 
 
 def solved(seed, bias=(0.0,) * 4, scale=1.0):
-    """Return the graph of a drive whose poses are known, solved for anchors, scale and biases, and its edges."""
+    """Return the graph of a path whose poses are known, solved for anchors, scale and biases, and its edges."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, 60.0)
     radio = ranges(rng, stamps, truth, PLACES, sigma=0.05, bias=bias)
@@ -134,7 +134,7 @@ def test_only_priors_of_units_and_biases_change():
 
 
 def driven(seed, scale=1.0, unit=1.0):
-    """Return the graph of a drive whose wheels count other units and whose radio has another scale, solved, and its edges."""
+    """Return the graph of a path whose wheels count other units and whose radio has another scale, solved, and its edges."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, 60.0)
     radio = ranges(rng, stamps, truth, PLACES, sigma=0.05)

@@ -19,7 +19,7 @@ MOUNTING = SensorMounting(tag_position=np.array([0.2, -0.1, 0.4]), anchor_height
 
 
 def world(seed, metres=40.0, anchors=3, **settings):
-    """Return stamps, truth, keyframes, places of anchors and edges of a drive with exact odometry."""
+    """Return stamps, truth, keyframes, places of anchors and edges of a path with exact odometry."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, metres)
     places = rng.uniform(-6, 6, (anchors, 2))

@@ -215,7 +215,7 @@ def test_ranges_from_one_place_weigh_as_one_draw_of_the_steady_part(n, distance,
 
 @given(st.floats(0.5, 5.0), st.floats(2.0, 20.0))
 def test_what_is_steady_depends_on_directions_and_ratios_of_distances(radius, factor):
-    """The same drive around an anchor at any scale; errors from all sides are more draws than errors from one."""
+    """The same path around an anchor at any scale; errors from all sides are more draws than errors from one."""
     bearing = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
     ring = radius * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
     near, far = steady_sigma(ring, CONFIG), steady_sigma(factor * ring, CONFIG)

@@ -64,7 +64,7 @@ def _settings(text: str, path: str) -> object:
 
 
 def _log(readings: int = 40) -> bytes:
-    """Return a recording of a drive along a wall with three anchors, as large as it takes to be mapped."""
+    """Return a recording of a path along a wall with three anchors, as large as it takes to be mapped."""
     rng, anchors = np.random.default_rng(1), (("91A3", 3.0, 6.0), ("5C0B", 3.0, 4.0), ("0D27", 6.0, -3.0))
     lines = [LOG.decode()]
     for k in range(readings):

@@ -32,9 +32,9 @@ class FloorPlan:
     landmarks: tuple[str, ...]
     """Names of the first columns; the rest of the columns (table legs) have none."""
     start: tuple[float, float, float]
-    """Pose at which the drive begins."""
+    """Pose at which the recording begins."""
     minutes: float
-    """Usual length of the drive."""
+    """Usual length of the recording."""
     opacity: float = 1.0
     """How much one obstacle disturbs a radio ray: 1 = concrete, 0 = air."""
     pairs: tuple[tuple[str, str], ...] = field(default=())

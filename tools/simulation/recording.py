@@ -127,7 +127,7 @@ def _lasting(owner: int | None, part: int, rng: np.random.Generator) -> np.rando
 
 
 def simulate(settings: Settings) -> Recording:
-    """Simulate a drive."""
+    """Simulate a recording."""
     plan = PLANS[settings.world]()
     seconds = 60.0 * (settings.minutes or plan.minutes)
     track = drive.wander(plan, _rng(settings, 0), settings.speed * seconds + 5.0)
