@@ -6,7 +6,8 @@
     python tools/faults.py --worlds hall,kasdorf --minutes 5 --sensors all,no-lidar --print
 
 A case is silently wrong when the map is trusted (exit code 0) and yet the trajectory is off by more than 0.5 m (rms), or
-an anchor that is called ok by more than 1 m and three standard deviations. Without lidar and without given anchors
+an anchor that is called ok by more than 1 m and three standard deviations (of what is true of a real recording as well:
+that is what its map says without a fault). Without lidar and without given anchors
 nothing but the odometry distinguishes a map from its mirror image: there the result is judged up to reflection.
 """
 
@@ -106,7 +107,7 @@ class Outcome:
 
 
 def judged(
-    result: MapResult, truth_stamps: Floats, truth: Floats, anchors: dict[str, list[Floats]], reflect: bool
+    result: MapResult, truth_stamps: Floats, truth: Floats, case: Case, reflect: bool
 ) -> tuple[float, float, float]:
     """Return the ATE, the worst error of an anchor called ok, and by how much it exceeds its bar, m."""
     rows_ = np.clip(np.searchsorted(truth_stamps, result.stamps), 0, len(truth_stamps) - 1)
@@ -119,17 +120,22 @@ def judged(
         worst, beyond = float("nan"), -np.inf
         for anchor in result.anchors:
             name, _, turn = anchor.id.partition("@")
-            places = anchors.get(name, [])
+            places = case.anchors.get(name, [])
             if anchor.status != "ok" or not places:
                 continue
             place = places[min(int(turn or 1), len(places)) - 1]
             off = float(np.hypot(*(se2.transform(move, anchor.position * sign) - place)))
-            sigma = float(np.sqrt(max(np.linalg.eigvalsh(anchor.covariance)[-1], 0.0)))
+            sigma = float(np.hypot(_largest_sigma(anchor.covariance), case.known.get(name, 0.0)))
             worst, beyond = np.fmax(worst, off), max(beyond, off - ANCHOR_BAR - 3.0 * sigma)
         if best is None or ate < best[0]:
             best = (ate, float(worst), float(beyond))
     assert best is not None
     return best
+
+
+def _largest_sigma(covariance: Floats) -> float:
+    """Return the standard deviation in the direction in which it is largest."""
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
 
 
 def _fit(points: Floats, onto: Floats) -> Floats:
@@ -157,7 +163,7 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
         check = 3 if checked(log) else 0
         began = time.process_time()
         result = build_map(log)
-        figures = judged(result, log.odometry.stamps, truth, case.anchors, sensors == "no-lidar")
+        figures = judged(result, log.odometry.stamps, truth, case, sensors == "no-lidar")
         stated, warnings = tuple(map(str, result.doubts)), tuple(map(str, result.warnings))
         code = 3 if result.doubts else 0
     except TimeoutError as error:
@@ -217,7 +223,9 @@ def real_case(path: Path) -> Case:
     """Return a real recording; what is true of it is what its map says without any fault."""
     log = read_log(path)
     result = build_map(log)
-    return Case(log, result.trajectory, {a.id: [a.position] for a in result.anchors if a.status == "ok"})
+    placed = [a for a in result.anchors if a.status == "ok"]
+    known = {a.id: _largest_sigma(a.covariance) for a in placed}
+    return Case(log, result.trajectory, {a.id: [a.position] for a in placed}, known)
 
 
 def shown(outcome: Outcome) -> list[object]:

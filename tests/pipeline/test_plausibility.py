@@ -10,9 +10,10 @@ from helpers.planted import aligned_error, box, odometry, ranges, recording, sca
 from uwblite import se2
 from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
+from uwblite.map_result import AnchorEstimate
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import OUTSIDE
-from uwblite.pipeline.plausibility import check_handedness, outlier_stretches
+from uwblite.pipeline.plausibility import check_certainty, check_handedness, check_moved_together, outlier_stretches
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import SensorMounting
 
@@ -85,6 +86,46 @@ def test_three_given_anchors_decide_the_sign_and_two_do_not(known, doubted, lida
     calibration = Calibration((UnknownKey("heading_scale"),), np.array([-1.9]))
     graph = Graph(np.zeros((1, 3)), PLACES, calibration=calibration).with_edges(prior, other)
     assert len(handedness(graph, lidar)) == doubted
+
+
+def moved_together(places, lidar=False):
+    """Return the doubts about a map in which the anchors A, B, ... have these places one after the other, from 0 and 100 s."""
+    anchors, stamps, anchor = [], [], []
+    for name, own in zip("ABCD", places, strict=False):
+        for number, place in enumerate(own):
+            since = 100.0 * number if len(own) > 1 else np.nan
+            label = name if number == 0 else f"{name}@{number + 1}"
+            anchors.append(AnchorEstimate(label, np.array(place), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok", "", None, since))
+            heard = np.arange(100.0 * number, 200.0 if number == len(own) - 1 else 100.0, 5.0)
+            stamps.append(heard)
+            anchor.append(np.full(len(heard), len(anchors) - 1))
+    stages = Stages(None, None)
+    edges = SimpleNamespace(stamps=np.concatenate(stamps), anchor=np.concatenate(anchor))
+    task = SimpleNamespace(recordings=SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0])), stages=stages)
+    check_moved_together(anchors, SimpleNamespace(ranges=edges), task)
+    return [notice.kind for notice in stages.doubts]
+
+
+A, B, C, ELSEWHERE = (0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 20.0)
+
+
+def test_anchors_that_were_moved_together_are_rather_another_change():
+    assert moved_together([[A, ELSEWHERE], [B, (4.0, 9.0)], [C]]) == ["anchors-moved-together"]
+    assert moved_together([[A, ELSEWHERE]]) == ["anchors-moved-together"]
+    assert not moved_together([[A, ELSEWHERE], [B], [C]])
+    assert not moved_together([[A, ELSEWHERE], [B, (4.0, 9.0)], [C]], lidar=True)
+
+
+def test_anchors_that_changed_places_were_only_renamed():
+    assert not moved_together([[A, B], [B, C], [C, A]])
+
+
+@pytest.mark.parametrize(("sigma", "doubted"), [(0.2, False), (0.9, False), (1.1, True)])
+def test_places_known_to_a_tenth_of_the_area_only_are_doubted(sigma, doubted):
+    stages, poses = Stages(None, None), np.array([[0.0, 0.0, 0.0], [6.0, 8.0, 0.0]])
+    covariances = np.tile(np.diag([0.5 * sigma**2, 0.5 * sigma**2, 1.0]), (2, 1, 1))
+    check_certainty(SimpleNamespace(graph=SimpleNamespace(poses=poses)), covariances, SimpleNamespace(stages=stages))
+    assert bool(stages.doubts) == doubted
 
 
 def test_a_value_far_from_usual_is_reported():

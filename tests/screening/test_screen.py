@@ -8,6 +8,7 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.errors import DataError
+from uwblite.screening import stuck_sensors
 from uwblite.screening.screen import _made_up_stamps, screen
 from uwblite.se2 import chain as chained
 from uwblite.sensor_log import LogNotes, Odometry, UwbRanges
@@ -158,6 +159,24 @@ def test_ranges_that_repeat_themselves_are_left_out(sound):
     done = screen(replace(sound, ranges=replace(sound.ranges, ranges=np.where(stuck, 4.2, sound.ranges.ranges))))
     assert kinds(done) == {"repeated-ranges"}
     assert len(done.ranges.stamps) == len(stuck) - stuck.sum()
+
+
+@pytest.mark.parametrize("beyond", [False, True])
+def test_a_value_that_marks_what_a_radio_could_not_measure_is_left_out(sound, beyond):
+    """A radio that reports its reach for all that is farther, or one value for every third range."""
+    r = sound.ranges
+    reach = float(np.quantile(r.ranges, 0.7))
+    marked = r.ranges >= reach if beyond else np.arange(len(r.ranges)) % 3 == 0
+    log = replace(sound, ranges=replace(r, ranges=np.where(marked, reach if beyond else 65.535, r.ranges)))
+    done = screen(log)
+    assert kinds(done) == {"repeated-ranges"}
+    np.testing.assert_array_equal(done.ranges.ranges, r.ranges[~marked])
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0])
+def test_rounded_ranges_mark_nothing(sound, step):
+    log = replace(sound, ranges=replace(sound.ranges, ranges=np.round(sound.ranges.ranges / step) * step))
+    assert len(stuck_sensors.without_marks(log)[0].ranges.ranges) == len(log.ranges.ranges)
 
 
 def test_a_heading_against_the_path_is_turned_and_the_laser_reports_how(sound):

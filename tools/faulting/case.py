@@ -23,6 +23,8 @@ class Case:
     """(n, 3) T_truth_base at each odometry reading."""
     anchors: dict[str, list[Floats]]
     """Places (2,) of each anchor, m, in the order of time."""
+    known: dict[str, float] = field(default_factory=dict)
+    """Standard deviation of the place of each anchor, m, where it is not simulated but found in a map."""
     clocks: dict[str, Floats] = field(default_factory=dict)
     """By odometry, radio and lidar: what its clock is wrong by at each reading, s."""
 

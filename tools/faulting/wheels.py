@@ -56,10 +56,10 @@ def redriven(way: float, turn: float) -> Fault:
     def change(stamps: Floats, poses: Floats) -> Floats:
         steps = se2.between(poses[:-1], poses[1:])
         half = 0.5 * steps[:, 2]
-        forward = steps[:, 0] * np.cos(half) + steps[:, 1] * np.sin(half)
+        # A base on omnidirectional wheels drives sideways as well.
+        moved = se2.rotate(-half, steps[:, :2]) * np.array([way, way * turn])
         turned = turn * steps[:, 2]
-        along = way * forward[:, None] * np.column_stack([np.cos(0.5 * turned), np.sin(0.5 * turned)])
-        return chained(poses[0], np.column_stack([along, turned]))
+        return chained(poses[0], np.column_stack([se2.rotate(0.5 * turned, moved), turned]))
 
     return lambda case, rng: with_odometry(case, change)
 
@@ -68,13 +68,13 @@ def carried(seconds: float, gap: float) -> Fault:
     """The robot is picked up half-way and put down where it would have been `seconds` later; the log pauses for a gap, s."""
 
     def fault(case: Case, rng: Rng) -> Case:
-        begin, end = case.middle, case.middle + seconds
+        begin, end = case.middle, case.middle + min(seconds, 0.3 * float(np.ptp(case.log.odometry.stamps)))
         poses, stamps = case.log.odometry.poses, case.log.odometry.stamps
         before, after = np.searchsorted(stamps, [begin, end])
         put_down = se2.compose(poses[before - 1], se2.inverse(poses[after]))
         case = with_odometry(case, lambda t, p: np.where((t >= end)[:, None], se2.compose(put_down, p), p))
         case = kept(case, lambda t: (t < begin) | (t >= end))
-        return shifted(case, lambda t: np.where(t >= end, gap - seconds, 0.0))
+        return shifted(case, lambda t: np.where(t >= end, gap - (end - begin), 0.0))
 
     return fault
 

@@ -13,6 +13,7 @@ from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..odometry.attached import OUTSIDE
+from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
 from .half_tests import check_halves
 from .residual_tests import check_residuals
@@ -29,16 +30,18 @@ _POOR_FIT = 4.0
 
 def judge(
     estimate: Estimate, anchors: Sequence[AnchorEstimate], calibrated: Sequence[CalibrationEstimate],
-    usual: Mapping[UnknownKey, Unknown], table: dict[str, Floats], grid: OccupancyGrid | None, task: Task,
+    usual: Mapping[UnknownKey, Unknown], table: dict[str, Floats], grid: OccupancyGrid | None, covariances: Floats, task: Task,
 ) -> None:
     """Add the warnings and doubts that a finished estimate gives rise to.
 
     Parameters
     ----------
     anchors, calibrated, grid : see MapResult. table : MapResult.range_table.
-    usual : unknowns with their prior standard deviations.
+    usual : unknowns with their prior standard deviations. covariances : (k, 3, 3) of the poses.
     """
+    check_certainty(estimate, covariances, task)
     check_anchors(anchors, task)
+    check_moved_together(anchors, estimate, task)
     check_sensors(grid, task)
     check_closures(estimate, anchors, grid, task)
     check_calibration(calibrated, usual, task)
@@ -54,6 +57,23 @@ def judge(
     check_fit(task)
 
 
+def check_certainty(estimate: Estimate, covariances: Floats, task: Task) -> None:
+    """Doubt a map whose own uncertainties are no small part of the place: the recording shows the path roughly at most."""
+    sigma = float(np.sqrt(np.mean(covariances[:, 0, 0] + covariances[:, 1, 1])))
+    extent = float(np.hypot(*np.ptp(estimate.graph.poses[:, :2], axis=0)))
+    if sigma > max(_UNCERTAIN, _UNCERTAIN_SHARE * extent):
+        text = (
+            f"the robot's places are known to {sigma:.1f} m (rms) only, in an area {extent:.0f} m across: too few ranges and "
+            "scans hold the trajectory"
+        )
+        task.stages.doubt("uncertain", text, sigma=sigma, extent=extent)
+
+
+_UNCERTAIN, _UNCERTAIN_SHARE = 0.3, 0.1
+"""Standard deviation of places, m and as a share of the area's diameter; recordings without lidar that turn out well have a
+share of 0.02 to 0.06, most of it the unit of length."""
+
+
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     """Name anchors that are not ok; where none of those in reach has one place alone, their mirror ambiguity is a doubt."""
     unclear = not any(anchor.status == "ok" for anchor in anchors)
@@ -65,6 +85,46 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     if anchors and all(a.status == "unplaced" for a in anchors):
         text = "no anchor could be placed: the trajectory rests on odometry and lidar alone"
         task.stages.doubt("no-anchor", text)
+
+
+def check_moved_together(anchors: Sequence[AnchorEstimate], estimate: Estimate, task: Task) -> None:
+    """Doubt a map without lidar in which half of the anchors were moved at one time, unless they changed places only.
+
+    Wheels that were swapped, or a radio that changed, look the same, and nothing but the odometry ties before to after.
+    """
+    if task.recordings.have_scans or estimate.ranges is None:
+        return
+    ranges, names = estimate.ranges, [name_and_number(anchor.id) for anchor in anchors]
+    base = np.array([name for name, _ in names])[ranges.anchor] if anchors else np.zeros(0, dtype=str)
+    moves = sorted((a.since, k) for k, a in enumerate(anchors) if np.isfinite(a.since) and names[k][1] > 1)
+    for start, _ in moves:
+        these = [k for since, k in moves if start <= since < start + _ONE_TIME]
+        before, after = base[ranges.stamps < start], base[ranges.stamps > start + _ONE_TIME]
+        heard = len(set(before.tolist()) & set(after.tolist()))
+        if len({names[k][0] for k in these}) >= max(0.5 * heard, min(2, heard)) and not _exchanged(these, anchors, names):
+            when = float(start - task.recordings.stamps[0])
+            task.stages.doubt(
+                "anchors-moved-together",
+                f"{len(these)} of {heard} anchors were moved at about t = {when:.0f} s: rather the wheels, tag or radio "
+                "changed then, and nothing but the odometry ties the two parts of the map",
+                at=when, moved=len(these), heard=heard,
+            )  # fmt: skip
+            return
+
+
+_ONE_TIME = 30.0
+"""Moves within so much of each other are of one time, s."""
+_SAME_PLACE = 1.5
+"""m; an anchor found so near to where another one was took its place, or only its name."""
+
+
+def _exchanged(these: Sequence[int], anchors: Sequence[AnchorEstimate], names: Sequence[tuple[str, int]]) -> bool:
+    """Return whether each of these anchors was moved to where another one was before."""
+    earlier = {names[k][0]: anchors[k].position for k in range(len(anchors)) if names[k][1] == 1}
+    return all(
+        any(name != names[k][0] and np.hypot(*(anchors[k].position - place)) < _SAME_PLACE for name, place in earlier.items())
+        for k in these
+    )
 
 
 def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:

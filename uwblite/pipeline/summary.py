@@ -25,6 +25,8 @@ from .recordings import Recording, Recordings
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not speak against all anchors."""
+_NO_BIAS = 1.6
+"""Constant error of an anchor's ranges, m, twice that of the worst radios: without a lidar its place may be what is wrong."""
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
 
@@ -52,7 +54,7 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
         "stamp": ranges.stamps, "anchor": ranges.anchor.astype(np.float64), "range": ranges.ranges,
         "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
     }
-    plausibility.judge(estimate, anchors, calibrated, listed, table, grid, task)
+    plausibility.judge(estimate, anchors, calibrated, listed, table, grid, covariance.poses, task)
     if any(notice.kind not in _ABOUT_PARTS for notice in stages.doubts):
         anchors = tuple(_distrusted(a) if a.status == "ok" else a for a in anchors)
     stages.end("summary")
@@ -125,6 +127,8 @@ def _anchor(
     if used < 0.5:
         few = f"only {used:.0%} of its ranges agree with the map"
         status, reason = ("distrusted", few) if status == "ok" else (status, f"{few}; {reason}")
+    elif status == "ok" and abs(bias) > _NO_BIAS and not recordings.have_scans:
+        status, reason = "distrusted", f"its ranges fit only with a constant error of {bias:.1f} m, which no radio has"
     return AnchorEstimate(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, spread_about_median(own), status, reason,
         alternative,

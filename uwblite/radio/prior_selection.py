@@ -37,8 +37,11 @@ _OFF = 1.0
 """Odds beforehand that the radio's scale is off, by whatever order of magnitude, against being sound."""
 _CLEARLY = 3.0
 """Posterior odds from which on the scale is off and floats; positive evidence (Kass and Raftery, Bayes factors, 1995)."""
-_FARTHEST = 0.12
+_FARTHEST = 0.08
 """Relative error beyond which no radio's scale is off: it measures times of flight. 0.07 is on record."""
+_SHORT, _TOO_SHORT = -0.01, 0.01
+"""Relative error from which on ranges are shorter than light allows, and the factor on the odds of a radio that says so: too
+long may come from late first paths, too short only from a wrong constant."""
 
 
 def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
@@ -71,8 +74,10 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     if not np.isfinite(worth).any():
         return graph
     if radios:
-        off = [abs(_mean_under(mean, covariance, before, row[0])[0]) for row in tried]
-        odds = np.where(np.array(off) > _FARTHEST, -np.inf, odds)
+        floats = int(np.flatnonzero(hypothesis == 0)[-1])
+        off = float(_mean_under(mean, covariance, before, tried[floats][0])[0])
+        against = -np.inf if abs(off) > _FARTHEST else np.log(_TOO_SHORT) if off < _SHORT else 0.0
+        odds = odds + np.where((hypothesis == 0) & (np.arange(len(odds)) > 0), against, 0.0)
     likely = np.exp(worth + odds[:, None] - (worth + odds[:, None]).max())
     rows = hypothesis == np.argmax(np.bincount(hypothesis, likely.sum(axis=1)))
     likely, units = likely[rows], units[rows]

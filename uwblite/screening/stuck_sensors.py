@@ -107,6 +107,34 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     return replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)), remarks
 
 
+def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Leave out a value that stands for no distance: what a radio reports beyond its reach, or when it missed its partner."""
+    ranges = log.ranges
+    if ranges is None or len(ranges.stamps) < _MARKS:
+        return log, []
+    travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
+    # A robot that stands repeats itself rightly.
+    apart = np.column_stack([ranges.ranges, ranges.anchor, np.floor(travelled / _MOVED)])[ranges.ranges > 0.0]
+    values, counts = np.unique(np.unique(apart, axis=0)[:, 0], return_counts=True)
+    if len(values) < 2:
+        return log, []
+    most = int(np.argmax(counts))
+    if counts[most] < max(_MARKS, _MARK_SHARE * counts.sum(), _TIMES_OTHERS * np.quantile(np.delete(counts, most), 0.9)):
+        return log, []
+    wrong = ranges.ranges == values[most]
+    if len(np.unique(ranges.anchor[wrong])) < 2:  # one that is stuck
+        return log, []
+    text = (
+        f"{int(wrong.sum())} of {len(wrong)} ranges are {values[most]:g} m to the last digit, wherever the robot is: the radio "
+        "marks with it what it could not measure; these were left out"
+    )
+    return replace(log, ranges=ranges.rows(~wrong)), [Remark("repeated-ranges", text)]
+
+
+_MARKS, _MARK_SHARE, _TIMES_OTHERS = 20, 0.03, 8.0
+"""Readings of one value at different places, their share of all, and how much more frequent than others it must be."""
+
+
 def _in_runs(flags: Bools, least: int) -> Bools:
     """Return which set flags stand in runs of at least so many."""
     long = np.zeros(len(flags), dtype=bool)
