@@ -45,9 +45,7 @@ def test_measurements_come_in_the_order_in_which_they_were_complete():
     assert [m.order for m in found] == sorted(m.order for m in found)
 
 
-def test_the_next_part_is_named():
+def test_a_line_in_pieces_is_one_line():
     reader = LiveReader()
-    reader.feed(b"COMMENT continued in run.2.log\n")
-    assert reader.continued == "run.2.log"
     reader.feed(b"x" * 5)
     assert reader.feed(b"\n") == []

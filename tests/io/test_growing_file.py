@@ -34,11 +34,12 @@ def test_a_long_log_begins_near_its_end_with_the_params_of_its_head(tmp_path):
 def test_it_goes_on_in_the_next_part(tmp_path):
     (tmp_path / "run.log").write_bytes(b"COMMENT continued in run.2.log\n")
     file = GrowingFile(str(tmp_path / "run.log"))
-    file.read()
-    assert not file.go_on_in("run.2.log")
+    assert file.read() == b"COMMENT continued in run.2.log\n"
+    assert file.read() == b""
     (tmp_path / "run.2.log").write_bytes(b"more\n")
-    assert file.go_on_in("run.2.log")
     assert file.read() == b"more\n"
+    assert file.read() == b""
+    assert file.restarts == 0
     file.close()
 
 

@@ -276,18 +276,13 @@ def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Ite
     file = GrowingFile(path)
     if file.skipped:
         console.note(f"uwblite: {file.skipped / 1e6:.0f} MB of {path} lie further back and are not read")
-    quiet, rest = 0.0, b""
+    quiet = 0.0
     try:
         while not stopping():
             data = file.read()
             if data:
-                quiet, rest = 0.0, (rest + data)[-_CONTINUED:]
+                quiet = 0.0
                 yield data
-                continue
-            mark = rest.rfind(b"COMMENT continued in ")
-            name = rest[mark:].split(b"\n")[0].split()[-1].decode("utf-8", "replace") if mark >= 0 else ""
-            if name and file.go_on_in(name):
-                rest = b""
                 continue
             if idle is not None and quiet >= idle:
                 return
@@ -300,5 +295,3 @@ def _growing(path: str, idle: float | None, stopping: Callable[[], bool]) -> Ite
 
 _PAUSE = 0.05
 """s between looks at a log that does not grow."""
-_CONTINUED = 1024
-"""Bytes at the end of a part in which it names the next one."""

@@ -51,8 +51,7 @@ _LEAST = 1e-300
 
 def _information(edges: RelativePoseEdges) -> Floats:
     """Return the diagonals (e, 3) of the information."""
-    diagonal = np.sum(edges.sqrt_information**2, axis=1)
-    return diagonal if edges.weights is None else diagonal * edges.weights[:, None]
+    return np.sum(edges.sqrt_information**2, axis=1) * edges.own_weights[:, None]
 
 
 def _solved(i: Ints, j: Ints, factor: Floats, step: Floats, weight: Floats, values: Floats, free: Bools) -> Floats:

@@ -107,4 +107,4 @@ def _weighted(current: Graph, plain: Graph, weights: Mapping[int, Floats]) -> tu
 
 
 def _reweighted(edges: Edges, weights: Floats) -> Edges:
-    return replace(edges, weights=weights if edges.weights is None else weights * edges.weights)  # type: ignore[type-var]
+    return replace(edges, weights=weights * edges.own_weights)  # type: ignore[type-var]

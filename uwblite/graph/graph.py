@@ -44,8 +44,20 @@ class EdgeTable:
     FIRST: ClassVar[str] = "i"
     """Name of an array with a row per edge."""
 
+    weights: Floats | None
+
     def __len__(self) -> int:
         return len(getattr(self, self.FIRST))
+
+    @property
+    def own_weights(self) -> Floats:
+        """Factors (e,) on each edge's cost."""
+        return np.ones(len(self)) if self.weights is None else np.asarray(self.weights)
+
+    @property
+    def alive(self) -> Bools:
+        """Which edges (e,) count."""
+        return self.own_weights > 0.0
 
     def rows(self, which: Ints | Bools) -> Self:
         """Return some of the edges."""
@@ -64,6 +76,10 @@ class Edges(Protocol):
     @property
     def weights(self) -> Floats | None:
         """(e,) factors on each edge's cost (0 switches it off), None = all 1."""
+
+    @property
+    def own_weights(self) -> Floats:
+        """The same, never None."""
 
     def __len__(self) -> int: ...
 
@@ -139,6 +155,11 @@ class Graph:
     fixed_calibration: Bools | None = None
     """(c,) True = fixed; None = all free."""
 
+    @property
+    def calibration_priors(self) -> "tuple[PriorEdges, ...]":
+        """Priors of the calibration among the edges."""
+        return tuple(e for e in self.edges if isinstance(e, PriorEdges) and e.block == "calibration")
+
     def with_edges(self, *edges: Edges) -> "Graph":
         """Return the graph with further edges; empty ones are left out."""
         return replace(self, edges=self.edges + tuple(e for e in edges if len(e)))
@@ -159,13 +180,12 @@ class Graph:
 def edge_cost(edges: Edges, residuals: Floats) -> float:
     """Return the robust, weighted cost of whitened residuals (e, d) of these edges."""
     rho = edges.kernel.rho(np.einsum("ed,ed->e", residuals, residuals))
-    return float(np.sum(rho if edges.weights is None else rho * edges.weights))
+    return float(np.sum(rho * edges.own_weights))
 
 
 def kernel_weights(edges: Edges, residuals: Floats) -> Floats:
     """Return each edge's share (e,) in the normal equations at whitened residuals (e, d): its own weight times the kernel's."""
-    kernel = edges.kernel.weight(np.einsum("ed,ed->e", residuals, residuals))
-    return kernel if edges.weights is None else kernel * edges.weights
+    return edges.kernel.weight(np.einsum("ed,ed->e", residuals, residuals)) * edges.own_weights
 
 
 def edge_weights(edges: Edges, graph: Graph) -> Floats:

@@ -65,7 +65,7 @@ class TangentForm:
         self._anchor, self._map = n, 2 * n + a
         self._entries: list[tuple[Ints, Ints, Complexes]] = []
         for edges in graph.edges:
-            self._add_edges(graph, edges, np.ones(len(edges)) if edges.weights is None else edges.weights)
+            self._add_edges(graph, edges, edges.own_weights)
 
     def matrix(self) -> sparse.csr_matrix:
         """Return M with x^H M x + const = the sum."""

@@ -158,8 +158,6 @@ def from_sweeps(
 
     Parameters
     ----------
-    recordings : their scans with known poses.
-    config : settings.
     geometry : the grid to fill; None = the smallest around all rays, coarser where config.max_cells asks for it.
     executor : any concurrent.futures executor; the result does not depend on it.
     progress : called after every batch of scans.
@@ -174,12 +172,12 @@ def from_sweeps(
         raise DataError("there are no scans to make a map of")
     tasks = [_task(sweeps, config) for sweeps in recordings if len(sweeps.first)]
     count = sum(len(task.chosen) for task in tasks)
-    boxes = [task.extent() for task in tasks]
-    low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+    low, high = _around([task.extent() for task in tasks])
     if geometry is None and np.prod((high - low) / config.resolution) > config.max_cells:
-        tasks = _together(tasks)
-        boxes = [task.extent() for task in tasks]
-        low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+        # Without the scans that lie far from all others.
+        box = central_box(np.concatenate([task.first[:, :2] for task in tasks]))
+        tasks = [task for task in (task.within(*box) for task in tasks) if len(task.chosen)]
+        low, high = _around([task.extent() for task in tasks])
     astray, count = count - sum(len(task.chosen) for task in tasks), sum(len(task.chosen) for task in tasks)
     grid = geometry or GridGeometry.around(low, high, config.resolution, config.max_cells)
     if announce is not None:
@@ -201,16 +199,14 @@ def from_sweeps(
     return replace(from_counts(counter if geometry else counter.cropped(), config, count), scans_astray=astray)
 
 
-def _together(tasks: "list[_Task]") -> "list[_Task]":
-    """Return the tasks without the scans that lie far from all others; see geometry.central_box."""
-    low, high = central_box(np.concatenate([task.first[:, :2] for task in tasks]))
-    return [task for task in (task.within(low, high) for task in tasks) if len(task.chosen)]
-
-
 def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":
     chosen = moved_scans(sweeps.first, config.move_distance, config.move_angle)
-    last = None if sweeps.last is None else sweeps.last[chosen]
-    return _Task(sweeps.scans, chosen, sweeps.first[chosen], last, sweeps.flipped, config)
+    return _Task(sweeps.scans, np.arange(len(sweeps.first)), sweeps.first, sweeps.last, sweeps.flipped, config).rows(chosen)
+
+
+def _around(boxes: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Return the box, given by two corners, around several."""
+    return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
 
 
 def walls_of(grid: OccupancyGrid) -> Bools:
@@ -256,23 +252,21 @@ class _Task:
         for part in self._parts():
             reach = np.maximum(self._reach(part, False), self._reach(part, True))
             boxes.append(extent(self.scans, reach, *self._poses(part), flipped=self.flipped))
-        return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+        return _around(boxes)
 
     def within(self, low: Floats, high: Floats) -> "_Task":
         """Return the task with the scans whose laser stood in a box."""
-        inside = ((self.first[:, :2] >= low) & (self.first[:, :2] <= high)).all(axis=1)
-        last = None if self.last is None else self.last[inside]
-        return replace(self, chosen=self.chosen[inside], first=self.first[inside], last=last)
+        return self.rows(np.flatnonzero(np.all((self.first[:, :2] >= low) & (self.first[:, :2] <= high), axis=1)))
+
+    def rows(self, which: Ints) -> "_Task":
+        """Return the task with some of its scans."""
+        last = None if self.last is None else self.last[which]
+        return replace(self, chosen=self.chosen[which], first=self.first[which], last=last)
 
     def split(self, parts: int) -> "list[_Task]":
         """Return tasks that hold only their own share of the scans."""
-        tasks = []
-        for part in np.array_split(np.arange(len(self.chosen)), parts):
-            own = self.chosen[part]
-            scans = self.scans.rows(own)
-            last = None if self.last is None else self.last[part]
-            tasks.append(_Task(scans, np.arange(len(own)), self.first[part], last, self.flipped, self.config))
-        return [task for task in tasks if len(task.chosen)]
+        tasks = [self.rows(part) for part in np.array_split(np.arange(len(self.chosen)), parts) if len(part)]
+        return [replace(task, scans=self.scans.rows(task.chosen), chosen=np.arange(len(task.chosen))) for task in tasks]
 
 
 def _trace(

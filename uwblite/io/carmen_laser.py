@@ -1,7 +1,6 @@
 """The laser messages of a CARMEN log: found line by line, decoded in bulk."""
 
 import math
-import re
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,9 +10,9 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats
-from ..errors import ConfigError
 from ..sensor_log import LaserScans
-from .carmen_messages import BrokenLine, numbers, stamp_of, time_order
+from .carmen_laser_words import HEAD, RANK, Layout, kinds_of, parse_head, split_tail
+from .carmen_messages import BrokenLine, numbers, time_order
 from .carmen_params import Params
 from .carmen_readings import Block, Pending
 from .scan_geometry import ScanGeometry, resampled, resampling_warning
@@ -22,29 +21,12 @@ DEFAULT_RANGE_MIN = 0.02
 """m; what a scanner reports below is an error code (URG-04LX: 0..19 mm). PARAM laser_range_min wins."""
 DEFAULT_RANGE_MAX = 80.0
 """m; reach of the scanners whose logs (FLASER) do not give it. PARAM robot_front_laser_max wins."""
-MAX_BEAMS = 100_000
-"""A message that claims more readings is broken."""
 POSE_TOLERANCE = 0.01
 """m or rad; a laser whose pose on the robot varies more than this is reported."""
 
-_RANK = {b"RAWLASER1": 0, b"FLASER": 1, b"ROBOTLASER1": 2}
-"""Messages that may carry the same scans; only those of the highest rank in the log are used."""
-HEAD = {b"RAWLASER1": 9, b"FLASER": 2, b"ROBOTLASER1": 9}
-"""Words before the readings."""
 _LAYOUTS_KEPT = 1000
 _URG_PERIOD = 0.1
 """s; time of one turn of a URG-04LX."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """Geometry that a message gives; messages with equal layout go into one array."""
-
-    beams: int
-    angle_min: float = 0.0
-    angle_increment: float = 0.0
-    range_max: float = 0.0
-    """m; 0 where the message does not give it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -56,25 +38,6 @@ class _Scans:
     stamps: "array[float]" = field(default_factory=lambda: array("d"))
     seen: int = 0
     pending: list[Pending] = field(default_factory=list)
-
-
-def kinds_of(message: str) -> dict[bytes, bytes]:
-    """Return the messages that hold the scans of one lidar, each with the kind that it is read as.
-
-    Parameters
-    ----------
-    message : name of the only message to read, such as ROBOTLASER2 of the second lidar; empty = the first lidar's.
-
-    Raises
-    ------
-    ConfigError : scans are not read from such a message.
-    """
-    if not message:
-        return {name: name for name in _RANK}
-    kind = "FLASER" if message == "RLASER" else re.sub("(?<=LASER)[1-5]$", "1", message)
-    if kind.encode() not in _RANK:
-        raise ConfigError(f"scans are not read from {message!r}; choose ROBOTLASER1 to 5, RAWLASER1 to 5, FLASER or RLASER")
-    return {message.encode(): kind.encode()}
 
 
 class LaserMessages:
@@ -93,9 +56,9 @@ class LaserMessages:
         """Whether the log leaves out ipc_timestamp; decides where a line alone does not."""
         self._every_nth = every_nth_scan
         self._kind = b""
-        self._counts = dict.fromkeys(_RANK, 0)
-        self._layouts: dict[bytes, _Layout] = {}
-        self._scans: dict[_Layout, _Scans] = {}
+        self._counts = dict.fromkeys(RANK, 0)
+        self._layouts: dict[bytes, Layout] = {}
+        self._scans: dict[Layout, _Scans] = {}
         self._poses = array("d")
         """stamp, laser pose (3), robot pose (3) of every message that gives them."""
 
@@ -107,7 +70,7 @@ class LaserMessages:
         """Take line `number`, block[start:end], whose name ends at gaps[gap], as a message of kind `name`."""
         self._counts[name] += 1
         if name != self._kind:
-            if self._kind and _RANK[name] < _RANK[self._kind]:
+            if self._kind and RANK[name] < RANK[self._kind]:
                 return
             self._kind = name
             self._scans, self._poses, self._layouts = {}, array("d"), {}
@@ -140,16 +103,16 @@ class LaserMessages:
         stamp = self._tail(name, tokens[head + layout.beams :])
         self._queue(layout, Pending(number, 0, readings, stamp))
 
-    def _queue(self, layout: _Layout, pending: Pending) -> None:
+    def _queue(self, layout: Layout, pending: Pending) -> None:
         scans = self._scans.setdefault(layout, _Scans())
         if scans.seen % self._every_nth == 0:
             scans.pending.append(pending)
         scans.seen += 1
 
-    def _layout(self, name: bytes, head: bytes) -> _Layout:
+    def _layout(self, name: bytes, head: bytes) -> Layout:
         layout = self._layouts.get(head)
         if layout is None:
-            layout = _parse_head(name, head.split())
+            layout = parse_head(name, head.split())
             if len(self._layouts) < _LAYOUTS_KEPT:
                 self._layouts[head] = layout
         return layout
@@ -204,18 +167,18 @@ class LaserMessages:
         warnings.extend(_fence_posts(laser))
         return laser, self._mounting(what, warnings)
 
-    def _geometry(self, layout: _Layout, params: Params) -> ScanGeometry:
+    def _geometry(self, layout: Layout, params: Params) -> ScanGeometry:
         """Return where the beams of messages of a layout point."""
         stated = (layout.angle_min, layout.angle_increment)
         return ScanGeometry(*(stated if self._kind != b"FLASER" else params.guess_scanner(layout.beams)), layout.beams)
 
-    def _reach(self, layout: _Layout, params: Params) -> float:
+    def _reach(self, layout: Layout, params: Params) -> float:
         """Return the range, m, from which a reading saw nothing."""
         given = params.get("robot_front_laser_max", "laser_front_laser_max_range")
         return layout.range_max or given or DEFAULT_RANGE_MAX
 
     def _merged(
-        self, kept: _Layout, params: Params, range_min: float, skipped: dict[str, int], warnings: list[str]
+        self, kept: Layout, params: Params, range_min: float, skipped: dict[str, int], warnings: list[str]
     ) -> tuple[Floats, NDArray[np.float32]]:
         """Return stamps (k,) and cleaned readings (k, b) of all scans of the lidar, in the geometry of one layout."""
         what, want = self._kind.decode(), self._geometry(kept, params)
@@ -264,26 +227,6 @@ class LaserMessages:
         return np.round(middle, 6)
 
 
-def split_tail(name: bytes, tail: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
-    """Return which word behind the readings the poses of laser and robot begin at (RAWLASER1 has none), and the stamp, s."""
-    if name == b"FLASER":
-        if len(tail) not in (8, 9):
-            raise BrokenLine(f"FLASER has {len(tail)} fields behind its readings, expected 9")
-        return 0, stamp_of(tail[6:])
-    rest = tail[1 + int(tail[0]) :] if tail and len(tail[0]) < 10 and tail[0].isdigit() else tail
-    if name == b"RAWLASER1":
-        rest = rest if len(rest) in (2, 3) else tail
-        if len(rest) not in (2, 3):
-            raise BrokenLine(f"RAWLASER1 has {len(tail)} fields behind its readings, expected 4 + remissions")
-        return len(tail) - len(rest), stamp_of(rest)
-    rest = rest if 12 <= len(rest) <= 14 else tail
-    if not 12 <= len(rest) <= 14:
-        raise BrokenLine(f"ROBOTLASER1 has {len(tail)} fields behind its readings, expected 15 + remissions")
-    # 14 = with turn_axis and ipc_timestamp, 12 = with neither; 13 is one of them.
-    has_ipc = len(rest) == 14 or (len(rest) == 13 and not ipc_left_out)
-    return len(tail) - len(rest), stamp_of(rest[-3:] if has_ipc else rest[-2:])
-
-
 def _fence_posts(scans: LaserScans) -> list[str]:
     """Say where an increment looks like the field of view divided by one beam too few, as logs of SICK scanners have it."""
     beams, degrees = scans.ranges.shape[1], math.degrees(abs(scans.angle_increment))
@@ -302,24 +245,6 @@ _USUAL_STEPS = (0.25, 0.5, 1.0)
 """Angles between beams of SICK scanners, degrees."""
 _FEW_BEAMS = 90
 """Fewer beams than any of these scanners has."""
-
-
-def _parse_head(name: bytes, tokens: list[bytes]) -> _Layout:
-    """Read the words before the readings."""
-    what = name.decode()
-    if len(tokens) != HEAD[name]:
-        raise BrokenLine(f"{what}: fields are parted unevenly")
-    beams = int(tokens[-1])
-    if not 1 <= beams <= MAX_BEAMS:
-        raise BrokenLine(f"{what} announces {beams} readings")
-    if name == b"FLASER":
-        return _Layout(beams)
-    angle_min, fov, increment, range_max = numbers(tokens[2:6], what, 4)
-    if increment == 0.0:
-        increment = fov / max(beams - 1, 1)
-    if abs(increment) * (beams - 1) > 2.1 * math.pi or abs(angle_min) > 2.1 * math.pi:
-        raise BrokenLine(f"{what}: {beams} readings {increment:g} rad apart are more than a turn")
-    return _Layout(beams, angle_min, increment, max(range_max, 0.0))
 
 
 def _cleaned(readings: "array[float]", beams: int, range_min: float, range_max: float) -> NDArray[np.float32]:

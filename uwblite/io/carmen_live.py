@@ -68,8 +68,6 @@ class LiveReader:
         self._reader = LogReader("live log", 1, 1.0)
         self._heading: list[tuple[float, float]] = []
         self._T_base_laser: Floats | None = None
-        self.continued = ""
-        """Name of the next part, where the log says that it goes on there."""
         self.broken = 0
         """Lines that could not be used."""
 
@@ -95,8 +93,6 @@ class LiveReader:
         reader.laser.ipc_left_out = before.laser.ipc_left_out
         reader.feed(lines)
         self._reader, self.broken = reader, self.broken + reader.broken
-        if b"COMMENT continued in " in lines:
-            self.continued = lines.rpartition(b"COMMENT continued in ")[2].split(b"\n")[0].strip().decode("utf-8", "replace")
         found: list[Measured] = [*self._poses(reader), *self._ranges(reader), *self._scans(reader), *self._turns(reader)]
         return sorted(found, key=lambda measured: measured.order)
 

@@ -25,6 +25,7 @@ import numpy as np
 from ..arrays import Floats
 from ..config import from_dict, parse_toml, setting
 from ..errors import ConfigError, FormatError
+from ..report.printable import csv_field
 from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, SensorMounting, UwbRanges, fault_of_id, one_word
 from .files import replacing
 from .folders import replacing_folder
@@ -115,16 +116,10 @@ def _write(path: Path, header: str, rows: Iterable[str]) -> None:
 
 
 def _range_rows(ranges: UwbRanges) -> Iterator[str]:
-    names = [_quoted(name) for name in ranges.anchor_ids]
+    names = [csv_field(name) for name in ranges.anchor_ids]
     columns = (ranges.stamps.tolist(), ranges.anchor.tolist(), ranges.ranges.tolist(), ranges.quality.tolist())
     for stamp, anchor, distance, quality in zip(*columns, strict=True):
         yield f"{stamp:.6f},{names[anchor]},{distance:.4f},{quality:g}"
-
-
-def _quoted(text: str) -> str:
-    out = io.StringIO()
-    csv.writer(out, lineterminator="").writerow([text])
-    return out.getvalue()
 
 
 def _scan_rows(scans: LaserScans) -> Iterator[str]:

@@ -1,6 +1,7 @@
-"""A file that somebody is writing, read as it grows."""
+"""A log that somebody is writing, read as it grows, over all its parts."""
 
 import os
+import re
 from pathlib import Path
 
 from ..errors import FormatError
@@ -11,12 +12,16 @@ TAIL_BYTES = 4 << 20
 """Bytes at the end of a long log with which following begins: about a minute of a robot with a lidar."""
 _PIECE = 1 << 17
 """Bytes read at once."""
+_NEXT_PART = re.compile(rb"^COMMENT continued in ([^\n]+)\n", re.MULTILINE)
+"""What the recorder writes at the end of a part, before the name of the next."""
+_MARK_BYTES = 1024
 
 
 class GrowingFile:
     """Follow a file from its head, and what it holds already from near its end or whole.
 
-    A file that became shorter, or that another has taken the place of, is read from its beginning.
+    It goes on in the next part, once that is there. A file that became shorter, or that another has taken the place of,
+    is read from its beginning.
 
     Parameters
     ----------
@@ -40,6 +45,7 @@ class GrowingFile:
         self.skipped = 0 if whole else max(size - HEAD_BYTES - TAIL_BYTES, 0)
         """Bytes between head and tail that are not read."""
         self._head_left = HEAD_BYTES if self.skipped else 0
+        self._end = b""
 
     def read(self) -> bytes:
         """Return what is new, at most a piece; b"" where nothing is."""
@@ -53,7 +59,10 @@ class GrowingFile:
         if os.fstat(self._file.fileno()).st_size < self._file.tell():
             self._file.seek(0)
             self.restarts += 1
-        return self._file.read(_PIECE) or self._successor()
+            self._end = b""
+        data = self._file.read(_PIECE) or self._successor() or self._next_part()
+        self._end = (self._end + data)[-_MARK_BYTES:]
+        return data
 
     def _successor(self) -> bytes:
         """Return the beginning of another file that has taken this one's place; b"" where none has."""
@@ -64,19 +73,20 @@ class GrowingFile:
         except OSError:
             return b""
         self._file.close()
-        self._file = other
+        self._file, self._end = other, b""
         self.restarts += 1
         return self._file.read(_PIECE)
 
-    def go_on_in(self, name: str) -> bool:
-        """Follow the next part beside this one, once it is there and this one has nothing more."""
-        following = self.path.with_name(os.path.basename(name))
-        if not following.is_file():
-            return False
+    def _next_part(self) -> bytes:
+        """Return the beginning of the part beside this one that this one names as the next; b"" where there is none."""
+        named = _NEXT_PART.findall(self._end)
+        following = self.path.with_name(os.path.basename(named[-1].decode("utf-8", "replace").strip())) if named else None
+        if following is None or not following.is_file():
+            return b""
         self._file.close()
-        self.path, self.skipped, self._head_left = following, 0, 0
+        self.path, self._end = following, b""
         self._file = open(following, "rb", buffering=0)  # noqa: SIM115
-        return True
+        return self._file.read(_PIECE)
 
     def close(self) -> None:
         """Let it go."""

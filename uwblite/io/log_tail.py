@@ -27,8 +27,6 @@ _ODOMETRY_STEP = 0.2
 _MOST_POSES = 100_000
 """Kept of the odometry: more than five hours."""
 _MOST_ANCHORS = 1000
-_CONTINUED = b"COMMENT continued in "
-"""What the recorder writes at the end of a part, before the name of the next."""
 
 
 @dataclass(slots=True)
@@ -77,7 +75,6 @@ class LogTail:
         self._odometry = array("d")
         self._latest: tuple[float, ...] = ()
         self._carry = b""
-        self._following = ""
 
     @property
     def seconds(self) -> float:
@@ -113,9 +110,6 @@ class LogTail:
             self._file, self._first = opened, os.stat(self.path)
         before = self._file.restarts
         data = self._file.read()
-        if not data and self._following and self._file.go_on_in(self._following):
-            self._carry, self._following = b"", ""
-            data = self._file.read()
         if self._file.restarts > before:
             self._restart()
             self._first = os.stat(self.path)
@@ -146,8 +140,6 @@ class LogTail:
         name = line[: line.find(b" ")]
         sensor = _sensor_of(name)
         if not sensor:
-            if line.startswith(_CONTINUED):
-                self._following = line[len(_CONTINUED) :].decode("utf-8", "replace").strip()
             return
         stamp = stamp_of(line.rsplit(None, 3)[1:])
         self.first, self.last = min(self.first, stamp), max(self.last, stamp)

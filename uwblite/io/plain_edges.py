@@ -57,10 +57,9 @@ def plain_edges(graph: Graph) -> dict[str, Measured]:
     for edges in graph.edges:
         if isinstance(edges, PriorEdges) and edges.block == "calibration":
             continue
-        weights = np.ones(len(edges)) if edges.weights is None else edges.weights
         kind, ends, value, L = _plain(edges, graph)
-        on = (weights > 0) & np.isfinite(value).all(axis=1)
-        root = L[on] * np.sqrt(weights[on])[:, None, None]
+        on = (edges.own_weights > 0) & np.isfinite(value).all(axis=1)
+        root = L[on] * np.sqrt(edges.own_weights[on])[:, None, None]
         found[kind].append(Measured(tuple(end[on] for end in ends), value[on], np.swapaxes(root, 1, 2) @ root))
     joined = {kind: measured(kind, parts) for kind, parts in found.items()}
     return {kind: m._replace(information=definite(m.information)) for kind, m in joined.items()}

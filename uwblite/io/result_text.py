@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Floats, Ints
 from ..map_result import MapResult, Notice
-from ..report.printable import encodable
+from ..report.printable import csv_field, encodable
 from ..sensor_log import LogNotes, SensorLog
 
 SCHEMA = 2
@@ -97,12 +96,8 @@ def anchors_csv(result: MapResult) -> str:
             a.reason,
             _decimal(a.since),
         )
-        lines.append(",".join(map(_quoted, values)))
+        lines.append(",".join(map(csv_field, values)))
     return "\n".join(lines) + "\n"
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace('"', '""') + '"' if re.search(r'[",\r\n]', text) else text
 
 
 def _travelled(result: MapResult) -> float:

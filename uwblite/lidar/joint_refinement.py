@@ -240,7 +240,7 @@ def _every_nth(edges: ScanEdges, most: int) -> ScanEdges:
     each = -(-len(far) // most)
     if each <= 1:
         return edges
-    weights = np.ones(len(edges)) if edges.weights is None else edges.weights.copy()
+    weights = edges.own_weights.copy()
     # A chain of single steps fills nothing up.
     steps, kept = near[gap[near] == 1], far[each // 2 :: each]
     weights[steps] *= len(near) / max(len(steps), 1)

@@ -59,14 +59,14 @@ def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Ta
     if ranges is None or min(places) < 0:
         return None
     steps = np.flatnonzero((wheels.i >= rows.start) & (wheels.j < rows.stop))
-    own = (ranges.pose >= rows.start) & (ranges.pose < rows.stop) & (np.asarray(ranges.weights) > 0.0)
+    own = (ranges.pose >= rows.start) & (ranges.pose < rows.stop) & ranges.alive
     unseen = np.bincount(ranges.anchor[own], minlength=len(graph.anchors)) < _FEW
     used = np.flatnonzero(own & ~unseen[ranges.anchor])
     if len(steps) < _LEAST_STEPS or len(used) < _LEAST_RANGES:
         return None
     fixed = np.ones(len(graph.poses), dtype=bool)
     fixed[rows.start + 1 : rows.stop] = False
-    priors = tuple(_loose(e, places[0]) for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration")
+    priors = tuple(_loose(e, places[0]) for e in graph.calibration_priors)
     known = np.zeros(len(graph.calibration.values), dtype=bool) | np.asarray(graph.fixed_calibration, dtype=bool)
     known |= graph.calibration.of_kinds(RANGE_SCALE)
     known[places] = False

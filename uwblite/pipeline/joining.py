@@ -156,9 +156,8 @@ def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, 
         assert graph.fixed_calibration is not None
         fixed[own] &= graph.fixed_calibration
         values[own] = graph.calibration.values
-        for edges in graph.edges:
-            if isinstance(edges, PriorEdges) and edges.block == "calibration":
-                roots[own[edges.index]] = edges.sqrt_information
+        for priors in graph.calibration_priors:
+            roots[own[priors.index]] = priors.sqrt_information
     return block, PriorEdges("calibration", np.arange(len(keys)), np.zeros((len(keys), 1)), roots), fixed, at
 
 
@@ -215,5 +214,5 @@ def _one_ranges(
     if not moved:
         return None
     rows: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in moved]) for name in _RANGE_ROWS}
-    rows["weights"] = np.concatenate([np.ones(len(r)) if r.weights is None else r.weights for r in moved])
+    rows["weights"] = np.concatenate([r.own_weights for r in moved])
     return replace(moved[0], **rows)

@@ -27,7 +27,7 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     ranges, found = estimate.ranges, estimate.bootstrap
     if ranges is None or found is None:
         return estimate
-    free = found.placed & (np.bincount(ranges.anchor[_alive(ranges)], minlength=len(found.placed)) > 0)
+    free = found.placed & (np.bincount(ranges.anchor[ranges.alive], minlength=len(found.placed)) > 0)
     if estimate.graph.fixed_anchors is not None:
         free &= ~np.asarray(estimate.graph.fixed_anchors)
     if not free.any():
@@ -49,7 +49,7 @@ def _images(estimate: Estimate, ranges: RangeEdges) -> Floats:
     assert estimate.bootstrap is not None
     anchors, tags = estimate.graph.anchors.copy(), ranges.tag_positions(estimate.graph.poses)
     for k in np.flatnonzero(estimate.placed).tolist():
-        own = tags[_alive(ranges) & (ranges.anchor == k)]
+        own = tags[ranges.alive & (ranges.anchor == k)]
         known = estimate.bootstrap.hypotheses[k]
         if estimate.bootstrap.ambiguous[k] and len(known) > 1:
             anchors[k] = known[1].position
@@ -74,18 +74,12 @@ def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Float
 def _costs(graph: Graph, ranges: RangeEdges) -> Floats:
     """Return the cost (a,) of each anchor's ranges, and of the priors of its bias and height."""
     squared = ranges.residuals(graph)[:, 0] ** 2
-    each = np.where(_alive(ranges), ranges.kernel.rho(squared), 0.0)
+    each = np.where(ranges.alive, ranges.kernel.rho(squared), 0.0)
     costs: Floats = np.bincount(ranges.anchor, each, len(graph.anchors)).astype(np.float64)
     of_unknown = np.zeros(len(graph.calibration.values))
-    for priors in graph.edges:
-        if isinstance(priors, PriorEdges) and priors.block == "calibration":
-            np.add.at(of_unknown, priors.index, np.sum(priors.residuals(graph) ** 2, axis=1))
+    for priors in graph.calibration_priors:
+        np.add.at(of_unknown, priors.index, np.sum(priors.residuals(graph) ** 2, axis=1))
     for k in range(len(graph.anchors)):
         used = np.unique(ranges.calibration[ranges.anchor == k][:, 1:3])
         costs[k] += float(of_unknown[used[used >= 0]].sum())
     return costs
-
-
-def _alive(ranges: RangeEdges) -> Bools:
-    """Return which ranges (m,) count."""
-    return np.ones(len(ranges), dtype=bool) if ranges.weights is None else np.asarray(ranges.weights) > 0.0

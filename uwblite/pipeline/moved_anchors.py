@@ -6,7 +6,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..graph.calibration import BIAS
-from ..graph.graph import Graph, PriorEdges
+from ..graph.graph import Graph
 from ..graph.marginals import marginals
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, optimize
@@ -75,12 +75,11 @@ def _places_by_recording(
     ranges, graph = estimate.ranges, estimate.graph
     assert ranges is not None
     assert graph.fixed_calibration is not None
-    alive = np.flatnonzero((np.asarray(ranges.weights) > 0) & estimate.placed[ranges.anchor])
+    alive = np.flatnonzero(ranges.alive & estimate.placed[ranges.anchor])
     pairs, which = np.unique(np.stack([ranges.anchor[alive], recording_of[alive]], axis=1), axis=0, return_inverse=True)
     own = graph.calibration.of_kinds(BIAS)
-    priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block == "calibration")
     all_poses, fixed = np.ones(len(graph.poses), dtype=bool), graph.fixed_calibration | ~own
-    alone = Graph(graph.poses, graph.anchors[pairs[:, 0]], priors, graph.calibration, all_poses, None, fixed)
+    alone = Graph(graph.poses, graph.anchors[pairs[:, 0]], graph.calibration_priors, graph.calibration, all_poses, None, fixed)
     # Outliers of the joint map may be of an anchor that was moved: first all ranges count alike.
     alike = np.ones(len(alive))
     edges = replace(

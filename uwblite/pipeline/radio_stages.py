@@ -77,7 +77,7 @@ def _bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     if ranges is None:
         return estimate
     path = recordings.path[recordings.each[number].rows]
-    used = np.asarray(ranges.weights) > 0
+    used = ranges.alive
     sigma = short_term_sigma(ranges.stamps[used], ranges.anchor[used], ranges.ranges[used], config.ranges)
     settings = replace(config.bootstrap, range_sigma=max(1.5 * sigma, config.bootstrap.least_sigma))
     found = bootstrap.bootstrap_graph(estimate.graph, estimate.odometry, ranges, path - path[0], settings, config.trilateration)

@@ -62,7 +62,7 @@ def check_residuals(estimate: Estimate, residuals: Floats, task: Task) -> None:
 def check_range_scatter(estimate: Estimate, residuals: Floats, task: Task) -> None:
     """Compare how ranges scatter about the map with how they scatter from one to the next."""
     ranges = estimate.ranges
-    if ranges is None or not (alive := np.asarray(ranges.weights) > 0).any():
+    if ranges is None or not (alive := ranges.alive).any():
         return
     short = short_term_sigma(ranges.stamps[alive], ranges.anchor[alive], ranges.ranges[alive], task.config.ranges)
     typical = float(np.median(_spread_by_anchor(residuals[alive], ranges.anchor[alive])))
@@ -229,7 +229,7 @@ def check_scales(estimate: Estimate, task: Task) -> None:
 def check_support(estimate: Estimate, task: Task) -> None:
     """Doubt a map that nothing but the odometry holds."""
     ranges = estimate.ranges
-    constrained = ranges is not None and bool(np.any(np.asarray(ranges.weights) > 0))
+    constrained = ranges is not None and bool(ranges.alive.any())
     constrained |= any(isinstance(edges, ScanEdges | RelativePoseEdges) for edges in estimate.graph.edges)
     if not constrained and len(estimate.graph.poses) > 2:
         text = "neither ranges nor scans hold the trajectory: it is the odometry's alone, and drifts"

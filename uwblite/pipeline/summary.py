@@ -100,8 +100,7 @@ def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, F
     if ranges is None:
         return np.zeros(0), np.zeros(0)
     whitened = ranges.residuals(graph)[:, 0]
-    own = np.ones(len(ranges)) if ranges.weights is None else ranges.weights
-    return whitened * ranges.sigma, own * ranges.kernel.weight(whitened**2)
+    return whitened * ranges.sigma, ranges.own_weights * ranges.kernel.weight(whitened**2)
 
 
 def _anchor(

@@ -72,5 +72,4 @@ def _distances_to(graph: Graph, anchor: int) -> tuple[Floats, Floats]:
 
 
 def _without(edges: RangeEdges, anchors: list[int]) -> RangeEdges:
-    weights = np.ones(len(edges)) if edges.weights is None else edges.weights
-    return replace(edges, weights=np.where(np.isin(edges.anchor, anchors), 0.0, weights))
+    return replace(edges, weights=np.where(np.isin(edges.anchor, anchors), 0.0, edges.own_weights))

@@ -122,7 +122,7 @@ class _Bootstrap:
     ) -> None:
         self.graph, self.odometry, self.ranges, self.path = graph, odometry, ranges, path
         self.config, self.search = config, search
-        self.live = np.ones(len(ranges), dtype=bool) if ranges.weights is None else ranges.weights > 0
+        self.live = ranges.alive
         self.poses = se2.chain(graph.poses[0], odometry.corrected(graph))
         self.anchors, self.calibration = graph.anchors.copy(), graph.calibration
         self.placed = np.zeros(len(graph.anchors), dtype=bool)

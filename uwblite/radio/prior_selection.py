@@ -160,9 +160,8 @@ def _free(graph: Graph, name: str) -> Ints:
 def _prior_sigma(graph: Graph) -> Floats:
     """Return the prior standard deviation (c,) of each calibration value, inf without a prior."""
     sigma = np.full(len(graph.calibration.values), np.inf)
-    for edges in graph.edges:
-        if isinstance(edges, PriorEdges) and edges.block == "calibration":
-            sigma[edges.index] = 1.0 / edges.sqrt_information[:, 0, 0]
+    for priors in graph.calibration_priors:
+        sigma[priors.index] = 1.0 / priors.sqrt_information[:, 0, 0]
     return sigma
 
 

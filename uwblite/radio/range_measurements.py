@@ -59,9 +59,8 @@ def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: Trilaterati
     edges : ranges; those of weight 0 do not count. placed : (a,) anchors that may be moved.
     """
     positions, anchors = edges.tag_positions(graph.poses), graph.anchors.copy()
-    alive = np.ones(len(edges), dtype=bool) if edges.weights is None else edges.weights > 0
     for anchor in np.flatnonzero(placed):
-        own = np.flatnonzero(alive & (edges.anchor == anchor))
+        own = np.flatnonzero(edges.alive & (edges.anchor == anchor))
         level = edges.rows(own).planar_ranges()
         found = trilaterate(positions[own], level, search, _LEVEL_SIGMA)
         if not found:
@@ -99,7 +98,7 @@ def learn_noise(
     """
     positions, sigma, weights = edges.tag_positions(graph.poses), edges.sigma.copy(), np.zeros(len(edges))
     errors = edges.residuals(graph)[:, 0] * edges.sigma
-    alive = np.ones(len(edges), dtype=bool) if edges.weights is None else edges.weights > 0
+    alive = edges.alive
     delay = 0.0 if blocked is None else max(spread(errors[alive & blocked]) if np.any(alive & blocked) else 0.0, _LEAST_DELAY)
     noises = []
     for anchor in range(anchors):

@@ -7,6 +7,7 @@ from urllib.parse import quote
 
 from .html import escape
 from .page import PAGE, STYLE
+from .printable import csv_field
 
 OUTCOMES = ("mapped", "doubted", "failed")
 
@@ -81,7 +82,7 @@ def row_of(recording: str, folder: str, report: dict[str, Any]) -> BatchRow:
 
 def table_csv(rows: Sequence[BatchRow]) -> str:
     """Return the table as CSV: a heading, a line a recording, empty where there is no figure."""
-    lines = [",".join(_COLUMNS), *(",".join(_quoted(_text(getattr(row, name))) for name in _COLUMNS) for row in rows)]
+    lines = [",".join(_COLUMNS), *(",".join(csv_field(_text(getattr(row, name))) for name in _COLUMNS) for row in rows)]
     return "\n".join(lines) + "\n"
 
 
@@ -111,7 +112,3 @@ def _text(value: object) -> str:
     if value is None:
         return ""
     return f"{value:.2f}" if isinstance(value, float) else str(value)
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text

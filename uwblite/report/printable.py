@@ -16,6 +16,11 @@ def encodable(text: str) -> str:
     return "".join(_escape(c) if "\ud800" <= c <= "\udfff" else c for c in text) if not text.isascii() else text
 
 
+def csv_field(text: str) -> str:
+    """Return text as a field of a CSV file."""
+    return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text
+
+
 def _escape(character: str) -> str:
     code = ord(character)
     if 0xDC80 <= code <= 0xDCFF:

@@ -9,7 +9,7 @@ from ..arrays import Bools, Floats
 from ..errors import DataError
 from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
-from . import cuts, directions, odometry_chain, range_motion, stuck_sensors, units, wheel_motion
+from . import cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
 from .wheel_motion import Pairs
 
 _GAP = 2.0
@@ -194,9 +194,7 @@ def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
     return replace(log, ranges=ranges, scans=scans)
 
 
-def _lost_wheels(
-    log: SensorLog, pairs: Pairs | None
-) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Remark]]:
+def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Remark]]:
     """Find stretches in which the wheels stand and other sensors move, and put something in their place."""
     start = float(log.odometry.stamps[0])
     if pairs is None:
@@ -207,7 +205,7 @@ def _lost_wheels(
     stretches = wheel_motion.lost(log, pairs)
     if not stretches:
         return log, pairs, OdometryBreaks.none(), []
-    odometry, breaks = wheel_motion.replaced(log, stretches)
+    odometry, breaks = replaced_wheels.replaced(log, stretches)
     remarks = [_lost_remark(a - start, b - start, "the motion from scan to scan stands in for them") for a, b in stretches]
     log = replace(log, odometry=odometry)
     return log, wheel_motion.compare(log), breaks, remarks

@@ -1,9 +1,9 @@
-"""Do wheels and lidar measure the same motion, stretch by stretch? And what stands in for wheels that stand still.
+"""Do wheels and lidar measure the same motion, stretch by stretch?
 
 Pairs of scans a moment apart, spread over the recording, are matched and compared with the odometry of the same moment.
 One factor for all ways and one for all turns is calibration, and taken out before. What then remains over a stretch is a
-fault: wheels that count nothing while the scans move are replaced there by the motion from scan to scan; any other
-sustained disagreement is a doubt.
+fault: wheels that count nothing while the scans move are replaced there (replaced_wheels.py); any other sustained
+disagreement is a doubt.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of, sigma_of_median, spread_about_median
 from ..lidar.scan_odometry import misfits, scan_steps
-from ..sensor_log import LaserScans, Odometry, OdometryBreaks, Remark, SensorLog
+from ..sensor_log import Odometry, Remark, SensorLog
 
 _PAIRS = 250
 """Pairs of scans compared over the whole recording."""
@@ -202,8 +202,7 @@ _NOISE_SHARE = 0.4
 def way_ratio(pairs: Pairs) -> float:
     """Return the way by the lidar / the way by the wheels; nan where there are too few clear motions."""
     own = pairs.rows(pairs.measured)
-    ratio = _ratios(own.wheels[:, :2], own.lidar[:, :2], _CLEAR_WAY)[1]
-    return float(np.median(ratio)) if len(ratio) >= 2 * _LEAST_PAIRS else float("nan")
+    return _factor(own.wheels[:, :2], own.lidar[:, :2], _CLEAR_WAY, float("nan"))
 
 
 def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
@@ -243,66 +242,7 @@ _OTHER_RATIO, _RATIO_SIGMAS = 0.15, 5.0
 """Relative difference of ratios, and in their standard deviations, from which they are not the same."""
 
 
-def _factor(wheels: Floats, lidar: Floats, least: float) -> float:
-    """Return the factor of the wheels' motions (e, d) that most agree on; 1 where there are too few."""
-    size = np.sqrt(np.sum(wheels**2, axis=1))
-    clear = size > least
-    if clear.sum() < 2 * _LEAST_PAIRS:
-        return 1.0
-    return float(np.median(np.sum(wheels * lidar, axis=1)[clear] / size[clear] ** 2))
-
-
-_SCANS_APART = 0.25
-"""Time between the scans whose motion stands in for wheels, s."""
-_STEP_SIGMA = (0.02, 0.02, 0.01)
-"""Standard deviation of such a step, m, m, rad."""
-_UNKNOWN_STEP = (0.3, 0.3, 0.3)
-"""The same where the scans do not match either."""
-_SEARCHES = 100
-"""Steps of a stretch that are searched for, where they match badly."""
-_FASTEST_STEP = 1.0
-"""No such step is longer, m: a speed of 4 m/s."""
-
-
-def replaced(log: SensorLog, stretches: list[tuple[float, float]]) -> tuple[Odometry, OdometryBreaks]:
-    """Return the odometry with the motion from scan to scan in stretches in which the wheels were lost."""
-    odometry, scans = log.odometry, log.scans
-    assert scans is not None
-    breaks = [OdometryBreaks.none()]
-    for a, b in stretches:
-        odometry, own = _replaced(odometry, scans, log, a, b)
-        breaks.append(own)
-    return odometry, OdometryBreaks.of_all(breaks)
-
-
-def _replaced(odometry: Odometry, scans: LaserScans, log: SensorLog, a: float, b: float) -> tuple[Odometry, OdometryBreaks]:
-    middle = scans.middles
-    period = max(float(np.median(np.diff(middle))), 1e-3)
-    first_scan, last_scan = max(int(np.searchsorted(middle, a)) - 1, 0), min(int(np.searchsorted(middle, b)), len(middle) - 1)
-    inside = np.unique([*range(first_scan, last_scan, max(1, round(_SCANS_APART / period))), last_scan]).astype(np.int64)
-    inside = inside[(middle[inside] >= odometry.stamps[0]) & (middle[inside] <= odometry.stamps[-1])]
-    if len(inside) < 2:
-        return odometry, OdometryBreaks.none()
-    steps, share = _smooth_steps(scans, log, inside)
-    chain = se2.chain(np.zeros(3), steps)
-    at = middle[inside]
-    own = (odometry.stamps > at[0]) & (odometry.stamps <= at[-1])
-    first, last = int(np.argmax(own)), len(own) - 1 - int(np.argmax(own[::-1]))
-    moved = se2.compose(odometry.poses[first - 1 if first else 0], se2.interpolate_trajectory(at, chain, odometry.stamps[own]))
-    rest = se2.compose(moved[-1], se2.between(odometry.poses[last], odometry.poses[last + 1 :]))
-    poses = np.concatenate([odometry.poses[:first], moved, rest])
-    sigma = np.where((share >= 0.5)[:, None], _STEP_SIGMA, _UNKNOWN_STEP)
-    before = np.clip(np.searchsorted(odometry.stamps, at[1:]) - 1, 0, len(odometry.stamps) - 1)
-    return Odometry(odometry.stamps, poses), OdometryBreaks(odometry.stamps[before], sigma)
-
-
-def _smooth_steps(scans: LaserScans, log: SensorLog, chosen: Ints) -> tuple[Floats, Floats]:
-    """Measure steps twice: what scans do not show, the second time goes on as before and after."""
-    first, second = chosen[:-1], chosen[1:]
-    steps, share = scan_steps(scans, log.mounting, first, second, np.zeros((len(first), 3)), _SEARCHES)
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(steps, ((3, 3), (0, 0)), mode="edge"), 7, axis=0)
-    usual = np.median(windows, axis=2)
-    again, better = scan_steps(scans, log.mounting, first, second, usual)
-    taken = np.where((better >= share - 0.1)[:, None], again, steps)
-    wild = (np.hypot(taken[:, 0], taken[:, 1]) > _FASTEST_STEP) | (np.maximum(share, better) < 0.3)
-    return np.where(wild[:, None], usual, taken), np.where(wild, 0.0, np.maximum(share, better))
+def _factor(wheels: Floats, lidar: Floats, clear: float, otherwise: float = 1.0) -> float:
+    """Return the factor of the wheels' motions (e, d) that most agree on; `otherwise` where there are too few."""
+    ratio = _ratios(wheels, lidar, clear)[1]
+    return float(np.median(ratio)) if len(ratio) >= 2 * _LEAST_PAIRS else otherwise

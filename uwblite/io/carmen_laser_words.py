@@ -1,0 +1,83 @@
+"""The words around the readings of a CARMEN laser message: geometry before, poses and stamp behind."""
+
+import math
+import re
+from dataclasses import dataclass
+
+from ..errors import ConfigError
+from .carmen_messages import BrokenLine, numbers, stamp_of
+
+MAX_BEAMS = 100_000
+"""A message that claims more readings is broken."""
+RANK = {b"RAWLASER1": 0, b"FLASER": 1, b"ROBOTLASER1": 2}
+"""Messages that may carry the same scans; only those of the highest rank in the log are used."""
+HEAD = {b"RAWLASER1": 9, b"FLASER": 2, b"ROBOTLASER1": 9}
+"""Words before the readings."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Geometry that a message gives; messages with equal layout go into one array."""
+
+    beams: int
+    angle_min: float = 0.0
+    angle_increment: float = 0.0
+    range_max: float = 0.0
+    """m; 0 where the message does not give it."""
+
+
+def kinds_of(message: str) -> dict[bytes, bytes]:
+    """Return the messages that hold the scans of one lidar, each with the kind that it is read as.
+
+    Parameters
+    ----------
+    message : name of the only message to read, such as ROBOTLASER2 of the second lidar; empty = the first lidar's.
+
+    Raises
+    ------
+    ConfigError : scans are not read from such a message.
+    """
+    if not message:
+        return {name: name for name in RANK}
+    kind = "FLASER" if message == "RLASER" else re.sub("(?<=LASER)[1-5]$", "1", message)
+    if kind.encode() not in RANK:
+        raise ConfigError(f"scans are not read from {message!r}; choose ROBOTLASER1 to 5, RAWLASER1 to 5, FLASER or RLASER")
+    return {message.encode(): kind.encode()}
+
+
+def parse_head(name: bytes, tokens: list[bytes]) -> Layout:
+    """Read the words before the readings."""
+    what = name.decode()
+    if len(tokens) != HEAD[name]:
+        raise BrokenLine(f"{what}: fields are parted unevenly")
+    beams = int(tokens[-1])
+    if not 1 <= beams <= MAX_BEAMS:
+        raise BrokenLine(f"{what} announces {beams} readings")
+    if name == b"FLASER":
+        return Layout(beams)
+    angle_min, fov, increment, range_max = numbers(tokens[2:6], what, 4)
+    if increment == 0.0:
+        increment = fov / max(beams - 1, 1)
+    if abs(increment) * (beams - 1) > 2.1 * math.pi or abs(angle_min) > 2.1 * math.pi:
+        raise BrokenLine(f"{what}: {beams} readings {increment:g} rad apart are more than a turn")
+    return Layout(beams, angle_min, increment, max(range_max, 0.0))
+
+
+def split_tail(name: bytes, tail: list[bytes], ipc_left_out: bool) -> tuple[int, float]:
+    """Return which word behind the readings the poses of laser and robot begin at (RAWLASER1 has none), and the stamp, s."""
+    if name == b"FLASER":
+        if len(tail) not in (8, 9):
+            raise BrokenLine(f"FLASER has {len(tail)} fields behind its readings, expected 9")
+        return 0, stamp_of(tail[6:])
+    rest = tail[1 + int(tail[0]) :] if tail and len(tail[0]) < 10 and tail[0].isdigit() else tail
+    if name == b"RAWLASER1":
+        rest = rest if len(rest) in (2, 3) else tail
+        if len(rest) not in (2, 3):
+            raise BrokenLine(f"RAWLASER1 has {len(tail)} fields behind its readings, expected 4 + remissions")
+        return len(tail) - len(rest), stamp_of(rest)
+    rest = rest if 12 <= len(rest) <= 14 else tail
+    if not 12 <= len(rest) <= 14:
+        raise BrokenLine(f"ROBOTLASER1 has {len(tail)} fields behind its readings, expected 15 + remissions")
+    # 14 = with turn_axis and ipc_timestamp, 12 = with neither; 13 is one of them.
+    has_ipc = len(rest) == 14 or (len(rest) == 13 and not ipc_left_out)
+    return len(tail) - len(rest), stamp_of(rest[-3:] if has_ipc else rest[-2:])
