@@ -26,14 +26,7 @@ class UsageError(UwbliteError):
 
 
 class FormatError(UwbliteError):
-    """A file or stream is not what it should be.
-
-    Parameters
-    ----------
-    problem : what is wrong and how to fix it.
-    path : name of the file, as the user gave it.
-    line : 1-based line number, where there is one.
-    """
+    """A file or stream is not what it should be."""
 
     def __init__(self, problem: str, path: str = "", line: int | None = None) -> None:
         self.problem, self.path, self.line = problem, path, line

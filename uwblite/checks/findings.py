@@ -59,8 +59,6 @@ def timing(
     Parameters
     ----------
     stamps : (n,) s, non-decreasing.
-    topic : sensor.
-    found : takes the findings.
     expected_gap : a silence longer than this is a gap, s (or five periods, where that is longer).
     repeats : share of equal stamps that is not right, where some are; None = any is wrong.
     """

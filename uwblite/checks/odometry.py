@@ -25,9 +25,10 @@ def check_odometry(odometry: Odometry, found: Findings) -> dict[str, Any]:
     figures["path m"] = round(float(length.sum()), 3)
     figures["turned rad"] = round(float(np.abs(steps[:, 2]).sum()), 3)
     figures["speed m/s"] = round(speed, 4)
-    _check_motion(speed, found)
+    if 0.0 < speed < 0.004:
+        found.warning("odometry", f"the usual speed is {1000 * speed:.2f} mm/s", "check the unit: positions must be metres")
     figures["heading"] = _check_heading(odometry, found)
-    figures["width of the path by its length"] = round(_straightness(odometry.poses[:, :2]), 4)
+    figures["width of the path by its length"] = round(straightness(odometry.poses[:, :2]), 4)
     if figures["rate Hz"] and figures["rate Hz"] < 5.0:
         found.warning(
             "odometry",
@@ -35,11 +36,6 @@ def check_odometry(odometry: Odometry, found: Findings) -> dict[str, Any]:
             "ranges and rays are placed between them by interpolation; 10 Hz or more is better",
         )
     return figures
-
-
-def _check_motion(speed: float, found: Findings) -> None:
-    if 0.0 < speed < 0.004:
-        found.warning("odometry", f"the usual speed is {1000 * speed:.2f} mm/s", "check the unit: positions must be metres")
 
 
 def _check_heading(odometry: Odometry, found: Findings) -> dict[str, float]:
@@ -55,7 +51,7 @@ def _check_heading(odometry: Odometry, found: Findings) -> dict[str, float]:
     return {"agreement with the motion": round(plain, 3)}
 
 
-def _straightness(xy: Floats) -> float:
+def straightness(xy: Floats) -> float:
     """Return the width of the path by its length: ratio of the standard deviations along its principal axes."""
     values = np.linalg.eigvalsh(np.cov(xy.T)) if len(xy) > 2 else np.zeros(2)
     return float(np.sqrt(max(values[0], 0.0) / values[1])) if values[1] > 0 else 0.0

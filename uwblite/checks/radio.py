@@ -10,7 +10,7 @@ from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.units import LONGEST
 from ..sensor_log import SensorLog, UwbRanges
 from .findings import Findings, timing
-from .odometry import STRAIGHT
+from .odometry import STRAIGHT, straightness
 
 FEW = 10
 """Ranges from which an anchor cannot be placed."""
@@ -74,7 +74,7 @@ def _check_anchor(
             f"anchor {anchor_id}: {100 * share:.0f} % of the ranges jump farther than the robot drove (line of sight blocked?)",
             "they are down-weighted; a higher or more open place helps the anchor",
         )
-    width = _width(where[usable])
+    width = straightness(where[usable])
     if width < STRAIGHT:
         found.warning(
             "radio",
@@ -111,22 +111,19 @@ def _spikes(values: Floats, travelled: Floats) -> tuple[int, float]:
     return int(np.sum(np.abs(windows[:, 2] - around) > driven + 5.0 * max(noise, 0.03))), noise
 
 
-def _width(where: Floats) -> float:
-    if len(where) < 3:
-        return 0.0
-    values = np.linalg.eigvalsh(np.cov(where.T))
-    return float(np.sqrt(max(values[0], 0.0) / values[1])) if values[1] > 0 else 0.0
+_WINDOW = 2.0
+"""s."""
 
 
-def _check_coverage(log: SensorLog, found: Findings, window: float = 2.0) -> dict[str, float]:
-    """Share of the time in which at least one, two and three anchors are in reach within a window, s."""
+def _check_coverage(log: SensorLog, found: Findings) -> dict[str, float]:
+    """Share of the time in which at least one, two and three anchors are in reach within a window."""
     ranges = log.ranges
     assert ranges is not None
     start, end = float(log.odometry.stamps[0]), float(log.odometry.stamps[-1])
     usable = (ranges.ranges > 0.02) & (ranges.ranges < LONGEST) & (ranges.stamps >= start) & (ranges.stamps <= end)
     # Windows without ranges are only counted, however long the recording claims to be.
-    windows = max(1.0, np.ceil((end - start) / window))
-    slot = np.floor((ranges.stamps[usable] - start) / window)
+    windows = max(1.0, np.ceil((end - start) / _WINDOW))
+    slot = np.floor((ranges.stamps[usable] - start) / _WINDOW)
     measured = np.unique(np.stack([slot, ranges.anchor[usable].astype(np.float64)]), axis=1)
     count = np.unique(measured[0], return_counts=True)[1]
     shares = {f"at least {n}": round(min(float(np.sum(count >= n)) / float(windows), 1.0), 3) for n in (1, 2, 3)}

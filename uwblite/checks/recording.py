@@ -49,7 +49,6 @@ def diagnose(
 
     Parameters
     ----------
-    log : the recording.
     anchors, calibration, doubts : of a trial map, where there is one: it shows the wheels' scale, the delay of the radio and
         the bias of each anchor, and whether the sensors agree.
     refused : why no trial map could be made; empty where it was, or was not tried.

@@ -17,7 +17,6 @@ class Child:
 
     Parameters
     ----------
-    words : arguments of `uwblite`.
     niceness : 0..19; 19 = it runs when nobody else wants to. Other than 0, numerical libraries take one core alone.
     """
 

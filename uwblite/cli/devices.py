@@ -125,7 +125,6 @@ def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> PortReport
 
     Parameters
     ----------
-    path : of the port.
     kinds : of device that it may be; empty = any.
     pan_id : network id that a tag should have, None = any.
 

@@ -38,7 +38,6 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
     Parameters
     ----------
     path : the file or folder; - is standard input.
-    every_nth_scan : how many scans are left out.
     bag : topics and mappings of a bag, of a log the message of the scans, as `options.bag_choices` returns them.
 
     Raises

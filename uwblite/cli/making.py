@@ -49,10 +49,8 @@ def make(
 
     Parameters
     ----------
-    args : the command line: settings, constraints, --out.
     logs : as `read_logs` returns them; the list is emptied, for scans that no map looks at are most of the memory.
     reading : time that it took to read them, s.
-    progress, executor : see `build_map`.
     """
     from ..io.result_text import RunRecord
     from ..io.results import write_result

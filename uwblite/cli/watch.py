@@ -113,10 +113,7 @@ class Watch:
 
     Parameters
     ----------
-    log : the growing log.
     folder : where the maps go; a map of an earlier watch is shown at once.
-    page : takes what is to be seen.
-    options : for `uwblite map`.
     """
 
     def __init__(self, log: str, folder: str, page: "LivePage", options: list[str]) -> None:

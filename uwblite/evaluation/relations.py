@@ -62,7 +62,6 @@ def evaluate_relations(stamps: Floats, poses: Floats, relations: Relations, dela
     Parameters
     ----------
     stamps, poses : (n,) s, non-decreasing, and (n, 3) T_map_base.
-    relations : what is given.
     delay : s, offset of the lidar's clock: a scan stamped t was taken at t + delay by the clock of the trajectory.
 
     Raises

@@ -30,7 +30,7 @@ def chordal_start(graph: Graph) -> Graph | None:
     if sum(map(len, relative)) <= free.sum():
         return None
     i, j, T = (np.concatenate([getattr(e, name) for e in relative]) for name in ("i", "j", "T_i_j"))
-    information = np.concatenate([_information(e) for e in relative])
+    information = np.concatenate([np.sum(e.sqrt_information**2, axis=1) * e.own_weights[:, None] for e in relative])
     z = np.exp(1j * graph.poses[:, 2])
     places = graph.poses[:, 0] + 1j * graph.poses[:, 1]
     try:
@@ -47,11 +47,6 @@ def chordal_start(graph: Graph) -> Graph | None:
 
 
 _LEAST = 1e-300
-
-
-def _information(edges: RelativePoseEdges) -> Floats:
-    """Return the diagonals (e, 3) of the information."""
-    return np.sum(edges.sqrt_information**2, axis=1) * edges.own_weights[:, None]
 
 
 def _solved(i: Ints, j: Ints, factor: Floats, step: Floats, weight: Floats, values: Floats, free: Bools) -> Floats:

@@ -57,7 +57,6 @@ def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False
     Parameters
     ----------
     pairs : (b, 2) poses that share an edge.
-    poses : how many there are.
     others : scalars that come after the poses.
     subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
     last : poses that come after the others, in the sparse form.

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import ConfigError
-from .graph import Edges, Graph, Linearization, linearize
+from .graph import Graph, Linearization, linearize
 from .normal_equations import NormalEquations
 from .problem_checks import check
 from .robust import SQUARED
@@ -101,10 +101,9 @@ def _squared(graph: Graph, thresholds: Mapping[int, float]) -> dict[int, Floats]
 
 def _weighted(current: Graph, plain: Graph, weights: Mapping[int, Floats]) -> tuple[Graph, list[Linearization]]:
     """Return the present estimates with the plain graph's edges weighted, and their linearisation."""
-    edges = tuple(_reweighted(e, weights[k]) if k in weights else e for k, e in enumerate(plain.edges))
+    edges = tuple(
+        replace(e, weights=weights[k] * e.own_weights) if k in weights else e  # type: ignore[type-var]
+        for k, e in enumerate(plain.edges)
+    )
     graph = replace(current, edges=edges)
     return graph, linearize(graph)
-
-
-def _reweighted(edges: Edges, weights: Floats) -> Edges:
-    return replace(edges, weights=weights * edges.own_weights)  # type: ignore[type-var]

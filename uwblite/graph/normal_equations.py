@@ -49,7 +49,6 @@ class NormalEquations:
 
         Parameters
         ----------
-        graph : what is free.
         linearized : of every kind of edges; only the indices and shapes of its blocks are read.
         subtrees : order for the selected inverse, not for speed.
         last : poses to be eliminated after all others.

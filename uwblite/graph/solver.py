@@ -110,8 +110,6 @@ def optimize(
     Parameters
     ----------
     graph : estimates to start from, what is fixed, and the edges; it is not changed.
-    config : stopping rules.
-    progress : called after every iteration with (done, most).
 
     Raises
     ------

@@ -160,7 +160,6 @@ def from_sweeps(
     ----------
     geometry : the grid to fill; None = the smallest around all rays, coarser where config.max_cells asks for it.
     executor : any concurrent.futures executor; the result does not depend on it.
-    progress : called after every batch of scans.
     announce : called with the geometry before the grid is allocated.
 
     Raises

@@ -30,7 +30,6 @@ def moved_scans(poses: Floats, distance: float, angle: float) -> Ints:
     ----------
     poses : (k, 3) T_map_laser of each scan.
     distance : m; 0 chooses every scan.
-    angle : rad.
 
     Returns
     -------
@@ -67,7 +66,6 @@ def scan_rays(
 
     Parameters
     ----------
-    scans : their geometry.
     reach : (s, b) length of the rays of each scan, m; where it is 0 there is no ray.
     first : (s, 3) T_map_laser at the first ray of each scan.
     last : (s, 3) T_map_laser at the last ray; in between the laser moves evenly. None = it stood still.

@@ -5,6 +5,7 @@ from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..arrays import Floats
 from ..errors import ConfigError
@@ -21,7 +22,9 @@ class Frames:
         for t in transforms:
             shift, turn = t.transform.translation, t.transform.rotation
             pose = np.eye(4)
-            pose[:3, :3] = rotation(turn.x, turn.y, turn.z, turn.w)
+            quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+            if 1e-6 < np.linalg.norm(quaternion) < 1e6:
+                pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
             pose[:3, 3] = shift.x, shift.y, shift.z
             self._parents.setdefault(_name(t.child_frame_id), (_name(t.header.frame_id), pose))
 
@@ -60,18 +63,3 @@ def planar(pose: Floats) -> tuple[Floats, bool]:
 
 def _name(frame: str) -> str:
     return frame.lstrip("/")
-
-
-def rotation(x: float, y: float, z: float, w: float) -> Floats:
-    """Return the rotation matrix of a quaternion of any positive length; the identity where it has none."""
-    n = x * x + y * y + z * z + w * w
-    if not 1e-12 < n < 1e12:
-        return np.eye(3)
-    s = 2.0 / n
-    return np.array(
-        [
-            [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
-            [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
-            [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
-        ]
-    )

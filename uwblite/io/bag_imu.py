@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Bools, Floats
+from ..arrays import Floats
 from ..sensor_log import Gyro
 from .bag_frames import Frames
 
@@ -49,7 +49,6 @@ class ImuReadings:
         Parameters
         ----------
         frames, base : where the sensor sits on the robot, and the robot's frame.
-        warnings : takes what is odd about it.
         """
         rows = np.array(self._rows).reshape(-1, 11)
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
@@ -68,7 +67,7 @@ class ImuReadings:
 
     def _vertical(self, acceleration: Floats, frames: Frames, base: str, warnings: list[str]) -> Floats:
         """Return which way is up, (3,) in the sensor's frame, length 1."""
-        felt = acceleration[_finite(acceleration)]
+        felt = acceleration[np.isfinite(acceleration).all(axis=1)]
         usual = np.median(felt, axis=0) if len(felt) else np.zeros(3)
         size = float(np.linalg.norm(usual))
         heavy = any(abs(size / one - 1.0) < SLACK for one in GRAVITY)
@@ -90,10 +89,6 @@ class ImuReadings:
                 f"by the transforms {self.frame} is tilted otherwise than by its accelerations, which are taken for its heading"
             )
         return up
-
-
-def _finite(rows: Floats) -> Bools:
-    return np.asarray(np.isfinite(rows).all(axis=1))
 
 
 def _headings(turns: Floats) -> Floats:

@@ -102,7 +102,8 @@ def plan_topics(
             unread[t.name] = guess
         if t.name in asked.uwb and t.name not in uwb:
             raise ConfigError(_no_mapping(t, unread.get(t.name)))
-    kept = uwb if asked.uwb else _uncorrected(uwb)
+    # X is left out where X_raw exists: the map has its own correction.
+    kept = uwb if asked.uwb else {name: m for name, m in uwb.items() if f"{name}_raw" not in uwb}
     spare = [t.name for t in topics if t.type in (ODOMETRY, SCAN, IMU) and t.name not in (odometry, scan, imu)]
     spare += [name for name in uwb if name not in kept]
     tf = tuple(t.name for t in topics if t.type == TRANSFORMS)
@@ -184,8 +185,3 @@ def _best(topics: Sequence[BagTopic], kind: str, liked: tuple[str, ...], dislike
 
     fitting = [t for t in topics if t.type == kind]
     return min(fitting, key=rank).name if fitting else ""
-
-
-def _uncorrected(by_topic: dict[str, tuple[UwbMapping, ...]]) -> dict[str, tuple[UwbMapping, ...]]:
-    """Leave out X where X_raw exists: the map has its own correction."""
-    return {name: m for name, m in by_topic.items() if f"{name}_raw" not in by_topic}

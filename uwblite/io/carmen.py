@@ -63,7 +63,6 @@ def read_log(
 
     Parameters
     ----------
-    path : the file.
     every_nth_scan : keep every n-th laser scan; the others are counted and never decoded.
     max_broken_share : share of the messages that may be broken (0..1); each is skipped and counted in the notes.
     scan_message : the messages whose scans are read, for example ROBOTLASER2 of a second lidar; empty = the first lidar's.

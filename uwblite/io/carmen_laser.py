@@ -41,13 +41,7 @@ class _Scans:
 
 
 class LaserMessages:
-    """Collects the scans of one log; `begin` a block, `take` its lines, `decode` the block, `finish` the log.
-
-    Parameters
-    ----------
-    every_nth_scan : how many are left out.
-    message : see `kinds_of`.
-    """
+    """Collects the scans of one log; `begin` a block, `take` its lines, `decode` the block, `finish` the log."""
 
     def __init__(self, every_nth_scan: int, message: str = "") -> None:
         self.kinds = kinds_of(message)

@@ -93,16 +93,10 @@ class LiveReader:
         reader.laser.ipc_left_out = before.laser.ipc_left_out
         reader.feed(lines)
         self._reader, self.broken = reader, self.broken + reader.broken
-        found: list[Measured] = [*self._poses(reader), *self._ranges(reader), *self._scans(reader), *self._turns(reader)]
+        poses, turns = np.array(reader.odometry).reshape(-1, 4), np.array(reader.gyro).reshape(-1, 2).tolist()
+        found: list[Measured] = [LiveOdometry(float(row[0]), row[1:], float(row[0])) for row in poses]
+        found += [*self._ranges(reader), *self._scans(reader), *(LiveGyro(t, heading, t) for t, heading in turns)]
         return sorted(found, key=lambda measured: measured.order)
-
-    def _poses(self, reader: LogReader) -> list[LiveOdometry]:
-        rows = np.array(reader.odometry).reshape(-1, 4)
-        return [LiveOdometry(float(row[0]), row[1:], float(row[0])) for row in rows]
-
-    def _turns(self, reader: LogReader) -> list[LiveGyro]:
-        rows = np.array(reader.gyro).reshape(-1, 2).tolist()
-        return [LiveGyro(stamp, heading, stamp) for stamp, heading in rows]
 
     def _ranges(self, reader: LogReader) -> list[LiveRange]:
         names = {number: name.decode() for name, number in reader.uwb_ids.items()}

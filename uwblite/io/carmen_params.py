@@ -10,22 +10,11 @@ from ..sensor_log import SensorMounting, fault_of_id
 from .carmen_messages import BrokenLine, numbers
 
 _ANCHOR_HEIGHT = "uwb_anchor_height_"
-_NUMBERS = frozenset(
-    [
-        "uwb_tag_offset_x",
-        "uwb_tag_offset_y",
-        "uwb_tag_height",
-        "uwb_anchor_height",
-        "robot_frontlaser_offset",
-        "robot_frontlaser_side_offset",
-        "robot_frontlaser_angular_offset",
-        "robot_front_laser_max",
-        "laser_front_laser_max_range",
-        "laser_front_laser_resolution",
-        "laser_time_increment",
-        "laser_range_min",
-    ]
-)
+_NUMBERS = frozenset((
+    "uwb_tag_offset_x", "uwb_tag_offset_y", "uwb_tag_height", "uwb_anchor_height", "robot_frontlaser_offset",
+    "robot_frontlaser_side_offset", "robot_frontlaser_angular_offset", "robot_front_laser_max", "laser_front_laser_max_range",
+    "laser_front_laser_resolution", "laser_time_increment", "laser_range_min",
+))  # fmt: skip
 _TAG = ("tag_offset_x", "tag_offset_y", "tag_height")
 _FURTHER_TAG = re.compile(r"uwb[2-9]_tag_(offset_x|offset_y|height)")
 _OF_LASER = ("laser_time_increment", "laser_range_min", "laser_flipped")

@@ -27,7 +27,6 @@ def write_log(path: str | os.PathLike[str], log: SensorLog) -> None:
     Parameters
     ----------
     path : the file; replaced only when the new one is complete.
-    log : the recording.
 
     Raises
     ------

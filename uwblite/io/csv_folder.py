@@ -30,7 +30,7 @@ from ..sensor_log import Gyro, LaserScans, LogNotes, Odometry, SensorLog, Sensor
 from .files import replacing
 from .folders import replacing_folder
 from .settings_toml import to_toml
-from .source import open_source
+from .source import finite, open_source
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -184,13 +184,7 @@ def _rows(path: Path, columns: int, digest: "hashlib._Hash") -> Iterator[tuple[i
 
 
 def _number(text: str, path: Path, line: int) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise FormatError(f"{text[:30]!r} is not a finite number", str(path), line)
-    return value
+    return finite(text, f"{text[:30]!r} is not a finite number", str(path), line)
 
 
 def _table(path: Path, columns: int, digest: "hashlib._Hash") -> Floats:

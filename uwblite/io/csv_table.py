@@ -36,7 +36,6 @@ class CsvTable:
 
         Parameters
         ----------
-        columns : names.
         default : value of a column that is absent or a field that is empty; None = it must be there.
 
         Raises

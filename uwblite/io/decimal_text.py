@@ -63,7 +63,6 @@ def decode_equal_widths(
 
     Parameters
     ----------
-    text : (bytes,) the text.
     begins : (k,) index of each row's first character.
     count : numbers in a row.
     width : characters of each number; one blank stands between numbers and behind the last.

@@ -61,7 +61,6 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
 
     Parameters
     ----------
-    path : the file.
     from_odometry : forget the vertices' places and start from the edges between successive poses.
 
     Raises
@@ -135,7 +134,8 @@ def write_g2o(
     """
     with replacing(path) as stream:
         names = [*(pose_ids or map(str, range(len(graph.poses)))), *anchor_ids]
-        kept = bool(pose_ids) and len(names) == len(graph.poses) + len(graph.anchors) and _are_numbers(names)
+        kept = bool(pose_ids) and len(set(names)) == len(names) == len(graph.poses) + len(graph.anchors)
+        kept = kept and all(_ID.fullmatch(name.encode()) for name in names)
         number = np.array([int(name) for name in names]) if kept else np.arange(len(graph.poses) + len(graph.anchors))
         for line in _lines(graph, ranges, number):
             stream.write(line.encode())
@@ -143,10 +143,6 @@ def write_g2o(
             first = 0 if pose_ids else len(graph.poses)
             for vertex, name in enumerate(names[first:], first):
                 stream.write(f"# vertex {vertex} is {'anchor ' if vertex >= len(graph.poses) else ''}{name}\n".encode())
-
-
-def _are_numbers(names: Sequence[str]) -> bool:
-    return len(set(names)) == len(names) and all(_ID.fullmatch(name.encode()) for name in names)
 
 
 def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:

@@ -156,7 +156,6 @@ def assembled(
 
     Parameters
     ----------
-    plain : measurements by kind.
     poses : (n, 3) given poses, nan where the file gives none; these are reached from the others along edges.
     anchors : (a, 2) given landmarks; nan where none is given; these are placed by the first edge that sees them.
     fixed, fixed_anchors : indices of what is fixed. Nothing named and no prior on a pose: the first pose is fixed.

@@ -23,7 +23,6 @@ def write_graph_with_scans(path: str | os.PathLike[str], result: StoredResult, l
     Parameters
     ----------
     path : the file, compressed where its name ends in ``.gz``.
-    result : the map.
     logs : its recordings, in their order; none: the graph alone.
 
     Returns

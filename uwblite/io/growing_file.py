@@ -25,7 +25,6 @@ class GrowingFile:
 
     Parameters
     ----------
-    path : the file.
     whole : read all that it holds already.
 
     Raises

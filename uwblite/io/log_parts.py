@@ -17,10 +17,6 @@ TAIL_BYTES = 1024
 def parts_of(path: str) -> tuple[list[str], str]:
     """Return the files of the recording that a file is part of.
 
-    Parameters
-    ----------
-    path : a log, plain or gzip; - is standard input.
-
     Returns
     -------
     parts : in order; `path` alone where it is no part.

@@ -6,7 +6,6 @@ and the rest unknown. The usual pixels 0, 254 and 205 give p = 1, 0.004 and 0.19
 exceed 0.196 or everything unknown becomes free.
 """
 
-import math
 import os
 import re
 from pathlib import Path
@@ -20,7 +19,7 @@ from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_ABOVE, OccupancyGrid
 from .files import replacing, write_text
 from .png import MOST_PIXELS, SIGNATURE, decode_png, encode_png, png_shape
-from .source import open_input, read_bounded
+from .source import finite, open_input, read_bounded
 
 Image = NDArray[np.uint8]
 
@@ -39,8 +38,6 @@ def write_map(
 
     Parameters
     ----------
-    folder : existing folder.
-    grid : the map.
     name : name of both files without ending.
     mode : 'trinary' writes a binary PGM of occupied, free and unknown; 'scale' a PNG of probabilities with unknown
         cells transparent.
@@ -169,24 +166,15 @@ def _text(settings: dict[str, str | list[str]], key: str, path: str) -> str:
 
 
 def _number(settings: dict[str, str | list[str]], key: str, path: str) -> float:
-    return _finite(_text(settings, key, path), key, path)
+    text = _text(settings, key, path)
+    return finite(text, f"{key}: {text[:40]!r} is not a number", path)
 
 
 def _numbers(settings: dict[str, str | list[str]], key: str, path: str) -> list[float]:
     value = settings.get(key)
     if not isinstance(value, list):
         raise FormatError(f"{key} must be a list of numbers", path)
-    return [_finite(item, key, path) for item in value]
-
-
-def _finite(text: str, key: str, path: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise FormatError(f"{key}: {text[:40]!r} is not a number", path)
-    return value
+    return [finite(item, f"{key}: {item[:40]!r} is not a number", path) for item in value]
 
 
 def _read_picture(path: str) -> Image:

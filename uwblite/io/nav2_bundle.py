@@ -89,7 +89,6 @@ def write_nav2_bundle(folder: str | os.PathLike[str], result: StoredResult) -> t
     Parameters
     ----------
     folder : made where it is missing; files of an earlier bundle are replaced, others stay.
-    result : the map.
 
     Raises
     ------

@@ -10,13 +10,7 @@ from ..errors import ConfigError
 
 
 def missing_package(package: str, purpose: str) -> ConfigError:
-    """Return the error for a package that is not installed, with a command that installs it for this Python.
-
-    Parameters
-    ----------
-    package : name on PyPI.
-    purpose : what needs it, such as 'reading bags'.
-    """
+    """Return the error for a package that is not installed, with a command that installs it for this Python."""
     return ConfigError(f"{purpose} needs the package {package}: {install_command(package)}")
 
 

@@ -54,7 +54,6 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
 
     Parameters
     ----------
-    path : the file.
     from_odometry : forget where the vertices are and start from the edges between successive poses; landmarks that only
         ranges measure then have no position (nan).
 

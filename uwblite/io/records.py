@@ -69,7 +69,6 @@ def read_records(source: TextSource, layouts: Mapping[str, Layout]) -> RecordFil
 
     Parameters
     ----------
-    source : the open file.
     layouts : by tag; lines of other tags are counted, comments (#) and blank lines are not.
 
     Raises

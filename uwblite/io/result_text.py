@@ -17,6 +17,10 @@ from ..sensor_log import LogNotes, SensorLog
 SCHEMA = 2
 """Version of report.json; it grows when a field changes its meaning or goes."""
 
+_ANCHOR_FIELDS = (
+    "id", "position", "covariance", "ranges", "used_share", "bias", "bias_sigma", "residual_rms", "status", "reason",
+    "alternative",
+)  # fmt: skip
 _CALIBRATION_FIELDS = ("name", "value", "sigma", "unit", "meaning", "state", "reason")
 
 
@@ -100,11 +104,6 @@ def anchors_csv(result: MapResult) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _travelled(result: MapResult) -> float:
-    steps = np.hypot(*np.diff(result.trajectory[:, :2], axis=0).T)
-    return float(steps[np.diff(result.recording) == 0].sum())
-
-
 def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, hashes: dict[str, str]) -> dict[str, Any]:
     """Return the result as report.json has it (JSON-ready); see docs/formats.md."""
     grid = result.grid
@@ -121,7 +120,7 @@ def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, has
         "trusted": not result.doubts,
         "doubts": notices(result.doubts),
         "warnings": notices(result.warnings),
-        "anchors": [_anchor_entry(a) for a in result.anchors],
+        "anchors": [{name: getattr(a, name) for name in _ANCHOR_FIELDS} for a in result.anchors],
         "calibration": [{name: getattr(c, name) for name in _CALIBRATION_FIELDS} for c in result.calibration],
         "closures": [_closure_entry(c, result.keyframe_stamps) for c in result.closures],
         "stages": [{"name": s.name, **s.figures} for s in result.stages],
@@ -154,9 +153,10 @@ def notices(found: Sequence[Notice]) -> list[dict[str, Any]]:
 
 def recording_figures(logs: Sequence[SensorLog], result: MapResult) -> dict[str, Any]:
     """Return duration, s, distance, m, and counts of all recordings together."""
+    steps = np.hypot(*np.diff(result.trajectory[:, :2], axis=0).T)
     return {
         "duration": sum(float(log.odometry.stamps[-1] - log.odometry.stamps[0]) for log in logs),
-        "travelled": _travelled(result),
+        "travelled": float(steps[np.diff(result.recording) == 0].sum()),
         "odometry": sum(len(log.odometry.stamps) for log in logs),
         "ranges": sum(0 if log.ranges is None else len(log.ranges.stamps) for log in logs),
         "scans": sum(log.notes.scans_left_out + (0 if log.scans is None else len(log.scans.stamps)) for log in logs),
@@ -189,11 +189,6 @@ def json_lines(content: dict[str, Any]) -> str:
         return json.dumps(value, allow_nan=False)
 
     return "{\n " + ",\n ".join(f"{json.dumps(k)}: {text(v)}" for k, v in content.items()) + "\n}\n"
-
-
-def _anchor_entry(anchor: Any) -> dict[str, Any]:
-    names = ("id", "position", "covariance", "ranges", "used_share", "bias", "bias_sigma", "residual_rms", "status", "reason")
-    return {name: getattr(anchor, name) for name in (*names, "alternative")}
 
 
 def _closure_entry(closure: Any, stamps: NDArray[np.float64]) -> dict[str, Any]:

@@ -92,9 +92,7 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
 
     Parameters
     ----------
-    folder : where to write.
     logs : the recordings, in the order of the result's sessions.
-    result, record : what was made of them, and how.
 
     Returns
     -------

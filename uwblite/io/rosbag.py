@@ -57,7 +57,6 @@ def read_bag(path: str | os.PathLike[str], topics: BagTopics = GUESSED, mappings
     Parameters
     ----------
     path : a ``.bag`` file, a ROS 2 bag's folder, or a single ``.mcap`` or ``.db3`` file.
-    topics : which topics to read.
     mappings : how ranges stand in messages; the known ones are tried after these.
 
     Returns

@@ -42,7 +42,6 @@ def write_bag(path: str | os.PathLike[str], log: SensorLog, *, storage: str = "m
     Parameters
     ----------
     path : file or folder to make; a folder must not exist.
-    log : the recording.
     storage : 'mcap' or 'sqlite3'.
 
     Raises
@@ -59,8 +58,6 @@ def write_messages(
 
     Parameters
     ----------
-    path : file or folder to make.
-    messages : yields them, made by what it is given.
     storage : 'mcap' or 'sqlite3'.
     """
     try:
@@ -128,8 +125,6 @@ def recording_messages(log: SensorLog, make: Messages, *, prefix: str = "") -> I
 
     Parameters
     ----------
-    log : the recording.
-    make : makes messages.
     prefix : of frames and topics, such as ``recording_2/``, where several recordings share a bag.
     """
     sensors = (log.odometry, log.gyro, log.ranges, log.scans)

@@ -45,7 +45,6 @@ def to_toml(config: Any, *, comments: bool = False, header: str = "", advanced: 
 
     Parameters
     ----------
-    config : settings.
     comments : write each field's docstring, permitted range and choices above it.
     header : text for the first lines, written as comments.
     advanced : also write advanced settings that have their defaults.

@@ -3,6 +3,7 @@
 import gzip
 import hashlib
 import io
+import math
 import os
 import select
 import stat
@@ -124,7 +125,6 @@ def open_source(path: str | os.PathLike[str], digest: "hashlib._Hash | None" = N
 
     Parameters
     ----------
-    path : the file.
     digest : takes the bytes as stored, where several files are hashed together.
 
     Raises
@@ -190,6 +190,22 @@ def read_bounded(name: str, most: int) -> bytes:
     if len(data) > most:
         raise FormatError(f"is larger than {most / 1e6:.0f} MB, far too large for what it should be", name)
     return data
+
+
+def finite(text: str | bytes, fault: str, path: str, line: int | None = None) -> float:
+    """Return the number that a text is.
+
+    Raises
+    ------
+    FormatError : with the words of `fault`, where it is none or not finite.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise FormatError(fault, path, line)
+    return value
 
 
 _LARGEST_SETTINGS = 1 << 20

@@ -15,6 +15,7 @@ from ..grid.occupancy_grid import OccupancyGrid
 from .csv_table import read_csv
 from .map_server import read_map
 from .results import repair_result
+from .source import finite
 from .tum import read_tum
 
 
@@ -130,7 +131,8 @@ def _keyframes(path: Path, recordings: int) -> tuple[Floats, Ints, Floats]:
         return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3, 3))
     table = read_csv(path)
     # Stamps are times since 1970 in many recordings: too large for the lengths that a table is checked for.
-    stamps = np.array([_stamp(text, table.path, line) for text, line in zip(table.texts("stamp"), table.lines, strict=True)])
+    texts = zip(table.texts("stamp"), table.lines, strict=True)
+    stamps = np.array([finite(text, f"stamp is {text[:40]!r}, not a time", table.path, line) for text, line in texts])
     upper = table.numbers("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
     covariances = np.empty((len(upper), 3, 3))
     row, col = np.triu_indices(3)
@@ -139,16 +141,6 @@ def _keyframes(path: Path, recordings: int) -> tuple[Floats, Ints, Floats]:
     if len(number) and not 1 <= number.min() <= number.max() <= recordings:
         raise FormatError(f"names recording {number.max()}; the folder holds {recordings} trajectories", table.path)
     return stamps, number, covariances
-
-
-def _stamp(text: str, path: str, line: int) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise FormatError(f"stamp is {text[:40]!r}, not a time", path, line)
-    return value
 
 
 def _anchors(path: Path) -> tuple[StoredAnchor, ...]:

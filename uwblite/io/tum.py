@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import FormatError
 from .files import write_bytes
-from .source import open_source
+from .source import finite, open_source
 
 
 def write_tum(path: str | os.PathLike[str], stamps: Floats, poses: Floats) -> None:
@@ -15,7 +15,6 @@ def write_tum(path: str | os.PathLike[str], stamps: Floats, poses: Floats) -> No
 
     Parameters
     ----------
-    path : the file.
     stamps : (n,) s, written to the microsecond.
     poses : (n, 3) x, y, theta; m, rad; written to the micrometre and 1e-9 of the quaternion.
     """
@@ -100,16 +99,10 @@ def _numbers(rows: list[tuple[int, list[bytes]]], path: str, columns: str) -> Fl
     try:
         table = np.array([tokens for _, tokens in rows], dtype=np.float64).reshape(-1, 8)
     except ValueError:
-        table = np.array([[_number(token, path, n) for token in tokens] for n, tokens in rows]).reshape(-1, 8)
+        cells = [finite(token, f"{token[:30]!r} is not a number", path, n) for n, tokens in rows for token in tokens]
+        table = np.array(cells).reshape(-1, 8)
     # Squares of the quaternion must stay finite too.
     bad = np.flatnonzero(~(np.abs(table) < 1e100).all(axis=1))
     if len(bad):
         raise FormatError("a number is not finite", path, rows[bad[0]][0])
     return table
-
-
-def _number(token: bytes, path: str, line: int) -> float:
-    try:
-        return float(token)
-    except ValueError:
-        raise FormatError(f"{token[:30]!r} is not a number", path, line) from None

@@ -39,7 +39,6 @@ def suggested(topic: str, message_type: str, samples: Callable[[str], Sequence[A
 
     Parameters
     ----------
-    topic, message_type : names of both.
     samples : gives the first messages of a topic.
     """
     kind = short_type(message_type)

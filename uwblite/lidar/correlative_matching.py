@@ -72,7 +72,6 @@ def search(
     target, source : one cloud each, in its own frame.
     T_target_source : (3,) centre of the grid; m, m, rad.
     window : half widths of the grid in x, y, m, and heading, rad.
-    config : defaults where None.
     oriented : the normals point to the sides from which the surfaces were seen, and must agree.
 
     Returns

@@ -179,8 +179,6 @@ def refine(
     graph : wheels, radio, priors and other edges; scan edges come from here.
     clouds, raster : see clouds.build and cloud_rasters.rasterize; the raster's reach bounds the gate.
     twist : (k, 3) velocity of the base at each keyframe.
-    i, j : (e,) pairs, see choose_pairs.
-    on_round : called with (round, rounds).
     delay : of the lidar's clock, s, with which the clouds were made.
     """
     # Lines seen obliquely lean a little, so the cloud that gives the points seems shifted towards where it was seen from:

@@ -59,7 +59,6 @@ def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
 
     Parameters
     ----------
-    log : with scans.
     pairs : scan pairs to match at most.
     """
     scans = log.scans

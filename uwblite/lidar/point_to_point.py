@@ -65,7 +65,6 @@ def align(target: cKDTree, source: Floats, T_target_source: Floats, config: IcpC
     ----------
     target : of the target's points, m; see make_tree. source : (n, 2) points in their own frame, m.
     T_target_source : (3,) initial guess; m, m, rad.
-    config : defaults where None.
     """
     config = config or IcpConfig()
     pose = np.array(T_target_source, dtype=np.float64)

@@ -36,12 +36,7 @@ _FAR = 10.0
 
 
 def loose_links(wheels: OdometryEdges, graph: Graph) -> Ints:
-    """Return the steps of the odometry (l,) that scan edges do not fix; none where these are no exceptions.
-
-    Parameters
-    ----------
-    graph : holds the scan edges.
-    """
+    """Return the steps of the odometry (l,) that scan edges do not fix; none where these are no exceptions."""
     links = np.flatnonzero(directions_held(graph)[wheels.i] < _LEAST_HELD)
     return links if len(links) <= max(_EXCEPTIONS, _SHARE * len(wheels)) else links[:0]
 

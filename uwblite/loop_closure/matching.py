@@ -64,9 +64,7 @@ def fit(
 
     Parameters
     ----------
-    candidates : at least one. clouds : of all sub-maps.
     free : what each sub-map saw to be free; None = not asked.
-    progress : called with (done, total). executor : see parallel.in_order.
     """
     total, done, parts = len(candidates.target), 0, []
     for part in in_order(_fit, _batches(candidates, clouds, config, search_config, free), executor):

@@ -42,7 +42,6 @@ def find(
     graph : poses that place the sub-maps.
     recording : (k,) recording of each keyframe; neighbouring sub-maps of one recording are no candidates.
     config : its partners bound the candidates per sub-map. icp : outlier distance, iterations and fitness.
-    progress : called with (done, total).
     executor : any concurrent.futures executor; the result does not depend on it.
     """
     target, source = candidates(graph.poses, submaps, recording, config.partners)

@@ -40,8 +40,6 @@ def find(
 
     Parameters
     ----------
-    candidates : see closure_candidates.propose. submaps : their clouds.
-    progress : called with (done, total).
     free : what each sub-map saw to be free, see visibility.observed_free_space; None = free-space violations are not tested.
     executor : any concurrent.futures executor; the result does not depend on it.
     """

@@ -87,7 +87,6 @@ def clearance_map(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse"
 
     Parameters
     ----------
-    grid : the map.
     radius : of the robot, m.
     unknown : 'refuse' makes unknown cells obstacles, 'price' makes them dear.
     """

@@ -204,7 +204,6 @@ def make_planner(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse")
 
     Parameters
     ----------
-    grid : the map.
     radius : of the robot, m.
     unknown : 'refuse' keeps the robot out of unknown space, 'price' makes it dear (see clearance.UNKNOWN_PRICE).
 

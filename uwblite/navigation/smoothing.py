@@ -43,7 +43,6 @@ def along_lines(clearance: ClearanceMap, begin: Floats, end: Floats) -> Lines:
 
     Parameters
     ----------
-    clearance : the map.
     begin, end : (n, 2) m, map frame.
     """
     lengths = np.hypot(*(end - begin).T)
@@ -74,7 +73,6 @@ def smoothed(clearance: ClearanceMap, line: Floats) -> Floats:
 
     Parameters
     ----------
-    clearance : the map.
     line : (n, 2) corners, m, map frame; its pieces are clear.
     """
     cost = np.inf

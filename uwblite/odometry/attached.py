@@ -111,7 +111,6 @@ def scan_points(
 
     Parameters
     ----------
-    log : recording with scans.
     owner, chosen : (s,) keyframe and scan indices, see choose_scans.
     range_max : longer readings are left out, m.
     """

@@ -65,10 +65,6 @@ def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     Each step of the wheels keeps its length; its direction turns by half of what both headings differ in (the chord of
     an arc). The bias is the gyro's turn rate while the wheels stand, else the median difference to that of the wheels;
     what is left of it is estimated with the map (``heading_rate``).
-
-    Parameters
-    ----------
-    log : with or without a gyro.
     """
     gyro, odometry = log.gyro, log.odometry
     if gyro is None or len(gyro.stamps) < 2 or len(odometry.stamps) < 2:

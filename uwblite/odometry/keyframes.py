@@ -62,7 +62,6 @@ def select(
     Parameters
     ----------
     odometry : n >= 1 samples.
-    config : thresholds.
     breaks : steps that were not measured; a keyframe stands on either side of each.
     scans : keyframes are then moments of scans, for at no other moment does the lidar measure a pose: what the
         odometry measures between two moments, and the jitter of both clocks, stays an edge of the graph and bends no cloud.

@@ -66,7 +66,6 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
     wheels : edges between neighbouring poses, in the order of the poses.
     steps : steps between neighbouring poses that the lidar measured. Directions that a step does not see do not count;
         where fewer than 20 steps see one, its noise stays.
-    graph : holds the wheels' calibration.
     """
     if len(steps) < _ENOUGH_STEPS:
         return wheels

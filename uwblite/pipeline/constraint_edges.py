@@ -62,7 +62,6 @@ def apply(given: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed:
 
     Parameters
     ----------
-    known : what is known.
     graph : first estimate; its first pose is fixed.
     anchor_ids : (a,) names of its anchors.
     placed : (a,) which of them have a position.

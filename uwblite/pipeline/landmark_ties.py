@@ -51,8 +51,6 @@ def sightings(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: Floa
     Parameters
     ----------
     landmark : its place, in the frame of the poses.
-    clouds : one per keyframe.
-    poses : (k, 3) T_map_base.
     path : (k,) m travelled.
 
     Raises
@@ -122,11 +120,6 @@ class Ties:
 
 def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) -> Ties:
     """Find the landmarks and tie the poses that see them at the measured distances.
-
-    Parameters
-    ----------
-    known : landmarks and distances.
-    clouds, poses, path : see sightings; poses in the frame of the landmarks' places.
 
     Raises
     ------

@@ -44,12 +44,7 @@ _SCALE = 0.12
 
 
 def check_residuals(estimate: Estimate, residuals: Floats, task: Task) -> None:
-    """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, speak against.
-
-    Parameters
-    ----------
-    estimate : final. residuals : what is left of its ranges (m,), m.
-    """
+    """Doubt a map that the residuals of ranges and odometry, or the lengths that sensors measure, speak against."""
     check_range_scatter(estimate, residuals, task)
     check_odometry_steps(estimate, task)
     check_odometry_jumps(estimate, task)

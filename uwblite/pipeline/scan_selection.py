@@ -35,7 +35,6 @@ def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorL
 
     Parameters
     ----------
-    log : any recording.
     frames, grid : which scans make clouds and which are traced. ``grid.move_distance = 0`` keeps all.
     """
     scans = log.scans

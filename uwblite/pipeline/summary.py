@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Floats, spread_about_median
-from ..graph.calibration import CalibrationConfig, Unknown, unknowns
+from ..graph.calibration import Unknown, unknowns
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
 from ..graph.pose_edges import ScanEdges
@@ -21,7 +21,7 @@ from . import plausibility
 from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
 from .radio_stages import heights_given, tag_rises
-from .recordings import Recording, Recordings
+from .recordings import Recordings
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not speak against all anchors."""
@@ -45,7 +45,11 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
     anchors = _with_times(anchors, ranges)
-    listed = {u.key: u for recording in recordings.each for u in _unknowns(recording, task.config.calibration)}
+    listed = {
+        u.key: u
+        for r in recordings.each
+        for u in unknowns(task.config.calibration, r.anchor_ids, heights_given(r), r.number, tag_rises(r))
+    }
     by_steps = {n.figures["name"]: n.figures["sigma"] for n in stages.warnings if n.kind == "turn-scale"}
     calibrated = tuple(
         _calibration(k, listed[key], graph, covariance, by_steps.get(key.label)) for k, key in enumerate(graph.calibration.keys)
@@ -56,7 +60,9 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     }
     plausibility.judge(estimate, anchors, calibrated, listed, table, grid, covariance.poses, task)
     if any(notice.kind not in _ABOUT_PARTS for notice in stages.doubts):
-        anchors = tuple(_distrusted(a) if a.status == "ok" else a for a in anchors)
+        anchors = tuple(
+            replace(a, status="distrusted", reason="the map is doubted") if a.status == "ok" else a for a in anchors
+        )
     stages.end("summary")
     stamps = [recording.trajectory_stamps for recording in recordings.each]
     return MapResult(
@@ -89,10 +95,6 @@ def _with_steady_errors(graph: Graph, anchors: int, config: RangeNoiseConfig) ->
     return replace(graph, edges=tuple(
         learn_noise(e, graph, anchors, config, steady=True)[0] if isinstance(e, RangeEdges) else e for e in graph.edges
     ))  # fmt: skip
-
-
-def _unknowns(recording: Recording, config: CalibrationConfig) -> tuple[Unknown, ...]:
-    return unknowns(config, recording.anchor_ids, heights_given(recording), recording.number, tag_rises(recording))
 
 
 def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, Floats]:
@@ -132,10 +134,6 @@ def _anchor(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, spread_about_median(own), status, reason,
         alternative,
     )
-
-
-def _distrusted(anchor: AnchorEstimate) -> AnchorEstimate:
-    return replace(anchor, status="distrusted", reason="the map is doubted")
 
 
 def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:

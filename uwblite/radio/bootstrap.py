@@ -84,7 +84,6 @@ def bootstrap_graph(
     odometry : k - 1 edges between consecutive poses.
     ranges : all ranges; those that cannot be distances must have weight 0.
     path : (k,) travelled distance at each pose, m.
-    config, search : settings.
     """
     best: _Bootstrap | None = None
     least = np.inf

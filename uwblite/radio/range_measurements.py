@@ -91,7 +91,6 @@ def learn_noise(
     Parameters
     ----------
     graph : estimates the residuals are taken at.
-    anchors : how many there are.
     steady : count errors that depend on direction and distance alone once as well, see range_noise.steady_sigma: right for
         anchors at given poses, and against anchors that lie for long. Poses do not feel such errors, since the anchors'
         places absorb them; what matters for poses is that all ranges together hold the trajectory.

@@ -62,7 +62,6 @@ def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift
     ----------
     path : (m, 2) positions of the tag at the ranges, m.
     ranges : (m,) m, usable ones.
-    config : search settings.
     drift : expected error of the path within this stretch, m; a lower bound of the ranges' standard deviation.
 
     Returns

@@ -51,13 +51,7 @@ _HEADINGS = {"duration": "duration, s", "travelled": "travelled, m", "anchors_ok
 
 
 def row_of(recording: str, folder: str, report: dict[str, Any]) -> BatchRow:
-    """Return the row of a result.
-
-    Parameters
-    ----------
-    recording, folder : see BatchRow.
-    report : its report.json.
-    """
+    """Return the row of a result."""
     figures, grid = report["recording"], report["map"]
     cell = 0.0 if grid is None else grid["resolution"]
     return BatchRow(

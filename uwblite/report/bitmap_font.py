@@ -93,7 +93,6 @@ def text_mask(text: str, scale: int = 1) -> Bools:
 
     Parameters
     ----------
-    text : what to write.
     scale : pixels of the picture per pixel of the font.
     """
     ink = np.zeros((HEIGHT, max(len(text), 1) * (WIDTH + 1) - 1), dtype=np.bool_)

@@ -27,10 +27,7 @@ def draw_errors(
 
     Parameters
     ----------
-    grid : the map.
     points, errors : (m, 2) m, (m,) m: the error at places of the free space; a cell has that of the nearest.
-    anchors : those to draw.
-    title : words below the map.
     size : pixels of the longer side, about.
 
     Returns

@@ -39,8 +39,6 @@ def render(
 
     Parameters
     ----------
-    result : the map.
-    title : name of the recording.
     command : command line that makes the same map again.
     facts : (name, value) pairs for the head of the page: input hash, version, settings.
     grid_png : picture of the bare grid, one pixel a cell, highest y first.

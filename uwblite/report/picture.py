@@ -58,7 +58,6 @@ def draw_map(
         which have colours of their own.
     anchors : those to draw; positions that are not finite are left out.
     closures : (c, 4) x, y, x, y of the two poses of each accepted loop closure, m.
-    caption : words below the map.
     size : pixels of the longer side, about; the scale is chosen so that cells are whole pixels where they can be.
     colours : (rows, cols, 3) of the cells; None = `shaded`.
 

@@ -33,7 +33,6 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
 
     Parameters
     ----------
-    log : any recording.
     turn_laser : take the laser as mounted the way that its scans show, not as given.
 
     Raises

@@ -45,7 +45,6 @@ def advice(
 
     Parameters
     ----------
-    sensors : by name: odometry, lidar, radio, gyro.
     anchors : s since the last range of each anchor.
     recorded : length of the recording, s.
     at_rest : s since the log has grown.

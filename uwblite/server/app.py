@@ -69,9 +69,7 @@ class App:
 
         Parameters
         ----------
-        method, target : as in the request line.
         headers : with names in lower case.
-        body : of a POST.
         """
         if refused := refusal(self, self.token, method, headers):
             return refused

@@ -24,12 +24,7 @@ _TRAIL = 300
 
 
 class LivePage:
-    """The page's state; threads may show and serve at will.
-
-    Parameters
-    ----------
-    title : of the page.
-    """
+    """The page's state; threads may show and serve at will."""
 
     def __init__(self, title: str) -> None:
         self.host = ""
@@ -83,7 +78,6 @@ def watch_status(tail: LogTail, result: StoredResult | None, at_rest: float, rou
 
     Parameters
     ----------
-    tail : the log.
     result : the latest map.
     at_rest : s since the log has grown.
     rounds : words about the latest map and the next.

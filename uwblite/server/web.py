@@ -113,7 +113,6 @@ def server_for(
     Parameters
     ----------
     page : its `host` is set, and its `names` where it is open to others.
-    port : 0 = any that is free.
     host : the address to listen on; 0.0.0.0 is the whole network.
     names : under which other computers may ask, beside addresses.
 
