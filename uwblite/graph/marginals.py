@@ -6,6 +6,7 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import sparse
 from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
@@ -17,7 +18,9 @@ from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
 
 _COMMON_AT_ONCE = 32
-"""Common errors solved for together."""
+"""Common errors solved for together: bounds the memory."""
+_MET_AT_ONCE = 1 << 14
+"""Rows of a table of common errors in memory at once."""
 _AT_ONCE = 300
 """Right-hand sides solved together: bounds the memory."""
 _DEPENDENT = 1e-13
@@ -63,22 +66,28 @@ class Marginals:
 
         These are the consider parameters of Schmidt (Application of state-space methods to navigation problems, 1966).
         """
-        numbers = self._unknowns.number
-        weights = edge_weights(common.edges, self._graph)[common.edge]
-        slopes = [
-            (numbers[name][index[common.edge]], np.einsum("mdk,md,m->mk", jacobian[common.edge], common.shift, weights))
-            for name, index, jacobian in common.edges.linearize(self._graph).blocks
-        ]
-        for first in range(0, int(common.error.max(initial=-1)) + 1, _COMMON_AT_ONCE):
-            some = (common.error >= first) & (common.error < first + _COMMON_AT_ONCE)
-            right = np.zeros((self._unknowns.size + 1, _COMMON_AT_ONCE))
-            for rows, values in slopes:
-                np.add.at(right, (rows[some], common.error[some, None] - first), values[some])
-            right[-1] = 0.0
-            right[:-1] = self._factor.solve(right[:-1])
+        numbers, right = self._unknowns.number, self._slopes(common)
+        for first in range(0, right.shape[1], _COMMON_AT_ONCE):
+            some = right[:, first : first + _COMMON_AT_ONCE].toarray()
+            moves = np.concatenate([self._factor.solve(some), np.zeros((1, some.shape[1]))])
             for name, block in blocks.items():
-                moved = right[numbers[name]]
-                block += moved @ moved.transpose(0, 2, 1)
+                own = moves[numbers[name]]
+                block += own @ own.transpose(0, 2, 1)
+
+    def _slopes(self, common: CommonErrors) -> sparse.csc_matrix:
+        """Return J^T W s of each error as a column."""
+        size, count = self._unknowns.size, int(common.error.max(initial=-1)) + 1
+        weights, right = edge_weights(common.edges, self._graph), sparse.csc_matrix((size, count))
+        for name, index, jacobian in common.edges.linearize(self._graph).blocks:
+            for first in range(0, len(common.edge), _MET_AT_ONCE):
+                part = slice(first, first + _MET_AT_ONCE)
+                edge = common.edge[part]
+                row = self._unknowns.number[name][index[edge]]
+                error = np.broadcast_to(common.error[part, None], row.shape)
+                slope = np.einsum("mdk,md,m->mk", jacobian[edge], common.shift[part], weights[edge])
+                free = row >= 0
+                right = right + sparse.csc_matrix((slope[free], (row[free], error[free])), shape=right.shape)
+        return right
 
     def _block_diagonal(self, unseen: Bools) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""

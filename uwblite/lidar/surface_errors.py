@@ -20,10 +20,13 @@ from .clouds import Clouds
 from .joint_refinement import RefinementConfig
 from .scan_matching import pair_points, shifts_by_range_error
 
-_ERRORS = ((np.inf, 0.010), (32.0, 0.014), (8.0, 0.014))
-"""Size of what an error stays with, and its standard deviation, m: the device, by data sheets (10 mm for URG-04LX, 15 mm for
-LMS 200), and surfaces, which err by 10 to 40 mm against each other (Kneip et al.), in equal parts a wall as long as a corridor
-and a piece of furniture: how far paint stays the same is not known."""
+_DEVICE = 0.010
+"""Constant error of a lidar's ranges, m, by data sheets (10 mm for URG-04LX, 15 mm for LMS 200)."""
+_SURFACE = 0.014
+"""Constant error of one surface for each of the sizes below, m: together 20 mm, of the 10 to 40 mm of Kneip et al."""
+_SIZES = (32.0, 8.0)
+"""Over how far surfaces err alike, m: a wall as long as a corridor, a piece of furniture. How far paint stays the same is not
+known: equal parts."""
 _MOST = 64
 """Places of one size; more of them would cost more than all else, and larger ones state larger errors."""
 
@@ -40,21 +43,21 @@ def with_range_errors(
 
 def common_range_errors(graph: Graph) -> list[CommonErrors]:
     """Return the errors that scan edges have in common: of the device, and of surfaces by place and by the way they face."""
-    return [
-        _of_size(edges, graph, size, sigma) for edges in graph.edges if isinstance(edges, ScanEdges) for size, sigma in _ERRORS
-        if edges.by_surface is not None
-    ]  # fmt: skip
+    return [_common(e, graph) for e in graph.edges if isinstance(e, ScanEdges) and e.by_surface is not None]
 
 
-def _of_size(edges: ScanEdges, graph: Graph, size: float, sigma: float) -> CommonErrors:
+def _common(edges: ScanEdges, graph: Graph) -> CommonErrors:
+    """Return the errors of one table, those of each size numbered after those before."""
     assert edges.by_surface is not None
-    shift = sigma * whiten(edges.sqrt_information, edges.by_surface.transpose(0, 2, 1)).transpose(0, 2, 1)
-    edge = np.arange(len(edges))
-    if not np.isfinite(size):
-        return CommonErrors(edges, edge, np.zeros(len(edges), dtype=np.int64), shift.sum(axis=1))
-    places = _places(graph.poses[edges.i, :2], size)
-    error = 4 * places[:, None] + np.arange(4)
-    return CommonErrors(edges, np.repeat(edge, 4), error.ravel(), shift.reshape(-1, 3))
+    shift = whiten(edges.sqrt_information, edges.by_surface.transpose(0, 2, 1)).transpose(0, 2, 1)
+    edge, errors, count = np.arange(len(edges)), [np.zeros(len(edges), dtype=np.int64)], 1
+    shifts = [_DEVICE * shift.sum(axis=1)]
+    for size in _SIZES:
+        errors.append((count + 4 * _places(graph.poses[edges.i, :2], size)[:, None] + np.arange(4)).ravel())
+        shifts.append(_SURFACE * shift.reshape(-1, 3))
+        count = int(errors[-1].max(initial=count)) + 1
+    own = np.concatenate([edge, *(np.repeat(edge, 4) for _ in _SIZES)])
+    return CommonErrors(edges, own, np.concatenate(errors), np.concatenate(shifts))
 
 
 def _places(xy: Floats, size: float) -> Ints:
