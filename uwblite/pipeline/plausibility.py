@@ -69,7 +69,7 @@ def check_certainty(estimate: Estimate, covariances: Floats, task: Task) -> None
         task.stages.doubt("uncertain", text, sigma=sigma, extent=extent)
 
 
-_UNCERTAIN, _UNCERTAIN_SHARE = 0.3, 0.1
+_UNCERTAIN, _UNCERTAIN_SHARE = 0.3, 0.07
 """Standard deviation of places, m and as a share of the area's diameter; recordings without lidar that turn out well have a
 share of 0.02 to 0.06, most of it the unit of length."""
 
