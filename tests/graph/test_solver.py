@@ -12,7 +12,7 @@ from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
-from uwblite.graph.solver import SolverConfig, optimize
+from uwblite.graph.solver import SolverConfig, _as_much_again, _extrapolated, _linked, _step, _trial, optimize
 from uwblite.graph.unknowns import moved, moved_along
 from uwblite.io.g2o import read_g2o
 
@@ -535,3 +535,70 @@ def test_an_anchor_in_line_with_its_robots_is_found_from_afar(off, across):
 
         further = least_squares(residuals, solved.anchors[0], x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
         assert summary.chi2 < 2.0 * further.cost + 0.1
+
+
+class WrongWay(PriorEdges):
+    """A prior whose Jacobian has the wrong sign: every step that it promises leads uphill."""
+
+    __slots__ = ()
+
+    def linearize(self, graph):
+        right = PriorEdges.linearize(self, graph)
+        return replace(right, blocks=tuple((name, number, -jacobian) for name, number, jacobian in right.blocks))
+
+
+@pytest.mark.parametrize("config", [SolverConfig(), SolverConfig(relative_decrease=0.5)])
+def test_a_search_in_which_no_step_helps_has_not_converged(config):
+    """However coarse the search: what a step promised is a hundredth of chi2, the rest lies in a fixed pose."""
+    constant = PriorEdges("poses", np.array([0]), np.array([[10.0, 0.0, 0.0]]), np.eye(3)[None])
+    wrong = WrongWay("anchors", np.array([0]), np.zeros((1, 2)), np.eye(2)[None])
+    graph = Graph(np.zeros((1, 3)), np.array([[1.0, 0.0]]), (constant, wrong))
+    solved, summary = optimize(graph, config)
+    assert (summary.converged, summary.reason) == (False, "no step decreases chi2")
+    assert summary.chi2 == summary.chi2_initial == pytest.approx(101.0)
+    assert np.array_equal(solved.anchors, graph.anchors)
+    assert min(summary.chi2_history) > 101.0
+
+
+@pytest.mark.parametrize("way", [moved, moved_along])
+def test_a_step_takes_whichever_way_costs_less(way):
+    """Priors lie where one of the two ways of carrying out the step ends: that one costs nothing."""
+    rng = np.random.default_rng(4)
+    graph = Graph(np.column_stack([np.arange(4.0), np.zeros(4), np.zeros(4)]), np.zeros((0, 2)))
+    everywhere = np.tile(np.eye(3), (4, 1, 1))
+    at_start = graph.with_edges(PriorEdges("poses", np.arange(4), graph.poses, everywhere))
+    unknowns = NormalEquations(at_start, linearize(at_start)).unknowns
+    step, linked = rng.normal(scale=0.5, size=unknowns.size), np.ones(3, dtype=bool)
+    ends = {moved: moved(graph, unknowns, step), moved_along: moved_along(graph, unknowns, step, linked)}
+    aimed = graph.with_edges(PriorEdges("poses", np.arange(4), ends[way].poses, everywhere))
+    assert not np.allclose(ends[moved].poses, ends[moved_along].poses)
+    assert np.allclose(_trial(aimed, unknowns, step, linked).poses, ends[way].poses)
+
+
+def test_linked_is_a_pose_that_is_measured_from_the_one_before_it():
+    poses = random_poses(np.random.default_rng(5), 5)
+    edges = relative_edges(poses, np.array([0, 1, 3, 2]), np.array([1, 3, 4, 1]), np.ones(3))
+    assert _linked(5, linearize(Graph(poses, np.zeros((0, 2)), (edges,)))).tolist() == [True, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("decrease", "last", "promised", "to_come"),
+    [(0.5, 1.0, 0.5, 0.5), (0.25, 1.0, 0.25, 1 / 12), (1.0, 0.5, 1.0, np.inf), (0.1, 1.0, 0.5, 0.5), (0.3, np.inf, 0.2, 0.3)],
+)
+def test_the_decrease_to_come_is_the_rest_of_the_geometric_series(decrease, last, promised, to_come):
+    """1/4 + 1/16 + ... of what came last; what the step promised where it kept less than half, or is the first."""
+    assert _extrapolated(decrease, last, promised) == pytest.approx(to_come)
+
+
+def test_a_robust_search_expects_as_much_again_as_the_last_step_brought_or_promised():
+    assert (_as_much_again(0.1, np.inf, 0.5), _as_much_again(0.5, 1.0, 0.1)) == (0.5, 0.5)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.7, 30.0])
+def test_a_damped_step_of_a_linear_problem_brings_what_it_promises(damping):
+    rng = np.random.default_rng(6)
+    prior = PriorEdges("anchors", np.array([0, 1, 1]), rng.normal(size=(3, 2)), rng.normal(size=(3, 2, 2)))
+    graph = Graph(np.zeros((1, 3)), rng.normal(size=(2, 2)), (prior,))
+    normal = filled(graph)
+    _, step, promised = _step(normal, damping * normal.diagonal, None)
+    assert promised == pytest.approx(graph.chi2() - moved(graph, normal.unknowns, step).chi2(), rel=1e-9)

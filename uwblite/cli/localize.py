@@ -172,7 +172,7 @@ def _say(found: "Localization", files: list[str]) -> None:
     console.say(f"{len(found.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m")
     console.say(f"{100 * found.located:.0f} % of the recording is located, typically to ±{sigma:.2f} m")
     if found.overlap == found.overlap:
-        console.say(f"{100 * found.overlap:.0f} % of what the lidar saw in known space lies on the walls of the map")
+        console.say(f"{100 * found.overlap:.0f} % of the lidar's points in known space lie on walls of the map")
     else:
         console.say("no walls to compare: the position rests on the anchors")
     for text in found.warnings:

@@ -87,7 +87,7 @@ def table_html(rows: Sequence[BatchRow], title: str) -> str:
     body = "".join(_table_row(row) for row in rows)
     table = f"<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
     body = f"<h1>{escape(title)}</h1><p>{len(rows)} recordings: {counts}</p>{table}"
-    return PAGE.format(title=escape(title), style=STYLE, script="", body=body)
+    return PAGE.format(title=escape(title), style=STYLE + "main{max-width:none}", script="", body=body)
 
 
 _SHADES = {"mapped": "good", "doubted": "warn", "failed": "bad"}
