@@ -8,9 +8,9 @@
 
 Parts: simulated (buildings x seeds against bars), oracle (against what the measurements allow, and the Cramer-Rao bound),
 real (recordings of others, where they are: UWBLITE_SHARED_DATA; with it benchmark: two of them against relations and
-published figures; --perturb N: N perturbed runs of each as well), ablation (each ingredient switched off in turn), injection
-(false closures and ranges into a good graph). How true the stated uncertainties are is measured by tools/consistency.py,
-which writes into the same page.
+published figures; --perturb N: N perturbed runs of each that has a lidar as well), ablation (each ingredient switched off in
+turn), raw (the same on recordings of others without a radio), injection (false closures and ranges into a good graph). How
+true the stated uncertainties are is measured by tools/consistency.py, which writes into the same page.
 """
 
 import argparse
@@ -46,7 +46,7 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.se2 import align
 from uwblite.sensor_log import SensorLog
 
-PARTS = ("simulated", "oracle", "real", "benchmark", "ablation", "injection")
+PARTS = ("simulated", "oracle", "real", "benchmark", "ablation", "raw", "injection")
 WORST = 1.6
 """The worst seed may exceed the bar on the mean by this factor."""
 
@@ -258,17 +258,16 @@ def real(args: argparse.Namespace) -> str:
     for name in asked(args, list(REAL)):
         folder = SHARED / name
         log = read_log(folder / "run.log.gz")
-        result = build_map(log, config)
         truth = true_path(folder, log)
-        # Some of them have one odometry pose in many seconds.
-        error = evaluate_trajectory(result.stamps, result.trajectory, *truth, max_gap=30.0).ate.rmse
-        note = ""
-        if name == "labyrinth":
-            note = "no heading in the truth; " + ("; ".join(map(str, result.doubts)) or "no doubts")
         wheels = evaluate_trajectory(log.odometry.stamps, log.odometry.poses, *truth, max_gap=30.0).ate.rmse
-        kept = "yes" if error <= REAL[name] and (name == "labyrinth" or not result.doubts) else "**no**"
-        rows.append([name, wheels, error, f"{REAL[name]:g}", kept, note or ", ".join(d.kind for d in result.doubts)])
-        print(f"{name}: {error:.4f}", file=sys.stderr, flush=True)
+        for seed in range(1 + (args.perturb if log.scans is not None else 0)):
+            error, doubts = raw_error(folder, perturbed(log, seed), config)
+            bar = REAL[name] * (PERTURBED if seed else 1.0)
+            kept = "yes" if error <= bar and (name == "labyrinth" or not doubts) else "**no**"
+            note = "no heading in the truth; " if name == "labyrinth" else ""
+            title = f"{name}, perturbed {seed}" if seed else name
+            rows.append([title, wheels, error, f"{REAL[name]:g}", kept, note + (", ".join(doubts) or "no doubts" * bool(note))])
+            print(f"{title}: {error:.4f} {', '.join(doubts)}", file=sys.stderr, flush=True)
     text = table(["recording", "odometry ATE", "ATE", "bar", "kept", ""], rows)
     more = "" if args.only else "\n" + halves(config)
     return f"## Recordings of others\n\nDefaults, from the raw logs; m.\n\n{text}{more}"
@@ -390,6 +389,47 @@ def ablation(args: argparse.Namespace) -> str:
     return f"## What each ingredient buys\n\nEach left out in turn, seed {args.seed}{length}.\n{text}\n{verdict}"
 
 
+WITHOUT_RADIO = (
+    "nothing (the defaults)", "calibration of the wheels", "calibration of the laser's place", "calibration of the clocks",
+    "robust kernels of wheels and ranges", "tracking", "loop closures of sub-maps", "joint refinement", "pairs chosen again",
+    "second scan per key pose", "corners", "deskewing",
+)  # fmt: skip
+"""Ingredients that matter to recordings of wheels and lidar."""
+RAW = ("kummerle/mit-csail", "kummerle/fr079", "intel_raw", "carmen/freiburg-101", "carmen/belgioioso")
+
+
+def raw(args: argparse.Namespace) -> str:
+    """Leave each ingredient out in turn on recordings of others; return the table."""
+    names, found = [n for n in asked(args, RAW) if (SHARED / n).is_dir()], {}
+    for name in names:
+        log = read_log(SHARED / name / "run.log.gz")
+        for run in WITHOUT_RADIO:
+            changes = INGREDIENTS[run]
+            config = override(MappingConfig(), (*args.set, *(c for c in changes if c != "deskew")))
+            error, doubts = raw_error(SHARED / name, flat(log) if "deskew" in changes else log, config)
+            found[run, name] = f"{error:.3f}{' *' if doubts else ''}"
+            print(f"{name}, without {run}: {found[run, name]}", file=sys.stderr, flush=True)
+    rows = [[run, *(found[run, n] for n in names)] for run in WITHOUT_RADIO]
+    text = table(["left out", *(Path(n).name for n in names)], rows)
+    return (
+        "## What each ingredient buys on recordings of others\n\nWheels and lidar alone, defaults otherwise; m: mean error "
+        "over relations (mit-csail, fr079), ATE against the reference\n(the others). * = doubted.\n\n" + text
+    )
+
+
+def raw_error(folder: Path, log: SensorLog, config: MappingConfig) -> tuple[float, list[str]]:
+    """Return the error of the map of a recording, m, by relations where there are any, and the kinds of its doubts."""
+    result = build_map(log, config)
+    doubts = [notice.kind for notice in result.doubts]
+    if (folder / "truth.relations.gz").exists():
+        relations = Relations(*read_relations(folder / "truth.relations.gz"))
+        delay = result.graph.calibration.get("laser_delay")
+        return evaluate_relations(result.stamps, result.trajectory, relations, delay).translations.mean, doubts
+    truth = true_path(folder, log)
+    # Some of them have one odometry pose in many seconds.
+    return evaluate_trajectory(result.stamps, result.trajectory, *truth, max_gap=30.0).ate.rmse, doubts
+
+
 def injection(args: argparse.Namespace) -> str:
     """Put false closures and ranges into good graphs; return what they cost."""
     rows = []
@@ -456,7 +496,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--perturb", type=int, default=0, metavar="N", help="perturbed runs of each benchmark recording (0)")
     p.add_argument("--quick", action="store_true", help="recordings of 6 min")
     args = p.parse_args(argv)
-    parts = (simulated, oracles, real, benchmark, ablation, injection)
+    parts = (simulated, oracles, real, benchmark, ablation, raw, injection)
     made_by = dict(zip(PARTS, parts, strict=True))
     if not args.print and not args.out.exists():
         args.out.write_text(HEAD)
