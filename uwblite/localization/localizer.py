@@ -26,7 +26,7 @@ from .odometer import Odometer
 from .range_likelihood import range_moments
 from .records import LocalizerState, Scanner
 from .running_fit import FIT_LOST, FIT_SOUND, full_agreement
-from .sensing import Range, Scan, scan_rays
+from .sensing import Range, Scan, Waiting, scan_rays
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
 MAP_COVARIANCE = np.diag(np.square((0.02, 0.02, 0.005)))
@@ -74,7 +74,7 @@ class Localizer:
         heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
         self._square = np.square(heights) + known.anchors.rise
         self._window = Window()
-        self._waiting: list[tuple[float, Range | Scan]] = []
+        self._waiting = Waiting()
         self._way = self._scan_way = self._search_way = self._unit_way = 0.0
         self._search_stamp = -np.inf
         self._certain = False
@@ -86,8 +86,6 @@ class Localizer:
         """Ranges to anchors that are not in the map, by id."""
         self.ends = np.zeros(2)
         """Of rays on walls, and in known space, while the pose was known."""
-
-    # ---- what comes in
 
     def add_odometry(self, stamp: float, x: float, y: float, theta: float) -> LocalizerState:
         """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
@@ -102,10 +100,7 @@ class Localizer:
         return self.state()
 
     def add_gyro(self, stamp: float, heading: float) -> LocalizerState:
-        """Take the heading of a gyro from any zero, bias and all; s, on the odometry's clock, rad.
-
-        From when its bias is known on, the steps of the wheels turn as it does.
-        """
+        """Take the heading of a gyro, s and rad from any zero; once its bias is known, the wheels turn as it does."""
         self._turns.add(stamp, heading)
         return self.state()
 
@@ -120,7 +115,7 @@ class Localizer:
         good = usable(values, TrilaterationConfig())
         for name, value in zip(np.asarray(anchor_ids)[good].tolist(), values[good].tolist(), strict=True):
             if name in self._names:
-                self._wait(stamp, Range(self._names[name], value, tag))
+                self._waiting.add(stamp, Range(self._names[name], value, tag))
             else:
                 self.strangers[name] = self.strangers.get(name, 0) + 1
         self._work_off()
@@ -138,11 +133,9 @@ class Localizer:
         if self.scanner is not None and self.known.walls is not None:
             readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
             scan = Scan(stamp + self.known.laser_delay, readings, self.scanner)
-            self._wait(scan.end, scan)
+            self._waiting.add(scan.end, scan)
         self._work_off()
         return self.state()
-
-    # ---- what is known
 
     def state(self) -> LocalizerState:
         """Return the pose at the time of the last odometry."""
@@ -164,22 +157,12 @@ class Localizer:
     def _sees(self) -> bool:
         return self.known.walls is not None and bool(self._window.looks)
 
-    # ---- measurements, in the order of their times
-
-    def _wait(self, until: float, entry: Range | Scan) -> None:
-        if np.isfinite(until):
-            self._waiting.append((until, entry))
-
     def _work_off(self) -> None:
         """Use the measurements that the odometry has reached."""
         if not len(self._odometer):
             return
-        if self._waiting:
-            self._bridge_silence()
-        now = self._odometer.stamp
-        due = sorted((w for w in self._waiting if w[0] <= now), key=lambda w: w[0])
-        self._waiting = [w for w in self._waiting if w[0] > now]
-        for until, entry in due:
+        self._bridge_silence()
+        for until, entry in self._waiting.reached(self._odometer.stamp):
             if isinstance(entry, Scan):
                 self._use_scan(entry)
             else:
@@ -188,10 +171,9 @@ class Localizer:
 
     def _bridge_silence(self) -> None:
         """Where the odometry has fallen silent, let the robot stand, and the pose become unsure."""
-        latest = max(until for until, _ in self._waiting)
-        gap = latest - self._odometer.stamp
+        gap = self._waiting.latest - self._odometer.stamp
         if gap > _PATIENCE:
-            self._odometer.add(latest - 0.1, self._odometer.pose.copy())
+            self._odometer.add(self._waiting.latest - 0.1, self._odometer.pose.copy())
             self._bank = hypotheses.moved(self._bank, np.zeros(3), _UNSEEN_SPEED * min(gap, 3.0))
 
     def _use_range(self, entry: Range, stamp: float) -> None:
@@ -232,8 +214,6 @@ class Localizer:
         if self._certain:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
         self._running.add_scan(float(found.fit[best]), bool(found.known[best] >= verdict.FEW_ENDS), self._odometer.stamp)
-
-    # ---- the start, and what ends in one
 
     def _search_or_check(self) -> None:
         """Do a unit of a search that is under way, or begin one where it is time for it."""

@@ -20,7 +20,7 @@ TRACK_RAYS = 180
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """A range that the odometry has not reached."""
+    """A range, as it waits for the odometry."""
 
     anchor: int
     metres: float
@@ -41,6 +41,29 @@ class Scan:
     def end(self) -> float:
         """s, of the last ray; of the first one in a recording that is played backwards."""
         return max(self.stamp, self.stamp + self.scanner.time_increment * max(len(self.readings) - 1, 0))
+
+
+class Waiting:
+    """Measurements that are ahead of the odometry."""
+
+    def __init__(self) -> None:
+        self._entries: list[tuple[float, Range | Scan]] = []
+
+    def add(self, until: float, entry: Range | Scan) -> None:
+        """Keep a measurement until the odometry has reached a time, s."""
+        if np.isfinite(until):
+            self._entries.append((until, entry))
+
+    @property
+    def latest(self) -> float:
+        """When the last of them was complete, s; -inf = none waits."""
+        return max((until for until, _ in self._entries), default=-np.inf)
+
+    def reached(self, now: float) -> list[tuple[float, Range | Scan]]:
+        """Return those that the odometry has reached, in the order of their times, and keep the others."""
+        due = sorted((w for w in self._entries if w[0] <= now), key=lambda w: w[0])
+        self._entries = [w for w in self._entries if w[0] > now]
+        return due
 
 
 def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
