@@ -14,11 +14,11 @@ import math
 import struct
 from dataclasses import dataclass
 
-from .clock import ClockMap
-from .events import Action, Corrupt, Lost, Note, OdometryPose, Pose, Send
+from .clock_map import ClockMap
+from .events import Action, Corrupt, Lost, OdometryPose, Pose, Send
 from .framing import FixedPackets
-from .odometer import WheelOdometer
-from .session import Driver, Identity, Script, Wait
+from .odometer import BaseDriver, WheelOdometer
+from .session import Script, Wait
 
 BAUD = 115200
 PERIOD = 0.015
@@ -34,7 +34,7 @@ MAX_BLIND = MODULUS / 2 * TICK / MAX_SPEED
 """s after which an encoder may have turned by half its range unseen."""
 HEAD, PACKETS = 0x13, bytes((7, 43, 44, 22))
 LAYOUT = struct.Struct(">BB BB BH BH BH B".replace(" ", ""))
-START, STREAM, PAUSE, RESUME = b"\x80", bytes((0x94, len(PACKETS))) + PACKETS, b"\x96\x00", b"\x96\x01"
+START, STREAM, PAUSE = b"\x80", bytes((0x94, len(PACKETS))) + PACKETS, b"\x96\x00"
 SILENCE = 1.0
 """s without a frame after which the stream is asked for again."""
 STALL = 0.3
@@ -75,7 +75,7 @@ class Create2Protocol(FixedPackets):
         return Encoders(stamp, left, right, bumps >> 2 & 3, millivolts / 1000)
 
 
-class Create2Driver(Driver):
+class Create2Driver(BaseDriver):
     """A Create 2 or Roomba. It is only listened to: the stream is asked for, no motor is ever moved.
 
     Parameters
@@ -86,8 +86,7 @@ class Create2Driver(Driver):
     baud = BAUD
 
     def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        super().__init__(Create2Protocol(), "iRobot Create 2")
-        self._odometer = WheelOdometer(TICK, WHEEL_BASE, MODULUS, start)
+        super().__init__(Create2Protocol(), "iRobot Create 2", WheelOdometer(TICK, WHEEL_BASE, MODULUS, start), LOW_VOLTAGE)
         self._last: Encoders | None = None
         self._new_clock()
 
@@ -121,11 +120,9 @@ class Create2Driver(Driver):
             actions.append(Lost(stamp, round(pause / PERIOD) - 1))
         if pause > MAX_BLIND:
             self._odometer.forget()
-            text = f"odometry: the base sent nothing for {pause:.1f} s: its motion meanwhile is unknown, pose held"
-            actions.append(Note("warning", "odometry-gap", text))
+            actions.append(self.gap(f"sent nothing for {pause:.1f} s, the pose is held: its motion"))
         travel, turn = self._odometer.update(event.left, event.right)
-        if event.wheel_drop and not (last and last.wheel_drop):
-            actions.append(Note("warning", "wheel-drop", "odometry: a wheel hangs in the air; travel is not to be trusted"))
+        actions += self.state(event.wheel_drop, event.voltage)
         elapsed = max(pause, PERIOD)
         return [*actions, OdometryPose(stamp, *self._odometer.pose, travel / elapsed, turn / elapsed)]
 
@@ -140,15 +137,3 @@ class Create2Driver(Driver):
     def stop(self) -> list[Action]:
         """Pause the stream."""
         return [Send(PAUSE)]
-
-    def identity(self) -> Identity:
-        """Say who answered."""
-        if self._last is None:
-            return Identity(self.title)
-        findings = []
-        if self._last.wheel_drop:
-            findings.append(Note("warning", "wheel-drop", "a wheel hangs in the air: travel will be wrong"))
-        if 0 < self._last.voltage < LOW_VOLTAGE:
-            text = f"the battery is low ({self._last.voltage:.1f} V): charge it before a run"
-            findings.append(Note("warning", "low-battery", text))
-        return Identity(self.title, (("battery", f"{self._last.voltage:.1f} V"),), tuple(findings))

@@ -122,10 +122,6 @@ def _scip(options: Options, setup: Setup) -> Driver:
     )  # fmt: skip
 
 
-def _kobuki(_options: Options, setup: Setup) -> Driver:
-    return KobukiDriver(setup.start)
-
-
 def _line(options: Options, setup: Setup) -> Driver:
     baud = options.whole("baud", OdometryLineDriver.baud, *BAUD)
     options.known += options.values
@@ -172,7 +168,7 @@ DEVICES = {
     kind.name: kind
     for kind in (
         DeviceKind(
-            "kobuki", "odometry", "Kobuki base", _kobuki, product="kobuki", talks=True,
+            "kobuki", "odometry", "Kobuki base", lambda _o, setup: KobukiDriver(setup.start), product="kobuki", talks=True,
             silent="the base is silent: switch it on (its USB chip is powered by this computer, the base is not)",
         ),
         DeviceKind(

@@ -166,4 +166,5 @@ class Lost:
 Pose = tuple[float, float, float]
 """x, y, theta of the base in the odom frame; m, m, rad."""
 
-Action = Corrupt | Send | SetBaud | SetDtr | Param | Note | Reopen | RangeEpoch | LaserScan | OdometryPose | GyroHeading | Lost
+Measurement = RangeEpoch | LaserScan | OdometryPose | GyroHeading
+Action = Corrupt | Send | SetBaud | SetDtr | Param | Note | Reopen | Measurement | Lost

@@ -16,10 +16,9 @@ from functools import reduce
 from operator import xor
 
 from .clock import DeviceClock
-from .events import Action, Corrupt, Lost, Note, OdometryPose, Pose, corrupt
+from .events import Action, Corrupt, Lost, OdometryPose, Pose, corrupt
 from .framing import FrameReader
-from .odometer import WheelOdometer
-from .session import Driver, Identity
+from .odometer import BaseDriver, WheelOdometer
 
 PERIOD = 0.020
 """s between packets."""
@@ -104,7 +103,7 @@ def _sub_payloads(payload: bytes) -> Iterator[tuple[int | None, bytes]]:
         yield None, b""
 
 
-class KobukiDriver(Driver):
+class KobukiDriver(BaseDriver):
     """A Kobuki base. Nothing is ever sent.
 
     Parameters
@@ -113,17 +112,15 @@ class KobukiDriver(Driver):
     """
 
     def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
-        super().__init__(KobukiProtocol(), "Kobuki base")
-        self._odometer = WheelOdometer(TICK, WHEEL_BASE, ENCODER_MODULUS, start)
+        odometer = WheelOdometer(TICK, WHEEL_BASE, ENCODER_MODULUS, start)
+        super().__init__(KobukiProtocol(), "Kobuki base", odometer, LOW_BATTERY)
         self._clock = DeviceClock(1e-3, STAMP_MODULUS, period=PERIOD)
         self._packets = 0
-        self._battery = 0.0
-        self._wheel_drop = 0
 
     def take(self, event: Feedback) -> list[Action]:
         """Turn a packet into a pose."""
         self._packets += 1
-        self._battery, self.ready = event.battery, self._packets > 2
+        self.ready = self._packets > 2
         reading = self._clock.read(event.time, event.stamp)
         if reading.elapsed is not None and reading.elapsed <= 0:
             return [Corrupt(b"", "packet sent twice")]
@@ -134,21 +131,7 @@ class KobukiDriver(Driver):
         travel, _ = self._odometer.update(event.left, event.right, event.heading, still=elapsed > MAX_GUESS)
         actions: list[Action] = [Lost(reading.stamp, reading.missing)] if reading.missing else []
         if reading.reset or (reading.elapsed or 0.0) > MAX_BLIND:
-            text = "odometry: the base restarted: its motion meanwhile is unknown, pose held"
-            if not reading.reset:
-                text = f"odometry: the base sent nothing for {reading.elapsed:.1f} s: how far it went meanwhile is unknown"
-            actions.append(Note("warning", "odometry-gap", text))
-        if event.wheel_drop and not self._wheel_drop:
-            actions.append(Note("warning", "wheel-drop", "odometry: a wheel hangs in the air; travel is not to be trusted"))
-        self._wheel_drop = event.wheel_drop
+            silent = f"sent nothing for {reading.elapsed or 0.0:.1f} s: how far it went"
+            actions.append(self.gap("restarted, the pose is held: its motion" if reading.reset else silent))
+        actions += self.state(event.wheel_drop, event.battery)
         return [*actions, OdometryPose(reading.stamp, *self._odometer.pose, travel / elapsed, event.turn_rate)]
-
-    def identity(self) -> Identity:
-        """Say who answered."""
-        findings = []
-        if self._wheel_drop:
-            findings.append(Note("warning", "wheel-drop", "a wheel hangs in the air: travel will be wrong"))
-        if 0 < self._battery < LOW_BATTERY:
-            text = f"the battery is low ({self._battery:.1f} V): charge it before a run"
-            findings.append(Note("warning", "low-battery", text))
-        return Identity(self.title, (("battery", f"{self._battery:.1f} V"),), tuple(findings))

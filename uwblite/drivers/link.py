@@ -1,6 +1,7 @@
 """One device of a recording: its port, its session, and what it did."""
 
 import re
+import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -8,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from ..errors import DeviceError
 from .events import Note, Send, SetBaud, SetDtr
 from .session import Session
-from .transport import Opening, Port
+from .transport import Port
 
 SILENCE = 3.0
 """s without a measurement before it is reported."""
@@ -50,6 +51,46 @@ class Mounting:
     """PARAM name, value."""
     more_lasers: tuple[tuple[float, float, float], ...] = ()
     """x, y, theta of the second lidar, the third ..."""
+
+
+class Opening:
+    """A port that is being opened by a thread of its own, so that nobody has to wait for it.
+
+    Parameters
+    ----------
+    open_port : (url, baud) -> Port; raises DeviceError.
+    url, baud : as for `open_port`.
+    """
+
+    def __init__(self, open_port: Callable[[str, int], Port], url: str, baud: int) -> None:
+        self._open, self._place = open_port, (url, baud)
+        self._lock = threading.Lock()
+        self._result: Port | DeviceError | None = None
+        self._given_up = False
+        threading.Thread(target=self._run, name=f"uwblite-open {url}", daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            result: Port | DeviceError = self._open(*self._place)
+        except DeviceError as error:
+            result = error
+        with self._lock:
+            if not self._given_up:
+                self._result = result
+                return
+        if not isinstance(result, DeviceError):
+            result.close()
+
+    def result(self) -> "Port | DeviceError | None":
+        """Return the port, why it cannot be opened, or None as long as that is not known."""
+        return self._result
+
+    def give_up(self) -> None:
+        """Close the port when it opens after all."""
+        with self._lock:
+            self._given_up = True
+        if self._result is not None and not isinstance(self._result, DeviceError):
+            self._result.close()
 
 
 class Link:

@@ -1,8 +1,9 @@
-"""Two wheels to a pose: encoder counts, with the heading of a gyro where there is one."""
+"""Two wheels to a pose: encoder counts, with the heading of a gyro where there is one; and what such bases share."""
 
 import math
 
-from .events import Pose
+from .events import Action, Note, Pose
+from .session import ByteProtocol, Driver, Identity
 
 
 def wrapped(difference: float, modulus: int) -> float:
@@ -58,3 +59,41 @@ class WheelOdometer:
     def forget(self) -> None:
         """Hold the pose over a gap: what wheels and gyro did meanwhile is unknown."""
         self._last = None
+
+
+class BaseDriver(Driver):
+    """A base with two wheels, switches that show a wheel in the air, and a battery; kinds derive from this.
+
+    Parameters
+    ----------
+    protocol : bytes to events. title : for people.
+    odometer : of its wheels. low : V, of a battery that is nearly empty.
+    """
+
+    def __init__(self, protocol: ByteProtocol, title: str, odometer: WheelOdometer, low: float) -> None:
+        super().__init__(protocol, title)
+        self._odometer, self._low = odometer, low
+        self._voltage: float | None = None
+        self._wheel_drop = 0
+
+    def state(self, wheel_drop: int, voltage: float) -> list[Action]:
+        """Note wheels in the air (bits) and the battery, V; return what must be reported."""
+        lifted, self._wheel_drop, self._voltage = wheel_drop and not self._wheel_drop, wheel_drop, voltage
+        text = "odometry: a wheel hangs in the air; travel is not to be trusted"
+        return [Note("warning", "wheel-drop", text)] if lifted else []
+
+    def gap(self, what: str) -> Note:
+        """Return what to say of a base that was not heard for a while."""
+        return Note("warning", "odometry-gap", f"odometry: the base {what} meanwhile is unknown")
+
+    def identity(self) -> Identity:
+        """Say who answered."""
+        if self._voltage is None:
+            return Identity(self.title)
+        findings = []
+        if self._wheel_drop:
+            findings.append(Note("warning", "wheel-drop", "a wheel hangs in the air: travel will be wrong"))
+        if 0 < self._voltage < self._low:
+            text = f"the battery is low ({self._voltage:.1f} V): charge it before a run"
+            findings.append(Note("warning", "low-battery", text))
+        return Identity(self.title, (("battery", f"{self._voltage:.1f} V"),), tuple(findings))

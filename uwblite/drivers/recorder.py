@@ -14,8 +14,8 @@ from .events import (
     Action,
     Corrupt,
     GyroHeading,
-    LaserScan,
     Lost,
+    Measurement,
     Note,
     OdometryPose,
     Param,
@@ -146,7 +146,7 @@ class Recorder:
     def _do(self, link: Link, actions: list[Action], now: float) -> None:
         counts = link.counts
         for action in actions:
-            if isinstance(action, LaserScan | RangeEpoch | OdometryPose | GyroHeading):
+            if isinstance(action, Measurement):
                 self._message(link, now)
                 self._write(action, link)
             elif isinstance(action, Send | SetBaud | SetDtr):
@@ -179,9 +179,9 @@ class Recorder:
             self._note(link, Note("info", f"{link.name}-data-again", f"{link.name}: data again after {pause:.1f} s"))
             link.stated.clear()
 
-    def _write(self, measured: LaserScan | RangeEpoch | OdometryPose | GyroHeading, link: Link) -> None:
+    def _write(self, measured: Measurement, link: Link) -> None:
         tail, counts = self._tail(measured.stamp), link.counts
-        spread = measured.spread if isinstance(measured, LaserScan | RangeEpoch) else 0.0
+        spread = getattr(measured, "spread", 0.0)
         counts.spread, counts.widest = counts.spread + spread, max(counts.widest, spread)
         if isinstance(measured, OdometryPose):
             self._pose = measured

@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from .clock import ClockMap, DeviceClock
+from .clock import DeviceClock
+from .clock_map import ClockMap
 from .events import Action, LaserScan, Lost, Reopen, SetDtr
 from .framing import FrameReader
 from .session import Driver, Identity, Script, Wait

@@ -8,8 +8,6 @@ import contextlib
 import os
 import select
 import socket
-import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -111,46 +109,6 @@ def open_port(url: str, baud: int) -> Port:
     DeviceError : cannot be opened; the message says how to fix it.
     """
     return SocketPort(url) if is_socket(url) else SerialPort(url, baud)
-
-
-class Opening:
-    """A port that is being opened by a thread of its own, so that nobody has to wait for it.
-
-    Parameters
-    ----------
-    open_port : (url, baud) -> Port; raises DeviceError.
-    url, baud : as for `open_port`.
-    """
-
-    def __init__(self, open_port: Callable[[str, int], Port], url: str, baud: int) -> None:
-        self._open, self._place = open_port, (url, baud)
-        self._lock = threading.Lock()
-        self._result: Port | DeviceError | None = None
-        self._given_up = False
-        threading.Thread(target=self._run, name=f"uwblite-open {url}", daemon=True).start()
-
-    def _run(self) -> None:
-        try:
-            result: Port | DeviceError = self._open(*self._place)
-        except DeviceError as error:
-            result = error
-        with self._lock:
-            if not self._given_up:
-                self._result = result
-                return
-        if not isinstance(result, DeviceError):
-            result.close()
-
-    def result(self) -> "Port | DeviceError | None":
-        """Return the port, why it cannot be opened, or None as long as that is not known."""
-        return self._result
-
-    def give_up(self) -> None:
-        """Close the port when it opens after all."""
-        with self._lock:
-            self._given_up = True
-        if self._result is not None and not isinstance(self._result, DeviceError):
-            self._result.close()
 
 
 class SocketPort:
