@@ -1,0 +1,115 @@
+"""Orders of elimination keep their promises; factors solve as dense matrices do; what is singular is said."""
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from uwblite.errors import SolverError
+from uwblite.graph.factorization import BandedFactor, BorderedFactor, choose_ordering, superlu
+
+
+def chain(n, reach=1):
+    return np.array([(k, k + r) for r in range(1, reach + 1) for k in range(n - r)])
+
+
+def anywhere(rng, n, count):
+    return np.vstack([chain(n), rng.integers(0, n, (count, 2))])
+
+
+def positive(rng, n, half=None):
+    """Return a random symmetric positive definite matrix, banded where half is given."""
+    matrix = rng.normal(size=(n, n))
+    matrix = matrix + matrix.T
+    if half is not None:
+        matrix[np.abs(np.subtract.outer(np.arange(n), np.arange(n))) > half] = 0.0
+    return matrix + (1.0 + np.abs(np.linalg.eigvalsh(matrix)).max()) * np.eye(n)
+
+
+@pytest.mark.parametrize("columns", [(), (1,), (4,)])
+@pytest.mark.parametrize("half", [0, 2])
+def test_a_band_and_its_border_solve_as_the_dense_matrix(half, columns):
+    rng = np.random.default_rng(half)
+    n, m = 12, 3
+    whole = positive(rng, n + m)
+    inside = positive(rng, n, half)
+    whole[:n, :n] = inside
+    whole += 10.0 * np.eye(n + m)
+    band = np.zeros((n, half + 1))
+    for j in range(n):
+        for below in range(min(half + 1, n - j)):
+            band[j, below] = whole[j + below, j]
+    right = rng.normal(size=(n + m, *columns))
+    assert np.allclose(BandedFactor(band.copy()).solve(right[:n]), np.linalg.solve(whole[:n, :n], right[:n]))
+    lower = np.hstack([whole[n:, :n], np.tril(whole[n:, n:])])
+    assert np.allclose(BorderedFactor(BandedFactor(band), lower).solve(right), np.linalg.solve(whole, right))
+
+
+def test_what_is_not_positive_definite_is_said():
+    good = BandedFactor(np.ones((3, 1)))
+    singular = [
+        lambda: BandedFactor(np.array([[1.0], [0.0], [1.0]])),
+        lambda: BorderedFactor(good, np.array([[2.0, 0.0, 0.0, 1.0]])),
+        lambda: superlu(sparse.csc_matrix(np.diag([1.0, 0.0])), "NATURAL"),
+    ]
+    for factorise in singular:
+        with pytest.raises(SolverError, match="normal equations are singular; add a prior"):
+            factorise()
+
+
+@pytest.mark.parametrize(
+    ("pairs", "poses", "others", "form"),
+    [
+        (chain(40), 40, 48, (True, True, False)),
+        (np.vstack([chain(40), [[0, 39]]]), 40, 48, (True, True, False)),
+        (chain(40), 40, 49, (False, False, False)),
+        (chain(60, 16), 60, 10, (True, True, False)),
+        (anywhere(np.random.default_rng(0), 200, 300), 200, 10, (True, False, False)),
+        (chain(500, 6), 500, 10, (False, False, True)),
+        (chain(499, 6), 499, 10, (True, True, False)),
+        (np.tile(chain(500), (6, 1))[:2500], 500, 10, (True, True, False)),
+        (np.tile(chain(500), (6, 1))[:2501], 500, 10, (False, False, True)),
+        (np.zeros((0, 2), dtype=int), 1, 10, (False, False, False)),
+    ],
+)
+def test_the_form_follows_the_structure(pairs, poses, others, form):
+    """Borders to 48 scalars, bands to 16 poses; iteration from 500 poses on with more than five edges each."""
+    ordering = choose_ordering(pairs, poses, others)
+    assert (ordering.bordered, ordering.banded, ordering.iterative) == form
+    assert sorted(ordering.order) == list(range(poses))
+    if ordering.banded:
+        position = np.argsort(ordering.order)
+        assert np.abs(np.diff(position[pairs], axis=1)).max() <= 16
+
+
+def test_the_selected_inverse_and_poses_that_come_last_need_a_factor():
+    pairs = chain(500, 6)
+    assert not choose_ordering(pairs, 500, 10, subtrees=True).iterative
+    assert not choose_ordering(pairs, 500, 10, last=np.array([3])).iterative
+
+
+@pytest.mark.parametrize("closures", [0, 40])
+def test_some_poses_come_last(closures):
+    rng = np.random.default_rng(closures)
+    last = rng.choice(100, 9, replace=False)
+    ordering = choose_ordering(anywhere(rng, 100, closures), 100, 10, last=last)
+    assert set(ordering.order[-9:]) == set(last)
+    assert sorted(ordering.order) == list(range(100))
+
+
+def test_subtrees_of_the_elimination_are_contiguous():
+    """By brute force: the pattern is eliminated column by column; the parent is the first row below that is filled."""
+    rng = np.random.default_rng(3)
+    n, pairs = 60, anywhere(rng, 60, 25)
+    ordering = choose_ordering(pairs, n, 10, subtrees=True)
+    assert (ordering.bordered, ordering.banded) == (False, False)
+    position = np.argsort(ordering.order)
+    filled = np.eye(n, dtype=bool)
+    filled[tuple(position[pairs].T)] = filled[tuple(position[pairs[:, ::-1]].T)] = True
+    size, parent = np.ones(n, dtype=int), np.full(n, n)
+    for column in range(n - 1):
+        below = column + 1 + np.flatnonzero(filled[column + 1 :, column])
+        filled[np.ix_(below, below)] = True
+        parent[column] = below[0]
+        size[below[0]] += size[column]
+    child = np.arange(n - 1)
+    assert np.all(child >= parent[child] - size[parent[child]] + 1)
