@@ -28,9 +28,11 @@ from scipy.stats import chi2
 from trials import ROOT, Trial, table, write_section
 
 from uwblite import se2
-from uwblite.grid.occupancy_grid import FREE
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import FREE, OccupancyGrid
 from uwblite.localization import Localizer, LocalizerState, Scanner
 from uwblite.localization.known_map import KnownMap
+from uwblite.localization.walls import walls_of
 
 WORLDS = ("hall", "lab", "warehouse")
 MOST_WAY = 10.0
@@ -39,6 +41,10 @@ WRONG = (0.5, 0.3)
 """m and rad; a pose that counts as found and is farther off is a wrong one."""
 BEFORE = 20.0
 """s of driving before a robot is carried away, in which it is found: four metres."""
+WRONG_SECONDS = 40.0
+"""s of each drive in a map that is not the building's."""
+ELSEWHERE = {"hall": "lab", "lab": "hall", "warehouse": "lab"}
+"""The other building."""
 AFTER = 3.0
 """s for which a start is watched after it was found."""
 
@@ -226,6 +232,49 @@ def with_moved_anchor(on: Bench) -> Bench:
     return replace(on, known=replace(on.known, anchors=replace(on.known.anchors, positions=places)))
 
 
+def scaled(on: Bench, grid: OccupancyGrid, factor: float) -> Bench:
+    """Return the bench with a map in another unit."""
+    g = grid.geometry
+    walls = walls_of(replace(grid, geometry=GridGeometry(g.resolution * factor, g.origin * factor, g.rows, g.cols)))
+    anchors = replace(on.known.anchors, positions=on.known.anchors.positions * factor)
+    return replace(on, known=replace(on.known, walls=walls, anchors=anchors))
+
+
+def abroad(on: Bench, other: KnownMap) -> Bench:
+    """Return the bench with the map of another building, whose anchors bear the same ids."""
+    count = min(len(on.known.anchors.ids), len(other.anchors.ids))
+    fields = ("positions", "bias", "rise", "sigma")
+    parts = {name: getattr(other.anchors, name)[:count] for name in fields}
+    return replace(on, known=replace(other, anchors=replace(other.anchors, ids=on.known.anchors.ids[:count], **parts)))
+
+
+def certain(on: Bench, drives: int, uwb: bool, lidar: bool) -> tuple[int, int]:
+    """Drive in a wrong map; return in how many drives, and in how many lines, one a second, the pose was ever certain."""
+    begin, end = on.trial.log.odometry.stamps[[0, -1]].tolist()
+    ever = lines = 0
+    for moment in np.linspace(begin + 3.0, end - WRONG_SECONDS - 5.0, drives):
+        localizer, at_next, count = on.localizer(), moment, 0
+        for at, kind, k in on.played(moment, moment + WRONG_SECONDS, uwb, lidar):
+            state = on.feed(localizer, kind, k)
+            if at >= at_next:
+                at_next += 1.0
+                count += not state.lost
+        ever, lines = ever + (count > 0), lines + count
+    return ever, lines
+
+
+def wrong_rows(on: Bench, grid: OccupancyGrid, other: KnownMap, drives: int) -> list[list[object]]:
+    """Return the rows of maps that are not this building's, or not in the sensors' unit."""
+    maps = {f"scaled by {factor}": scaled(on, grid, factor) for factor in (0.9, 1.05, 1.1)}
+    maps["another building's, same anchor ids"] = abroad(on, other)
+    lines = drives * int(WRONG_SECONDS)
+    rows = []
+    for name, wrong in maps.items():
+        found = [certain(wrong, drives, *KINDS[kind]) for kind in ("all sensors", "without lidar")]
+        rows.append([name, *(f"{lost} of {drives}, {n} of {lines} s" for lost, n in found)])
+    return rows
+
+
 KINDS = {"all sensors": (True, True), "without lidar": (True, False), "without UWB": (False, True)}
 
 
@@ -269,6 +318,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", default=",".join(WORLDS), help="worlds, separated by commas")
     parser.add_argument("--starts", type=int, default=100)
     parser.add_argument("--carried", type=int, default=20)
+    parser.add_argument("--wrong", type=int, default=6, help="drives in each of four wrong maps")
     parser.add_argument("--seconds", type=float, default=480.0, help="of tracking")
     parser.add_argument("--seed", type=int, default=301)
     parser.add_argument("--building", type=int, default=31, help="paint of walls, glass, multipath, biases of anchors")
@@ -279,6 +329,12 @@ def main(argv: list[str] | None = None) -> int:
     for world in args.only.split(","):
         on = bench(Place(world, args.building, args.seed, args.easy), args.keep)
         text = report(on, args.starts, args.carried, args.seconds)
+        if args.wrong:
+            place, other = (Place(w, args.building, args.seed, args.easy) for w in (world, ELSEWHERE[world]))
+            grid = mapped(place, keep=args.keep).result.grid
+            assert grid is not None
+            rows = wrong_rows(on, grid, mapped(other, keep=args.keep).known, args.wrong)
+            text += "\n" + table((f"{world}, wrong map: certain in", "all sensors", "without lidar"), rows)
         print(text, flush=True)
         if not args.print:
             write_section(ROOT / "docs" / "navigation.md", f"localization {world}", text)

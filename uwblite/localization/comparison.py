@@ -68,11 +68,12 @@ class PlaceSearch:
         self._bounds = _bounds(known)
         self._odom = np.zeros(3)
         self._steps: search.Steps | None = None
+        self._found: search.Places | None = None
 
     @property
     def idle(self) -> bool:
         """Whether no search is under way."""
-        return self._steps is None
+        return self._steps is None and self._found is None
 
     def begin(self, window: Window, odom: Floats, way: float) -> None:
         """Begin to search the whole map for what a window holds.
@@ -87,23 +88,23 @@ class PlaceSearch:
 
     def drop(self) -> None:
         """Leave a search that is under way."""
-        self._steps = None
+        self._steps = self._found = None
 
     def advance(self, odom: Floats) -> search.Places | None:
-        """Do a unit of the work; return where the robot is now, if the search has ended with it.
+        """Do a unit of the work; return where the robot may be now, if the search had ended before.
 
         Parameters
         ----------
         odom : (3,) present pose in the odometry frame.
         """
-        if self._steps is None:
-            return None
-        try:
-            next(self._steps)
-        except StopIteration as end:
-            self._steps = None
-            found: search.Places = end.value
+        if self._found is not None:
+            found, self._found = self._found, None
             return search.Places(se2.compose(found.poses, se2.between(self._odom, odom)), found.complete)
+        try:
+            if self._steps is not None:
+                next(self._steps)
+        except StopIteration as end:
+            self._steps, self._found = None, end.value
         return None
 
     def compared(self, found: search.Places, bank: Hypotheses, window: Window, odom: Floats, way: float) -> Comparison:

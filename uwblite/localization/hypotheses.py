@@ -21,10 +21,10 @@ POSE, WHEELS = slice(0, 3), slice(3, 6)
 FIRST_ANCHOR = 6
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
-SLOW_SIGMA = 0.085
-"""m; what ranges to one anchor err alike, see RangeNoiseConfig: half of the variance of 0.12 m."""
-SLOW_LENGTH = 1.5
-"""m; the distance over which it stays alike."""
+SLOW_SIGMA = 0.12
+"""m; what ranges to one anchor err alike, as the spread of RangeNoiseConfig: multipath, antennas, the anchor's place."""
+SLOW_LENGTH = 5.0
+"""m; the distance over which it stays alike: fields of a room's size last longer than the 1.5 m of single reflections."""
 _DISTANCE, _HEADING_PER_METRE, _HEADING_PER_TURN = 0.02, 0.02, 0.03
 """Random errors of the wheels after one metre (m and rad) and one radian (rad), as in OdometryNoiseConfig, where the heading
 per metre is what a recording begins with before it is learnt; here nothing is learnt."""

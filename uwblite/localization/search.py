@@ -249,6 +249,7 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     order = np.argsort(cost, kind="stable")
     order = order[cost[order] <= cost[order[:1]] + _RANGE_RIVAL]
     tried = _distinct(poses[order[:_MOST_RIVALS]], True).poses
+    yield
     return _distinct(refined_by_ranges(tried, ranges), 0 < len(order) <= _MOST_RIVALS)
 
 

@@ -28,10 +28,12 @@ ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
 """Rays' ends, or ranges to two anchors, that a start needs."""
 _FIT_CLEAR, _RANGES_CLEAR, _ANCHORS_CLEAR = -0.3, 0.75, 3
 """Fit of the rays, share of the ranges and anchors from which they speak clearly for a place."""
-_CONFIRM, _CONFIRM_ALONE = 0.5, 2.0
-"""m driven between two searches that agree; the second where scans or ranges are alone."""
+_CONFIRM, _CONFIRM_BUSY, _CONFIRM_ALONE = 0.5, 1.0, 2.0
+"""m driven between two searches that agree; the second where people are about, the third where scans or ranges are alone."""
 _UNIT_KNOWN = 0.04
-"""Standard deviation of the map's unit by ranges alone, from which another one would have been noticed."""
+"""Standard deviation of the map's unit from which another one would have been noticed."""
+_UNIT_CLEAR = 0.01
+"""The same by scans, from which ranges say nothing against a pose that was found: of four anchors two may have been moved."""
 
 
 def doubt(bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, fitting: "RangeFit") -> str:
@@ -76,6 +78,8 @@ def other_unit(walls: Walls | None, pose: Floats, rays: Rays, looks: int, ranges
     for name, scale, limit in compared:
         if scale.off(limit):
             return f"distances in the map are {1.0 + scale.error:.2f} times those of the {name}; is this the right map?"
+        if not start and scale.sigma < _UNIT_CLEAR:
+            break
     if start and compared and min(scale.sigma for _, scale, _ in compared) > _UNIT_KNOWN:
         return "whether the map has the sensors' unit is not known yet; drive on"
     return ""
@@ -99,9 +103,12 @@ def confirming_way(fit: float, ends: float, fitting: RangeFit) -> float:
 
     Errors of scans and ranges have nothing in common: where both speak clearly for a place, each confirms the other.
     """
-    if ends < ENOUGH_ENDS or fit < _FIT_CLEAR or not fitting.enough:
+    if ends < ENOUGH_ENDS or not fitting.enough:
         return _CONFIRM_ALONE
-    return 0.0 if fitting.anchors >= _ANCHORS_CLEAR and fitting.share >= _RANGES_CLEAR else _CONFIRM
+    clear = fitting.anchors >= _ANCHORS_CLEAR and fitting.share >= _RANGES_CLEAR
+    if fit < _FIT_CLEAR:
+        return _CONFIRM_BUSY if clear else _CONFIRM_ALONE
+    return 0.0 if clear else _CONFIRM
 
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
