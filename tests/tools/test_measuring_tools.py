@@ -114,3 +114,8 @@ def test_sections_of_a_page_are_replaced_and_the_rest_is_left(tmp_path):
 
 def test_tables_report_what_is_not_known():
     assert trials.table(["a", "b"], [[1, float("nan")], ["x", 0.12345]]) == "| a | b |\n|---|---|\n| 1 | - |\n| x | 0.123 |\n"
+
+
+def test_what_is_left_out_of_recordings_of_others_has_settings():
+    assert set(accuracy.WITHOUT_RADIO) <= set(accuracy.INGREDIENTS)
+    assert accuracy.WITHOUT_RADIO[0] == next(iter(accuracy.INGREDIENTS))
