@@ -13,20 +13,18 @@ from ..errors import DeviceError
 from .events import (
     Action,
     Corrupt,
-    GyroHeading,
     Lost,
     Measurement,
     Note,
-    OdometryPose,
     Param,
-    RangeEpoch,
     Reopen,
     Send,
     SetBaud,
     SetDtr,
 )
 from .link import Link, Mounting, doubts, summary_lines
-from .log_file import LogFile, gyro_line, number_text, pose_line, range_lines, scan_line
+from .log_file import LogFile
+from .log_text import LogText
 from .transport import Port, open_port
 
 HOUSEKEEPING = 0.25
@@ -63,17 +61,14 @@ class Recorder:
         open_port: Callable[[str, int], Port] = open_port, wall: Callable[[], float] | None = None,
     ) -> None:  # fmt: skip
         self.links, self.log = links, log
-        self._now, self._offset, self._host = monotonic, wall_offset, host
-        self._mounting = mounting or Mounting()
+        self._now, self._offset = monotonic, wall_offset
         self._on_note = on_note or (lambda _t, _n: None)
         self._open_port, self._wall = open_port, wall
         self._set_by = 0.0
         """s, by how much the computer's clock was set since the start."""
         self._selector = selectors.DefaultSelector()
-        self._pose: OdometryPose | None = None
-        self._params: dict[str, str] = {}
-        self._lines: list[str] = []
         self.start = monotonic()
+        self._text = LogText(log, mounting or Mounting(), monotonic, self.start, wall_offset, host)
         self.end = self._damage_due = self.start
 
     # ---- running
@@ -105,8 +100,7 @@ class Recorder:
                     if on_status:
                         on_status()
                 self._wait(next_look if until is None else min(next_look, until))
-                self.log.write(self._lines)
-                self._lines = []
+                self._text.flush()
         finally:
             self.end = self._now()
             self._finish()
@@ -148,7 +142,7 @@ class Recorder:
         for action in actions:
             if isinstance(action, Measurement):
                 self._message(link, now)
-                self._write(action, link)
+                self._text.write(action, link)
             elif isinstance(action, Send | SetBaud | SetDtr):
                 if not self._send(link, action):
                     return
@@ -161,7 +155,7 @@ class Recorder:
             elif isinstance(action, Note):
                 self._note(link, link.named(action))
             elif isinstance(action, Param):
-                self.param(link.param_name(action.name), action.value)
+                self._text.param(link.param_name(action.name), action.value)
             elif isinstance(action, Reopen):
                 self._down(link, action.why)
                 return
@@ -179,60 +173,15 @@ class Recorder:
             self._note(link, Note("info", f"{link.name}-data-again", f"{link.name}: data again after {pause:.1f} s"))
             link.stated.clear()
 
-    def _write(self, measured: Measurement, link: Link) -> None:
-        tail, counts = self._tail(measured.stamp), link.counts
-        spread = getattr(measured, "spread", 0.0)
-        counts.spread, counts.widest = counts.spread + spread, max(counts.widest, spread)
-        if isinstance(measured, OdometryPose):
-            self._pose = measured
-            self._lines.append(pose_line(measured, tail))
-        elif isinstance(measured, GyroHeading):
-            self._lines.append(gyro_line(measured, tail))
-        elif isinstance(measured, RangeEpoch):
-            self._lines += range_lines(measured, tail, link.number)
-            counts.anchors.update(reading.anchor_id for reading in measured.readings)
-        else:
-            self.param(link.param_name("laser_time_increment"), f"{measured.time_increment:.9f}")
-            self.param(link.param_name("laser_range_min"), f"{measured.range_min:.3f}")
-            lasers = (self._mounting.laser, *self._mounting.more_lasers, (0.0, 0.0, 0.0))
-            laser = lasers[min(link.number, len(lasers)) - 1]
-            self._lines.append(scan_line(measured, laser, self._pose, tail, link.number))
-
     # ---- the log
 
-    def _tail(self, stamp: float) -> str:
-        return f"{stamp + self._offset:.6f} {self._host} {max(0.0, self._now() - self.start):.6f}"
-
     def begin(self, lines: list[str]) -> None:
-        """Write the head of the log.
-
-        Parameters
-        ----------
-        lines : comments, without the word COMMENT.
-        """
-        self.log.head.append("# CARMEN Logfile")
-        self._lines.append("# CARMEN Logfile")
-        for line in lines:
-            self.comment(line)
-        for name, value in self._mounting.params:
-            self.param(name, value)
-
-    def comment(self, text: str) -> None:
-        """Write a COMMENT with the time since the start."""
-        clean = " ".join(text.split())
-        self._lines.append(f"COMMENT {number_text(max(0.0, self._now() - self.start))[:-3]} {clean}")
-
-    def param(self, name: str, value: str) -> None:
-        """Write a PARAM unless it stands there already."""
-        if self._params.get(name) != value:
-            self._params[name] = value
-            line = f"PARAM {name} {value} {self._tail(self._now())}"
-            self._lines.append(line)
-            self.log.head.append(line)
+        """Write the head of the log; lines are comments, without the word COMMENT."""
+        self._text.head(lines)
 
     def note(self, note: Note) -> None:
         """Write a Note as COMMENT and report it to the caller."""
-        self.comment(f"{note.level} {note.name}: {note.text}")
+        self._text.comment(f"{note.level} {note.name}: {note.text}")
         self._on_note(self._now() - self.start, note)
 
     def _note(self, link: Link, note: Note) -> None:
@@ -269,7 +218,7 @@ class Recorder:
     def _report_damage(self) -> None:
         hurt = [link for link in self.links if link.new_lost or link.new_corrupt]
         if hurt:
-            self.comment("; ".join(f"{link.name}: lost {link.new_lost}, corrupt {link.new_corrupt}" for link in hurt))
+            self._text.comment("; ".join(f"{link.name}: lost {link.new_lost}, corrupt {link.new_corrupt}" for link in hurt))
         for link in hurt:
             link.new_lost = link.new_corrupt = 0
 
@@ -320,6 +269,5 @@ class Recorder:
         self._selector.close()
         self._report_damage()
         for line in self.summary():
-            self.comment(line)
-        self.log.write(self._lines)
-        self._lines = []
+            self._text.comment(line)
+        self._text.flush()
