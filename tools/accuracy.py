@@ -392,7 +392,7 @@ def ablation(args: argparse.Namespace) -> str:
 WITHOUT_RADIO = (
     "nothing (the defaults)", "calibration of the wheels", "calibration of the laser's place", "calibration of the clocks",
     "robust kernels of wheels and ranges", "scan-to-scan matching", "loop closures of sub-maps", "joint refinement",
-    "pairs chosen again", "second scan per key pose", "corners", "deskewing",
+    "pairs chosen again", "second scan per keyframe", "corners", "deskewing",
 )  # fmt: skip
 """Ingredients that matter to recordings of wheels and lidar."""
 RAW = ("kummerle/mit-csail", "kummerle/fr079", "intel_raw", "carmen/freiburg-101", "carmen/belgioioso")
