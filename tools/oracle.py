@@ -1,9 +1,10 @@
 """What the measurements of a simulated drive allow: least squares with true associations and true noise, from the truth.
 
-Poses, anchors, walls, columns, the paint of surfaces, the wheels' calibration, the anchors' biases and the antennas' patterns
-are all unknown. Known are which surface each ray hit, which steps slipped, which ranges were shadowed by what, and how all
-errors are distributed: the multipath of an anchor, and what patches of floor add to steps, as Gaussian processes over the
-floor. The maximum-likelihood optimum is found by Gauss-Newton from the truth; its covariance is the Cramer-Rao bound.
+Poses, anchors, walls, columns and their radii, the paint of surfaces, the wheels' calibration, the anchors' biases and
+the antennas' patterns are all unknown. Known are which surface each ray hit, which steps slipped, which ranges were
+shadowed by what, and how all errors are distributed: the multipath of an anchor, and what patches of floor add to steps,
+as Gaussian processes over the floor. The maximum-likelihood optimum is found by Gauss-Newton from the truth; its
+covariance is the Cramer-Rao bound.
 
     residuals   wheels   log of the step against the calibrated step, (x, y, theta)
                 wall     n . (R (p - paint r) + t) - d    n, d of the wall; p a point in the base frame, r the ray's direction
@@ -11,7 +12,7 @@ floor. The maximum-likelihood optimum is found by Gauss-Newton from the truth; i
                 range    scale |tag - anchor| + bias + patterns - range, white noise + Gaussian process
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,8 @@ _AT_ONCE = 200_000
 """Rays linearised at once."""
 _ANY_PLACE = 10.0
 """m and rad; prior standard deviation of a surface, for those that a single ray hit."""
+_ANY_RADIUS = 0.1
+"""m; prior standard deviation of a column's radius."""
 _GRAZING = 0.3
 """Cosine of incidence below which a ray at a column shows the place of its edge, not of its surface; it is left out."""
 _SLIP = 0.5
@@ -91,6 +94,8 @@ class _Layout:
         begin += 2 * surfaces
         self.paint = begin + np.arange(surfaces)
         begin += surfaces
+        self.radius = begin + np.arange(surfaces)
+        begin += surfaces
         self.wheels = begin + np.arange(_WHEELS)
         begin += _WHEELS
         self.bias = begin + np.arange(anchors)
@@ -100,14 +105,20 @@ class _Layout:
 
 
 class Oracle:
-    """The least-squares problem of one recording."""
+    """The least-squares problem of one recording.
 
-    def __init__(self, recording: Recording, log: SensorLog, lidar: bool = True) -> None:
+    In pieces, the oracle knows of surfaces what a map can see of them: not that metres of wall are one straight line of one
+    paint, nor that what is seen of a column from all sides is one circle.
+    """
+
+    def __init__(self, recording: Recording, log: SensorLog, lidar: bool = True, pieces: bool = False) -> None:
         self.recording, self.log, self.rooms = recording, log, recording.settings.rooms
         self.frames = keyframes.select(log.odometry, KeyframeConfig())
         self.truth = self._at(self.frames.stamps)
         self.rays = self._rays() if lidar and len(recording.scans) else None
-        self.walls = recording.plan.walls
+        self.walls, self.columns = recording.plan.walls, recording.plan.columns
+        if pieces and self.rays is not None:
+            self.rays, self.walls, self.columns = _in_pieces(self.rays, self.truth, self.walls, self.columns)
         self.has_ranges = log.ranges is not None
         seen = np.unique(self.rays.surface) if self.rays is not None else np.zeros(0, dtype=np.int64)
         self.seen = seen
@@ -134,7 +145,7 @@ class Oracle:
 
     def _start(self) -> Floats:
         """Return the truth as the vector of unknowns."""
-        x, layout, plan = np.zeros(self.layout.size), self.layout, self.recording.plan
+        x, layout = np.zeros(self.layout.size), self.layout
         x[layout.poses[1:].ravel()] = self.truth[1:].ravel()
         if self.anchors:
             x[layout.anchors] = self.recording.anchors
@@ -144,7 +155,7 @@ class Oracle:
                 angle = np.arctan2(x2 - x1, y1 - y2)
                 x[layout.surfaces[k]] = angle, np.cos(angle) * x1 + np.sin(angle) * y1
             else:
-                x[layout.surfaces[k]] = plan.columns[surface - len(self.walls), :2]
+                x[layout.surfaces[k]] = self.columns[surface - len(self.walls), :2]
         return x
 
     def poses(self) -> Floats:
@@ -256,10 +267,11 @@ class Oracle:
         layout, model = self.layout, self.recording.settings.radio
         pattern = self._antenna_sd() * np.sqrt(0.5 / 3.0)
         paint = self.recording.settings.laser.surface_sd if self.rooms is None else self.rooms.paint_sd
-        which = np.concatenate([layout.wheels, layout.bias, layout.patterns.ravel(), layout.paint])
+        which = np.concatenate([layout.wheels, layout.bias, layout.patterns.ravel(), layout.paint, layout.radius])
         bias = np.full(len(layout.bias), max(model.bias_sd, 1e-4))
         patterns = np.full(layout.patterns.size, max(pattern, 1e-6))
-        sd = np.concatenate([[0.05, 0.05, 0.02], bias, patterns, np.full(len(layout.paint), max(paint, 1e-6))])
+        paints, radii = np.full(len(layout.paint), max(paint, 1e-6)), np.full(len(layout.radius), _ANY_RADIUS)
+        sd = np.concatenate([[0.05, 0.05, 0.02], bias, patterns, paints, radii])
         return self._rows(which[:, None], 1.0 / sd[:, None]), self.x[which] / sd
 
     def _antenna_sd(self) -> float:
@@ -281,7 +293,7 @@ class Oracle:
             normal = np.stack([np.cos(surface[:, 0]), np.sin(surface[:, 0])], axis=1)
             flat = (normal * at).sum(axis=1) - surface[:, 1]
             column = np.maximum(rays.surface[part] - len(self.walls), 0)
-            radius = np.append(self.recording.plan.columns[:, 2], 1.0)[column]
+            radius = np.append(self.columns[:, 2], 1.0)[column] + self.x[layout.radius[place[part]]]
             shift, outwards = _to_circle(at - surface, direction, radius)
             normal = np.where(wall[:, None], normal, outwards)
             incidence = (normal * direction).sum(axis=1)
@@ -289,14 +301,14 @@ class Oracle:
             # A grazing ray errs along the wall; what the estimator could at best know of it is kept finite.
             sd = rays.sd[part] * np.maximum(np.abs(incidence), 0.05)
             sd = np.where(wall | (np.abs(incidence) > _GRAZING), sd, np.inf)
-            rows = np.empty((len(wall), 6))
+            rows = np.empty((len(wall), 7))
             rows[:, :2] = normal
             rows[:, 2] = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
             rows[:, 3] = np.where(wall, normal[:, 0] * at[:, 1] - normal[:, 1] * at[:, 0], -normal[:, 0])
             rows[:, 4] = np.where(wall, -1.0, -normal[:, 1])
-            rows[:, 5] = -incidence
-            paint = layout.paint[place[part]][:, None]
-            columns = np.concatenate([layout.poses[rays.pose[part]], layout.surfaces[place[part]], paint], axis=1)
+            rows[:, 5], rows[:, 6] = -incidence, np.where(wall, 0.0, -1.0)
+            own = np.stack([layout.paint[place[part]], layout.radius[place[part]]], axis=1)
+            columns = np.concatenate([layout.poses[rays.pose[part]], layout.surfaces[place[part]], own], axis=1)
             jacobian = self._rows(columns, rows / sd[:, None])
             product = (jacobian.T @ jacobian).tocoo()
             matrix[product.row, product.col] += product.data
@@ -434,11 +446,35 @@ def _to_circle(points: Floats, direction: Floats, radius: Floats) -> tuple[Float
     return shift, (points + shift[:, None] * direction) / radius[:, None]
 
 
+def _in_pieces(rays: _Rays, poses: Floats, walls: Floats, columns: Floats) -> tuple[_Rays, Floats, Floats]:
+    """Return rays, walls and columns with every wall cut into pieces of either side, and every column into sectors."""
+    own = poses[rays.pose]
+    at, wall = se2.transform(own, rays.points), rays.surface < len(walls)
+    line = walls[np.where(wall, rays.surface, 0)]
+    along = (line[:, 2:] - line[:, :2]) / np.hypot(*(line[:, 2:] - line[:, :2]).T)[:, None]
+    piece = np.floor(np.maximum(((at - line[:, :2]) * along).sum(axis=1), 0.0) / _PIECE).astype(np.int64)
+    behind = (along[:, 0] * (own[:, 1] - line[:, 1]) - along[:, 1] * (own[:, 0] - line[:, 0]) > 0.0).astype(np.int64)
+    away = at - columns[np.where(wall, 0, rays.surface - len(walls)), :2] if len(columns) else at
+    sector = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (2.0 * np.pi / _SECTORS)).astype(np.int64) % _SECTORS
+    part = np.where(wall, 2 * piece + behind, sector)
+    many = int(part.max(initial=0)) + 1
+    found, surface = np.unique(rays.surface * many + part, return_inverse=True)
+    parent = found // many
+    of_wall = parent < len(walls)
+    return replace(rays, surface=surface), walls[parent[of_wall]], columns[parent[~of_wall] - len(walls)]
+
+
+_PIECE = 1.0
+"""Length of a piece of wall, m."""
+_SECTORS = 8
+"""Pieces of a column."""
+
+
 def _harmonics(angle: Floats) -> Floats:
     """Return cosine and sine of one, two and three times an angle (m, 6)."""
     return np.stack([f(k * angle) for k in (1, 2, 3) for f in (np.cos, np.sin)], axis=1)
 
 
-def solve(recording: Recording, log: SensorLog, lidar: bool = True) -> OracleFigures:
+def solve(recording: Recording, log: SensorLog, lidar: bool = True, pieces: bool = False) -> OracleFigures:
     """Return what the measurements of a recording allow."""
-    return Oracle(recording, log, lidar).solve()
+    return Oracle(recording, log, lidar, pieces).solve()
