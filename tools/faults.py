@@ -161,6 +161,7 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
     try:
         log, truth = sorted_log(case)
         check = 3 if checked(log) else 0
+        signal.setitimer(signal.ITIMER_PROF, TIME_BAR)
         began = time.process_time()
         result = build_map(log)
         figures = judged(result, log.odometry.stamps, truth, case, sensors == "no-lidar")

@@ -98,5 +98,19 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "clock of the lidar forward 0.5 s half-way": (logs.time_jump("lidar", 0.5), LIDAR),
     "all stamps in whole seconds": (logs.whole_stamps("odometry radio lidar", 1.0), ALL),
     "30 s not recorded, the robot drives on": (logs.cut_out(30.0), ALL),
+    "odometry times 0.93": (wheels.rescaled(0.93, 0.93, 1.0), WHEELS),
+    "odometry times 1.1": (wheels.rescaled(1.1, 1.1, 1.0), WHEELS),
+    "wheels' radius drifts to 0.85 times": (wheels.drifting_radius(0.85), WHEELS),
+    "wheels swapped from half time": (wheels.from_half(wheels.redriven(1.0, -1.0)), WHEELS),
+    "driving direction reversed from half time": (wheels.from_half(wheels.redriven(-1.0, 1.0)), WHEELS),
+    "pushed sideways by 0.8 m": (wheels.pushed(0.8), WHEELS),
+    "lidar sees the floor at 1.2 m from half time": (lidar.tilted(1.2), LIDAR),
+    "ranges beyond 5 m reported as 5 m": (radio.saturated(5.0), RADIO),
+    "all ranges 2 m longer from half time": (radio.longer_from_half(2.0), RADIO),
+    "ranges grow by 1 m as the radio warms up": (radio.warming_up(1.0), RADIO),
+    "nine of ten readings lost": (logs.lost(0.9), ALL),
+    "wheels frozen for 20 s, an anchor moved": (
+        lambda case, rng: wheels.frozen_wheels(0.5, 20.0)(radio.moved_anchor(case, rng), rng), RADIO,
+    ),
 }
 """Each with the sensors it is tried with."""

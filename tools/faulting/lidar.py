@@ -154,3 +154,15 @@ def shuffled_beams(case: Case, rng: Rng) -> Case:
         return replace(s, ranges=np.take_along_axis(s.ranges, column, axis=1))
 
     return with_scans(case, change)
+
+
+def tilted(reach: float) -> Fault:
+    """From half-way on the lidar is tilted and sees the floor ahead, so many metres away."""
+
+    def change(s: LaserScans, case: Case, rng: Rng) -> LaserScans:
+        ahead = np.cos(s.angles)
+        floor = np.where(ahead > 0.1, reach / np.maximum(ahead, 0.1), np.inf)
+        nearer = np.fmin(s.ranges, floor * rng.normal(1.0, 0.02, s.ranges.shape)).astype(np.float32)
+        return replace(s, ranges=np.where((s.stamps >= case.middle)[:, None], nearer, s.ranges))
+
+    return lambda case, rng: with_scans(case, lambda s: change(s, case, rng))

@@ -156,3 +156,8 @@ def whole_stamps(kinds: str, step: float) -> Fault:
 def cut_out(seconds: float) -> Fault:
     """Nothing is recorded for a while half-way, and the robot drives on."""
     return lambda case, rng: kept(case, lambda t: (t < case.middle) | (t >= case.middle + seconds))
+
+
+def lost(share: float) -> Fault:
+    """A share of all readings is lost."""
+    return lambda case, rng: kept(case, lambda t: rng.random(len(t)) >= share)

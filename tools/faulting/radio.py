@@ -179,3 +179,20 @@ def late_echo(case: Case, rng: Rng) -> Case:
         return replace(r, ranges=r.ranges + hidden * rng.uniform(0.8, 2.0, len(r.ranges)))
 
     return with_ranges(case, change)
+
+
+def saturated(reach: float) -> Fault:
+    """The radio reports its reach, m, for all that is farther."""
+    return lambda case, rng: with_ranges(case, lambda r: replace(r, ranges=np.minimum(r.ranges, reach)))
+
+
+def longer_from_half(metres: float) -> Fault:
+    """A new firmware adds so much to all ranges from half time on."""
+    return lambda case, rng: with_ranges(case, lambda r: replace(r, ranges=r.ranges + metres * (r.stamps >= case.middle)))
+
+
+def warming_up(metres: float) -> Fault:
+    """All ranges grow longer steadily, by so much in the end."""
+    return lambda case, rng: with_ranges(
+        case, lambda r: replace(r, ranges=r.ranges + metres * (r.stamps - r.stamps[0]) / np.ptp(r.stamps))
+    )

@@ -64,6 +64,44 @@ def redriven(way: float, turn: float) -> Fault:
     return lambda case, rng: with_odometry(case, change)
 
 
+def from_half(fault: Fault) -> Fault:
+    """Another fault of the wheels from half time on: the chain of steps goes on where it was."""
+
+    def half(case: Case, rng: Rng) -> Case:
+        other = fault(case, rng).log.odometry.poses
+
+        def change(stamps: Floats, poses: Floats) -> Floats:
+            sound, wrong = (se2.between(p[:-1], p[1:]) for p in (poses, other))
+            return chained(poses[0], np.where((stamps[1:] >= case.middle)[:, None], wrong, sound))
+
+        return with_odometry(case, change)
+
+    return half
+
+
+def pushed(metres: float) -> Fault:
+    """The robot is pushed sideways half-way within 2 s, and no wheel counts it."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, middle = se2.between(poses[:-1], poses[1:]), float(np.mean(stamps[[0, -1]]))
+        on = (stamps[1:] >= middle) & (stamps[1:] < middle + 2.0)
+        steps[on, 1] -= 0.5 * metres * np.diff(stamps)[on]
+        return chained(poses[0], steps)
+
+    return lambda case, rng: with_odometry(case, change)
+
+
+def drifting_radius(to: float) -> Fault:
+    """The wheels' radius changes steadily, up to a factor on their ways: a tyre loses air."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, age = se2.between(poses[:-1], poses[1:]), (stamps[1:] - stamps[0]) / np.ptp(stamps)
+        steps[:, :2] *= (1.0 + (to - 1.0) * age)[:, None]
+        return chained(poses[0], steps)
+
+    return lambda case, rng: with_odometry(case, change)
+
+
 def carried(seconds: float, gap: float) -> Fault:
     """The robot is picked up half-way and put down where it would have been `seconds` later; the log pauses for a gap, s."""
 
