@@ -103,12 +103,12 @@ def confirming_way(fit: float, ends: float, fitting: RangeFit) -> float:
 
     Errors of scans and ranges have nothing in common: where both speak clearly for a place, each confirms the other.
     """
-    if ends < ENOUGH_ENDS or not fitting.enough:
+    if ends < FEW_ENDS or not fitting.enough:
         return _CONFIRM_ALONE
     clear = fitting.anchors >= _ANCHORS_CLEAR and fitting.share >= _RANGES_CLEAR
     if fit < _FIT_CLEAR:
         return _CONFIRM_BUSY if clear else _CONFIRM_ALONE
-    return 0.0 if clear else _CONFIRM
+    return 0.0 if clear and ends >= ENOUGH_ENDS else _CONFIRM
 
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
