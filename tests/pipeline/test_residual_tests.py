@@ -53,7 +53,7 @@ def test_a_lidar_of_another_scale_contradicts_wheels_and_radio(sound):
 
 
 def test_odometry_alone_drifts(sound):
-    assert doubts(sound.without(uwb=True, lidar=True)) == {"odometry-alone"}
+    assert doubts(sound.without(uwb=True, lidar=True)) == {"odometry-alone", "uncertain"}
 
 
 def steps_that_slip(spans, doubts=(), degenerate=False, standing=False):
