@@ -12,20 +12,17 @@ from typing import Generic, TypeVar
 
 from .events import Action, Corrupt, RangeEpoch, RangeReading
 
-DISTRUST = 20.0
+DISTRUST = 60.0
 """s for which a link counts as damaged after bytes that were no line or frame."""
-WITNESSES, STRANGERS = (1, 2), (1, 5)
-"""Readings that must agree with one that leaps, and with the first of an anchor: on a clean link, and on a damaged one."""
-SPREAD = 0.3, 0.15
-"""m by which two ranges of one anchor may differ at rest: on a clean link an outlier is more likely the radio's."""
+WITNESSES, STRANGERS = (1, 2), 5
+"""Readings that must agree with one that leaps, on a clean link and on a damaged one; and with the first of an anchor."""
+SPREAD = 0.15
+"""m by which two ranges of one anchor may differ at rest, on a damaged link; on a clean one an outlier is the radio's."""
 SPEED = 1.5
 """m/s; robots for indoors are slower."""
 MOST_GAP, STALE = 0.2, 1.0
 """s, on a damaged link: ranges that lie further apart are compared as if they were so close; and they are not compared at
 all, unless that is less than three times the least that lay between two ranges of an anchor lately."""
-MOST_LEAPS, SMOOTH = 0.3, 0.1
-"""Share of ranges that may leap on a clean link; where more do, as long as that is not known, and until bytes are damaged,
-the board's ranges scatter and nothing is given up. And the share by which each range changes that figure."""
 MOST_ANCHORS = 256
 """That are remembered."""
 FORGET = 10.0
@@ -49,10 +46,6 @@ class Continuity(Generic[Item]):
         self.waiting: list[Item] = []
         """Those that leapt and go on from each other."""
 
-    def leaps(self, item: Item) -> bool:
-        """Return whether a reading does not go on from the last one; the first one does."""
-        return self.last is not None and not self._follows(self.last, item)
-
     def take(self, item: Item, witnesses: int) -> tuple[list[Item], list[Item]]:
         """Take the next reading; return those that pass now, in their order, and those that are given up.
 
@@ -62,7 +55,7 @@ class Continuity(Generic[Item]):
         """
         if witnesses == 0:
             passed, dropped = [*self.waiting, item], []
-        elif self.last is not None and not self.leaps(item):
+        elif self.last is not None and self._follows(self.last, item):
             passed, dropped, self.waiting = [item], self.waiting, []
         elif self.waiting and self._follows(self.waiting[-1], item):
             passed, dropped = [*self.waiting, item], []
@@ -94,7 +87,7 @@ Ranged = tuple[RangeEpoch, RangeReading]
 
 
 class RangeGuard:
-    """Ranges that no sum protects: one that leaps from those of its anchor, and a new anchor, must be seen again.
+    """Ranges that no sum protects: on a damaged link one that leaps, and a new anchor, must be seen again.
 
     Parameters
     ----------
@@ -102,7 +95,7 @@ class RangeGuard:
     """
 
     def __init__(self, health: LinkHealth) -> None:
-        self._health, self._damaged, self._leaps = health, False, 1.0
+        self._health, self._damaged = health, False
         self._intervals: deque[float] = deque(maxlen=50)
         """s, between two ranges of one anchor."""
         self._anchors: dict[str, Continuity[Ranged]] = {}
@@ -114,25 +107,19 @@ class RangeGuard:
         given_up = self._forgotten(epoch.stamp)
         for reading in epoch.readings:
             series = self._anchors.setdefault(reading.anchor_id, Continuity(self._follows))
-            before, witnesses = series.last, STRANGERS if series.last is None else WITNESSES
-            if before is not None and not self._damaged:
-                self._leaps += SMOOTH * (series.leaps((epoch, reading)) - self._leaps)
-            through, dropped = series.take((epoch, reading), witnesses[self._damaged] if self._is_strict else 0)
+            before, witnesses = series.last, STRANGERS if series.last is None else WITNESSES[True]
+            through, dropped = series.take((epoch, reading), witnesses if self._damaged else 0)
             if before is not None and through:
                 self._intervals.append(through[-1][0].stamp - before[0].stamp)
             passed, given_up = passed + through, given_up + dropped
         return self._sorted_out(passed, given_up)
-
-    @property
-    def _is_strict(self) -> bool:
-        return self._damaged or self._leaps < MOST_LEAPS
 
     def finish(self) -> list[Action]:
         """Return what still waits at the end: ranges, or Corrupt."""
         return self._sorted_out([], self._forgotten(math.inf))
 
     def _sorted_out(self, passed: list[Ranged], given_up: list[Ranged]) -> list[Action]:
-        if not self._is_strict:
+        if not self._damaged:
             passed, given_up = passed + given_up, []
         rounds: dict[float, list[Ranged]] = {}
         for item in sorted(passed, key=lambda item: item[0].stamp):
@@ -144,10 +131,9 @@ class RangeGuard:
 
     def _follows(self, before: Ranged, after: Ranged) -> bool:
         seconds = max(after[0].stamp - before[0].stamp, 0.0)
-        if self._damaged and seconds > max(STALE, 3 * min(self._intervals, default=0.0)):
+        if seconds > max(STALE, 3 * min(self._intervals, default=0.0)):
             return False
-        reach = SPREAD[self._damaged] + SPEED * (min(seconds, MOST_GAP) if self._damaged else seconds)
-        return abs(after[1].range - before[1].range) <= reach
+        return abs(after[1].range - before[1].range) <= SPREAD + SPEED * min(seconds, MOST_GAP)
 
     def _forgotten(self, stamp: float) -> list[Ranged]:
         """Return what has waited for too long."""
