@@ -318,7 +318,7 @@ def test_localize_finds_a_part_in_the_map(mapped, room_log, tmp_path, capsys):
     before = contents(mapped[0])
     assert main(["localize", str(part), *words, "--covariance", str(tmp_path / "p.csv")]) == 0
     output = capsys.readouterr().out
-    assert "lies on the walls of the map" in output
+    assert "lie on walls of the map" in output
     stamps, poses = read_tum(tmp_path / "p.tum")
     there, whole = read_tum(mapped[0] / "trajectory.tum")
     from uwblite.se2 import interpolate_trajectory

@@ -225,7 +225,8 @@ def cases() -> dict[str, Case]:
         ),
         "convert": _verb("x.log", log, "convert", "{}/x.log", "{}/out.log", "-q", "--force", cost=5),
         "localize": _verb(
-            "x.log", log, "localize", "{}/x.log", "--map", "{}", "--out", "{}/out.tum", *shared, cost=100, prepare=_map_folder
+            "x.log", _log(80), "localize", "{}/x.log", "--map", "{}", "--out", "{}/out.tum", *shared,
+            cost=100, prepare=_map_folder,
         ),
         "plan": _verb(
             "map.pgm", b"", "plan", "--map", "{}/map.yaml", "--from", "0,-0.88", "--to", "1,-0.88", "--radius", "0",

@@ -4,19 +4,25 @@ A heading that stands still from some moment on, or a tyre that was changed, can
 wheels' calibration, constant over the whole recording, and bent anchors, with hardly larger residuals. So both halves are
 estimated once more, each with a calibration of its own, from the joint estimate. Where a lidar measures the motion from
 scan to scan, such a change is seen directly (screening/wheel_motion.py).
+
+Turns whose sign changed (wheels swapped, a gyro turned over) are not near the joint estimate. There each half is
+bootstrapped on its own: their anchors are then mirror images of each other.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
+from .. import se2
 from ..arrays import Floats
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph, PriorEdges
 from ..graph.marginals import marginals
 from ..graph.solver import optimize
 from .estimate import Estimate, Task
-from .recordings import Recording
+from .progress import Stages
+from .radio_stages import first_optimisation
+from .recordings import Recording, gather
 
 _CHANGES = {"odometry_scale": 0.1, "heading_scale": 0.2, "heading_per_metre": 0.05}
 """Differences between halves that no sound base has: of lengths, of turns, and of turns per metre, rad/m."""
@@ -33,6 +39,7 @@ def check_halves(estimate: Estimate, task: Task) -> None:
     for recording in task.recordings.each:
         if recording.has_scans or estimate.ranges is None:
             continue
+        _check_sign_of_turns(recording, task)
         rows, middle = recording.rows, (recording.rows.start + recording.rows.stop) // 2
         halves = [_calibration(estimate, recording, slice(*ends), task) for ends in ((rows.start, middle), (middle, rows.stop))]
         if halves[0] is None or halves[1] is None:
@@ -83,3 +90,52 @@ def _loose(priors: PriorEdges, place: int) -> PriorEdges:
 
 _LOOSER = 20.0
 """Factor on the prior standard deviation of that unit: what changed on the way is of any size."""
+
+
+def _check_sign_of_turns(recording: Recording, task: Task) -> None:
+    """Doubt where anchors by either half alone are mirror images of each other."""
+    stamps = recording.frames.stamps
+    middle = float(stamps[len(stamps) // 2])
+    one, other = (_anchors_alone(recording, *ends, task) for ends in ((-np.inf, middle), (middle, np.inf)))
+    both = sorted(one.keys() & other.keys())
+    if len(both) < _TRIANGLE:
+        return
+    p, q = np.array([one[name] for name in both]), np.array([other[name] for name in both])
+    turned, mirrored = _misfit(p, q), _misfit(p * (1.0, -1.0), q)
+    if turned > max(_FAR, _CLEARLY * mirrored):
+        text = (
+            f"the anchors by the first and the second half of the recording are mirror images of each other ({turned:.1f} m "
+            f"apart, {mirrored:.1f} m as mirror images): the sign of the odometry's turns changed on the way"
+        )
+        task.stages.doubt("halves-disagree", text, apart=turned, mirrored=mirrored)
+
+
+_TRIANGLE = 3
+"""Anchors that have a handedness."""
+_FAR, _CLEARLY = 1.0, 4.0
+"""How far anchors are apart at least, m, and how many times as far as their mirror images."""
+_RANGES_ALONE = 1500
+"""Ranges with which a half is bootstrapped, at most."""
+_WIDE = 0.1
+"""Width of a path by its length that shows to which side it turns."""
+
+
+def _anchors_alone(recording: Recording, start: float, end: float, task: Task) -> dict[str, Floats]:
+    """Return the anchors (2,) by a part of a recording alone, in a frame of their own; none where it shows them badly."""
+    log = recording.log.crop(start, end)
+    if log.ranges is None or len(log.ranges.stamps) < _LEAST_RANGES or len(log.odometry.stamps) < _LEAST_STEPS:
+        return {}
+    some = np.arange(0, len(log.ranges.stamps), -(-len(log.ranges.stamps) // _RANGES_ALONE))
+    thinned = gather([replace(log, ranges=log.ranges.rows(some))], task.config.keyframes)
+    found = first_optimisation(replace(task, recordings=thinned, stages=Stages(None, None)))
+    places = found.graph.poses[:, :2]
+    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    if found.ranges is None or spread[1] < _WIDE * spread[0]:
+        return {}
+    often = np.bincount(found.ranges.anchor, found.ranges.alive, minlength=len(found.anchor_ids)) >= _FEW
+    return {found.anchor_ids[k]: found.graph.anchors[k] for k in np.flatnonzero(found.placed & often)}
+
+
+def _misfit(p: Floats, q: Floats) -> float:
+    """Return the rms distance of points (n, 2) after the best rigid motion, m."""
+    return float(np.sqrt(np.mean(np.sum(np.square(se2.transform(se2.align(p, q), p) - q), axis=1))))
