@@ -62,3 +62,19 @@ def in_map(clouds: Clouds, poses):
     """Return all points and normals (p, 2) in the map frame, given keyframe poses (k, 3)."""
     own = poses[clouds.owner]
     return se2.transform(own, clouds.points), se2.rotate(own[:, 2], clouds.normals)
+
+
+def returned(walls, far, shift):
+    """Return a drive of 45 m along x, again after a way back known to `far` m only and wrong by shift (3,).
+
+    Returns
+    -------
+    True poses (k, 3), the graph, travelled distances (k,) and the clouds.
+    """
+    once = np.column_stack([np.arange(0.0, 45.0, 0.6), np.zeros(75), np.zeros(75)])
+    truth = np.concatenate([once, once])
+    edges = chained(truth, [0.003, 0.003, 0.0005])
+    edges.sqrt_information[74] = np.diag(1.0 / np.array([far, far, 0.03]))
+    poses = np.concatenate([once, se2.compose(np.asarray(shift), once)])
+    path = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(truth[:, 0])))])
+    return truth, Graph(poses).with_edges(edges), path, scanned(truth, walls, 0.01, 5, beams=240, reach=8.0)

@@ -101,7 +101,7 @@ def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
     assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
 
 
-GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "spread": 9.0, "off": 0.0,
+GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "everywhere": 1.0, "spread": 7.0, "off": 0.0,
         "held": True, "strength": 1e4}  # fmt: skip
 """Figures of a match that no rule objects to, found by a search."""
 
@@ -118,6 +118,8 @@ GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3,
     ({"strength": 1.1}, "accepted"),
     ({"second": CONFIG.uniqueness + 0.001}, "ambiguous"),
     ({"second": CONFIG.uniqueness + 0.001, "spread": 0.0}, "accepted"),
+    ({"everywhere": CONFIG.overlap_everywhere - 0.001}, "ambiguous"),
+    ({"everywhere": CONFIG.overlap_everywhere + 0.001}, "accepted"),
     ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 1.01}, "contradicts-graph"),
     ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 0.97}, "accepted"),
     ({"off": 5.0, "held": False}, "accepted"),
@@ -126,7 +128,7 @@ def test_each_rule_rejects_by_its_own_limit(figures, outcome):
     """A guess known to 0.1 m and 0.1 rad, a measurement to 0.01; the matched surfaces see every direction."""
     f = {**GOOD, **figures}
     best = SimpleNamespace(share=np.array([f["share"]]), rms=np.array([f["rms"]]))
-    fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through")})
+    fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through", "everywhere")})
     guess, covariance = np.array([[f["off"], 0.0, 0.0]]), 0.01 * np.eye(3)[None]
     candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, np.array([f["spread"]]), f["held"])
     root = np.sqrt(np.diag([f["strength"], f["strength"], 1e4]))[None]

@@ -34,7 +34,7 @@ class Candidates:
     constrained: bool = True
     """Ranges or given anchors constrain the trajectory, so that its covariance is reliable."""
 
-    def rows(self, chosen: slice) -> "Candidates":
+    def rows(self, chosen: slice | Ints) -> "Candidates":
         """Return some of them."""
         return replace(
             self, target=self.target[chosen], source=self.source[chosen], guess=self.guess[chosen],
@@ -53,7 +53,7 @@ class Candidates:
 
 def propose(
     graph: Graph, marginals: JointCovariance, submaps: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
-    missed: set[tuple[int, int]], constrained: bool, config: LoopClosureConfig,
+    missed: set[tuple[int, int]], constrained: bool, config: LoopClosureConfig, beyond: float = -1.0,
 ) -> Candidates:
     """List pairs of sub-maps that may overlap, best expected overlap first within each sub-map.
 
@@ -63,6 +63,7 @@ def propose(
     recording : (k,) recording of each keyframe.
     tried : (target, source, searched) of earlier rounds; not proposed again.
     constrained : ranges constrain the trajectory.
+    beyond : pairs whose 3 sigma are no larger, m, are left out; so are those of which a search would see a part only.
     missed : (target, source) that did not match from the graph's guess though the graph may be wrong: searched with slack.
     """
     s = len(submaps)
@@ -88,6 +89,7 @@ def propose(
     doubtful = spread > config.direct
     worth = np.where(doubtful & ~astray, 1.0 - distance / (config.reach + np.minimum(spread, config.search_limit)), expected)
     possible = np.where(doubtful, worth > 0.0, expected > 0.25) & (size[a] > 5) & (size[b] > 5)
+    possible &= (spread > beyond) & (spread <= config.search_limit)
     fresh = np.array([(int(x), int(y), bool(d)) not in tried for x, y, d in zip(a, b, doubtful, strict=True)])
     kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
     a, b = a[kept], b[kept]

@@ -30,7 +30,7 @@ class LoopClosureConfig:
     reach: float = setting(6.0, advanced=True)
     """Sub-maps whose middles lie farther apart than this, after the uncertainty is taken off, are no candidates, m."""
     search_limit: float = setting(8.0, advanced=True)
-    """Largest half-width of a search, m."""
+    """Largest half-width of a search among sub-maps, m; pairs less certain than that are sought by long stretches."""
     search_angle: ClassVar[float] = 0.7
     """Largest half-width of a search, rad."""
     gate: float = 0.15
@@ -41,6 +41,8 @@ class LoopClosureConfig:
     """Least share of points with a match when the graph's guess was good."""
     overlap_after_search: ClassVar[float] = 0.5
     """Least share of points with a match after a search, which can be fooled."""
+    overlap_everywhere: ClassVar[float] = 0.6
+    """Least share of long stretches that matches in every direction (see directional_overlap)."""
     uniqueness: ClassVar[float] = 0.85
     """A second place that matches this share as well as the first makes a search ambiguous."""
     slip: ClassVar[float] = 1.0

@@ -6,7 +6,7 @@ several, with the same outcome.
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -21,10 +21,15 @@ from ..lidar.scan_matching import PairFactors, match, pair_points
 from ..lidar.visibility import violates_free_space
 from .candidates import Candidates
 from .closures import LoopClosureConfig
+from .directional_overlap import directional_overlap
 from .parallel import in_order
 
 _AT_ONCE = 32
 """Candidates of a batch."""
+_MANY_PLACES = 20
+"""Places found by a wide search that are matched before one is chosen: along a corridor many fit its walls."""
+_MANY_POINTS = 1000
+"""Points of each of two long stretches that are compared at every place."""
 _SAME_PLACE = 0.3
 """Matches nearer than this, m and rad, are one place."""
 
@@ -41,6 +46,8 @@ class ClosureMatches:
     """(c,) what share of its matches another place reaches."""
     through: Floats
     """(c,) share of its points that would stand in free space."""
+    everywhere: Floats
+    """(c,) least share over all directions that matches, see directional_overlap; 1 where no wide search was made."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +81,8 @@ def fit(
             progress(done, total)
     factors = (np.concatenate([getattr(p.best.factors, f.name) for p in parts]) for f in fields(PairFactors))
     best = Aligned(np.concatenate([p.best.pose for p in parts]), PairFactors(*factors))
-    return ClosureMatches(best, *(np.concatenate([getattr(p, name) for p in parts]) for name in ("found", "second", "through")))
+    names = ("found", "second", "through", "everywhere")
+    return ClosureMatches(best, *(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 def _batches(
@@ -96,13 +104,19 @@ def _fit(batch: _Batch) -> ClosureMatches:
     row, guess = _guesses(batch)
     points = pair_points(clouds, candidates.source[row], config.points)
     tries = align_pairs(clouds, raster, candidates.target[row], candidates.source[row], guess, points, 0.5, config.gate)
-    place, second = _best_places(row, tries, len(candidates.target))
+    wide = candidates.spread > config.search_limit
+    score, some = tries.share, np.flatnonzero(wide[row])
+    target, source = candidates.target[row[some]], candidates.source[row[some]]
+    score[some] = directional_overlap(clouds, raster, target, source, tries.pose[some], _MANY_POINTS, config.gate)
+    place, second = _best_places(row, tries.pose, score, len(candidates.target))
     found, pose = place >= 0, candidates.guess.copy()
+    everywhere = np.ones(len(place))
+    everywhere[wide & found] = score[place[wide & found]]
     pose[found] = tries.pose[place[found]]
     points = pair_points(clouds, candidates.source, config.points)
     factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
     best = Aligned(pose, factors)
-    return ClosureMatches(best, found, second, _free_space_violations(batch, best))
+    return ClosureMatches(best, found, second, _free_space_violations(batch, best), everywhere)
 
 
 def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
@@ -113,24 +127,36 @@ def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
     for k, searched in enumerate((candidates.spread > config.direct).tolist()):
         poses = candidates.guess[k : k + 1]
         if searched:
-            half_width = float(np.minimum(candidates.spread[k], config.search_limit))
+            half_width = float(candidates.spread[k])
+            wide = half_width > config.search_limit
+            search_config, places = (_coarse(batch.search), _MANY_PLACES) if wide else (batch.search, config.places)
             turn = float(np.clip(3.0 * np.sqrt(candidates.covariance[k, 2, 2]), 0.1, config.search_angle))
             target, source = (_prepare(batch.clouds, int(c[k]), prepared) for c in (candidates.target, candidates.source))
-            poses = search(target, source, poses[0], (half_width, half_width, turn), batch.search).poses[: config.places]
+            poses = search(target, source, poses[0], (half_width, half_width, turn), search_config).poses[:places]
         rows.append(np.full(len(poses), k))
         guesses.append(poses)
     return np.concatenate(rows).astype(np.int64), np.concatenate(guesses)
 
 
-def _best_places(row: Ints, tries: Aligned, candidates: int) -> tuple[Ints, Floats]:
-    """Return the best try of each candidate (c,), -1 = none, and what share of its matches another place reaches (c,)."""
+def _coarse(config: CorrelativeConfig) -> CorrelativeConfig:
+    """Return the settings of a wide search: twice the cells, finer headings for long clouds, and many places."""
+    twice = replace(config, resolution=2.0 * config.resolution, spread=2.0 * config.spread, candidates=_MANY_PLACES)
+    return replace(twice, angle_step=config.angle_step / 1.5)
+
+
+def _best_places(row: Ints, pose: Floats, share: Floats, candidates: int) -> tuple[Ints, Floats]:
+    """Return the best try of each candidate (c,), -1 = none, and what share of its matches another place reaches (c,).
+
+    Parameters
+    ----------
+    row : (g,) candidate of each try. pose : (g, 3). share : (g,) that matches.
+    """
     best, second = np.full(candidates, -1, dtype=np.int64), np.zeros(candidates)
-    share = tries.share
     for k in np.unique(row):
         own = np.flatnonzero(row == k)
         first = own[np.argmax(share[own])]
         best[k] = first
-        apart = se2.between(tries.pose[first], tries.pose[own])
+        apart = se2.between(pose[first], pose[own])
         other = own[(np.hypot(apart[:, 0], apart[:, 1]) > _SAME_PLACE) | (np.abs(apart[:, 2]) > _SAME_PLACE)]
         second[k] = share[other].max(initial=0.0) / max(share[first], 1e-9)
     return best, second

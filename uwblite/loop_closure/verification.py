@@ -84,6 +84,8 @@ def _judge(
             verdict = "degenerate", "the surfaces fix neither position nor heading"
         elif searched[k] and fits.second[k] > config.uniqueness:
             verdict = "ambiguous", f"another place matches {fits.second[k]:.0%} as well"
+        elif fits.everywhere[k] < config.overlap_everywhere:
+            verdict = "ambiguous", f"only {fits.everywhere[k]:.0%} match in one direction, as where walls look alike"
         elif distance[k] > most:
             text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {most:g})"
             verdict = "contradicts-graph", text

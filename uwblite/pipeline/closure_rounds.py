@@ -2,13 +2,16 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
 from ..graph.pose_edges import OdometryEdges
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
+from ..lidar.submaps import Submaps
 from ..loop_closure import candidates as closure_candidates
-from ..loop_closure import closures, loose_links, paper_method, verification
+from ..loop_closure import closures, long_stretches, loose_links, paper_method, verification
 from ..loop_closure.closures import Closures
 from .estimate import Estimate, Task
 from .progress import Stage, solver_figures
@@ -20,6 +23,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     assert scans is not None
     base = estimate.graph.with_edges(*estimate.odometry_and_ranges, *estimate.steps_and_closures)
     base, found, estimate = _with_loose_links_tied(base, estimate, task)
+    base, found, stretches = _with_long_stretches_tied(base, found, estimate, task)
     tried: set[tuple[int, int, bool]] = set()
     missed: set[tuple[int, int]] = set()
     with_ranges = estimate.ranges is not None
@@ -48,7 +52,68 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
         unsearched = missed - {(a, b) for a, b, searched in tried if searched}
         if (tied or len(new.edges) <= 0.05 * len(found.edges)) and not unsearched:
             break
+    if stretches is not None:
+        _check_open_loops(base, found, stretches, with_ranges, task)
     return replace(estimate, closures=found).with_estimates_of(base)
+
+
+def _with_long_stretches_tied(
+    base: Graph, found: Closures, estimate: Estimate, task: Task
+) -> tuple[Graph, Closures, Submaps | None]:
+    """Close loops whose ends are too uncertain for a search of sub-maps, the surest first; each round makes others surer.
+
+    Returns
+    -------
+    The solved graph, the closures, and the stretches; None where nothing is as uncertain.
+    """
+    recordings, scans, rules = task.recordings, estimate.scans, task.config.loop_closure
+    assert scans is not None
+    pieces = long_stretches.stretches(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, task.config.submaps)
+    free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
+    pieces = visibility.static_points(pieces, free)
+    tried: set[tuple[int, int, bool]] = set()
+    accepted = 0
+    for _ in range(_WIDE_ROUNDS):
+        covariance = JointCovariance(base.with_edges(found.edges), pieces.reference)
+        pairs = long_stretches.uncertain_pairs(
+            base, covariance, pieces, recordings.of_keyframe, tried, estimate.ranges is not None, rules
+        )
+        if not len(pairs.target):
+            break
+        pairs = long_stretches.first_of(pairs, pieces)
+        tried |= pairs.names(rules)
+        new = verification.find(pairs, pieces, rules, task.config.correlative, None, free, task.executor)
+        new = _without_forbidden(new, task)
+        found = closures.merged(found, new)
+        if len(new.edges):
+            base, found = verification.reconcile(base, found, rules, task.config.solver)
+            accepted += len(new.edges)
+    if not tried:
+        return base, found, None
+    task.stages.end("long stretches", stretches=len(pieces), candidates=len(tried), accepted=accepted)
+    return base, found, pieces
+
+
+def _check_open_loops(base: Graph, found: Closures, stretches: Submaps, with_ranges: bool, task: Task) -> None:
+    """Doubt a map in which stretches that may show the same place are still too uncertain for any search."""
+    recordings, rules = task.recordings, task.config.loop_closure
+    covariance = JointCovariance(base.with_edges(found.edges), stretches.reference)
+    left = long_stretches.likely(long_stretches.uncertain_pairs(
+        base, covariance, stretches, recordings.of_keyframe, set(), with_ranges, rules, np.inf
+    ))  # fmt: skip
+    if not len(left.target):
+        return
+    a, b = (float(recordings.stamps[stretches.reference[k[0]]] - recordings.stamps[0]) for k in (left.target, left.source))
+    sigma = float(left.spread[0]) / 3.0
+    text = (
+        f"what was seen at t = {a:.0f} s and at t = {b:.0f} s may be the same place, known to {sigma:.1f} m only, and no scans "
+        f"decide it ({len(left.target)} such pairs): drive there once more in the same direction, or give the closure"
+    )
+    task.stages.doubt("open-loops", text, pairs=len(left.target), first=a, second=b, sigma=sigma)
+
+
+_WIDE_ROUNDS = 12
+"""Rounds of searching among long stretches, at most; a bound on the time where no loop closes."""
 
 
 def _with_loose_links_tied(base: Graph, estimate: Estimate, task: Task) -> tuple[Graph, Closures, Estimate]:

@@ -1,0 +1,91 @@
+"""Loops whose ends are known to many metres: closed where long stretches fit at one place only, left open elsewhere."""
+
+import numpy as np
+import pytest
+from helpers.laser_walks import returned
+
+from uwblite import se2
+from uwblite.graph.marginals import JointCovariance
+from uwblite.lidar.correlative_matching import CorrelativeConfig
+from uwblite.lidar.submaps import SubmapConfig
+from uwblite.loop_closure.candidates import propose
+from uwblite.loop_closure.closures import LoopClosureConfig
+from uwblite.loop_closure.long_stretches import first_of, likely, stretches, uncertain_pairs
+from uwblite.loop_closure.verification import find
+
+CONFIG = LoopClosureConfig()
+SHIFT = np.array([7.0, -3.0, 0.04])
+"""m, m, rad; by what the way back is wrong."""
+
+
+def corridor(places):
+    """Return two walls with pillars of 0.4 m at places (p,) along both."""
+    x = np.asarray(places)
+    pillars = [
+        [[a, s, a, 0.8 * s], [a, 0.8 * s, a + 0.4, 0.8 * s], [a + 0.4, 0.8 * s, a + 0.4, s]] for a in x for s in (-2.0, 2.0)
+    ]
+    walls = [[-20.0, -2.0, 70.0, -2.0], [70.0, 2.0, -20.0, 2.0]]
+    return np.concatenate([np.array(walls), np.array(pillars).reshape(-1, 4)])
+
+
+UNLIKE = corridor(np.cumsum(np.random.default_rng(3).uniform(1.2, 5.0, 24)) - 15.0)
+ALIKE = corridor(np.arange(-15.0, 65.0, 2.5))
+
+
+def looked_for(walls):
+    """Return truth, stretches and their uncertain pairs of a drive whose way back is known to 4 m."""
+    truth, graph, path, clouds = returned(walls, 4.0, SHIFT)
+    recording = np.zeros(len(truth), dtype=np.int64)
+    pieces = stretches(clouds, graph.poses, path, recording, SubmapConfig())
+    covariance = JointCovariance(graph, pieces.reference)
+    few = propose(graph, covariance, pieces, recording, set(), set(), False, CONFIG)
+    assert np.all(few.spread <= CONFIG.search_limit)
+    return truth, pieces, uncertain_pairs(graph, covariance, pieces, recording, set(), False, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def unlike():
+    return looked_for(UNLIKE)
+
+
+def test_each_stretch_overlaps_the_next_of_its_recording_by_half():
+    truth, graph, path, clouds = returned(UNLIKE[:2], 4.0, SHIFT)
+    pieces = stretches(clouds, graph.poses, path, (np.arange(len(truth)) >= 75).astype(np.int64), SubmapConfig())
+    own = np.flatnonzero(pieces.last <= 75)
+    length = path[pieces.last - 1] - path[pieces.first]
+    assert np.all(pieces.first[own[1:]] < pieces.last[own[:-1]])
+    assert np.all(length[own[:-1]] > 25.0)
+    assert not np.any((pieces.first < 75) & (pieces.last > 75))
+
+
+def test_only_pairs_beyond_a_search_of_sub_maps_are_listed_the_surest_first(unlike):
+    _, pieces, pairs = unlike
+    assert len(pairs.target)
+    assert np.all(pairs.spread > CONFIG.search_limit)
+    assert np.all(np.diff(pairs.spread) >= 0.0)
+    assert len(first_of(pairs, pieces).target) == min(40, len(pairs.target))
+
+
+def test_a_loop_is_closed_where_pillars_stand_unlike(unlike):
+    """The guess is 7 m off; whatever is accepted is right, and something is."""
+    truth, pieces, pairs = unlike
+    found = find(pairs, pieces, CONFIG, CorrelativeConfig())
+    error = se2.between(se2.between(truth[found.edges.i], truth[found.edges.j]), found.edges.T_i_j)
+    assert len(found.edges) >= 2
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.1
+
+
+def test_where_all_pillars_are_alike_none_is_accepted():
+    _, pieces, pairs = looked_for(ALIKE)
+    found = find(pairs.rows(slice(0, 2)), pieces, CONFIG, CorrelativeConfig())
+    assert len(found.candidates)
+    assert not len(found.edges)
+    assert any(c.outcome == "ambiguous" for c in found.candidates)
+
+
+def test_what_lies_beyond_one_sigma_is_not_likely(unlike):
+    pairs = unlike[2]
+    distance = np.hypot(pairs.guess[:, 0], pairs.guess[:, 1])
+    kept = likely(pairs)
+    assert 0 < len(kept.target) <= len(pairs.target)
+    assert len(kept.target) == np.sum(distance < 15.0 + pairs.spread / 3.0)

@@ -1,0 +1,58 @@
+"""What share of two clouds matches in the direction in which fewest points do.
+
+In corridors the walls match wherever one is laid along the other: of two places that look alike most points match, but
+not the few surfaces that face along the corridor. With the normals n of the points looked up, A = sum n n^T over all of
+them and M the same sum over those that match, the share that matches in a direction u is u^T M u / u^T A u; the least of
+all directions is the smaller eigenvalue of M u = l A u.
+"""
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Floats, Ints
+from ..lidar.cloud_rasters import CloudRasters, look_up
+from ..lidar.clouds import Clouds
+from ..lidar.scan_matching import pair_points
+
+_NOISE = 0.005
+"""Share of the points added to A in every direction: where fewer face, as along a bare wall, the noise of normals does."""
+_SAME_FACING = float(np.sqrt(0.5))
+"""Least cosine between the normals of two matched points."""
+
+
+def directional_overlap(
+    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, limit: int, gate: float
+) -> Floats:
+    """Return the least share (e,) over all directions of clouds i and j (e,) that matches when laid at poses (e, 3).
+
+    Parameters
+    ----------
+    limit : most points looked up per cloud. gate : farthest match, m.
+    """
+    asked, matched = _sums(clouds, raster, i, j, T_i_j, limit, gate)
+    back = _sums(clouds, raster, j, i, se2.inverse(T_i_j), limit, gate)
+    c, s = se2.cos_sin(T_i_j[:, 2])
+    turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    asked, matched = (a + turn @ b @ np.swapaxes(turn, 1, 2) for a, b in zip((asked, matched), back, strict=True))
+    noise = _NOISE * np.trace(asked, axis1=1, axis2=2) + np.finfo(float).tiny
+    root = np.linalg.inv(np.linalg.cholesky(asked + noise[:, None, None] * np.eye(2)))
+    return np.asarray(np.linalg.eigvalsh(root @ matched @ np.swapaxes(root, 1, 2))[:, 0])
+
+
+def _sums(
+    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, limit: int, gate: float
+) -> tuple[Floats, Floats]:
+    """Return A and M (e, 2, 2), in the frames of i, of the points of clouds j looked up in clouds i."""
+    row = pair_points(clouds, j, limit).row
+    real = row >= 0
+    row = np.where(real, row, 0)
+    points = se2.transform(T_i_j[:, None], clouds.points[row])
+    normals = se2.rotate(T_i_j[:, 2, None], clouds.normals[row])
+    found = look_up(raster, i, points[..., 0], points[..., 1])
+    near = (found >= 0) & real
+    target = (found + clouds.offsets[i, None]) * near
+    away = points - clouds.points[target]
+    near &= np.einsum("enk,enk->en", away, away) <= gate * gate
+    near &= np.einsum("enk,enk->en", normals, clouds.normals[target]) > _SAME_FACING
+    sums = [np.einsum("en,enk,enl->ekl", mask.astype(np.float64), normals, normals) for mask in (real, near)]
+    return sums[0], sums[1]

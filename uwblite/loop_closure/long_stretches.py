@@ -1,0 +1,66 @@
+"""Loops closed where the graph knows the way round to many metres only: long stretches of the path against each other.
+
+A search narrower than the uncertainty may miss the true place, and one as wide finds many places at which one sub-map of a
+corridor fits. Stretches of tens of metres fit at one place only, where doors and pillars match as well as walls do
+(directional_overlap). The surest pairs come first: a loop that is closed makes the others surer.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from ..graph.graph import Graph
+from ..graph.marginals import JointCovariance
+from ..lidar import submaps
+from ..lidar.clouds import Clouds
+from ..lidar.submaps import SubmapConfig, Submaps
+from .candidates import Candidates, propose
+from .closures import LoopClosureConfig
+
+_LENGTH = 30.0
+"""Travelled distance of a stretch, m: several doors or pillars, and a chain of scans does not bend by more than the final
+matching forgives. Each begins in the middle of the one before."""
+FARTHEST = 60.0
+"""Largest half-width of a search, m; a bound on time and memory."""
+_AT_ONCE, _PART = 40, 8
+"""Pairs tried before the graph is solved again, and how many stretches there are for each where that is more."""
+
+
+def stretches(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, merging: SubmapConfig) -> Submaps:
+    """Return the trajectory's stretches, each of which overlaps the next by half.
+
+    Parameters
+    ----------
+    clouds : one per keyframe. poses : (k, 3). path : (k,) travelled distance, m. recording : (k,).
+    """
+    first, last = submaps.cut(path, recording, _LENGTH / 2.0)
+    goes_on = recording[first[1:]] == recording[first[:-1]]
+    last[:-1] = np.where(goes_on, last[1:], last[:-1])
+    return submaps.of_pieces(clouds, poses, first, last, (first + last - 1) // 2, merging)
+
+
+def uncertain_pairs(
+    graph: Graph, covariance: JointCovariance, pieces: Submaps, recording: Ints, tried: set[tuple[int, int, bool]],
+    constrained: bool, config: LoopClosureConfig, farthest: float = FARTHEST,
+) -> Candidates:
+    """Return pairs of stretches that may overlap and are too uncertain for a search of sub-maps, the surest first.
+
+    Parameters
+    ----------
+    farthest : pairs whose 3 sigma are larger, m, are left out. For the others see candidates.propose.
+    """
+    wide = replace(config, reach=_LENGTH / 2.0, search_limit=farthest)
+    found = propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, config.search_limit)
+    return found.rows(np.argsort(found.spread, kind="stable"))
+
+
+def first_of(candidates: Candidates, pieces: Submaps) -> Candidates:
+    """Return the candidates that are tried before the graph is solved again."""
+    return candidates.rows(slice(0, max(_AT_ONCE, len(pieces) // _PART)))
+
+
+def likely(candidates: Candidates) -> Candidates:
+    """Return the candidates whose stretches overlap within one standard deviation."""
+    distance = np.hypot(candidates.guess[:, 0], candidates.guess[:, 1])
+    return candidates.rows(np.flatnonzero(distance < _LENGTH / 2.0 + candidates.spread / 3.0))
