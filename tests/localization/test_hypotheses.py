@@ -50,7 +50,7 @@ def test_a_range_corrects_as_a_kalman_filter_with_the_numeric_jacobian():
         H, P = numeric(expected, bank.mean[0]), bank.covariance[0]
         measured = float(expected(bank.mean[0])[0]) + 0.05
         late = RangeFacts(fact.anchor, fact.place, measured, fact.square, fact.sigma, fact.scale)
-        found, weight, _ = hypotheses.ranged(bank, late, tag)
+        found, weight, _, _ = hypotheses.ranged(bank, late, tag)
         gain = P @ H.T / (H @ P @ H.T + fact.sigma**2 / weight[0])
         np.testing.assert_allclose(found.mean[0], bank.mean[0] + gain[:, 0] * 0.05, atol=1e-8)
         np.testing.assert_allclose(found.covariance[0], P - gain @ H @ P, atol=1e-9)
@@ -60,6 +60,8 @@ def test_a_range_corrects_as_a_kalman_filter_with_the_numeric_jacobian():
 def test_a_range_that_is_metres_late_moves_nothing():
     bank = a_bank(1)
     fact = RangeFacts(0, np.array([4.0, -2.0]), 60.0, 0.0, 0.1, 0.0)
-    found, weight, _ = hypotheses.ranged(bank, fact, np.zeros(2))
+    found, weight, likelihood, anywhere = hypotheses.ranged(bank, fact, np.zeros(2))
+    # 0.05 of such ranges over 60 m, against one over 30 m: the likelihood of one that comes from anywhere is 40 times as large.
+    np.testing.assert_allclose(anywhere - likelihood, np.log(40.0), atol=1e-6)
     assert weight[0] < 1e-3
     np.testing.assert_array_equal(found.mean, bank.mean)

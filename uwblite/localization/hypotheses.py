@@ -39,6 +39,8 @@ _GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
 _TAIL, _DETOUR, _WILD, _WIDTH = 0.15, 0.4, 0.05, 60.0
 """Share of ranges with a detour and its mean, m; share of nonsense and its extent, m: the mixture of radio.nlos_mixture with
 what is usual, there being no recording to learn it from."""
+_ANYWHERE = 30.0
+"""m over which ranges are spread where nothing is known of the place: the reach of the radio indoors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +162,7 @@ class RangeFacts:
     """Relative error of all ranges."""
 
 
-def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses, Floats, Floats]:
+def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses, Floats, Floats, Floats]:
     """Correct every hypothesis by one range.
 
     Parameters
@@ -169,7 +171,8 @@ def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses,
 
     Returns
     -------
-    The hypotheses, and for each the weight (h,), 0..1, that the range got and its log-likelihood (h,).
+    The hypotheses, and for each the weight (h,), 0..1, that the range got, its log-likelihood (h,), 0 = the likeliest, and
+    that of a range from anywhere (h,).
     """
     theta = bank.mean[:, 2]
     lever = se2.rotate(theta, np.broadcast_to(tag, (len(bank), 2)))
@@ -184,13 +187,15 @@ def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses,
     jacobian[:, column] = 1.0
     spread = np.einsum("hij,hj->hi", bank.covariance, jacobian)
     own = np.einsum("hi,hi->h", jacobian, spread)
-    weight, likelihood = _judged(error, np.sqrt(own + fact.sigma**2))
+    sigma = np.sqrt(own + fact.sigma**2)
+    weight, likelihood = _judged(error, sigma)
     gain = spread / (own + fact.sigma**2 / np.maximum(weight, 1e-3))[:, None]
     gain *= (weight > 1e-3)[:, None]
     mean = bank.mean + gain * error[:, None]
     mean[:, 2] = se2.wrap_angle(mean[:, 2])
     covariance = _symmetric(bank.covariance - gain[:, :, None] * spread[:, None, :])
-    return Hypotheses(mean, covariance, bank.log_weight), weight, likelihood
+    anywhere = np.log(sigma * np.sqrt(2.0 * np.pi) / _ANYWHERE)
+    return Hypotheses(mean, covariance, bank.log_weight), weight, likelihood, anywhere
 
 
 def _judged(error: Floats, sigma: Floats) -> tuple[Floats, Floats]:

@@ -35,12 +35,14 @@ _FRESH_WAY = 0.1
 """m; a scan taken so far from the last one errs independently of it; a nearer one in proportion."""
 _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
 """Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
-_SEARCH_WAY, _SEARCH_TIME = 0.5, 1.0
+_SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
 """m driven and s between two searches."""
 _UNIT_WAY = 1.0
 """m driven between two comparisons of the map's unit with the sensors'."""
 _MOST, _FORGET = 40, -14.0
 """Hypotheses, and log-weight below which one goes."""
+_MOST_PARTS = 4
+"""Into how many parts the window is divided at most: a quarter of ten metres holds what a start needs."""
 _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent."""
 _UNSEEN_SPEED = 0.3
@@ -75,6 +77,8 @@ class Localizer:
         self._square = np.square(heights) + known.anchors.rise
         self._window = Window()
         self._waiting = Waiting()
+        self._parts = 1
+        """Into how many parts the window is divided, of which the newest is searched for."""
         self._way = self._scan_way = self._search_way = self._unit_way = 0.0
         self._search_stamp = -np.inf
         self._certain = False
@@ -189,9 +193,10 @@ class Localizer:
         if not len(self._bank):
             return
         arm = se2.transform(se2.between(self._odometer.pose, then), place)
-        bank, weight, likelihood = hypotheses.ranged(self._bank, fact, arm)
+        bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, fact, arm)
         self._bank = hypotheses.weighed(bank, likelihood if len(bank) > 1 else np.zeros(1))
-        self._running.add_range(anchor, float(weight[int(np.argmax(bank.log_weight))]), stamp)
+        best = int(np.argmax(bank.log_weight))
+        self._running.add_range(anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)
 
     def _use_scan(self, entry: Scan) -> None:
         rays = scan_rays(self._odometer, self._laser, entry)
@@ -213,12 +218,14 @@ class Localizer:
         best = int(np.argmax(self._bank.log_weight))
         if self._certain:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
-        self._running.add_scan(float(found.fit[best]), bool(found.known[best] >= verdict.FEW_ENDS), self._odometer.stamp)
+        self._running.add_scan(float(found.fit[best]), bool(found.met[best] >= verdict.FEW_ENDS), self._odometer.stamp)
 
     def _search_or_check(self) -> None:
         """Do a unit of a search that is under way, or begin one where it is time for it."""
         if self._certain and (why := self._doubted()):
             self._lose(why)
+        elif not self._certain and self._running.jumped():
+            self._lose("the ranges do not fit what was measured before; was the robot carried?")
         odom = self._odometer.pose
         if (found := self._places.advance(odom)) is not None:
             compared = self._places.compared(found, self._bank, self._searched, odom, self._way)
@@ -228,7 +235,7 @@ class Localizer:
                 self._lose(_SCANS_DIFFER)
         if self._places.idle and (not self._certain or self._running.scans_contradict()) and self._due():
             # Of a pose that ranges vouch for, places are compared by what was measured since it was sound.
-            self._searched = self._window.since(self._running.sound) if self._certain else self._window
+            self._searched = self._window.since(self._running.sound) if self._certain else self._window.newest(self._parts)
             self._places.begin(self._searched, odom, self._way)
 
     def _due(self) -> bool:
@@ -261,7 +268,7 @@ class Localizer:
 
     def _lose(self, why: str) -> None:
         self._certain, self._confirmed, self._reason = False, None, why
-        self._window = self._window.since(self._running.sound)
+        self._window, self._parts = self._window.since(self._running.agreed()), 1
         self._places.drop()
         self._running.forget_anchors()
         self._search_way, self._search_stamp = self._way, self._odometer.stamp
@@ -281,8 +288,19 @@ class Localizer:
         self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting) or verdict.other_unit(
             self.known.walls, pose, found.rays, found.looks, ranges, True
         )
+        self._trim(bool(verdict.nowhere(fit, known, fitting)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         self._decide(pose, verdict.confirming_way(fit, known, fitting))
+
+    def _trim(self, nowhere: bool) -> None:
+        """Choose the part of the window that the next search goes by.
+
+        What fits nowhere may be of two places, before and after the robot was carried: its newest half is tried, then
+        its newest quarter. Once such a part is enough by itself, the rest is forgotten.
+        """
+        if self._parts > 1 and not self._reason:
+            self._window = self._searched
+        self._parts = 2 * self._parts if nowhere and self._parts < _MOST_PARTS else 1
 
     def _decide(self, pose: Floats, confirm: float) -> None:
         """Take the best hypothesis for the truth where two searches, so many metres apart, came to it without a doubt."""

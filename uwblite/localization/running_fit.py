@@ -22,6 +22,8 @@ search of a robot that is lost."""
 _RANGES_SOUND, _RECENT = 0.5, 5.0
 """Mean weight of ranges, the last of them s ago, from which they speak for a pose that scans contradict: it is given up only
 for a better one. Rooms that the map holds in part look like that, and people around the robot."""
+_JUMPED = 6.0
+"""Log-likelihood, 400 : 1, by which the ranges must be likelier from anywhere than from the pose for it to be lost at once."""
 _MOVED = (0.2, 20.0)
 """Mean weight below which, after so many ranges, an anchor counts as moved."""
 
@@ -32,12 +34,18 @@ class RunningFit:
 
     trust: Floats
     """(a, 2) of each anchor: mean weight of its ranges, and how many there were."""
+    against: Floats
+    """(a,) log-likelihood of each anchor's last range at the pose against one from anywhere, since the sum was above 0."""
     fit: float = 0.0
     """Mean log-likelihood of the rays of scans that met known space."""
     seen: float = 0.0
     """Share of scans that met known space."""
     ranges: float = 1.0
     """Mean weight of ranges."""
+    before: float = 1.0
+    """Mean weight of ranges when that sum was last above 0."""
+    first: float = np.inf
+    """s, of the first range since then."""
     sound: float = -np.inf
     """s, of the last measurement that spoke for the pose."""
     ranged: float = -np.inf
@@ -45,15 +53,23 @@ class RunningFit:
 
     def restart(self, sees: bool) -> None:
         """Begin with full agreement: the pose was found now."""
-        self.fit, self.seen, self.ranges = 0.0, 1.0 if sees else 0.0, 1.0
+        self.fit, self.seen, self.ranges, self.before = 0.0, 1.0 if sees else 0.0, 1.0, 1.0
         self.forget_anchors()
 
     def forget_anchors(self) -> None:
         """Trust all anchors again."""
-        self.trust[:] = (1.0, 0.0)
+        self.trust[:], self.against[:], self.first = (1.0, 0.0), 0.0, np.inf
 
-    def add_range(self, anchor: int, weight: float, stamp: float) -> None:
-        """Take the weight, 0..1, of a range at the pose."""
+    def add_range(self, anchor: int, weight: float, ratio: float, stamp: float) -> None:
+        """Take the weight, 0..1, of a range at the pose, and the logarithm of how much likelier it is there than anywhere.
+
+        The sum since it was last above 0 is Page's test for a sudden change (Continuous inspection schemes, Biometrika 1954);
+        ranges to one anchor err alike, so that each anchor counts once, as far as it was trusted.
+        """
+        self.against[anchor] = self.trust[anchor, 0] * ratio
+        self.first = min(self.first, stamp)
+        if self.against.sum() >= 0.0:
+            self.against[:], self.before, self.first = 0.0, self.ranges, np.inf
         self.trust[anchor] += (_FORGETTING * (weight - self.trust[anchor, 0]), 1.0)
         self.ranges += _FORGETTING_RANGES * (weight - self.ranges)
         self.ranged = max(self.ranged, stamp)
@@ -73,11 +89,19 @@ class RunningFit:
 
     def ranges_contradict(self) -> bool:
         """Return whether the ranges contradict the pose, and no scans speak for it."""
-        return self.ranges < _RANGES_LOST and not (self.seen > _SEEN and self.fit > FIT_SOUND)
+        return (self.ranges < _RANGES_LOST or self.jumped()) and not (self.seen > _SEEN and self.fit > FIT_SOUND)
+
+    def jumped(self) -> bool:
+        """Return whether the ranges, which agreed, now contradict the pose all at once."""
+        return self.before > _RANGES_SOUND and float(self.against.sum()) < -_JUMPED
 
     def ranges_vouch(self, now: float) -> bool:
         """Return whether recent ranges speak for the pose."""
         return self.ranges > _RANGES_SOUND and now - self.ranged < _RECENT
+
+    def agreed(self) -> float:
+        """Return until when, s, the measurements spoke for the pose: by chance some still do after a jump."""
+        return min(self.sound, float(np.nextafter(self.first, -np.inf))) if self.jumped() else self.sound
 
     def moved_anchors(self) -> Ints:
         """Return the anchors that most ranges have long disagreed with."""
@@ -86,4 +110,4 @@ class RunningFit:
 
 def full_agreement(anchors: int) -> RunningFit:
     """Return the state before anything was measured."""
-    return RunningFit(np.tile((1.0, 0.0), (anchors, 1)))
+    return RunningFit(np.tile((1.0, 0.0), (anchors, 1)), np.zeros(anchors))

@@ -48,17 +48,26 @@ def doubt(bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, 
     rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
     if not complete:
         return "too many places are as likely; drive on"
-    if ends < ENOUGH_ENDS and not fitting.enough:
+    # Rays and ranges err independently: half of what either needs is enough where there is half of the other as well.
+    if evidence_of(ends) + fitting.evidence < 1.0:
         return "too little was measured yet; drive on"
-    if ends >= ENOUGH_ENDS and fit < (FIT_BESIDE_RANGES if fitting.enough else FIT_ALONE):
-        return "the scans fit the walls nowhere well; is this the right map?"
-    if fitting.count >= ENOUGH_RANGES and fitting.share < (RANGES_FOUND if ends >= ENOUGH_ENDS else RANGES_ALONE):
-        return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
+    if why := nowhere(fit, ends, fitting):
+        return why
     if len(rivals) and rivals.max() > -CERTAIN:
         count = 1 + int((rivals > -CERTAIN).sum())
         return f"{count} places are as likely; drive on, around a corner or past another anchor"
     if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
         return "place or heading is not sure yet; drive on"
+    return ""
+
+
+def nowhere(fit: float, ends: float, fitting: "RangeFit") -> str:
+    """Return what contradicts even the best place; "" = nothing does."""
+    seen = evidence_of(ends)
+    if seen and fit < (FIT_BESIDE_RANGES if fitting.enough else FIT_ALONE):
+        return "the scans fit the walls nowhere well; is this the right map?"
+    if fitting.count >= ENOUGH_RANGES and fitting.share < RANGES_ALONE + seen * (RANGES_FOUND - RANGES_ALONE):
+        return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
     return ""
 
 
@@ -92,10 +101,17 @@ class RangeFit:
     count: int
     share: float
     """Of the ranges that agree, 0..1."""
-    enough: bool
-    """As many to as many anchors as a start needs agree."""
     anchors: int
     """To which ranges agree."""
+
+    @property
+    def evidence(self) -> float:
+        """Ranges to two anchors or more that agree, as a share of what a start needs."""
+        return self.share * self.count / ENOUGH_RANGES if self.anchors >= 2 else 0.0
+
+    @property
+    def enough(self) -> bool:
+        return self.evidence >= 1.0
 
 
 def confirming_way(fit: float, ends: float, fitting: RangeFit) -> float:
@@ -108,15 +124,20 @@ def confirming_way(fit: float, ends: float, fitting: RangeFit) -> float:
     clear = fitting.anchors >= _ANCHORS_CLEAR and fitting.share >= _RANGES_CLEAR
     if fit < _FIT_CLEAR:
         return _CONFIRM_BUSY if clear else _CONFIRM_ALONE
-    return 0.0 if clear and ends >= ENOUGH_ENDS else _CONFIRM
+    return 0.0 if clear and evidence_of(ends) + fitting.evidence >= 2.0 else _CONFIRM
+
+
+def evidence_of(ends: float) -> float:
+    """Return rays' ends in known space as a share of what a start needs."""
+    return min(ends / ENOUGH_ENDS, 1.0) if ends >= FEW_ENDS else 0.0
 
 
 def agreeing(pose: Floats, ranges: Ranges) -> RangeFit:
     if not len(ranges):
-        return RangeFit(0, 0.0, False, 0)
+        return RangeFit(0, 0.0, 0)
     agree = np.abs(range_errors(pose[None], ranges)[0][0]) <= 3.0 * ranges.sigma
     anchors = len(np.unique(ranges.anchor[agree]))
-    return RangeFit(len(ranges), float(agree.mean()), anchors >= 2 and int(agree.sum()) >= ENOUGH_RANGES, anchors)
+    return RangeFit(len(ranges), float(agree.mean()), anchors)
 
 
 def too_little(rays: Rays, ranges: Ranges) -> str:

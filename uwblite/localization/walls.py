@@ -66,6 +66,8 @@ class Agreement:
     """(h,) share of the rays' ends, 0..1, that lie on a wall, of those in known space."""
     known: Floats
     """(h,) ends in known space."""
+    met: Floats
+    """(h,) rays that end in known space or pass a wall: those that can tell a place from another one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,10 +180,10 @@ class Walls:
         known = ends.sum(axis=1).astype(np.float64)
         share = (ends & (on_wall > 0.3)).sum(axis=1) / np.maximum(known, 1.0)
         if not x.shape[1]:
-            return Agreement(np.zeros(len(poses)), np.zeros(len(poses)), share, known)
+            return Agreement(np.zeros(len(poses)), np.zeros(len(poses)), share, known, known)
         judged = ~unknown | ~rays.hit | passed
         fit = (value * judged).sum(axis=1) / np.maximum(judged.sum(axis=1), 1)
-        return Agreement(value.mean(axis=1), fit, share, known)
+        return Agreement(value.mean(axis=1), fit, share, known, (ends | passed).sum(axis=1).astype(np.float64))
 
 
 _ON_WALL = 0.1

@@ -83,6 +83,11 @@ class Window:
         """Return a window of what was measured after a time, s."""
         return Window([r for r in self.ranges if r.stamp > stamp], [k for k in self.looks if k.stamp > stamp])
 
+    def newest(self, parts: int) -> "Window":
+        """Return the newest of so many parts of the window's time."""
+        stamps = [r.stamp for r in self.ranges] + [k.stamp for k in self.looks]
+        return self if parts == 1 or not stamps else self.since(max(stamps) - (max(stamps) - min(stamps)) / parts)
+
     def forget(self, way: float, length: float = LENGTH) -> None:
         """Forget what was measured more than a length ago, m, by the odometer."""
         self.ranges = [r for r in self.ranges if way - r.way <= length]

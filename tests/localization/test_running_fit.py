@@ -1,0 +1,59 @@
+"""When ranges take a pose away: several anchors at once, never one alone."""
+
+import numpy as np
+
+from uwblite.localization.running_fit import full_agreement
+
+AGREES, CONTRADICTS = (0.95, 4.0), (0.0, -3.7)
+"""Weight and log-likelihood ratio of a range that is as expected, and of one that is metres off."""
+
+
+def after(*ranges):
+    """Return the fit after ranges (anchor, what) at 1, 2, 3 ... s, each anchor having agreed before."""
+    fit = full_agreement(4)
+    fit.restart(False)
+    for anchor in range(4):
+        fit.add_range(anchor, *AGREES, 0.0)
+    for k, (anchor, what) in enumerate(ranges):
+        fit.add_range(anchor, *what, k + 1.0)
+    return fit
+
+
+def test_two_anchors_at_once_contradict_the_pose_and_one_does_not():
+    assert after((0, CONTRADICTS), (1, CONTRADICTS)).ranges_contradict()
+    assert not after((0, CONTRADICTS)).ranges_contradict()
+    # Again and again: its ranges err alike.
+    assert not after(*[(0, CONTRADICTS)] * 5).ranges_contradict()
+
+
+def test_a_moved_anchor_among_others_takes_no_pose_away():
+    rounds = [(k % 4, CONTRADICTS if k % 4 == 0 else AGREES) for k in range(100)]
+    for count in range(1, 100):
+        assert not after(*rounds[:count]).ranges_contradict()
+    np.testing.assert_array_equal(after(*rounds).moved_anchors(), [0])
+
+
+def test_walls_that_fit_outweigh_ranges_that_jump():
+    fit = after((0, CONTRADICTS), (1, CONTRADICTS))
+    for k in range(20):
+        fit.add_scan(-0.05, True, 3.0 + 0.1 * k)
+    assert fit.jumped()
+    assert not fit.ranges_contradict()
+
+
+def test_what_agrees_by_chance_after_a_jump_does_not_hide_its_beginning():
+    fit = after((0, AGREES), (1, CONTRADICTS), (2, CONTRADICTS))
+    fit.add_scan(-0.1, True, 3.5)
+    assert 1.0 <= fit.agreed() < 2.0
+
+
+def test_ranges_that_never_agreed_do_not_jump():
+    fit = full_agreement(4)
+    fit.restart(False)
+    for k in range(12):
+        fit.add_range(k % 4, *CONTRADICTS, float(k))
+        fit.add_range(k % 4, 0.3, 1.0, float(k))
+    fit.add_range(0, 0.3, 20.0, 20.0)
+    fit.add_range(0, *CONTRADICTS, 21.0)
+    fit.add_range(1, *CONTRADICTS, 22.0)
+    assert not fit.jumped()
