@@ -105,7 +105,7 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> None:
     if turned > max(_FAR, _CLEARLY * mirrored):
         text = (
             f"the anchors by the first and the second half of the recording are mirror images of each other ({turned:.1f} m "
-            f"apart, {mirrored:.1f} m as mirror images): the sign of the odometry's turns changed on the way"
+            f"apart, {mirrored:.1f} m as mirror images): the turns that the odometry counts are wrong in one of them"
         )
         task.stages.doubt("halves-disagree", text, apart=turned, mirrored=mirrored)
 
