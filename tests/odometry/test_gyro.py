@@ -97,6 +97,7 @@ def test_priors_and_noise_are_a_gyros_and_what_is_off_stays_off():
     assert settings(log, replace(config.calibration, heading_rate=0.0), config.odometry)[0].heading_rate == 0.0
 
 
+@pytest.mark.slow
 def test_the_map_of_slipping_wheels_is_better_with_a_gyro():
     rng = np.random.default_rng(5)
     stamps, truth = rested(*planted.wander(rng, 100.0))

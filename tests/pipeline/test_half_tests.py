@@ -35,6 +35,7 @@ def test_a_heading_that_drifts_throughout_is_calibrated(sound):
     assert doubts(replace(sound, odometry=Odometry(sound.odometry.stamps, chained(poses[0], steps)))) == set()
 
 
+@pytest.mark.slow
 def test_turns_that_change_their_sign_half_way(sound):
     poses = sound.odometry.poses
     steps = se2.between(poses[:-1], poses[1:])

@@ -36,7 +36,7 @@ def stated(notices, words):
     return [t.text for t in notices if words in t.text]
 
 
-@pytest.mark.parametrize("turn_scale", [-2.0, 2.0, 0.5])
+@pytest.mark.parametrize("turn_scale", [-2.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (2.0, 0.5))])
 def test_gross_turns_leave_the_mirror_image_open(turn_scale):
     """By minus the factor that makes the turns agree, the mirror image fits as well: the ranges do not say which it is."""
     _, truth, log = run(turn_scale=turn_scale)

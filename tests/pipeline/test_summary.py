@@ -105,6 +105,7 @@ def test_a_mirror_is_named_with_its_alternative():
         assert any(anchor.id in doubt.text for doubt in result.doubts)
 
 
+@pytest.mark.slow
 def test_an_anchor_with_false_ranges_is_named_and_bends_nothing(run):
     """Two thirds of one anchor's ranges are wrong by metres: the others hold the trajectory."""
     stamps, truth, log, good = run

@@ -21,7 +21,7 @@ from ..graph.marginals import marginals
 from ..graph.solver import optimize
 from .estimate import Estimate, Task
 from .progress import Stages
-from .radio_stages import first_optimisation
+from .radio_stages import bootstrapped, dead_reckoning
 from .recordings import Recording, gather
 
 _CHANGES = {"odometry_scale": 0.1, "heading_scale": 0.2, "heading_per_metre": 0.05}
@@ -127,7 +127,8 @@ def _anchors_alone(recording: Recording, start: float, end: float, task: Task) -
         return {}
     some = np.arange(0, len(log.ranges.stamps), -(-len(log.ranges.stamps) // _RANGES_ALONE))
     thinned = gather([replace(log, ranges=log.ranges.rows(some))], task.config.keyframes)
-    found = first_optimisation(replace(task, recordings=thinned, stages=Stages(None, None)))
+    own = replace(task, recordings=thinned, stages=Stages(None, None))
+    found = bootstrapped(dead_reckoning(thinned.each[0], task.config), 0, own)
     places = found.graph.poses[:, :2]
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
     if found.ranges is None or spread[1] < _WIDE * spread[0]:

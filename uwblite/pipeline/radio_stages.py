@@ -35,7 +35,7 @@ def first_optimisation(task: Task) -> Estimate:
     estimates = [dead_reckoning(recording, task.config) for recording in recordings.each]
     ranges = sum(len(estimate.ranges) for estimate in estimates if estimate.ranges is not None)
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
-    estimates = [_optimised(_bootstrapped(estimate, n, task), task) for n, estimate in enumerate(estimates)]
+    estimates = [_optimised(bootstrapped(estimate, n, task), task) for n, estimate in enumerate(estimates)]
     if len(estimates) == 1:
         return estimates[0]
     return _optimised(joining.join(estimates, task), task)
@@ -71,7 +71,7 @@ def heights_given(recording: Recording) -> Bools:
     return np.array([height is not None for height in heights], dtype=bool)
 
 
-def _bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
+def bootstrapped(estimate: Estimate, number: int, task: Task) -> Estimate:
     """Find trajectory and anchors of one recording without any guess of the anchors."""
     ranges, recordings, config = estimate.ranges, task.recordings, task.config
     if ranges is None:
