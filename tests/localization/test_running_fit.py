@@ -57,3 +57,12 @@ def test_ranges_that_never_agreed_do_not_jump():
     fit.add_range(0, *CONTRADICTS, 21.0)
     fit.add_range(1, *CONTRADICTS, 22.0)
     assert not fit.jumped()
+
+
+def test_a_pose_that_is_lost_is_not_lost_again_by_the_same_ranges():
+    fit = after(*[(k % 4, CONTRADICTS) for k in range(8)])
+    assert fit.jumped()
+    fit.forget_anchors()
+    for k in range(40):
+        fit.add_range(k % 4, *CONTRADICTS, 10.0 + k)
+        assert not fit.jumped()

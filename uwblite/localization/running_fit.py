@@ -57,8 +57,8 @@ class RunningFit:
         self.forget_anchors()
 
     def forget_anchors(self) -> None:
-        """Trust all anchors again."""
-        self.trust[:], self.against[:], self.first = (1.0, 0.0), 0.0, np.inf
+        """Trust all anchors again; ranges that contradict already are no jump."""
+        self.trust[:], self.against[:], self.before, self.first = (1.0, 0.0), 0.0, self.ranges, np.inf
 
     def add_range(self, anchor: int, weight: float, ratio: float, stamp: float) -> None:
         """Take the weight, 0..1, of a range at the pose, and the logarithm of how much likelier it is there than anywhere.
