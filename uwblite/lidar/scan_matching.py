@@ -4,6 +4,7 @@ Nearest neighbours come from one raster per cloud. A pair's matches are condense
 pose (3 x 3), which is all that the graph needs to know of them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -87,64 +88,60 @@ def match(
     -------
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
+    parts = [_condensed(clouds, found, scale) for found in correspondences(clouds, raster, i, T_i_j, points, gate)]
+    return _joined(parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correspondences:
+    """Points (e, n) of the source clouds of some pairs, and what they meet in the target clouds."""
+
+    pairs: slice
+    """Which of the pairs these are."""
+    row: NDArray[np.int32]
+    """Rows of the points in the clouds' arrays; -1 where there is none."""
+    target: Ints
+    """Rows of their matches; any where there is none."""
+    good: Bools
+    """Whether it is a match."""
+    distance: Floats
+    """m, point to line."""
+    normal: tuple[Floats, Floats]
+    """x and y of the line's, frame of the target cloud."""
+    arm: tuple[Floats, Floats]
+    """x and y of the points as the relative pose turns them, m."""
+
+
+def correspondences(
+    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float
+) -> Iterator[Correspondences]:
+    """Yield the matches of all pairs, a bounded number of pairs at a time; for the parameters see match."""
     surface = _Surface.of(clouds)
     at_once = max(_AT_ONCE // max(points.row.shape[1], 1), 1)
-    parts = [
-        _match(clouds, surface, raster, i[a : a + at_once], T_i_j[a : a + at_once], points.row[a : a + at_once], gate, scale)
-        for a in range(0, max(len(i), 1), at_once)
-    ]
-    return PairFactors(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PairFactors)))
+    for first in range(0, max(len(i), 1), at_once):
+        part = slice(first, first + at_once)
+        yield _looked_up(clouds, surface, raster, part, i[part], T_i_j[part], points.row[part], gate)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Surface:
-    """Points, normals and variances of all clouds, each coordinate in one piece."""
+    """Points and normals of all clouds, each coordinate in one piece."""
 
     x: Floats
     y: Floats
     nx: Floats
     ny: Floats
-    variance: Floats
 
     @classmethod
     def of(cls, clouds: Clouds) -> "_Surface":
-        columns = (*clouds.points.T, *clouds.normals.T, clouds.normal_variance)
-        return cls(*(np.ascontiguousarray(column) for column in columns))
-
-
-def _match(
-    clouds: Clouds, surface: _Surface, raster: CloudRasters, i: Ints, T_i_j: Floats, row: NDArray[np.int32],
-    gate: float, scale: float,
-) -> PairFactors:
-    """Match pairs (e,) whose source points stand in a table (e, n): per-pair values are columns (e, 1)."""
-    rx, ry, target, nx, ny, r, good = _looked_up(clouds, surface, raster, i, T_i_j, row, gate)
-    root = good / (1.0 + np.square(r * (1.0 / scale)))
-    weighted = np.empty((len(i), 4, row.shape[1]))
-    wx, wy = np.multiply(root, nx, out=weighted[:, 0]), np.multiply(root, ny, out=weighted[:, 1])
-    weighted[:, 2] = wy * rx - wx * ry
-    weighted[:, 3] = root * r
-    summed = weighted @ weighted.transpose(0, 2, 1)
-    weighted[:, 2] = wx * rx + wy * ry
-    # The tangent (-ny, nx) stands where the normal stood; its variance weighs it once more.
-    tangent = np.stack([-wy, wx, weighted[:, 2]], axis=1)
-    scatter = surface.variance.take(target) + surface.variance.take(row)
-    spurious = (tangent * scatter[:, None]) @ tangent.transpose(0, 2, 1)
-    return PairFactors(
-        hessian=summed[:, :3, :3],
-        spurious=spurious,
-        gradient=summed[:, :3, 3],
-        matched=good.sum(axis=1),
-        asked=(row >= 0).sum(axis=1),
-        squared=summed[:, 3, 3],
-        weight=np.einsum("en,en->e", root, root),
-    )
+        return cls(*(np.ascontiguousarray(column) for column in (*clouds.points.T, *clouds.normals.T)))
 
 
 def _looked_up(
-    clouds: Clouds, surface: _Surface, raster: CloudRasters, i: Ints, T_i_j: Floats, row: NDArray[np.int32], gate: float
-) -> tuple[Floats, Floats, Ints, Floats, Floats, Floats, Bools]:
-    """Return (e, n) of source points: coordinates turned into the target's axes, the target's point and normal, the distance
-    r from its line, and whether it is a match."""
+    clouds: Clouds, surface: _Surface, raster: CloudRasters, pairs: slice, i: Ints, T_i_j: Floats, row: NDArray[np.int32],
+    gate: float,
+) -> Correspondences:
+    """Look up the points of some pairs (e,): per-pair values are columns (e, 1)."""
     c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
     px, py = surface.x.take(row), surface.y.take(row)
     rx, ry = c * px - s * py, s * px + c * py
@@ -158,7 +155,36 @@ def _looked_up(
     sx, sy = surface.nx.take(row), surface.ny.take(row)
     facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
     good = near & (dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING) & (row >= 0)
-    return rx, ry, target, nx, ny, nx * dx + ny * dy, good
+    return Correspondences(pairs, row, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
+
+
+def _condensed(clouds: Clouds, found: Correspondences, scale: float) -> PairFactors:
+    """Condense the matches of each pair into the quadratic form of its relative pose."""
+    row, good, r, (nx, ny), (rx, ry) = found.row, found.good, found.distance, found.normal, found.arm
+    root = good / (1.0 + np.square(r * (1.0 / scale)))
+    weighted = np.empty((len(row), 4, row.shape[1]))
+    wx, wy = np.multiply(root, nx, out=weighted[:, 0]), np.multiply(root, ny, out=weighted[:, 1])
+    weighted[:, 2] = wy * rx - wx * ry
+    weighted[:, 3] = root * r
+    summed = weighted @ weighted.transpose(0, 2, 1)
+    weighted[:, 2] = wx * rx + wy * ry
+    # The tangent (-ny, nx) stands where the normal stood; its variance weighs it once more.
+    tangent = np.stack([-wy, wx, weighted[:, 2]], axis=1)
+    scatter = clouds.normal_variance.take(found.target) + clouds.normal_variance.take(row)
+    spurious = (tangent * scatter[:, None]) @ tangent.transpose(0, 2, 1)
+    return PairFactors(
+        hessian=summed[:, :3, :3],
+        spurious=spurious,
+        gradient=summed[:, :3, 3],
+        matched=good.sum(axis=1),
+        asked=(row >= 0).sum(axis=1),
+        squared=summed[:, 3, 3],
+        weight=np.einsum("en,en->e", root, root),
+    )
+
+
+def _joined(parts: list[PairFactors]) -> PairFactors:
+    return PairFactors(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PairFactors)))
 
 
 def shifts_by_range_error(
@@ -181,21 +207,20 @@ def shifts_by_range_error(
     (e, 4, 3) change of the error Z^-1 T_i_j by metre of the surfaces that face each quarter, m/m and rad/m; 0 along what the
     scans cannot see.
     """
-    surface = _Surface.of(clouds)
-    factors, slopes = match(clouds, raster, i, T_i_j, points, gate, scale), np.zeros((len(i), 4, 3))
-    at_once = max(_AT_ONCE // max(points.row.shape[1], 1), 1)
-    for first in range(0, len(i), at_once):
-        part = slice(first, first + at_once)
-        pose, row = T_i_j[part], points.row[part]
-        rx, ry, target, nx, ny, r, good = _looked_up(clouds, surface, raster, i[part], pose, row, gate)
-        qx, qy = surface.x.take(target), surface.y.take(target)
+    parts, slopes = [], np.zeros((len(i), 4, 3))
+    for found in correspondences(clouds, raster, i, T_i_j, points, gate):
+        parts.append(_condensed(clouds, found, scale))
+        (nx, ny), (rx, ry) = found.normal, found.arm
+        qx, qy = (column.take(found.target) for column in clouds.points.T)
         far_p, far_q = np.maximum(np.hypot(rx, ry), _NEAREST), np.maximum(np.hypot(qx, qy), _NEAREST)
         by_range = nx * (rx / far_p - qx / far_q) + ny * (ry / far_p - qy / far_q)
-        weighted = good / np.square(1.0 + np.square(r * (1.0 / scale))) * by_range
-        quarter = np.floor((np.arctan2(ny, nx) + turn[part, None]) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
+        weighted = found.good / np.square(1.0 + np.square(found.distance * (1.0 / scale))) * by_range
+        quarter = np.floor((np.arctan2(ny, nx) + turn[found.pairs, None]) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
         for k in range(4):
             own = weighted * (quarter == k)
-            slopes[part, k] = np.stack([(own * nx).sum(1), (own * ny).sum(1), (own * (ny * rx - nx * ry)).sum(1)], axis=1)
+            sums = [(own * nx).sum(1), (own * ny).sum(1), (own * (ny * rx - nx * ry)).sum(1)]
+            slopes[found.pairs, k] = np.stack(sums, axis=1)
+    factors = _joined(parts)
     moved = np.stack([nondegenerate_step(replace(factors, gradient=slopes[:, k]))[0] for k in range(4)], axis=1)
     moved[..., :2] = se2.rotate(-T_i_j[:, None, 2], moved[..., :2])
     return -moved

@@ -10,14 +10,12 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..lidar.cloud_rasters import CloudRasters, look_up
+from ..lidar.cloud_rasters import CloudRasters
 from ..lidar.clouds import Clouds
-from ..lidar.scan_matching import pair_points
+from ..lidar.scan_matching import correspondences, pair_points
 
 _NOISE = 0.005
 """Share of the points added to A in every direction: where fewer face, as along a bare wall, the noise of normals does."""
-_SAME_FACING = float(np.sqrt(0.5))
-"""Least cosine between the normals of two matched points."""
 
 
 def directional_overlap(
@@ -43,16 +41,9 @@ def _sums(
     clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, limit: int, gate: float
 ) -> tuple[Floats, Floats]:
     """Return A and M (e, 2, 2), in the frames of i, of the points of clouds j looked up in clouds i."""
-    row = pair_points(clouds, j, limit).row
-    real = row >= 0
-    row = np.where(real, row, 0)
-    points = se2.transform(T_i_j[:, None], clouds.points[row])
-    normals = se2.rotate(T_i_j[:, 2, None], clouds.normals[row])
-    found = look_up(raster, i, points[..., 0], points[..., 1])
-    near = (found >= 0) & real
-    target = (found + clouds.offsets[i, None]) * near
-    away = points - clouds.points[target]
-    near &= np.einsum("enk,enk->en", away, away) <= gate * gate
-    near &= np.einsum("enk,enk->en", normals, clouds.normals[target]) > _SAME_FACING
-    sums = [np.einsum("en,enk,enl->ekl", mask.astype(np.float64), normals, normals) for mask in (real, near)]
-    return sums[0], sums[1]
+    asked, matched = np.zeros((2, len(i), 2, 2))
+    for found in correspondences(clouds, raster, i, T_i_j, pair_points(clouds, j, limit), gate):
+        normals = se2.rotate(T_i_j[found.pairs, 2, None], clouds.normals[found.row])
+        for sums, mask in ((asked, found.row >= 0), (matched, found.good)):
+            sums[found.pairs] = np.einsum("en,enk,enl->ekl", mask.astype(np.float64), normals, normals)
+    return asked, matched
