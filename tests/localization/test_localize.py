@@ -65,6 +65,7 @@ def test_without_walls_the_anchors_fix_the_place(log, earlier):
     assert np.sqrt(np.mean(errors(found, earlier) ** 2)) < 0.25
 
 
+@pytest.mark.slow
 def test_a_moved_anchor_is_named_and_does_not_pull(log, earlier):
     found = localize(part(log), map_of(earlier, aDD07=(2.0, 1.0)))
     assert any("DD07" in w.text and "moved" in w.text for w in found.warnings)
@@ -106,6 +107,7 @@ def test_a_place_with_two_equal_halves_is_refused(log, earlier):
         localize(part(log).without(uwb=True), map_of(earlier, both))
 
 
+@pytest.mark.slow
 def test_covariances_are_symmetric_positive_and_the_ends_as_sure_as_the_middle(log, earlier):
     found = localize(part(log).crop(end=float(log.odometry.stamps[0]) + 150.0), map_of(earlier))
     np.testing.assert_array_equal(found.covariances, found.covariances.transpose(0, 2, 1))

@@ -156,11 +156,13 @@ def test_one_of_them_may_lack_lidar(two):
     assert result.grid is not None
 
 
+@pytest.mark.slow
 def test_wheels_and_radio_alone_share_a_frame(two):
     result = build_map([log.without(lidar=True) for log, _ in two])
     assert joint_ate(result, [truth for _, truth in two])[0] < 0.15
 
 
+@pytest.mark.slow
 def test_a_third_links_two_that_share_nothing():
     """West has ranges to A and B, east to C and D; the third to all. Order does not matter."""
     whole, truth = drive(4, lidar=False, start=900.0)
@@ -183,6 +185,7 @@ def test_a_third_links_two_that_share_nothing():
     assert joint_ate(result, truths)[0] < 0.3
 
 
+@pytest.mark.slow
 def test_equal_input_gives_equal_bytes(two):
     short = [log.crop(end=log.odometry.stamps[0] + 10.0) for log, _ in two]
     one, other = build_map(short), build_map(short)
