@@ -9,8 +9,6 @@ Reading order: ``se2``, ``sensor_log``, ``mapping`` (the page that is the algori
 Importing this package loads nothing but itself; names below are resolved on first use.
 """
 
-from typing import Any
-
 __version__ = "0.1.0"
 
 _LAZY = {
@@ -24,7 +22,7 @@ _LAZY = {
 __all__ = ["MapResult", "MappingConfig", "SensorLog", "__version__", "build_map", "read_log"]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

@@ -1,9 +1,11 @@
-"""``python -m uwblite`` and the command ``uwblite``."""
+"""``python -m uwblite`` and the command ``uwblite``.
+
+This file and the package's ``__init__`` import as little as they can: until `start` runs, Ctrl-C ends in a traceback.
+"""
 
 import os
 import signal
 import sys
-from typing import Any, NoReturn
 
 
 def start() -> int:
@@ -15,7 +17,7 @@ def start() -> int:
     return main()
 
 
-def _leave(_number: int, _frame: Any) -> NoReturn:
+def _leave(_number: int, _frame: object) -> None:
     try:
         os.write(2, b"uwblite: interrupted\n")
     finally:

@@ -309,8 +309,8 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 results.picture = lambda *_: np.zeros((2, 3, 3), dtype=np.uint8)
 try:
     results.write_result(sys.argv[1], [small_log()], small_result(evil="x"), results.RunRecord("c", "k"))
-except OSError:
-    sys.exit(7)
+except OSError as error:
+    sys.exit(7 if error.filename.startswith(sys.argv[1] + "/") else error.filename)
 """
 
 

@@ -45,9 +45,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             if not (waiting := WAITING in os.path.basename(folder)):
                 os.fsync(stream.fileno())
         os.replace(temporary, target)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             os.unlink(temporary)
+        if isinstance(error, OSError) and error.filename in (None, temporary):
+            # A write that fails names no file, and nobody asked for the temporary one.
+            error.filename = os.fspath(path)
         raise
     if not waiting:
         sync_folder(folder)

@@ -62,6 +62,10 @@ def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:
             os.replace(waiting, folder / _READY)
             sync_folder(folder)
             _repair(folder, owned)
+    except OSError as error:
+        if error.filename is not None and (path := Path(os.fsdecode(error.filename))).parent == waiting:
+            error.filename = os.fspath(folder / path.name)
+        raise
     finally:
         shutil.rmtree(waiting, ignore_errors=True)
 

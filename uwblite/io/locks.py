@@ -53,7 +53,12 @@ def _locked(path: str | os.PathLike[str], what: str, wait: bool) -> tuple[int, s
     except ImportError:
         return _NO_LOCKS, ""
     key = hashlib.sha256(os.fsencode(os.path.realpath(path))).hexdigest()[:24]
-    name = os.path.join(tempfile.gettempdir(), f"uwblite-{os.getuid()}-{key}.{what}")
+    try:
+        folder = tempfile.gettempdir()
+    except FileNotFoundError:
+        # Full disks: none of them takes a file, and the one that is written to may be another.
+        return _NO_LOCKS, ""
+    name = os.path.join(folder, f"uwblite-{os.getuid()}-{key}.{what}")
     while True:
         try:
             handle = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
