@@ -200,7 +200,7 @@ def test_the_result_does_not_depend_on_the_odometry_s_frame(minute, truth):
 
 
 def simulated(tmp_path, **settings):
-    """Return the recording and the truth of a simulated drive."""
+    """Return the recording and the truth of a simulated recording."""
     logfile.write(simulate(Settings(**settings)), tmp_path)
     return read_log(tmp_path / "run.log"), read_tum(tmp_path / "truth.tum")
 
@@ -257,8 +257,8 @@ def test_real_recordings_with_a_truth(shared_data, name):
 
 @pytest.mark.slow
 def test_the_labyrinth_is_right_up_to_its_mirror_image(shared_data):
-    """Its wheels say every turn twice as large and the other way round (against the directions in which the true positions
-    move: correlation -0.87). Ranges know no left and right, so the odometry decides between the two images."""
+    """Its odometry counts every turn twice as large and the other way round (against the directions in which the true positions
+    move: correlation -0.87). Ranges do not distinguish left and right, so the odometry decides between the two images."""
     folder = shared_data / "labyrinth"
     stamps, truth = read_tum(folder / "truth_position.tum")
     result = build_map(read_log(folder / "run.log.gz"))
@@ -350,7 +350,7 @@ def test_wheels_in_another_unit_are_reported_by_the_radio(shared_data):
 
 @pytest.mark.slow
 def test_a_lidar_that_sees_little_does_no_harm_to_the_radio(tmp_path):
-    """A nearly empty hall: with lidar no worse than without, up to a twentieth, on average over three drives."""
+    """A nearly empty hall: with lidar no worse than without, up to a twentieth, on average over three recordings."""
     fused, alone = [], []
     for seed in (1, 2, 3):
         log, truth = simulated(tmp_path / str(seed), world="arena", seed=seed, minutes=12.0, speed=0.4)

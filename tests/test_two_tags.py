@@ -93,19 +93,19 @@ def test_a_log_keeps_the_tags_apart_and_old_logs_have_one(tmp_path):
         replace(log, mounting=SensorMounting())
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_each_tag_has_its_own_place_delay_and_height(told):
+@pytest.mark.parametrize("given", [True, False])
+def test_each_tag_has_its_own_place_delay_and_height(given):
     """At the truth every range fits, where the second tag hangs 5 cm off its place and is late by 0.4 m of light."""
     rng = np.random.default_rng(9)
     stamps, truth = planted.wander(rng, 30.0)
     ranges, odometry = both(stamps, truth, rng), planted.odometry(stamps, truth)
     ranges = replace(ranges, ranges=ranges.ranges + 0.4 * (ranges.tag == 1))
     beside = np.array([[REAR[0] - 0.05, REAR[1], 0.9]])
-    mounting = replace(MOUNTING, more_tags=beside, anchor_height=1.4 if told else None)
+    mounting = replace(MOUNTING, more_tags=beside, anchor_height=1.4 if given else None)
     frames = keyframes.select(odometry, KeyframeConfig())
     attached = attach_ranges(ranges, odometry, frames, mounting)
     ids = ranges.anchor_ids
-    listed = unknowns(CalibrationConfig(), ids, np.full(4, told), rises=(0.0, 0.3))
+    listed = unknowns(CalibrationConfig(), ids, np.full(4, given), rises=(0.0, 0.3))
     values = {"tag_x@tag2": 0.05, **{f"bias:{name}@tag2": 0.4 for name in ids}}
     for name in ids:
         values |= {f"height2:{name}": 0.8**2, f"height2:{name}@tag2": 0.5**2}

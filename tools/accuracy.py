@@ -238,9 +238,9 @@ def oracles(args: argparse.Namespace) -> str:
     return (
         f"## What the measurements allow\n\nDefaults, recordings of 6 to 12 min, mean of {args.seeds} seeds; m. *Oracle*: "
         "least squares from the truth with known associations\n(which ray hit which wall or column, what shadowed which "
-        "range) and the true distribution of all errors, poses, anchors,\nwalls, columns, paint and calibration unknown "
-        "(tools/oracle.py); *bound*: Cramer-Rao bound of the recording, which is what\nthe oracle's error is on average; "
-        "*in pieces*: ATE of an oracle that does not know which metres of wall are one straight\nline of one paint, nor that "
+        "range) and the true distribution of all errors, poses, anchors,\nwalls, columns, range offsets and calibration "
+        "free (tools/oracle.py); *bound*: Cramer-Rao bound of the recording, which is what\nthe oracle's error is on average; "
+        "*in pieces*: ATE of an oracle that does not know which metres of wall are one straight\nline of one offset, nor that "
         "what is seen of a column from all sides is one circle. Arena and tunnel as simulated, the\nothers with errors of "
         f"real rooms.\n\n{table(head, rows)}"
     )

@@ -151,7 +151,7 @@ def bench_gnc(repeats: int) -> None:
 
 
 def bench_hundred() -> None:
-    """Grow a hundred times the paper's graph from its odometry; compare with the minimum next to the truth."""
+    """Optimise a hundred times the paper's graph from its odometry; compare with the minimum next to the truth."""
     from bench_graphs import ate, paper_graph, trilaterated
 
     from uwblite.graph.solver import optimize

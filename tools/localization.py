@@ -248,11 +248,11 @@ def abroad(on: Bench, other: KnownMap) -> Bench:
     return replace(on, known=replace(other, anchors=replace(other.anchors, ids=on.known.anchors.ids[:count], **parts)))
 
 
-def certain(on: Bench, drives: int, uwb: bool, lidar: bool) -> tuple[int, int]:
-    """Drive in a wrong map; return in how many drives, and in how many lines, one a second, the pose was ever certain."""
+def certain(on: Bench, starts: int, uwb: bool, lidar: bool) -> tuple[int, int]:
+    """Drive in a wrong map; return from how many starts, and in how many lines, one a second, the pose was ever certain."""
     begin, end = on.trial.log.odometry.stamps[[0, -1]].tolist()
     ever = lines = 0
-    for moment in np.linspace(begin + 3.0, end - WRONG_SECONDS - 5.0, drives):
+    for moment in np.linspace(begin + 3.0, end - WRONG_SECONDS - 5.0, starts):
         localizer, at_next, count = on.localizer(), moment, 0
         for at, kind, k in on.played(moment, moment + WRONG_SECONDS, uwb, lidar):
             state = on.feed(localizer, kind, k)
@@ -263,15 +263,15 @@ def certain(on: Bench, drives: int, uwb: bool, lidar: bool) -> tuple[int, int]:
     return ever, lines
 
 
-def wrong_rows(on: Bench, grid: OccupancyGrid, other: KnownMap, drives: int) -> list[list[object]]:
+def wrong_rows(on: Bench, grid: OccupancyGrid, other: KnownMap, starts: int) -> list[list[object]]:
     """Return the rows of maps that are not this building's, or not in the sensors' unit."""
     maps = {f"scaled by {factor}": scaled(on, grid, factor) for factor in (0.9, 1.05, 1.1)}
     maps["another building's, same anchor ids"] = abroad(on, other)
-    lines = drives * int(WRONG_SECONDS)
+    lines = starts * int(WRONG_SECONDS)
     rows = []
     for name, wrong in maps.items():
-        found = [certain(wrong, drives, *KINDS[kind]) for kind in ("all sensors", "without lidar")]
-        rows.append([name, *(f"{lost} of {drives}, {n} of {lines} s" for lost, n in found)])
+        found = [certain(wrong, starts, *KINDS[kind]) for kind in ("all sensors", "without lidar")]
+        rows.append([name, *(f"{lost} of {starts}, {n} of {lines} s" for lost, n in found)])
     return rows
 
 
@@ -318,10 +318,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", default=",".join(WORLDS), help="worlds, separated by commas")
     parser.add_argument("--starts", type=int, default=100)
     parser.add_argument("--carried", type=int, default=20)
-    parser.add_argument("--wrong", type=int, default=6, help="drives in each of four wrong maps")
+    parser.add_argument("--wrong", type=int, default=6, help="starts in each of four wrong maps")
     parser.add_argument("--seconds", type=float, default=480.0, help="of tracking")
     parser.add_argument("--seed", type=int, default=301)
-    parser.add_argument("--building", type=int, default=31, help="paint of walls, glass, multipath, biases of anchors")
+    parser.add_argument("--building", type=int, default=31, help="range offsets of walls, glass, multipath, biases of anchors")
     parser.add_argument("--easy", action="store_true", help="rooms without the errors of real ones")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep maps and recordings, and use those that are there")
     parser.add_argument("--print", action="store_true", help="write nothing")

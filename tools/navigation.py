@@ -290,7 +290,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", default=",".join(WORLDS), help="worlds, separated by commas")
     parser.add_argument("--goals", type=int, default=20)
     parser.add_argument("--seed", type=int, default=301)
-    parser.add_argument("--building", type=int, default=31, help="paint of walls, glass, multipath, biases of anchors")
+    parser.add_argument("--building", type=int, default=31, help="range offsets of walls, glass, multipath, biases of anchors")
     parser.add_argument("--easy", action="store_true", help="rooms without the errors of real ones")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep maps and recordings, and use those that are there")
     parser.add_argument("--print", action="store_true", help="write nothing")

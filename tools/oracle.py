@@ -1,14 +1,14 @@
-"""What the measurements of a simulated drive allow: least squares with true associations and true noise, from the truth.
+"""What the measurements of a simulated recording allow: least squares with true associations and true noise, from the truth.
 
-Poses, anchors, walls, columns and their radii, the paint of surfaces, the wheels' calibration, the anchors' biases and
+Poses, anchors, walls, columns and their radii, the range offsets of surfaces, the wheels' calibration, the anchors' biases and
 the antennas' patterns are all unknown. Known are which surface each ray hit, which steps slipped, which ranges were
 shadowed by what, and how all errors are distributed: the multipath of an anchor, and what patches of floor add to steps,
 as Gaussian processes over the floor. The maximum-likelihood optimum is found by Gauss-Newton from the truth; its
 covariance is the Cramer-Rao bound.
 
     residuals   wheels   log of the step against the calibrated step, (x, y, theta)
-                wall     n . (R (p - paint r) + t) - d    n, d of the wall; p a point in the base frame, r the ray's direction
-                column   |R (p - paint r) + t - c| - radius
+                wall     n . (R (p - offset r) + t) - d    n, d of the wall; p a point in the base frame, r the ray's direction
+                column   |R (p - offset r) + t - c| - radius
                 range    scale |tag - anchor| + bias + patterns - range, white noise + Gaussian process
 """
 
@@ -92,7 +92,7 @@ class _Layout:
         begin += 2 * anchors
         self.surfaces = begin + np.arange(2 * surfaces).reshape(-1, 2)
         begin += 2 * surfaces
-        self.paint = begin + np.arange(surfaces)
+        self.offset = begin + np.arange(surfaces)
         begin += surfaces
         self.radius = begin + np.arange(surfaces)
         begin += surfaces
@@ -108,7 +108,7 @@ class Oracle:
     """The least-squares problem of one recording.
 
     In pieces, the oracle knows of surfaces what a map can see of them: not that metres of wall are one straight line of one
-    paint, nor that what is seen of a column from all sides is one circle.
+    range offset, nor that what is seen of a column from all sides is one circle.
     """
 
     def __init__(self, recording: Recording, log: SensorLog, lidar: bool = True, pieces: bool = False) -> None:
@@ -266,12 +266,12 @@ class Oracle:
         """Return what is known of the scalars beforehand: the distributions they were drawn from."""
         layout, model = self.layout, self.recording.settings.radio
         pattern = self._antenna_sd() * np.sqrt(0.5 / 3.0)
-        paint = self.recording.settings.laser.surface_sd if self.rooms is None else self.rooms.paint_sd
-        which = np.concatenate([layout.wheels, layout.bias, layout.patterns.ravel(), layout.paint, layout.radius])
+        offset = self.recording.settings.laser.surface_sd if self.rooms is None else self.rooms.surface_sd
+        which = np.concatenate([layout.wheels, layout.bias, layout.patterns.ravel(), layout.offset, layout.radius])
         bias = np.full(len(layout.bias), max(model.bias_sd, 1e-4))
         patterns = np.full(layout.patterns.size, max(pattern, 1e-6))
-        paints, radii = np.full(len(layout.paint), max(paint, 1e-6)), np.full(len(layout.radius), _ANY_RADIUS)
-        sd = np.concatenate([[0.05, 0.05, 0.02], bias, patterns, paints, radii])
+        offsets, radii = np.full(len(layout.offset), max(offset, 1e-6)), np.full(len(layout.radius), _ANY_RADIUS)
+        sd = np.concatenate([[0.05, 0.05, 0.02], bias, patterns, offsets, radii])
         return self._rows(which[:, None], 1.0 / sd[:, None]), self.x[which] / sd
 
     def _antenna_sd(self) -> float:
@@ -286,7 +286,7 @@ class Oracle:
             part = slice(first, first + _AT_ONCE)
             own = poses[rays.pose[part]]
             direction = se2.rotate(own[:, 2], rays.directions[part])
-            arm = se2.rotate(own[:, 2], rays.points[part]) - self.x[layout.paint[place[part]], None] * direction
+            arm = se2.rotate(own[:, 2], rays.points[part]) - self.x[layout.offset[place[part]], None] * direction
             at = own[:, :2] + arm
             surface = self.x[layout.surfaces[place[part]]]
             wall = rays.surface[part] < len(self.walls)
@@ -307,7 +307,7 @@ class Oracle:
             rows[:, 3] = np.where(wall, normal[:, 0] * at[:, 1] - normal[:, 1] * at[:, 0], -normal[:, 0])
             rows[:, 4] = np.where(wall, -1.0, -normal[:, 1])
             rows[:, 5], rows[:, 6] = -incidence, np.where(wall, 0.0, -1.0)
-            own = np.stack([layout.paint[place[part]], layout.radius[place[part]]], axis=1)
+            own = np.stack([layout.offset[place[part]], layout.radius[place[part]]], axis=1)
             columns = np.concatenate([layout.poses[rays.pose[part]], layout.surfaces[place[part]], own], axis=1)
             jacobian = self._rows(columns, rows / sd[:, None])
             product = (jacobian.T @ jacobian).tocoo()

@@ -88,7 +88,7 @@ def parser() -> argparse.ArgumentParser:
         ("multipath-length", "m"),
         ("antenna-sd", "m"),
         ("loss", "share"),
-        ("scale", "range said / distance"),
+        ("scale", "range reported / distance"),
         ("max-range", "m"),
     ):
         default = getattr(RadioModel(), name.replace("-", "_"))

@@ -16,13 +16,13 @@ PER_RANGE = ("stamps", "anchor", "ranges", "quality")
 
 
 @pytest.fixture(scope="module")
-def drive():
+def poses():
     return two_rounds()
 
 
 @pytest.fixture(scope="module")
-def sound(drive):
-    return recording(drive)
+def sound(poses):
+    return recording(poses)
 
 
 def texts(log, **options):
@@ -45,15 +45,15 @@ def test_a_sound_recording_has_nothing_to_complain_about(sound):
     assert abs(figures["lidar"]["turning"]["laser_delay s"]) <= 0.04
 
 
-def test_a_laser_upside_down_is_named_and_so_is_a_needless_flip(drive, sound):
-    assert_named(recording(drive, flipped=True), "serious", "upside down")
-    assert "serious" not in str(texts(replace(recording(drive, flipped=True), mounting=SensorMounting(laser_flipped=True))))
+def test_a_laser_upside_down_is_named_and_so_is_a_needless_flip(poses, sound):
+    assert_named(recording(poses, flipped=True), "serious", "upside down")
+    assert "serious" not in str(texts(replace(recording(poses, flipped=True), mounting=SensorMounting(laser_flipped=True))))
     assert_named(replace(sound, mounting=SensorMounting(laser_flipped=True)), "serious", "mounted upright")
 
 
 @pytest.mark.parametrize("lag", [0.3, -0.4])
-def test_the_delay_of_the_laser_is_measured_with_the_sign_that_a_map_reports(drive, lag):
-    diagnosis = diagnose(recording(drive, lag=lag))
+def test_the_delay_of_the_laser_is_measured_with_the_sign_that_a_map_reports(poses, lag):
+    diagnosis = diagnose(recording(poses, lag=lag))
     assert diagnosis.figures["lidar"]["turning"]["laser_delay s"] == pytest.approx(-lag, abs=0.04)
     assert any(f"too {'late' if lag > 0 else 'early'}" in f.what for f in diagnosis.findings)
 

@@ -346,7 +346,7 @@ def test_two_recordings_become_one_map_through_their_anchors(mapped, room_log, t
     there, whole = read_tum(mapped[0] / "trajectory.tum")
     from uwblite.se2 import between, compose, interpolate_trajectory, inverse
 
-    # Both drives lie as in the map of the whole: where the first begins there is where it begins here.
+    # Both recordings lie as in the map of the whole: where the first begins there is where it begins here.
     first, start = read_tum(tmp_path / "map" / "trajectory.tum")
     T = compose(interpolate_trajectory(there, whole, first[:1])[0], inverse(start[0]))
     second, poses = read_tum(tmp_path / "map" / "trajectory_2.tum")

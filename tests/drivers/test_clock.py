@@ -86,7 +86,7 @@ def test_map_keeps_a_bounded_number_of_points():
 
 
 def test_a_reset_keeps_the_latency_that_was_measured():
-    """The counter begins anew at 60 s; frames arrive 101 ms and a random millisecond after their stamp."""
+    """The counter begins again at 60 s; frames arrive 101 ms and a random millisecond after their stamp."""
     rng, clock = random.Random(1), DeviceClock(1e-3, 1 << 24, period=0.1, latency=0.066)
     for k in range(8):
         sent = 5.0 + 0.01 * k

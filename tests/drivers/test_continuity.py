@@ -95,7 +95,7 @@ def test_a_leap_that_stays_passes_with_its_own_stamps():
     assert guard(rows, damaged=True) == (rows, 0)
 
 
-def test_anchors_are_rarely_invented_by_a_damaged_link_and_a_slow_board_is_heard():
+def test_anchors_are_rarely_invented_by_a_damaged_link_and_a_slow_board_is_read():
     rng = random.Random(1)
     strange = [(0.05 * k, f"{rng.randrange(8)}", 0.001 * 2 ** rng.randrange(9)) for k in range(0, 2000, 7)]
     passed, given_up = guard(strange, damaged=True)

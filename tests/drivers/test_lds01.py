@@ -1,4 +1,4 @@
-"""LDS-01 packets: both sums that are told, and units that use another one."""
+"""LDS-01 packets: both sums that are documented, and units that use another one."""
 
 import struct
 

@@ -124,7 +124,7 @@ def test_a_part_that_cannot_begin_is_one_clear_error(tmp_path):
 
 
 @pytest.mark.parametrize("what", ["file", "folder"])
-def test_a_log_that_is_deleted_is_written_anew(tmp_path, what):
+def test_a_log_that_is_deleted_is_written_again(tmp_path, what):
     folder = tmp_path / "logs"
     folder.mkdir()
     log = LogFile(folder / "run.log", sync=60.0)

@@ -46,7 +46,7 @@ def test_transcript_in_every_split_and_among_noise(name):
 @pytest.mark.parametrize("name", LIDARS)
 @pytest.mark.parametrize("wobble", [0.0, 0.02])
 def test_scans_are_right_in_range_and_time(name, wobble):
-    """Jitter of 1 ms on the line; stamps within 2 ms, and readings within the 1 mm in which the lidars speak."""
+    """Jitter of 1 ms on the line; stamps within 2 ms, and readings within the 1 mm that the lidars resolve."""
     rng = random.Random(3)
     actions, turns, _ = run(name, 5.0, device=emulator(name, wobble=wobble), jitter=lambda: rng.expovariate(1000.0))
     scans = of_kind(actions, LaserScan)

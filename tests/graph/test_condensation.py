@@ -44,9 +44,9 @@ def city(seed, recordings=4, n=60, closures=3, steps=1):
     part = np.repeat(np.arange(recordings), n)
     each = np.flatnonzero(np.diff(part, append=-1) == 0)
     pose = np.repeat(np.arange(len(truth)), 6)
-    heard = np.tile([0, 1, 2, 3, 4, 5], len(truth)) + np.where(np.arange(len(pose)) % 6 == 5, np.repeat(part, 6), 0)
+    measured = np.tile([0, 1, 2, 3, 4, 5], len(truth)) + np.where(np.arange(len(pose)) % 6 == 5, np.repeat(part, 6), 0)
     sigma, noise = 0.1, rng.normal(scale=0.1, size=len(pose))
-    ranges = plain_ranges(pose, heard, np.hypot(*(truth[pose, :2] - anchors[heard]).T) + noise, sigma)
+    ranges = plain_ranges(pose, measured, np.hypot(*(truth[pose, :2] - anchors[measured]).T) + noise, sigma)
     index = np.full((len(pose), 6), -1)
     index[:, 0], index[:, 1] = 0, 1 + part[pose]
     ranges = replace(ranges, calibration=index, kernel=Kernel("huber", 2.0))

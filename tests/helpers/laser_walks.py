@@ -65,7 +65,7 @@ def in_map(clouds: Clouds, poses):
 
 
 def returned(walls, far, shift):
-    """Return a drive of 45 m along x, again after a way back known to `far` m only and wrong by shift (3,).
+    """Return a path of 45 m along x, again after a way back known to `far` m only and wrong by shift (3,).
 
     Returns
     -------

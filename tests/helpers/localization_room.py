@@ -113,7 +113,7 @@ class Drive:
         return states
 
     def carried(self):
-        """Lift the robot: its wheels notice nothing."""
+        """Lift the robot: its wheels do not turn."""
         self.last = None
 
 

@@ -39,7 +39,7 @@ def chain(start, motion) -> np.ndarray:
 
 
 def odometry(stamps, truth, rng=None, scale=1.0, turn_scale=1.0, drift=0.0, noise=0.0, turn_noise=0.0) -> Odometry:
-    """Return what wheels say of a true motion.
+    """Return what wheels report of a true motion.
 
     scale, turn_scale : said / true. drift : rad per metre. noise, turn_noise : m and rad per square root of a metre.
     """

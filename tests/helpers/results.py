@@ -27,7 +27,7 @@ def contents(folder):
 
 
 def small_result(*, evil: str = "", lidar: bool = True, each: int = 1, seconds: float = 0.0) -> MapResult:
-    """Return a result of a square drive with two anchors and three closures; `evil` is put into every text of it."""
+    """Return a result of a square path with two anchors and three closures; `evil` is put into every text of it."""
     k = 24 * each
     turn = np.linspace(0, 4 * np.pi, k, endpoint=False)
     poses = np.stack([3 * np.cos(turn), 2 * np.sin(turn), se2.wrap_angle(turn + np.pi / 2)], axis=1)

@@ -1,4 +1,4 @@
-"""A drive through a small room with columns of nothing but walls: wheels without errors, ranges, scans."""
+"""A recording of a small room with columns of nothing but walls: wheels without errors, ranges, scans."""
 
 import numpy as np
 
@@ -37,18 +37,18 @@ def two_rounds():
     return np.array(poses)
 
 
-def recording(drive, *, flipped=False, lag=0.0):
-    stamps = 100.0 + 0.05 * np.arange(len(drive))
+def recording(poses, *, flipped=False, lag=0.0):
+    stamps = 100.0 + 0.05 * np.arange(len(poses))
     rng = np.random.default_rng(1)
     ids = tuple(sorted(ANCHORS))
     when = np.repeat(np.arange(100.0, stamps[-1], 0.5), len(ids))
-    where = se2.interpolate_trajectory(stamps, drive, when)[:, :2]
+    where = se2.interpolate_trajectory(stamps, poses, when)[:, :2]
     anchor = np.tile(np.arange(len(ids)), len(when) // len(ids))
     ranges = np.hypot(*(where - np.array([ANCHORS[i] for i in ids])[anchor]).T) + rng.normal(0, 0.03, len(when))
     scan_stamps = np.arange(100.0, stamps[-1], 0.2)
     bearings = np.linspace(-2.0, 2.0, 161)
     sign = -1.0 if flipped else 1.0
-    seen = [walls_seen(p, sign * bearings) for p in se2.interpolate_trajectory(stamps, drive, scan_stamps)]
+    seen = [walls_seen(p, sign * bearings) for p in se2.interpolate_trajectory(stamps, poses, scan_stamps)]
     readings = np.array(seen) + rng.normal(0, 0.01, (len(seen), len(bearings)))
     scans = LaserScans(scan_stamps + lag, readings.astype(np.float32), -2.0, 0.025, 0.0, 0.02, 5.6)
-    return SensorLog(Odometry(stamps, drive), UwbRanges(when, anchor, ranges, np.full(len(when), 100.0), ids), scans)
+    return SensorLog(Odometry(stamps, poses), UwbRanges(when, anchor, ranges, np.full(len(when), 100.0), ids), scans)

@@ -1,4 +1,4 @@
-"""A log is followed as it grows, goes on in its next part, or begins anew."""
+"""A log is followed as it grows, goes on in its next part, or begins again."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A growing log is followed byte by byte, over parts, replacement and damage; nothing is told before its line is whole."""
+"""A growing log is followed byte by byte, over parts, replacement and damage; nothing is reported before its line is whole."""
 
 import os
 

@@ -169,7 +169,7 @@ def test_a_measurement_has_the_cost_of_its_factors(seed, rank):
 
 @settings(max_examples=30)
 @given(st.integers(0, 10_000))
-def test_what_scatter_feigns_is_taken_off_and_never_more(seed):
+def test_what_scatter_adds_is_taken_off_and_never_more(seed):
     """0 <= information <= H, and a direction in which H is less than twice the spurious information is not moved."""
     rng = np.random.default_rng(seed)
     (hessian, gradient), (spurious, _) = quadratic_form(rng, 3), quadratic_form(rng, 3)

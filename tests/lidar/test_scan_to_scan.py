@@ -17,7 +17,7 @@ GATE = 0.5
 
 
 def odometry_steps(truth, clouds, stated):
-    """Follow a chain whose wheels say the steps said (k - 1, 3)."""
+    """Match a chain whose odometry reports the steps said (k - 1, 3)."""
     wheels = replace(chained(truth, NOISE), motion=stated)
     poses = [truth[0]]
     for step in stated:

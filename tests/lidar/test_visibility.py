@@ -18,12 +18,12 @@ from uwblite.lidar.visibility import (
 
 
 @pytest.fixture(scope="module")
-def drive():
+def hall():
     return walked(3)
 
 
-def test_nearest_by_bearing_is_the_nearest_point_of_every_direction(drive):
-    clouds = drive[2]
+def test_nearest_by_bearing_is_the_nearest_point_of_every_direction(hall):
+    clouds = hall[2]
     nearest = nearest_by_bearing(clouds)
     bins = nearest.shape[1]
     points = clouds.cloud(7)[0]
@@ -34,29 +34,29 @@ def test_nearest_by_bearing_is_the_nearest_point_of_every_direction(drive):
         assert nearest[7, k] == pytest.approx(expected)
 
 
-def test_visits_agree_where_every_pose_is_true(drive):
-    truth, path, clouds = drive
+def test_visits_agree_where_every_pose_is_true(hall):
+    truth, path, clouds = hall
     share, visits = free_space_violation(clouds, truth, path, np.zeros(len(truth), dtype=np.int64))
     assert visits > 20
     assert share < 0.01
 
 
 @pytest.mark.parametrize("error", [(2.0, 1.0, 0.0), (0.0, 0.0, 0.5)])
-def test_visits_disagree_where_half_of_the_recording_lies_elsewhere(drive, error):
-    truth, path, clouds = drive
+def test_visits_disagree_where_half_of_the_recording_lies_elsewhere(hall, error):
+    truth, path, clouds = hall
     poses, half = truth.copy(), len(truth) // 2
     poses[half:] = se2.compose(np.array(error), truth[half:])
     assert free_space_violation(clouds, poses, path, np.zeros(len(truth), dtype=np.int64))[0] > 0.05
 
 
-def test_one_visit_has_nothing_to_compare_with(drive):
-    truth, path, clouds = drive
+def test_one_visit_has_nothing_to_compare_with(hall):
+    truth, path, clouds = hall
     assert free_space_violation(clouds, truth, 0.01 * path, np.zeros(len(truth), dtype=np.int64)) == (0.0, 0)
 
 
-def test_one_keyframe_compared_with_many_is_one_visit(drive):
+def test_one_keyframe_compared_with_many_is_one_visit(hall):
     """A person who stood before that one keyframe stands in all comparisons."""
-    truth, path, clouds = drive
+    truth, path, clouds = hall
     again = next(k for k in range(len(truth) - 1, 0, -1) if np.sum(near(truth, k) & (path < path[k] - 10.0)) > 4)
     poses = truth + 1000.0 * np.outer(np.arange(len(truth)), (1, 0, 0))
     kept = near(truth, again) & (path < path[again] - 10.0)
@@ -72,14 +72,14 @@ def near(poses, k):
     return np.hypot(*(poses[:, :2] - poses[k, :2]).T) < 1.5
 
 
-def test_recordings_are_visits_of_their_own(drive):
-    truth, path, clouds = drive
+def test_recordings_are_visits_of_their_own(hall):
+    truth, path, clouds = hall
     recording = (np.arange(len(truth)) >= len(truth) // 2).astype(np.int64)
     assert free_space_violation(clouds, truth, 0.01 * path, recording)[1] > 0
 
 
-def test_sub_maps_in_their_place_violate_no_free_space_and_elsewhere_they_do(drive):
-    truth, path, clouds = drive
+def test_sub_maps_in_their_place_violate_no_free_space_and_elsewhere_they_do(hall):
+    truth, path, clouds = hall
     pieces = build(clouds, truth, path, np.zeros(len(truth), dtype=np.int64), SubmapConfig(epsilon=4.0))
     free = observed_free_space(clouds, pieces, truth)
     where = truth[pieces.reference]
@@ -108,8 +108,8 @@ def with_a_walker(truth, clouds):
     return Clouds(np.concatenate([[0], np.cumsum(counts)]), points, normals, owner, np.zeros(len(points)))
 
 
-def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(drive):
-    truth, path, clouds = drive
+def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(hall):
+    truth, path, clouds = hall
     recording = np.zeros(len(truth), dtype=np.int64)
     settings = SubmapConfig(epsilon=4.0)
     quiet = build(clouds, truth, path, recording, settings)
@@ -125,8 +125,8 @@ def test_what_moved_leaves_the_sub_maps_and_what_stands_stays(drive):
     assert walkers[1] < 0.7 * walkers[0]
 
 
-def test_dynamic_points_are_none_in_an_empty_hall_and_some_among_people(drive):
-    truth, path, clouds = drive
+def test_dynamic_points_are_none_in_an_empty_hall_and_some_among_people(hall):
+    truth, path, clouds = hall
     recording = np.zeros(len(truth), dtype=np.int64)
 
     def of(own):
@@ -137,8 +137,8 @@ def test_dynamic_points_are_none_in_an_empty_hall_and_some_among_people(drive):
     assert of(with_a_walker(truth, clouds)) > of(clouds) + 0.05
 
 
-def test_sub_maps_of_different_recordings_do_not_follow_each_other(drive):
-    truth, path, clouds = drive
+def test_sub_maps_of_different_recordings_do_not_follow_each_other(hall):
+    truth, path, clouds = hall
     recording = np.arange(len(truth))
     pieces = build(clouds, truth, path, recording, SubmapConfig(epsilon=4.0))
     assert dynamic_share(pieces, observed_free_space(clouds, pieces, truth), truth, recording) == 0.0

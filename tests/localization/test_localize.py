@@ -55,7 +55,7 @@ def test_a_part_finds_its_place_in_the_whole(log, earlier):
     assert found.overlap > 0.9
     assert not found.doubts
     # Each pass knows the metres that the other one needs for its start.
-    assert found.located == 1.0
+    assert found.localized == 1.0
 
 
 def test_without_walls_the_anchors_fix_the_place(log, earlier):
@@ -136,7 +136,7 @@ def test_another_recording_through_the_same_room(tmp_path):
 
     start = GivenPose(float(first.odometry.stamps[0]), tuple(poses[0].tolist()), (1e-4, 1e-4, 1e-4))
     known = build_map(first, constraints=Constraints(poses=(start,)))
-    # The map's own frame, found from its trajectory, is what the other drive is judged in.
+    # The map's own frame, found from its trajectory, is what the other recording is judged in.
     truth = se2.interpolate_trajectory(stamps, poses, known.stamps)
     a, b = known.trajectory[:, :2], truth[:, :2]
     p, q = a - a.mean(axis=0), b - b.mean(axis=0)

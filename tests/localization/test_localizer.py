@@ -111,7 +111,7 @@ def test_ranges_alone_notice_that_it_was_carried_away():
 
 
 def test_scans_of_unknown_space_speak_for_no_pose_that_ranges_contradict():
-    """Carried to where the walls of the map are out of sight: what fitted before must not vouch for the old place."""
+    """Carried to where the walls of the map are out of view: what fitted before does not support the old place."""
     poses = path(ROUND)
     drive = robot(known())
     assert not drive.along(poses[:30])[-1].lost

@@ -1,4 +1,4 @@
-"""What ranges say of a pose: the factors' gradient, and moments that hold the truth."""
+"""The likelihood of ranges at a pose: the factors' gradient, and moments that hold the truth."""
 
 import numpy as np
 

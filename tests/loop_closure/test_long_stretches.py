@@ -33,7 +33,7 @@ ALIKE = corridor(np.arange(-15.0, 65.0, 2.5))
 
 
 def looked_for(walls):
-    """Return truth, stretches and their uncertain pairs of a drive whose way back is known to 4 m."""
+    """Return truth, stretches and their uncertain pairs of a recording whose way back is known to 4 m."""
     truth, graph, path, clouds = returned(walls, 4.0, SHIFT)
     recording = np.zeros(len(truth), dtype=np.int64)
     pieces = stretches(clouds, graph.poses, path, recording, SubmapConfig())

@@ -1,4 +1,4 @@
-"""The scale of turns from step to step: recovered where it is constant, not bent by one bad turn, and told where it varies."""
+"""The scale of turns by steps: recovered where it is constant, not bent by one bad turn, and reported where it varies."""
 
 import numpy as np
 import pytest

@@ -41,5 +41,5 @@ def test_turns_that_change_their_sign_half_way(sound):
     steps = se2.between(poses[:-1], poses[1:])
     steps[len(steps) // 2 :, 2] *= -1.0
     log = replace(sound, odometry=Odometry(sound.odometry.stamps, chained(poses[0], steps)))
-    told = [n.text for n in build_map(log).doubts if n.kind == "halves-disagree"]
-    assert any("mirror images" in text for text in told)
+    texts = [n.text for n in build_map(log).doubts if n.kind == "halves-disagree"]
+    assert any("mirror images" in text for text in texts)

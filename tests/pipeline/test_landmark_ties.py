@@ -17,7 +17,7 @@ from uwblite.io.constraints_file import parse_constraints
 from uwblite.lidar import clouds
 from uwblite.lidar.scan_to_scan import TrackingConfig
 from uwblite.mapping import MappingConfig
-from uwblite.pipeline.landmark_ties import sightings, ties
+from uwblite.pipeline.landmark_ties import observations, ties
 from uwblite.sensor_log import Odometry
 
 LONG, SCALE = 24.0, 0.96
@@ -187,12 +187,12 @@ def test_a_column_is_found_beside_its_given_place():
     ring = np.column_stack([4.0 + 0.3 * np.cos(angle), 1.0 + 0.3 * np.sin(angle)])
     pose = np.array([[1.0, 2.0, 0.7]])
     given = tuple(se2.transform(pose[0], np.array([4.15, 0.9])).tolist())
-    found = sightings(GivenLandmark("c", given, 0.3), one_cloud(ring), pose, np.zeros(1))
+    found = observations(GivenLandmark("c", given, 0.3), one_cloud(ring), pose, np.zeros(1))
     np.testing.assert_allclose(found.position, [[4.0, 1.0]], atol=0.01)
-    plain = sightings(GivenLandmark("c", given), one_cloud(ring), pose, np.zeros(1))
+    plain = observations(GivenLandmark("c", given), one_cloud(ring), pose, np.zeros(1))
     np.testing.assert_allclose(plain.position, [[4.15, 0.9]], atol=1e-12)
     with pytest.raises(ConfigError, match=r"no column of radius 0\.6"):
-        sightings(GivenLandmark("c", given, 0.6), one_cloud(ring), pose, np.zeros(1))
+        observations(GivenLandmark("c", given, 0.6), one_cloud(ring), pose, np.zeros(1))
 
 
 def test_all_ties_of_a_distance_weigh_as_much_as_it_does():

@@ -37,7 +37,7 @@ class Hypothesis:
 
 
 def estimate(bend, believed=ANCHOR):
-    """An anchor heard with 0.1 m of noise along 10 m that end `bend` metres off the straight line."""
+    """An anchor with ranges of 0.1 m noise along 10 m that end `bend` metres off the straight line."""
     x = np.linspace(0.0, 10.0, 60)
     tags = np.column_stack([x, np.where(x > 6.0, (x - 6.0) / 4.0 * bend, 0.0)])
     count, none = len(x), np.zeros((len(x), 2))

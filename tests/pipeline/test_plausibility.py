@@ -96,9 +96,9 @@ def moved_together(places, lidar=False):
             since = 100.0 * number if len(own) > 1 else np.nan
             label = name if number == 0 else f"{name}@{number + 1}"
             anchors.append(AnchorEstimate(label, np.array(place), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok", "", None, since))
-            heard = np.arange(100.0 * number, 200.0 if number == len(own) - 1 else 100.0, 5.0)
-            stamps.append(heard)
-            anchor.append(np.full(len(heard), len(anchors) - 1))
+            measured = np.arange(100.0 * number, 200.0 if number == len(own) - 1 else 100.0, 5.0)
+            stamps.append(measured)
+            anchor.append(np.full(len(measured), len(anchors) - 1))
     stages = Stages(None, None)
     edges = SimpleNamespace(stamps=np.concatenate(stamps), anchor=np.concatenate(anchor))
     task = SimpleNamespace(recordings=SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0])), stages=stages)
@@ -155,7 +155,7 @@ def test_ranges_without_odometry_are_left_out_and_counted():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_map_begins_where_the_odometry_did(seed):
-    """Wherever the first estimate grew from."""
+    """Wherever the bootstrap began."""
     log = run(seed, metres=40.0)[2]
     moved = replace(log, odometry=replace(log.odometry, poses=se2.compose(np.array([3.0, -2.0, 1.0]), log.odometry.poses)))
     for some in (log, moved):

@@ -24,7 +24,7 @@ bootstrapped trajectory is good enough as a start when it lies well within the w
 
 
 def start(wheels: Odometry, radio: UwbRanges) -> tuple[BootstrapResult, np.ndarray]:
-    """Grow from one recording; return the estimate and the keyframes' stamps."""
+    """Bootstrap one recording; return the estimate and the keyframes' stamps."""
     frames = select(wheels, KeyframeConfig())
     ids = radio.anchor_ids
     listed = unknowns(CalibrationConfig(anchor_height=0.0), ids, np.zeros(len(ids), dtype=bool))

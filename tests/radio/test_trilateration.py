@@ -74,7 +74,7 @@ def test_a_straight_path_leaves_two_mirrored_places(seed, aside, heading):
 
 @settings(max_examples=20)
 @given(st.integers(0, 1000), st.booleans())
-def test_a_corner_in_the_path_settles_the_mirror(seed, left):
+def test_a_corner_in_the_path_resolves_the_mirror_ambiguity(seed, left):
     rng = np.random.default_rng(seed)
     leg = np.linspace(0, 8, 80)
     path = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([8 + 0 * leg, leg if left else -leg])])

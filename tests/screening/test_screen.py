@@ -203,16 +203,16 @@ def test_a_base_that_drives_backwards_has_its_laser_turned(sound):
 
 
 def test_a_base_that_drives_backwards_carries_its_sensors_elsewhere_and_a_laser_turned_on_the_spot_does_not(sound):
-    told = replace(sound.mounting, T_base_laser=np.array([0.1, 0.0, 0.0]), tag_position=np.array([-0.1, 0.05, 0.6]))
+    given = replace(sound.mounting, T_base_laser=np.array([0.1, 0.0, 0.0]), tag_position=np.array([-0.1, 0.05, 0.6]))
     # The room's scans are where the odometry is; with the laser 0.1 m ahead of the base, the base is behind that.
     about = se2.compose(sound.odometry.poses, np.array([-0.1, 0.0, 0.0]))
-    assert np.allclose(se2.compose(about, told.T_base_laser), sound.odometry.poses)
-    reversed_ = replace(with_poses(sound, se2.compose(about, np.array([0.0, 0.0, np.pi]))), mounting=told)
+    assert np.allclose(se2.compose(about, given.T_base_laser), sound.odometry.poses)
+    reversed_ = replace(with_poses(sound, se2.compose(about, np.array([0.0, 0.0, np.pi]))), mounting=given)
     done = screen(reversed_)
     np.testing.assert_allclose(np.abs(done.mounting.T_base_laser), [0.1, 0.0, np.pi], atol=0.05)
     assert done.mounting.T_base_laser[0] < 0.0
     np.testing.assert_allclose(done.mounting.tag_position, [0.1, -0.05, 0.6], atol=0.02)
-    turned = replace(with_poses(sound, about), mounting=replace(told, T_base_laser=np.array([0.1, 0.0, np.pi])))
+    turned = replace(with_poses(sound, about), mounting=replace(given, T_base_laser=np.array([0.1, 0.0, np.pi])))
     done = screen(turned)
     np.testing.assert_allclose(done.mounting.T_base_laser[:2], [0.1, 0.0], atol=0.01)
     assert abs(se2.wrap_angle(done.mounting.T_base_laser[2])) < 0.1

@@ -143,7 +143,7 @@ def test_motion_is_what_a_differential_drive_can_do(room):
 
 
 LARGE = {"arena", "site", "site_next_day"}
-"""Worlds whose drives take seconds to make."""
+"""Worlds whose recordings take seconds to make."""
 
 
 def marked(worlds):
@@ -331,7 +331,7 @@ def test_the_oracle_is_near_the_truth_and_its_bound_reports_how_near():
     log = as_read(made).log
     without, with_lidar = (oracle.solve(made, log, lidar=lidar) for lidar in (False, True))
     assert with_lidar.ate < without.ate
-    # One drive has a handful of independent patches of multipath: a factor of two either way.
+    # One recording has a handful of independent patches of multipath: a factor of two either way.
     assert 0.4 * without.bound_ate < without.ate < 2.0 * without.bound_ate
     assert 0.3 * without.bound_anchors < without.anchors < 2.0 * without.bound_anchors
     assert with_lidar.bound_ate < 0.5 * without.bound_ate

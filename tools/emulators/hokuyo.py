@@ -1,4 +1,4 @@
-"""What Hokuyo's lidars say of themselves, and a real unit's answers from a capture that a user has."""
+"""How Hokuyo's lidars identify themselves, and a real unit's answers from a capture that a user has."""
 
 import gzip
 import struct

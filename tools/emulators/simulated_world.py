@@ -38,7 +38,7 @@ class SimulatedWorld(RoomWorld):
             yield Pose(time, x, y, theta)
 
     def true_poses(self) -> Iterator[Pose]:
-        """Yield where the robot really is, which a gyro feels."""
+        """Yield where the robot really is, which a gyro measures."""
         for time, (x, y, theta) in zip(self.recording.stamps.tolist(), self.recording.truth.tolist(), strict=True):
             yield Pose(time, x, y, theta)
 

@@ -39,7 +39,7 @@ class RadioModel:
     antenna_sd: float = 0.03
     """m, by the direction in which either antenna is hit."""
     scale: float = 1.0
-    """Range said / distance."""
+    """Range reported / distance."""
     loss: float = 0.20
     """Share of the ranges lost for no reason."""
     per_epoch: int = 4

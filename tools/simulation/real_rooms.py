@@ -66,7 +66,7 @@ class RealRooms:
     """Mean way between bumps, m."""
     bump_turn: float = np.deg2rad(0.6)
     """rad."""
-    paint_sd: float = 0.012
+    surface_sd: float = 0.012
     """m, constant error of one surface."""
     warm_up: tuple[float, float] = (0.01, 1200.0)
     """m at the start, and the time in which it falls to a third, s."""

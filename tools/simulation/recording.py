@@ -81,7 +81,7 @@ class Settings:
     robot: int | None = None
     """Which robot, so that several recordings are of the same one; None: one of the seed's own."""
     building: int | None = None
-    """Which building of this plan: paint of walls, multipath, biases of anchors; None: one of the seed's own."""
+    """Which building of this plan: range offsets of walls, multipath, biases of anchors; None: one of the seed's own."""
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,7 @@ def scene_of(settings: Settings, plan: FloorPlan, crowd: list[drive.Motion], rng
     """Draw what stays with the surfaces of a building."""
     model, rooms = settings.laser, settings.rooms
     if rooms is not None:
-        model = replace(model, surface_sd=rooms.paint_sd, mixed=rooms.mixed, grazing=rooms.grazing)
+        model = replace(model, surface_sd=rooms.surface_sd, mixed=rooms.mixed, grazing=rooms.grazing)
     surfaces = _lasting(settings.building, 5, rng)
     colour = model.surface_sd * surfaces.standard_normal(len(plan.walls) + len(plan.columns) + len(crowd))
     glass = np.zeros(len(plan.walls), dtype=bool)

@@ -49,9 +49,9 @@ def diagnose(
 
     Parameters
     ----------
-    anchors, calibration, doubts : of a trial map, where there is one: it shows the wheels' scale, the delay of the radio and
-        the bias of each anchor, and whether the sensors agree.
-    refused : why no trial map could be made; empty where it was, or was not tried.
+    anchors, calibration, doubts : of a map made for the check, where there is one: it shows the wheels' scale, the delay of
+        the radio and the bias of each anchor, and whether the sensors agree.
+    refused : why no map could be made; empty where it was, or was not tried.
     """
     found = Findings()
     _check_notes(log, found)
@@ -70,7 +70,7 @@ def diagnose(
         _check_overlap(log, "lidar", log.scans.stamps, found)
     if log.ranges is not None and len(log.ranges.stamps):
         _check_overlap(log, "radio", log.ranges.stamps, found)
-    _check_trial(doubts, refused, found)
+    _check_map(doubts, refused, found)
     return Diagnosis(found.ranked(), figures)
 
 
@@ -98,8 +98,8 @@ def _check_screening(log: SensorLog, found: Findings) -> None:
             found.warning("log", remark.text, "a map repairs it so; the files stay as they are")
 
 
-def _check_trial(doubts: tuple[Notice, ...], refused: str, found: Findings) -> None:
-    """What a trial map doubts, or why there is none, but for what the screening said."""
+def _check_map(doubts: tuple[Notice, ...], refused: str, found: Findings) -> None:
+    """What the check's map doubts, or why there is none, but for what the screening said."""
     said = {finding.what for finding in found.ranked()}
     for text in [doubt.text for doubt in doubts] + ([refused] if refused else []):
         if text not in said:

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("log", help="CARMEN log, plain or .gz, ROS bag or CSV folder; - reads a log from standard input")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    text = "make no trial map: no scales and biases, no doubts of a map, a coarser estimate of the time"
+    text = "make no map: no scales and biases, no doubts of a map, a coarser estimate of the time"
     parser.add_argument("--quick", action="store_true", help=text)
     add_mounting_arguments(parser)
     add_bag_arguments(parser)
@@ -51,11 +51,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
-    """Diagnose a recording by a trial map as well: what `uwblite map` will doubt or refuse, this finds serious.
+    """Diagnose a recording by mapping it as well: what `uwblite map` will doubt or refuse, this finds serious.
 
     Returns
     -------
-    The findings, and the seconds that `uwblite map` will take here: those of the trial, and what every run takes.
+    The findings, and the seconds that `uwblite map` will take here: those of that map, and what every run takes.
     """
     from ..checks.recording import diagnose
     from ..errors import UwbliteError
@@ -64,11 +64,11 @@ def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
 
     began = time.perf_counter()
     try:
-        trial = build_map(log)
+        made = build_map(log)
     except UwbliteError as error:
         return diagnose(log, refused=str(error)), SECONDS_AT_LEAST
     seconds = SECONDS_AT_LEAST + time.perf_counter() - began
-    return diagnose(log, anchors=trial.anchors, calibration=trial.calibration, doubts=trial.doubts), seconds
+    return diagnose(log, anchors=made.anchors, calibration=made.calibration, doubts=made.doubts), seconds
 
 
 def expected_cost(

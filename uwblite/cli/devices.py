@@ -130,7 +130,7 @@ def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> PortReport
 
     Returns
     -------
-    Sight
+    PortReport
     """
     from ..drivers.devices import DEVICES
     from ..drivers.transport import open_port

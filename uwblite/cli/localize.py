@@ -26,9 +26,9 @@ examples:
   uwblite localize --live --map map/ --odometry kobuki:/dev/kobuki --lidar /dev/ttyACM1 --uwb /dev/ttyACM0
 
 The start pose need not be known: ranges and scans are searched for in the whole map, as with --live; then the recording is
-tracked forwards and backwards and both are averaged. Without lidar the anchors say it to a decimetre. The map is not changed.
+tracked forwards and backwards and both are averaged. Ranges alone determine it to a decimetre. The map is not changed.
 With --live, a line a tenth of a second: stamp, pose, covariance, quality (0..1), lost, and why; see docs/navigation.md.
-exit code 3: written, but doubted: the walls do not fit, or much of it is not located; the reasons are named
+exit code 3: written, but doubted: the walls do not fit, or much of it is not localized; the reasons are named
 exit code 1: found nowhere for certain; nothing is written
 """
 
@@ -155,7 +155,7 @@ def _summary(found: "Localization", files: list[str]) -> dict[str, Any]:
     return {
         "files": files,
         "poses": len(found.stamps),
-        "located": found.located,
+        "localized": found.localized,
         "overlap": found.overlap if found.overlap == found.overlap else None,
         "warnings": notices(found.warnings),
         "doubts": notices(found.doubts),
@@ -170,7 +170,7 @@ def _say(found: "Localization", files: list[str]) -> None:
     start = found.trajectory[0]
     sigma = sorted((c[0, 0] + c[1, 1]) ** 0.5 for c in found.covariances)[len(found.covariances) // 2]
     console.say(f"{len(found.stamps)} poses; the recording began at x {signed(start[0])} m, y {signed(start[1])} m")
-    console.say(f"{100 * found.located:.0f} % of the recording is located, typically to ±{sigma:.2f} m")
+    console.say(f"{100 * found.localized:.0f} % of the recording is localized, typically to ±{sigma:.2f} m")
     if found.overlap == found.overlap:
         console.say(f"{100 * found.overlap:.0f} % of the lidar's points in known space lie on walls of the map")
     else:

@@ -182,7 +182,7 @@ class LogFile:
                     os.fdatasync(self._fd)
 
     def restore(self) -> bool:
-        """Write the log anew where somebody deleted it, perhaps with its folder; return whether that was so.
+        """Write the log again where somebody deleted it, perhaps with its folder; return whether that was so.
 
         Raises
         ------
@@ -197,7 +197,7 @@ class LogFile:
             while piece := os.pread(deleted, _PIECE, size):
                 size += os.write(self._fd, piece)
         except OSError as error:
-            raise DataError(f"{self.path}: was deleted, and cannot be written anew ({error.strerror})") from None
+            raise DataError(f"{self.path}: was deleted, and cannot be written again ({error.strerror})") from None
         os.close(deleted)
         self._size += size
         return True

@@ -83,7 +83,7 @@ class BaseDriver(Driver):
         return [Note("warning", "wheel-drop", text)] if lifted else []
 
     def gap(self, what: str) -> Note:
-        """Return what to say of a base that was not heard for a while."""
+        """Return what to say of a base that sent nothing for a while."""
         return Note("warning", "odometry-gap", f"odometry: the base {what} meanwhile is unknown")
 
     def identity(self) -> Identity:

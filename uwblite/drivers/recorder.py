@@ -194,7 +194,7 @@ class Recorder:
 
     def _housekeeping(self, now: float) -> None:
         if self.log.restore():
-            text = f"{self.log.path} was deleted; it is written anew, with all that was in it"
+            text = f"{self.log.path} was deleted; it is written again, with all that was in it"
             self.note(Note("warning", "log-deleted", text))
         self._look_at_clock(now)
         for link in self.links:

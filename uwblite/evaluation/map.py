@@ -48,8 +48,8 @@ def landmark_errors(found: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, 
     """Compare distances between columns found in a map with the true ones; `pairs` of names, None = all pairs."""
     place = dict(zip(found.names, found.positions, strict=True))
     missing = tuple(name for name in truth.names if name not in place or not np.isfinite(place[name]).all())
-    sightings = {name: place[name][None] for name in truth.names if name not in missing}
-    return _distance_errors(sightings, truth, pairs, missing)
+    observations = {name: place[name][None] for name in truth.names if name not in missing}
+    return _distance_errors(observations, truth, pairs, missing)
 
 
 def landmark_errors_along(
@@ -63,8 +63,8 @@ def landmark_errors_along(
 ) -> LandmarkErrors:
     """Compare distances between columns as a trajectory would draw them with the true ones.
 
-    Every sighting draws a column once more. The error of a pair is the mean over all combinations of a sighting of one
-    with a sighting of the other, so it needs no map and also judges one too smeared to find a column in it.
+    Every observation draws a column once more. The error of a pair is the mean over all combinations of an observation of one
+    with an observation of the other, so it needs no map and also judges one too smeared to find a column in it.
 
     Parameters
     ----------
@@ -72,30 +72,30 @@ def landmark_errors_along(
     true_poses, poses : (n, 3) T_truth_base and T_map_base at the same stamps.
     pairs : names; None = all pairs.
     reach : m, distance up to which a column counts as visible.
-    most : sightings used of each column, evenly spread.
+    most : observations used of each column, evenly spread.
     """
-    sightings = {}
+    observations = {}
     for name, place in zip(truth.names, truth.positions, strict=True):
         from_base = se2.transform(se2.inverse(true_poses), place)
         seen = np.flatnonzero(np.hypot(*from_base.T) <= reach)
         seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(most, len(seen))).astype(np.int64))]
         if len(seen):
-            sightings[name] = se2.transform(poses[seen], from_base[seen])
-    return _distance_errors(sightings, truth, pairs, tuple(name for name in truth.names if name not in sightings))
+            observations[name] = se2.transform(poses[seen], from_base[seen])
+    return _distance_errors(observations, truth, pairs, tuple(name for name in truth.names if name not in observations))
 
 
 def _distance_errors(
-    sightings: dict[str, Floats],
+    observations: dict[str, Floats],
     truth: Landmarks,
     pairs: tuple[tuple[str, str], ...] | None,
     missing: tuple[str, ...],
 ) -> LandmarkErrors:
     if pairs is None:
         pairs = tuple((a, b) for i, a in enumerate(truth.names) for b in truth.names[i + 1 :])
-    judged = tuple((a, b) for a, b in pairs if a in sightings and b in sightings)
+    judged = tuple((a, b) for a, b in pairs if a in observations and b in observations)
     true_place = dict(zip(truth.names, truth.positions, strict=True))
     true_distances = np.array([np.hypot(*(true_place[a] - true_place[b])) for a, b in judged])
-    measured = [np.hypot(*(sightings[a][:, None] - sightings[b][None]).transpose(2, 0, 1)) for a, b in judged]
+    measured = [np.hypot(*(observations[a][:, None] - observations[b][None]).transpose(2, 0, 1)) for a, b in judged]
     errors = np.array([np.mean(np.abs(d - t)) for d, t in zip(measured, true_distances, strict=True)])
     distances = np.array([np.mean(d) for d in measured])
     mean = float(np.mean(errors)) if judged else float("nan")

@@ -12,7 +12,7 @@ is left out, so H stays positive semi-definite whatever the kernel. The step sol
 which is Marquardt's scaling: it makes lambda a pure number, the same for metres, radians and scale factors, and it
 keeps the matrix positive definite where the measurements leave a direction open (an anchor without ranges, a closure
 whose information is singular): such a direction simply does not move. D never shrinks (J. J. More, The Levenberg-Marquardt
-algorithm, 1978): an anchor that comes into line with the poses that hear it loses all curvature across that line, and a
+algorithm, 1978): an anchor that comes into line with the poses with ranges to it loses all curvature across that line, and a
 damping that went with it would brake every other direction before this one. The model promises the decrease
 h^T (lambda D h - g); the ratio of what F really does to that promise decides. A step that decreases F is taken, and
 lambda is multiplied by max(1/3, 1 - (2 ratio - 1)^3); otherwise the step is dropped and lambda is multiplied by
@@ -131,7 +131,7 @@ def minimise(
     chi2 = chi2_initial = _cost(graph, linearized)
     if not np.isfinite(chi2):
         raise SolverError(what_is_not_finite(graph, linearized))
-    damping, growth, last_decrease = config.initial_damping, 2.0, np.inf
+    damping, raised_by, last_decrease = config.initial_damping, 2.0, np.inf
     history: list[float] = []
     to_come = _extrapolated if all(edges.kernel.name == "none" for edges in graph.edges) else _as_much_again
     reason, improved = "", True
@@ -170,13 +170,13 @@ def minimise(
             factor = factor if near else None
             graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3), _LEAST_DAMPING)
-            growth = 2.0
+            raised_by = 2.0
         elif 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * chi2) and damping <= _FREE:
             reason = NO_DECREASE
         else:
             factor = None
             if not reused:
-                damping, growth = max(damping * growth, _FIRST_BRAKE), growth * 2.0
+                damping, raised_by = max(damping * raised_by, _FIRST_BRAKE), raised_by * 2.0
         if not reason and damping > _MOST_DAMPING:
             # At a minimum no step helps either: then all that the gradient could still bring is lost in rounding.
             reason = NO_DECREASE if np.max(normal.gradient**2 / scale) <= _ROUNDING * chi2 else STUCK

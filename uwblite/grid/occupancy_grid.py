@@ -7,7 +7,7 @@ scans Bayes' rule adds log-odds,
     l = hits log(p_hit / (1 - p_hit)) + misses log(p_miss / (1 - p_miss)),    |l| <= clamp,
 
 so only two counts per cell need be kept, their order does not matter, and work can be split and added up exactly. A person
-who stood somewhere for a few scans is outvoted by the scans that look through the place later.
+who stood somewhere for a few scans is outvoted by the later scans that see the place free.
 
 A beam that saw nothing is a weak observation: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique".
 Such beams never draw anything; runs of adjacent ones clear space, with less weight, up to a stated distance and never beyond a

@@ -276,7 +276,7 @@ class LogReader:
         rows = rows[order]
         tag = rows[:, 4].astype(np.int64)
         self.tags = int(tag.max()) + 1
-        silent = [k + 1 for k in np.unique(tag[tag > 0]) if not self.params.tells_tag(k + 1)]
+        silent = [k + 1 for k in np.unique(tag[tag > 0]) if not self.params.gives_tag(k + 1)]
         if silent:
             name = f"uwb{silent[0]}_tag_offset_x"
             warnings.append(f"no PARAM {name} gives where tag {silent[0]} is; the middle of the base is taken")

@@ -60,7 +60,7 @@ class Params:
         """Return x, y, z of a tag on the base, m."""
         return np.array([self._numbers.get(prefix + name, 0.0) for name in _TAG], dtype=np.float64)
 
-    def tells_tag(self, number: int) -> bool:
+    def gives_tag(self, number: int) -> bool:
         """Return whether the place of a further tag, 2 to 9, was given."""
         return any(f"uwb{number}_{name}" in self._numbers for name in _TAG)
 

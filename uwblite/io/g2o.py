@@ -26,7 +26,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, measurements, told_places
+from .graph_file import GraphFile, assembled, given_places, measurements
 from .plain_edges import ENDS, measured, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
@@ -45,7 +45,7 @@ _LAYOUTS = {
     "EDGE2": Layout(2, 9, places=3),
 }
 _TAGS = {
-    "relative": "EDGE_SE2", "sighting": "EDGE_SE2_XY", "pose_prior": "EDGE_PRIOR_SE2", "landmark_prior": "EDGE_PRIOR_XY",
+    "relative": "EDGE_SE2", "observation": "EDGE_SE2_XY", "pose_prior": "EDGE_PRIOR_SE2", "landmark_prior": "EDGE_PRIOR_XY",
     "range": "EDGE_RANGE_SE2_XY", "pose_range": "EDGE_RANGE_SE2",
 }  # fmt: skip
 _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
@@ -91,8 +91,8 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     lines = {kind: records[tag] for kind, tag in _TAGS.items()} | {"relative": steps}
     plain = {kind: measurements(of, kind, index, content, "information") for kind, of in lines.items()}
     plain["landmark_range"] = measured("landmark_range")
-    poses = told_places(vertices, pose_of, len(pose_ids), content, from_odometry)
-    anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
+    poses = given_places(vertices, pose_of, len(pose_ids), content, from_odometry)
+    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
     fixed = records["FIX"].names[:, 0]
     graph = assembled(plain, poses, anchors, *(index[fixed][index[fixed] >= 0] for index in (pose_of, landmark_of)))
     return GraphFile.checked(
@@ -152,7 +152,7 @@ def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:
     yield from _rows("VERTEX_SE2", [number[:n]], graph.poses)
     first = {"pose": 0, "landmark": n}
     for kind, tag in _TAGS.items():
-        if kind == "sighting":
+        if kind == "observation":
             yield from _rows("VERTEX_XY", [number[n:][placed]], graph.anchors[placed])
         if ranges or "range" not in kind:
             m = plain[kind]

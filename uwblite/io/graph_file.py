@@ -103,7 +103,7 @@ def symmetric(upper: Floats, size: int) -> Floats:
     return matrices
 
 
-def told_places(vertices: Records, index_of: Ints, count: int, content: RecordFile, forget: bool) -> Floats:
+def given_places(vertices: Records, index_of: Ints, count: int, content: RecordFile, forget: bool) -> Floats:
     """Return the places (count, numbers) that vertices give, nan where none does or all are to be forgotten.
 
     Raises
@@ -166,7 +166,7 @@ def assembled(
     """
     (i, j), T_i_j, _ = plain["relative"]
     poses = chained_poses(poses, i, j, T_i_j)
-    (pose, anchor), position, _ = plain["sighting"]
+    (pose, anchor), position, _ = plain["observation"]
     placed = np.full_like(anchors, np.nan)
     placed[anchor[::-1]] = se2.transform(poses[pose], position)[::-1]
     anchors = np.where(np.isnan(anchors), placed, anchors)
@@ -178,7 +178,7 @@ def assembled(
     nowhere = np.zeros((len(ranges["pose_range"][0]), 2))
     edges = (
         RelativePoseEdges(i, j, T_i_j, L["relative"]),
-        LandmarkEdges(pose, anchor, position, L["sighting"]),
+        LandmarkEdges(pose, anchor, position, L["observation"]),
         _ranges_from_poses(seer, seen, *ranges["range"]),
         PointDistanceEdges(one, other, nowhere, nowhere, *ranges["pose_range"]),
         AnchorDistanceEdges(first, second, *ranges["landmark_range"]),

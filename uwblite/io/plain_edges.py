@@ -15,13 +15,13 @@ from ..graph.range_edges import RangeEdges
 
 _NONE = np.zeros(0, dtype=np.int64)
 ENDS = {
-    "relative": ("pose", "pose"), "sighting": ("pose", "landmark"), "range": ("pose", "landmark"),
+    "relative": ("pose", "pose"), "observation": ("pose", "landmark"), "range": ("pose", "landmark"),
     "pose_range": ("pose", "pose"), "landmark_range": ("landmark", "landmark"), "pose_prior": ("pose",),
     "landmark_prior": ("landmark",),
 }  # fmt: skip
 """What the text formats can say, and between what: the pose of one in the other, a landmark's position in a pose, distances,
 and where a pose or a landmark is."""
-WIDTHS = {"relative": 3, "pose_prior": 3, "sighting": 2, "landmark_prior": 2}
+WIDTHS = {"relative": 3, "pose_prior": 3, "observation": 2, "landmark_prior": 2}
 """Numbers of a measurement; 1 of a distance."""
 
 
@@ -76,7 +76,7 @@ def _plain(edges: Edges, graph: Graph) -> tuple[str, tuple[Ints, ...], Floats, F
     if isinstance(edges, AnchorDistanceEdges):
         return "landmark_range", (edges.i, edges.j), edges.distance[:, None], (1.0 / edges.sigma)[:, None, None]
     if isinstance(edges, LandmarkEdges):
-        return "sighting", (edges.pose, edges.anchor), edges.position, edges.sqrt_information
+        return "observation", (edges.pose, edges.anchor), edges.position, edges.sqrt_information
     if isinstance(edges, PriorEdges):
         if edges.block == "anchors":
             return "landmark_prior", (edges.index,), edges.value, edges.sqrt_information

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, measurements, told_places
+from .graph_file import GraphFile, assembled, given_places, measurements
 from .plain_edges import ENDS, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
@@ -39,7 +39,7 @@ _LAYOUTS = {
     "EDGE_RANGE": Layout(2, 2, stamped=True, places=1),
 }
 _TAGS = {
-    "pose_prior": "VERTEX_SE2:PRIOR", "landmark_prior": "VERTEX_XY:PRIOR", "relative": "EDGE_SE2", "sighting": "EDGE_SE2_XY",
+    "pose_prior": "VERTEX_SE2:PRIOR", "landmark_prior": "VERTEX_XY:PRIOR", "relative": "EDGE_SE2", "observation": "EDGE_SE2_XY",
     "range": "EDGE_RANGE", "pose_range": "EDGE_RANGE", "landmark_range": "EDGE_RANGE",
 }  # fmt: skip
 """In the order of the file."""
@@ -89,14 +89,14 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
             raise content.error(problem, int(of.lines[int(np.argmax(wrong))]))
 
     index = {"pose": pose_of, "landmark": landmark_of}
-    lines = {"relative": steps, "sighting": seen, "pose_prior": pinned, "landmark_prior": surveyed, "range": ranged}
+    lines = {"relative": steps, "observation": seen, "pose_prior": pinned, "landmark_prior": surveyed, "range": ranged}
     lines |= {"pose_range": meetings, "landmark_range": surveys}
     plain = {}
     for kind, of in lines.items():
         found = measurements(of, kind, index, content, "covariance")
         plain[kind] = found._replace(information=_inverse(found.information, of, content))
-    poses = told_places(records["VERTEX_SE2"], pose_of, len(pose_ids), content, from_odometry)
-    anchors = told_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
+    poses = given_places(records["VERTEX_SE2"], pose_of, len(pose_ids), content, from_odometry)
+    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
     stamps[ends[:, 1]] = steps.stamps
     stamps[pose_of[records["VERTEX_SE2"].names[:, 0]]] = records["VERTEX_SE2"].stamps

@@ -92,7 +92,7 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
 
     Parameters
     ----------
-    logs : the recordings, in the order of the result's sessions.
+    logs : the recordings, in the order of the result's recordings.
 
     Returns
     -------

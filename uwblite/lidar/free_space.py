@@ -40,12 +40,12 @@ def free_space(poses: Floats, nearest: Floats) -> FreeSpace:
 
 
 def seen_beyond(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, Ints]:
-    """Count for each point the places from which one looked through it, and those from which it was in view.
+    """Count for each point the places that saw beyond it, and those from which it was in view.
 
     Parameters
     ----------
     free : of a cloud. points : (m, 2) m, in its frame.
-    margin : m; a point was looked through if the bearing was free for more than that beyond it.
+    margin : m; a point was seen beyond where the bearing was free for more than that behind it.
 
     Returns
     -------

@@ -3,8 +3,8 @@
 The neighbouring cloud alone shows too little after a fast turn or a gap; the last few together show what was in view
 before. Every pose that the window allows is scored (see raster_search), matching descends from the best few and from the
 guesses, and free space decides between them: of two scans in their true places hardly any surface of the one stands where
-the other looked through. A step for which two distinct places score alike is ambiguous and counts as not found. Places along
-a bare wall are one place: the match says nothing of that direction, and fixes the others.
+the other saw free space. A step for which two distinct places score alike is ambiguous and counts as not found. Places along
+a bare wall are one place: the match leaves that direction free, and fixes the others.
 """
 
 from dataclasses import dataclass, fields

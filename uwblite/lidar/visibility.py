@@ -1,6 +1,6 @@
-"""Who sees through whom: what clouds saw to be free, and surfaces of other clouds that stand in it.
+"""Visibility between clouds: free space of one, and surfaces of others that stand in it.
 
-Of two clouds in the right place to each other, hardly any surface of the one stands where the other looked through;
+Of two clouds in the right place to each other, hardly any surface of the one stands in the other's free space;
 people, glass and doors leave a few per cent. Of clouds in a wrong place, half of the surfaces do.
 """
 
@@ -85,7 +85,7 @@ def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, 
 
 
 def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, recording: Ints) -> float:
-    """Return how much of a sub-map the next one sees through where nothing but people, glass and drift can be the cause.
+    """Return the share of a sub-map in the next one's free space where nothing but people, glass and drift can be the cause.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ def from_result(result: StoredResult) -> KnownMap:
     calibration = _calibration(result.report)
     anchors = known_anchors(result.anchors, calibration)
     if not anchors.ids and result.grid is None:
-        raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: nothing locates a robot")
+        raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: no robot can be localized in it")
     correction = np.array([calibration.get(f"laser_{name}", 0.0) for name in ("x", "y", "theta")])
     walls = None if result.grid is None else walls_of(result.grid)
     return KnownMap(anchors, walls, correction, calibration.get("laser_delay", 0.0))

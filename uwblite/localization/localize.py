@@ -20,7 +20,7 @@ from .passes import Pass, pose_rows, run_pass, smoothed
 
 LEAST_OVERLAP = 0.4
 """Share of the rays' ends in known space that must lie on walls of the map; the rest may be people, or what was moved."""
-LEAST_LOCATED = 0.8
+LEAST_LOCALIZED = 0.8
 """Share of the poses that must be known, and on which both passes must agree."""
 Progress = Callable[[str, int, int], object]
 """Called with what is done, steps done, steps; what returns False stops the work."""
@@ -36,7 +36,7 @@ class Localization:
     """(n, 3) T_map_base; m, m, rad."""
     covariances: Floats
     """(n, 3, 3) m, m, rad; map frame; the map's own errors are in them."""
-    located: float
+    localized: float
     """Share of the recording's poses that are known, 0..1."""
     overlap: float
     """Share of the rays' ends that lie on walls of the map, of those in its known space; nan without walls to compare."""
@@ -77,10 +77,10 @@ def localize(
     there = np.isfinite(found.poses).all(axis=1)
     ends = passes[0].ends + passes[1].ends
     overlap = float(ends[0] / ends[1]) if ends[1] else float("nan")
-    located, agreed = float(there.mean()), 1.0 - float(found.contradicting[there].mean())
-    warnings, more = _notices(log, known, passes, located, agreed, overlap)
+    localized, agreed = float(there.mean()), 1.0 - float(found.contradicting[there].mean())
+    warnings, more = _notices(log, known, passes, localized, agreed, overlap)
     return Localization(
-        log.odometry.stamps[rows][there], found.poses[there], found.covariances[there], located, overlap,
+        log.odometry.stamps[rows][there], found.poses[there], found.covariances[there], localized, overlap,
         warnings, (*doubts, *more),
     )  # fmt: skip
 
@@ -118,7 +118,7 @@ def _refuse_nothing_in_common(log: SensorLog, known: KnownMap) -> None:
 
 
 def _notices(
-    log: SensorLog, known: KnownMap, passes: tuple[Pass, Pass], located: float, agreed: float, overlap: float
+    log: SensorLog, known: KnownMap, passes: tuple[Pass, Pass], localized: float, agreed: float, overlap: float
 ) -> tuple[tuple[Notice, ...], tuple[Notice, ...]]:
     """Return warnings and doubts."""
     remarks = () if log.screening is None else log.screening.remarks
@@ -133,11 +133,12 @@ def _notices(
         warnings.append(Notice("moved-anchor", text, {"anchor": name}))
     if overlap < LEAST_OVERLAP:
         doubts.append(_walls_differ(f"overlap {overlap:.0%}"))
-    if located < 1.0:
+    if localized < 1.0:
         reason = passes[0].reason or passes[1].reason or "measurements and map fell apart meanwhile"
-        text = f"{1.0 - located:.0%} of the recording is not located and left out: {reason}"
-        (doubts if located < LEAST_LOCATED else warnings).append(Notice("not-located", text, {"located": round(located, 4)}))
-    if agreed < LEAST_LOCATED:
+        text = f"{1.0 - localized:.0%} of the recording is not localized and left out: {reason}"
+        notices = doubts if localized < LEAST_LOCALIZED else warnings
+        notices.append(Notice("not-localized", text, {"localized": round(localized, 4)}))
+    if agreed < LEAST_LOCALIZED:
         text = f"forwards and backwards the recording is found at different places for {1.0 - agreed:.0%} of its poses"
         doubts.append(Notice("ambiguous-place", text, {"agreed": round(agreed, 4)}))
     return tuple(warnings), tuple(doubts)

@@ -1,4 +1,4 @@
-"""Loops closed where the graph knows the way round to many metres only: long stretches of the path against each other.
+"""Loops closed where the way round is uncertain by many metres: long stretches of the path against each other.
 
 A search narrower than the uncertainty may miss the true place, and one as wide finds many places at which one sub-map of a
 corridor fits. Stretches of tens of metres fit at one place only, where doors and pillars match as well as walls do

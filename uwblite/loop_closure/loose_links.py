@@ -17,9 +17,9 @@ from ..lidar.clouds import Clouds
 from ..lidar.submaps import SubmapConfig, Submaps
 from .candidates import Candidates
 from .closures import LoopClosureConfig
-from .slid_stretches import directions_held, tied_parts
+from .slid_stretches import directions_constrained, tied_parts
 
-_LEAST_HELD = 2
+_LEAST_CONSTRAINED = 2
 """Directions that scans fix in a sound link: a bare corridor leaves the way along it to the odometry."""
 _VIEWS = 6
 """Keyframes of one side that make its sub-map; fewer are no part of a map."""
@@ -37,7 +37,7 @@ _FAR = 10.0
 
 def loose_links(wheels: OdometryEdges, graph: Graph) -> Ints:
     """Return the steps of the odometry (l,) that scan edges do not fix; none where these are no exceptions."""
-    links = np.flatnonzero(directions_held(graph)[wheels.i] < _LEAST_HELD)
+    links = np.flatnonzero(directions_constrained(graph)[wheels.i] < _LEAST_CONSTRAINED)
     return links if len(links) <= max(_EXCEPTIONS, _SHARE * len(wheels)) else links[:0]
 
 
@@ -49,7 +49,7 @@ def untied_links(wheels: OdometryEdges, graph: Graph, clouds: Clouds) -> Ints:
     graph : final; holds the scan edges of all visits. clouds : one per keyframe.
     """
     links = loose_links(wheels, graph)
-    part = tied_parts(wheels, graph, _LEAST_HELD)
+    part = tied_parts(wheels, graph, _LEAST_CONSTRAINED)
     size, i, j = np.bincount(part), wheels.i[links], wheels.j[links]
     large = np.minimum(size[part[i]], size[part[j]]) >= _VIEWS
     seen = np.minimum(clouds.counts[i], clouds.counts[j]) >= _LEAST_POINTS

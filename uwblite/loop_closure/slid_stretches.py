@@ -53,9 +53,9 @@ def scans_fixing(graph: Graph) -> Ints:
     return np.cumsum(count)[:-1]
 
 
-def directions_held(graph: Graph) -> Ints:
+def directions_constrained(graph: Graph) -> Ints:
     """Return in how many directions, 0 to 3, the best scan edge of the same visit fixes the step from each keyframe (k,)."""
-    held = np.zeros(len(graph.poses), dtype=np.int64)
+    constrained = np.zeros(len(graph.poses), dtype=np.int64)
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
             first, span = np.minimum(edges.i, edges.j), np.abs(edges.i - edges.j)
@@ -63,8 +63,8 @@ def directions_held(graph: Graph) -> Ints:
             fixed = _fixed(edges)
             for k in range(_NEAR):
                 over = agrees & (span > k)
-                np.maximum.at(held, first[over] + k, fixed[over])
-    return held
+                np.maximum.at(constrained, first[over] + k, fixed[over])
+    return constrained
 
 
 def tied_parts(wheels: OdometryEdges, graph: Graph, least: int) -> Ints:
@@ -72,8 +72,8 @@ def tied_parts(wheels: OdometryEdges, graph: Graph, least: int) -> Ints:
 
     Steps that such edges of the same visit hold together tie, too.
     """
-    held = directions_held(graph)[wheels.i] >= least
-    i, j = [wheels.i[held]], [wheels.j[held]]
+    constrained = directions_constrained(graph)[wheels.i] >= least
+    i, j = [wheels.i[constrained]], [wheels.j[constrained]]
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
             good = (_fixed(edges) >= least) & _agrees(edges, graph)

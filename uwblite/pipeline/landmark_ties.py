@@ -28,15 +28,15 @@ from .lidar_stages import refine_jointly
 _NEAR = 0.4
 """Points count as the landmark's when they lie so near to its place, or to the rim of its column, m."""
 _LEAST_POINTS = 3
-"""Points of a cloud that make a sighting."""
+"""Points of a cloud that make an observation."""
 _ONE_VISIT = 3.0
-"""Sightings belong to one visit while less than this is travelled between two, m."""
+"""Observations belong to one visit while less than this is travelled between two, m."""
 _VISITS = 4
 """Visits used of a landmark, those with most points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class Observations:
     """Where a landmark stands, seen from some keyframes."""
 
     keyframe: Ints
@@ -45,7 +45,7 @@ class Sightings:
     """(v, 2) m, in the frame of that keyframe."""
 
 
-def sightings(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: Floats) -> Sightings:
+def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: Floats) -> Observations:
     """Find the keyframes that see a landmark.
 
     Parameters
@@ -78,7 +78,7 @@ def sightings(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: Floa
     if landmark.radius > 0.0:
         views = zip(best_view.tolist(), position, strict=True)
         position = np.array([_column_in(clouds.cloud(k)[0], at, landmark.radius) for k, at in views])
-    return Sightings(best_view, position)
+    return Observations(best_view, position)
 
 
 def _column_in(points: Floats, place: Floats, radius: float) -> Floats:
@@ -130,7 +130,7 @@ def ties(constraints: Constraints, clouds: Clouds, poses: Floats, path: Floats) 
     missing = sorted(set(wanted) - set(listed))
     if missing:
         raise ConfigError(f"constraints: [[landmark_distance]] names {missing[0]!r}, of which there is no [[landmark]]")
-    found = {name: sightings(listed[name], clouds, poses, path) for name in dict.fromkeys(wanted)}
+    found = {name: observations(listed[name], clouds, poses, path) for name in dict.fromkeys(wanted)}
     rows: list[tuple[NDArray[Any], ...]] = []
     for number, given in enumerate(constraints.landmark_distances):
         one, other = (found[name] for name in given.landmarks)

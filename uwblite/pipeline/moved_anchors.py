@@ -26,7 +26,7 @@ freedom; 5e-5 by chance, the rest for errors that the sigmas leave out)."""
 def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
     """Give anchors that were moved between recordings a place of their own, once the poses are known well.
 
-    With the poses fixed, every recording's ranges say where each anchor stood then; places whose distance their
+    With the poses fixed, every recording's ranges determine where each anchor stood then; places whose distance their
     uncertainty does not explain are not the same. Where one was moved, the joint refinement is done again.
     """
     if len(task.recordings) == 1 or estimate.ranges is None or estimate.bootstrap is None:

@@ -100,14 +100,14 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], estimate: Estimate, 
     for start, _ in moves:
         these = [k for since, k in moves if start <= since < start + _ONE_TIME]
         before, after = base[ranges.stamps < start], base[ranges.stamps > start + _ONE_TIME]
-        heard = len(set(before.tolist()) & set(after.tolist()))
-        if len({names[k][0] for k in these}) >= max(0.5 * heard, min(2, heard)) and not _exchanged(these, anchors, names):
+        measured = len(set(before.tolist()) & set(after.tolist()))
+        if len({names[k][0] for k in these}) >= max(0.5 * measured, min(2, measured)) and not _exchanged(these, anchors, names):
             when = float(start - task.recordings.stamps[0])
             task.stages.doubt(
                 "anchors-moved-together",
-                f"{len(these)} of {heard} anchors were moved at about t = {when:.0f} s: rather the wheels, tag or radio "
+                f"{len(these)} of {measured} anchors were moved at about t = {when:.0f} s: rather the wheels, tag or radio "
                 "changed then, and nothing but the odometry ties the two parts of the map",
-                at=when, moved=len(these), heard=heard,
+                at=when, moved=len(these), measured=measured,
             )  # fmt: skip
             return
 
