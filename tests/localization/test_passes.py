@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from uwblite.localization.localizer import MAP_COVARIANCE
 from uwblite.localization.passes import Pass, smoothed
+from uwblite.localization.pose_estimator import MAP_COVARIANCE
 
 
 def a_pass(poses, covariances):

@@ -15,7 +15,8 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..sensor_log import SensorLog
 from .known_map import KnownMap
-from .localizer import MAP_COVARIANCE, Localizer
+from .localizer import Localizer
+from .pose_estimator import MAP_COVARIANCE
 from .records import Scanner
 
 _SPACING = (0.1, 0.1, 1.0)
@@ -88,7 +89,7 @@ def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, repor
             localizer.add_scan(sign * float(log.scans.stamps[k]), log.scans.ranges[k])
         if done % 1000 == 0:
             report(done, len(times))
-    return Pass(poses, covariances, localizer.ends.copy(), localizer.state().moved_anchors, reason)
+    return Pass(poses, covariances, localizer.ends, localizer.state().moved_anchors, reason)
 
 
 def _scanner(log: SensorLog, sign: float) -> Scanner | None:
