@@ -1,17 +1,13 @@
 """Devices for `uwblite localize --live`: the recorder of `uwblite record`, whose lines go to the localiser and to no file."""
 
 import argparse
-import re
-import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from ..drivers.log_file import LogFile
 from ..drivers.recorder import Recorder
-from ..drivers.transport import check_pyserial, check_url
-from . import console
-from .record import device_links
+from .named_devices import device_links, host_name, show_note
 
 
 class LinesTo(LogFile):
@@ -39,14 +35,9 @@ class LinesTo(LogFile):
 def record_into(args: argparse.Namespace, take: Callable[[bytes], None], stopping: Callable[[], bool]) -> None:
     """Read devices until asked to stop, and hand on what `uwblite record` would write."""
     links = device_links(args)
-    for link in links:
-        check_url(link.url)
-        check_pyserial(link.url)
     offset = time.time() - time.monotonic()
     recorder = Recorder(
-        links, LinesTo(take), monotonic=time.monotonic, wall_offset=offset,
-        host=re.sub(r"\s+", "_", socket.gethostname()) or "host",
-        on_note=lambda seconds, note: console.note(f"[{seconds:8.1f} s] {note.level}: {note.text}"),
-    )  # fmt: skip
+        links, LinesTo(take), monotonic=time.monotonic, wall_offset=offset, host=host_name(), on_note=show_note
+    )
     recorder.begin([])
     recorder.run(duration=None, stopping=stopping)

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .console import note, say, say_json
+from .named_devices import MOST, device_links, host_name, mounting_params, show_note, use_lasting_names
 from .options import number, numbers, place
 from .serving import LOCAL, page_address
 
 if TYPE_CHECKING:
-    from ..drivers.events import Note, Pose
-    from ..drivers.link import Link
     from ..drivers.recorder import Recorder
 
 HELP = "record a run: UWB tag, lidar and odometry into a log that `uwblite map` reads"
@@ -43,8 +42,7 @@ computer's monotonic clock, s).
 
 _PAGE_NICENESS = 10
 """Of the page beside the recorder."""
-MOST = {"uwb": 9, "lidar": 5, "gyro": 1, "odometry": 1}
-"""How many of a kind a log keeps apart."""
+
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -86,13 +84,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Record until the time is over or somebody stops it."""
     import signal
-    import socket
     import time
 
     from ..drivers.link import Mounting
     from ..drivers.log_file import LogFile, last_state
     from ..drivers.recorder import Recorder
-    from ..drivers.transport import check_pyserial, check_url
 
     if not any(getattr(args, sensor) for sensor in MOST):
         note("uwblite: error: name at least one of --uwb, --lidar, --gyro, --odometry; `uwblite devices` lists what is there")
@@ -111,23 +107,20 @@ def run(args: argparse.Namespace) -> int:
             remark += f"; this computer's clock is {last - time.monotonic() - offset:.0f} s behind the log and was moved"
             offset = last + 1.0 - time.monotonic()
     links = device_links(args, pose)
-    for link in links:
-        check_url(link.url)
-        check_pyserial(link.url)
     log = LogFile(path, append=args.append, rotate=args.rotate, sync=args.sync)
     lasers = args.laser_pose or [(0.0, 0.0, 0.0)]
-    mounting = Mounting(lasers[0], tuple(_mounting_params(args, offset)), more_lasers=tuple(lasers[1:]))
+    mounting = Mounting(lasers[0], tuple(mounting_params(args, offset)), more_lasers=tuple(lasers[1:]))
     stopped: list[int] = []
     watching = _Watching(args) if args.watch else None
     recorder = Recorder(
-        links, log, monotonic=time.monotonic, wall_offset=offset, host=re.sub(r"\s+", "_", socket.gethostname()) or "host",
-        mounting=mounting, on_note=_show_note, wall=time.time,
+        links, log, monotonic=time.monotonic, wall_offset=offset, host=host_name(), mounting=mounting,
+        on_note=show_note, wall=time.time,
     )  # fmt: skip
     endings = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {ending: signal.signal(ending, lambda n, _f: stopped.append(n)) for ending in endings}
     try:
         recorder.begin(_head(args, remark))
-        _use_lasting_names(links)
+        use_lasting_names(links)
         recorder.run(duration=args.duration, stopping=lambda: bool(stopped), on_status=_status_line(recorder, watching))
     finally:
         log.close()
@@ -180,56 +173,11 @@ def _last_part(path: Path) -> Path:
     return path
 
 
-def device_links(args: argparse.Namespace, pose: "Pose" = (0.0, 0.0, 0.0)) -> list["Link"]:
-    """Return the devices that the command line names; pose is where the odometry goes on."""
-    from ..drivers.devices import SENSORS, Setup, open_device
-    from ..drivers.link import Link
-    from ..errors import ConfigError
-
-    names = ("steps", "cluster", "skip", "narrow", "baud")
-    lidar = {name: str(value) for name in names if (value := getattr(args, f"lidar_{name}", None)) is not None}
-    links = []
-    for sensor in reversed(SENSORS):
-        specs = getattr(args, sensor) or []
-        if len(specs) > MOST[sensor]:
-            raise ConfigError(f"--{sensor} is given {len(specs)} times; a log keeps {MOST[sensor]} apart")
-        for k, spec in enumerate(specs, start=1):
-            session, url = open_device(sensor, spec, Setup(pose), lidar if sensor == "lidar" else None)
-            links.append(Link(sensor, url, session, k))
-    return links
-
-
-def _mounting_params(args: argparse.Namespace, offset: float) -> list[tuple[str, str]]:
-    params = [("host_monotonic_zero", f"{offset:.6f}")]
-    for k, position in enumerate(args.tag or [], start=1):
-        names = (f"uwb{k if k > 1 else ''}_tag_{name}" for name in ("offset_x", "offset_y", "height"))
-        params += [(name, f"{value:.6f}") for name, value in zip(names, position, strict=True)]
-    if args.anchor_height is not None:
-        params.append(("uwb_anchor_height", f"{args.anchor_height:.6f}"))
-    params += [(f"laser{k if k > 1 else ''}_flipped", "on") for k in args.laser_flipped or ()]
-    return params
-
-
 def _head(args: argparse.Namespace, remark: str) -> list[str]:
     from .. import __version__
 
     devices = ", ".join(f"{name} {spec}" for name in MOST for spec in getattr(args, name) or [])
     return [f"recorded by uwblite {__version__}: {devices}", *([remark] if remark else [])]
-
-
-def _use_lasting_names(links: list["Link"]) -> None:
-    """Open ports by names that stay when they are unplugged and plugged in again."""
-    from ..drivers.ports import stable_name
-
-    for link in links:
-        better = stable_name(link.url)
-        if better:
-            note(f"{link.name}: {link.url} may change its number; it is opened as {better}")
-            link.url = better
-
-
-def _show_note(seconds: float, message: "Note") -> None:
-    note(f"[{seconds:8.1f} s] {message.level}: {message.text}")
 
 
 class _Watching:
