@@ -8,7 +8,7 @@ from emulators.kobuki_device import Create2Device
 from emulators.world import Pose, RoomWorld, WorldClock
 from helpers.driver_harness import check_transcript, feed_whole, of_kind, simulate
 
-from uwblite.drivers.create2 import MODULUS, TICK, WHEEL_BASE, Create2Driver, Create2Protocol, WheelOdometer
+from uwblite.drivers.create2 import MODULUS, TICK, WHEEL_BASE, Create2Driver, Create2Protocol, Encoders, WheelOdometer
 from uwblite.drivers.events import Corrupt, Lost, Note, OdometryPose
 
 RNG = random.Random(2)
@@ -123,3 +123,30 @@ class _Asleep:
         if now > 1005.0 and not self._slept:
             self._slept, self._device.streaming, self._device.awake = True, False, False
         return self._device.advance(now)
+
+
+def test_counts_that_begin_again_are_no_motion():
+    """The robot was switched off and on: its counts are zero, and 3.7 m backwards in 3 s are more than it can drive."""
+    driver = Create2Driver()
+    driver.take(Encoders(1000.0, 8000, 8400, 0, 15.8))
+    (before,) = of_kind([(0.0, action) for action in driver.take(Encoders(1000.015, 8464, 8900, 0, 15.8))], OdometryPose)
+    actions = driver.take(Encoders(1003.0, 0, 0, 0, 15.8))
+    assert [type(action) for action in actions] == [Lost, Note, OdometryPose]
+    assert (actions[-1].x, actions[-1].y) == (before.x, before.y)
+    *_, after = driver.take(Encoders(1003.015, 10, 10, 0, 15.8))
+    assert math.hypot(after.x - before.x, after.y - before.y) == pytest.approx(10 * TICK)
+
+
+def test_it_streams_whatever_packets_a_host_asks_for():
+    """As libcreate does: sensors of one and of two bytes, 29 packets a frame."""
+    words = (22, 23, 25, 26, 43, 44, *range(46, 52))
+    packets = bytes((7, 8, 9, 10, 11, 12, 13, 15, 17, 18, 21, 22, 23, 24, 25, 26, 35, 43, 44, 45, *range(46, 54), 58))
+    device, _ = emulated()
+    device.power_up(1000.0)
+    device.receive(b"\x80" + bytes((148, len(packets))) + packets, 1000.0)
+    frame = device.advance(device.next_time(1000.0))
+    sizes = [2 if packet in words else 1 for packet in packets]
+    assert (frame[0], frame[1], len(frame)) == (19, len(packets) + sum(sizes), len(packets) + sum(sizes) + 3)
+    assert sum(frame) % 256 == 0
+    places = [2 + sum(sizes[:k]) + k for k in range(len(packets))]
+    assert bytes(frame[place] for place in places) == packets

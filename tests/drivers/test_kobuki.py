@@ -185,3 +185,23 @@ def test_odometer_follows_the_emulated_circle(skew):
         now = device.next_time(now)
     assert max(errors) < 0.01
     assert max(stamps[1000:]) < 0.002
+
+
+def test_the_emulator_tells_versions_and_gains_once_to_hosts_that_ask():
+    """Requests 09 (flags 1 hardware, 2 firmware, 8 serial number) and 0E, as kobuki_core sends them, in two pieces."""
+    device = KobukiDevice(iter([Pose(0.0, 0.0, 0.0, 0.0), Pose(10.0, 2.0, 0.0, 0.0)]), clock := WorldClock())
+    clock.start(0.0)
+    device.next_time(0.0)
+    wanted = encode_packet([(0x09, b"\x0b\x00")]) + encode_packet([(0x0E, b"\x00")])
+    for piece in (wanted[:5], wanted[5:]):
+        assert device.receive(piece, 0.0) == b""
+    sizes = {}
+    packet = device.advance(0.0)
+    at = 3
+    while at < len(packet) - 1:
+        sizes[packet[at]] = packet[at + 1]
+        at += 2 + packet[at + 1]
+    assert {0x0A: 4, 0x0B: 4, 0x13: 12, 0x15: 13}.items() <= sizes.items()
+    (event,) = feed_whole(KobukiProtocol, packet)
+    assert isinstance(event, Feedback)
+    assert len(device.advance(0.021)) == 81

@@ -95,3 +95,22 @@ def test_firmware_without_express_scan_is_read_in_standard_scan():
     actions, turns, reopens = run("rplidar", 4.0, device=(device, turns))
     assert not reopens
     assert len(of_kind(actions, LaserScan)) > 5
+
+
+def test_the_emulator_tells_its_scan_modes_to_hosts_that_ask():
+    """The maker's SDK asks units from firmware 1.24 on (GET_LIDAR_CONF) and does not scan without an answer."""
+    device, _ = emulator("rplidar")
+    device.power_up(0.0)
+
+    def ask(entry, mode=None):
+        body = struct.pack("<I", entry) + (b"" if mode is None else struct.pack("<H", mode))
+        whole = b"\xa5\x84" + bytes([len(body)]) + body
+        reply = device.receive(whole + bytes([reduce(xor, whole)]), 0.0)
+        assert reply[:7] == b"\xa5\x5a" + struct.pack("<IB", len(reply) - 7, 0x20)
+        assert reply[7:11] == body[:4]
+        return reply[11:]
+
+    assert (ask(0x70), ask(0x7C)) == (b"\2\0", b"\1\0")
+    assert [ask(0x75, mode) for mode in (0, 1)] == [bytes([STANDARD_REPLY]), bytes([EXPRESS_REPLY])]
+    assert [ask(0x7F, mode) for mode in (0, 1)] == [b"Standard\0", b"Express\0"]
+    assert struct.unpack("<I", ask(0x71, 1)) == (250 * 256,)

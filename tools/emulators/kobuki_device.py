@@ -3,7 +3,6 @@
 import math
 import struct
 from collections.abc import Iterator
-from types import MappingProxyType
 
 from .world import Feed, Pose, WorldClock
 
@@ -89,7 +88,23 @@ class WheeledDevice:
 
 
 class KobukiDevice(WheeledDevice):
-    """A Kobuki: fifty feedback packets a second."""
+    """A Kobuki: fifty feedback packets a second; versions, serial number and gains where they are asked for."""
+
+    _input = b""
+    _asked: tuple[tuple[int, bytes], ...] = ()
+
+    def receive(self, data: bytes, now: float) -> bytes:
+        """Take commands; what they ask for comes with the next packet."""
+        self._input += data
+        while (at := self._input.find(b"\xaa\x55")) >= 0 and len(self._input) >= at + 4 + (self._input + b"\0\0\0")[at + 2]:
+            payload = self._input[at + 3 : at + 3 + self._input[at + 2]]
+            self._input = self._input[at + 4 + len(payload) :]
+            asked = {0x0A: b"\4\0\1\0", 0x0B: b"\0\2\1\0", 0x13: bytes(12)}
+            if payload[:2] == b"\x09\x02":
+                self._asked += tuple((kind, asked[kind]) for bit, kind in ((1, 0x0A), (2, 0x0B), (8, 0x13)) if payload[2] & bit)
+            elif payload[:1] == b"\x0e":
+                self._asked += ((0x15, struct.pack("<B3I", 0, 100_000, 100, 2000)),)
+        return b""
 
     def encode(self, ms: int, left: int, right: int, theta: float, turn_rate: float) -> bytes:
         """Return a feedback packet."""
@@ -103,7 +118,9 @@ class KobukiDevice(WheeledDevice):
             (0x06, b"\x05\x05"),
             (0x0D, struct.pack("<BB6h", self._sent & 0xFF, 6, 0, 0, rate, 0, 0, rate)),
             (0x10, struct.pack("<H4H6x", 0, 4095, 4095, 4095, 4095)),
+            *self._asked,
         ]
+        self._asked = ()
         return encode_packet(subs)
 
 
@@ -113,7 +130,8 @@ class Create2Device(WheeledDevice):
     PERIOD = 0.015
     METRES_PER_TICK = math.pi * 0.072 / 508.8
     WHEEL_BASE = 0.235
-    SIZES = MappingProxyType({7: 1, 22: 2, 43: 2, 44: 2})
+    WORDS = (19, 20, 22, 23, 25, 26, 27, 28, 29, 30, 31, 33, 39, 40, 41, 42, 43, 44, 46, 47, 48, 49, 50, 51, 54, 55, 56, 57)
+    """Packets of two bytes; the others, of 7 to 58, have one."""
 
     def power_up(self, now: float) -> None:
         """The port was opened again; a stream that was asked for goes on."""
@@ -144,8 +162,8 @@ class Create2Device(WheeledDevice):
 
     def encode(self, ms: int, left: int, right: int, theta: float, turn_rate: float) -> bytes:
         """Return a frame of the stream."""
-        values = {7: 0, 22: 15800, 43: left & 0xFFFF, 44: right & 0xFFFF}
-        body = b"".join(bytes([p]) + values[p].to_bytes(self.SIZES[p], "big") for p in self.packets)
+        values = {22: 15800, 43: left & 0xFFFF, 44: right & 0xFFFF}
+        body = b"".join(bytes([p]) + values.get(p, 0).to_bytes(1 + (p in self.WORDS), "big") for p in self.packets)
         frame = bytes((19, len(body))) + body
         return frame + bytes([-sum(frame) & 0xFF])
 

@@ -195,7 +195,7 @@ class SlamtecDevice(SpinningDevice):
     INFO = struct.pack("<BBBB16s", 0x18, 29, 1, 7, bytes(range(16)))
     COMMANDS: Mapping[int, tuple[bytes, str]] = MappingProxyType({})
     """Command -> reply and what it does: "stop", the name of a stream, or ""."""
-    WITH_PAYLOAD = (0x82, 0xF0)
+    WITH_PAYLOAD = (0x82, 0x84, 0xF0)
 
     def __init__(self, world, clock, *, health: bytes = b"\0\0\0", **options) -> None:
         self.health = health
@@ -243,6 +243,20 @@ class SlamtecDevice(SpinningDevice):
         """Begin a stream."""
 
 
+def scan_mode_reply(entry: int, mode: int) -> bytes:
+    """Answer GET_LIDAR_CONF, which units have from firmware 1.24 and the maker's SDK asks: mode 0 standard, 1 express."""
+    microseconds, reply, name = ((500, 0x81, b"Standard"), (250, 0x82, b"Express"))[mode == 1]
+    values = {
+        0x70: struct.pack("<H", 2),  # number of modes
+        0x71: struct.pack("<I", microseconds << 8),
+        0x74: struct.pack("<I", 12 << 8),  # m
+        0x75: bytes([reply]),
+        0x7C: struct.pack("<H", 1),  # the usual mode
+        0x7F: name + b"\0",
+    }
+    return slamtec_reply(0x20, struct.pack("<I", entry) + values[entry]) if entry in values and mode < 2 else b""
+
+
 class RpLidarDevice(SlamtecDevice):
     """RPLIDAR A1."""
 
@@ -260,6 +274,11 @@ class RpLidarDevice(SlamtecDevice):
 
     def __init__(self, world, clock, *, speed: float = 5.5, **options) -> None:
         super().__init__(world, clock, speed=speed, **options)
+
+    def _obey(self, command: int, whole: bytes, now: float) -> bytes:
+        if command == 0x84 and not self.streaming:
+            return scan_mode_reply(*struct.unpack_from("<IH", whole[3:-1].ljust(6, b"\0")))
+        return super()._obey(command, whole, now)
 
     def begin(self) -> None:
         """Begin a stream; standard scan has half the rate."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from .clock_map import ClockMap
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, Send
 from .framing import FixedPackets
-from .odometer import BaseDriver, WheelOdometer
+from .odometer import BaseDriver, WheelOdometer, wrapped
 from .session import Script, Wait
 
 BAUD = 115200
@@ -118,9 +118,10 @@ class Create2Driver(BaseDriver):
         pause = event.stamp - last.stamp if last is not None else 0.0
         if pause > STALL:
             actions.append(Lost(stamp, round(pause / PERIOD) - 1))
-        if pause > MAX_BLIND:
+        if last is not None and (pause > MAX_BLIND or _moved(last, event) > MAX_SPEED * max(pause, STALL)):
             self._odometer.forget()
-            actions.append(self.gap(f"sent nothing for {pause:.1f} s, the pose is held: its motion"))
+            why = f"sent nothing for {pause:.1f} s" if pause > MAX_BLIND else "restarted"
+            actions.append(self.gap(f"{why}, the pose is held: its motion"))
         travel, turn = self._odometer.update(event.left, event.right)
         actions += self.state(event.wheel_drop, event.voltage)
         elapsed = max(pause, PERIOD)
@@ -137,3 +138,9 @@ class Create2Driver(BaseDriver):
     def stop(self) -> list[Action]:
         """Pause the stream."""
         return [Send(PAUSE)]
+
+
+def _moved(last: Encoders, event: Encoders) -> float:
+    """Return how far the wheels turned between two frames, m; more than they can means that the counts began again."""
+    ticks = (event.left - last.left, event.right - last.right)
+    return max(abs(wrapped(difference, MODULUS)) for difference in ticks) * TICK

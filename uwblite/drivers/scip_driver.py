@@ -163,7 +163,7 @@ class ScipDriver(ScipUnit):
         for rate in FAST_RATES:
             if rate <= self.baud or rate in self._rates_tried:
                 continue
-            self._rates_tried.add(rate)
+            self._rates_tried.add(rate)  # until it has proved itself
             command = rate_command(rate)
             reply = yield from self.ask(command, lambda e: isinstance(e, Reply) and e.command[:2] == "SS", PATIENCE)
             if reply is None or status_meaning("SS", reply.status)[0] != "ok":
@@ -175,6 +175,7 @@ class ScipDriver(ScipUnit):
                 continue
             text = f"lidar: scans did not fit a line of {self.baud} bit/s; it now runs at {rate}"
             self.baud = rate
+            self._rates_tried.discard(rate)
             yield Note("info", "lidar-faster-line", text)
             return True
         return False
