@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.lidar.clouds import CloudConfig, build, make_cloud, two_sided
+from uwblite.lidar.clouds import CloudConfig, build, make_cloud
 from uwblite.odometry.attached import ScanPoints
 
 EVERYTHING = CloudConfig(voxel=0.1, normal_radius=0.3, min_neighbours=0)
@@ -135,16 +135,6 @@ def test_normals_point_to_the_viewpoint_in_any_frame():
         pose = np.array([3.0, -2.0, 2.5])
         cloud = make_cloud(se2.transform(pose, wall), se2.transform(pose, np.array([1.0, side])))
         assert (se2.rotate(-pose[2], cloud.normals)[:, 1] * side > 0.9).all()
-
-
-def test_a_two_sided_cloud_has_each_point_with_either_normal():
-    cloud = make_cloud(np.random.default_rng(5).uniform(0.0, 3.0, (100, 2)), np.ones(2))
-    both = two_sided(cloud)
-    assert both.offsets.tolist() == [0, 200]
-    for half, sign in ((slice(0, 100), 1.0), (slice(100, 200), -1.0)):
-        np.testing.assert_array_equal(both.points[half], cloud.points)
-        np.testing.assert_array_equal(both.normals[half], sign * cloud.normals)
-        np.testing.assert_array_equal(both.normal_variance[half], cloud.normal_variance)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])

@@ -117,3 +117,19 @@ def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> Ints:
     if not len(raster.nearest):
         return np.full(x.shape, NOBODY, dtype=np.int64)
     return np.where(inside, raster.nearest.take(cell), NOBODY).astype(np.int64)
+
+
+def surface_field(clouds: Clouds, raster: CloudRasters, spread: float) -> NDArray[np.complex64]:
+    """Return exp(-d^2 / 2 spread^2) times the nearest normal as a complex number for every cell of cloud 0's raster.
+
+    d is the distance from the cell's centre to the point that the raster names; 0 where it names none.
+    """
+    wide, high = raster.shape[0].tolist()
+    nearest = raster.nearest[: wide * high].astype(np.int64)
+    cells = np.flatnonzero(nearest >= 0)
+    own = nearest[cells]
+    centre = raster.origin[0] + (np.column_stack([cells // high, cells % high]) + 0.5) * raster.cell
+    square = np.sum((centre - clouds.points[own]) ** 2, axis=1)
+    field = np.zeros(len(nearest), np.complex64)
+    field[cells] = np.exp(-0.5 * square / spread**2) * (clouds.normals[own, 0] + 1j * clouds.normals[own, 1])
+    return field

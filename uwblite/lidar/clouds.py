@@ -154,12 +154,6 @@ _STRAIGHT = 0.6
 """Least linearity of a line through single points."""
 
 
-def two_sided(cloud: Clouds) -> Clouds:
-    """Return one cloud with every point twice, once with either normal: of a source seen from an unknown side one matches."""
-    normals = np.concatenate([cloud.normals, -cloud.normals])
-    return _one(np.tile(cloud.points, (2, 1)), normals, np.tile(cloud.normal_variance, 2))
-
-
 def _one(points: Floats, normals: Floats, variance: Floats) -> Clouds:
     return Clouds(np.array([0, len(points)]), points, normals, np.zeros(len(points), dtype=np.int32), variance)
 

@@ -19,7 +19,7 @@ from scipy import fft
 from .. import se2
 from ..arrays import Floats, Ints
 from ..config import setting
-from .cloud_rasters import rasterize
+from .cloud_rasters import rasterize, surface_field
 from .clouds import Clouds
 
 Singles = NDArray[np.float32]
@@ -63,7 +63,6 @@ def search(
     T_target_source: Floats,
     window: tuple[float, float, float],
     config: CorrelativeConfig | None = None,
-    oriented: bool = True,
 ) -> SearchResult:
     """Score every pose of a grid around a guess and return the best few.
 
@@ -72,14 +71,13 @@ def search(
     target, source : one cloud each, in its own frame.
     T_target_source : (3,) centre of the grid; m, m, rad.
     window : half widths of the grid in x, y, m, and heading, rad.
-    oriented : the normals point to the sides from which the surfaces were seen, and must agree.
 
     Returns
     -------
     SearchResult; without candidates where nothing fits at all.
     """
     config = config or CorrelativeConfig()
-    scores, headings, shift_x, shift_y = score_grid(target, source, T_target_source, window, config, oriented)
+    scores, headings, shift_x, shift_y = score_grid(target, source, T_target_source, window, config)
     found = _peaks(scores, config)
     poses = np.stack(
         [
@@ -98,7 +96,6 @@ def score_grid(
     T_target_source: Floats,
     window: tuple[float, float, float],
     config: CorrelativeConfig,
-    oriented: bool = True,
 ) -> tuple[Singles, Floats, Ints, Ints]:
     """Score every pose of the grid.
 
@@ -114,39 +111,27 @@ def score_grid(
     shift_x, shift_y = (np.arange(-n, n + 1) for n in half)
     scores = np.zeros((len(headings), len(shift_y), len(shift_x)), np.float32)
     if target.normals.any() and source.normals.any():
-        field, origin = _target_field(target, config, oriented)
+        raster = rasterize(target, config.resolution, _CELLS_PER_REACH * config.resolution)
+        field = surface_field(target, raster, config.spread).reshape(raster.shape[0]).T
         # Points that no shift brings onto the field are left out; of the rest none may wrap around onto it.
         shape = tuple(fft.next_fast_len(field.shape[k] + 2 * half[1 - k]) for k in (0, 1))
         spectrum = fft.fft2(field, shape)
         normals = source.normals[:, 0] + 1j * source.normals[:, 1]
-        weight = normals if oriented else (normals != 0.0).astype(complex)
         for k, heading in enumerate(headings):
-            image = _source_image(source, weight, heading, T_target_source, origin, field.shape, half, shape, config)
+            image = _source_image(source, normals, heading, T_target_source, raster.origin[0], field.shape, half, shape, config)
             product = np.conj(fft.fft2(image)) * spectrum
-            if oriented:
-                product *= np.complex64(np.exp(-1j * heading))
+            product *= np.complex64(np.exp(-1j * heading))
             rows = fft.ifft(product, axis=0)[shift_y]
             scores[k] = fft.ifft(rows, axis=1)[:, shift_x].real
         scores /= len(source.points)
     return scores, headings, shift_x, shift_y
 
 
-def _target_field(target: Clouds, config: CorrelativeConfig, oriented: bool) -> tuple[NDArray[np.complex64], Floats]:
-    """Return the field (rows, columns) and the place of its lower left corner, m."""
-    raster = rasterize(target, config.resolution, _CELLS_PER_REACH * config.resolution)
-    index, origin = raster.nearest.reshape(raster.shape[0]).T, raster.origin[0]
-    x, y = (origin[k] + (np.arange(raster.shape[0, k]) + 0.5) * config.resolution for k in (0, 1))
-    (near_x, near_y), (normal_x, normal_y) = target.points[index].T, target.normals[index].T
-    square = (x[:, None] - near_x) ** 2 + (y - near_y) ** 2
-    field = np.exp(-0.5 * np.minimum(square / config.spread**2, 200.0)).T * (index >= 0)
-    return (field * (normal_x + 1j * normal_y).T if oriented else field).astype(np.complex64), origin
-
-
 def _source_image(
-    source: Clouds, weight: NDArray[np.complex128], heading: float, guess: Floats, origin: Floats,
+    source: Clouds, normals: NDArray[np.complex128], heading: float, guess: Floats, origin: Floats,
     field: tuple[int, ...], half: list[int], shape: tuple[int, ...], config: CorrelativeConfig,
 ) -> NDArray[np.complex64]:
-    """Return the source turned to the heading and put at the guess, as weights in the cells of the target's field."""
+    """Return the source turned to the heading and put at the guess, its normals summed in the cells of the target's field."""
     c, s = np.cos(heading), np.sin(heading)
     x, y = source.points.T
     column = np.floor((c * x - s * y + guess[0] - origin[0]) / config.resolution).astype(np.int64)
@@ -154,8 +139,8 @@ def _source_image(
     inside = (column >= -half[0]) & (column < field[1] + half[0]) & (row >= -half[1]) & (row < field[0] + half[1])
     cell = (row[inside] % shape[0]) * shape[1] + column[inside] % shape[1]
     image = np.empty(shape[0] * shape[1], np.complex64)
-    image.real = np.bincount(cell, weight.real[inside], len(image))
-    image.imag = np.bincount(cell, weight.imag[inside], len(image))
+    image.real = np.bincount(cell, normals.real[inside], len(image))
+    image.imag = np.bincount(cell, normals.imag[inside], len(image))
     return image.reshape(shape)
 
 

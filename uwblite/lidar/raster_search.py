@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Floats, Ints
-from .cloud_rasters import CloudRasters
+from .cloud_rasters import CloudRasters, surface_field
 from .clouds import Clouds
 
 _LEAST_SHARE = 0.5
@@ -50,7 +50,7 @@ def best_poses(clouds: Clouds, raster: CloudRasters, rows: Ints, guess: Floats, 
     """
     if not len(rows) or not raster.shape[0].prod():
         return np.zeros((0, 3))
-    field, (wide, high) = _field(clouds, raster, window.spread), raster.shape[0].tolist()
+    field, (wide, high) = surface_field(clouds, raster, window.spread), raster.shape[0].tolist()
     turns, half = int(np.ceil(window.angle / window.angle_step)), int(np.ceil(window.distance / raster.cell))
     shift = np.arange(-half, half + 1)
     headings = guess[2] + np.arange(-turns, turns + 1) * window.angle_step
@@ -66,19 +66,6 @@ def best_poses(clouds: Clouds, raster: CloudRasters, rows: Ints, guess: Floats, 
         scores[n] = ((normals * np.complex64(np.exp(-1j * heading))) @ seen).real.reshape(scores.shape[1:])
     best = _maxima(scores, count)
     return np.column_stack([guess[:2] + shift[best[:, 1:]] * raster.cell, headings[best[:, 0]]])
-
-
-def _field(clouds: Clouds, raster: CloudRasters, spread: float) -> NDArray[np.complex64]:
-    """Return exp(-d^2 / 2 spread^2) times the nearest normal as a complex number for every cell of cloud 0's raster."""
-    wide, high = raster.shape[0].tolist()
-    nearest = raster.nearest[: wide * high].astype(np.int64)
-    cells = np.flatnonzero(nearest >= 0)
-    own = nearest[cells]
-    centre = raster.origin[0] + (np.column_stack([cells // high, cells % high]) + 0.5) * raster.cell
-    square = np.sum((centre - clouds.points[own]) ** 2, axis=1)
-    field = np.zeros(len(nearest), np.complex64)
-    field[cells] = np.exp(-0.5 * square / spread**2) * (clouds.normals[own, 0] + 1j * clouds.normals[own, 1])
-    return field
 
 
 def _maxima(scores: NDArray[np.float32], count: int) -> Ints:
