@@ -13,6 +13,13 @@ from .. import se2
 from ..arrays import Bools, Floats
 from ..lidar.columns import Landmarks
 
+REACH = 4.0
+"""Distance up to which a column or a wall counts as visible, m: the reach of a URG-04LX."""
+_MOST_OBSERVATIONS = 200
+"""Observations used of each column, evenly spread over the path."""
+_STEP = 0.05
+"""Spacing of samples on true surfaces, m: a cell of the map."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkErrors:
@@ -57,9 +64,6 @@ def landmark_errors_along(
     true_poses: Floats,
     poses: Floats,
     pairs: tuple[tuple[str, str], ...] | None = None,
-    *,
-    reach: float = 4.0,
-    most: int = 200,
 ) -> LandmarkErrors:
     """Compare distances between columns as a trajectory would draw them with the true ones.
 
@@ -71,14 +75,12 @@ def landmark_errors_along(
     truth : true columns, frame of the truth.
     true_poses, poses : (n, 3) T_truth_base and T_map_base at the same stamps.
     pairs : names; None = all pairs.
-    reach : m, distance up to which a column counts as visible.
-    most : observations used of each column, evenly spread.
     """
     observations = {}
     for name, place in zip(truth.names, truth.positions, strict=True):
         from_base = se2.transform(se2.inverse(true_poses), place)
-        seen = np.flatnonzero(np.hypot(*from_base.T) <= reach)
-        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(most, len(seen))).astype(np.int64))]
+        seen = np.flatnonzero(np.hypot(*from_base.T) <= REACH)
+        seen = seen[np.unique(np.linspace(0, len(seen) - 1, min(_MOST_OBSERVATIONS, len(seen))).astype(np.int64))]
         if len(seen):
             observations[name] = se2.transform(poses[seen], from_base[seen])
     return _distance_errors(observations, truth, pairs, tuple(name for name in truth.names if name not in observations))
@@ -109,8 +111,7 @@ def wall_errors(
     viewpoints: Floats,
     *,
     tolerance: float = 0.10,
-    reach: float = 4.0,
-    step: float = 0.05,
+    reach: float = REACH,
 ) -> WallErrors:
     """Compare occupied cells with the true surfaces.
 
@@ -121,9 +122,8 @@ def wall_errors(
     columns : (c, 3) m, x, y, radius of round ones.
     viewpoints : (v, 2) m, the true path; only surface that can be seen from it within `reach` m counts for the recall.
     tolerance : m.
-    step : m, spacing of the samples on the surfaces.
     """
-    surface = sample_surfaces(walls, columns, step)
+    surface = sample_surfaces(walls, columns, _STEP)
     if not len(occupied) or not len(surface):
         return WallErrors(tolerance, 0.0, 0.0)
     distance = cKDTree(surface).query(occupied)[0]

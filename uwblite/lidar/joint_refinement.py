@@ -96,14 +96,18 @@ class RefinementResult:
     summary: SolverSummary
 
 
-def surface_cells(clouds: Clouds, poses: Floats, size: float = 0.5) -> sparse.csr_matrix:
+_SURFACE_CELL = 0.5
+"""Size of a surface cell, m: about what a cloud's normal is the same over in a room."""
+
+
+def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
     """Return which surface cells (columns) each cloud (rows) sees; a cell is a square of the map and one of 8 facings."""
     usable = np.flatnonzero(np.any(clouds.normals != 0.0, axis=1))
     cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
     for first in range(0, len(usable), _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
         own = poses[clouds.owner[usable[part]]]
-        cell[part] = np.floor(se2.transform(own, clouds.points[usable[part]]) / size)
+        cell[part] = np.floor(se2.transform(own, clouds.points[usable[part]]) / _SURFACE_CELL)
         bearing = se2.bearing(se2.rotate(own[:, 2], clouds.normals[usable[part]]))
         facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
     cell -= cell.min(axis=0, initial=0)

@@ -201,12 +201,16 @@ def _reached(ways: Floats, here: int, most: float) -> int:
     return min(int(np.searchsorted(way, way[here] + most, "right")) for way in ways) - 1
 
 
-def velocity_at(odometry: Odometry, stamps: Floats, window: float = 0.1) -> Floats:
-    """Return the velocity (m, 3) of the base in its own frame at the stamps (m,), m/s, m/s, rad/s, over a time window, s."""
-    before = se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps - window)
-    after = se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps + window)
+_HALF_WINDOW = 0.1
+"""Time before and after a stamp over which the velocity is a mean, s: two readings of a base at 20 Hz."""
+
+
+def velocity_at(odometry: Odometry, stamps: Floats) -> Floats:
+    """Return the velocity (m, 3) of the base in its own frame at the stamps (m,), m/s, m/s, rad/s."""
+    before = se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps - _HALF_WINDOW)
+    after = se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps + _HALF_WINDOW)
     start, end = odometry.stamps[0], odometry.stamps[-1]
-    span = np.clip(stamps + window, start, end) - np.clip(stamps - window, start, end)
+    span = np.clip(stamps + _HALF_WINDOW, start, end) - np.clip(stamps - _HALF_WINDOW, start, end)
     motion = se2.log(se2.between(before, after))
     return np.where(span[:, None] > 0, motion / np.where(span > 0, span, 1.0)[:, None], 0.0)
 

@@ -10,7 +10,7 @@ from ..graph.range_edges import RangeEdges
 from .trilateration import TrilaterationConfig, trilaterate
 
 
-def place_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> tuple[Graph, tuple[int, ...]]:
+def place_anchors(graph: Graph) -> tuple[Graph, tuple[int, ...]]:
     """Return the graph with a position for each anchor that has none, and the anchors that could not be placed.
 
     The poses are taken as they are; anchors without a position are found from their ranges alone (trilateration.trilaterate).
@@ -22,7 +22,7 @@ def place_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> tu
     anchors, lost = graph.anchors.copy(), []
     for anchor in missing.tolist():
         positions, ranges = _distances_to(graph, anchor)
-        found = trilaterate(positions, ranges, config or TrilaterationConfig())
+        found = trilaterate(positions, ranges, TrilaterationConfig())
         anchors[anchor] = found[0].position if found else 0.0
         if not found:
             lost.append(anchor)
@@ -32,7 +32,7 @@ def place_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> tu
     return replace(graph, anchors=anchors, fixed_anchors=fixed, edges=edges), tuple(lost)
 
 
-def search_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> Graph | None:
+def search_anchors(graph: Graph) -> Graph | None:
     """Return the graph with anchors put where their ranges alone cost less from these poses, None where none does.
 
     An anchor that starts far away, or on the wrong side of a path, can end in a local minimum and bend the path there; the
@@ -43,7 +43,7 @@ def search_anchors(graph: Graph, config: TrilaterationConfig | None = None) -> G
         if fixed is not None and fixed[anchor]:
             continue
         own = replace(graph, edges=tuple(e.rows(e.anchor == anchor) for e in graph.edges if isinstance(e, RangeEdges)))
-        found = trilaterate(*_distances_to(own, anchor), config or TrilaterationConfig())
+        found = trilaterate(*_distances_to(own, anchor), TrilaterationConfig())
         places = [graph.anchors[anchor], *(h.position for h in found)]
         costs = [_moved(own, anchor, place).chi2() for place in places]
         anchors[anchor] = places[int(np.argmin([(1.0 - _CLEARLY) * costs[0], *costs[1:]]))]

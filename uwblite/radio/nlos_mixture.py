@@ -102,10 +102,10 @@ def fit(errors: Floats, least_sigma: float) -> RangeMixture:
     return RangeMixture(centre, sigma, tail, detour, wild, width)
 
 
-def shortest_half(values: Floats, share: float = 0.5) -> tuple[float, float]:
-    """Return middle and normal-equivalent standard deviation of the shortest interval with this share of the values (m,)."""
+def shortest_half(values: Floats) -> tuple[float, float]:
+    """Return middle and normal-equivalent standard deviation of the shortest interval with half of the values (m,)."""
     order = np.sort(values)
-    inside = max(int(np.ceil(share * len(order))), 1)
+    inside = max(int(np.ceil(0.5 * len(order))), 1)
     spans = order[inside - 1 :] - order[: len(order) - inside + 1]
     first = int(np.argmin(spans))
     return float(order[first : first + inside].mean()), float(spans[first]) / (2.0 * 0.6745)

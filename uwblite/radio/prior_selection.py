@@ -68,7 +68,7 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
         return graph
     mean, before = graph.calibration.values[which], sigma[which]
     units, odds, hypothesis = _units(radios, len(groups[1]), config)
-    biases = np.array(_between(config.range_bias_sound, config.range_bias, _STEPS) if len(groups[2]) else [1.0])
+    biases = np.array(_between(config.range_bias_sound, config.range_bias) if len(groups[2]) else [1.0])
     tried = [[np.append(unit, np.full(len(groups[2]), bias)) for bias in biases] for unit in units]
     worth = np.array([[log_marginal_likelihood(mean, covariance, before, widths) for widths in row] for row in tried])
     if not np.isfinite(worth).any():
@@ -108,7 +108,7 @@ def _units(radios: int, wheels: int, config: CalibrationConfig) -> tuple[Floats,
     -------
     Widths (h, radios + wheels), their logarithmic odds (h,), and numbers of hypotheses (h,).
     """
-    scales = _between(config.range_scale_sound, config.range_scale, _STEPS) if radios else [1.0]
+    scales = _between(config.range_scale_sound, config.range_scale) if radios else [1.0]
     right = np.full(wheels, config.odometry_scale)
     units = [np.append(np.full(radios, scale), right) for scale in scales]
     odds = [1.0, *np.full(len(scales) - 1, _OFF / max(len(scales) - 1, 1))]
@@ -147,8 +147,8 @@ def log_marginal_likelihood(mean: Floats, covariance: Floats, before: Floats, af
     return float(0.5 * (gain - spread - determinant) - np.sum(np.log(after / before)))
 
 
-def _between(low: float, high: float, steps: int) -> Sequence[float]:
-    return [high] if not 0.0 < low < high else np.geomspace(low, high, steps).tolist()
+def _between(low: float, high: float) -> Sequence[float]:
+    return [high] if not 0.0 < low < high else np.geomspace(low, high, _STEPS).tolist()
 
 
 def _free(graph: Graph, name: str) -> Ints:

@@ -119,5 +119,9 @@ def text_of(notice: object) -> str:
     return str(notice.get("text", "")) if isinstance(notice, dict) else str(notice)
 
 
-def _listed(names: Sequence[str], most: int = 6) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
+
+
+_LISTED = 6
+"""Names that a line of advice shows."""
