@@ -9,6 +9,7 @@ from emulators.world import Pose, RoomWorld, WorldClock
 from helpers.driver_harness import check_transcript, feed_whole, of_kind, simulate
 
 from uwblite.drivers.create2 import MODULUS, TICK, WHEEL_BASE, Create2Driver, Create2Protocol, Encoders, WheelOdometer
+from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, Lost, Note, OdometryPose
 
 RNG = random.Random(2)
@@ -150,3 +151,7 @@ def test_it_streams_whatever_packets_a_host_asks_for():
     assert sum(frame) % 256 == 0
     places = [2 + sum(sizes[:k]) + k for k in range(len(packets))]
     assert bytes(frame[place] for place in places) == packets
+
+
+def test_the_bit_rate_can_be_said():
+    assert [open_device("odometry", f"create2:port{more}")[0].baud for more in ("", "?baud=19200")] == [115200, 19200]

@@ -81,11 +81,11 @@ class Create2Driver(BaseDriver):
     Parameters
     ----------
     start : pose of the base at the first frame; m, m, rad.
+    baud : bit/s; a robot that was told so while it was switched on talks at 19200.
     """
 
-    baud = BAUD
-
-    def __init__(self, start: Pose = (0.0, 0.0, 0.0)) -> None:
+    def __init__(self, start: Pose = (0.0, 0.0, 0.0), baud: int = BAUD) -> None:
+        self.baud = baud
         super().__init__(Create2Protocol(), "iRobot Create 2", WheelOdometer(TICK, WHEEL_BASE, MODULUS, start), LOW_VOLTAGE)
         self._last: Encoders | None = None
         self._new_clock()

@@ -172,7 +172,8 @@ DEVICES = {
             silent="the base is silent: switch it on (its USB chip is powered by this computer, the base is not)",
         ),
         DeviceKind(
-            "create2", "odometry", "iRobot Create 2, Roomba 500 to 900", lambda _o, setup: Create2Driver(setup.start),
+            "create2", "odometry", "iRobot Create 2, Roomba 500 to 900",
+            lambda options, setup: Create2Driver(setup.start, options.whole("baud", 115200, *BAUD)), options="baud",
             silent="the base is silent: press its power button, check the cable (115200 bit/s, 5 V levels)",
         ),
         DeviceKind(
