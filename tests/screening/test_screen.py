@@ -61,6 +61,17 @@ def test_without_lidar_ranges_show_that_wheels_stand_still_and_the_map_is_doubte
     assert kinds(done, doubts=True) == {"wheels-stand-still"}
 
 
+def test_ranges_show_it_as_well_while_the_lidar_is_silent(sound):
+    log = frozen(sound, 130.0, 150.0)
+    silent = replace(log, scans=log.scans.rows((log.scans.stamps < 120.0) | (log.scans.stamps > 160.0)))
+    done = screen(silent)
+    assert kinds(done, doubts=True) == {"wheels-stand-still"}
+    unknown = done.screening.breaks.stamps
+    assert unknown.min() > 129.0
+    assert unknown.max() < 150.0
+    assert not kinds(screen(silent.without(uwb=True)), doubts=True)
+
+
 def test_a_robot_that_stands_has_no_lost_wheels(sound):
     rests = 0.05 * np.arange(400)
     stamps = np.concatenate([100.0 + rests, sound.odometry.stamps + 20.0])

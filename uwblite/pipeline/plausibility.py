@@ -18,6 +18,7 @@ from .estimate import Estimate, Task
 from .half_tests import check_halves
 from .residual_tests import check_residuals
 from .turn_checks import check_turn_scales
+from .untied_parts import check_untied_parts
 
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate is worth a warning."""
@@ -52,6 +53,7 @@ def judge(
     else:
         check_residuals(estimate, np.zeros(0), task)
     check_halves(estimate, task)
+    check_untied_parts(estimate, task)
     check_handedness(estimate, task)
     check_turn_scales(estimate, task)
     check_fit(task)

@@ -39,11 +39,13 @@ def excess(log: SensorLog, start: float, end: float) -> float:
         noise = _noise(ranges)
         before, after = ranges[stamps <= start][-_WINDOW:], ranges[stamps >= end][:_WINDOW]
         inside = ranges[(stamps > start) & (stamps < end)]
-        chunks = [np.median(part) for part in (before, *_chunks(inside), after) if len(part) >= _WINDOW]
-        # Where the readings stand that are compared, the robot may have driven a little.
+        within = [np.median(part) for part in _chunks(inside) if len(part) >= _WINDOW]
+        ends = [np.median(part) for part in (before, after) if len(part) >= _WINDOW]
+        # Where the readings before and after stand, the robot may have driven a little.
         extra = _way(log, stamps[stamps <= start][-_WINDOW:]) + _way(log, stamps[stamps >= end][:_WINDOW])
-        if len(chunks) >= 2:
-            found.append(float(np.ptp(chunks)) - _way(log, np.array([start, end])) - extra - _MARGIN - _TIMES_NOISE * noise)
+        changes = [np.ptp(chunks) - more for chunks, more in ((within, 0.0), (within + ends, extra)) if len(chunks) >= 2]
+        if changes:
+            found.append(float(max(changes)) - _way(log, np.array([start, end])) - _MARGIN - _TIMES_NOISE * noise)
     return _agreed(found)
 
 
@@ -107,7 +109,7 @@ def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:
 
 
 def _chunks(values: Floats) -> list[Floats]:
-    return np.array_split(values, max(1, len(values) // (2 * _WINDOW)))
+    return np.array_split(values, max(1, min(2, len(values) // _WINDOW), len(values) // (2 * _WINDOW)))
 
 
 def _noise(ranges: Floats) -> float:

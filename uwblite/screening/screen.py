@@ -22,6 +22,8 @@ _ANYWHERE = (20.0, 20.0, 3.0)
 """Standard deviation of a step that nothing measured, m, m, rad."""
 _STEP = 2.0
 """Time between the steps of lost wheels, where no lidar stands in for them, s."""
+_LONG_STAND = 5.0
+"""Stand of the wheels, s, that ranges are asked about where no lidar sees it."""
 _APART = 3.0
 """A cut so near in time to another break is the same, s."""
 UNKNOWN = 3.0
@@ -196,18 +198,18 @@ def _without(log: SensorLog, silent: list[tuple[float, float]]) -> SensorLog:
 def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs | None, OdometryBreaks, list[Remark]]:
     """Find stretches in which the wheels stand and other sensors move, and put something in their place."""
     start = float(log.odometry.stamps[0])
-    if pairs is None:
-        stretches = [(a, b) for a, b in wheel_motion.standing(log.odometry, 5.0) if range_motion.excess(log, a, b) > 0.0]
-        text = "the trajectory there rests on ranges alone"
-        remarks = [replace(_lost_remark(a - start, b - start, text), doubt=True) for a, b in stretches]
-        return log, None, _unknown_steps(log.odometry, stretches), remarks
-    stretches = wheel_motion.lost(log, pairs)
+    unseen = [s for s in wheel_motion.standing(log.odometry, _LONG_STAND) if pairs is None or not wheel_motion.seen(pairs, *s)]
+    unseen = [(a, b) for a, b in unseen if range_motion.excess(log, a, b) > 0.0]
+    text = "the trajectory there rests on ranges alone"
+    remarks = [replace(_lost_remark(a - start, b - start, text), doubt=True) for a, b in unseen]
+    unknown = _unknown_steps(log.odometry, unseen)
+    stretches = [] if pairs is None else wheel_motion.lost(log, pairs)
     if not stretches:
-        return log, pairs, OdometryBreaks.none(), []
+        return log, pairs, unknown, remarks
     odometry, breaks = replaced_wheels.replaced(log, stretches)
-    remarks = [_lost_remark(a - start, b - start, "the motion from scan to scan stands in for them") for a, b in stretches]
+    remarks += [_lost_remark(a - start, b - start, "the motion from scan to scan stands in for them") for a, b in stretches]
     log = replace(log, odometry=odometry)
-    return log, wheel_motion.compare(log), breaks, remarks
+    return log, wheel_motion.compare(log), OdometryBreaks.of_all([unknown, breaks]), remarks
 
 
 def _lost_remark(a: float, b: float, outcome: str) -> Remark:

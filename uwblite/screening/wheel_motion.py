@@ -133,13 +133,27 @@ def _wheels(odometry: Odometry, middle: Floats, first: Ints, second: Ints) -> Fl
     return se2.between(*at)
 
 
+def seen(pairs: Pairs, start: float, end: float) -> bool:
+    """Return whether scans show if the robot moves between two times, s."""
+    return int(_within(pairs, start, end).sum()) >= _FEW
+
+
+def _within(pairs: Pairs, start: float, end: float) -> Bools:
+    """Return which pairs (e,) measure a motion between two times, s."""
+    return pairs.measured & (pairs.start >= start) & (pairs.end <= end)
+
+
+_FEW = 3
+"""Pairs of scans below which nothing is shown."""
+
+
 def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
     """Return the stretches in which the wheels stand and the scans move."""
     moving = (np.hypot(*pairs.lidar[:, :2].T) > _SEEN_MOVING[0]) | (np.abs(pairs.lidar[:, 2]) > _SEEN_MOVING[1])
     found = []
     for a, b in standing(log.odometry):
-        own = pairs.measured & (pairs.start >= a) & (pairs.end <= b)
-        if own.sum() < 3 or np.mean(moving[own]) <= _MOST:
+        own = _within(pairs, a, b)
+        if own.sum() < _FEW or np.mean(moving[own]) <= _MOST:
             continue
         if np.mean(_not_at_rest(log, pairs.rows(own & moving))) * np.mean(moving[own]) > _MOST:
             found.append((a, b))

@@ -1,0 +1,96 @@
+"""Is there a moment that neither scans, closures nor anchors tie to what came before it?
+
+Where the lidar is silent while the robot drives, or where all anchors give way to others at once, the odometry alone lays
+the later part of the map onto the earlier one. Whatever went wrong with it meanwhile (wheels that stood still, a log that
+goes on in another building) leaves no residual.
+"""
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from ..graph.graph import Graph
+from ..graph.pose_edges import RelativePoseEdges, ScanEdges
+from ..graph.range_edges import RangeEdges
+from .estimate import Estimate, Task
+from .recordings import Recording
+
+_SILENT, _DRIVEN = 10.0, 3.0
+"""Time without any scan, s, and way meanwhile, m, after which the odometry may be anywhere where it failed."""
+_PART = 6
+"""Keyframes of a part that is worth a word."""
+_ANCHORS, _HEARD = 2, 3
+"""Anchors that hold two parts to each other, and ranges to one of them in each part."""
+_AT_ONCE = 10.0
+"""s; anchors that all fall silent, and others that all appear, within so much were not left behind one after the other."""
+
+
+def check_untied_parts(estimate: Estimate, task: Task) -> None:
+    """Doubt a map whose parts the odometry alone ties, where a sensor that should tie them broke off."""
+    ranges = estimate.ranges
+    alive = None if ranges is None else ranges.rows(np.flatnonzero(ranges.alive))
+    for recording in task.recordings.each:
+        stamps = recording.frames.stamps
+        breaks = _without_scans(recording) if recording.has_scans else _exchanged(recording, alive)
+        for before, after in breaks:
+            first = recording.rows.start + int(np.searchsorted(stamps, before, "right"))
+            last = recording.rows.start + int(np.searchsorted(stamps, after))
+            sizes = first - recording.rows.start, recording.rows.stop - last
+            if min(sizes) < _PART or _tied(estimate.graph, alive, first, last):
+                continue
+            what = "the lidar is silent" if recording.has_scans else "all anchors give way to others"
+            task.stages.doubt(
+                "untied-parts",
+                f"from t = {before - stamps[0]:.0f} to {after - stamps[0]:.0f} s {what}, and neither scans nor anchors tie "
+                "what comes later to what was mapped before: both parts may be right, but how they lie to each other rests on "
+                "the odometry alone; drive through the first part once more, or map the parts on their own",
+                start=before, end=after,
+            )  # fmt: skip
+
+
+def _without_scans(recording: Recording) -> list[tuple[float, float]]:
+    """Return the times in which a robot that drives has no scans."""
+    scans, odometry = recording.log.scans, recording.log.odometry
+    if scans is None or len(scans.stamps) < 2:
+        return []
+    way = np.diff(np.interp(scans.stamps, odometry.stamps, odometry.travelled))
+    at = np.flatnonzero((np.diff(scans.stamps) > _SILENT) & (way > _DRIVEN))
+    return [(float(scans.stamps[k]), float(scans.stamps[k + 1])) for k in at.tolist()]
+
+
+def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[float, float]]:
+    """Return the times at which several anchors fall silent for good and several others appear."""
+    if ranges is None or not len(ranges):
+        return []
+    own = ranges.rows(np.flatnonzero((ranges.pose >= recording.rows.start) & (ranges.pose < recording.rows.stop)))
+    order = np.argsort(own.stamps, kind="stable")
+    stamps, anchor = own.stamps[order], own.anchor[order]
+    _, appears = np.unique(anchor, return_index=True)
+    _, from_end = np.unique(anchor[::-1], return_index=True)
+    silent = len(anchor) - 1 - from_end
+    # No anchor is heard both up to and after range k.
+    spans = np.zeros(len(anchor) + 1, dtype=np.int64)
+    np.add.at(spans, appears, 1)
+    np.add.at(spans, silent, -1)
+    at = np.flatnonzero(np.cumsum(spans)[: len(anchor)] == 0)[:-1]
+    return [(float(stamps[k]), float(stamps[k + 1])) for k in at.tolist() if _suddenly(stamps, anchor, k)]
+
+
+def _suddenly(stamps: Floats, anchor: Ints, k: int) -> bool:
+    """Return whether several anchors are heard shortly before a range and several shortly after the next."""
+    before = (stamps > stamps[k] - _AT_ONCE) & (stamps <= stamps[k])
+    after = (stamps > stamps[k]) & (stamps < stamps[k + 1] + _AT_ONCE)
+    return min(len(np.unique(anchor[side])) for side in (before, after)) >= _ANCHORS
+
+
+def _tied(graph: Graph, ranges: RangeEdges | None, first: int, last: int) -> bool:
+    """Return whether scans, closures or enough anchors tie keyframes before the first to those from the last on."""
+    for edges in graph.edges:
+        if isinstance(edges, ScanEdges | RelativePoseEdges):
+            low, high = np.minimum(edges.i, edges.j), np.maximum(edges.i, edges.j)
+            if np.any((low < first) & (high >= last)):
+                return True
+    if ranges is None:
+        return False
+    parts = ranges.pose < first, ranges.pose >= last
+    counts = [np.bincount(ranges.anchor[part], minlength=len(graph.anchors)) for part in parts]
+    return int(np.sum(np.minimum(*counts) >= _HEARD)) >= _ANCHORS
