@@ -34,7 +34,7 @@ _STEPS = 4
 _WRONG_UNIT = 0.1
 """Odds beforehand that the wheels' unit of length is wrong, against all units being right."""
 _OFF = 1.0
-"""Odds beforehand that the radio's scale is off, by whatever order of magnitude, against being sound."""
+"""Odds beforehand that the radio's scale is off, by whatever order of magnitude, against being sound; and that biases are."""
 _CLEARLY = 3.0
 """Posterior odds from which on the scale is off and floats; positive evidence (Kass and Raftery, Bayes factors, 1995)."""
 _FARTHEST = 0.08
@@ -78,7 +78,8 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
         off = float(_mean_under(mean, covariance, before, tried[floats][0])[0])
         against = -np.inf if abs(off) > _FARTHEST else np.log(_TOO_SHORT) if off < _SHORT else 0.0
         odds = odds + np.where((hypothesis == 0) & (np.arange(len(odds)) > 0), against, 0.0)
-    likely = np.exp(worth + odds[:, None] - (worth + odds[:, None]).max())
+    worth = worth + odds[:, None] + np.log(_odds(len(biases)))
+    likely = np.exp(worth - worth.max())
     rows = hypothesis == np.argmax(np.bincount(hypothesis, likely.sum(axis=1)))
     likely, units = likely[rows], units[rows]
     sigma[which[:scales]] = _unit_widths(units, likely.sum(axis=1))
@@ -111,7 +112,7 @@ def _units(radios: int, wheels: int, config: CalibrationConfig) -> tuple[Floats,
     scales = _between(config.range_scale_sound, config.range_scale) if radios else [1.0]
     right = np.full(wheels, config.odometry_scale)
     units = [np.append(np.full(radios, scale), right) for scale in scales]
-    odds = [1.0, *np.full(len(scales) - 1, _OFF / max(len(scales) - 1, 1))]
+    odds = list(_odds(len(scales)))
     hypothesis = [0] * len(scales)
     if wheels and config.odometry_unit > config.odometry_scale:
         wrong = [np.arange(wheels) == k for k in range(wheels)]
@@ -120,6 +121,11 @@ def _units(radios: int, wheels: int, config: CalibrationConfig) -> tuple[Floats,
             odds.append(_WRONG_UNIT)
             hypothesis.append(number + 1)
     return np.array(units), np.log(odds), np.array(hypothesis)
+
+
+def _odds(widths: int) -> Floats:
+    """Return the odds (widths,) beforehand of the widths from sound to unsound."""
+    return np.append(1.0, np.full(widths - 1, _OFF / max(widths - 1, 1)))
 
 
 def _mean_under(mean: Floats, covariance: Floats, before: Floats, after: Floats) -> Floats:
