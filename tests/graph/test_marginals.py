@@ -9,6 +9,7 @@ from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge
 from uwblite.graph.marginals import CommonErrors, JointCovariance, calibration_covariance, marginals
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import optimize
+from uwblite.graph.variance_components import variances_of_kinds
 
 
 def dense_covariance(graph):
@@ -183,3 +184,52 @@ def test_common_errors_add_what_they_move_squared():
         np.testing.assert_allclose(other - one, own @ own.transpose(0, 2, 1), rtol=1e-6, atol=1e-12)
     own = np.square(moved[number["calibration"][:, 0]]).sum(axis=1)
     np.testing.assert_allclose(after.calibration**2 - before.calibration**2, own, rtol=1e-6, atol=1e-12)
+
+
+def dense_jacobian(graph):
+    """Return J (m, u) and r (m,) of all edges, whitened and weighted, and the rows of each table of edges."""
+    H, _, number = dense_system(graph)
+    rows, residuals, parts, first = [], [], [], 0
+    for edges in graph.edges:
+        lin, root = edges.linearize(graph), np.sqrt(edge_weights(edges, graph))
+        own = np.zeros((*lin.residuals.shape, len(H) + 1))
+        for name, index, jacobian in lin.blocks:
+            for e, numbers in enumerate(number[name][index]):
+                own[e][:, numbers] += root[e] * jacobian[e]
+        rows.append(own.reshape(-1, len(H) + 1)[:, :-1])
+        residuals.append((root[:, None] * lin.residuals).ravel())
+        parts.append(slice(first, first + lin.residuals.size))
+        first += lin.residuals.size
+    return np.concatenate(rows), np.concatenate(residuals), parts
+
+
+def test_common_errors_of_unknown_size_have_the_variances_that_the_residuals_show():
+    """Against dense P = 1 - J (J^T J)^-1 J^T: what is handed to the estimate, and that it scales each kind's share."""
+    graph, _ = calibrated(n=40)
+    graph = replace(graph, poses=graph.poses + 0.01 * np.random.default_rng(1).normal(size=graph.poses.shape))
+    edges, rng = graph.edges[1], np.random.default_rng(0)
+    edge, error = np.repeat(np.arange(len(edges)), 2), rng.permutation(2 * len(edges)) % 9
+    common = CommonErrors(edges, edge, error, rng.normal(size=(len(edge), 3)), np.arange(9) % 2)
+    jacobian, residuals, parts = dense_jacobian(graph)
+    shifts = np.zeros((len(edges), 3, 9))
+    np.add.at(shifts, (edge, slice(None), error), common.shift)
+    shifts *= np.sqrt(edge_weights(edges, graph))[:, None, None]
+    whole = np.zeros((len(residuals), 9))
+    whole[parts[1]] = shifts.reshape(-1, 9)
+    moved = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ whole)
+    seen = whole.T @ residuals - moved.T @ (jacobian.T @ residuals)
+    scales = variances_of_kinds(seen, whole.T @ whole - whole.T @ jacobian @ moved, common.kind)
+    before, after = marginals(graph), marginals(graph, [common])
+    _, _, number = dense_system(graph)
+    own = np.vstack([moved, np.zeros((1, 9))])[number["poses"]] * np.sqrt(scales[common.kind])
+    np.testing.assert_allclose(after.poses - before.poses, own @ own.transpose(0, 2, 1), rtol=1e-4, atol=1e-12)
+
+
+def test_redundancy_is_the_diagonal_of_the_dense_projection():
+    graph, _ = calibrated(n=40)
+    jacobian, _, parts = dense_jacobian(graph)
+    checked = 1.0 - np.einsum("mu,uv,mv->m", jacobian, np.linalg.inv(jacobian.T @ jacobian), jacobian)
+    found = marginals(graph)
+    for edges, part in zip(graph.edges, parts, strict=True):
+        np.testing.assert_allclose(found.redundancy(edges).ravel(), checked[part], atol=1e-7)
+    assert checked.sum() == pytest.approx(len(checked) - jacobian.shape[1])

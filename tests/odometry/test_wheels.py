@@ -16,7 +16,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.graph.solver import optimize
 from uwblite.odometry.keyframes import KeyframeConfig, select
-from uwblite.odometry.wheels import OdometryNoiseConfig, reestimate_wheel_noise, wheel_edges, with_floor_errors
+from uwblite.odometry.wheels import OdometryNoiseConfig, reestimate_wheel_noise, wheel_edges, with_noise_shown
 from uwblite.sensor_log import Odometry
 
 NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
@@ -122,10 +122,10 @@ def test_noise_does_not_draw_the_wheels_scale(calibration):
     assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])
 
 
-@pytest.mark.parametrize(("alike", "measured", "factor"), [(0.0, True, 1.0), (0.8, True, 2.0), (0.8, False, 1.0)])
-def test_floors_inflate_what_adds_up(alike, measured, factor):
+@pytest.mark.parametrize(("alike", "factor"), [(0.0, 1.0), (0.8, 2.0)])
+def test_floors_inflate_what_adds_up(alike, factor):
     """Half-and-half of white errors and of a floor alike over ten steps: the sum over ten steps from anywhere has about
-    0.36 + 0.64 * 10 * 2 / 3 = 4.6 times the variance of independent ones; nothing changes where no lidar saw it."""
+    0.36 + 0.64 * 10 * 2 / 3 = 4.6 times the variance of independent ones."""
     rng, n = np.random.default_rng(3), 2000
     floor = np.repeat(rng.standard_normal(n // 10), 10)
     turn = 0.01 * (np.sqrt(1.0 - alike**2) * rng.standard_normal(n) + alike * floor)
@@ -135,9 +135,33 @@ def test_floors_inflate_what_adds_up(alike, measured, factor):
     wheels = replace(wheels, motion=steps + turn[:, None] * [0.0, 0.0, 1.0])
     root, still = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
     seen = ScanEdges(np.arange(n), np.arange(1, n + 1), steps, root, still, still, scan_indices(Calibration()))
-    graph = Graph(truth).with_edges(wheels, *([seen] if measured else []))
-    inflated = with_floor_errors(graph)
+    graph = Graph(truth).with_edges(wheels, seen)
+    inflated = with_noise_shown(graph)
     assert inflated.poses is graph.poses
     ratio = wheels.sqrt_information[0].diagonal() / inflated.edges[0].sqrt_information[0].diagonal()
     np.testing.assert_allclose(ratio, [1.0, 1.0, factor], atol=0.25)
     assert np.all(ratio >= 1.0)
+
+
+@pytest.mark.parametrize("true", [0.4, 1.0, 2.5])
+def test_steps_that_no_lidar_measured_err_as_their_residuals_show(true):
+    """Steps that err so many times as much as stated, every second pose measured exactly: half of the residuals is checked."""
+    rng, n = np.random.default_rng(4), 400
+    truth = np.column_stack([0.3 * np.arange(n + 1), np.zeros(n + 1), np.zeros(n + 1)])
+    exact = chained(truth, (0.02, 0.01, 0.01))
+    wheels = replace(exact, motion=exact.motion + true * rng.standard_normal((n, 3)) * [0.02, 0.01, 0.01], kernel=SQUARED)
+    i, still = np.arange(0, n, 2), np.zeros((n // 2, 3))
+    steps, root = se2.between(truth[i], truth[i + 2]), np.tile(1e4 * np.eye(3), (n // 2, 1, 1))
+    pairs = ScanEdges(i, i + 2, steps, root, still, still, scan_indices(Calibration()))
+    graph = Graph(truth, fixed_poses=np.arange(n + 1) == 0).with_edges(wheels, pairs)
+    shown = with_noise_shown(optimize(graph)[0])
+    ratio = wheels.sqrt_information[0].diagonal() / shown.edges[0].sqrt_information[0].diagonal()
+    # 200 squares, of half of the variance each: known to a tenth, three times that is allowed.
+    np.testing.assert_allclose(ratio, true, rtol=0.15)
+
+
+def test_steps_that_nothing_checks_err_as_assumed():
+    truth = np.column_stack([0.3 * np.arange(41), np.zeros(41), np.zeros(41)])
+    wheels = chained(truth, (0.02, 0.01, 0.01))
+    shown = with_noise_shown(Graph(truth, fixed_poses=np.arange(41) == 0).with_edges(wheels))
+    np.testing.assert_allclose(shown.edges[0].sqrt_information, wheels.sqrt_information, rtol=1e-6)

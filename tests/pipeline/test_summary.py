@@ -11,6 +11,7 @@ from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.calibration import CalibrationConfig
 from uwblite.graph.marginals import marginals
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.wheels import with_noise_shown
 from uwblite.pipeline.mapping_config import preset
 from uwblite.sensor_log import SensorMounting
 
@@ -163,7 +164,7 @@ def test_calibration_that_is_switched_off_is_not_listed(run):
 def test_without_lidar_what_ranges_err_alike_is_stated(run):
     """Errors of 6 cm by direction and distance are in no residual; they count once in the sigmas."""
     result = run[-1]
-    unaware = marginals(result.graph)
+    unaware = marginals(with_noise_shown(result.graph))
     one, other = (np.einsum("kii->k", c[1:, :2, :2]) for c in (result.keyframe_covariances, unaware.poses))
     assert np.all(one > other)
     assert all(np.trace(a.covariance) > np.trace(c) for a, c in zip(result.anchors, unaware.anchors, strict=True))

@@ -16,6 +16,7 @@ from ..errors import SolverError
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
+from .variance_components import variances_of_kinds
 
 _COMMON_AT_ONCE = 32
 """Common errors solved for together: bounds the memory."""
@@ -38,6 +39,8 @@ class CommonErrors:
     """(m,) number of the error that it meets."""
     shift: Floats
     """(m, d) change of the edge's whitened residual by that error."""
+    kind: Ints | None = None
+    """(k,) kind of each error: those of one have one variance, of which 1 is a guess. None: all have 1."""
 
 
 class Marginals:
@@ -53,7 +56,7 @@ class Marginals:
         unseen = np.append(normal.diagonal <= 0, False)
         blocks = self._block_diagonal(unseen)
         for errors in common:
-            self._consider(errors, blocks)
+            self._consider(errors, normal.gradient, blocks)
         self.poses = blocks["poses"]
         """(n, 3, 3) of x, y, theta, map frame, m and rad."""
         self.anchors = blocks["anchors"]
@@ -61,18 +64,44 @@ class Marginals:
         self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
         """(c,) standard deviations, unit by name."""
 
-    def _consider(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
+    def _consider(self, common: CommonErrors, gradient: Floats, blocks: dict[str, Floats]) -> None:
         """Add to the covariances what errors that nothing estimates make: H^-1 J^T W s of each, squared.
 
-        These are the consider parameters of Schmidt (Application of state-space methods to navigation problems, 1966).
+        These are the consider parameters of Schmidt (Application of state-space methods to navigation problems, 1966). How
+        large the errors of each kind are, the residuals say, see variance_components.
         """
-        numbers, right = self._unknowns.number, self._slopes(common)
-        for first in range(0, right.shape[1], _COMMON_AT_ONCE):
-            some = right[:, first : first + _COMMON_AT_ONCE].toarray()
-            moves = np.concatenate([self._factor.solve(some), np.zeros((1, some.shape[1]))])
-            for name, block in blocks.items():
-                own = moves[numbers[name]]
-                block += own @ own.transpose(0, 2, 1)
+        slopes, (seen, products) = self._slopes(common), self._seen(common)
+        kind = np.zeros(slopes.shape[1], dtype=np.int64) if common.kind is None else common.kind
+        kinds = int(kind.max(initial=-1)) + 1
+        added = {name: np.zeros((kinds, *block.shape)) for name, block in blocks.items()}
+        for first in range(0, slopes.shape[1], _COMMON_AT_ONCE):
+            some = slice(first, first + _COMMON_AT_ONCE)
+            moves = self._factor.solve(slopes[:, some].toarray())
+            seen[some] -= moves.T @ gradient
+            products[:, some] -= slopes.T @ moves
+            self._square(moves, kind[some], added)
+        scales = np.ones(kinds) if common.kind is None else variances_of_kinds(seen, products, kind)
+        for name, block in blocks.items():
+            block += np.tensordot(scales, added[name], axes=1)
+
+    def _square(self, moves: Floats, kind: Ints, added: dict[str, Floats]) -> None:
+        """Add the squares of moves (size, k) of the unknowns to the covariances by kind."""
+        moves = np.concatenate([moves, np.zeros((1, moves.shape[1]))])
+        for name, number in self._unknowns.number.items():
+            for g in np.unique(kind):
+                own = moves[number][..., kind == g]
+                added[name][g] += own @ own.transpose(0, 2, 1)
+
+    def _seen(self, common: CommonErrors) -> tuple[Floats, Floats]:
+        """Return S^T W r (k,) and S^T W S (k, k)."""
+        edge, d = common.edge, common.shift.shape[1]
+        weights = edge_weights(common.edges, self._graph)
+        shape = (len(common.edges) * d, int(common.error.max(initial=-1)) + 1)
+        rows, columns = (edge[:, None] * d + np.arange(d)).ravel(), np.repeat(common.error, d)
+        shifts = sparse.csc_matrix((common.shift.ravel(), (rows, columns)), shape=shape)
+        weighted = shifts.multiply(np.repeat(weights, d)[:, None]).tocsc()
+        residuals = common.edges.residuals(self._graph).ravel()
+        return np.asarray(weighted.T @ residuals), np.asarray((weighted.T @ shifts).todense())
 
     def _slopes(self, common: CommonErrors) -> sparse.csc_matrix:
         """Return J^T W s of each error as a column."""
@@ -101,6 +130,23 @@ class Marginals:
         values[unseen[row] & (row == column)] = np.inf
         ends = np.cumsum([part.size for part in rows.values()])[:-1]
         return {name: v.reshape(rows[name].shape) for name, v in zip(numbers, np.split(values, ends), strict=True)}
+
+    def redundancy(self, edges: Edges) -> Floats:
+        """Return how far each residual (e, d) of some of the graph's edges is checked by all others: 0 not at all, 1 fully.
+
+        1 - w j H^-1 j^T for each row j of the Jacobian (W. Baarda, A testing procedure for use in geodetic networks, 1968):
+        the sum over residuals is what the sum of their squares is expected to be.
+        """
+        blocks = edges.linearize(self._graph).blocks
+        number = np.concatenate([self._unknowns.number[name][index] for name, index, _ in blocks], axis=1)
+        jacobian = np.concatenate([own for *_, own in blocks], axis=2)
+        row, column = np.broadcast_arrays(number[:, :, None], number[:, None, :])
+        free = (row >= 0) & (column >= 0)
+        covariance = np.zeros(row.shape)
+        covariance[free] = selected_inverse(self._factor, row[free], column[free])
+        explained = np.einsum("edk,ekl,edl->ed", jacobian, covariance, jacobian)
+        # Along open directions the covariance is round-off.
+        return np.clip(1.0 - edge_weights(edges, self._graph)[:, None] * explained, 0.0, 1.0)
 
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""

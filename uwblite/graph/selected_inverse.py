@@ -42,6 +42,8 @@ class _Front:
 def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
     """Return entries (k,) of the inverse of a symmetric matrix, at places (k,) where the matrix itself is not empty.
 
+    0 where it holds a zero that its factor need not fill.
+
     Parameters
     ----------
     factor : by SuperLU in symmetric mode.
@@ -72,7 +74,9 @@ def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
             if not waiting[front.parent]:
                 del inverses[front.parent]
         here = order[bounds[s] : bounds[s + 1]]
-        found[here] = inverse[first[here] - starts[s], np.searchsorted(front.rows, second[here])]
+        column = np.minimum(np.searchsorted(front.rows, second[here]), len(front.rows) - 1)
+        known = front.rows[column] == second[here]
+        found[here] = np.where(known, inverse[first[here] - starts[s], column], 0.0)
     return found
 
 

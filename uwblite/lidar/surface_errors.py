@@ -26,7 +26,7 @@ _SURFACE = 0.014
 """Constant error of one surface for each of the sizes below, m: together 20 mm, of the 10 to 40 mm of Kneip et al."""
 _SIZES = (32.0, 8.0)
 """Over how far surfaces err alike, m: a wall as long as a corridor, a piece of furniture. How far one colour reaches is not
-known: equal parts."""
+known: equal parts, of which the recording may show otherwise (graph/variance_components.py)."""
 _MOST = 64
 """Places of one size; more of them would cost more than all else, and larger ones state larger errors."""
 
@@ -51,13 +51,14 @@ def _common(edges: ScanEdges, graph: Graph) -> CommonErrors:
     assert edges.by_surface is not None
     shift = whiten(edges.sqrt_information, edges.by_surface.transpose(0, 2, 1)).transpose(0, 2, 1)
     edge, errors, count = np.arange(len(edges)), [np.zeros(len(edges), dtype=np.int64)], 1
-    shifts = [_DEVICE * shift.sum(axis=1)]
-    for size in _SIZES:
+    shifts, kind = [_DEVICE * shift.sum(axis=1)], [np.zeros(1, dtype=np.int64)]
+    for number, size in enumerate(_SIZES):
         errors.append((count + 4 * _places(graph.poses[edges.i, :2], size)[:, None] + np.arange(4)).ravel())
         shifts.append(_SURFACE * shift.reshape(-1, 3))
-        count = int(errors[-1].max(initial=count)) + 1
+        kind.append(np.full(int(errors[-1].max(initial=count)) + 1 - count, number + 1))
+        count += len(kind[-1])
     own = np.concatenate([edge, *(np.repeat(edge, 4) for _ in _SIZES)])
-    return CommonErrors(edges, own, np.concatenate(errors), np.concatenate(shifts))
+    return CommonErrors(edges, own, np.concatenate(errors), np.concatenate(shifts), np.concatenate(kind))
 
 
 def _places(xy: Floats, size: float) -> Ints:

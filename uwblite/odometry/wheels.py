@@ -8,7 +8,8 @@ from .. import se2
 from ..arrays import Bools, Floats, spread
 from ..config import setting
 from ..graph.calibration import odometry_indices
-from ..graph.graph import Calibration, Graph
+from ..graph.graph import Calibration, Graph, edge_weights
+from ..graph.marginals import marginals
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.robust import Kernel
 from .keyframes import Keyframes
@@ -85,24 +86,24 @@ _ENOUGH_STEPS = 20
 """Measured steps from which the noise of the wheels may be learnt."""
 
 
-def with_floor_errors(graph: Graph) -> Graph:
-    """Return the graph with its odometry inflated by errors that stay with places on the floor; poses stay where they are.
+def with_noise_shown(graph: Graph) -> Graph:
+    """Return the graph with the noise of its odometry as the residuals show it, for covariances; poses stay where they are.
 
     A carpet's nap, a cross slope or a smooth patch makes all steps on it wrong alike, over some three metres, ten steps. Their
     errors then add up faster than with the square root of the way, and the noise of single steps does not show it; where the
-    lidar measured every one of ten consecutive steps, their sum does. Nothing becomes smaller by it.
+    lidar measured every one of ten consecutive steps, their sum does, and nothing becomes smaller by it. Where it did not,
+    the noise is the assumed one, as far as the residuals, of which ranges and the few scans check a part, say nothing else.
     """
     scans = [e for e in graph.edges if isinstance(e, ScanEdges)]
     measured = np.zeros(max(len(graph.poses) - 1, 0), dtype=bool)
     for e in scans:
         measured[np.minimum(e.i, e.j)[np.abs(e.i - e.j) == 1]] = True
     return replace(
-        graph,
-        edges=tuple(_with_floor_errors(e, graph, measured) if isinstance(e, OdometryEdges) else e for e in graph.edges),
+        graph, edges=tuple(_as_shown(e, graph, measured) if isinstance(e, OdometryEdges) else e for e in graph.edges)
     )
 
 
-def _with_floor_errors(wheels: OdometryEdges, graph: Graph, measured: Bools) -> OdometryEdges:
+def _as_shown(wheels: OdometryEdges, graph: Graph, measured: Bools) -> OdometryEdges:
     """Inflate the edges by how far the sums over consecutive measured steps scatter beyond those of independent ones."""
     errors = wheels.residuals(graph)
     summed = np.concatenate([np.zeros((1, 3)), np.cumsum(errors, axis=0)])
@@ -110,12 +111,22 @@ def _with_floor_errors(wheels: OdometryEdges, graph: Graph, measured: Bools) -> 
     # Windows across the seam of two recordings are few.
     whole = np.flatnonzero(known[_PATCH:] - known[:-_PATCH] == _PATCH)
     if len(whole) < _ENOUGH_SUMS:
-        return wheels
-    sums = (summed[whole + _PATCH] - summed[whole]) / np.sqrt(_PATCH)
-    factor = np.array([np.clip(spread(column), 1.0, _MOST_FLOOR) for column in sums.T])
+        factor = _by_redundancy(wheels, graph)
+    else:
+        sums = (summed[whole + _PATCH] - summed[whole]) / np.sqrt(_PATCH)
+        factor = np.array([np.clip(spread(column), 1.0, _MOST_FLOOR) for column in sums.T])
     return replace(wheels, sqrt_information=wheels.sqrt_information / factor[:, None])
 
 
+def _by_redundancy(wheels: OdometryEdges, graph: Graph) -> Floats:
+    """Return by how much the assumed noise along, across and in heading (3,) is to be scaled: Helmert's variance components."""
+    squares = edge_weights(wheels, graph)[:, None] * np.square(wheels.residuals(graph))
+    checked = marginals(graph).redundancy(wheels).sum(axis=0)
+    return np.clip(np.sqrt((_ASSUMED + squares.sum(axis=0)) / (_ASSUMED + checked)), 1.0 / _MOST_FLOOR, _MOST_FLOOR)
+
+
+_ASSUMED = 2.0
+"""What the assumed noise counts, in residuals: it is right within a factor of two."""
 _PATCH = 10
 """Steps over which errors of the floor are alike: 3 m."""
 _ENOUGH_SUMS = 60

@@ -14,7 +14,7 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
-from ..odometry.wheels import with_floor_errors
+from ..odometry.wheels import with_noise_shown
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
 from . import plausibility
@@ -34,7 +34,7 @@ _SHOWN = 0.7
 def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> MapResult:
     """Gather the result of a run; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
-    stated = with_floor_errors(_with_steady_errors(with_fewer_pairs(graph), len(estimate.anchor_ids), task.config.ranges))
+    stated = _with_steady_errors(with_noise_shown(with_fewer_pairs(graph)), len(estimate.anchor_ids), task.config.ranges)
     covariance = marginals(stated, common_range_errors(stated))
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
