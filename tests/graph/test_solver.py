@@ -12,7 +12,7 @@ from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
-from uwblite.graph.solver import SolverConfig, _as_much_again, _extrapolated, _linked, _step, _trial, optimize
+from uwblite.graph.solver import SolverConfig, _as_much_again, _extrapolated, _linked, _relaxed, _step, _trial, optimize
 from uwblite.graph.unknowns import moved, moved_along
 from uwblite.io.g2o import read_g2o
 
@@ -196,6 +196,18 @@ def test_robust_minima_have_no_gradient(name):
             costs.append(found.updated(poses, found.anchors, found.calibration.values).chi2())
         # chi2 is 200, its second derivative 1e5: rounding 1e-13 200 / 1e-6 and a rest from the tolerance.
         assert (costs[0] - costs[1]) / (2 * step) == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("name", "large"), [("none", True), ("huber", False)])
+def test_a_robust_search_ends_at_a_small_decrease_any_other_where_the_next_ones_are_small(name, large):
+    """Reweighting converges linearly at an unknown rate: there the last decrease itself has to be small."""
+    graph, _, _ = loop(3)
+    graph = replace(graph, edges=tuple(replace(e, kernel=Kernel(name, 1.5)) for e in graph.edges))
+    coarse = SolverConfig(relative_decrease=2e-3)
+    _, summary = optimize(graph, coarse)
+    last = -np.diff(summary.chi2_history)[-1]
+    assert (summary.converged, summary.reason) == (True, "chi2 no longer decreases")
+    assert (last > coarse.relative_decrease * summary.chi2) == large
 
 
 def test_an_outlier_bends_the_robust_minimum_less():
@@ -592,6 +604,13 @@ def test_the_decrease_to_come_is_the_rest_of_the_geometric_series(decrease, last
 
 def test_a_robust_search_expects_as_much_again_as_the_last_step_brought_or_promised():
     assert (_as_much_again(0.1, np.inf, 0.5), _as_much_again(0.5, 1.0, 0.1)) == (0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "factor"), [(0.0, 2.0), (0.25, 1.125), (0.5, 1.0), (0.75, 0.875), (1.0, 1 / 3), (1.5, 1 / 3)]
+)
+def test_lambda_follows_the_ratio_of_decrease_and_promise_as_nielsen_has_it(ratio, factor):
+    assert _relaxed(ratio) == pytest.approx(factor)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.7, 30.0])

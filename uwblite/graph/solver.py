@@ -169,7 +169,7 @@ def minimise(
             near = not reused and decrease <= _NEAR * chi2 and damping <= _NEARLY_FREE
             factor = factor if near else None
             graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
-            damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / promised - 1.0) ** 3), _LEAST_DAMPING)
+            damping = max(damping * _relaxed(decrease / promised), _LEAST_DAMPING)
             raised_by = 2.0
         elif 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * chi2) and damping <= _FREE:
             reason = NO_DECREASE
@@ -223,6 +223,11 @@ def _extrapolated(decrease: float, last: float, promised: float) -> float:
     if not np.isfinite(last) or decrease < _KEPT * promised:
         return max(decrease, promised)
     return decrease * (decrease / (last - decrease)) if decrease < last else np.inf
+
+
+def _relaxed(ratio: float) -> float:
+    """Return the factor of lambda after a step that decreased the cost by this ratio of what it promised."""
+    return max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
 
 
 def _as_much_again(decrease: float, last: float, promised: float) -> float:
