@@ -166,10 +166,11 @@ def test_an_anchor_seen_from_one_place_is_uncertain_along_the_circle_only():
     assert along @ found.anchors[0] @ along > 1e3
 
 
-def test_common_errors_add_what_they_move_squared():
+@pytest.mark.parametrize("kind", [0, 1], ids=["odometry", "robust closures"])
+def test_common_errors_add_what_they_move_squared(kind):
     """Against a loop over edges with the dense inverse: each error moves the estimate by H^-1 sum J^T w s."""
     graph, _ = calibrated(n=40)
-    edges, rng = graph.edges[1], np.random.default_rng(0)
+    edges, rng = graph.edges[kind], np.random.default_rng(0)
     edge, error = np.repeat(np.arange(len(edges)), 2), rng.integers(0, 40, 2 * len(edges))
     shift = rng.normal(size=(len(edge), 3))
     H, _, number = dense_system(graph)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.laser_walks import CORRIDOR, ROOM, chained, drifted, in_map, scanned, walked
 from helpers.planted import aligned_error, box
+from scipy import sparse
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
@@ -14,6 +15,7 @@ from uwblite.graph.solver import SolverConfig
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
+    _best_views,
     choose_pairs,
     refine,
     surface_cells,
@@ -55,6 +57,7 @@ def test_a_noise_free_room_is_found_to_a_millimetre():
     heading = se2.wrap_angle(result.graph.poses[:, 2] - truth[:, 2])
     assert np.abs(heading - heading.mean()).max() < 1e-3
     assert result.sigma < 0.01
+    assert result.rounds < 40
 
 
 def test_noisy_clouds_and_wheels_reach_what_their_matches_allow():
@@ -103,6 +106,33 @@ def test_pairs_are_ordered_unique_and_overlap():
     assert np.all(np.abs(path[i] - path[j])[~near] > CONFIG.epoch)
     for n in CONFIG.neighbours:
         assert {(a, a + n) for a in range(len(truth) - n)} <= set(zip(i.tolist(), j.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("partners", [0, 1, 3])
+def test_the_best_views_are_those_of_a_loop(partners):
+    """Of each epoch and recording the one that shares most; of these the best few, ties by number."""
+    rng = np.random.default_rng(partners)
+    clouds, epoch = 60, CONFIG.epoch
+    seen = (rng.random((clouds, 40)) < rng.uniform(0.05, 0.5, clouds)[:, None]).astype(float)
+    path, recording = np.sort(rng.uniform(0.0, 30.0, clouds)), np.repeat([0, 1], clouds // 2)
+    size, expected = seen.sum(axis=1), []
+    for i in range(clouds):
+        best = {}
+        for j in range(clouds):
+            common = (seen[i] * seen[j]).sum()
+            share = common / max(min(size[i], size[j]), 1)
+            if abs(path[i] - path[j]) > epoch and share > CONFIG.min_share and common >= 4:
+                key = path[j] // epoch, recording[j]
+                best[key] = min(best.get(key, (0.0, j)), (-share, j))
+        expected += [(i, j) for _, j in sorted(best.values())[:partners]]
+    found = _best_views(sparse.csr_matrix(seen), path, recording, replace(CONFIG, partners=partners))
+    assert list(zip(*(part.tolist() for part in found), strict=True)) == expected
+    assert len(expected) > 10 * partners or not partners
+
+
+def test_a_single_cloud_has_no_pair():
+    pairs = choose_pairs(scanned(np.zeros((1, 3)), ROOM), np.zeros((1, 3)), np.zeros(1), np.zeros(1, dtype=np.int64), CONFIG)
+    assert [part.tolist() for part in pairs] == [[], []]
 
 
 def test_clouds_take_turns_at_giving_the_lines():

@@ -34,8 +34,8 @@ def by_loops(clouds, pose):
 
 def test_it_is_the_least_over_all_directions():
     """A raster's cell is 5 cm, so points within that of the gate may count otherwise; the hall has walls of both kinds."""
-    clouds = scanned(np.array([[0.0, 0.0, 0.0], [1.0, 0.5, 0.4]]), HALL, 0.01, 1, beams=720, reach=9.0)
-    true = np.array([1.0, 0.5, 0.4])
+    poses = np.array([[0.0, 0.0, 0.7], [1.0, 0.5, 1.1]])
+    clouds, true = scanned(poses, HALL, 0.01, 1, beams=720, reach=9.0), se2.between(*poses)
     for off in ([0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.4, 0.05]):
         assert abs(overlap(clouds, true + off) - by_loops(clouds, true + off)) < 0.05
 
@@ -45,6 +45,10 @@ def test_walls_alone_match_in_no_place_of_a_corridor():
     clouds = scanned(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), CORRIDOR, 0.01, 2, reach=6.0)
     assert overlap(clouds, np.array([2.0, 0.0, 0.0])) < 0.5
     assert overlap(clouds, np.array([0.5, 0.0, 0.0])) < 0.5
+
+
+def test_clouds_without_any_point_share_nothing():
+    assert overlap(scanned(np.zeros((2, 3)), HALL, reach=0.1), np.zeros(3)) == 0.0
 
 
 def test_clouds_without_common_points_share_nothing():

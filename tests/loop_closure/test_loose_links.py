@@ -119,6 +119,21 @@ def test_pieces_stay_in_the_recording_of_their_link(walk):
     assert pieces.last.max() <= LINK + 2
 
 
+@pytest.mark.parametrize("border", [27, 35])
+def test_pieces_reach_over_no_other_link(walk, border):
+    truth, _, clouds = walk
+    graph, wheels = broken(truth, np.zeros(3))
+    links, recording = np.array([24, 30, 32, 38]), (np.arange(len(truth)) > border).astype(np.int64)
+    candidates, pieces = propose(graph, clouds, wheels, links, recording, CONFIG, SubmapConfig())
+    over = (pieces.first[:, None] <= links) & (pieces.last[:, None] > links + 1)
+    assert not over.any()
+    assert np.array_equal(recording[pieces.first], recording[pieces.last - 1])
+    ends = np.sort(pieces.reference.reshape(-1, 2), axis=1)
+    assert np.all(((ends[:, :1] <= links) & (ends[:, 1:] > links)).any(axis=0))
+    assert np.array_equal(candidates.source, candidates.target + 1)
+    assert pieces.first[pieces.last == border + 1].size > 0
+
+
 @pytest.mark.parametrize("revisited", [False, True])
 def test_a_link_is_untied_until_scan_edges_of_another_visit_join_its_sides(walk, revisited):
     truth, _, clouds = walk

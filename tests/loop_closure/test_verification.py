@@ -56,6 +56,8 @@ def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess
     i, j = pieces.reference[candidates.target], pieces.reference[candidates.source]
     np.testing.assert_allclose(candidates.guess, se2.between(graph.poses[i], graph.poses[j]))
     np.testing.assert_allclose(candidates.covariance, known.relative(i, j))
+    longest = np.sqrt(np.linalg.norm(candidates.covariance[:, :2, :2], 2, axis=(1, 2)))
+    np.testing.assert_allclose(candidates.spread, 3.0 * longest)
     pairs = list(zip(candidates.target.tolist(), candidates.source.tolist(), strict=True))
     assert len(set(pairs)) == len(pairs)
     assert len(pairs) <= 2 * CONFIG.partners * len(pieces)
@@ -102,7 +104,7 @@ def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
 
 
 GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "everywhere": 1.0, "spread": 7.0, "off": 0.0,
-        "held": True, "strength": 1e4}  # fmt: skip
+        "held": True, "along": 1e4, "strength": 1e4}  # fmt: skip
 """Figures of a match that no rule objects to, found by a search."""
 
 
@@ -114,8 +116,9 @@ GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3,
     ({"share": CONFIG.overlap + 0.001, "spread": 0.0}, "accepted"),
     ({"rms": CONFIG.sigma + 1e-4}, "far-matches"),
     ({"through": CONFIG.through + 0.001}, "free-space-violation"),
-    ({"strength": 0.9}, "degenerate"),
-    ({"strength": 1.1}, "accepted"),
+    ({"along": 0.0}, "accepted"),
+    ({"along": 0.0, "strength": 0.9}, "degenerate"),
+    ({"along": 0.0, "strength": 1.1}, "accepted"),
     ({"second": CONFIG.uniqueness + 0.001}, "ambiguous"),
     ({"second": CONFIG.uniqueness + 0.001, "spread": 0.0}, "accepted"),
     ({"everywhere": CONFIG.overlap_everywhere - 0.001}, "ambiguous"),
@@ -125,13 +128,13 @@ GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3,
     ({"off": 5.0, "held": False}, "accepted"),
 ])  # fmt: skip
 def test_each_rule_rejects_by_its_own_limit(figures, outcome):
-    """A guess known to 0.1 m and 0.1 rad, a measurement to 0.01; the matched surfaces see every direction."""
+    """A guess known to 0.1 m and 0.1 rad, a measurement to 0.01 where the matched surfaces see that."""
     f = {**GOOD, **figures}
     best = SimpleNamespace(share=np.array([f["share"]]), rms=np.array([f["rms"]]))
     fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through", "everywhere")})
     guess, covariance = np.array([[f["off"], 0.0, 0.0]]), 0.01 * np.eye(3)[None]
     candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, np.array([f["spread"]]), f["held"])
-    root = np.sqrt(np.diag([f["strength"], f["strength"], 1e4]))[None]
+    root = np.sqrt(np.diag([f["along"], f["strength"], 1e4]))[None]
     ((found, reason),) = _judge(candidates, fits, np.zeros((1, 3)), root, CONFIG)
     assert found == outcome
     assert reason

@@ -134,7 +134,7 @@ def choose_pairs(
     near_j = np.concatenate([np.arange(n, k) for n in config.neighbours if n < k] or [np.zeros(0, dtype=np.int64)])
     joined = (recording[near_i] == recording[near_j]) & (path[near_j] - path[near_i] < 3.0)
     near_i, near_j = near_i[joined], near_j[joined]
-    i, j = _best_views(surface_cells(clouds, poses), path, recording, config) if config.partners else (near_i[:0], near_j[:0])
+    i, j = _best_views(surface_cells(clouds, poses), path, recording, config)
     low, high = np.minimum(i, j), np.maximum(i, j)
     pairs = np.unique(np.concatenate([low, near_i]) * k + np.concatenate([high, near_j]))
     return pairs // k, pairs % k
@@ -192,8 +192,8 @@ def refine(
     points = pair_points(clouds, j, config.points)
     names = scan_indices(graph.calibration)
     gate, sigma, rounds = config.first_gate, config.sigma, 0
-    empty = ScanEdges(i[:0], j[:0], np.zeros((0, 3)), np.zeros((0, 3, 3)), twist[:0], twist[:0], names, delay)
-    probe = replace(empty, i=i, j=j, twist_i=twist[i], twist_j=twist[j], kernel=Kernel("cauchy", 5.0))
+    none = np.zeros((0, 3)), np.zeros((0, 3, 3))
+    probe = ScanEdges(i, j, *none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
     normal: NormalEquations | None = None
     # The next round looks all matches up again: one good step is enough.
     brief = replace(solver, max_iterations=3, relative_decrease=0.5)
