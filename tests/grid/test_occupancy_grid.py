@@ -291,10 +291,11 @@ def test_rays_start_where_the_laser_was_at_their_time():
 
 
 @pytest.mark.parametrize("flipped", [False, True])
-def test_the_extent_holds_all_rays(flipped):
+@pytest.mark.parametrize("moving", [(0.05, 0.05, 0.05), (0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 0.3)])
+def test_the_extent_holds_all_rays(moving, flipped):
     rng = np.random.default_rng(4)
     poses = rng.uniform(-1.0, 1.0, (20, 3)) * [1.0, 1.0, np.pi]
-    last = poses + rng.normal(scale=0.05, size=(20, 3))
+    last = poses + rng.normal(scale=moving, size=(20, 3))
     scans = room_scans(poses, noise=0.01, range_max=2.2)
     chosen = np.arange(20)
     reach = np.maximum(seen_reach(scans, chosen, 2.1), empty_reach(scans, chosen, 1.5, 3))
@@ -337,6 +338,8 @@ def test_a_flipped_laser_sees_the_mirror_image():
 def test_scans_that_did_not_move_are_not_traced_again():
     poses = np.array([[0, 0, 0], [0.05, 0, 0], [0.11, 0, 0], [0.11, 0, 0.05], [0.11, 0, 0.2], [0.11, 0, 0.2 - 2 * np.pi]])
     np.testing.assert_array_equal(moved_scans(poses, 0.1, 0.1), [0, 2, 4])
+    np.testing.assert_array_equal(moved_scans(poses[:, [1, 0, 2]] + [0.0, 5.0, 0.0], 0.1, 0.1), [0, 2, 4])
+    assert len(moved_scans(poses[:0], 0.1, 0.1)) == 0
     np.testing.assert_array_equal(moved_scans(poses, 0.0, 0.1), np.arange(6))
     assert from_scans(poses, room_scans(poses), GridConfig()).scans_used == 3
 
@@ -347,11 +350,17 @@ def test_the_map_does_not_depend_on_the_executor(pool):
     scans = room_scans(poses, noise=0.02, range_max=2.4)
     steps = []
     alone = from_scans(poses, scans, last=poses + 0.01, progress=lambda done, total: steps.append((done, total)))
+    assert steps[-1][0] == steps[-1][1]
+    total = steps.pop()[1]
+    steps.clear()
     with pool(2) as executor:
-        split = from_scans(poses, scans, last=poses + 0.01, executor=executor)
+        split = from_scans(
+            poses, scans, last=poses + 0.01, executor=executor, progress=lambda done, total: steps.append((done, total))
+        )
+    assert steps == sorted(steps)
+    assert steps[-1] == (total, total)
     assert alone.log_odds.tobytes() == split.log_odds.tobytes()
     assert alone.scans_used == split.scans_used
-    assert steps[-1][0] == steps[-1][1]
 
 
 def test_scan_by_scan_insertion_makes_the_same_map():

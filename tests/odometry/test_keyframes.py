@@ -96,6 +96,7 @@ def test_keyframes_are_scans_where_there_are_any():
     assert looks[dense].all()
     assert not looks[silent].any()
     assert np.isin(lidar.middles[begin > 14.0], frames.stamps).all()
+    assert looks[frames.stamps > 14.5][:-1].all()
     np.testing.assert_allclose(frames.odometry, se2.interpolate_trajectory(stamps, truth, frames.stamps), atol=1e-9)
     step = np.diff(frames.stamps)[dense[:-1]]
     assert step.max() <= 0.6 + 1e-9
@@ -103,8 +104,9 @@ def test_keyframes_are_scans_where_there_are_any():
     assert frames.path.sum() == pytest.approx(10.0)
 
 
-def test_keyframes_come_in_time_where_a_robot_creeps():
-    stamps, truth = drive([(0.05, 0, 0), (0.0, 0, 0)], [30.0, 30.0])
+@pytest.mark.parametrize("creeping", [(0.05, 0.0, 0.0), (0.0, 0.0, 0.06)])
+def test_keyframes_come_in_time_where_a_robot_creeps(creeping):
+    stamps, truth = drive([creeping, (0.0, 0, 0)], [30.0, 30.0])
     begin = np.arange(0.0, 59.0, 0.1)
     lidar = LaserScans(begin, np.ones((len(begin), 10), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 5.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig(duration=1.5), scans=lidar)

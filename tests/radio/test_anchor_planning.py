@@ -8,9 +8,12 @@ from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
 from uwblite.radio.anchor_planning import (
     SIGMA_BEHIND_WALLS,
     SIGMA_LINE_OF_SIGHT,
+    _choose,
     _coarse,
     _information,
     _line_of_sight,
+    _near,
+    _wall_cells,
     plan_anchors,
     position_errors,
 )
@@ -85,6 +88,32 @@ def test_line_of_sight_ends_at_walls_and_passes_doors():
     source = np.array([[4, 2]])
     targets = np.array([[4, 18], [1, 18], [1, 6], [4, 2]])
     assert _line_of_sight(blocked, source, targets)[0].tolist() == [True, False, True, True]
+
+
+def test_places_beside_walls_are_those_of_a_loop():
+    rng = np.random.default_rng(3)
+    blocked = rng.random((8, 9)) < 0.2
+    free = ~blocked & (rng.random((8, 9)) < 0.7)
+    expected = []
+    for row, col in np.argwhere(free):
+        around = [(row + 1, col), (row - 1, col), (row, col + 1), (row, col - 1)]
+        if any(0 <= r < 8 and 0 <= c < 9 and blocked[r, c] for r, c in around):
+            expected.append([row, col])
+    assert _wall_cells(blocked, free).tolist() == expected
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_exchange_of_one_place_is_better(seed):
+    rng = np.random.default_rng(seed)
+    at, offered, today = rng.uniform(0, 10, (30, 2)), rng.uniform(0, 10, (25, 2)), np.zeros((30, 3))
+    gains = _information(at, offered, rng.random((25, 30)) < 0.6, 8.0)
+    taken = offered[:, 0] < 1.0
+    chosen = _choose(today, gains, offered, taken, 3)
+    least = position_errors(gains[chosen].sum(axis=0)).mean()
+    for k in range(3):
+        others = np.delete(chosen, k)
+        for other in np.flatnonzero(~taken & ~_near(offered, offered[others])):
+            assert position_errors(gains[[*others, other]].sum(axis=0)).mean() > least - 1e-12
 
 
 def test_what_cannot_be_planned_is_reported():

@@ -23,11 +23,11 @@ WELL = 0.3
 bootstrapped trajectory is good enough as a start when it lies well within the width of the kernels that follow."""
 
 
-def start(wheels: Odometry, radio: UwbRanges) -> tuple[BootstrapResult, np.ndarray]:
+def start(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[BootstrapResult, np.ndarray]:
     """Bootstrap one recording; return the estimate and the keyframes' stamps."""
     frames = select(wheels, KeyframeConfig())
     ids = radio.anchor_ids
-    listed = unknowns(CalibrationConfig(anchor_height=0.0), ids, np.zeros(len(ids), dtype=bool))
+    listed = unknowns(CalibrationConfig(anchor_height=0.0), ids, np.zeros(len(ids), dtype=bool)) if calibrated else ()
     calibration = block(listed)
     free = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate", "bias", "range_scale")
     held = ~calibration.of_kinds(*free)
@@ -169,6 +169,7 @@ def test_a_straight_run_reports_that_its_anchors_are_ambiguous():
         sides = np.array([[place[0], abs(place[1])], [place[0], -abs(place[1])]])
         gap = np.hypot(*(found[:, None] - sides[None]).transpose(2, 0, 1))
         assert gap.min(axis=0).max() < 1.0
+        np.testing.assert_array_equal(bootstrapped.graph.anchors[k], found[0])
 
 
 def test_ranges_of_no_weight_and_none_at_all_leave_the_odometry():
@@ -180,6 +181,15 @@ def test_ranges_of_no_weight_and_none_at_all_leave_the_odometry():
     bootstrapped, at = start(wheels, nothing)
     assert not bootstrapped.placed.any()
     np.testing.assert_allclose(bootstrapped.graph.poses, se2.interpolate_trajectory(stamps, wheels.poses, at), atol=1e-9)
+
+
+def test_ranges_that_never_agree_are_tried_with_no_other_heading_where_that_is_no_unknown():
+    rng = np.random.default_rng(52)
+    stamps, truth = wander(rng, 20.0)
+    wheels = odometry(stamps, truth, rng, noise=0.01)
+    radio = ranges(rng, stamps, truth, places_around(rng, 2))
+    bootstrapped, _ = start(wheels, replace(radio, ranges=rng.uniform(1.0, 12.0, len(radio.ranges))), calibrated=False)
+    assert np.isfinite(bootstrapped.graph.poses).all()
 
 
 def test_a_robot_that_stands_places_nothing_for_sure():

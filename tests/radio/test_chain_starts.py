@@ -16,7 +16,7 @@ from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
 from uwblite.io.graph_chains import chained_poses
 from uwblite.io.pyfg import read_pyfg, write_pyfg
-from uwblite.radio.chain_starts import place_chains
+from uwblite.radio.chain_starts import _BEND, _converged, place_chains
 
 ROBOTS, STEPS = 3, 80
 
@@ -103,3 +103,20 @@ def test_four_robots_of_tiers_from_their_odometry(shared_data, tmp_path):
         return evaluate_trajectory(number, poses, number, whole.graph.poses, max_gap=1.5).ate.rmse
 
     assert ate(found) <= 1.05 * ate(local)
+
+
+def test_from_everywhere_the_search_goes_down():
+    """The cost is sum log(1 + (error / bend)^2); a step that would raise it is tried again, shorter."""
+    rng = np.random.default_rng(7)
+    there, own, place = rng.uniform(-1, 1, (20, 2)), rng.uniform(-1, 1, (20, 2)), np.array([1.0, -2.0, 0.5])
+    ranges = np.hypot(*(se2.transform(place, own) - there).T) + rng.normal(0.0, 0.05, 20)
+
+    def cost(T):
+        return np.log1p(((np.hypot(*(se2.transform(T, own) - there).T) - ranges) / _BEND) ** 2).sum()
+
+    starts = np.column_stack([rng.uniform(-8, 8, (20, 2)), rng.uniform(-3, 3, 20)])
+    found = [_converged(start, there, own, ranges) for start in starts]
+    for start, (least, T) in zip(starts, found, strict=True):
+        assert least == pytest.approx(cost(T))
+        assert least < cost(start) - 1.0
+    assert np.abs(se2.between(place, min(found, key=lambda f: f[0])[1])).max() < 0.1

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,24 @@ def test_a_bent_guess_ends_at_the_minimum(seed):
     assert summary.converged
     # dof is about 4,500: chi2 over dof scatters by 0.02.
     assert summary.chi2_per_dof == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("fits_from", "everything"), [(890, False), (300, False), (0, False), (-1, False), (0, True)])
+def test_a_part_that_does_not_fit_is_solved_with_ever_more_of_the_path(fits_from, everything):
+    """Until it fits, or reaches back to the start."""
+    lows: list[int] = []
+
+    def solve(low, now):
+        lows.append(low)
+        assert len(lows) < 10
+        return SimpleNamespace(fits=low <= fits_from, low=low)
+
+    stand_in = SimpleNamespace(_solve=solve, _without_outliers=lambda part, low, now: part)
+    part = _Incremental._fit(stand_in, 900, everything)
+    assert part.low == lows[-1]
+    assert [low <= fits_from or low == 0 for low in lows] == [False] * (len(lows) - 1) + [True]
+    assert lows[0] == (0 if everything else 900 - incremental._WINDOW)
+    assert np.all(np.diff(900 - np.array([low for low in lows if low]), prepend=0) > 0)
 
 
 def test_all_at_once_the_same_guess_is_lost():

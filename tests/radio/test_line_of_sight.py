@@ -50,6 +50,7 @@ def test_the_wall_that_an_anchor_hangs_on_and_the_robot_itself_do_not_count():
     wall = seen([-5.0, 0.0], [5.0, 0.0])
     tags, anchors = np.array([[0.0, -6.0], [0.0, 0.2], [0.0, -6.0]]), np.array([[0.0, 0.4], [0.0, 6.0], [0.0, 6.0]])
     assert blocked(tags, anchors, wall).tolist() == [False, False, True]
+    assert blocked(tags[:, ::-1], anchors[:, ::-1], wall[:, ::-1]).tolist() == [False, False, True]
 
 
 def test_single_points_are_no_surface_and_nothing_seen_blocks_nothing():

@@ -158,6 +158,17 @@ def test_ranges_of_weight_zero_move_no_anchor_and_teach_no_noise():
     assert not silent.weights.any()
 
 
+def test_what_is_steady_does_not_depend_on_where_the_map_frame_lies():
+    _, truth, frames, places, _, edges = world(12)
+    config = RangeNoiseConfig(learn=False, slow_share=0.0)
+    one, other = (
+        learn_noise(edges, Graph(truth[frames.index] + [*away, 0.0], places + away), 3, config, steady=True)[0].weights
+        for away in (np.zeros(2), np.array([5.0, -7.0]))
+    )
+    np.testing.assert_allclose(one, other, rtol=1e-9)
+    assert np.ptp(one) > 0.01
+
+
 def test_ranges_through_something_weigh_together_as_one_draw_of_their_delay():
     _, truth, frames, places, _, edges = world(11, 150.0, 1, sigma=0.0, rate=4.0)
     rng, graph = np.random.default_rng(8), Graph(truth[frames.index], places)

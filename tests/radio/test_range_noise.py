@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from uwblite import se2
 from uwblite.radio.range_noise import (
     RangeNoise,
     RangeNoiseConfig,
+    _covariance_by_distance,
     assumed,
     effective_sigma,
     learn,
@@ -74,6 +76,20 @@ def test_outliers_of_weight_zero_do_not_count_and_a_constant_neither():
     wild = np.where(weights > 0, errors, 50.0)
     one, other = learn(positions, errors, weights, CONFIG), learn(positions, wild + 3.0, weights, CONFIG)
     assert (one.white, one.slow, one.length) == pytest.approx((other.white, other.slow, other.length), rel=1e-9)
+
+
+def test_covariances_by_distance_are_those_of_a_loop_over_pairs():
+    """Places on a grid of 1 m: some pairs lie on the bounds of the bins, the last of which holds its upper one."""
+    rng = np.random.default_rng(6)
+    p, e, edges = rng.integers(0, 8, (60, 2)).astype(float), rng.standard_normal(60), np.array([0.0, 0.5, 1.0, 3.0, 6.0])
+    first, second = np.triu_indices(60, 1)
+    distance, products = np.hypot(*(p[first] - p[second]).T), e[first] * e[second]
+    assert np.any(distance == 6.0)
+    upper = [0.5, 1.0, 3.0, 6.0 + 1e-9]
+    inside = [(distance >= a) & (distance < b) for a, b in zip(edges[:-1], upper, strict=True)]
+    covariance, pairs = _covariance_by_distance(p, e, edges)
+    assert pairs.tolist() == [i.sum() for i in inside]
+    np.testing.assert_allclose(covariance, [products[i].sum() / max(i.sum(), 1) for i in inside])
 
 
 @pytest.mark.filterwarnings("error")
@@ -222,6 +238,16 @@ def test_what_is_steady_depends_on_directions_and_ratios_of_distances(radius, fa
     np.testing.assert_allclose(near, far, rtol=0.1)
     side = radius * np.stack([np.cos(bearing / 20.0), np.sin(bearing / 20.0)], axis=1)
     assert np.sum(near**-2.0) > 1.5 * np.sum(steady_sigma(side, CONFIG) ** -2.0)
+
+
+@pytest.mark.parametrize(("other", "apart"), [((0.0, 1.0), 2.0**0.5), ((-1.0, 0.0), 2.0), ((np.exp(0.5), 0.0), 0.5)])
+def test_half_a_radian_of_direction_or_half_an_e_fold_of_distance_is_alike(other, apart):
+    """By chords of the unit circle and logarithms of distance."""
+    alike = np.exp(-apart / 0.5)
+    for turn in (0.0, np.pi / 2):
+        first, second = steady_sigma(se2.rotate(turn, np.array([[1.0, 0.0], other])), CONFIG)
+        assert first == second
+        assert (first / CONFIG.steady) ** 2 - 1.0 == pytest.approx(alike)
 
 
 def test_steady_errors_can_be_switched_off():

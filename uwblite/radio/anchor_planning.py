@@ -67,7 +67,7 @@ def plan_anchors(grid: OccupancyGrid, anchors: Floats, count: int, *, reach: flo
         return low + cell * (cells[:, ::-1] + 0.5)
 
     at, offered = metres(points), metres(candidates)
-    here = np.floor((anchors - low) / cell).astype(np.int64)[:, ::-1] if len(anchors) else np.zeros((0, 2), dtype=np.int64)
+    here = np.floor((anchors - low) / cell).astype(np.int64)[:, ::-1]
     today = _information(at, anchors, _line_of_sight(blocked, here, points), reach).sum(axis=0)
     gains = _information(at, offered, _line_of_sight(blocked, candidates, points), reach)
     offered_too_near = _near(offered, anchors)
@@ -127,8 +127,6 @@ def _best(base: Floats, gains: Floats, taken: Bools) -> int:
 
 def _near(places: Floats, others: Floats) -> Bools:
     """Return which places (n, 2) are nearer to one of the others than anchors should be."""
-    if len(others) == 0:
-        return np.zeros(len(places), dtype=np.bool_)
     return np.asarray((np.linalg.norm(places[:, None] - others[None], axis=2) < _APART).any(axis=1))
 
 
