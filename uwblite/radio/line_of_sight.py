@@ -42,7 +42,7 @@ def blocked(tags: Floats, anchors: Floats, surfaces: Floats) -> Bools:
         begins = np.cumsum(count[part]) - count[part]
         along = _NEAR_TAG + 0.5 * cell * (np.arange(len(row)) - np.repeat(begins, count[part]))
         place = tags[row] + way[row] * (along / length[row])[:, None]
-        np.logical_or.at(through, row, _look_up(place, low, cell, occupied))
+        through[row[_look_up(place, low, cell, occupied)]] = True
     return through
 
 
