@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.browser import CHROMIUM, Browser
 from helpers.results import small_log, small_result
-from helpers.served import Served
+from helpers.served import PATIENCE, Served
 
 from uwblite.cli import main, watch
 from uwblite.io.result_text import RunRecord
@@ -179,12 +179,19 @@ def served_watch(log, *words):
 
 
 @pytest.mark.slow
+def test_ctrl_c_at_the_moment_of_the_address_ends_it_as_well(tmp_path):
+    with served_watch(tmp_path / "run.log") as served:
+        pass
+    assert served.code == 0
+
+
+@pytest.mark.slow
 def test_it_reports_its_address_serves_and_ends_with_ctrl_c(tmp_path):
-    with served_watch(tmp_path / "run.log") as served, urllib.request.urlopen(served.address, timeout=20) as answer:
+    with served_watch(tmp_path / "run.log") as served, urllib.request.urlopen(served.address, timeout=PATIENCE) as answer:
         assert b"uwblite watch run.log" in answer.read()
     assert served.code == 0
     with served_watch(tmp_path / "run.log", "--parent", "1") as served:
-        assert served.process.wait(timeout=20) == 0
+        assert served.process.wait(timeout=PATIENCE) == 0
 
 
 @pytest.mark.slow

@@ -7,6 +7,9 @@ import sys
 
 from conftest import ROOT
 
+PATIENCE = 120
+"""s after which a program that does not end counts as hanging: a loaded computer is slow."""
+
 
 class Served:
     """The program at work: `address` of its page; `code`, its exit code after Ctrl-C at the end of the block."""
@@ -24,4 +27,4 @@ class Served:
 
     def __exit__(self, *_):
         self.process.send_signal(signal.SIGINT)
-        self.code = self.process.wait(timeout=20)
+        self.code = self.process.wait(timeout=PATIENCE)

@@ -59,16 +59,16 @@ def run(args: argparse.Namespace) -> int:
     effective_config(args)
     folder = _folder(args)
     page = LivePage(f"uwblite watch {os.path.basename(args.log)}")
+    watch = Watch(args.log, folder, page, map_options(args))
     with serving(page, args.host, args.port) as address:
-        with suppress(OSError, AttributeError):
-            os.nice(_OWN_NICENESS)
-        console.say(f"open {address} in a browser; Ctrl-C ends it")
-        console.note(f"uwblite: the latest map is in {folder}")
-        console.flush()
-        with suppress(ValueError):  # not the main thread: signals are somebody else's
-            signal.signal(signal.SIGTERM, _interrupt)
-        watch = Watch(args.log, folder, page, map_options(args))
         try:
+            with suppress(OSError, AttributeError):
+                os.nice(_OWN_NICENESS)
+            with suppress(ValueError):  # not the main thread: signals are somebody else's
+                signal.signal(signal.SIGTERM, _interrupt)
+            console.say(f"open {address} in a browser; Ctrl-C ends it")
+            console.note(f"uwblite: the latest map is in {folder}")
+            console.flush()
             while args.parent is None or os.getppid() == args.parent:
                 watch.step(time.monotonic())
                 time.sleep(_STEP)
