@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite import se2
@@ -253,20 +253,3 @@ def test_half_a_radian_of_direction_or_half_an_e_fold_of_distance_is_alike(other
 def test_steady_errors_can_be_switched_off():
     assert not np.any(steady_sigma(np.ones((4, 2)), replace(CONFIG, steady=0.0)))
     assert len(steady_sigma(np.zeros((0, 2)), CONFIG)) == 0
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 1000), st.integers(2, 60))
-def test_covariance_by_distance_is_the_mean_product_over_all_pairs(seed, count):
-    rng = np.random.default_rng(seed)
-    places, errors = rng.normal(0.0, 2.0, (count, 2)), rng.normal(size=count)
-    places[count // 2] = places[0]
-    edges = np.array([0.0, 0.5, 1.0, 3.0, 6.0])
-    covariance, pairs = _covariance_by_distance(places, errors, edges)
-    i, j = np.triu_indices(count, 1)
-    distance = np.hypot(*(places[i] - places[j]).T)
-    for k in range(len(edges) - 1):
-        own = (distance >= edges[k]) & (distance < edges[k + 1])
-        assert pairs[k] == own.sum()
-        expected = np.mean(errors[i[own]] * errors[j[own]]) if own.any() else 0.0
-        assert covariance[k] == pytest.approx(expected, abs=1e-9)

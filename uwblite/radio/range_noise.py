@@ -119,8 +119,9 @@ def _covariance_by_distance(p: Floats, e: Floats, edges: Floats) -> tuple[Floats
     p, e = p[::stride], e[::stride]
     tree = cKDTree(p)
     # Both trees at once count pairs by the thousand; each pair comes twice and each place with itself once, at distance 0.
-    pairs = tree.count_neighbors(tree, edges[1:], cumulative=False).astype(np.float64)
-    product = tree.count_neighbors(tree, edges[1:], weights=(e, e), cumulative=False)
+    upto = np.append(np.nextafter(edges[1:-1], 0.0), edges[-1])
+    pairs = tree.count_neighbors(tree, upto, cumulative=False).astype(np.float64)
+    product = tree.count_neighbors(tree, upto, weights=(e, e), cumulative=False)
     pairs[0], product[0] = pairs[0] - len(e), product[0] - e @ e
     return product / np.maximum(pairs, 1.0), 0.5 * pairs
 
