@@ -71,3 +71,12 @@ def test_tables_that_do_not_fit_are_named(written):
     (folder / "trajectory_covariance.csv").write_text(table.replace("1000.000000", "soon"))
     with pytest.raises(FormatError, match="'soon', not a time"):
         read_result(folder)
+
+
+@pytest.mark.parametrize("name", ["anchors.csv", "map.yaml", "trajectory_covariance.csv"])
+def test_what_is_there_and_no_file_is_not_taken_for_missing(written, name):
+    _, folder = written
+    (folder / name).unlink()
+    (folder / name).mkdir()
+    with pytest.raises(FormatError, match="Is a directory"):
+        read_result(folder)

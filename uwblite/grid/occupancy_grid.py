@@ -42,6 +42,8 @@ FREE_BELOW = 0.196
 """Probability below which a cell counts as free; between the two it is unknown."""
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """States of a cell, numbered as in ROS nav_msgs/OccupancyGrid."""
+LEAST_CELL, LARGEST_CELL = 1e-4, 1e3
+"""Edges of cells, m, beyond which no map is drawn or read."""
 
 _SCANS_AT_A_TIME = 64
 _TASKS = 8
@@ -76,8 +78,8 @@ class GridConfig:
     """Largest grid, cells (12 bytes each while it is made); a larger map is drawn with larger cells."""
 
     def __post_init__(self) -> None:
-        if not self.resolution > 0:
-            raise ConfigError(f"grid.resolution must be positive, not {self.resolution}")
+        if not LEAST_CELL <= self.resolution <= LARGEST_CELL:
+            raise ConfigError(f"grid.resolution must lie in {LEAST_CELL:g}..{LARGEST_CELL:g} m, not {self.resolution}")
         if not 0.5 < self.p_hit < 1.0 or not 0.0 < self.p_miss < 0.5:
             raise ConfigError(f"grid needs 0 < p_miss < 0.5 < p_hit < 1, not {self.p_miss} and {self.p_hit}")
         if not 0.0 <= self.clear_weight <= 1.0:

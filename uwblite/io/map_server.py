@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from ..grid.geometry import GridGeometry
-from ..grid.occupancy_grid import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_ABOVE, OccupancyGrid
+from ..grid.occupancy_grid import FREE, FREE_BELOW, LARGEST_CELL, LEAST_CELL, OCCUPIED, OCCUPIED_ABOVE, OccupancyGrid
 from .files import replacing, write_text
 from .png import MOST_PIXELS, SIGNATURE, decode_png, encode_png, png_shape
 from .source import finite, open_input, read_bounded
@@ -105,7 +105,7 @@ def read_map(path: str | os.PathLike[str]) -> OccupancyGrid:
     resolution = _number(settings, "resolution", name)
     origin = _numbers(settings, "origin", name)
     occupied, free = _number(settings, "occupied_thresh", name), _number(settings, "free_thresh", name)
-    if not 1e-4 <= resolution <= 1e3 or len(origin) != 3 or max(map(abs, origin)) > 1e7:
+    if not LEAST_CELL <= resolution <= LARGEST_CELL or len(origin) != 3 or max(map(abs, origin)) > 1e7:
         raise FormatError("resolution must be positive (0.0001 to 1000 m) and origin must be a place [x, y, yaw]", name)
     if origin[2] != 0.0:
         raise FormatError(f"origin is turned by {origin[2]} rad; only maps with yaw 0 are read", name)

@@ -107,7 +107,7 @@ def read_result(folder: str | os.PathLike[str]) -> StoredResult:
         covariances,
         _anchors(path / "anchors.csv"),
         (),
-        read_map(path / "map.yaml") if (path / "map.yaml").is_file() else None,
+        read_map(path / "map.yaml") if (path / "map.yaml").exists() else None,
         report,
     )
     return _with_closures(result)
@@ -127,7 +127,7 @@ def _report(path: Path) -> dict[str, Any]:
 
 def _keyframes(path: Path, recordings: int) -> tuple[Floats, Ints, Floats]:
     """Return stamps (k,), recordings (k,) and covariances (k, 3, 3) of the keyframes; none where the file is missing."""
-    if not path.is_file():
+    if not path.exists():
         return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3, 3))
     table = read_csv(path)
     # Stamps are times since 1970 in many recordings: too large for the lengths that a table is checked for.
@@ -144,7 +144,7 @@ def _keyframes(path: Path, recordings: int) -> tuple[Floats, Ints, Floats]:
 
 
 def _anchors(path: Path) -> tuple[StoredAnchor, ...]:
-    if not path.is_file():
+    if not path.exists():
         return ()
     table = read_csv(path)
     values = table.numbers("x", "y", "sigma_x", "sigma_y", "covariance_xy", "bias", "residual_rms", default=np.nan)
