@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 from faulting.case import Case, Fault, Floats, Ints
 from faulting.every import FAULTS
-from faulting.logs import two_robots
+from faulting.logs import two_buildings, two_robots
 from simulation.recording import Settings
 from trials import ROOT, SHARED, made, table, write_section
 
@@ -179,6 +179,8 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
     return Outcome(world, name, sensors, *figures, code, stated, check, time.process_time() - began, warnings)
 
 
+WITH_ANOTHER = {"two robots in one log": two_robots, "two buildings in one log": two_buildings}
+"""Faults that need a second recording."""
 Task = tuple[str, str, str, Case, Fault]
 _tasks: list[Task] = []
 """What forked processes find in their memory: faults are functions and do not travel."""
@@ -259,10 +261,10 @@ def main(argv: list[str] | None = None) -> int:
         for name, (fault, kinds) in FAULTS.items():
             if args.only and not any(word in name for word in args.only):
                 continue
-            if name == "two robots in one log":
+            if name in WITH_ANOTHER:
                 if world == "kasdorf":
                     continue
-                fault = two_robots(clean_cases([world], args.minutes, args.seed + 1)[world])
+                fault = WITH_ANOTHER[name](clean_cases([world], args.minutes, args.seed + 1)[world])
             tasks += [(world, name, s, case, fault) for s in kinds if s in args.sensors.split(",")]
     done = []
     for outcome in outcomes(tasks, args.jobs):

@@ -27,11 +27,6 @@ def laser_factor(factor: float) -> Fault:
     )
 
 
-def wide_claim(case: Case, rng: Rng) -> Case:
-    """The driver claims twice the field of view."""
-    return with_scans(case, lambda s: replace(s, angle_min=2.0 * s.angle_min, angle_increment=2.0 * s.angle_increment))
-
-
 def mirrored_laser(case: Case, rng: Rng) -> Case:
     """Beams in the wrong order."""
     return with_scans(case, lambda s: replace(s, ranges=s.ranges[:, ::-1].copy()))
@@ -166,3 +161,32 @@ def tilted(reach: float) -> Fault:
         return replace(s, ranges=np.where((s.stamps >= case.middle)[:, None], nearer, s.ranges))
 
     return lambda case, rng: with_scans(case, lambda s: change(s, case, rng))
+
+
+def reach_as_hits(reach: float) -> Fault:
+    """What the lidar does not see it reports as walls at its reach, m."""
+
+    def change(s: LaserScans) -> LaserScans:
+        seen = np.isfinite(s.ranges) & (s.ranges < reach)
+        return replace(s, ranges=np.where(seen, s.ranges, np.float32(reach)), range_max=max(s.range_max, 1.2 * reach))
+
+    return lambda case, rng: with_scans(case, change)
+
+
+def turning_mount(angle: float) -> Fault:
+    """The lidar turns on its mount steadily, by so much in the end, rad."""
+
+    def change(s: LaserScans) -> LaserScans:
+        age, beams = (s.stamps - s.stamps[0]) / np.ptp(s.stamps), s.ranges.shape[1]
+        column = np.arange(beams) + np.round(age * angle / abs(s.angle_increment)).astype(np.int64)[:, None]
+        readings = np.take_along_axis(s.ranges, np.clip(column, 0, beams - 1), axis=1)
+        return replace(s, ranges=np.where((column >= 0) & (column < beams), readings, np.float32(np.nan)))
+
+    return lambda case, rng: with_scans(case, change)
+
+
+def angles_times(factor: float) -> Fault:
+    """The driver states a wrong angle between beams."""
+    return lambda case, rng: with_scans(
+        case, lambda s: replace(s, angle_min=factor * s.angle_min, angle_increment=factor * s.angle_increment)
+    )

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblite import se2
 from uwblite.sensor_log import Odometry, UwbRanges
 
 from .case import Case, Fault, Floats, Ints, Rng, kept, rows, shifted
@@ -52,6 +53,26 @@ def absent(kinds: str, share: float = 0.4) -> Fault:
 def two_robots(other: Case) -> Fault:
     """Two robots wrote into one log."""
     return lambda case, rng: merged(case, other)
+
+
+def two_buildings(other: Case) -> Fault:
+    """The log goes on in another building with other anchors; the odometry goes on where it was."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        one, two = case.log, other.log
+        later = float(one.odometry.stamps[-1] - two.odometry.stamps[0]) + 0.05
+        end = se2.compose(one.odometry.poses[-1], se2.inverse(two.odometry.poses[0]))
+        moved = replace(two, odometry=Odometry(two.odometry.stamps + later, se2.compose(end, two.odometry.poses)))
+        if two.scans is not None:
+            moved = replace(moved, scans=replace(two.scans, stamps=two.scans.stamps + later))
+        if one.ranges is not None and two.ranges is not None:
+            r, names = two.ranges, one.ranges.anchor_ids
+            ids = (*names, *(f"Z{name}" for name in r.anchor_ids))
+            moved = replace(moved, ranges=UwbRanges(r.stamps + later, r.anchor + len(names), r.ranges, r.quality, ids))
+            case = replace(case, log=replace(one, ranges=replace(one.ranges, anchor_ids=ids)))
+        return merged(case, replace(other, log=moved))
+
+    return fault
 
 
 def twice(case: Case, rng: Rng) -> Case:

@@ -104,22 +104,46 @@ def one_radio_clock_fast(case: Case, rng: Rng) -> Case:
     return shifted(case, lambda t: 0.02 * (t - first), "radio")
 
 
-def round_trip(case: Case, rng: Rng) -> Case:
-    """One anchor's firmware reports the way there and back."""
-    return with_ranges(case, lambda r: replace(r, ranges=np.where(r.anchor == 0, 2.0 * r.ranges, r.ranges)))
+def one_times(factor: float) -> Fault:
+    """One anchor reports so many times its distance; 2: the way there and back."""
+    return lambda case, rng: with_ranges(
+        case, lambda r: replace(r, ranges=np.where(r.anchor == 0, factor * r.ranges, r.ranges))
+    )
 
 
-def swapped_tag(case: Case, rng: Rng) -> Case:
-    """Half-way the tag is replaced by another one: it hangs 0.3 m to the left and measures 0.4 m too much."""
+def other_tag(ahead: float, left: float, longer: float) -> Fault:
+    """From half-way on the tag hangs elsewhere on the robot, m, and measures so much too much."""
 
-    def change(r: UwbRanges) -> UwbRanges:
+    def change(r: UwbRanges, case: Case) -> UwbRanges:
         base = se2.interpolate_trajectory(case.log.odometry.stamps, case.truth, r.stamps)
         tag = np.broadcast_to(case.log.mounting.tag_position[:2], (len(base), 2))
         place = np.array([case.anchors[name][0] for name in r.anchor_ids])[r.anchor]
-        old, new = (np.hypot(*(place - se2.transform(base, np.add(tag, [0.0, left]))).T) for left in (0.0, 0.3))
-        return replace(r, ranges=np.where(r.stamps >= case.middle, r.ranges + new - old + 0.4, r.ranges))
+        old, new = (np.hypot(*(place - se2.transform(base, tag + by)).T) for by in (np.zeros(2), np.array([ahead, left])))
+        return replace(r, ranges=np.where(r.stamps >= case.middle, r.ranges + new - old + longer, r.ranges))
 
-    return with_ranges(case, change)
+    return lambda case, rng: with_ranges(case, lambda r: change(r, case))
+
+
+def own_body(metres: float) -> Fault:
+    """The robot's body delays what comes from behind by so much."""
+
+    def change(r: UwbRanges, case: Case) -> UwbRanges:
+        base = se2.interpolate_trajectory(case.log.odometry.stamps, case.truth, r.stamps)
+        away = np.array([case.anchors[name][0] for name in r.anchor_ids])[r.anchor] - base[:, :2]
+        behind = np.cos(np.arctan2(away[:, 1], away[:, 0]) - base[:, 2]) < -0.2
+        return replace(r, ranges=r.ranges + metres * behind)
+
+    return lambda case, rng: with_ranges(case, lambda r: change(r, case))
+
+
+def exchanged_for(seconds: float) -> Fault:
+    """Two anchors answer to each other's names for a while."""
+
+    def change(r: UwbRanges, case: Case) -> UwbRanges:
+        on = (r.stamps >= case.middle) & (r.stamps < case.middle + seconds) & (r.anchor < 2)
+        return replace(r, anchor=np.where(on, 1 - r.anchor, r.anchor))
+
+    return lambda case, rng: with_ranges(case, lambda r: change(r, case))
 
 
 def now_and_then(metres: float) -> Fault:

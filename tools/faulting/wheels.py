@@ -179,17 +179,48 @@ def stuck_heading(case: Case, rng: Rng) -> Case:
     return with_odometry(case, change)
 
 
-def one_dead_wheel(case: Case, rng: Rng) -> Case:
-    """From half-way on the left wheel of a track of 0.3 m counts nothing."""
+def one_wheel(factor: float, seconds: float = 1e9) -> Fault:
+    """From half-way on the left wheel of a track of 0.3 m counts so many times its way, for so long."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        def change(stamps: Floats, poses: Floats) -> Floats:
+            steps, track = se2.between(poses[:-1], poses[1:]), 0.3
+            on = (stamps[1:] >= case.middle) & (stamps[1:] < case.middle + seconds)
+            left, right = (steps[on, 0] + side * 0.5 * track * steps[on, 2] for side in (-factor, 1.0))
+            left += (factor - 1.0) * steps[on, 0]
+            steps[on] = np.column_stack([0.5 * (left + right), steps[on, 1], (right - left) / track])
+            return chained(poses[0], steps)
+
+        return with_odometry(case, change)
+
+    return fault
+
+
+def wrapped_counters(case: Case, rng: Rng) -> Case:
+    """The counters of both wheels have 16 bits, 0.2 mm each, and the base does not notice that they wrap."""
 
     def change(stamps: Floats, poses: Floats) -> Floats:
-        steps, track = se2.between(poses[:-1], poses[1:]), 0.3
-        dead = stamps[1:] >= case.middle
-        right = steps[dead, 0] + 0.5 * track * steps[dead, 2]
-        steps[dead] = np.column_stack([0.5 * right, np.zeros(len(right)), right / track])
-        return chained(poses[0], steps)
+        steps, track, size = se2.between(poses[:-1], poses[1:]), 0.3, 2**16 * 0.0002
+        counted = np.cumsum([steps[:, 0] + side * 0.5 * track * steps[:, 2] for side in (-1.0, 1.0)], axis=1)
+        left, right = np.diff(np.mod(counted + 0.4 * size, size), axis=1, prepend=0.4 * size)
+        return chained(poses[0], np.column_stack([0.5 * (left + right), steps[:, 1], (right - left) / track]))
 
     return with_odometry(case, change)
+
+
+def corrected_by_jumps(metres: float, turn: float, every: float) -> Fault:
+    """What is recorded as odometry is the pose of a SLAM, which jumps now and then (1 sigma, m and rad)."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        def change(stamps: Floats, poses: Floats) -> Floats:
+            steps = se2.between(poses[:-1], poses[1:])
+            at = np.flatnonzero(np.diff(np.floor((stamps - stamps[0]) / every)) > 0)
+            steps[at] += rng.normal(0.0, [metres, metres, turn], (len(at), 3))
+            return chained(poses[0], steps)
+
+        return with_odometry(case, change)
+
+    return fault
 
 
 def exchanged_axes(case: Case, rng: Rng) -> Case:
