@@ -49,6 +49,24 @@ def test_errors_are_taken_in_the_frame_of_the_first_pose(trial, result):
     np.testing.assert_allclose(consistency.compare("", turned, trial).poses, one.poses / 4.0)
 
 
+def test_consistency_goes_on_where_an_earlier_call_stopped(tmp_path, monkeypatch, capsys):
+    """Each world and seed is mapped once; a world that needs it gets a longer recording."""
+    asked = []
+
+    def work(task):
+        asked.append((task.name, task.settings.seed, task.settings.minutes))
+        some = np.ones(3)
+        return consistency.Consistency(task.name, some, some, some, some, 0.1, 0.1, 0, False)
+
+    monkeypatch.setattr(consistency, "work", work)
+    call = ["--only", "warehouse", "--first", "5", "--minutes", "2", "--keep", str(tmp_path / "rows"), "--jobs", "1", "--print"]
+    for runs in ("1", "3"):
+        assert consistency.main([*call, "--runs", runs]) == 0
+    assert asked == [("warehouse", seed, 4.5) for seed in (5, 6, 7)]
+    assert "| warehouse | 3 |" in capsys.readouterr().out
+
+
+
 def test_a_trial_is_judged_by_all_figures(trial, result):
     found = trials.judged(result, trial)
     assert 0.0 < found.ate < 0.1
