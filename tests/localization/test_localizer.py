@@ -102,6 +102,21 @@ def test_a_robot_that_was_carried_away_is_lost_and_found_within_ten_seconds():
     assert errors(states[found:], poses[100 + found : 150]).max() < 0.1
 
 
+def test_a_robot_that_was_tracked_is_found_again_before_it_drives_on():
+    """Ranges to two anchors: at a start it has to drive half a metre; here the map is known to be the right one."""
+    two = {name: ANCHORS[name] for name in ("A", "C")}
+    poses = path(ROUND)
+    stands = np.repeat(poses[120:121], 20, axis=0)
+    assert all(s.lost for s in robot(known(anchors=two), anchors=two).along(stands))
+    drive = robot(known(anchors=two), anchors=two)
+    assert not drive.along(poses[:60])[-1].lost
+    drive.carried()
+    states = drive.along(stands)
+    assert any(s.lost for s in states)
+    assert not states[-1].lost
+    assert errors(states[-1:], stands[-1:])[0] < 0.1
+
+
 def test_ranges_alone_notice_that_it_was_carried_away():
     poses = path(ROUND)
     drive = robot(known(None))

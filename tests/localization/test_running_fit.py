@@ -66,3 +66,15 @@ def test_a_pose_that_is_lost_is_not_lost_again_by_the_same_ranges():
     for k in range(40):
         fit.add_range(k % 4, *CONTRADICTS, 10.0 + k)
         assert not fit.jumped()
+
+
+def test_a_range_that_agrees_by_chance_does_not_hide_since_when_scans_doubt():
+    fit = after((0, AGREES))
+    fit.add_scan(-0.1, True, 2.0)
+    assert not fit.scans_doubt()
+    for k in range(20):
+        fit.add_scan(-0.5, True, 2.1 + 0.1 * k)
+    fit.add_range(1, *AGREES, 4.0)
+    assert fit.scans_doubt()
+    assert not fit.scans_contradict()
+    assert (fit.matched, fit.sound) == (2.0, 4.0)

@@ -32,6 +32,8 @@ _SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
 """m driven and s between two searches."""
 _UNIT_WAY = 1.0
 """m driven between two comparisons of the map's unit with the sensors'."""
+_PROVEN = 3
+"""Comparisons of the unit that a tracked pose must have passed, two metres of driving, for the map to count as right."""
 _MOST, _FORGET = 40, -14.0
 """Hypotheses, and log-weight below which one goes."""
 _MOST_PARTS = 4
@@ -64,6 +66,8 @@ class PoseEstimator:
         self._certain = False
         self._confirmed: tuple[float, Floats] | None = None
         """Odometer and T_map_odom of the first of the searches that agree."""
+        self._compared = 0
+        """Comparisons of the unit that the map has passed, one after the other."""
         self._running = full_agreement(len(known.anchors.ids))
         self._reason = "nothing has been measured yet"
 
@@ -123,10 +127,11 @@ class PoseEstimator:
             if not self._certain:
                 self._decide_by(compared)
             elif compared.elsewhere:
-                self._lose(_SCANS_DIFFER)
-        if self._places.idle and (not self._certain or self._running.scans_contradict()) and self._due():
-            # Of a pose that ranges vouch for, places are compared by what was measured since it was sound.
-            self._searched = self._window.since(self._running.sound) if self._certain else self._window.newest(self._parts)
+                self._lose(_SCANS_DIFFER, self._running.matched)
+        if self._places.idle and (not self._certain or self._running.scans_doubt()) and self._due():
+            # Of a pose that is in doubt, places are compared by what was measured since scans fitted there: ranges to a wrong
+            # place agree by chance.
+            self._searched = self._window.since(self._running.matched) if self._certain else self._window.newest(self._parts)
             self._places.begin(self._searched, odom, self._way)
 
     def state(self, wheels: Floats) -> LocalizerState:
@@ -163,8 +168,9 @@ class PoseEstimator:
         One that ranges vouch for is given up only where another place explains better what was measured since.
         """
         if self._way - self._unit_way >= _UNIT_WAY:
-            self._unit_way = self._way
+            self._unit_way, self._compared = self._way, self._compared + 1
             if why := self._other_unit():
+                self._compared = 0
                 return why
         if self._sees() and self._running.scans_contradict():
             return "" if self._running.ranges_vouch(self._odometer.stamp) else _SCANS_DIFFER
@@ -177,9 +183,10 @@ class PoseEstimator:
         ranges = self._window.ranges_since(odom, way)
         return verdict.other_unit(self.known.walls, self._bank.poses[0], rays, len(np.unique(ago)), ranges, False)
 
-    def _lose(self, why: str) -> None:
+    def _lose(self, why: str, since: float | None = None) -> None:
+        """Begin anew with what was measured since a time, s; None = since measurements spoke for the pose."""
         self._certain, self._confirmed, self._reason = False, None, why
-        self._window, self._parts = self._window.since(self._running.agreed()), 1
+        self._window, self._parts = self._window.since(self._running.agreed() if since is None else since), 1
         self._places.drop()
         self._running.forget_anchors()
         self._search_way, self._search_stamp = self._way, self._odometer.stamp
@@ -197,11 +204,11 @@ class PoseEstimator:
         pose = self._bank.poses[best].copy()
         fitting = verdict.agreeing(pose, ranges)
         self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting) or verdict.other_unit(
-            self.known.walls, pose, found.rays, found.looks, ranges, True
+            self.known.walls, pose, found.rays, found.looks, ranges, self._compared < _PROVEN
         )
         self._trim(bool(verdict.nowhere(fit, known, fitting)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
-        self._decide(pose, verdict.confirming_way(fit, known, fitting))
+        self._decide(pose, verdict.confirming_way(fit, known, fitting, self._compared >= _PROVEN))
 
     def _trim(self, nowhere: bool) -> None:
         """Choose the part of the window that the next search goes by.
@@ -214,15 +221,20 @@ class PoseEstimator:
         self._parts = 2 * self._parts if nowhere and self._parts < _MOST_PARTS else 1
 
     def _decide(self, pose: Floats, confirm: float) -> None:
-        """Take the best hypothesis for the truth where two searches, so many metres apart, came to it without a doubt."""
+        """Take the best hypothesis for the truth where two searches, so many metres apart, came to it without a doubt.
+
+        0 m: a second search of a standing robot will do; below 0 the first one will.
+        """
         if self._reason:
             self._confirmed = None
             return
         self._reason = "found; a little more driving will confirm it"
         odom, confirmed = self._odometer.pose, self._confirmed
         if confirmed is None or hypotheses.apart(pose, se2.compose(confirmed[1], odom)[None])[0]:
-            self._confirmed = (self._way, se2.compose(pose, se2.inverse(odom)))
-        elif self._way - confirmed[0] >= confirm:
+            self._confirmed = confirmed = (self._way, se2.compose(pose, se2.inverse(odom)))
+            if confirm >= 0.0:
+                return
+        if self._way - confirmed[0] >= confirm:
             self._certain = True
             self._bank = hypotheses.pruned(self._bank, 1, -1.0)
             self._running.restart(self._sees())

@@ -50,6 +50,8 @@ class RunningFit:
     """s, of the last measurement that spoke for the pose."""
     ranged: float = -np.inf
     """s, of the last range."""
+    matched: float = -np.inf
+    """s, of the last scan that fitted."""
 
     def restart(self, sees: bool) -> None:
         """Begin with full agreement: the pose was found now."""
@@ -82,7 +84,11 @@ class RunningFit:
         if informative:
             self.fit += _FORGETTING * (fit - self.fit)
             if fit > FIT_SOUND:
-                self.sound = max(self.sound, stamp)
+                self.sound, self.matched = max(self.sound, stamp), max(self.matched, stamp)
+
+    def scans_doubt(self) -> bool:
+        """Return whether scans fit worse than they should: people may be about, or the robot is elsewhere."""
+        return self.fit < FIT_SOUND
 
     def scans_contradict(self) -> bool:
         return self.fit < FIT_LOST

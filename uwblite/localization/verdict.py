@@ -114,11 +114,17 @@ class RangeFit:
         return self.evidence >= 1.0
 
 
-def confirming_way(fit: float, ends: float, fitting: RangeFit) -> float:
-    """Return how far a robot must drive, m, between two searches that agree.
+def confirming_way(fit: float, ends: float, fitting: RangeFit, proven: bool) -> float:
+    """Return how far a robot must drive, m, between two searches that agree; below 0, a second one is not needed.
 
     Errors of scans and ranges have nothing in common: where both speak clearly for a place, each confirms the other.
+
+    Parameters
+    ----------
+    proven : the map is the right one, as a pose was tracked in it: what is left to be told is the place alone.
     """
+    if proven and fitting.anchors >= 2:
+        return -1.0
     if ends < FEW_ENDS or not fitting.enough:
         return _CONFIRM_ALONE
     clear = fitting.anchors >= _ANCHORS_CLEAR and fitting.share >= _RANGES_CLEAR

@@ -1,0 +1,29 @@
+"""How far a robot drives between two searches that agree, by what each kind of measurement says."""
+
+import pytest
+
+from uwblite.localization.verdict import ENOUGH_ENDS, RangeFit, confirming_way
+
+CLEAR = RangeFit(8, 1.0, 4)
+TWO_ANCHORS, ONE_ANCHOR = RangeFit(3, 1.0, 2), RangeFit(3, 1.0, 1)
+
+
+def test_scans_and_ranges_that_are_clear_confirm_each_other():
+    assert confirming_way(-0.1, ENOUGH_ENDS, CLEAR, proven=False) == 0.0
+
+
+def test_what_is_known_by_one_kind_alone_takes_longest_and_people_half_of_it():
+    alone = confirming_way(-0.1, 0.0, CLEAR, proven=False)
+    assert alone == confirming_way(-0.1, ENOUGH_ENDS, ONE_ANCHOR, proven=False)
+    assert confirming_way(-0.4, ENOUGH_ENDS, CLEAR, proven=False) == 0.5 * alone
+
+
+@pytest.mark.parametrize("fit", [-0.1, -0.4])
+@pytest.mark.parametrize("ends", [0.0, ENOUGH_ENDS])
+def test_in_a_map_in_which_the_robot_was_tracked_ranges_to_two_anchors_need_no_second_search(fit, ends):
+    assert confirming_way(fit, ends, TWO_ANCHORS, proven=True) < 0.0
+
+
+def test_ranges_to_one_anchor_confirm_nothing_in_any_map():
+    for fit, ends in ((-0.1, 0.0), (-0.1, ENOUGH_ENDS), (-0.4, ENOUGH_ENDS)):
+        assert confirming_way(fit, ends, ONE_ANCHOR, proven=True) == confirming_way(fit, ends, ONE_ANCHOR, proven=False)
