@@ -113,7 +113,10 @@ def test_ranges_zero_absurd_spiky_or_in_millimetres(without_scans):
     struck = mine & (rng.uniform(size=len(values)) < 0.2)
     assert_named(with_ranges(without_scans, np.where(struck, 0.0, values)), "warning", "anchor B2: ")
     figures = diagnose(with_ranges(without_scans, np.where(struck, 0.0, values))).figures["uwb"]["anchors"]["B2"]
-    assert figures["zeros"] == struck.sum()
+    sound = diagnose(without_scans).figures["uwb"]["anchors"]["B2"]
+    assert (figures["zeros"], figures["absurd"]) == (struck.sum(), 0)
+    assert figures["spikes"] <= sound["spikes"] + 2
+    assert figures["noise m"] < 2.0 * sound["noise m"]
     negative = diagnose(with_ranges(without_scans, np.where(struck, -3.0, values))).figures["uwb"]["anchors"]["B2"]
     assert negative["absurd"] == struck.sum()
     few = mine & (np.arange(len(values)) % 30 == 1)
@@ -169,6 +172,8 @@ def test_what_a_trial_map_doubts_or_refuses_is_serious_and_said_once(without_sca
     doubt = Notice("scales", "the ranges are 0.80 times the distances on the map", {})
     assert_named(without_scans, "serious", doubt.text, doubts=(doubt,))
     assert_named(without_scans, "serious", "nothing to map", refused="nothing to map")
+    for options, advice in (({"doubts": (doubt,)}, "doubted"), ({"refused": "nothing to map"}, "no map is made")):
+        assert advice in str([f.advice for f in diagnose(without_scans, **options).findings if f.topic == "map"])
     still = with_poses(without_scans, np.repeat(without_scans.odometry.poses[:1], len(without_scans.odometry.stamps), axis=0))
     (found,) = [f for f in diagnose(still).findings if "hardly moves" in f.what]
     again = diagnose(still, doubts=(Notice("hardly-moving", found.what, {}),)).findings

@@ -28,6 +28,14 @@ def test_every_unknown_has_a_name_of_its_own_a_unit_and_a_meaning():
     assert {f"bias:{a}" for a in IDS} <= {u.key.label for u in listed}
 
 
+def test_what_recordings_have_in_common_is_listed_once():
+    first, second = (unknowns(CalibrationConfig(), IDS, GIVEN, recording) for recording in (0, 1))
+    common = {u.key for u in first if u.key.recording is None}
+    assert common
+    assert {u.key.recording for u in second} == {1}
+    assert {u.key._replace(recording=1) for u in first if u.key not in common} == {u.key for u in second}
+
+
 def test_height_is_unknown_only_where_none_is_given():
     names = {u.key.label for u in unknowns(CalibrationConfig(), IDS, GIVEN)}
     assert {n for n in names if n.startswith("height2:")} == {"height2:1E05", "height2:91A3"}

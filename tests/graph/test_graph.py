@@ -223,6 +223,13 @@ def test_calibration_by_name():
     assert (calibration.get("b"), calibration.get("c"), calibration.get("c", 7.0)) == (2.0, 0.0, 7.0)
 
 
+def test_the_label_of_an_unknown_counts_tags_and_recordings_from_one():
+    labels = [UnknownKey("bias", "5C0B", recording, tag).label for recording in (None, 0, 1) for tag in (0, 1)]
+    first, second = ["bias:5C0B", "bias:5C0B@tag2"], ["bias:5C0B#2", "bias:5C0B@tag2#2"]
+    assert labels == [*first, *first, *second]
+    assert UnknownKey("laser_x").label == "laser_x"
+
+
 def test_a_prior_on_an_unknown_block_is_refused():
     with pytest.raises(DataError, match="anchor"):
         PriorEdges("anchor", np.array([0]), np.zeros((1, 2)), np.eye(2)[None])
