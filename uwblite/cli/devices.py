@@ -161,7 +161,7 @@ def look(path: str, kinds: "list[DeviceKind]", pan_id: int | None) -> PortReport
 
 def _ask(port: "Port", kind: "DeviceKind", port_report: PortReport) -> bool:
     """Let a device's session find it; True when it did."""
-    from ..drivers.devices import Options, Setup
+    from ..drivers.device_options import Options, Setup
     from ..drivers.events import Note, Reopen, Send, SetBaud, SetDtr
     from ..drivers.session import Session
 

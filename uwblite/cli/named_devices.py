@@ -16,7 +16,8 @@ MOST = {"uwb": 9, "lidar": 5, "gyro": 1, "odometry": 1}
 
 def device_links(args: argparse.Namespace, pose: "Pose" = (0.0, 0.0, 0.0)) -> list["Link"]:
     """Return the devices that the command line names; pose is where the odometry goes on."""
-    from ..drivers.devices import SENSORS, Setup, open_device
+    from ..drivers.device_options import Setup
+    from ..drivers.devices import SENSORS, open_device
     from ..drivers.link import Link
     from ..drivers.transport import check_pyserial, check_url
     from ..errors import ConfigError

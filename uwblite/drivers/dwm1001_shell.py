@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from .events import Corrupt, RangeReading, corrupt
-from .framing import Line, LineReader
+from .line_reader import Line, LineReader
 
 ENTER = b"\r\r"
 PROMPT = b"dwm> "

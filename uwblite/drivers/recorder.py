@@ -10,19 +10,9 @@ import selectors
 from collections.abc import Callable
 
 from ..errors import DeviceError
-from .events import (
-    Action,
-    Corrupt,
-    Lost,
-    Measurement,
-    Note,
-    Param,
-    Reopen,
-    Send,
-    SetBaud,
-    SetDtr,
-)
-from .link import Link, Mounting, doubts, summary_lines
+from .events import Action, Corrupt, Lost, Measurement, Note, Param, Reopen, Send, SetBaud, SetDtr
+from .link import Link, Mounting
+from .link_summary import doubts, summary_lines
 from .log_file import LogFile
 from .log_text import LogText
 from .transport import Port, open_port

@@ -16,7 +16,7 @@ import re
 from dataclasses import dataclass
 
 from .events import Corrupt, corrupt
-from .framing import Line, LineReader
+from .line_reader import Line, LineReader
 
 TIME_MODULUS = 1 << 24
 """The time stamp is a counter of 24 bit, 1 ms each: it wraps every 4 h 39 min 37 s."""

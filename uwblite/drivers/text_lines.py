@@ -9,7 +9,7 @@ from typing import Any
 from .clock import DeviceClock
 from .continuity import WITNESSES, Continuity, LinkHealth
 from .events import Action, Corrupt, Lost, corrupt
-from .framing import LineReader
+from .line_reader import LineReader
 from .session import ByteProtocol, Driver, Script, Wait
 
 EARLY = 0.02
