@@ -121,74 +121,96 @@ def optimize(
 
 
 def minimise(
-    graph: Graph,
-    linearized: list[Linearization],
-    normal: NormalEquations,
-    config: SolverConfig,
+    graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig,
     progress: Progress | None = None,
-) -> tuple[Graph, SolverSummary]:
+) -> tuple[Graph, SolverSummary]:  # fmt: skip
     """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
-    chi2 = chi2_initial = _cost(graph, linearized)
-    if not np.isfinite(chi2):
-        raise SolverError(what_is_not_finite(graph, linearized))
-    damping, raised_by, last_decrease = config.initial_damping, 2.0, np.inf
-    history: list[float] = []
-    to_come = _extrapolated if all(edges.kernel.name == "none" for edges in graph.edges) else _as_much_again
-    reason, improved = "", True
-    factor: Factor | None = None
-    linked, scale = _linked(len(graph.poses), linearized), np.zeros(normal.unknowns.size)
+    descent = _Descent(graph, linearized, normal, config)
+    del linearized
+    chi2_initial, reason = descent.chi2, descent.prepare()
     while not reason:
-        reused = factor is not None
-        if improved:
-            normal.fill(linearized, [_or_none(e, lin.residuals) for e, lin in zip(graph.edges, linearized, strict=True)])
-            # The normal equations hold it all now; the Jacobians of a recording of hours are large.
-            linearized = []
-            diagonal = normal.diagonal
-            curvature = np.where(diagonal > 0, diagonal, 1.0)
-            scale = np.maximum(scale, curvature)
-            if np.max(np.abs(normal.gradient) / np.sqrt(curvature)) <= config.gradient_tolerance:
-                reason = GRADIENT
-                break
-        if len(history) == config.max_iterations:
-            reason = USED_UP
-            break
-        trial_linearized: list[Linearization] = []
-        factor, step, promised = _step(normal, damping * scale, factor)
-        trial = _trial(graph, normal.unknowns, step, linked)
-        trial_linearized = linearize(trial)
-        trial_chi2 = _cost(trial, trial_linearized)
-        history.append(trial_chi2)
+        reason = descent.step()
         if progress is not None:
-            progress(len(history), config.max_iterations)
-        decrease = chi2 - trial_chi2
-        improved = promised > 0 and decrease >= 0
-        negligible = config.relative_decrease * chi2 + _NOTHING
-        if improved:
-            if to_come(decrease, last_decrease, promised) <= negligible and damping <= _FREE:
-                reason = NO_DECREASE
-            near = not reused and decrease <= _NEAR * chi2 and damping <= _NEARLY_FREE
-            factor = factor if near else None
-            graph, linearized, chi2, last_decrease = trial, trial_linearized, trial_chi2, decrease
-            damping = max(damping * _relaxed(decrease / promised), _LEAST_DAMPING)
-            raised_by = 2.0
-        elif 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * chi2) and damping <= _FREE:
-            reason = NO_DECREASE
+            progress(len(descent.history), config.max_iterations)
+        reason = reason or descent.prepare()
+    graph, history, converged = descent.graph, np.array(descent.history), reason in (NO_DECREASE, GRADIENT)
+    dof = independent_residuals(graph, descent.linearized or linearize(graph)) - normal.unknowns.size
+    return graph, SolverSummary(converged, reason, len(history), chi2_initial, descent.chi2, dof, history)
+
+
+class _Descent:
+    """A search under way: the estimate, what is linearised there, and the damping of the next step."""
+
+    def __init__(self, graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig) -> None:
+        self.graph, self.linearized, self.normal, self.config = graph, linearized, normal, config
+        self.chi2 = _cost(graph, linearized)
+        if not np.isfinite(self.chi2):
+            raise SolverError(what_is_not_finite(graph, linearized))
+        self.history: list[float] = []
+        self.moved = True
+        """The normal equations are of an estimate before this one."""
+        self.factor: Factor | None = None
+        """To be used again; None = factorise."""
+        self.damping, self.raised_by, self.last_decrease = config.initial_damping, 2.0, np.inf
+        self.scale = np.zeros(normal.unknowns.size)
+        self.linked = _linked(len(graph.poses), linearized)
+        robust = any(edges.kernel.name != "none" for edges in graph.edges)
+        self.to_come = _as_much_again if robust else _extrapolated
+
+    def prepare(self) -> str:
+        """Bring the normal equations to the estimate; return why the search ends here, "" where it goes on."""
+        if self.moved:
+            weights = [_or_none(e, lin.residuals) for e, lin in zip(self.graph.edges, self.linearized, strict=True)]
+            self.normal.fill(self.linearized, weights)
+            # The normal equations hold it all now; the Jacobians of a recording of hours are large.
+            self.linearized = []
+            diagonal = self.normal.diagonal
+            curvature = np.where(diagonal > 0, diagonal, 1.0)
+            self.scale = np.maximum(self.scale, curvature)
+            if np.max(np.abs(self.normal.gradient) / np.sqrt(curvature)) <= self.config.gradient_tolerance:
+                return GRADIENT
+        return USED_UP if len(self.history) == self.config.max_iterations else ""
+
+    def step(self) -> str:
+        """Try a step, and take it where the cost falls; return why the search ends with it, "" where it goes on."""
+        reused = self.factor is not None
+        self.factor, step, promised = _step(self.normal, self.damping * self.scale, self.factor)
+        trial = _trial(self.graph, self.normal.unknowns, step, self.linked)
+        linearized = linearize(trial)
+        chi2 = _cost(trial, linearized)
+        self.history.append(chi2)
+        negligible = self.config.relative_decrease * self.chi2 + _NOTHING
+        self.moved = promised > 0 and chi2 <= self.chi2
+        if self.moved:
+            over = self._take(trial, linearized, chi2, promised, negligible, reused)
         else:
-            factor = None
-            if not reused:
-                damping, raised_by = max(damping * raised_by, _FIRST_BRAKE), raised_by * 2.0
-        if not reason and damping > _MOST_DAMPING:
+            over = self._refuse(promised, negligible, reused)
+        if not over and self.damping > _MOST_DAMPING:
             # At a minimum no step helps either: then all that the gradient could still bring is lost in rounding.
-            reason = NO_DECREASE if np.max(normal.gradient**2 / scale) <= _ROUNDING * chi2 else STUCK
-    return graph, SolverSummary(
-        converged=reason in (NO_DECREASE, GRADIENT),
-        reason=reason,
-        iterations=len(history),
-        chi2_initial=chi2_initial,
-        chi2=chi2,
-        dof=independent_residuals(graph, linearized or linearize(graph)) - normal.unknowns.size,
-        chi2_history=np.array(history),
-    )
+            lost = np.max(self.normal.gradient**2 / self.scale) <= _ROUNDING * self.chi2
+            return NO_DECREASE if lost else STUCK
+        return NO_DECREASE if over else ""
+
+    def _take(
+        self, trial: Graph, linearized: list[Linearization], chi2: float, promised: float, negligible: float, reused: bool
+    ) -> bool:
+        """Go on from the trial, with less damping; return whether next to nothing is left to come."""
+        decrease = self.chi2 - chi2
+        over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= _FREE
+        near = not reused and decrease <= _NEAR * self.chi2 and self.damping <= _NEARLY_FREE
+        self.factor = self.factor if near else None
+        self.graph, self.linearized, self.chi2, self.last_decrease = trial, linearized, chi2, decrease
+        self.damping, self.raised_by = max(self.damping * _relaxed(decrease / promised), _LEAST_DAMPING), 2.0
+        return over
+
+    def _refuse(self, promised: float, negligible: float, reused: bool) -> bool:
+        """Stay, with more damping where the step was not by an old factor; return whether it promised next to nothing."""
+        self.factor = None
+        if 0 < promised <= (1e-3 if reused else 1.0) * min(negligible, _LITTLE * self.chi2) and self.damping <= _FREE:
+            return True
+        if not reused:
+            self.damping, self.raised_by = max(self.damping * self.raised_by, _FIRST_BRAKE), self.raised_by * 2.0
+        return False
 
 
 NO_DECREASE = "chi2 no longer decreases"
