@@ -7,7 +7,7 @@ import pytest
 from helpers.planted_graphs import loop, plain_ranges, relative_edges
 
 from uwblite import se2
-from uwblite.graph.condensation import solve_condensed
+from uwblite.graph.condensation import _damped, solve_condensed
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.partition import split
 from uwblite.graph.robust import Kernel
@@ -101,3 +101,7 @@ def test_one_part_alone_shares_nothing():
     solution = solve_condensed(*split(graph, np.zeros(len(graph.poses), dtype=int)))
     assert solution.sent == (0,)
     np.testing.assert_allclose(solution.parts[0].graph.poses, optimize(graph, CAREFUL)[0].poses, atol=1e-6)
+
+
+def test_what_nothing_measures_is_damped_as_one():
+    assert _damped(np.array([4.0, 0.5, 0.0]), 0.5).tolist() == [2.0, 0.25, 0.5]

@@ -8,7 +8,7 @@ from uwblite import se2
 from uwblite.errors import SolverError
 from uwblite.graph.graph import Graph, linearize
 from uwblite.graph.normal_equations import NormalEquations
-from uwblite.graph.schwarz_cg import TwoLevelFactor
+from uwblite.graph.schwarz_cg import _PIECE, TwoLevelFactor, cut
 from uwblite.graph.solver import optimize
 
 
@@ -80,3 +80,22 @@ def test_an_indefinite_matrix_is_refused():
     normal = system(graph)
     with pytest.raises(SolverError, match="singular"):
         normal.factor(-2.0 * np.asarray(normal.diagonal))
+
+
+def test_the_coarse_level_moves_pieces_as_rigid_bodies_and_all_else_on_its_own():
+    """A small motion of a piece about its middle, in differences; an unknown that is no pose has a column of its own."""
+    rng = np.random.default_rng(3)
+    count, size = 2 * _PIECE, 6 * _PIECE + 4
+    poses, places = rng.normal(size=(count, 3)), rng.permutation(size)
+    number, others = places[: 3 * count].reshape(count, 3), np.sort(places[3 * count :])
+    basis = cut(number, poses, size).basis.toarray()
+    motion, step = rng.normal(size=(2, 3)), 1e-6
+    moved = basis @ np.concatenate([motion.ravel(), rng.normal(size=4)])
+    for k in range(2):
+        own = np.arange(k * _PIECE, (k + 1) * _PIECE)
+        middle = np.append(poses[own, :2].mean(axis=0), 0.0)
+        about = se2.compose(se2.compose(middle + step * motion[k], se2.inverse(middle)), poses[own])
+        np.testing.assert_allclose(moved[number[own]], (about - poses[own]) / step, atol=1e-4)
+    np.testing.assert_array_equal(basis[others][:, 6:], np.eye(4))
+    assert not basis[others][:, :6].any()
+    assert not basis[number.ravel()][:, 6:].any()

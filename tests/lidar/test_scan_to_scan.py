@@ -120,6 +120,23 @@ def test_a_keyframe_that_matches_no_neighbour_is_laid_between_them(walk):
     np.testing.assert_array_equal(np.delete(found, astray, axis=0), np.delete(poses, astray, axis=0))
 
 
+def test_as_many_as_three_keyframes_in_a_row_are_laid_where_their_stamps_say(walk):
+    """The odometry says nothing of them; the clock of the recording may have begun long ago."""
+    truth, clouds, _ = walk
+    lines = np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
+    first = int(np.argmax(np.convolve(lines, np.ones(7), mode="valid"))) + 2
+    run, tied = np.arange(first, first + 3), np.ones(len(truth), dtype=bool)
+    tied[run] = False
+    poses = truth.copy()
+    poses[run] += [30.0, 0.0, 1.0]
+    stamps = 1e6 + np.arange(len(truth))
+    found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), poses, stamps, tied, GATE, TrackingConfig())
+    assert laid.tolist() == run.tolist()
+    error = se2.between(truth[run], found[run])
+    assert np.abs(error[:, :2]).max() < 0.03
+    assert np.abs(error[:, 2]).max() < 0.02
+
+
 def test_keyframes_without_neighbours_on_both_sides_stay(walk):
     truth, clouds, _ = walk
     tied = np.ones(len(truth), dtype=bool)
