@@ -47,6 +47,17 @@ def test_no_step_is_longer_than_allowed(world):
     np.testing.assert_allclose(np.cross(taken, step), 0.0, atol=1e-9)
 
 
+def test_pairs_go_on_at_the_last_gate_until_none_moves(world):
+    """By then one more step would move no pair; the first step was far from that."""
+    clouds, raster, points, exact = world
+    guess = exact + np.array([0.2, -0.15, 0.1])
+    moves = []
+    for pose in (guess, align_pairs(clouds, raster, I, J, guess, points, 0.5, 0.5, iterations=60).pose):
+        moves.append(np.abs(nondegenerate_step(match(clouds, raster, I, pose, points, 0.5, 0.25))[0]).max())
+    assert moves[0] > 0.05
+    assert moves[1] < 1e-3
+
+
 def test_motions_are_recovered_and_distinguished_from_guesses(world):
     clouds, raster, points, exact = world
     found = align_pairs(clouds, raster, I, J, exact + np.array([0.15, -0.1, 0.08]), points, 0.5, 0.1)

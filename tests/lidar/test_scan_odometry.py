@@ -1,0 +1,46 @@
+"""Motions between pairs of scans: measured where walls are seen, the guess where none are."""
+
+import numpy as np
+import pytest
+from helpers.planted import box, drive, scans
+
+from uwblite import se2
+from uwblite.lidar.scan_odometry import _FIRST_GATE, misfits, scan_steps
+from uwblite.sensor_log import SensorMounting
+
+WALLS = np.concatenate([box(9, 7), box(1, 2) + np.array([2.5, 1.5] * 2)])
+FIRST, SECOND = np.array([0, 2, 1]), np.array([1, 4, 5])
+NOMINAL = SensorMounting()
+BEHIND = SensorMounting(laser_flipped=True, T_base_laser=np.array([-0.1, 0.05, 2.0]))
+
+
+def seen(mounting=NOMINAL, **settings):
+    """Return scans of a drive through a room and the true motions between pairs of them."""
+    stamps, truth = drive([(0.3, 0.0, 0.2)], [3.0])
+    lidar = scans(stamps, truth, WALLS, beams=360, sweep=1e-6, mounting=mounting, **settings)
+    poses = se2.interpolate_trajectory(stamps, truth, lidar.stamps)
+    return lidar, se2.between(poses[FIRST], poses[SECOND])
+
+
+@pytest.mark.parametrize("mounting", [NOMINAL, BEHIND])
+def test_motions_are_found_whatever_the_mounting(mounting):
+    lidar, exact = seen(mounting, noise=0.005, rng=np.random.default_rng(1))
+    found, share = scan_steps(lidar, mounting, FIRST, SECOND, exact + np.array([0.05, -0.04, 0.03]))
+    error = se2.between(exact, found)
+    assert np.abs(error[:, :2]).max() < 0.01
+    assert np.abs(error[:, 2]).max() < 0.005
+    assert share.min() > 0.8
+    right, wrong = (misfits(lidar, mounting, FIRST, SECOND, exact + off) for off in (np.zeros(3), np.array([0.1, 0.1, 0.0])))
+    assert np.all(right < 0.2 * wrong)
+    away = misfits(lidar, mounting, FIRST, SECOND, exact + np.array([90.0, 0.0, 0.0]))
+    np.testing.assert_allclose(away, _FIRST_GATE**2)
+
+
+@pytest.mark.filterwarnings("error")
+def test_scans_that_see_nothing_match_nothing():
+    lidar, exact = seen(range_max=0.1)
+    assert not np.isfinite(lidar.ranges).any()
+    found, share = scan_steps(lidar, NOMINAL, FIRST, SECOND, exact)
+    np.testing.assert_allclose(found, exact)
+    assert not share.any()
+    assert not misfits(lidar, NOMINAL, FIRST, SECOND, exact).any()
