@@ -50,7 +50,7 @@ RECORDINGS = {
     "hall, no UWB": Settings(world="hall", without=("uwb",)),
 }
 LONGER = {"warehouse": 2.25}
-"""Worlds whose recordings are so many times as long: before, half of the warehouse is not driven, nor its anchors heard."""
+"""Worlds whose recordings are so many times as long: before, half of the warehouse is not driven, nor near its anchors."""
 FIRST_SEED = 1000
 
 

@@ -17,7 +17,7 @@ STAMPS = np.arange(100.0)
 POSES = np.column_stack([0.3 * STAMPS, np.zeros(100), np.zeros(100)])
 
 
-def heard(*spans):
+def measured(*spans):
     """Ranges of anchors from and until a time (s), each second."""
     at = [np.arange(*span, dtype=np.float64) for span in spans]
     stamps, anchor = np.concatenate(at), np.repeat(np.arange(len(spans)), [len(a) for a in at])
@@ -49,7 +49,7 @@ def untied(ranges=None, scans_at=None, edges=(), poses=POSES):
 
 @pytest.mark.parametrize("gap", [1.0, 20.0])
 def test_all_anchors_give_way_to_others_at_once(gap):
-    assert untied(heard((0, 50), (2, 49), (49 + gap, 95), (51 + gap, 95))) == [(49.0, 49.0 + gap)]
+    assert untied(measured((0, 50), (2, 49), (49 + gap, 95), (51 + gap, 95))) == [(49.0, 49.0 + gap)]
 
 
 @pytest.mark.parametrize(
@@ -57,12 +57,12 @@ def test_all_anchors_give_way_to_others_at_once(gap):
     [
         (((0, 50), (2, 30), (50, 95), (51, 95)), "one was left behind long before: the robot drove out of its reach"),
         (((0, 50), (2, 49), (50, 95), (75, 95)), "only one appears"),
-        (((0, 50), (2, 55), (50, 95), (51, 95)), "one is heard on both sides"),
+        (((0, 50), (2, 55), (50, 95), (51, 95)), "one is measured on both sides"),
         (((0, 3), (1, 4), (4, 95), (5, 95)), "the first part is too small for a word"),
     ],
 )
 def test_a_robot_that_drives_from_anchor_to_anchor(spans, why):
-    assert untied(heard(*spans)) == [], why
+    assert untied(measured(*spans)) == [], why
 
 
 WITHOUT = np.concatenate([np.arange(0.0, 40.0), np.arange(70.0, 100.0)])
@@ -70,11 +70,11 @@ WITHOUT = np.concatenate([np.arange(0.0, 40.0), np.arange(70.0, 100.0)])
 
 def test_the_lidar_is_silent_while_the_robot_drives():
     assert untied(scans_at=WITHOUT) == [(39.0, 70.0)]
-    assert untied(heard((0, 95)), WITHOUT) == [(39.0, 70.0)]
+    assert untied(measured((0, 95)), WITHOUT) == [(39.0, 70.0)]
 
 
 def test_what_bridges_the_silence():
-    assert untied(heard((0, 95), (10, 90)), WITHOUT) == []
+    assert untied(measured((0, 95), (10, 90)), WITHOUT) == []
     assert untied(scans_at=WITHOUT, edges=(scan_edge(20, 80),)) == []
     assert untied(scans_at=WITHOUT, edges=(scan_edge(80, 20),)) == []
     assert untied(scans_at=WITHOUT, edges=(scan_edge(20, 39),)) == [(39.0, 70.0)]

@@ -31,8 +31,8 @@ def test_anchors_without_a_place_are_put_where_their_ranges_cost_least(fixed):
     *others, ranges = graph.edges
     few = ranges.rows(np.flatnonzero((ranges.anchor != 0) | (np.cumsum(ranges.anchor == 0) <= 2)))
     anchors = np.array([[np.nan, np.nan], [np.nan, np.nan], where[2]])
-    held = None if fixed is None else np.array(fixed)
-    found, lost = place_anchors(replace(graph, poses=truth, anchors=anchors, edges=(*others, few), fixed_anchors=held))
+    given = None if fixed is None else np.array(fixed)
+    found, lost = place_anchors(replace(graph, poses=truth, anchors=anchors, edges=(*others, few), fixed_anchors=given))
     assert lost == (0,)
     np.testing.assert_array_equal(found.anchors[[0, 2]], [[0.0, 0.0], where[2]])
     np.testing.assert_allclose(found.anchors[1], where[1], atol=0.2)

@@ -20,7 +20,7 @@ _NOISE = np.log(10.0)
 """The same of the scale of the noise, whose variances are careful guesses."""
 _UNSEEN = 1e-9
 """Share of the largest eigenvalue of A below which a direction was seen by nothing."""
-_ROUNDS, _SETTLED, _LONGEST = 50, 1e-3, 1.0
+_ROUNDS, _NEGLIGIBLE, _LONGEST = 50, 1e-3, 1.0
 """Most rounds; change of all logarithms that ends them; longest step in a logarithm."""
 
 
@@ -51,7 +51,7 @@ def variances_of_kinds(y: Floats, a: Floats, kind: Ints) -> Floats:
         precision = curvature + np.diag(width**-2.0)
         step = -np.linalg.solve(precision, slope + (logs - mean) / width**2)
         logs = logs + step * min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-12))
-        if np.all(np.abs(step) < _SETTLED):
+        if np.all(np.abs(step) < _NEGLIGIBLE):
             break
     spread = np.diagonal(np.linalg.inv(precision))
     return np.exp(logs[1:] + 0.5 * spread[1:])

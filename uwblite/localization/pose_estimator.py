@@ -184,7 +184,7 @@ class PoseEstimator:
         return verdict.other_unit(self.known.walls, self._bank.poses[0], rays, len(np.unique(ago)), ranges, False)
 
     def _lose(self, why: str, since: float | None = None) -> None:
-        """Begin anew with what was measured since a time, s; None = since measurements spoke for the pose."""
+        """Begin again with what was measured since a time, s; None = since measurements spoke for the pose."""
         self._certain, self._confirmed, self._reason = False, None, why
         self._window, self._parts = self._window.since(self._running.agreed() if since is None else since), 1
         self._places.drop()

@@ -121,7 +121,7 @@ def confirming_way(fit: float, ends: float, fitting: RangeFit, proven: bool) -> 
 
     Parameters
     ----------
-    proven : the map is the right one, as a pose was tracked in it: what is left to be told is the place alone.
+    proven : the map is the right one, as a pose was tracked in it: what is left open is the place alone.
     """
     if proven and fitting.anchors >= 2:
         return -1.0

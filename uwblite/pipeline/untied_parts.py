@@ -67,7 +67,7 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     _, appears = np.unique(anchor, return_index=True)
     _, from_end = np.unique(anchor[::-1], return_index=True)
     silent = len(anchor) - 1 - from_end
-    # No anchor is heard both up to and after range k.
+    # No anchor is measured both up to and after range k.
     spans = np.zeros(len(anchor) + 1, dtype=np.int64)
     np.add.at(spans, appears, 1)
     np.add.at(spans, silent, -1)
@@ -76,7 +76,7 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
 
 
 def _suddenly(stamps: Floats, anchor: Ints, k: int) -> bool:
-    """Return whether several anchors are heard shortly before a range and several shortly after the next."""
+    """Return whether several anchors are measured shortly before a range and several shortly after the next."""
     before = (stamps > stamps[k] - _AT_ONCE) & (stamps <= stamps[k])
     after = (stamps > stamps[k]) & (stamps < stamps[k + 1] + _AT_ONCE)
     return min(len(np.unique(anchor[side])) for side in (before, after)) >= _ANCHORS
