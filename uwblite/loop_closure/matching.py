@@ -15,13 +15,13 @@ from ..arrays import Bools, Floats, Ints
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
+from ..lidar.directional_overlap import directional_overlap
 from ..lidar.free_space import FreeSpace
 from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.scan_matching import PairFactors, match, pair_points
 from ..lidar.visibility import violates_free_space
 from .candidates import Candidates
 from .closures import LoopClosureConfig
-from .directional_overlap import directional_overlap
 from .parallel import in_order
 
 _AT_ONCE = 32

@@ -10,9 +10,9 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..lidar.cloud_rasters import CloudRasters
-from ..lidar.clouds import Clouds
-from ..lidar.scan_matching import correspondences, pair_points
+from .cloud_rasters import CloudRasters
+from .clouds import Clouds
+from .scan_matching import correspondences, pair_points
 
 _NOISE = 0.005
 """Share of the points added to A in every direction: where fewer face, as along a bare wall, the noise of normals does."""

@@ -5,7 +5,7 @@ from helpers.laser_walks import CORRIDOR, HALL, scanned
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.loop_closure.directional_overlap import _NOISE, directional_overlap
+from uwblite.lidar.directional_overlap import _NOISE, directional_overlap
 
 GATE = 0.15
 FIRST, SECOND = np.array([0]), np.array([1])
