@@ -8,20 +8,22 @@ from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, odometry_indices, scan_indices, unknowns
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import ScanEdges
-from uwblite.odometry.turn_scale import turn_scales
+from uwblite.odometry.turn_scale import _independent, turn_scales
 
 STEPS, NOISE = 400, 0.01
 CALIBRATION = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
 INDEX = CALIBRATION.index("heading_scale")
 
 
-def found(scale, *, missed=(), frozen=(), seed=0, turned_round=False):
+def found(scale, *, missed=(), frozen=(), seed=0, turned_round=False, same_way=1):
     """Compare wheels whose turns are to be multiplied by 1 + scale (number or one per step) with exact scans.
 
     missed, frozen : steps of which the wheels count no turn, or nothing. turned_round : every other edge measures i from j.
+    same_way : steps in a row that turn the same way.
     """
     rng = np.random.default_rng(seed)
     motion = np.column_stack([np.full(STEPS, 0.2), np.zeros(STEPS), rng.uniform(-0.35, 0.35, STEPS)])
+    motion[:, 2] = np.abs(motion[:, 2]) * np.repeat(np.sign(motion[::same_way, 2]), same_way)
     truth = np.zeros((STEPS + 1, 3))
     for k, step in enumerate(motion):
         truth[k + 1] = se2.compose(truth[k], step)
@@ -76,3 +78,23 @@ def test_few_turns_show_nothing():
     none = np.zeros((0, 3))
     steps = ScanEdges(np.zeros(0, int), np.zeros(0, int), none, np.zeros((0, 3, 3)), none, none, scan_indices(CALIBRATION))
     assert turn_scales(wheels, steps, Graph(truth, calibration=CALIBRATION)) == {}
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.3, 0.9])
+def test_steps_of_a_turn_whose_errors_are_alike_count_for_fewer(alike):
+    """The variance of a mean over turns of eight steps is that of as many independent ones, by 4,000 drawn means."""
+    rng, turns, steps = np.random.default_rng(3), 60, 8
+    shape = (4000, turns, 1)
+    errors = np.sqrt(alike) * rng.standard_normal(shape) + np.sqrt(1.0 - alike) * rng.standard_normal((4000, turns, steps))
+    turn, ones = np.repeat(np.arange(turns), steps), np.ones(turns * steps)
+    counts = [_independent(one.ravel(), ones, turn) for one in errors[:50]]
+    assert np.median(counts) == pytest.approx(1.0 / errors.mean(axis=(1, 2)).var(), rel=0.1)
+
+
+def test_turns_that_slip_each_by_another_amount_are_no_change_of_the_scale():
+    """Forty steps turn the same way each time, by a factor of its own that scatters by 0.2: ten turns in all."""
+    for seed in range(5):
+        slip = np.repeat(np.random.default_rng(seed).normal(0.0, 0.2, STEPS // 40), 40)
+        one = found(slip, seed=seed, same_way=40)
+        assert not one.varies
+        assert abs(one.value) < 4.0 * one.sigma

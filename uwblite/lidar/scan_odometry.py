@@ -14,8 +14,10 @@ from . import cloud_rasters, clouds, scan_matching
 from .cloud_rasters import CloudRasters
 from .clouds import CloudConfig, Clouds, make_cloud
 from .correlative_matching import CorrelativeConfig, search
+from .directional_overlap import directional_overlap
 from .pair_alignment import align_pairs
 from .scan_matching import PairPoints
+from .visibility import nearest_by_bearing, pair_violations
 
 _FIRST_GATE, _LAST_GATE = 0.4, 0.12
 """Farthest match in the first and last iteration, m."""
@@ -68,6 +70,25 @@ def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: In
     built, raster, i, _, points = _pairs(scans, mounting, first, second)
     found = scan_matching.match(built, raster, i, motion, points, _FIRST_GATE, _FIRST_GATE)
     return (found.squared + _FIRST_GATE**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
+
+
+def directional_shares(
+    scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats
+) -> Floats:
+    """Return what share (e,) of two scans matches at a motion (e, 3) in the direction in which fewest points do, 0..1.
+
+    Along a corridor a scan matches the next one best where the robot stood, ray by ray: only the few surfaces that face
+    along it tell.
+    """
+    built, raster, i, j, _ = _pairs(scans, mounting, first, second)
+    return directional_overlap(built, raster, i, j, motion, _POINTS, _LAST_GATE)
+
+
+def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
+    """Return what share (e,) of either of two scans stands where the other looked through, for motions (e, 3), 0..1."""
+    built, _, i, j, _ = _pairs(scans, mounting, first, second)
+    nearest, pairs = nearest_by_bearing(built), zip(i.tolist(), j.tolist(), motion, strict=True)
+    return np.array([pair_violations(built, nearest, a, b, step[None])[0] for a, b, step in pairs])
 
 
 def _pairs(

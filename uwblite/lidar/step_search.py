@@ -15,11 +15,10 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from .cloud_rasters import rasterize
 from .clouds import Clouds
-from .free_space import free_space
 from .pair_alignment import Aligned, align_pairs
 from .raster_search import Window, best_poses
 from .scan_matching import PairFactors, measured, pair_points
-from .visibility import nearest_by_bearing, violates_free_space
+from .visibility import nearest_by_bearing, pair_violations
 
 _VIEWS = 6
 """Keyframes before the step that make its local sub-map."""
@@ -119,9 +118,7 @@ class StepSearch:
 
     def _through(self, k: int, poses: Floats) -> Floats:
         """Return the shares (c,) of either scan that would stand in free space for poses (c, 3) of keyframe k + 1 in k."""
-        here, there = (free_space(np.zeros((1, 3)), self._nearest[n : n + 1]) for n in (k, k + 1))
-        own, following = (self._clouds.cloud(n)[0] for n in (k, k + 1))
-        return np.array([violates_free_space(here, own, there, following, pose) for pose in poses])
+        return pair_violations(self._clouds, self._nearest, k, k + 1, poses)
 
 
 def _apart(pose: Floats, others: Floats) -> Bools:

@@ -84,6 +84,18 @@ def violates_free_space(free_a: FreeSpace, points_a: Floats, free_b: FreeSpace, 
     return max(one, other)
 
 
+def pair_violations(clouds: Clouds, nearest: Floats, i: int, j: int, poses: Floats) -> Floats:
+    """Return the larger share (c,) of either of two clouds that would stand in free space for poses (c, 3) of j in i, 0..1.
+
+    Parameters
+    ----------
+    nearest : see nearest_by_bearing; of all clouds.
+    """
+    here, there = (free_space(np.zeros((1, 3)), nearest[k : k + 1]) for k in (i, j))
+    own, other = (clouds.cloud(k)[0] for k in (i, j))
+    return np.array([violates_free_space(here, own, there, other, pose) for pose in poses])
+
+
 def dynamic_share(submaps: Submaps, free: Sequence[FreeSpace], poses: Floats, recording: Ints) -> float:
     """Return the share of a sub-map in the next one's free space where nothing but people, glass and drift can be the cause.
 

@@ -28,7 +28,7 @@ class TurnScale:
     value: float
     """Turn by the lidar / turn by the wheels - 1, 1: what ``heading_scale`` should be."""
     sigma: float
-    """Standard deviation, by the scatter of steps and by that of the stretches, 1."""
+    """Standard deviation, by the scatter of steps, whose errors within a turn are alike, and by that of the stretches, 1."""
     stretches: Floats
     """(4,) the same of each quarter of the turning steps."""
     stretch_sigma: float
@@ -73,7 +73,7 @@ def turn_scales(wheels: OdometryEdges, steps: ScanEdges, graph: Graph) -> dict[i
     for index in np.unique(of_recording[clear & (of_recording >= 0)]).tolist():
         own = clear & (of_recording == index)
         if own.sum() >= _ENOUGH:
-            found[index] = _scale(lidar[own], turned[own])
+            found[index] = _scale(lidar[own], turned[own], _turns(row[own], turned[own] + lidar[own]))
     return found
 
 
@@ -88,8 +88,23 @@ def _neighbours(wheels: OdometryEdges, steps: ScanEdges) -> tuple[Ints, Floats]:
     return row[same][order], turned[same][order]
 
 
-def _scale(lidar: Floats, wheels: Floats) -> TurnScale:
-    """Return the scale of turning steps (s,) in the order of time."""
+def _turns(row: Ints, turned: Floats) -> Ints:
+    """Return which turn each step (s,) belongs to: steps soon after each other that turn the same way are of one.
+
+    Parameters
+    ----------
+    row : (s,) of the odometry's edges, increasing. turned : (s,) its sign is the step's way of turning.
+    """
+    other = (np.diff(row) > _SOON) | (np.sign(turned[1:]) != np.sign(turned[:-1]))
+    return np.concatenate([[0], np.cumsum(other)])
+
+
+_SOON = 4
+"""Steps from one turning step to the next of the same turn."""
+
+
+def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
+    """Return the scale of turning steps (s,) in the order of time; turn : (s,) increasing number of each one's turn."""
     weight = np.hypot(lidar, wheels)
     direction = np.arctan2(lidar, wheels)
     centre = 0.25 * np.pi
@@ -100,13 +115,25 @@ def _scale(lidar: Floats, wheels: Floats) -> TurnScale:
     parts = np.array_split(np.arange(len(weight)), _STRETCHES)
     centres = np.array([_weighted_median(direction[p], weight[p]) for p in parts])
     steepness = 1.0 + np.tan(centre) ** 2
-    count = weight.sum() ** 2 / np.square(weight).sum()
+    count = _independent(direction - centre, weight, turn)
     by_steps = steepness * _OF_MEDIAN * spread_about_median(direction) / np.sqrt(count)
     by_stretches = steepness * float(np.std(centres, ddof=1)) / np.sqrt(_STRETCHES)
     scales = np.tan(centres) - 1.0
     return TurnScale(
         float(np.tan(centre)) - 1.0, float(max(by_steps, by_stretches)), scales, float(by_steps * np.sqrt(_STRETCHES))
     )
+
+
+def _independent(error: Floats, weight: Floats, turn: Ints) -> float:
+    """Return how many independent steps weighted ones (s,) are worth whose errors are partly alike within a turn.
+
+    Tyres slip, and floors give way, for as long as a turn lasts. The correlation of neighbouring steps of one turn is taken
+    from how often their errors have the same sign: of normal values with correlation r it is 1/2 + arcsin(r) / pi.
+    """
+    same = np.sign(error[1:] * error[:-1])[turn[1:] == turn[:-1]]
+    alike = float(np.sin(0.5 * np.pi * np.clip(same.mean(), 0.0, 1.0))) if len(same) else 0.0
+    sums, squares = np.bincount(turn, weight), np.square(weight).sum()
+    return float(weight.sum() ** 2 / (squares + alike * (np.square(sums).sum() - squares)))
 
 
 _OF_MEDIAN = 1.2533

@@ -2,13 +2,15 @@
 
 Neighbouring scans differ little. Where one differs from the next by far more than its neighbours do, and no motion
 near the wheels' brings the two together, the robot is somewhere else; so it is where ranges to several anchors jump.
+After a fast turn two scans may show little in common: the surfaces of the one then stand beside or behind what the other
+saw. Of scans from different places, many stand where the other looked through.
 """
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
-from ..lidar.scan_odometry import scan_steps
+from ..arrays import Bools, Floats, Ints
+from ..lidar.scan_odometry import in_free_space, scan_steps
 from ..sensor_log import SensorLog
 from . import range_motion
 
@@ -24,6 +26,8 @@ _MOST = 40
 """Candidates looked at, the largest first."""
 _SAME_PLACE = 0.55
 """Scans that match by a larger share are of one place."""
+_THROUGH = 0.12
+"""Share in free space that a true place does not have; people and doors leave less."""
 _MOST_CHANGE = 1.0
 """A reading that differs more counts as so much, m."""
 
@@ -44,7 +48,7 @@ def same_place(log: SensorLog, before: float, after: float) -> bool | None:
     first, second = int(np.searchsorted(middle, before, "right")) - 1, int(np.searchsorted(middle, after))
     if first < 0 or second >= len(middle) or middle[second] - after > 2.0 or before - middle[first] > 2.0:
         return None
-    share = _shares(log, np.array([first]), np.array([second]))[0]
+    share = _matched(log, np.array([first]), np.array([second]))[1][0]
     return bool(share >= _SAME_PLACE) if share > 0.0 else None
 
 
@@ -62,11 +66,11 @@ def _by_lidar(log: SensorLog) -> Floats:
     jumps = np.sort(jumps[np.argsort(-change[jumps], kind="stable")[:_MOST]])
     if not len(jumps):
         return np.zeros(0)
-    share = _shares(log, jumps, jumps + 1)
+    apart, share = _elsewhere(log, jumps, jumps + 1)
+    apart &= share > 0.0
     # The scan itself may be at fault: those on either side of both must not match either.
     low, high = np.maximum(jumps - 1, 0), np.minimum(jumps + 2, len(scans.stamps) - 1)
-    apart = (share < _SAME_PLACE) & (share > 0.0)
-    apart[apart] &= _shares(log, low[apart], high[apart]) < _SAME_PLACE
+    apart[apart] &= _elsewhere(log, low[apart], high[apart])[0]
     middle = scans.middles
     return 0.5 * (middle[jumps[apart]] + middle[jumps[apart] + 1])
 
@@ -80,11 +84,19 @@ def _changes(log: SensorLog) -> Floats:
     return np.minimum(np.abs(np.diff(readings, axis=0)), _MOST_CHANGE).mean(axis=1)
 
 
-def _shares(log: SensorLog, first: Ints, second: Ints) -> Floats:
-    """Return how well scans match from the wheels' guess (e,), 0..1."""
+def _elsewhere(log: SensorLog, first: Ints, second: Ints) -> tuple[Bools, Floats]:
+    """Return which pairs of scans (e,) no motion near the wheels' brings together, and what share of them matches (e,)."""
     assert log.scans is not None
-    if not len(first):
-        return np.zeros(0)
+    motion, share = _matched(log, first, second)
+    apart = share < _SAME_PLACE
+    through = in_free_space(log.scans, log.mounting, first[apart], second[apart], motion[apart])
+    apart[apart] &= through > _THROUGH
+    return apart, share
+
+
+def _matched(log: SensorLog, first: Ints, second: Ints) -> tuple[Floats, Floats]:
+    """Return the motions (e, 3) at which scans match best near the wheels' guess, and how well (e,), 0..1."""
+    assert log.scans is not None
     middle, odometry = log.scans.middles, log.odometry
     at = (se2.interpolate_trajectory(odometry.stamps, odometry.poses, middle[k]) for k in (first, second))
-    return scan_steps(log.scans, log.mounting, first, second, se2.between(*at), searches=len(first))[1]
+    return scan_steps(log.scans, log.mounting, first, second, se2.between(*at), searches=len(first))

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of, sigma_of_median, spread_about_median
-from ..lidar.scan_odometry import misfits, scan_steps
+from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import Odometry, Remark, SensorLog
 
 _PAIRS = 250
@@ -32,7 +32,9 @@ _APART = 0.1
 _CLEAR_SHARE = 0.9
 """Pairs that match so well from the wheels' guess are not matched from rest too."""
 _GAIN = 0.03
-"""Share by which rest must explain a pair better than the wheels do."""
+"""Share by which rest must explain a pair better than the wheels do, of all points and of those that face the way fewest do."""
+_EVERYWHERE = 0.5
+"""Least share of the points that face the way fewest do by which a match is right: of two neighbouring scans most match."""
 _SHARE = 0.6
 """Pairs that match less measure nothing."""
 _ABSOLUTE, _RELATIVE = (0.05, 0.06), 0.35
@@ -99,8 +101,16 @@ def compare(log: SensorLog) -> Pairs | None:
     poor = np.flatnonzero(good < _CLEAR_SHARE)
     by_rest, rest = scan_steps(scans, log.mounting, first[poor], second[poor], np.zeros((len(poor), 3)))
     better = rest > good[poor] + _GAIN
+    better[better] = _fit_better(log, first[poor[better]], second[poor[better]], by_rest[better], by_wheels[poor[better]])
     by_wheels[poor[better]], good[poor[better]] = by_rest[better], rest[better]
     return Pairs(middle[first], middle[second], by_wheels, wheels, good)
+
+
+def _fit_better(log: SensorLog, first: Ints, second: Ints, one: Floats, other: Floats) -> Bools:
+    """Return for which pairs of scans (e,) one motion (e, 3) matches better than another in every direction."""
+    assert log.scans is not None
+    a, b = (directional_shares(log.scans, log.mounting, first, second, motion) for motion in (one, other))
+    return np.asarray((a > b + _GAIN) & (a > _EVERYWHERE))
 
 
 def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
