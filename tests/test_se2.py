@@ -144,6 +144,8 @@ def test_trajectories_are_interpolated_in_time_and_fixed_at_their_ends():
     at = se2.interpolate_trajectory(stamps, path, np.array([-1.0, 0.5, 1.0, 2.0, 9.0]))
     np.testing.assert_allclose(at[:, 0], [0.0, 0.5, 5.0, 6.0, 7.0])
     np.testing.assert_array_equal(se2.interpolate_trajectory(stamps[:1], path[:1], np.array([4.0])), path[:1])
+    ends = se2.interpolate_trajectory(np.array([2.0, 2.0, 4.0, 4.0]), path, np.array([1.0, 2.0, 4.0, 5.0]))
+    np.testing.assert_allclose(ends[:, 0], [0.0, 1.0, 7.0, 7.0])
 
 
 @given(poses, poses)

@@ -126,7 +126,8 @@ def interpolate_trajectory(stamps: Floats, poses: Floats, query: ArrayLike) -> F
         return np.broadcast_to(poses[0], (*query.shape, 3)).copy()
     left = np.clip(np.searchsorted(stamps, query, side="right") - 1, 0, len(stamps) - 2)
     span = stamps[left + 1] - stamps[left]
-    fraction = np.clip((query - stamps[left]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
+    since = query - stamps[left]
+    fraction = np.where(span > 0, np.clip(since / np.where(span > 0, span, 1.0), 0.0, 1.0), since >= 0)
     return interpolate(poses[left], poses[left + 1], fraction)
 
 
