@@ -262,7 +262,7 @@ def main(argv=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("devices", nargs="*", metavar="DEVICE", help=f"of {', '.join(DEVICES)} (all)")
     parser.add_argument("--link", action="append", choices=LINKS, help="repeatable (all)")
-    parser.add_argument("--grid", action="store_true", help="one line a device: false, missing, lost, 95 % of stamps (ms)")
+    parser.add_argument("--grid", action="store_true", help="one line a device: false, missing, lost, 95 %% of stamps (ms)")
     parser.add_argument("--seconds", type=float, default=60.0, help="simulated time of each (60)")
     args = parser.parse_args(argv)
     if args.grid:
