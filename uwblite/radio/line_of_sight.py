@@ -35,15 +35,28 @@ def blocked(tags: Floats, anchors: Floats, surfaces: Floats) -> Bools:
     low, cell, occupied = _occupied(surfaces)
     way = anchors - tags
     length = np.hypot(way[:, 0], way[:, 1])
-    count = np.maximum(np.ceil((length - _NEAR_TAG - _NEAR_ANCHOR) / (0.5 * cell)), 0.0).astype(np.int64)
+    first, count = _over_map(tags - low, way / np.maximum(length, 1e-9)[:, None], length, cell, cell * np.array(occupied.shape))
     through = np.zeros(len(tags), dtype=bool)
     for part in np.array_split(np.arange(len(tags)), 1 + int(count.sum()) // _SAMPLES_AT_ONCE):
         row = np.repeat(part, count[part])
         begins = np.cumsum(count[part]) - count[part]
-        along = _NEAR_TAG + 0.5 * cell * (np.arange(len(row)) - np.repeat(begins, count[part]))
+        along = _NEAR_TAG + 0.5 * cell * (np.arange(len(row)) + np.repeat(first[part] - begins, count[part]))
         place = tags[row] + way[row] * (along / length[row])[:, None]
         through[row[_look_up(place, low, cell, occupied)]] = True
     return through
+
+
+def _over_map(start: Floats, ahead: Floats, length: Floats, cell: float, size: Floats) -> tuple[Ints, Ints]:
+    """Return the first place (m,) of each way that is looked up and how many are: those half a cell apart over the map.
+
+    An anchor may be taken for kilometres away; the map ends where the lidar saw its last wall.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        edges = (-cell - start) / ahead, (size + cell - start) / ahead  # a cell around the map: no rounding matters
+    enter = np.fmin(np.fmax.reduce([np.full(len(length), _NEAR_TAG), *np.fmin(*edges).T]), length)
+    leave = np.fmin.reduce([length - _NEAR_ANCHOR, *np.fmax(*edges).T])
+    first, last = (np.ceil((at - _NEAR_TAG) / (0.5 * cell)) for at in (enter, leave))
+    return first.astype(np.int64), np.maximum(last - first, 0.0).astype(np.int64)
 
 
 def _occupied(surfaces: Floats) -> tuple[Floats, float, Bools]:
