@@ -69,7 +69,7 @@ def test_an_anchor_taken_for_far_away_costs_no_more_than_the_map_is_wide(monkeyp
     wall, tags = seen([-5.0, 0.0], [5.0, 0.0]), np.array([[0.0, -6.0], [2.0, -6.0], [2.0, 6.0], [-5.0, -6.0]])
     near, looked_up = np.array([[0.0, 6.0], [2.0, -9.0], [9.0, 6.0], [-5.0, 6.0]]), []
     look_up = line_of_sight._look_up
-    monkeypatch.setattr(line_of_sight, "_look_up", lambda places, *map_: looked_up.append(len(places)) or look_up(places, *map_))
+    monkeypatch.setattr(line_of_sight, "_look_up", lambda at, *rest: looked_up.append(len(at)) or look_up(at, *rest))
     far = tags + 1e6 * (near - tags)
     assert blocked(tags, far, wall).tolist() == blocked(tags, near, wall).tolist() == [True, False, False, True]
     assert sum(looked_up) < 4 * 2 * (10.0 + 1.0) / (0.5 * 0.2)

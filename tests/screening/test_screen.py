@@ -190,6 +190,28 @@ def test_rounded_ranges_mark_nothing(sound, step):
     assert len(stuck_sensors.without_marks(log)[0].ranges.ranges) == len(log.ranges.ranges)
 
 
+@pytest.mark.parametrize("beyond", [False, True])
+def test_a_value_that_a_lidar_repeats_everywhere_is_no_wall(sound, beyond):
+    """A lidar that reports its reach for all that is farther, or one value for every tenth beam."""
+    scans = sound.scans
+    reach = np.float32(np.nanquantile(scans.ranges, 0.7))
+    every_tenth = np.broadcast_to(np.arange(scans.ranges.shape[1]) % 10 == 0, scans.ranges.shape)
+    marked = ~(scans.ranges < reach) if beyond else every_tenth
+    mark = reach if beyond else np.float32(1.0)
+    done = screen(replace(sound, scans=replace(scans, ranges=np.where(marked, mark, scans.ranges))))
+    assert kinds(done) == {"repeated-readings"}
+    assert done.screening.remarks[0].text.startswith(f"{marked.sum()} of {marked.size} readings")
+    np.testing.assert_array_equal(done.scans.ranges[~marked], scans.ranges[~marked])
+    assert np.isposinf(done.scans.ranges[marked]).all() if beyond else np.isnan(done.scans.ranges[marked]).all()
+    assert done.scans.range_max == (reach if beyond else scans.range_max)
+
+
+@pytest.mark.parametrize("step", [0.001, 0.01, 0.05])
+def test_rounded_readings_mark_nothing(sound, step):
+    log = replace(sound, scans=replace(sound.scans, ranges=(np.round(sound.scans.ranges / step) * step).astype(np.float32)))
+    assert stuck_sensors.without_lidar_marks(log)[0] is log
+
+
 def test_a_heading_against_the_path_is_turned_and_the_laser_reports_how(sound):
     done = screen(with_poses(sound, sound.odometry.poses * (1, 1, -1)))
     assert kinds(done) == {"heading-against-path"}

@@ -54,8 +54,8 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     odometry, jumps, broken = odometry_chain.rejoined(odometry)
     log, turned = heading_from_gyro(replace(log, odometry=odometry))
     remarks += [*_repeats(repeats), *bursts, *glitches, *broken, *turned]
-    repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges]
-    repairs += [directions.heading_with_the_path]
+    repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_lidar_marks]
+    repairs += [stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges, directions.heading_with_the_path]
     for repair in repairs + [directions.laser_upright] * turn_laser:
         log, more = repair(log)
         remarks += more

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Bools, Floats, runs_of
 from ..sensor_log import Remark, SensorLog
@@ -115,24 +116,53 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
     # A robot that stands repeats itself rightly.
     apart = np.column_stack([ranges.ranges, ranges.anchor, np.floor(travelled / _MOVED)])[ranges.ranges > 0.0]
-    values, counts = np.unique(np.unique(apart, axis=0)[:, 0], return_counts=True)
-    if len(values) < 2:
+    mark = _mark(np.unique(apart, axis=0)[:, 0])
+    if mark is None:
         return log, []
-    most = int(np.argmax(counts))
-    if counts[most] < max(_MARKS, _MARK_SHARE * counts.sum(), _TIMES_OTHERS * np.quantile(np.delete(counts, most), 0.9)):
-        return log, []
-    wrong = ranges.ranges == values[most]
+    wrong = ranges.ranges == mark
     if len(np.unique(ranges.anchor[wrong])) < 2:  # one that is stuck
         return log, []
     text = (
-        f"{int(wrong.sum())} of {len(wrong)} ranges are {values[most]:g} m to the last digit, wherever the robot is: the radio "
+        f"{int(wrong.sum())} of {len(wrong)} ranges are {mark:g} m to the last digit, wherever the robot is: the radio "
         "marks with it what it could not measure; these were left out"
     )
     return replace(log, ranges=ranges.rows(~wrong)), [Remark("repeated-ranges", text)]
 
 
+def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Take a reading that stands for no distance as no wall: what a lidar or its driver reports beyond its reach, say."""
+    scans = log.scans
+    if scans is None or not len(scans.stamps):
+        return log, []
+    travelled = np.interp(scans.stamps, log.odometry.stamps, log.odometry.travelled)
+    apart = scans.ranges[np.unique(np.floor(travelled / _MOVED), return_index=True)[1]]
+    holds = (apart >= scans.range_min) & (apart <= scans.range_max)
+    mark = _mark(apart[holds])
+    if mark is None or np.any(apart == np.float32(mark), axis=1).sum() < _MARKS:
+        return log, []
+    wrong = scans.ranges == np.float32(mark)
+    farthest = mark == float(apart[holds].max())
+    what = "it marks with it what it did not see" if farthest else "it is a mark, or the robot itself that it sees"
+    share = f"{int(wrong.sum())} of {wrong.size} readings of the lidar are {mark:g} m to the last digit, wherever the robot is"
+    ranges = np.where(wrong, np.float32(np.inf if farthest else np.nan), scans.ranges)
+    scans = replace(scans, ranges=ranges, range_max=mark if farthest else scans.range_max)
+    return replace(log, scans=scans), [Remark("repeated-readings", f"{share}: {what}; they were taken as no wall")]
+
+
+def _mark(values: Floats | NDArray[np.float32]) -> float | None:
+    """Return the value among readings (n,), of different places, that is far more frequent than others; None without one."""
+    distinct, counts = np.unique(values, return_counts=True)
+    if len(distinct) < 2:
+        return None
+    most = int(np.argmax(counts))
+    usual = np.quantile(np.delete(counts, most), 0.9)
+    frequent = counts[most] >= max(_MARKS, _MARK_SHARE * counts.sum(), _TIMES_OTHERS * usual)
+    return float(distinct[most]) if frequent else None
+
+
 _MARKS, _MARK_SHARE, _TIMES_OTHERS = 20, 0.03, 8.0
-"""Readings of one value at different places, their share of all, and how much more frequent than others it must be."""
+"""Readings (of a lidar: scans with readings) of one value at different places, their share of all, and how much more frequent
+than others it must be. No value of seven recorded lidars, in steps of 1 mm to 1 cm, is more than 0.7 % of their readings."""
 
 
 def _in_runs(flags: Bools, least: int) -> Bools:
