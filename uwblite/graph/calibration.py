@@ -6,6 +6,8 @@ import numpy as np
 
 from ..arrays import Bools, Ints
 from .graph import Calibration, Graph, PriorEdges, UnknownKey
+from .solver import SolverConfig, SolverSummary, optimize
+from .unknowns import free_unknowns
 
 ODOMETRY = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
 """Kinds of unknowns of the odometry."""
@@ -167,6 +169,19 @@ def with_free(graph: Graph, *kinds: str) -> Graph:
     """Return the graph with the calibration unknowns of these kinds set free."""
     assert graph.fixed_calibration is not None
     return replace(graph, fixed_calibration=graph.fixed_calibration & ~graph.calibration.of_kinds(*kinds))
+
+
+def optimize_with_heights(graph: Graph, config: SolverConfig = SolverConfig()) -> tuple[Graph, SolverSummary]:
+    """Return the graph at its optimum without a squared height below 0, and how the last search went; see solver.optimize.
+
+    Heights that come out negative are fixed at 0, and all else is solved again: it was at the optimum with them.
+    """
+    while True:
+        solved, summary = optimize(graph, config)
+        graph = with_nonnegative_heights(solved)
+        anything_free = any(free.any() for free in free_unknowns(graph).values())
+        if not anything_free or np.array_equal(graph.calibration.values, solved.calibration.values):
+            return graph, summary
 
 
 def with_nonnegative_heights(graph: Graph) -> Graph:

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_nonnegative_heights
+from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, optimize_with_heights
 from ..graph.graph import Graph
-from ..graph.solver import optimize
 from ..graph.unknowns import free_unknowns
 from ..grid import occupancy_grid as grids
 from ..grid.geometry import GridGeometry
@@ -59,7 +58,7 @@ _LAPS = 2
 
 def _solved(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate at the optimum of all of its measurements."""
-    solved = with_nonnegative_heights(optimize(estimate.problem, task.config.solver)[0])
+    solved = optimize_with_heights(estimate.problem, task.config.solver)[0]
     graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
     return replace(estimate, graph=graph.with_estimates_of(solved))
 

@@ -11,7 +11,15 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats
 from ..graph import calibration
-from ..graph.calibration import BIAS, ODOMETRY, RADIO, RANGE_SCALE, with_free, with_nonnegative_heights
+from ..graph.calibration import (
+    BIAS,
+    ODOMETRY,
+    RADIO,
+    RANGE_SCALE,
+    optimize_with_heights,
+    with_free,
+    with_nonnegative_heights,
+)
 from ..graph.graph import Graph
 from ..graph.solver import optimize
 from ..odometry import gyro
@@ -101,8 +109,9 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         if lap == _NOISE_ROUNDS - 1:
             graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
             estimate = replace(estimate, graph=with_free(graph, *RADIO))
-        solved, result = optimize(estimate.graph.with_edges(*estimate.odometry_and_ranges), config.solver)
-        estimate = replace(estimate, graph=with_nonnegative_heights(estimate.graph.with_estimates_of(solved)))
+        solved, result = optimize_with_heights(estimate.graph.with_edges(*estimate.odometry_and_ranges), config.solver)
+        graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
+        estimate = replace(estimate, graph=graph.with_estimates_of(solved))
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
     return estimate
