@@ -6,9 +6,9 @@ from itertools import islice
 
 import pytest
 from emulators.uwb_boards import BOARDS, slots
-from emulators.world import Epoch, RoomWorld
+from emulators.world import RoomWorld
 
-from uwblite.drivers.continuity import MOST_GAP, SPEED, SPREADS, Continuity, LinkHealth, RangeGuard
+from uwblite.drivers.continuity import MOST_GAP, SPEED, SPREAD, Continuity, LinkHealth, RangeGuard
 from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt, RangeEpoch, RangeReading
 
@@ -17,7 +17,7 @@ NUMBERED = ("makerfabs-at", "bu01", "bu03", "linktrack")
 SPECS = {name: f"{name}:port" for name in BOARDS} | {
     "line": "line:port?columns=t,id,range,quality&prefix=UWB&unit=0.001&time_unit=0.001"
 }
-SEEN = SPREADS[True] + SPEED * MOST_GAP + 0.1
+SEEN = SPREAD + SPEED * MOST_GAP + 0.1
 """m; a wrong range that lies so near to the one before cannot be told from a right one; that one may be a little wrong, too."""
 
 
@@ -86,39 +86,7 @@ def test_a_robot_that_walks_loses_nothing(damaged):
 @pytest.mark.parametrize("wrong", [(2.05, "A", 9.0), (2.05, "B", 7.0)])
 def test_a_leap_away_and_back_and_an_anchor_seen_once_are_given_up_and_counted(wrong):
     assert guard(sorted([*WALK, wrong]), damaged=True) == (WALK, 1)
-
-
-def test_on_a_clean_link_only_a_range_that_both_neighbours_contradict_is_given_up():
-    begin, lone, near = (0.85, "A", 9.0), (2.05, "B", 7.0), (2.05, "A", 8.0)
-    for row in (begin, lone, near):  # the series is not steady yet; another anchor; as far as a board may scatter
-        assert guard(sorted([*WALK, row])) == (sorted([*WALK, row]), 0)
-    assert guard(sorted([*WALK, (2.05, "A", 9.0)])) == (WALK, 1)
-    stays = [(t, name, metres + 2.0 * (t > 1.95)) for t, name, metres in WALK]
-    assert guard(stays) == (stays, 0)
-    flickers = [(t, name, metres + 3.0 * (k > 20 and k % 2)) for k, (t, name, metres) in enumerate(WALK)]
-    passed, given_up = guard(flickers)
-    assert len(passed) + given_up == len(WALK)
-    assert given_up <= 1
-    last = [*WALK, (4.0, "A", 19.0)]
-    assert guard(last) == (last, 0)  # nothing contradicts it
-
-
-@pytest.mark.parametrize("name", SPECS)
-def test_the_first_false_range_of_a_link_that_was_never_damaged_is_noticed(name):
-    """One bit of one range is changed, so that every character and every frame looks right."""
-    session, actions, sent = open_device("uwb", SPECS[name])[0], [], []
-    session.start(0.0)
-    for k, epoch in enumerate(islice(RoomWorld().epochs(), 60)):
-        sent.append((100.0 + epoch.time, {mm / 1000 for _, mm, _ in epoch.readings}))
-        if k == 42:
-            (anchor, mm, quality), *others = epoch.readings
-            epoch = Epoch(epoch.time, [(anchor, mm ^ 2048, quality), *others])
-        actions += session.feed(BOARDS[name](epoch, k, round(1000 * epoch.time)), 100.0 + epoch.time)
-    actions += session.stop()
-    assert sum(isinstance(action, Corrupt) for action in actions) == 1
-    for epoch in (a for a in actions if isinstance(a, RangeEpoch)):
-        ranges = min(sent, key=lambda round_: abs(round_[0] - epoch.stamp))[1]
-        assert all(min(abs(reading.range - true) for true in ranges) < 0.006 for reading in epoch.readings)
+    assert guard(sorted([*WALK, wrong])) == (sorted([*WALK, wrong]), 0)
 
 
 def test_a_leap_that_stays_passes_with_its_own_stamps():

@@ -16,15 +16,12 @@ DISTRUST = 60.0
 """s for which a link counts as damaged after bytes that were no line or frame."""
 WITNESSES, STRANGERS = (1, 2), 5
 """Readings that must agree with one that leaps, on a clean link and on a damaged one; and with the first of an anchor."""
-STEADY = 10
-"""Ranges in a row that went on from each other; on a clean link the next one, if it leaps, must not be contradicted."""
-SPREADS = 1.0, 0.15
-"""m by which two ranges of one anchor may differ at rest: on a clean link as far as the noise of any board reaches (0.2 m), on
-a damaged one as little as a good board's does."""
+SPREAD = 0.15
+"""m by which two ranges of one anchor may differ at rest, on a damaged link; on a clean one an outlier is the radio's."""
 SPEED = 1.5
 """m/s; robots for indoors are slower."""
 MOST_GAP, STALE = 0.2, 1.0
-"""s: ranges that lie further apart are compared as if they were so close; and they are not compared at
+"""s, on a damaged link: ranges that lie further apart are compared as if they were so close; and they are not compared at
 all, unless that is less than three times the least that lay between two ranges of an anchor lately."""
 MOST_ANCHORS = 256
 """That are remembered."""
@@ -48,8 +45,6 @@ class Continuity(Generic[Item]):
         """The latest that passed."""
         self.waiting: list[Item] = []
         """Those that leapt and go on from each other."""
-        self.steady = 0
-        """How many in a row went on from the one before, with none that leapt."""
 
     def take(self, item: Item, witnesses: int) -> tuple[list[Item], list[Item]]:
         """Take the next reading; return those that pass now, in their order, and those that are given up.
@@ -60,7 +55,7 @@ class Continuity(Generic[Item]):
         """
         if witnesses == 0:
             passed, dropped = [*self.waiting, item], []
-        elif self.follows(item):
+        elif self.last is not None and self._follows(self.last, item):
             passed, dropped, self.waiting = [item], self.waiting, []
         elif self.waiting and self._follows(self.waiting[-1], item):
             passed, dropped = [*self.waiting, item], []
@@ -69,13 +64,8 @@ class Continuity(Generic[Item]):
         else:
             passed, dropped, self.waiting = [], self.waiting, [item]
         if passed:
-            self.steady = self.steady + 1 if self.follows(item) and not dropped else 0
             self.last, self.waiting = item, []
         return passed, dropped
-
-    def follows(self, item: Item) -> bool:
-        """Return whether it can go on from the latest that passed."""
-        return self.last is not None and self._follows(self.last, item)
 
 
 class LinkHealth:
@@ -99,9 +89,6 @@ Ranged = tuple[RangeEpoch, RangeReading]
 class RangeGuard:
     """Ranges that no sum protects: on a damaged link one that leaps, and a new anchor, must be seen again.
 
-    On a clean link a range that leaps out of a steady series is given up only if the next one goes on as if it had not been;
-    where ranges scatter, all pass.
-
     Parameters
     ----------
     health : of the link.
@@ -116,34 +103,40 @@ class RangeGuard:
     def take(self, epoch: RangeEpoch, now: float) -> list[Action]:
         """Return the rounds whose ranges pass now, each with its own stamp, and Corrupt for ranges that are given up."""
         self._damaged = self._health.is_damaged(now)
-        passed, given_up = self._forgotten(epoch.stamp)
+        passed: list[Ranged] = []
+        given_up = self._forgotten(epoch.stamp)
         for reading in epoch.readings:
             series = self._anchors.setdefault(reading.anchor_id, Continuity(self._follows))
-            before, item = series.last, (epoch, reading)
-            through, dropped = series.take(item, self._witnesses(series, item))
+            before, witnesses = series.last, STRANGERS if series.last is None else WITNESSES[True]
+            through, dropped = series.take((epoch, reading), witnesses if self._damaged else 0)
             if before is not None and through:
                 self._intervals.append(through[-1][0].stamp - before[0].stamp)
             passed, given_up = passed + through, given_up + dropped
-        return _sorted_out(passed, given_up)
+        return self._sorted_out(passed, given_up)
 
     def finish(self) -> list[Action]:
         """Return what still waits at the end: ranges, or Corrupt."""
-        return _sorted_out(*self._forgotten(math.inf))
+        return self._sorted_out([], self._forgotten(math.inf))
 
-    def _witnesses(self, series: Continuity[Ranged], item: Ranged) -> int:
-        if self._damaged:
-            return STRANGERS if series.last is None else WITNESSES[True]
-        doubted = series.follows(item) if series.waiting else series.steady >= STEADY
-        return WITNESSES[False] if doubted else 0
+    def _sorted_out(self, passed: list[Ranged], given_up: list[Ranged]) -> list[Action]:
+        if not self._damaged:
+            passed, given_up = passed + given_up, []
+        rounds: dict[float, list[Ranged]] = {}
+        for item in sorted(passed, key=lambda item: item[0].stamp):
+            rounds.setdefault(item[0].stamp, []).append(item)
+        return [*[Corrupt(b"", "range that leaps away and back, or of an anchor seen once")] * len(given_up), *(
+            RangeEpoch(stamp, tuple([reading for _, reading in items]), items[0][0].spread)
+            for stamp, items in rounds.items()
+        )]  # fmt: skip
 
     def _follows(self, before: Ranged, after: Ranged) -> bool:
         seconds = max(after[0].stamp - before[0].stamp, 0.0)
         if seconds > max(STALE, 3 * min(self._intervals, default=0.0)):
             return False
-        return abs(after[1].range - before[1].range) <= SPREADS[self._damaged] + SPEED * min(seconds, MOST_GAP)
+        return abs(after[1].range - before[1].range) <= SPREAD + SPEED * min(seconds, MOST_GAP)
 
-    def _forgotten(self, stamp: float) -> tuple[list[Ranged], list[Ranged]]:
-        """Return what has waited for too long: what passes on a clean link, and what is given up on a damaged one."""
+    def _forgotten(self, stamp: float) -> list[Ranged]:
+        """Return what has waited for too long."""
         found: list[Ranged] = []
         for name, series in list(self._anchors.items()):
             if series.waiting and stamp - series.waiting[-1][0].stamp > FORGET:
@@ -152,14 +145,4 @@ class RangeGuard:
                     del self._anchors[name]
         while len(self._anchors) > MOST_ANCHORS:
             found += self._anchors.pop(next(iter(self._anchors))).waiting
-        return ([], found) if self._damaged else (found, [])
-
-
-def _sorted_out(passed: list[Ranged], given_up: list[Ranged]) -> list[Action]:
-    rounds: dict[float, list[Ranged]] = {}
-    for item in sorted(passed, key=lambda item: item[0].stamp):
-        rounds.setdefault(item[0].stamp, []).append(item)
-    return [*[Corrupt(b"", "range that leaps away and back, or of an anchor seen once")] * len(given_up), *(
-        RangeEpoch(stamp, tuple([reading for _, reading in items]), items[0][0].spread)
-        for stamp, items in rounds.items()
-    )]  # fmt: skip
+        return found
