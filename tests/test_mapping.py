@@ -279,16 +279,8 @@ def test_plaza_s_anchors_and_range_scale(shared_data):
     assert scale.value == pytest.approx(0.07, abs=0.015)
 
 
-DELAY = (
-    "0.107 m: the laser is 0.18 s late (turns alone say 0.20 s; stamps 0.18 s later make it 0.37 s), no closure is found, "
-    "and the joint refinement bends a map that is doubted"
-)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["kasdorf_2017-11-17-12-31-28", pytest.param("mines_exp1", marks=pytest.mark.xfail(reason=DELAY))]
-)
+@pytest.mark.parametrize("name", ["kasdorf_2017-11-17-12-31-28", "mines_exp1"])
 def test_real_recordings_without_a_truth(shared_data, name):
     """Nothing to compare with: the map must be of what was seen, and halves of the recording must agree with the whole."""
     log = read_log(shared_data / name / "run.log.gz")

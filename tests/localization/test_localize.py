@@ -90,6 +90,7 @@ def test_a_recording_with_neither_an_anchor_of_the_map_nor_walls_is_refused(log,
             localize(alone, known)
 
 
+@pytest.mark.slow
 def test_walls_alone_find_the_place_and_it_is_reported(log, earlier):
     found = localize(part(log).without(uwb=True), map_of(earlier))
     assert np.sqrt(np.mean(errors(found, earlier) ** 2)) < 0.025

@@ -17,7 +17,8 @@ def test_names_of_places():
     assert name_and_number("user@home") == ("user@home", 1)
 
 
-@pytest.mark.parametrize("lidar", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("lidar", [False, True])
 def test_a_moved_anchor_has_a_row_for_each_place(lidar):
     truth = two_rounds()
     log = recording(truth).without(lidar=not lidar)
