@@ -294,6 +294,19 @@ def test_real_recordings_without_a_truth(shared_data, name):
 
 
 @pytest.mark.slow
+def test_a_place_that_only_an_impossible_bias_explains_is_not_ok(shared_data):
+    """Two anchors 5 m apart under one id fit at one place with a constant error of 2.7 m, though the lidar holds the path."""
+    log = read_log(shared_data / "kasdorf_2017-11-17-12-31-28" / "run.log.gz")
+    ids = log.ranges.anchor_ids
+    one, other = ids.index("177"), ids.index("178")
+    joined = replace(log.ranges, anchor=np.where(log.ranges.anchor == other, one, log.ranges.anchor))
+    result = build_map(replace(log, ranges=joined))
+    statuses = {anchor.id: anchor.status for anchor in result.anchors}
+    assert statuses["177"] == "distrusted"
+    assert statuses["180"] == "ok"
+
+
+@pytest.mark.slow
 def test_intel_is_closed(shared_data):
     """2,725 raw scans whose odometry turns wrong by more than 150 degrees, against a SLAM estimate of others."""
     folder = shared_data / "intel_raw"

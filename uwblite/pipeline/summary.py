@@ -26,7 +26,7 @@ from .recordings import Recordings
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not speak against all anchors."""
 _NO_BIAS = 1.6
-"""Constant error of an anchor's ranges, m, twice that of the worst radios: without a lidar its place may be what is wrong."""
+"""Constant error of an anchor's ranges, m, twice that of the worst radios: rather its place is what is wrong."""
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
 
@@ -128,7 +128,7 @@ def _anchor(
     if used < 0.5:
         few = f"only {used:.0%} of its ranges agree with the map"
         status, reason = ("distrusted", few) if status == "ok" else (status, f"{few}; {reason}")
-    elif status == "ok" and abs(bias) > _NO_BIAS and not recordings.have_scans:
+    elif status == "ok" and abs(bias) > _NO_BIAS:
         status, reason = "distrusted", f"its ranges fit only with a constant error of {bias:.1f} m, which no radio has"
     return AnchorEstimate(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, spread_about_median(own), status, reason,
