@@ -1,20 +1,10 @@
-"""What the devices of a recording did, in sentences."""
+"""What the devices of a recording did, in sentences; a recording lasts from start to end, s."""
 
 from .link import Link
 
 
 def summary_lines(links: list[Link], start: float, end: float) -> list[str]:
-    """Return what each device did, for people.
-
-    Parameters
-    ----------
-    links : the devices.
-    start, end : of the recording, s.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return what each device did, for people."""
     lines = []
     for link in links:
         counts = link.counts
@@ -34,17 +24,7 @@ def summary_lines(links: list[Link], start: float, end: float) -> list[str]:
 
 
 def doubts(links: list[Link], start: float, end: float) -> list[str]:
-    """Return why a recording should not be trusted; empty when it can be.
-
-    Parameters
-    ----------
-    links : the devices.
-    start, end : of the recording, s.
-
-    Returns
-    -------
-    list of str
-    """
+    """Return why a recording should not be trusted; empty when it can be."""
     seconds, found = max(end - start, 1e-9), []
     for link in links:
         counts = link.counts

@@ -18,7 +18,7 @@ _SILENT, _DRIVEN = 10.0, 3.0
 """Time without any scan, s, and way meanwhile, m, after which the odometry may be anywhere where it failed."""
 _PART = 6
 """Keyframes of a part that is worth a word."""
-_ANCHORS, _HEARD = 2, 3
+_ANCHORS, _MEASURED = 2, 3
 """Anchors that hold two parts to each other, and ranges to one of them in each part."""
 _AT_ONCE = 10.0
 """s; anchors that all fall silent, and others that all appear, within so much were not left behind one after the other."""
@@ -93,4 +93,4 @@ def _tied(graph: Graph, ranges: RangeEdges | None, first: int, last: int) -> boo
         return False
     parts = ranges.pose < first, ranges.pose >= last
     counts = [np.bincount(ranges.anchor[part], minlength=len(graph.anchors)) for part in parts]
-    return int(np.sum(np.minimum(*counts) >= _HEARD)) >= _ANCHORS
+    return int(np.sum(np.minimum(*counts) >= _MEASURED)) >= _ANCHORS
