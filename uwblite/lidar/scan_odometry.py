@@ -78,14 +78,14 @@ def directional_shares(
     """Return what share (e,) of two scans matches at a motion (e, 3) in the direction in which fewest points do, 0..1.
 
     Along a corridor a scan matches the next one best where the robot stood, ray by ray: only the few surfaces that face
-    along it tell.
+    along it show the motion.
     """
     built, raster, i, j, _ = _pairs(scans, mounting, first, second)
     return directional_overlap(built, raster, i, j, motion, _POINTS, _LAST_GATE)
 
 
 def in_free_space(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
-    """Return what share (e,) of either of two scans stands where the other looked through, for motions (e, 3), 0..1."""
+    """Return what share (e,) of either of two scans stands in the free space of the other, for motions (e, 3), 0..1."""
     built, _, i, j, _ = _pairs(scans, mounting, first, second)
     nearest, pairs = nearest_by_bearing(built), zip(i.tolist(), j.tolist(), motion, strict=True)
     return np.array([pair_violations(built, nearest, a, b, step[None])[0] for a, b, step in pairs])

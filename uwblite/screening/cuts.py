@@ -3,7 +3,7 @@
 Neighbouring scans differ little. Where one differs from the next by far more than its neighbours do, and no motion
 near the wheels' brings the two together, the robot is somewhere else; so it is where ranges to several anchors jump.
 After a fast turn two scans may show little in common: the surfaces of the one then stand beside or behind what the other
-saw. Of scans from different places, many stand where the other looked through.
+saw. Of scans from different places, many points stand in the free space of the other.
 """
 
 import numpy as np
