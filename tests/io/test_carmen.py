@@ -230,6 +230,8 @@ def test_scans_of_another_number_of_beams_are_resampled(tmp_path):
     assert log.scans.stamps.tolist() == [0, 1, 2, 3, 4]
     np.testing.assert_allclose(log.scans.ranges, np.tile(reach[:180], (5, 1)), atol=1e-6)
     assert any("2 of 5 scans have other beams than most; they were resampled to 180" in w for w in log.notes.warnings)
+    assert not log.notes.set_back
+    assert not any("out of time order" in w for w in log.notes.warnings)
     log = read(tmp_path, odometry() + few[0] + most[0] + few[1])
     assert log.scans.ranges.shape == (3, 181)
     assert np.isnan(log.scans.ranges[:, 180]).tolist() == [True, False, False]

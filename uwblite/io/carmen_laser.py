@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from ..sensor_log import LaserScans
 from .carmen_laser_words import HEAD, RANK, Layout, kinds_of, parse_head, split_tail
 from .carmen_messages import BrokenLine, numbers, time_order
@@ -36,6 +36,8 @@ class _Scans:
     ranges: "array[float]" = field(default_factory=lambda: array("f"))
     """Readings of all scans, one behind the other; an array grows in place where blocks would have to be joined."""
     stamps: "array[float]" = field(default_factory=lambda: array("d"))
+    numbers: "array[int]" = field(default_factory=lambda: array("q"))
+    """Line of each scan: layouts take turns in one log."""
     seen: int = 0
     pending: list[Pending] = field(default_factory=list)
 
@@ -127,7 +129,9 @@ class LaserMessages:
                 keep = np.array([e is None for e in errors])
                 if keep.any():
                     scans.ranges.frombytes(np.ascontiguousarray(values if keep.all() else values[keep]).data.cast("B"))
-                scans.stamps.extend(p.stamp for p, error in zip(pending, errors, strict=True) if error is None)
+                sound = [p for p, error in zip(pending, errors, strict=True) if error is None]
+                scans.stamps.extend(p.stamp for p in sound)
+                scans.numbers.extend(p.number for p in sound)
                 yield from ((p.number, e) for p, e in zip(pending, errors, strict=True) if e is not None)
 
     def robot_poses(self) -> Floats:
@@ -148,8 +152,9 @@ class LaserMessages:
         range_min = params.get("laser_range_min")
         range_min = DEFAULT_RANGE_MIN if range_min is None else range_min
         range_max = self._reach(kept, params)
-        stamps, ranges = self._merged(kept, params, range_min, skipped, warnings)
-        order = time_order(stamps, what, warnings, set_back)
+        stamps, ranges, lines = self._merged(kept, params, range_min, skipped, warnings)
+        as_written = np.argsort(lines)
+        order = as_written[time_order(stamps[as_written], what, warnings, set_back)]
         time_increment = params.get("laser_time_increment")
         if time_increment is None:
             period = stamps[order] * 1.0
@@ -173,10 +178,10 @@ class LaserMessages:
 
     def _merged(
         self, kept: Layout, params: Params, range_min: float, skipped: dict[str, int], warnings: list[str]
-    ) -> tuple[Floats, NDArray[np.float32]]:
-        """Return stamps (k,) and cleaned readings (k, b) of all scans of the lidar, in the geometry of one layout."""
+    ) -> tuple[Floats, NDArray[np.float32], Ints]:
+        """Return stamps (k,), cleaned readings (k, b) and lines (k,) of all scans of the lidar, in one layout's geometry."""
         what, want = self._kind.decode(), self._geometry(kept, params)
-        stamps, parts, thinned, others, resized = [], [], 0, 0, 0
+        stamps, lines, parts, thinned, others, resized = [], [], [], 0, 0, 0
         for layout in sorted(self._scans, key=lambda layout: layout != kept):
             scans, have = self._scans.pop(layout), self._geometry(layout, params)
             if not want.is_of_one_lidar_with(have):
@@ -188,6 +193,7 @@ class LaserMessages:
                 resized += len(cleaned)
                 cleaned = resampled(cleaned, have, want)
             stamps.append(np.array(scans.stamps))
+            lines.append(np.array(scans.numbers))
             parts.append(cleaned)
         if others:
             skipped[f"{what} of another geometry"] = others
@@ -196,7 +202,8 @@ class LaserMessages:
             warnings.append(resampling_warning(resized, sum(map(len, stamps)), kept.beams))
         if thinned and self._every_nth > 1:
             skipped[f"{what} thinned out"] = thinned
-        return np.concatenate(stamps), parts[0] if len(parts) == 1 else np.concatenate(parts)
+        ranges = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return np.concatenate(stamps), ranges, np.concatenate(lines)
 
     def _mounting(self, what: str, warnings: list[str]) -> Floats | None:
         rows = np.array(self._poses).reshape(-1, 7)
