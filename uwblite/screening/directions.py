@@ -15,8 +15,9 @@ _AGREEMENT, _CLEARLY = 0.7, 0.2
 """Agreement of heading and path below which the sign is looked at, and by how much the other sign must agree better."""
 _TURNS = 300
 """Scan pairs looked at for the way up of the laser."""
-_LEAST_TURNED, _CONCENTRATED = 0.3, 0.8
-"""Angle, rad, by which a laser points elsewhere than given, and the share of the motions' directions that must agree on it."""
+_LEAST_TURNED, _ALIKE, _CONCENTRATED = 0.3, 0.5, 0.7
+"""Angle by which a laser points elsewhere than given, difference up to which directions of motion agree, both rad, and share
+of them that must agree. Along bare walls a match stays at the wheels' guess, whichever way the laser looks."""
 _CLEAR_WAY, _CLEAR_TURN = 0.05, 0.3
 """Pairs of scans with a longer way, m, and a smaller turn, rad, show the direction of driving."""
 _LEAST_PAIRS = 15
@@ -74,9 +75,12 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
     if clear.sum() < _LEAST_PAIRS:
         return log, []
     by_wheels, by_lidar = (m[clear, 0] + 1j * m[clear, 1] for m in (pairs.wheels, pairs.lidar))
-    turn = np.mean(np.exp(1j * (np.angle(by_wheels) - np.angle(by_lidar))))
-    angle = float(np.angle(turn))
-    if abs(angle) < _LEAST_TURNED or abs(turn) < _CONCENTRATED:
+    turns = by_wheels * by_lidar.conj() / np.abs(by_wheels * by_lidar)
+    middle = float(np.angle(turns.mean()))
+    off = np.angle(turns * np.exp(-1j * middle))
+    alike = np.abs(off) < _ALIKE
+    angle = middle + float(np.median(off[alike])) if alike.any() else 0.0
+    if abs(angle) < _LEAST_TURNED or np.mean(alike) < _CONCENTRATED:
         return log, []
     given = log.mounting.T_base_laser
     turned = np.array([given[0], given[1], float(se2.wrap_angle(given[2] + angle))])

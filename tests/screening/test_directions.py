@@ -1,0 +1,39 @@
+"""Where the laser looks, from how it sees the robot drive."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwblite import se2
+from uwblite.screening.directions import laser_ahead
+from uwblite.screening.wheel_motion import Pairs
+from uwblite.sensor_log import Odometry, SensorLog
+
+
+def pairs_of_a_laser_turned_by(angle: float, stuck: float) -> Pairs:
+    """Ways of 0.12 m and small turns; of a share of the pairs, along bare walls, the lidar repeats what the wheels said."""
+    rng, count = np.random.default_rng(3), 200
+    wheels = np.column_stack([np.full(count, 0.12), np.zeros(count), rng.normal(0.0, 0.05, count)])
+    lidar = np.column_stack([se2.rotate(np.full(count, -angle), wheels[:, :2]), wheels[:, 2]])
+    lidar[:, :2] += rng.normal(0.0, 0.004, (count, 2))
+    kept = rng.permutation(count) < stuck * count
+    lidar[kept] = wheels[kept]
+    return Pairs(np.arange(count) * 1.0, np.arange(count) + 0.3, lidar, wheels, np.ones(count))
+
+
+@pytest.mark.parametrize("angle", [np.pi, np.pi / 2, -np.pi / 2, 0.5])
+@pytest.mark.parametrize("stuck", [0.0, 0.2])
+def test_pairs_along_bare_walls_do_not_hide_where_the_laser_looks(angle, stuck):
+    log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), None, None)
+    turned, remarks = laser_ahead(log, pairs_of_a_laser_turned_by(angle, stuck))
+    assert [r.kind for r in remarks] == ["laser-turned-away"]
+    assert abs(se2.wrap_angle(turned.mounting.T_base_laser[2] - angle)) < 0.1
+
+
+def test_directions_that_do_not_agree_leave_the_laser_as_given():
+    log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), None, None)
+    pairs = pairs_of_a_laser_turned_by(np.pi, 0.4)
+    assert laser_ahead(log, pairs) == (log, [])
+    anyhow = replace(pairs, lidar=np.random.default_rng(1).normal(0.0, 0.1, pairs.lidar.shape))
+    assert laser_ahead(log, anyhow) == (log, [])
