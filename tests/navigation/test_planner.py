@@ -81,10 +81,10 @@ def test_laws_of_a_path(seed):
         assert planner.plan(goal, [start]).cost == pytest.approx(path.cost, rel=0.02, abs=1e-3)
 
 
-@pytest.mark.parametrize("detour", [(0.0, 0.0), (0.01, 0.3), (0.5, 2.0)])
+@pytest.mark.parametrize("nearby", [0.0, 0.25, 1e9])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_search_between_start_and_goal_finds_what_one_through_the_whole_map_does(monkeypatch, seed, detour):
-    monkeypatch.setattr("uwblite.navigation.planner._DETOUR", detour)
+def test_the_search_among_short_paths_finds_what_one_through_the_whole_map_does(monkeypatch, seed, nearby):
+    monkeypatch.setattr("uwblite.navigation.planner._NEARBY", nearby)
     grid = random_grid(seed, rows=60, cols=80, boxes=20)
     grid.log_odds[20:30, 20:26] = 0.0
     planner = make_planner(grid, RADIUS, unknown="price")
@@ -95,6 +95,15 @@ def test_the_search_between_start_and_goal_finds_what_one_through_the_whole_map_
         assert (cells[0], cells[-1]) == (first, last)
         cost = np.asarray(planner.graph[cells[:-1], cells[1:]]).sum()
         assert cost == pytest.approx(dijkstra(planner.graph, indices=first)[last], abs=1e-9)
+
+
+def test_an_open_way_is_taken_without_a_search(monkeypatch):
+    planner = make_planner(grid_of("\n".join(["." * 60] * 60)), 0.2)
+    monkeypatch.setattr("uwblite.navigation.planner.dijkstra", None)
+    path = planner.plan(np.array([1.03, 1.11]), [np.array([4.5, 3.2])])
+    assert path.cost == pytest.approx(np.hypot(3.47, 2.09), rel=1e-12)
+    with pytest.raises(TypeError):
+        planner.plan(np.array([0.25, 1.11]), [np.array([0.25, 3.2])])
 
 
 def test_open_space_is_crossed_in_a_straight_line():

@@ -6,7 +6,7 @@ from helpers.planning_worlds import grid_of, random_grid
 
 from uwblite.navigation import smoothing
 from uwblite.navigation.clearance import clearance_map
-from uwblite.navigation.smoothing import along_lines, sampled, smoothed
+from uwblite.navigation.smoothing import _graded, along_lines, sampled, smoothed
 
 
 def test_costs_along_lines_are_integrals():
@@ -37,6 +37,27 @@ def test_a_staircase_becomes_straight():
     stairs = np.repeat(np.arange(1.05, 4.0, 0.1), 2)
     line = smoothed(clearance, np.stack([stairs[1:], stairs[:-1]], axis=1))
     assert len(line) == 2
+
+
+def test_places_lie_on_their_pieces_and_closer_near_corners():
+    line = np.array([[0.0, 0.0], [25.6, 0.0], [25.6, 0.1], [19.2, 4.9]])
+    places, piece = _graded(line, 0.1)
+    ways = np.diff(places, axis=0)
+    along = np.diff(line, axis=0)[piece]
+    assert ways[:, 0] * along[:, 1] == pytest.approx(ways[:, 1] * along[:, 0], abs=1e-12)
+    assert np.add.reduceat(np.hypot(*ways.T), np.flatnonzero(np.diff(piece, prepend=-1))) == pytest.approx([25.6, 0.1, 8.0])
+    gaps = np.hypot(*ways[piece == 0].T)
+    away = np.minimum(places[:-1][piece == 0, 0], 25.6 - places[1:][piece == 0, 0])
+    assert gaps[:8] == pytest.approx(0.1)
+    assert gaps[-8:] == pytest.approx(0.1)
+    assert np.all(gaps <= np.maximum(0.1, away / 8) + 1e-9)
+    assert len(gaps) == 2 * (16 + 3 * 8)
+
+
+def test_a_line_that_is_cheapest_stays_and_corners_without_a_turn_go():
+    clearance = clearance_map(grid_of("\n".join(["." * 60] * 60)), 0.2)
+    line = np.array([[1.0, 1.0], [2.0, 1.5], [4.0, 2.5]])
+    assert np.array_equal(smoothed(clearance, line), line[[0, 2]])
 
 
 def test_poses_lie_evenly_on_every_piece():

@@ -16,11 +16,12 @@ from .smoothing import along_lines, sampled, smoothed, walk_back
 
 STEPS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Rows and columns to the eight neighbours of a cell."""
-_DIAGONAL = float(np.sqrt(2.0))
-"""Length of a step to a corner, in cells."""
-_DETOUR = 0.01, 0.3
-"""By what share of a path's least possible cost, and by how many metres more, it may be dearer and still be found by a search
-between start and goal, which takes a third of the time of one through the whole map; most paths in rooms are."""
+_NOTHING = 1e-9
+"""m; what a straight way through open space may cost more than its length, by rounding. No other way costs as little."""
+_DETOUR = 1.5, 1.0
+"""A path is looked for first among those that cost so many times the straight way, and so many metres more."""
+_NEARBY = 0.25
+"""Share of the map's cells up to which those in such a path's reach are worth a search of their own."""
 
 
 class NoPathError(DataError):
@@ -93,6 +94,9 @@ class Planner:
 
     def _leg(self, start: Floats, goal: Floats) -> Floats:
         """Return the corners (k, 2) of the path between two places, the first of which is left out."""
+        straight = along_lines(self.clearance, start[None], goal[None])
+        if straight.clear[0] and straight.costs[0] <= np.hypot(*(goal - start)) + _NOTHING:
+            return goal[None]
         way, first = self._entrance(start)
         cells = self._search(first, self._beside(goal), goal)
         line = smoothed(self.clearance, np.concatenate([way[-1:], self._places(cells)[len(way) > 1 :], goal[None]]))
@@ -100,45 +104,13 @@ class Planner:
 
     def _search(self, first: int, last: int, goal: Floats) -> Ints:
         """Return the nodes (k,) of the cheapest path to the last, which is beside the goal; -1 = none is."""
-        if last >= 0:
-            slack = _DETOUR[0] * float(self._least(np.array([first]), last)[0]) + _DETOUR[1]
-            costs, before = dijkstra(self._towards(first, last, slack), indices=first, return_predecessors=True, limit=slack)
-            if np.isfinite(costs[last]):
+        reach = _DETOUR[0] * float(np.hypot(*(self._places(np.array([first]))[0] - goal))) + _DETOUR[1]
+        nearby = last >= 0 and np.pi * reach**2 < _NEARBY * len(self.nodes) * self.clearance.geometry.resolution**2
+        for limit in (reach, np.inf) if nearby else (np.inf,):
+            costs, before = dijkstra(self.graph, indices=first, return_predecessors=True, limit=limit)
+            if last >= 0 and np.isfinite(costs[last]):
                 return walk_back(before, first, last)
-        costs, before = dijkstra(self.graph, indices=first, return_predecessors=True)
-        if last < 0 or not np.isfinite(costs[last]):
-            raise self._no_path(goal, np.isfinite(costs))
-        return walk_back(before, first, last)
-
-    def _least(self, nodes: Ints, last: int) -> Floats:
-        """Return the least cost (k,) that a path from nodes to the last can have: that of its steps in open space."""
-        grid = self.clearance.geometry
-        row, col = np.divmod(self.nodes[nodes], grid.cols)
-        there = divmod(int(self.nodes[last]), grid.cols)
-        down, across = np.abs(row - there[0]), np.abs(col - there[1])
-        cells = np.maximum(down, across) + (_DIAGONAL - 1.0) * np.minimum(down, across)
-        return np.asarray(grid.resolution * cells)
-
-    def _towards(self, first: int, last: int, slack: float) -> csr_matrix:
-        """Return the graph (n, n) of A*: a step costs as much more as it leads away from the last node, or less towards it.
-
-        A path that costs the slack more than the least, m, has just that length here, and what Dijkstra's algorithm finds
-        within it is the cheapest path of all (Hart, Nilsson and Raphael 1968). Only those rows of the map are in it that such
-        a path can touch: leaving the rows of both ends by y cells and coming back costs 2 (sqrt(2) - 1) y.
-        """
-        grid = self.clearance.geometry
-        ends = np.sort(self.nodes[[first, last]]) // grid.cols
-        beyond = int(np.ceil(slack / (2.0 * (_DIAGONAL - 1.0) * grid.resolution)))
-        rows = np.array([ends[0] - beyond, ends[1] + beyond + 1])
-        (begin, end), (low, high) = (np.searchsorted(self.nodes, (rows + more) * grid.cols) for more in (0, np.array([-1, 1])))
-        least = self._least(np.arange(low, high), last)
-        starts = self.graph.indptr[[begin, end]]
-        targets = self.graph.indices[starts[0] : starts[1]]
-        degrees = np.diff(self.graph.indptr[begin : end + 1])
-        before = np.repeat(least[begin - low : end - low], degrees)
-        costs = self.graph.data[starts[0] : starts[1]] + least[targets - low] - before
-        pointers = np.clip(self.graph.indptr, *starts) - starts[0]
-        return csr_matrix((np.maximum(costs, 0.0), targets, pointers), shape=self.graph.shape)
+        raise self._no_path(goal, np.isfinite(costs))
 
     def _entrance(self, start: Floats) -> tuple[Floats, int]:
         """Return the corners (k, 2) of the way from a place to the first node, which keeps no clearance, and that node.

@@ -20,6 +20,10 @@ _SAMPLES_PER_CELL = 2
 _SAMPLES_AT_A_TIME = 200_000
 _STARTS_PER_SHORTCUT = 4
 """Shortcuts of the same reach that overlap."""
+_PLACES_PER_OCTAVE = 8
+"""Places on a straight piece between one distance from its nearer end and twice that distance."""
+_SIEVE = 16
+"""Parts of a shortcut, at whose ends it is looked up first: most of the long ones lead through obstacles."""
 _CORNER_COST = 1e-3
 """m; a corner is worth as much, so that of equal lines the one with the fewest pieces is taken."""
 _GAIN = 1e-3
@@ -77,7 +81,7 @@ def smoothed(clearance: ClearanceMap, line: Floats) -> Floats:
     """
     cost = np.inf
     for _ in range(_MOST_ROUNDS):
-        line, now = _shortened(clearance, _divided(line, clearance.geometry.resolution))
+        line, now = _shortened(clearance, _straightened(line))
         if not now < cost * (1.0 - _GAIN):
             break
         cost = now
@@ -85,14 +89,28 @@ def smoothed(clearance: ClearanceMap, line: Floats) -> Floats:
 
 
 def _shortened(clearance: ClearanceMap, line: Floats) -> tuple[Floats, float]:
-    """Return the cheapest line (k, 2) by shortcuts between corners (n, 2), and its cost."""
-    begin, end = _shortcuts(len(line))
-    along = along_lines(clearance, line[begin], line[end])
-    kept = along.clear | (end - begin == 1)
-    costs = along.costs[kept] + _CORNER_COST
-    graph = csr_matrix((costs, (begin[kept], end[kept])), shape=(len(line), len(line)))
+    """Return the cheapest line (k, 2) by shortcuts between places on a line (n, 2), and its cost."""
+    places, piece = _graded(line, clearance.geometry.resolution)
+    begin, end = _shortcuts(len(places))
+    steps = along_lines(clearance, places[:-1], places[1:]).costs
+    driven = np.concatenate([[0.0], np.cumsum(steps)])
+    costs = driven[end] - driven[begin]
+    across = np.flatnonzero(piece[begin] != piece[end - 1])
+    across = across[_likely(clearance, places[begin[across]], places[end[across]])]
+    along = along_lines(clearance, places[begin[across]], places[end[across]])
+    costs[across] = along.costs
+    kept = piece[begin] == piece[end - 1]
+    kept[across] = along.clear
+    graph = csr_matrix((costs[kept] + _CORNER_COST, (begin[kept], end[kept])), shape=(len(places), len(places)))
     totals, before = dijkstra(graph, indices=0, return_predecessors=True)
-    return line[walk_back(before, 0, len(line) - 1)], float(totals[-1])
+    return places[walk_back(before, 0, len(places) - 1)], float(totals[-1])
+
+
+def _likely(clearance: ClearanceMap, begin: Floats, end: Floats) -> Bools:
+    """Return which lines (m,) keep the clearance at a few places at least."""
+    share = np.arange(1, _SIEVE)[:, None, None] / _SIEVE
+    squared, _ = clearance.at(begin + share * (end - begin))
+    return np.asarray(squared.min(axis=0) >= clearance.radius**2)
 
 
 def _shortcuts(corners: int) -> tuple[Ints, Ints]:
@@ -126,6 +144,33 @@ def _divided(line: Floats, step: float) -> Floats:
     owner = np.repeat(np.arange(len(ways)), pieces)
     share = (np.arange(len(owner)) - (np.cumsum(pieces) - pieces)[owner]) / pieces[owner]
     return np.concatenate([line[owner] + share[:, None] * ways[owner], line[-1:]])
+
+
+def _straightened(line: Floats) -> Floats:
+    """Return a line (n, 2) without the corners at which it does not turn."""
+    ways = np.diff(line, axis=0)
+    before, after = ways[:-1], ways[1:]
+    turns = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > 1e-9
+    return line[np.concatenate([[True], turns, [True]])]
+
+
+def _graded(line: Floats, step: float) -> tuple[Floats, Ints]:
+    """Divide a line (n, 2) at about the step near its corners, and ever more coarsely between them.
+
+    Returns
+    -------
+    places : (k, 2) m.
+    piece : (k - 1,) number of the line's piece on which the way to the next place lies.
+    """
+    ways = np.diff(line, axis=0)
+    pieces = np.maximum(np.ceil(np.hypot(*ways.T) / step - 1e-9), 1).astype(np.int64)
+    owner = np.repeat(np.arange(len(ways)), pieces)
+    number = np.arange(len(owner)) - (np.cumsum(pieces) - pieces)[owner]
+    away = np.minimum(number, pieces[owner] - number)
+    coarseness = 2 ** np.log2(np.maximum(away / _PLACES_PER_OCTAVE, 1.0)).astype(np.int64)
+    kept = away % coarseness == 0
+    piece, share = owner[kept], (number / pieces[owner])[kept]
+    return np.concatenate([line[piece] + share[:, None] * ways[piece], line[-1:]]), piece
 
 
 def sampled(line: Floats, step: float, heading: float | None = None) -> tuple[Floats, Floats]:
