@@ -1,10 +1,14 @@
-"""The width of a path by its length."""
+"""The width of a path by its length; figures of the wheels and what is said of them."""
 
 import numpy as np
 import pytest
+from helpers.planted import chain
+from scipy.special import j0
 
 from uwblite import se2
-from uwblite.checks.odometry import straightness
+from uwblite.checks.findings import Findings
+from uwblite.checks.odometry import check_odometry, straightness
+from uwblite.sensor_log import Odometry
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4, 2.0])
@@ -18,3 +22,42 @@ def test_a_path_is_as_wide_as_its_principal_axes_are_long(turn):
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
 def test_a_robot_that_stands_has_no_width(count):
     assert straightness(np.ones((count, 2))) == 0.0
+
+
+def checked(poses, rate):
+    found = Findings()
+    return check_odometry(Odometry(np.arange(len(poses)) / rate, poses), found), found.ranked()
+
+
+@pytest.mark.parametrize(("rate", "slow"), [(4.9, True), (5.1, False)])
+def test_figures_of_a_square(rate, slow):
+    """Four sides of five steps of 0.1 m; after each side a step that turns on the spot and one that rests."""
+    steps = np.tile(np.array([[0.1, 0.0, 0.0]] * 5 + [[0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.0]]), (4, 1))
+    figures, found = checked(chain(np.zeros(3), steps), rate)
+    assert figures["path m"] == 2.0
+    assert figures["turned rad"] == pytest.approx(2.0 * np.pi, abs=1e-3)
+    assert figures["speed m/s"] == pytest.approx(0.1 * rate, abs=1e-4)
+    assert figures["width of the path by its length"] == pytest.approx(1.0, abs=0.05)
+    assert ["readings a second" in f.what for f in found] == ([True] if slow else [])
+
+
+@pytest.mark.parametrize(("speed", "said"), [(0.0, False), (0.0039, True), (0.0041, False)])
+def test_a_speed_of_some_millimetres_a_second_has_another_unit(speed, said):
+    poses = np.column_stack([speed / 10.0 * np.arange(50), np.zeros((50, 2))])
+    assert ["check the unit" in f.advice for f in checked(poses, 10.0)[1]] == ([True] if said else [])
+
+
+@pytest.mark.parametrize(("swing", "said"), [(0.5, False), (0.6, True)])
+def test_a_robot_that_moves_across_its_heading_is_named(swing, said):
+    """A heading that swings about the tangent of a circle: the mean of exp(2i swing sin) is Bessel's J0(2 swing)."""
+    angle = np.linspace(0.0, 4.0 * np.pi, 800)
+    there = np.column_stack([3.0 * np.cos(angle), 3.0 * np.sin(angle)])
+    off = 0.5 * np.pi + swing * np.sin(3.0 * angle)
+    figures, found = checked(np.column_stack([there, se2.wrap_angle(angle + off)]), 20.0)
+    assert figures["heading"]["agreement with the motion"] == pytest.approx(j0(2.0 * swing), abs=0.02)
+    assert ["across its heading" in f.what for f in found] == ([True] if said else [])
+
+
+def test_three_places_have_a_width_and_two_have_none():
+    assert straightness(np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])) == pytest.approx(1.0)
+    assert straightness(np.array([[0.0, 0.0], [1.0, 3.0]])) == 0.0

@@ -7,7 +7,7 @@ import pytest
 from helpers.planted import box, drive, odometry, recording, scans, wander
 
 from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.lidar.laser_mounting import LEAST_PAIRS, compare
+from uwblite.lidar.laser_mounting import _LAGS, LEAST_PAIRS, _Agreement, _ratio, compare
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.sensor_log import SensorMounting
 
@@ -95,3 +95,37 @@ def test_a_laser_upside_down_is_mapped_and_reported():
     np.testing.assert_array_equal(reported.trajectory, result.trajectory)
     counted = build_map(log, MappingConfig(detect_laser_flip=False))
     assert not [d for d in counted.doubts if d.kind == "laser-turned-over"]
+
+
+@pytest.mark.parametrize(("centre", "best", "scatter", "clear"), [
+    (0.10, 0.069, 0.0, True), (0.10, 0.071, 0.0, False), (0.10, 0.06, 0.081, False), (0.10, 0.06, 0.079, True),
+])  # fmt: skip
+def test_a_delay_is_clear_by_its_gain_and_by_the_gain_s_own_scatter(monkeypatch, centre, best, scatter, clear):
+    """Below 0.7 of the difference without it, and by more than two standard deviations of the mean gain of all pairs."""
+    log, _ = turner()
+    pairs = 16
+    errors = np.full((len(_LAGS), pairs), 0.29)
+    errors[len(_LAGS) // 2] = centre
+    errors[30] = best + scatter * np.where(np.arange(pairs) % 2 == 0, 1.0, -1.0)
+    given = _Agreement(np.full(pairs, 0.3), errors)
+    other = _Agreement(np.full(pairs, 0.3), np.full_like(errors, 0.3))
+    monkeypatch.setattr(_Agreement, "of", staticmethod(lambda *args: given if args[-1] > 0.0 else other))
+    monkeypatch.setattr("uwblite.lidar.laser_mounting._ratio", lambda laser, wheels: (1.0, 0.1))
+    seen = compare(log)
+    assert seen.delay == _LAGS[30]
+    assert (seen.as_given, seen.other, seen.misfit) == pytest.approx((best, 0.3, best))
+    assert seen.delay_clear is clear
+
+
+def test_the_ratio_of_turns_is_a_median_of_clear_ones():
+    """Turns of more than 0.1 rad; the standard deviation of a median of Gaussian ratios is 1.2533 times that of a mean."""
+    rng = np.random.default_rng(3)
+    wheels = rng.uniform(0.11, 0.5, 4000) * rng.choice([-1.0, 1.0], 4000)
+    small = np.full(500, 0.1)
+    laser = wheels * (1.2 + 0.1 * rng.standard_normal(4000))
+    ratio, sigma = _ratio(np.append(laser, 9.0 * small), np.append(wheels, small))
+    assert ratio == pytest.approx(1.2, abs=4 * sigma)
+    assert sigma == pytest.approx(1.2533 * 0.1 / np.sqrt(4000), rel=0.1)
+    few = wheels[: LEAST_PAIRS - 1]
+    assert np.isnan(_ratio(few, few)).all()
+    assert _ratio(wheels[:LEAST_PAIRS], wheels[:LEAST_PAIRS]) == (1.0, 0.0)
