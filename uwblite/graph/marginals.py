@@ -39,8 +39,8 @@ class CommonErrors:
     """(m,) number of the error that it meets."""
     shift: Floats
     """(m, d) change of the edge's whitened residual by that error."""
-    kind: Ints | None = None
-    """(k,) kind of each error: those of one have one variance, of which 1 is a guess. None: all have 1."""
+    kind: Ints
+    """(k,) kind of each error: those of one have one variance, of which 1 is a guess."""
 
 
 class Marginals:
@@ -70,8 +70,7 @@ class Marginals:
         These are the consider parameters of Schmidt (Application of state-space methods to navigation problems, 1966). How
         large the errors of each kind are, the residuals say, see variance_components.
         """
-        slopes, (seen, products) = self._slopes(common), self._seen(common)
-        kind = np.zeros(slopes.shape[1], dtype=np.int64) if common.kind is None else common.kind
+        slopes, (seen, products), kind = self._slopes(common), self._seen(common), common.kind
         kinds = int(kind.max(initial=-1)) + 1
         added = {name: np.zeros((kinds, *block.shape)) for name, block in blocks.items()}
         for first in range(0, slopes.shape[1], _COMMON_AT_ONCE):
@@ -80,7 +79,7 @@ class Marginals:
             seen[some] -= moves.T @ gradient
             products[:, some] -= slopes.T @ moves
             self._square(moves, kind[some], added)
-        scales = np.ones(kinds) if common.kind is None else variances_of_kinds(seen, products, kind)
+        scales = variances_of_kinds(seen, products, kind)
         for name, block in blocks.items():
             block += np.tensordot(scales, added[name], axes=1)
 
