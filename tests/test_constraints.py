@@ -61,8 +61,8 @@ def test_the_users_frame_is_found_from_anchors(T, ids):
 
 @given(st.tuples(st.floats(-50, 50), st.floats(-50, 50), angle))
 def test_the_users_frame_is_found_from_a_pose(T):
-    known = Constraints(poses=(GivenPose(float(STAMPS[7]), tuple(drive()[7].tolist())),))
-    done = apply(known, first_estimate(T), IDS, ALL, CLOCK)
+    constraints = Constraints(poses=(GivenPose(float(STAMPS[7]), tuple(drive()[7].tolist())),))
+    done = apply(constraints, first_estimate(T), IDS, ALL, CLOCK)
     np.testing.assert_allclose(se2.between(drive(), done.graph.poses), 0, atol=1e-9)
 
 
@@ -88,8 +88,8 @@ def test_solving_keeps_what_was_given_and_the_first_pose_is_free():
 def test_an_anchor_moved_since_the_earlier_map_is_named_and_does_not_bend_the_map(which):
     anchors = TRUE.copy()
     anchors[IDS.index(which)] += (2.0, -1.5)
-    known = Constraints(anchors=surveyed(*IDS, movable=True))
-    done = apply(known, first_estimate(anchors=anchors), IDS, ALL, CLOCK)
+    constraints = Constraints(anchors=surveyed(*IDS, movable=True))
+    done = apply(constraints, first_estimate(anchors=anchors), IDS, ALL, CLOCK)
     assert set(done.moved) == {which}
     assert done.moved[which] == pytest.approx(2.5, abs=0.01)
     np.testing.assert_allclose(done.graph.anchors, anchors, atol=1e-6)
@@ -98,8 +98,8 @@ def test_an_anchor_moved_since_the_earlier_map_is_named_and_does_not_bend_the_ma
 
 
 def test_a_given_distance_between_anchors_counts():
-    known = Constraints(distances=(GivenDistance(("A", "B"), 9.0, 0.001),))
-    done = apply(known, first_estimate(), IDS, ALL, CLOCK)
+    constraints = Constraints(distances=(GivenDistance(("A", "B"), 9.0, 0.001),))
+    done = apply(constraints, first_estimate(), IDS, ALL, CLOCK)
     assert done.graph.fixed_poses is None
     solved, _ = optimize(done.graph)
     assert np.hypot(*(solved.anchors[0] - solved.anchors[1])) == pytest.approx(9.0, abs=0.05)
@@ -119,17 +119,17 @@ def test_the_jacobian_of_a_distance_is_right():
 
 
 def test_a_given_closure_ties_two_times_together():
-    known = Constraints(closures=(GivenClosure((float(STAMPS[3]), float(STAMPS[30]))),))
-    edges = apply(known, first_estimate(), IDS, ALL, CLOCK).graph.edges[-1]
+    constraints = Constraints(closures=(GivenClosure((float(STAMPS[3]), float(STAMPS[30]))),))
+    edges = apply(constraints, first_estimate(), IDS, ALL, CLOCK).graph.edges[-1]
     assert (edges.i.tolist(), edges.j.tolist()) == ([3], [30])
     np.testing.assert_allclose(edges.sqrt_information[0], np.eye(3) * 10)
 
 
 def test_forbidden_pairs_are_refused_both_ways_and_others_not():
-    known = Constraints(forbidden=(ForbiddenClosure((100.0, 200.0), within=5.0),))
+    constraints = Constraints(forbidden=(ForbiddenClosure((100.0, 200.0), within=5.0),))
     one, two = np.array([101.0, 199.0, 101.0, 150.0]), np.array([198.0, 104.0, 190.0, 200.0])
     clock = Clock(np.concatenate([one, two]), np.zeros(8, dtype=np.int64))
-    assert known.allowed(clock, np.arange(4), np.arange(4, 8)).tolist() == [False, False, True, True]
+    assert constraints.allowed(clock, np.arange(4), np.arange(4, 8)).tolist() == [False, False, True, True]
 
 
 def test_stamps_of_several_recordings_are_distinguished():
@@ -137,8 +137,8 @@ def test_stamps_of_several_recordings_are_distinguished():
     clock = Clock(np.concatenate([STAMPS[:20], STAMPS[:20]]), np.repeat([0, 1], 20))
     stamp = float(STAMPS[7])
     assert (clock.nearest(stamp, 1), clock.nearest(stamp, 2)) == (7, 27)
-    known = Constraints(closures=(GivenClosure((stamp, stamp), recordings=(2, 1)),))
-    edges = apply(known, first_estimate(), IDS, ALL, clock).graph.edges[-1]
+    constraints = Constraints(closures=(GivenClosure((stamp, stamp), recordings=(2, 1)),))
+    edges = apply(constraints, first_estimate(), IDS, ALL, clock).graph.edges[-1]
     assert (edges.i.tolist(), edges.j.tolist()) == ([27], [7])
     banned = Constraints(forbidden=(ForbiddenClosure((stamp, stamp), within=0.1, recordings=(1, 2)),))
     i, j = np.array([7, 27, 6, 7]), np.array([27, 7, 27, 7])
@@ -161,7 +161,7 @@ def test_sums_take_the_later_place_of_an_anchor():
 
 
 @pytest.mark.parametrize(
-    ("known", "message"),
+    ("constraints", "message"),
     [
         (Constraints(anchors=(GivenAnchor("X", (0, 0)),)), "no ranges to anchor X; the recording has A, B, C, D"),
         (Constraints(distances=(GivenDistance(("A", "Y"), 1.0),)), "anchor Y"),
@@ -169,9 +169,9 @@ def test_sums_take_the_later_place_of_an_anchor():
         (Constraints(closures=(GivenClosure((101.0, 900.0)),)), "stamp 900 lies outside"),
     ],
 )
-def test_what_does_not_belong_to_the_recording_is_refused(known, message):
+def test_what_does_not_belong_to_the_recording_is_refused(constraints, message):
     with pytest.raises(ConfigError, match=message):
-        apply(known, first_estimate(), IDS, ALL, CLOCK)
+        apply(constraints, first_estimate(), IDS, ALL, CLOCK)
     gone = Constraints(anchors=(GivenAnchor("X", (0, 0), movable=True), *surveyed("A", "B", movable=True)))
     np.testing.assert_allclose(apply(gone, first_estimate(), IDS, ALL, CLOCK).graph.anchors, TRUE, atol=1e-6)
 
@@ -200,12 +200,12 @@ within = 20
 
 
 def test_a_file_reports_it_all():
-    known = parse_constraints(FILE)
-    assert known.anchors == (GivenAnchor("5C0B", (1.0, 2.0), 0.02),)
-    assert known.poses[0].pose == (0.0, 0.0, 1.5)
-    assert known.distances[0].anchors == ("5C0B", "91A3")
-    assert known.closures[0].stamps == (10.0, 200.0)
-    assert known.forbidden[0].within == 20.0
+    constraints = parse_constraints(FILE)
+    assert constraints.anchors == (GivenAnchor("5C0B", (1.0, 2.0), 0.02),)
+    assert constraints.poses[0].pose == (0.0, 0.0, 1.5)
+    assert constraints.distances[0].anchors == ("5C0B", "91A3")
+    assert constraints.closures[0].stamps == (10.0, 200.0)
+    assert constraints.forbidden[0].within == 20.0
 
 
 @pytest.mark.parametrize(
@@ -229,8 +229,8 @@ def test_a_wrong_file_is_named(text, message):
 def test_the_anchors_of_an_earlier_map(tmp_path):
     file = tmp_path / "anchors.csv"
     file.write_text("id,x,y,sigma_x,sigma_y,status\nA,1,2,0.01,0.3,ok\nB,3,4,,,ok\nC,,,,,unplaced\nD,1,1,1,1,distrusted\n")
-    known = read_anchors(file)
-    assert known.anchors == (GivenAnchor("A", (1.0, 2.0), 0.3, True), GivenAnchor("B", (3.0, 4.0), 0.02, True))
+    constraints = read_anchors(file)
+    assert constraints.anchors == (GivenAnchor("A", (1.0, 2.0), 0.3, True), GivenAnchor("B", (3.0, 4.0), 0.02, True))
     file.write_text("id,x,y\nC,,\n")
     with pytest.raises(FormatError, match="no anchor in it has a place"):
         read_anchors(file)

@@ -121,8 +121,8 @@ def test_memory_is_bounded():
     protocol = TlvProtocol()
     for k in range(900):
         protocol.feed(RNG.randbytes(997) if k % 3 else b"\x40\x01\x00\x49\xf1\x0c" * 100, 0.0)
-        assert len(protocol.held.data) < 800
-        assert len(protocol.held._marks) < 800
+        assert len(protocol.pending.data) < 800
+        assert len(protocol.pending._marks) < 800
 
 
 # ---- the emulator, against the guide

@@ -132,7 +132,7 @@ def test_memory_is_bounded():
     protocol = ShellProtocol()
     for _ in range(3000):
         protocol.feed(b"DIST,4,AN0," * 100, 0.0)
-        assert protocol._lines.held <= dwm1001_shell.MAX_LINE
+        assert protocol._lines.pending <= dwm1001_shell.MAX_LINE
 
 
 def test_the_emulated_shell_takes_lf_and_cr_lf_as_one_line_end():

@@ -51,13 +51,13 @@ def session_of(name):
     return open_device(DEVICES[name].sensor, f"{name}:/dev/null" + LINE_OPTIONS * (name == "line"))[0]
 
 
-def held(value):
+def memory(value):
     """Return the bytes that a protocol holds, in whatever it is made of."""
     if isinstance(value, bytearray | bytes):
         return len(value)
     if isinstance(value, list | tuple):
-        return 16 + sum(map(held, value))
-    return sum(map(held, vars(value).values())) if hasattr(value, "__dict__") and not callable(value) else 0
+        return 16 + sum(map(memory, value))
+    return sum(map(memory, vars(value).values())) if hasattr(value, "__dict__") and not callable(value) else 0
 
 
 def pieces(words):
@@ -72,7 +72,7 @@ def test_protocols_take_anything(name, data):
     protocol = make()
     for piece in data.draw(pieces(words)):
         protocol.feed(piece, 1.0)
-        assert held(protocol) < 120_000
+        assert memory(protocol) < 120_000
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
@@ -131,6 +131,6 @@ def test_a_million_bytes(name, kind):
         sys.setprofile(None)
         session.feed(piece, now)
         session.tick(now)
-        largest = max(largest, held(protocol))
+        largest = max(largest, memory(protocol))
     assert largest < 120_000
     assert calls[0] < 60 * fed

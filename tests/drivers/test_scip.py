@@ -193,9 +193,9 @@ def test_memory_is_bounded():
     for _ in range(2000):
         protocol.feed(b"x" * 1000, 0.0)
         protocol.feed(b"MD0044072501000\n" if _ % 7 == 0 else b"abc\n", 0.0)
-    assert protocol._lines.held <= scip.MAX_LINE
+    assert protocol._lines.pending <= scip.MAX_LINE
     assert len(protocol._frame) <= scip.MAX_LINES + 1
-    assert len(protocol._lines._held._marks) <= scip.MAX_LINE + 2
+    assert len(protocol._lines._pending._marks) <= scip.MAX_LINE + 2
 
 
 def test_range_codes_are_complete_and_become_rep_117():

@@ -110,10 +110,10 @@ def test_a_ring_is_certified_and_one_wound_once_more_is_not(seed):
     best = optimize(graph)[1].chi2
     assert summary.converged
     assert summary.chi2 > 10.0 * best + 100.0
-    known = certify(local)
-    assert not known.is_global
-    assert known.lower_bound <= best
-    assert known.reason
+    certified = certify(local)
+    assert not certified.is_global
+    assert certified.lower_bound <= best
+    assert certified.reason
 
 
 def brute_force(graph, cells=20):
@@ -146,9 +146,9 @@ def test_certificates_of_tiny_graphs_agree_with_brute_force():
         for _ in range(4):
             poses = np.column_stack([rng.normal(size=(3, 2)), rng.uniform(-np.pi, np.pi, 3)]) * [[0], [1], [1]]
             found, summary = optimize(replace(graph, poses=poses), CAREFUL)
-            known = certify(found)
-            assert known.lower_bound <= least * (1.0 + 1e-6)
-            if known.is_global:
+            of_this = certify(found)
+            assert of_this.lower_bound <= least * (1.0 + 1e-6)
+            if of_this.is_global:
                 certified += 1
                 assert summary.chi2 == pytest.approx(least, rel=2e-6, abs=2e-3)
     assert certified >= 6
@@ -169,9 +169,9 @@ def test_the_mirror_image_of_an_anchor_is_not_certified(seed):
     best = optimize(graph)[1].chi2
     mirrored, other = optimize(replace(graph, anchors=graph.anchors * [1, -1]))
     assert other.chi2 > best + 1.0
-    known = certify(mirrored)
-    assert not known.is_global
-    assert known.lower_bound <= best
+    certified = certify(mirrored)
+    assert not certified.is_global
+    assert certified.lower_bound <= best
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -204,6 +204,6 @@ def test_what_is_outside_the_relaxation_is_named():
 @pytest.mark.parametrize("name", ["efpno_manhattanOlson3500", "sesync_intel", "sesync_CSAIL"])
 def test_public_pose_graphs_are_certified(name, shared_data):
     graph = optimize(read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz").graph)[0]
-    known = certify(graph)
-    assert known.is_global
-    assert known.lower_bound == pytest.approx(graph.chi2(), abs=2e-3)
+    certified = certify(graph)
+    assert certified.is_global
+    assert certified.lower_bound == pytest.approx(graph.chi2(), abs=2e-3)

@@ -34,8 +34,8 @@ def test_rooms_are_kept_and_the_length_of_corridors_is_dropped(noise):
                 assert kept[0, 0] > 0.9 * raw[0, 0]
             else:
                 # What is known of x when y and theta are free, too.
-                known = [1.0 / np.linalg.inv(h + 1e-9 * raw[1, 1] * np.eye(3))[0, 0] for h in (kept, raw)]
-                along.append(known[0] / known[1])
+                along_x = [1.0 / np.linalg.inv(h + 1e-9 * raw[1, 1] * np.eye(3))[0, 0] for h in (kept, raw)]
+                along.append(along_x[0] / along_x[1])
     assert np.median(along) < 1e-3
     assert np.max(along) < 0.5
 

@@ -78,16 +78,16 @@ def test_jumps_that_scans_measure_are_the_odometry_s():
 
 def test_many_closures_of_a_place_that_looks_alike_are_overruled_by_the_odometry():
     truth, wheels = chain()
-    true, known = closures([(k, 59 - k) for k in (0, 1, 2, 3, 26, 27, 28)], truth, np.zeros(3))
-    false, told = closures([(k, 59 - k) for k in range(8, 20)], truth, np.array([SLIDE, 0.0, 0.0]))
+    true, true_records = closures([(k, 59 - k) for k in (0, 1, 2, 3, 26, 27, 28)], truth, np.zeros(3))
+    false, false_records = closures([(k, 59 - k) for k in range(8, 20)], truth, np.array([SLIDE, 0.0, 0.0]))
     columns = ("i", "j", "T_i_j", "sqrt_information")
     edges = RelativePoseEdges(*(np.concatenate([getattr(true, n), getattr(false, n)]) for n in columns))
-    found = Closures(edges, known + told)
+    found = Closures(edges, true_records + false_records)
     graph = Graph(truth, edges=(wheels,))
     solver, config = SolverConfig(), LoopClosureConfig()
     torn, _ = _tightened(graph, found, config, solver)
     assert np.abs(torn.poses[:, 0] - truth[:, 0]).max() > 0.8 * SLIDE
     solved, left = reconcile(graph, found, config, solver)
     assert np.hypot(*(solved.poses - truth)[:, :2].T).max() < 3.0 * 0.02 * np.sqrt(15.0)
-    assert [c.outcome for c in left.candidates] == ["accepted"] * len(known) + ["contradicts-graph"] * len(told)
-    assert len(left.edges) == len(known)
+    assert [c.outcome for c in left.candidates] == ["accepted"] * len(true_records) + ["contradicts-graph"] * len(false_records)
+    assert len(left.edges) == len(true_records)

@@ -40,8 +40,9 @@ def hall():
     graph = drifted(np.random.default_rng(4), truth, NOISE)
     recording = np.zeros(len(truth), dtype=np.int64)
     pieces = build(clouds, graph.poses, path, recording, SubmapConfig(epsilon=4.0))
-    known = marginals(graph)
-    return truth, graph, known, pieces, recording, propose(graph, known, pieces, recording, set(), set(), True, CONFIG)
+    covariances = marginals(graph)
+    proposed = propose(graph, covariances, pieces, recording, set(), set(), True, CONFIG)
+    return truth, graph, covariances, pieces, recording, proposed
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +51,12 @@ def closures(hall):
 
 
 def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess(hall):
-    _, graph, known, pieces, _, candidates = hall
+    _, graph, covariances, pieces, _, candidates = hall
     assert len(candidates.target) > 5
     assert np.all(candidates.source - candidates.target > 1)
     i, j = pieces.reference[candidates.target], pieces.reference[candidates.source]
     np.testing.assert_allclose(candidates.guess, se2.between(graph.poses[i], graph.poses[j]))
-    np.testing.assert_allclose(candidates.covariance, known.relative(i, j))
+    np.testing.assert_allclose(candidates.covariance, covariances.relative(i, j))
     longest = np.sqrt(np.linalg.norm(candidates.covariance[:, :2, :2], 2, axis=(1, 2)))
     np.testing.assert_allclose(candidates.spread, 3.0 * longest)
     pairs = list(zip(candidates.target.tolist(), candidates.source.tolist(), strict=True))
@@ -64,23 +65,23 @@ def test_candidates_are_pairs_of_different_places_in_time_with_the_graph_s_guess
 
 
 def test_where_nothing_is_near_nothing_is_proposed(hall):
-    _, graph, known, pieces, recording, _ = hall
-    none = propose(graph, known, pieces, recording, set(), set(), True, replace(CONFIG, reach=0.0, search_limit=0.0))
+    _, graph, covariances, pieces, recording, _ = hall
+    none = propose(graph, covariances, pieces, recording, set(), set(), True, replace(CONFIG, reach=0.0, search_limit=0.0))
     assert [getattr(none, name).shape for name in ("target", "source", "guess", "covariance", "spread")] == [
         (0,), (0,), (0, 3), (0, 3, 3), (0,)
     ]  # fmt: skip
 
 
 def test_what_was_tried_is_not_proposed_again(hall):
-    _, graph, known, pieces, recording, candidates = hall
+    _, graph, covariances, pieces, recording, candidates = hall
     tried = candidates.names(CONFIG)
-    again = propose(graph, known, pieces, recording, tried, set(), True, CONFIG)
+    again = propose(graph, covariances, pieces, recording, tried, set(), True, CONFIG)
     assert not tried & again.names(CONFIG)
 
 
 def test_pairs_that_missed_are_searched_with_slack(hall, closures):
     """After wheels have slipped the graph is sure and wrong: what did not match is proposed once more, with a wide search."""
-    truth, graph, known, pieces, recording, candidates = hall
+    truth, graph, covariances, pieces, recording, candidates = hall
     sure = replace(candidates, spread=np.zeros(len(candidates.target)))
     gone = missed(sure, closures, CONFIG)
     few = {(int(a), int(b)) for a, b, c in zip(sure.target, sure.source, closures.candidates, strict=True)
@@ -88,7 +89,7 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
     assert gone == few
     assert gone
     assert not missed(replace(candidates, spread=np.full(len(candidates.target), 9.0)), closures, CONFIG)
-    again = propose(graph, known, pieces, recording, sure.names(CONFIG), gone, True, replace(CONFIG, partners=99))
+    again = propose(graph, covariances, pieces, recording, sure.names(CONFIG), gone, True, replace(CONFIG, partners=99))
     for a, b, spread in zip(again.target.tolist(), again.source.tolist(), again.spread, strict=True):
         assert (a, b) not in gone or spread > 3 * CONFIG.slip * 0.99
     assert gone & set(zip(again.target.tolist(), again.source.tolist(), strict=True))
@@ -96,15 +97,15 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
 
 
 def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
-    _, graph, known, pieces, recording, _ = hall
+    _, graph, covariances, pieces, recording, _ = hall
     half = (np.arange(len(recording)) >= pieces.first[len(pieces) // 2]).astype(np.int64)
-    candidates = propose(graph, known, pieces, half, set(), set(), True, replace(CONFIG, partners=99))
+    candidates = propose(graph, covariances, pieces, half, set(), set(), True, replace(CONFIG, partners=99))
     close = candidates.source - candidates.target == 1
     assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
 
 
 GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "everywhere": 1.0, "spread": 7.0, "off": 0.0,
-        "held": True, "along": 1e4, "strength": 1e4}  # fmt: skip
+        "constrained": True, "along": 1e4, "strength": 1e4}  # fmt: skip
 """Figures of a match that no rule objects to, found by a search."""
 
 
@@ -125,7 +126,7 @@ GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3,
     ({"everywhere": CONFIG.overlap_everywhere + 0.001}, "accepted"),
     ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 1.01}, "contradicts-graph"),
     ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 0.97}, "accepted"),
-    ({"off": 5.0, "held": False}, "accepted"),
+    ({"off": 5.0, "constrained": False}, "accepted"),
 ])  # fmt: skip
 def test_each_rule_rejects_by_its_own_limit(figures, outcome):
     """A guess known to 0.1 m and 0.1 rad, a measurement to 0.01 where the matched surfaces see that."""
@@ -133,7 +134,7 @@ def test_each_rule_rejects_by_its_own_limit(figures, outcome):
     best = SimpleNamespace(share=np.array([f["share"]]), rms=np.array([f["rms"]]))
     fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through", "everywhere")})
     guess, covariance = np.array([[f["off"], 0.0, 0.0]]), 0.01 * np.eye(3)[None]
-    candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, np.array([f["spread"]]), f["held"])
+    candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, np.array([f["spread"]]), f["constrained"])
     root = np.sqrt(np.diag([f["along"], f["strength"], 1e4]))[None]
     ((found, reason),) = _judge(candidates, fits, np.zeros((1, 3)), root, CONFIG)
     assert found == outcome

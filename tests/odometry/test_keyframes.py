@@ -164,8 +164,8 @@ def test_dense_trajectory_of_a_few_samples_is_what_they_are(samples):
     poses = se2.compose(shift, frames.odometry)
     np.testing.assert_allclose(dense_trajectory(wheels, frames, poses), expected, atol=1e-12)
     at = np.array([-9.0, 0.0, 0.5, 99.0])
-    held = se2.interpolate_trajectory(wheels.stamps, expected, at)
-    np.testing.assert_allclose(dense_trajectory(wheels, frames, poses, at), held, atol=1e-12)
+    interpolated = se2.interpolate_trajectory(wheels.stamps, expected, at)
+    np.testing.assert_allclose(dense_trajectory(wheels, frames, poses, at), interpolated, atol=1e-12)
 
 
 def test_equal_stamps_do_no_harm():

@@ -93,7 +93,7 @@ def wrong_wheels():
     return drive_along(lambda x: np.full(len(x), SCALE))
 
 
-def known(far, distance=LONG, sigma=0.02, radius=0.3):
+def surveyed(far, distance=LONG, sigma=0.02, radius=0.3):
     places = {"near": (2.0, 0.9), "far": (far, 0.9)}
     return Constraints(
         landmarks=tuple(GivenLandmark(name, place, radius) for name, place in places.items()),
@@ -113,7 +113,7 @@ def test_a_measured_distance_gives_the_map_its_true_length(carpet):
     log, stamps, truth = carpet
     before = stretch(build_map(log), stamps, truth)
     assert before < 0.98
-    after = build_map(log, constraints=known(2.0 + LONG * before))
+    after = build_map(log, constraints=surveyed(2.0 + LONG * before))
     # The tape's sigma, and a centimetre or two of each column's place.
     assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=3 * np.hypot(0.02, 0.02) / LONG)
     reported = next(s for s in after.stages if s.name == "landmark distances").figures["distances"]
@@ -127,7 +127,7 @@ def test_a_measured_distance_calibrates_the_wheels(wrong_wheels):
     blind = MappingConfig(use_loops=False, scan_to_scan=TrackingConfig(on=False))
     assert stretch(build_map(log, blind), stamps, truth) == pytest.approx(SCALE, abs=0.003)
     names = zip(("near", "far"), (2.0, 2.0 + LONG), strict=True)
-    shrunk = replace(known(0.0), landmarks=tuple(GivenLandmark(name, (SCALE * x, 0.9), 0.3) for name, x in names))
+    shrunk = replace(surveyed(0.0), landmarks=tuple(GivenLandmark(name, (SCALE * x, 0.9), 0.3) for name, x in names))
     after = build_map(log, blind, constraints=shrunk)
     reported = next(s for s in after.stages if s.name == "landmark distances").figures["distances"]
     assert reported[0]["map"] == pytest.approx(LONG, abs=0.06)
@@ -147,7 +147,7 @@ def test_places_are_those_of_the_map_as_it_is_turned(carpet):
     turn = se2.compose(walls.graph.poses[0], se2.inverse(plain.graph.poses[0]))
     places = se2.transform(turn, np.array([[2.0, 0.9], [2.0 + LONG * stretch(plain, stamps, truth), 0.9]])).tolist()
     names = zip(("near", "far"), places, strict=True)
-    given = replace(known(0.0), landmarks=tuple(GivenLandmark(name, tuple(place), 0.3) for name, place in names))
+    given = replace(surveyed(0.0), landmarks=tuple(GivenLandmark(name, tuple(place), 0.3) for name, place in names))
     after = build_map(log, MappingConfig(align="walls"), constraints=given)
     assert stretch(after, stamps, truth) == pytest.approx(1.0, abs=3 * np.hypot(0.02, 0.02) / LONG)
 
@@ -173,7 +173,7 @@ def test_what_is_not_there_is_reported(carpet):
     with pytest.raises(ConfigError, match="saw nothing within"):
         build_map(log, MappingConfig(use_loops=False), constraints=lost)
     with pytest.raises(ConfigError, match="need the lidar"):
-        build_map(log, MappingConfig(use_lidar=False), constraints=known(26.0))
+        build_map(log, MappingConfig(use_lidar=False), constraints=surveyed(26.0))
 
 
 def one_cloud(points):

@@ -70,18 +70,18 @@ def test_wheels_that_turn_against_the_laser_are_doubted(error, doubted):
 
 def test_given_anchors_decide_the_sign():
     log = run(turn_scale=2.0)[2]
-    known = Constraints(
+    given = Constraints(
         anchors=tuple(GivenAnchor(name, tuple(place), 0.05) for name, place in zip(log.ranges.anchor_ids, PLACES, strict=True))
     )
-    result = build_map(log, constraints=known)
+    result = build_map(log, constraints=given)
     assert not stated(result.doubts, "mirrored")
 
 
-@pytest.mark.parametrize(("known", "doubted"), [(0, True), (2, True), (3, False), (4, False)])
+@pytest.mark.parametrize(("given", "doubted"), [(0, True), (2, True), (3, False), (4, False)])
 @pytest.mark.parametrize("lidar", [False, True])
-def test_three_given_anchors_decide_the_sign_and_two_do_not(known, doubted, lidar):
+def test_three_given_anchors_decide_the_sign_and_two_do_not(given, doubted, lidar):
     """Two points and their mirror image lie on one another by a rigid motion; three do not."""
-    prior = PriorEdges("anchors", np.arange(known), PLACES[:known], np.tile(np.eye(2), (known, 1, 1)))
+    prior = PriorEdges("anchors", np.arange(given), PLACES[:given], np.tile(np.eye(2), (given, 1, 1)))
     other = PriorEdges("calibration", np.zeros(3, int), np.zeros((3, 1)), np.ones((3, 1, 1)))
     calibration = Calibration((UnknownKey("heading_scale"),), np.array([-1.9]))
     graph = Graph(np.zeros((1, 3)), PLACES, calibration=calibration).with_edges(prior, other)

@@ -103,19 +103,19 @@ def test_events_flow_for_as_long_as_somebody_listens(live):
 
 def test_a_thousand_connections_are_turned_away_and_do_no_harm(live):
     _, server = live
-    held = []
+    streams = []
     refused = 0
     for _ in range(1000):
         line = socket.create_connection(server.server_address, timeout=10)
-        held.append(line)
-        if len(held) > 20:
+        streams.append(line)
+        if len(streams) > 20:
             # The first eight hold the room with half a request each; whoever comes later is refused at once.
-            old = held.pop(12)
+            old = streams.pop(12)
             refused += old.recv(100).startswith(b"HTTP/1.1 503")
             old.close()
     assert refused > 900
     assert threading.active_count() < 40
-    for line in held:
+    for line in streams:
         line.close()
     for _ in range(200):
         status = ask(server, "GET", "/")[0]

@@ -43,7 +43,7 @@ class TlvProtocol(FrameReader):
 
     def measure(self, at: int) -> int:
         """Return the size of the head or block at `at`; 0 = wait for more bytes; -n = the first n bytes are noise."""
-        buffer = self.held.data
+        buffer = self.pending.data
         if buffer[at] == self.lead:
             # Bytes that were taken already are accepted as a head only together with the block that follows.
             want = 5 if at < self.taken else 3

@@ -67,9 +67,9 @@ class FrameReader:
     """What bytes between frames are called in the counters."""
 
     def __init__(self) -> None:
-        self.held = StampedBuffer()
+        self.pending = StampedBuffer()
         self.taken = 0
-        """Bytes of `held` that belong to a frame that was decoded."""
+        """Bytes of `pending` that belong to a frame that was decoded."""
         self._told = 0
 
     def frame_size(self, head: bytes) -> int:
@@ -99,18 +99,18 @@ class FrameReader:
         """
         events: list[Any] = []
         for start in range(0, len(data), CHUNK):
-            self.held.append(data[start : start + CHUNK], stamp)
+            self.pending.append(data[start : start + CHUNK], stamp)
             self._scan(events)
         return events
 
     def reset(self) -> None:
         """Forget what is half received."""
-        self.held.clear()
+        self.pending.clear()
         self.taken = self._told = 0
 
     def measure(self, at: int) -> int:
         """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
-        buffer = self.held.data
+        buffer = self.pending.data
         size = self.frame_size(bytes(buffer[at : at + self.head_size]))
         if size < 0:
             following = buffer.find(self.lead, at + 1)
@@ -123,7 +123,7 @@ class FrameReader:
 
     def head_inside(self, start: int, end: int) -> int:
         """Return where a whole head stands between two offsets, 0 = nowhere."""
-        buffer, at = self.held.data, start
+        buffer, at = self.pending.data, start
         while 0 <= (at := buffer.find(self.lead, at, end)) <= end - self.head_size:
             if self.frame_size(bytes(buffer[at : at + self.head_size])) >= 0:
                 return at
@@ -131,14 +131,14 @@ class FrameReader:
         return 0
 
     def _scan(self, events: list[Any]) -> None:
-        buffer, at, noise = self.held.data, 0, 0
+        buffer, at, noise = self.pending.data, 0, 0
         while at < len(buffer) and (size := self.measure(at)):
             if size < 0:
                 at -= size
                 continue
             self._report(noise, at, events)
             frame = bytes(buffer[at : at + size])
-            event = self.decode(frame, self.held.stamp_at(at))
+            event = self.decode(frame, self.pending.stamp_at(at))
             events.append(event)
             self._told = at + size
             if isinstance(event, Corrupt):
@@ -148,7 +148,7 @@ class FrameReader:
                 at -= self._overlap(frame)
             noise = at
         self._report(noise, at, events)
-        self.held.drop(at)
+        self.pending.drop(at)
         self.taken, self._told = max(0, self.taken - at), max(0, self._told - at)
 
     def _overlap(self, frame: bytes) -> int:
@@ -159,7 +159,7 @@ class FrameReader:
     def _report(self, start: int, end: int, events: list[Any]) -> None:
         start = max(start, self._told)
         if end > start:
-            events.append(corrupt(bytes(self.held.data[start:end]), self.noise))
+            events.append(corrupt(bytes(self.pending.data[start:end]), self.noise))
 
 
 class PacketReader(FrameReader):
@@ -182,7 +182,7 @@ class PacketReader(FrameReader):
 
     def measure(self, at: int) -> int:
         """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
-        buffer = self.held.data
+        buffer = self.pending.data
         size, behind = self.size_at(buffer, at), at + 1
         end = len(buffer) if size == 0 else at + size if size > 0 and not self.is_checked(buffer[at]) else at
         while behind + self.smallest <= end:

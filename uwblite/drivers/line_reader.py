@@ -35,39 +35,39 @@ class LineReader:
     """
 
     def __init__(self, most: int, *, keep: int = 0, ends: tuple[bytes, ...] = (b"\r", b"\n")) -> None:
-        self._held = StampedBuffer()
+        self._pending = StampedBuffer()
         self._most, self._step = most, most - keep
         self._ends = re.compile(b"|".join(re.escape(end) for end in ends))
         self._look_back = max(map(len, ends)) - 1
         self._cut = False
 
     @property
-    def held(self) -> int:
-        """Number of bytes held."""
-        return len(self._held.data)
+    def pending(self) -> int:
+        """Number of bytes not yet decoded."""
+        return len(self._pending.data)
 
     def feed(self, data: bytes, stamp: float) -> list[Line | Corrupt]:
         """Take bytes that arrived at `stamp` s; return the lines they complete, and Corrupt for what was too long."""
         lines: list[Line | Corrupt] = []
         if not data:
             return lines
-        begin = max(0, self.held - self._look_back)
-        self._held.append(data, stamp)
+        begin = max(0, self.pending - self._look_back)
+        self._pending.append(data, stamp)
         at = 0
-        for match in self._ends.finditer(bytes(self._held.data), begin):
+        for match in self._ends.finditer(bytes(self._pending.data), begin):
             cut = at
             while match.start() - cut > self._most:
                 lines.append(self._too_long(cut))
                 cut += self._step
-            text = bytes(self._held.data[cut : match.start()])
-            lines.append(Line(text, match[0], self._held.marks(cut, match.end()), self._cut))
+            text = bytes(self._pending.data[cut : match.start()])
+            lines.append(Line(text, match[0], self._pending.marks(cut, match.end()), self._cut))
             at, self._cut = match.end(), False
-        while self.held - at > self._most:
+        while self.pending - at > self._most:
             lines.append(self._too_long(at))
             at += self._step
-        self._held.drop(at)
+        self._pending.drop(at)
         return lines
 
     def _too_long(self, at: int) -> Corrupt:
         self._cut = True
-        return corrupt(bytes(self._held.data[at : at + self._step]), "line too long")
+        return corrupt(bytes(self._pending.data[at : at + self._step]), "line too long")

@@ -75,8 +75,8 @@ def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
                 del inverses[front.parent]
         here = order[bounds[s] : bounds[s + 1]]
         column = np.minimum(np.searchsorted(front.rows, second[here]), len(front.rows) - 1)
-        known = front.rows[column] == second[here]
-        found[here] = np.where(known, inverse[first[here] - starts[s], column], 0.0)
+        present = front.rows[column] == second[here]
+        found[here] = np.where(present, inverse[first[here] - starts[s], column], 0.0)
     return found
 
 

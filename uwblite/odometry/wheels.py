@@ -107,9 +107,9 @@ def _as_shown(wheels: OdometryEdges, graph: Graph, measured: Bools) -> OdometryE
     """Inflate the edges by how far the sums over consecutive measured steps scatter beyond those of independent ones."""
     errors = wheels.residuals(graph)
     summed = np.concatenate([np.zeros((1, 3)), np.cumsum(errors, axis=0)])
-    known = np.concatenate([[0], np.cumsum(measured[wheels.i])])
+    count = np.concatenate([[0], np.cumsum(measured[wheels.i])])
     # Windows across the seam of two recordings are few.
-    whole = np.flatnonzero(known[_PATCH:] - known[:-_PATCH] == _PATCH)
+    whole = np.flatnonzero(count[_PATCH:] - count[:-_PATCH] == _PATCH)
     if len(whole) < _ENOUGH_SUMS:
         factor = _by_redundancy(wheels, graph)
     else:

@@ -50,9 +50,9 @@ def _images(estimate: Estimate, ranges: RangeEdges) -> Floats:
     anchors, tags = estimate.graph.anchors.copy(), ranges.tag_positions(estimate.graph.poses)
     for k in np.flatnonzero(estimate.placed).tolist():
         own = tags[ranges.alive & (ranges.anchor == k)]
-        known = estimate.bootstrap.hypotheses[k]
-        if estimate.bootstrap.ambiguous[k] and len(known) > 1:
-            anchors[k] = known[1].position
+        found = estimate.bootstrap.hypotheses[k]
+        if estimate.bootstrap.ambiguous[k] and len(found) > 1:
+            anchors[k] = found[1].position
         elif len(own) > 2:
             across = np.linalg.eigh(np.cov(own.T))[1][:, 0]
             anchors[k] -= 2.0 * across * float(across @ (anchors[k] - own.mean(axis=0)))

@@ -11,7 +11,7 @@ SILENT = 3.0
 """s without a message of a sensor that sent before, or five of its periods where that is longer."""
 _NOT_GROWING = 10.0
 """s after which a log that does not grow is reported."""
-_NEVER_HEARD = 15.0
+_NO_DATA = 15.0
 """s of recording after which a sensor that never sent is reported."""
 _ANCHOR_LOST = 60.0
 """s without a range of an anchor that was in reach before."""
@@ -72,7 +72,7 @@ def _about_sensors(sensors: Mapping[str, SensorState], recorded: float, at_rest:
         return [f"the log has not grown for {at_rest:.0f} s: is the recorder still running?"]
     late = sorted(((s.silent, name) for name, s in sensors.items() if s.silent > silent_after(s)), reverse=True)
     found = [f"no message from the {name} for {silent:.0f} s: check its cable and power" for silent, name in late]
-    missing = [name for name in ("odometry", "lidar", "radio") if name not in sensors and recorded > _NEVER_HEARD]
+    missing = [name for name in ("odometry", "lidar", "radio") if name not in sensors and recorded > _NO_DATA]
     return found + [f"no message came from the {name} at all: it is not recorded, or it is silent" for name in missing]
 
 
