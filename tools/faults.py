@@ -36,7 +36,7 @@ from uwblite.cli.check import examined
 from uwblite.errors import UwbliteError
 from uwblite.io.carmen import read_log
 from uwblite.io.carmen_messages import time_order
-from uwblite.map_result import MapResult
+from uwblite.map_result import AnchorEstimate, MapResult
 from uwblite.mapping import build_map
 from uwblite.sensor_log import Odometry, SensorLog, UwbRanges
 
@@ -118,12 +118,13 @@ def judged(
         move = _fit(result.trajectory[:, :2] * sign, true)
         ate = float(np.sqrt(np.mean(np.sum((se2.transform(move, result.trajectory[:, :2] * sign) - true) ** 2, axis=1))))
         worst, beyond = float("nan"), -np.inf
-        for anchor in result.anchors:
-            name, _, turn = anchor.id.partition("@")
+        for anchor, until in zip(result.anchors, _ends(result.anchors), strict=True):
+            name = anchor.id.partition("@")[0]
             places = case.anchors.get(name, [])
             if anchor.status != "ok" or not places:
                 continue
-            place = places[min(int(turn or 1), len(places)) - 1]
+            # An anchor that is said to have moved at another time than it did is judged by where it stood for longer.
+            place = places[-1 if np.isfinite(anchor.since) and 0.5 * (anchor.since + until) > case.middle else 0]
             off = float(np.hypot(*(se2.transform(move, anchor.position * sign) - place)))
             sigma = float(np.hypot(_largest_sigma(anchor.covariance), case.known.get(name, 0.0)))
             worst, beyond = np.fmax(worst, off), max(beyond, off - ANCHOR_BAR - 3.0 * sigma)
@@ -131,6 +132,14 @@ def judged(
             best = (ate, float(worst), float(beyond))
     assert best is not None
     return best
+
+
+def _ends(anchors: Sequence[AnchorEstimate]) -> list[float]:
+    """Return until when each row of the anchors holds, s; inf where no later row is of the same anchor."""
+    names = [a.id.partition("@")[0] for a in anchors]
+    later = ((b.since for other, b in zip(names, anchors, strict=True) if other == name and b.since > a.since)
+             for name, a in zip(names, anchors, strict=True))  # fmt: skip
+    return [min(times, default=float("inf")) for times in later]
 
 
 def _largest_sigma(covariance: Floats) -> float:

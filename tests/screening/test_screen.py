@@ -8,8 +8,8 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.screening import stuck_sensors
-from uwblite.screening.screen import _made_up_stamps, screen
+from uwblite.screening import clocks, stuck_sensors
+from uwblite.screening.screen import screen
 from uwblite.se2 import chain as chained
 from uwblite.sensor_log import LogNotes, Odometry, UwbRanges
 
@@ -322,4 +322,48 @@ def test_stamps_that_somebody_counted_are_named(sound, period, jitter, faster, m
     counts = len(sound.odometry.stamps), len(sound.scans.stamps)
     odometry, scans = (period * np.arange(n) + jitter * rng.random(n) for n in counts)
     log = replace(sound, odometry=Odometry(odometry / faster, sound.odometry.poses), scans=replace(sound.scans, stamps=scans))
-    assert [r.kind for r in _made_up_stamps(log)] == ["made-up-stamps"] * made_up
+    assert [r.kind for r in clocks.made_up(log)] == ["made-up-stamps"] * made_up
+
+
+def after_half(stamps, by):
+    return np.where(stamps > stamps.mean(), stamps + by, stamps)
+
+
+@pytest.mark.parametrize("by", [20.0, 3600.0])
+@pytest.mark.parametrize("sensor", ["scans", "ranges"])
+def test_a_sensor_whose_clock_jumps_forward_is_set_right(sound, sensor, by):
+    true = getattr(sound, sensor)
+    done = screen(replace(sound, **{sensor: replace(true, stamps=after_half(true.stamps, by))}))
+    assert kinds(done) == {"clock-jump"}
+    assert not kinds(done, doubts=True)
+    np.testing.assert_allclose(getattr(done, sensor).stamps, true.stamps, atol=0.5 if sensor == "ranges" else 0.01)
+
+
+def test_where_the_clock_of_the_odometry_jumps_the_other_sensors_follow(sound):
+    done = screen(replace(sound, odometry=replace(sound.odometry, stamps=after_half(sound.odometry.stamps, 3600.0))))
+    assert kinds(done) == {"clock-jump"}
+    middle = sound.odometry.stamps.mean()
+    for sensor, true in ((done.scans, sound.scans), (done.ranges, sound.ranges)):
+        late = true.stamps > middle + 0.1
+        np.testing.assert_allclose(sensor.stamps[late] - true.stamps[late], 3600.0, atol=0.06)
+        np.testing.assert_allclose(sensor.stamps[true.stamps < middle - 0.1], true.stamps[true.stamps < middle - 0.1])
+
+
+def test_a_sensor_that_goes_silent_or_starts_late_has_no_jump(sound):
+    """A lidar that fails for 20 s, and one that fails for 20 s and ends with the recording, or 30 s before it."""
+    for end in (0.0, 30.0):
+        stamps = sound.scans.stamps
+        on = ((stamps < 130.0) | (stamps > 150.0)) & (stamps < stamps[-1] - end)
+        assert clocks.without_jumps(replace(sound, scans=sound.scans.rows(on)))[1] == []
+
+
+@pytest.mark.parametrize(("off", "said"), [(0.0, None), (30.0, False), (1e6, True)])
+def test_readings_outside_the_time_of_the_odometry_are_counted_and_doubted_where_they_are_most(sound, off, said):
+    log = replace(sound, scans=replace(sound.scans, stamps=sound.scans.stamps + off))
+    left, remarks = clocks.within_odometry(log)
+    remarks = [r for r in remarks if r.kind == "scans-outside-odometry"]
+    assert [r.doubt for r in remarks] == ([] if said is None else [said])
+    outside = len(log.scans.stamps) - len(left.scans.stamps)
+    assert outside == {0.0: 0, 30.0: 150 - 1, 1e6: len(log.scans.stamps)}[off]
+    assert all(f"{outside} of {len(log.scans.stamps)} scans" in r.text for r in remarks)
+    assert all("by about 1000000 s" in r.text for r in remarks if r.doubt)

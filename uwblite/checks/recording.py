@@ -8,8 +8,6 @@ degrees, a laser upside down, clocks that differ), it is asked.
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from ..errors import DataError
 from ..map_result import AnchorEstimate, CalibrationEstimate, Notice
 from ..screening.screen import screen
@@ -67,9 +65,6 @@ def diagnose(
         found.note("lidar", "there are no laser scans", "there will be a trajectory and anchors, but no map")
     else:
         figures["lidar"] = check_scans(log, found)
-        _check_overlap(log, "lidar", log.scans.stamps, found)
-    if log.ranges is not None and len(log.ranges.stamps):
-        _check_overlap(log, "radio", log.ranges.stamps, found)
     _check_map(doubts, refused, found)
     return Diagnosis(found.ranked(), figures)
 
@@ -119,22 +114,3 @@ def _check_notes(log: SensorLog, found: Findings) -> None:
         )
     for warning in notes.warnings:
         found.warning("log", warning, "")
-
-
-def _check_overlap(log: SensorLog, topic: str, stamps: np.ndarray[Any, Any], found: Findings) -> None:
-    """A sensor whose stamps lie outside the odometry's time has another clock."""
-    start, end = float(log.odometry.stamps[0]), float(log.odometry.stamps[-1])
-    outside = float(np.mean((stamps < start - 0.5) | (stamps > end + 0.5)))
-    if outside > 0.5:
-        shift = float(np.median(stamps) - 0.5 * (start + end))
-        found.serious(
-            topic,
-            f"{100 * outside:.0f} % of the stamps lie outside the odometry's time; the clocks differ by about {shift:.1f} s",
-            "record all sensors with one clock (uwblite record does), or shift the stamps",
-        )
-    elif outside > 0.02:
-        found.warning(
-            topic,
-            f"{100 * outside:.0f} % of the stamps lie outside the odometry's time",
-            "they are tied to the first or last pose; start the odometry first and stop it last",
-        )

@@ -12,7 +12,6 @@ from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
-from ..odometry.attached import OUTSIDE
 from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
 from .half_tests import check_halves
@@ -46,7 +45,6 @@ def judge(
     check_sensors(grid, task)
     check_closures(estimate, anchors, grid, task)
     check_calibration(calibrated, usual, task)
-    check_range_stamps(task, OUTSIDE)
     if table:
         check_sustained_outliers(table, estimate.anchor_ids, task)
         check_residuals(estimate, table["residual"], task)
@@ -253,20 +251,4 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
                 f"anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
                 "its line of sight was blocked, or it was moved; these ranges count for little",
                 anchor=name, stretches=stretches,
-            )  # fmt: skip
-
-
-def check_range_stamps(task: Task, slack: float) -> None:
-    """Warn where ranges are stamped outside the odometry's time by more than the slack, s."""
-    for recording in task.recordings.each:
-        ranges, odometry = recording.log.ranges, recording.log.odometry.stamps
-        if ranges is None or not len(ranges.stamps):
-            continue
-        outside = int(np.sum((ranges.stamps < odometry[0] - slack) | (ranges.stamps > odometry[-1] + slack)))
-        if outside:
-            task.stages.warn(
-                "ranges-outside-odometry",
-                f"{outside} of {len(ranges.stamps)} ranges were stamped outside the odometry's time and left out: "
-                "start the odometry first and stop it last, and use one clock",
-                ranges=len(ranges.stamps), outside=outside,
             )  # fmt: skip

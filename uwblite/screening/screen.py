@@ -6,10 +6,9 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..errors import DataError
 from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
-from . import cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
+from . import clocks, cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
 from .wheel_motion import Pairs
 
 _GAP = 2.0
@@ -43,8 +42,11 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     """
     if log.screening is not None:
         return log
-    _refuse_without_stamps(log)
-    remarks = [*_clock_remarks(log), *_made_up_stamps(log)]
+    clocks.refuse_without_stamps(log)
+    remarks = [*clocks.set_back(log), *clocks.made_up(log)]
+    log, set_right = clocks.without_jumps(log)
+    log, outside = clocks.within_odometry(log)
+    remarks += [*set_right, *outside]
     units.refuse_wrong_lengths(log)
     odometry, repeats = odometry_chain.without_repeats(log.odometry)
     log, bursts = stuck_sensors.without_bursts(replace(log, odometry=odometry))
@@ -93,49 +95,6 @@ def _hardly_moving(odometry: Odometry) -> list[Remark]:
         "report its wheels, in metres? Drive through the place"
     )
     return [Remark("hardly-moving", text, doubt=True)]
-
-
-def _refuse_without_stamps(log: SensorLog) -> None:
-    """Refuse a recording of a moving robot whose readings all have one time."""
-    stamps, poses = log.odometry.stamps, log.odometry.poses
-    if len(stamps) > 2 and np.ptp(stamps) == 0.0 and np.any(np.ptp(poses, axis=0) > 0.0):
-        raise DataError(
-            f"the readings have no stamps: all {len(stamps)} of the odometry are of t = {stamps[0]:g} s; write the time of "
-            "each, or, where it is lost and messages came in a steady rhythm, one that grows from message to message (of a "
-            "CARMEN log: awk '{$NF = $(NF-2) = NR / 10; print}')"
-        )
-
-
-def _made_up_stamps(log: SensorLog) -> list[Remark]:
-    """Say where stamps are a grid too coarse for any sensor's own: somebody counted messages."""
-    if log.scans is None or len(log.scans.stamps) < _FEW_STAMPS or len(log.odometry.stamps) < _FEW_STAMPS:
-        return []
-    steps = np.diff(log.scans.stamps), np.diff(log.odometry.stamps)
-    period = min(float(np.median(s)) for s in steps)
-    if period < _COARSE or any(np.ptp(s) > _SAME_STEP for s in steps):
-        return []
-    text = (
-        f"odometry and scans are stamped every {period:g} s to the last digit, as made-up stamps are: speeds, durations and "
-        "the delay of the laser are in that unit of time, whatever it was"
-    )
-    return [Remark("made-up-stamps", text)]
-
-
-_FEW_STAMPS = 20
-"""Stamps that may be alike by chance."""
-_COARSE = 0.4
-"""s; sensors of moving robots are faster."""
-_SAME_STEP = 1e-4
-"""s; no clock is as even."""
-
-
-def _clock_remarks(log: SensorLog) -> list[Remark]:
-    """Return a doubt for each sensor whose clock was set back."""
-    return [
-        Remark("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: part the log there", doubt=True)
-        for sensor, by in log.notes.set_back.items()
-        if by > 1.0
-    ]
 
 
 def _repeats(count: int) -> list[Remark]:

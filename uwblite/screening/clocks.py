@@ -1,0 +1,120 @@
+"""Clocks: stamps that are missing, made up, set back, or of another time than the odometry's."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import DataError
+from ..odometry.attached import OUTSIDE
+from ..sensor_log import LaserScans, Remark, SensorLog, UwbRanges
+
+_FEW_STAMPS = 20
+"""Stamps that may be alike by chance."""
+_COARSE = 0.4
+"""s; sensors of moving robots are faster."""
+_SAME_STEP = 1e-4
+"""s; no clock is as even."""
+_JUMP = 10.0
+"""A clock that was set forward by less is not told from a sensor that was silent, s."""
+_SAME_END = 2.0
+"""Sensors of one recording end within so much of each other, s."""
+_SOME, _MOST = 0.02, 0.5
+"""Share of scans outside the odometry's time that is worth a word; share of any readings that leaves no map to be trusted."""
+
+
+def refuse_without_stamps(log: SensorLog) -> None:
+    """Refuse a recording of a moving robot whose readings all have one time."""
+    stamps, poses = log.odometry.stamps, log.odometry.poses
+    if len(stamps) > 2 and np.ptp(stamps) == 0.0 and np.any(np.ptp(poses, axis=0) > 0.0):
+        raise DataError(
+            f"the readings have no stamps: all {len(stamps)} of the odometry are of t = {stamps[0]:g} s; write the time of "
+            "each, or, where it is lost and messages came in a steady rhythm, one that grows from message to message (of a "
+            "CARMEN log: awk '{$NF = $(NF-2) = NR / 10; print}')"
+        )
+
+
+def made_up(log: SensorLog) -> list[Remark]:
+    """Say where stamps are a grid too coarse for any sensor's own: somebody counted messages."""
+    if log.scans is None or len(log.scans.stamps) < _FEW_STAMPS or len(log.odometry.stamps) < _FEW_STAMPS:
+        return []
+    steps = np.diff(log.scans.stamps), np.diff(log.odometry.stamps)
+    period = min(float(np.median(s)) for s in steps)
+    if period < _COARSE or any(np.ptp(s) > _SAME_STEP for s in steps):
+        return []
+    text = (
+        f"odometry and scans are stamped every {period:g} s to the last digit, as made-up stamps are: speeds, durations and "
+        "the delay of the laser are in that unit of time, whatever it was"
+    )
+    return [Remark("made-up-stamps", text)]
+
+
+def set_back(log: SensorLog) -> list[Remark]:
+    """Return a doubt for each sensor whose clock was set back."""
+    return [
+        Remark("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: part the log there", doubt=True)
+        for sensor, by in log.notes.set_back.items()
+        if by > 1.0
+    ]
+
+
+def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Undo jumps forward of one clock: a silence without which odometry and sensor end together, and with which they do not.
+
+    The odometry's stamps stay: where its own clock jumped, those of the other sensors follow.
+    """
+    odometry, remarks = log.odometry.stamps, []
+    for name, what, sensor in _sensors(log):
+        own = sensor.stamps
+        ahead, behind = _jump(own, float(odometry[-1])), _jump(odometry, float(own[-1]))
+        if ahead is None and behind is None:
+            continue
+        at, by = ahead or behind or (0.0, 0.0)
+        moved = -by if ahead else by
+        log = replace(log, **{name: replace(sensor, stamps=np.where(own > at, own + moved, own))})  # type: ignore[arg-type]
+        text = (
+            f"the clock of the {what if ahead else 'odometry'} was set forward by {by:.1f} s at t = {at - odometry[0]:.0f} s, "
+            f"as where it ends shows: the {what}'s stamps from then on were moved by {moved:+.1f} s"
+        )
+        remarks.append(Remark("clock-jump", text))
+    return log, remarks
+
+
+def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
+    """Return the stamp before a jump of the clock and its size, s, where stamps (n,) end with the others without it alone."""
+    if len(stamps) < _FEW_STAMPS or stamps[-1] - end < _JUMP:
+        return None
+    steps = np.diff(stamps)
+    longest = int(np.argmax(steps))
+    by = float(steps[longest] - np.median(steps))
+    return (float(stamps[longest]), by) if abs(stamps[-1] - by - end) < _SAME_END else None
+
+
+def within_odometry(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Leave out scans outside the odometry's time; say how many, and how many ranges. Doubt the recording where it is most.
+
+    Ranges outside it stay in the recording; a map gives them no weight.
+    """
+    first, last = log.odometry.stamps[[0, -1]]
+    remarks = []
+    for name, _, sensor in _sensors(log):
+        outside = (sensor.stamps < first - OUTSIDE) | (sensor.stamps > last + OUTSIDE)
+        share = float(np.mean(outside))
+        if share == 0.0 or (name == "scans" and share < _SOME):
+            continue
+        if isinstance(sensor, LaserScans):
+            log = replace(log, scans=sensor.rows(~outside))
+        off = float(np.median(sensor.stamps) - 0.5 * (first + last))
+        differ = f"the clocks differ by about {off:.0f} s; " if share > _MOST else ""
+        text = (
+            f"{np.sum(outside)} of {len(outside)} {name} were stamped outside the odometry's time and left out: {differ}"
+            "start the odometry first and stop it last, and use one clock"
+        )
+        remarks.append(Remark(f"{name}-outside-odometry", text, doubt=share > _MOST))
+    return log, remarks
+
+
+def _sensors(log: SensorLog) -> list[tuple[str, str, UwbRanges | LaserScans]]:
+    """Return the sensors besides the odometry: field, name for people, readings."""
+    sensors = (("ranges", "radio", log.ranges), ("scans", "lidar", log.scans))
+    return [(name, what, s) for name, what, s in sensors if s is not None and len(s.stamps)]
