@@ -10,7 +10,7 @@ from uwblite.io.png import decode_png, encode_png
 from uwblite.report.bitmap_font import HEIGHT, WIDTH, text_mask
 from uwblite.report.canvas import Canvas
 from uwblite.report.palette import ACCEPTED, ANCHOR, PATH, PATHS, START
-from uwblite.report.picture import WALL, PictureAnchor, _paste, draw_map
+from uwblite.report.picture import WALL, PictureAnchor, _paste, draw_map, shaded
 from uwblite.report.picture_frame import INK, PAPER, Key, _rows, foot_height, round_length
 
 
@@ -213,3 +213,20 @@ def test_start_and_end_have_the_marks_of_the_legend():
     assert cols.max() - cols.min() < 14
     # The path leads right and up: it starts on the left.
     assert cols.mean() < drawn.shape[1] / 2
+
+
+def test_shading_is_done_in_strips_and_takes_little_more_than_its_colours():
+    rows, cols = 1100, 500
+    log_odds = np.random.default_rng(4).choice([-2.0, -0.3, 0.0, 0.2, 0.9, 4.0], (rows, cols)).astype(np.float32)
+    grid = OccupancyGrid(GridGeometry(0.05, np.zeros(2), rows, cols), log_odds)
+    tracemalloc.start()
+    colours, states = shaded(grid), grid.states()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Three bytes for colours, one for states; a strip is a quarter of the rows, with some 50 bytes per cell.
+    assert peak < 20 * rows * cols
+    p = grid.probability()
+    np.testing.assert_array_equal(states, np.where(p > 0.65, 100, np.where(p < 0.196, 0, -1)))
+    for value in np.unique(log_odds):
+        cell = OccupancyGrid(GridGeometry(0.05, np.zeros(2), 1, 1), np.full((1, 1), value))
+        assert (colours[log_odds == value] == shaded(cell)[0, 0]).all()

@@ -1,5 +1,6 @@
 """Where the cells of a map are: the only place that turns metres into cells and back."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,8 @@ from ..errors import ConfigError
 
 BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
+_STRIP = 256
+"""Rows of a map that are computed with at a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +52,11 @@ class GridGeometry:
     def inside(self, row: Ints, col: Ints) -> Bools:
         """Return which cells belong to the grid."""
         return (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
+
+    def strips(self) -> Iterator[slice]:
+        """Yield the rows in strips, for what takes many bytes per cell."""
+        for start in range(0, self.rows, _STRIP):
+            yield slice(start, min(start + _STRIP, self.rows))
 
     def window(self, row: int, col: int, rows: int, cols: int) -> "GridGeometry":
         """Return the part of the grid whose first cell is (row, col)."""

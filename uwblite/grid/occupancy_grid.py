@@ -101,14 +101,17 @@ class OccupancyGrid:
     scans_astray: int = 0
     """Scans not traced, because they lie so far from all others that the grid would have been too large."""
 
-    def probability(self) -> NDArray[np.float32]:
-        """Return the probability of being occupied (rows, cols); 0.5 = unknown."""
-        return (1.0 / (1.0 + np.exp(-self.log_odds))).astype(np.float32)
+    def probability(self, rows: slice = slice(None)) -> NDArray[np.float32]:
+        """Return the probability of being occupied (rows, cols), of some rows; 0.5 = unknown."""
+        return (1.0 / (1.0 + np.exp(-self.log_odds[rows]))).astype(np.float32)
 
     def states(self) -> NDArray[np.int8]:
         """Return FREE, OCCUPIED or UNKNOWN (rows, cols)."""
-        p = self.probability()
-        return np.select([p > OCCUPIED_ABOVE, p < FREE_BELOW], [OCCUPIED, FREE], UNKNOWN).astype(np.int8)
+        states = np.full(self.log_odds.shape, UNKNOWN, dtype=np.int8)
+        for rows in self.geometry.strips():
+            p = self.probability(rows)
+            states[rows][p > OCCUPIED_ABOVE], states[rows][p < FREE_BELOW] = OCCUPIED, FREE
+        return states
 
     def occupied_points(self) -> Floats:
         """Return the centres (n, 2) of the occupied cells, m, map frame."""
@@ -121,9 +124,8 @@ def from_counts(counter: RayCounter, config: GridConfig, scans_used: int = 0) ->
     per_hit = np.float32(math.log(config.p_hit / (1.0 - config.p_hit)))
     per_miss = np.float32(math.log(config.p_miss / (1.0 - config.p_miss)) / WEIGHT_UNIT)
     log_odds = np.zeros(counter.hits.shape, dtype=np.float32)
-    # Row by row in blocks: the products in double precision would be the largest arrays of the run.
-    for start in range(0, len(log_odds), 256):
-        rows = slice(start, start + 256)
+    # In strips: the products in double precision would be the largest arrays of the run.
+    for rows in counter.geometry.strips():
         part = counter.hits[rows] * per_hit + counter.misses[rows] * per_miss
         log_odds[rows] = np.clip(part, -config.clamp, config.clamp)
     return OccupancyGrid(counter.geometry, log_odds, scans_used)

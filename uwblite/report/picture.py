@@ -148,13 +148,15 @@ def _pixels_per_metre(extent: float, resolution: float, size: int) -> float:
 
 def shaded(grid: OccupancyGrid) -> Image:
     """Return the colours (rows, cols, 3) of the cells: the surer a cell, the clearer its white or black."""
-    p = grid.probability()
-    observed = (grid.log_odds != 0.0)[:, :, None]
-    free = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, :, None]
-    wall = np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, :, None]
+    image = np.empty((*grid.log_odds.shape, 3), dtype=np.uint8)
     paper, floor, ink = (np.array(c, dtype=np.float32) for c in (PAPER, FLOOR, WALL))
-    colours = paper + free * (floor - paper) + wall * (ink - paper)
-    return np.rint(np.where(observed, colours, paper)).astype(np.uint8)
+    for rows in grid.geometry.strips():
+        p = grid.probability(rows)
+        free = np.clip((0.5 - p) / 0.35, 0.0, 1.0)[:, :, None]
+        wall = np.clip((p - 0.5) / 0.25, 0.0, 1.0)[:, :, None]
+        colours = paper + free * (floor - paper) + wall * (ink - paper)
+        image[rows] = np.rint(np.where(grid.log_odds[rows, :, None] != 0.0, colours, paper))
+    return image
 
 
 def _paste(image: Image, colours: Image, geometry: GridGeometry, low: Floats, scale: float) -> None:
