@@ -188,3 +188,20 @@ def test_heights_put_back_to_zero_leave_everything_else_at_the_optimum(seed):
     for value, fixed in enumerate(graph.fixed_calibration):
         derivative, sigma = slope(calibration, value)
         assert derivative > 0.0 if fixed else abs(derivative) * sigma < 1e-2
+
+
+def test_each_tag_has_its_place_and_each_anchor_its_error_from_it():
+    """Two tags, the second one 0.4 m higher: heights below both where none is given."""
+    config = CalibrationConfig()
+    texts = {u.key.label: u.meaning for u in unknowns(config, ("A", "B"), np.array([False, True]), rises=(0.0, 0.4))}
+    assert {k: v for k, v in texts.items() if k.startswith(("tag", "bias", "height"))} == {
+        "tag_x": "correction of the tag's x on the base", "tag_y": "correction of the tag's y on the base",
+        "tag_x@tag2": "correction of tag 2's x on the base", "tag_y@tag2": "correction of tag 2's y on the base",
+        "bias:A": "constant error of ranges to anchor A", "bias:B": "constant error of ranges to anchor B",
+        "bias:A@tag2": "constant error of ranges to anchor A from tag 2",
+        "bias:B@tag2": "constant error of ranges to anchor B from tag 2",
+        "height2:A": "squared height of anchor A above the tag", "height2:A@tag2": "squared height of anchor A above tag 2",
+    }  # fmt: skip
+    level = {u.key.label for u in unknowns(config, ("A",), np.array([False]), rises=(0.0, 0.0))}
+    assert {name for name in level if name.startswith("height")} == {"height2:A"}
+    assert all(u.meaning.endswith(" in recording 2") for u in unknowns(config, ("A",), np.array([False]), recording=1))

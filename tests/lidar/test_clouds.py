@@ -143,3 +143,16 @@ def test_tiny_clouds_have_no_lines(n):
     assert cloud.offsets.tolist() == [0, n]
     assert (cloud.normals == 0.0).all()
     assert (cloud.normal_variance == 0.0).all()
+
+
+def test_a_normal_faces_where_its_rays_came_from():
+    """A wall along x = y, seen from two places on either side, each by a keyframe of its own."""
+    along = np.linspace(4.0, 6.0, 80)
+    wall, away = np.column_stack([along, along]), np.array([[9.0, 1.0], [1.0, 9.0]])
+    origins = np.repeat(away, 80, axis=0)
+    clouds = build(rays_from(np.tile(wall, (2, 1)), np.repeat([0, 1], 80), origins), 2, EVERYTHING)
+    for k, side in enumerate(away):
+        normals = clouds.cloud(k)[1]
+        towards = (side - 5.0) / np.hypot(*(side - 5.0))
+        np.testing.assert_allclose(normals[normals.any(axis=1)] @ towards, 1.0, atol=1e-4)
+        assert normals.any(axis=1).sum() > 10

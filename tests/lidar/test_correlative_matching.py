@@ -8,7 +8,7 @@ from helpers.registration_worlds import CORRIDOR, ROOM, pair, wall_points
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize, surface_field
 from uwblite.lidar.clouds import joined, make_cloud
-from uwblite.lidar.correlative_matching import CorrelativeConfig, score_grid, search
+from uwblite.lidar.correlative_matching import CorrelativeConfig, _peaks, score_grid, search
 from uwblite.lidar.pair_alignment import align_pairs
 from uwblite.lidar.scan_matching import pair_points
 
@@ -149,3 +149,31 @@ def test_the_same_input_gives_the_same_candidates():
         found = search(target, source, np.array([0.5, -0.5, 0.1]), (1.0, 1.0, 0.3))
         results.append(found.poses.tobytes() + found.scores.tobytes())
     assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_peaks_are_those_of_a_loop(seed):
+    """No neighbour of the 26 is better, half of the best at least, and none within the separation of a better one."""
+    rng = np.random.default_rng(seed)
+    config = CorrelativeConfig(resolution=0.25, angle_step=0.1, candidates=4)
+    scores = np.pad(rng.random((7, 9, 11)), 1).astype(np.float32)
+    peaks = []
+    for place in zip(*np.nonzero(scores), strict=True):
+        around = scores[tuple(slice(k - 1, k + 2) for k in place)]
+        if scores[place] == around.max() and scores[place] >= 0.5 * scores.max():
+            peaks.append(place)
+    chosen = []
+    for place in sorted(peaks, key=lambda p: -scores[p]):
+        off = [np.abs(np.subtract(place, other)) for other in chosen]
+        if all(d[0] >= 2 or d[1] >= 2 or d[2] >= 2 for d in off):
+            chosen.append(place)
+    np.testing.assert_array_equal(_peaks(scores, config), chosen[:4])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_shoulder_of_a_peak_is_no_peak(axis):
+    """The score falls off slowly along one axis: places beyond the separation are still more than half as good."""
+    at = np.stack(np.indices((13, 13, 13)), axis=-1) - 6
+    slope = np.where(np.arange(3) == axis, 0.05, 1.0)
+    scores = np.maximum(1.0 - np.abs(at) @ slope, 0.0).astype(np.float32)
+    assert _peaks(scores, CorrelativeConfig(resolution=0.25, angle_step=0.1)).tolist() == [[6, 6, 6]]

@@ -1,6 +1,7 @@
 """A gyro's heading in place of the wheels'."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from helpers import planted
 from uwblite import se2
 from uwblite.io.carmen import read_log, write_log
 from uwblite.mapping import build_map
-from uwblite.odometry.gyro import LEFT_OF_BIAS, heading_from_gyro, settings
+from uwblite.odometry.gyro import GAP, LEFT_OF_BIAS, _covered, heading_from_gyro, settings
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.sensor_log import Gyro, Odometry, SensorLog
 
@@ -110,3 +111,19 @@ def test_the_map_of_slipping_wheels_is_better_with_a_gyro():
         turn = se2.wrap_angle(result.trajectory[:, 2] - truth[:, 2])
         errors.append(np.degrees(np.sqrt(np.mean(se2.wrap_angle(turn - np.median(turn)) ** 2))))
     assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_is_covered_where_the_gyro_was_read_throughout(seed):
+    """By a loop: readings from before its begin to behind its end, none of them further apart than a gap."""
+    rng = np.random.default_rng(seed)
+    read = np.cumsum(rng.choice([0.05, GAP, 1.5 * GAP], 40, p=[0.6, 0.3, 0.1]))
+    stamps = np.sort(np.append(rng.uniform(0.0, read[-1] + 0.3, 60), read[[0, 3, 17, -1]]))
+    expected = []
+    for begin, end in pairwise(stamps):
+        before, behind = read[read <= begin], read[read >= end]
+        inside = read[(read >= before.max(initial=-np.inf)) & (read <= behind.min(initial=np.inf))]
+        expected.append(len(before) and len(behind) and np.diff(inside).max(initial=0.0) <= GAP)
+    covered = _covered(Gyro(read, np.zeros(40)), stamps)
+    np.testing.assert_array_equal(covered, np.array(expected, dtype=bool))
+    assert 5 < covered.sum() < 58

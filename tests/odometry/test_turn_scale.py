@@ -47,6 +47,7 @@ def test_a_constant_scale_is_recovered(scale, turned_round):
     for one in scales:
         assert abs(one.value - scale) < 4.0 * one.sigma
         assert one.sigma < 0.02 * (1.0 + scale) ** 2
+        assert np.abs(one.stretches - scale).max() < 5.0 * one.stretch_sigma
         assert not one.contradicts(scale)
         assert one.contradicts(scale + 0.2)
         assert not one.varies

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.radio.trilateration import TrilaterationConfig, _raster_search, agreement, ambiguous, trilaterate, usable
+from uwblite.radio.trilateration import TrilaterationConfig, _raster_search, _score, agreement, ambiguous, trilaterate, usable
 
 CONFIG = TrilaterationConfig()
 
@@ -165,3 +165,15 @@ def test_agreement_is_the_share_of_ranges_that_fit_a_place_whatever_the_bias(fal
     stated = stated + 3.0 * wrong
     assert agreement(path, stated, place) == pytest.approx(1.0 - wrong.mean(), abs=0.02)
     assert agreement(path, stated, np.array([8.0, 2.0])) < 0.6
+
+
+def test_the_score_of_a_place_is_its_truncated_cost_with_that_of_its_bias():
+    """Errors of 0.1, -0.2 and 4 m at a sigma of 0.1 m: (1 + 4 + outlier^2) / 3, and the bias by its prior."""
+    path, state = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]]), np.array([3.0, 4.0, 0.3])
+    ranges = np.array([5.0, 4.0, 3.0]) + 0.3 + [0.1, -0.2, 4.0]
+    covariance = np.array([[0.04, 0.0, 9.0], [0.0, 0.01, 9.0], [9.0, 9.0, 99.0]])
+    scored = _score(path, ranges, state, covariance, 0.5, 0.1, CONFIG)
+    assert scored.cost == pytest.approx((5.0 + CONFIG.outlier**2) / 3.0 + (0.3 / CONFIG.bias_sigma) ** 2 / 3.0)
+    assert (scored.sigma, scored.bias) == (0.5, 0.3)
+    assert scored.position_sigma == pytest.approx(0.5 * 0.2)
+    assert _score(path, ranges, state, -covariance, 0.5, 0.1, CONFIG).position_sigma == 0.0
