@@ -10,7 +10,7 @@ _SECONDS = 30.0
 _FASTEST = 5.0
 """m/s and rad/s; a step that is faster was not driven: the base's counters began again."""
 _LEAST_STEP = 0.5
-"""m and rad; a smaller step is none of these."""
+"""m and rad; a smaller step is no jump, however short its time."""
 
 
 class Odometer:
@@ -23,7 +23,7 @@ class Odometer:
         self.jumps = 0
         """Steps that no robot drives; they count as standing still."""
         self.late = 0
-        """Poses that were older than one before them, and were left out."""
+        """Poses that were left out: not newer than the one before, or not finite."""
 
     def __len__(self) -> int:
         return self._end - self._begin

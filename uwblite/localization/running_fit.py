@@ -17,8 +17,8 @@ _FORGETTING, _FORGETTING_RANGES = 0.1, 0.2
 _SEEN = 0.5
 """Share of the last scans that must have met known space for their fit to speak for a pose that ranges contradict."""
 _SOUND_WEIGHT = 0.5
-"""Weight from which a range speaks for the pose; what was measured since the last one, or the last scan that fits, begins the
-search of a robot that is lost."""
+"""Weight from which a range speaks for the pose. The search for a robot that is lost begins with what was measured after the
+last such range, or after the last scan that fits."""
 _RANGES_SOUND, _RECENT = 0.5, 5.0
 """Mean weight of ranges, the last of them s ago, from which they speak for a pose that scans contradict: it is given up only
 for a better one. Rooms that the map holds in part look like that, and people around the robot."""
@@ -91,6 +91,7 @@ class RunningFit:
         return self.fit < FIT_SOUND
 
     def scans_contradict(self) -> bool:
+        """Return whether scans fit so badly that the robot is elsewhere."""
         return self.fit < FIT_LOST
 
     def ranges_contradict(self) -> bool:
@@ -115,5 +116,5 @@ class RunningFit:
 
 
 def full_agreement(anchors: int) -> RunningFit:
-    """Return the state before anything was measured."""
+    """Return the state before anything was measured, for so many anchors."""
     return RunningFit(np.tile((1.0, 0.0), (anchors, 1)), np.zeros(anchors))

@@ -27,7 +27,7 @@ _ITERATIONS = 6
 SCAN_LIMIT, RANGE_LIMIT = 0.03, 0.05
 """Relative error that is a lidar's or a map's own: data sheets allow 1 to 3 %; of radios besides what walls add."""
 _SURE = 4.0
-"""Standard deviations beyond the limit's nought from which it is one."""
+"""Standard deviations from which a scale error is certain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,9 @@ class Scale:
     """By how much the map's distances are longer than the sensor's."""
 
     error: float
-    """Relative."""
+    """Relative, 1."""
     sigma: float
+    """Its standard deviation, 1."""
 
     def off(self, limit: float) -> bool:
         """Return whether map and sensor are in different units for certain."""
@@ -68,7 +69,7 @@ def range_scale(pose: Floats, ranges: Ranges) -> Scale:
 
     Returns
     -------
-    The smaller of both errors: an anchor that was moved makes no other metre.
+    The error that is fewer of its standard deviations from 0: an anchor that was moved makes no other metre.
     """
     whole, own = _fitted(pose, ranges)
     odd = ranges.anchor == np.unique(ranges.anchor)[int(np.argmax(np.abs(own)))]

@@ -23,8 +23,10 @@ class Range:
     """A range, as it waits for the odometry."""
 
     anchor: int
+    """Its index in the map."""
     metres: float
     tag: int
+    """Which of the robot's tags measured it, from 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

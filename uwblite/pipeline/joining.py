@@ -28,6 +28,8 @@ from .recordings import Recording, Recordings
 
 _FIRST_TOLERANCE = 0.5
 """How far first estimates of one anchor may lie apart beyond their sigmas, m; NLOS and biases are not yet known well."""
+_MOST_VARIANCE = 25.0
+"""m^2; an anchor whose first place is less sure, or open, still has to lie within some metres to join in."""
 
 
 def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
@@ -84,11 +86,14 @@ def _other_name(name: str, here: Floats, spread: float, number: int, placed: dic
     """Return what to call an anchor that does not stand at its first place: as a recording that found it here does."""
     for earlier in range(1, number):
         other = numbered(name, earlier)
-        if other in placed and np.hypot(*(placed[other][0] - here)) < _FIRST_TOLERANCE + 2.0 * np.hypot(
-            spread, placed[other][1]
-        ):
+        if other in placed and np.hypot(*(placed[other][0] - here)) < _tolerance(spread, placed[other][1]):
             return other
     return numbered(name, number)
+
+
+def _tolerance(one: float, other: float) -> float:
+    """Return how far two first places of one anchor with these standard deviations may lie apart, m."""
+    return _FIRST_TOLERANCE + 2.0 * float(np.hypot(one, other))
 
 
 def _places(estimate: Estimate) -> dict[str, tuple[Floats, float]]:
@@ -100,7 +105,7 @@ def _places(estimate: Estimate) -> dict[str, tuple[Floats, float]]:
         placed = np.flatnonzero(estimate.placed)
     spread = marginals(estimate.graph.with_edges(*estimate.odometry_and_ranges)).anchors
     return {
-        estimate.anchor_ids[k]: (estimate.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, 25.0))))
+        estimate.anchor_ids[k]: (estimate.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, _MOST_VARIANCE))))
         for k in placed
     }
 
@@ -116,8 +121,7 @@ def _laid_on(
             "or more are needed to bring it into their frame: map it alone, or record where common anchors are in reach"
         )
     here, there = (np.array([side[name][0] for name in common]) for side in (found, placed))
-    spread = np.array([np.hypot(found[name][1], placed[name][1]) for name in common])
-    tolerance = _FIRST_TOLERANCE + 2.0 * spread
+    tolerance = np.array([_tolerance(found[name][1], placed[name][1]) for name in common])
     motion = consensus(here, there, tolerance)
     off = np.hypot(*(se2.transform(motion, here) - there).T)
     return motion, {name: float(d) for name, d, most in zip(common, off, tolerance, strict=True) if d > most}

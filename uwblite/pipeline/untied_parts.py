@@ -17,7 +17,7 @@ from .recordings import Recording
 _SILENT, _DRIVEN = 10.0, 3.0
 """Time without any scan, s, and way meanwhile, m, after which the odometry may be anywhere where it failed."""
 _PART = 6
-"""Keyframes of a part that is worth a word."""
+"""Keyframes of the smallest part that is worth a doubt."""
 _ANCHORS, _MEASURED = 2, 3
 """Anchors that hold two parts to each other, and ranges to one of them in each part."""
 _AT_ONCE = 10.0
@@ -48,7 +48,7 @@ def check_untied_parts(estimate: Estimate, task: Task) -> None:
 
 
 def _without_scans(recording: Recording) -> list[tuple[float, float]]:
-    """Return the times in which a robot that drives has no scans."""
+    """Return when, from and to, s, a robot that drives has no scans."""
     scans, odometry = recording.log.scans, recording.log.odometry
     if scans is None or len(scans.stamps) < 2:
         return []
@@ -58,7 +58,7 @@ def _without_scans(recording: Recording) -> list[tuple[float, float]]:
 
 
 def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[float, float]]:
-    """Return the times at which several anchors fall silent for good and several others appear."""
+    """Return when, from and to, s, several anchors fall silent for good and several others appear."""
     if ranges is None or not len(ranges):
         return []
     own = ranges.rows(np.flatnonzero((ranges.pose >= recording.rows.start) & (ranges.pose < recording.rows.stop)))

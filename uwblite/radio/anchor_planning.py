@@ -25,6 +25,7 @@ _PRIOR = 3.0
 _CELL = 0.2
 """m; the map is looked at in cells at least this large."""
 _MOST_POINTS, _MOST_CANDIDATES = 1500, 400
+"""Cells at which the error is evaluated, and places offered to anchors: the time goes with their product."""
 _APART = 1.0
 """m; least distance between anchors."""
 _SWEEPS = 10
