@@ -7,9 +7,9 @@ import pytest
 from helpers.planted import box, drive, odometry, recording, scans, wander
 
 from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.lidar.laser_mounting import _LAGS, LEAST_PAIRS, _Agreement, _ratio, compare
+from uwblite.lidar.laser_mounting import _LAGS, LEAST_PAIRS, _Agreement, _ratio, _turning_pairs, compare
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.sensor_log import SensorMounting
+from uwblite.sensor_log import LaserScans, SensorMounting
 
 ROOM = np.concatenate([box(14, 11), box(3, 1) + np.array([2, 1, 2, 1]), box(1, 2) - np.array([4, 2, 4, 2])])
 TURNS = [(0.0, 0.0, 0.6), (0.4, 0.0, 0.0), (0.0, 0.0, -0.5), (0.3, 0.0, 0.0), (0.0, 0.0, 0.4)] * 2
@@ -129,3 +129,28 @@ def test_the_ratio_of_turns_is_a_median_of_clear_ones():
     few = wheels[: LEAST_PAIRS - 1]
     assert np.isnan(_ratio(few, few)).all()
     assert _ratio(wheels[:LEAST_PAIRS], wheels[:LEAST_PAIRS]) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(("speed", "compared"), [(0.09, False), (0.11, True), (0.58, True), (0.62, False)])
+def test_turns_are_compared_between_too_small_to_see_and_too_large_to_overlap(speed, compared):
+    """Half a second of turning on the spot: more than 0.05 rad, and less than 0.4 of a view of 0.75 rad."""
+    stamps, truth = drive([(0.0, 0.0, speed)], [20.0])
+    lidar = LaserScans(np.arange(0.0, 19.0, 0.1), np.ones((190, 30), dtype=np.float32), -0.375, 0.025, 0.0, 0.1, 5.0)
+    first, second = _turning_pairs(recording(odometry(stamps, truth), None, lidar), lidar, 50)
+    np.testing.assert_array_equal(second - first, 5)
+    assert (len(first) > 0) is compared
+    assert len(first) <= 2 * 50
+
+
+def test_pairs_of_turns_on_the_spot_come_first_and_where_there_are_few_those_that_drive_least():
+    """On the spot for 5 s, then in an arc, whose 0.5 m in half a second are more than 0.15 m + 0.3 times the turn."""
+    stamps, truth = drive([(0.0, 0.0, 0.4), (1.0, 0.0, 0.4)], [5.0, 5.0])
+    for begin, spot in ((0.0, True), (4.9, False)):
+        lidar = LaserScans(np.arange(begin, 9.9, 0.1), np.ones((len(np.arange(begin, 9.9, 0.1)), 100), dtype=np.float32),
+                           -1.0, 0.02, 0.0, 0.1, 5.0)  # fmt: skip
+        first, second = _turning_pairs(recording(odometry(stamps, truth), None, lidar), lidar, 1000)
+        assert len(first) >= (40 if spot else 1)
+        if spot:
+            assert lidar.stamps[second].max() < 5.3
+        else:
+            assert len(first) <= 2 * LEAST_PAIRS

@@ -15,7 +15,16 @@ from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig
 from uwblite.lidar.visibility import observed_free_space
 from uwblite.loop_closure.closures import LoopClosureConfig
-from uwblite.loop_closure.loose_links import contradicted, loose_links, loosened, propose, spanned, untied_links
+from uwblite.loop_closure.loose_links import (
+    _LEAST_POINTS,
+    _pieces,
+    contradicted,
+    loose_links,
+    loosened,
+    propose,
+    spanned,
+    untied_links,
+)
 from uwblite.loop_closure.verification import find, reconcile
 from uwblite.odometry.wheels import OdometryNoiseConfig
 
@@ -145,3 +154,17 @@ def test_a_link_is_untied_until_scan_edges_of_another_visit_join_its_sides(walk,
     assert untied_links(wheels, found, clouds).tolist() == ([] if revisited else [LINK])
     blind = replace(clouds, offsets=np.concatenate([clouds.offsets[: LINK + 1], clouds.offsets[LINK:-1]]))
     assert untied_links(wheels, graph, blind).tolist() == []
+
+
+def test_pieces_end_at_the_next_link(walk):
+    """Of links behind keyframes 10 and 14: six keyframes before and behind each, as far as no other link lies between."""
+    _, _, clouds = walk
+    recording = np.zeros(len(clouds), dtype=np.int64)
+    first, last, reference = _pieces(np.array([10, 14]), np.array([11, 15]), clouds, recording)
+    several = {(int(r), int(a), int(b)) for r, a, b in zip(reference[:, 0], first[:, 0], last[:, 0], strict=True)}
+    assert several == {(10, 5, 11), (11, 11, 15), (14, 11, 15), (15, 15, 21)}
+    single = {tuple(row) for row in np.column_stack([reference, first[:, 1], last[:, 1]]).tolist()}
+    enough = clouds.counts >= _LEAST_POINTS
+    expected = {(b, a + n, a + n, a + n + 1) for b, a in ((10, 11), (14, 15)) for n in range(3) if enough[a + n]}
+    expected |= {(a, b - n, b - n, b - n + 1) for b, a in ((10, 11), (14, 15)) for n in range(3) if enough[b - n]}
+    assert single == expected

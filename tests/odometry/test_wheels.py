@@ -1,6 +1,7 @@
 """From keyframes to edges of odometry: noise that grows as stated, and is what measured steps show."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.graph.robust import SQUARED
 from uwblite.graph.solver import optimize
 from uwblite.odometry.keyframes import KeyframeConfig, select
-from uwblite.odometry.wheels import OdometryNoiseConfig, reestimate_wheel_noise, wheel_edges, with_noise_shown
+from uwblite.odometry.wheels import OdometryNoiseConfig, drift_time, reestimate_wheel_noise, wheel_edges, with_noise_shown
 from uwblite.sensor_log import Odometry
 
 NOISE = OdometryNoiseConfig(distance=0.02, heading_per_metre=0.01, heading_per_turn=0.05, standing=0.001)
@@ -165,3 +166,10 @@ def test_steps_that_nothing_checks_err_as_assumed():
     wheels = chained(truth, (0.02, 0.01, 0.01))
     shown = with_noise_shown(Graph(truth, fixed_poses=np.arange(41) == 0).with_edges(wheels))
     np.testing.assert_allclose(shown.edges[0].sqrt_information, wheels.sqrt_information, rtol=1e-6)
+
+
+def test_a_heading_drifts_for_one_second_of_a_pause():
+    """Steps whose heading may have slipped count one second at most, all others their whole time."""
+    slack, duration = np.zeros((4, 3)), np.array([0.4, 3600.0, 0.4, 3600.0])
+    slack[:2, 2], slack[2:, 0] = 0.1, 0.1
+    assert drift_time(SimpleNamespace(slack=slack, duration=duration)).tolist() == [0.4, 1.0, 0.4, 3600.0]

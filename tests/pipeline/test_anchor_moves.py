@@ -8,7 +8,9 @@ from helpers.room_recording import ANCHORS, recording, two_rounds
 
 from uwblite import se2
 from uwblite.mapping import build_map
-from uwblite.pipeline.anchor_moves import name_and_number
+from uwblite.pipeline.anchor_moves import _alike, _of_all, _renamed, name_and_number
+from uwblite.radio.change_points import Move
+from uwblite.sensor_log import Odometry, SensorLog, SensorMounting, UwbRanges
 
 
 def test_names_of_places():
@@ -51,3 +53,50 @@ def test_anchors_that_change_names_at_once_are_distinguished():
     for k, name in enumerate(names):
         assert np.hypot(*(by_id[name].position - ANCHORS[name])) < 0.3
         assert np.hypot(*(by_id[f"{names[following[k]]}@2"].position - ANCHORS[name])) < 0.3
+
+
+def moved(stamp, far=1.0):
+    return Move(stamp, np.zeros(2), np.array([far, 0.0]))
+
+
+def four_ranges(**moves):
+    """Return a log of ranges at t = 0, 1, 2, 3 s to A and B in turn twice, with moves applied."""
+    stamps = np.repeat(np.arange(4.0), 2)
+    ranges = UwbRanges(stamps, np.tile([0, 1], 4), np.ones(8), np.ones(8), ("A", "B"))
+    log = SensorLog(Odometry(np.array([0.0, 9.0]), np.zeros((2, 3))), ranges, None, SensorMounting(anchor_heights={"A": 2.0}))
+    return _renamed(log, moves)
+
+
+def names(log):
+    return [log.ranges.anchor_ids[k] for k in log.ranges.anchor]
+
+
+def test_ranges_have_another_name_from_each_move_on():
+    """From the first range at the second place on; a given height stays with the anchor; the recording says so."""
+    log = four_ranges(A=[moved(1.0, 0.7), moved(3.0)])
+    assert names(log) == ["A", "B", "A@2", "B", "A@2", "B", "A@3", "B"]
+    assert log.mounting.anchor_heights == {"A": 2.0, "A@2": 2.0, "A@3": 2.0}
+    first, second = log.screening.remarks
+    assert first.text == "anchor A was moved by 0.7 m at about t = 1 s; from then on it is called A@2"
+    assert second.text.endswith("it is called A@3")
+    assert names(four_ranges(B=[moved(2.0)])) == ["A", "B", "A", "B", "A", "B@2", "A", "B@2"]
+    assert names(four_ranges()) == ["A", "B"] * 4
+
+
+def test_two_ranges_at_each_move_may_be_called_otherwise():
+    one, none = four_ranges(A=[moved(1.0)]).ranges, four_ranges().ranges
+    moves = {"A": [moved(1.0)]}
+    assert not _alike(one, none, moves)  # three ranges have another name
+    assert _alike(one, four_ranges(A=[moved(3.0)]).ranges, moves)
+    assert not _alike(one, four_ranges(A=[moved(3.0)]).ranges, {})
+    assert _alike(one, none, {"A": [moved(1.0)], "B": [moved(2.0)]})
+    assert _alike(None, none, {})
+
+
+def test_moves_of_about_the_same_time_are_one_for_all_anchors():
+    """Each is compared with the one before it: 10, 40 and 70 s are one, 100.1 s is another."""
+    moves = {"A": [moved(40.0), moved(100.1)], "B": [moved(10.0), moved(70.0)]}
+    found = _of_all(four_ranges(), moves)
+    assert list(found) == ["A", "B"]
+    assert [m.stamp for m in found["A"]] == [m.stamp for m in found["B"]] == [10.0, 100.1]
+    assert _of_all(replace(four_ranges(), ranges=None), moves) == {}

@@ -253,3 +253,19 @@ def test_half_a_radian_of_direction_or_half_an_e_fold_of_distance_is_alike(other
 def test_steady_errors_can_be_switched_off():
     assert not np.any(steady_sigma(np.ones((4, 2)), replace(CONFIG, steady=0.0)))
     assert len(steady_sigma(np.zeros((0, 2)), CONFIG)) == 0
+
+
+@pytest.mark.parametrize("index", [3, 7, 11])
+def test_exact_covariances_give_the_length_and_the_slow_part_back(monkeypatch, index):
+    """At the middles of the bins; one of the lengths that are tried."""
+    length, rng = np.geomspace(0.3, 8.0, 15)[index], np.random.default_rng(9)
+
+    def exact(p, e, edges):
+        return 0.06**2 * np.exp(-0.5 * (edges[1:] + edges[:-1]) / length), np.full(len(edges) - 1, 100.0)
+
+    monkeypatch.setattr("uwblite.radio.range_noise._covariance_by_distance", exact)
+    errors = 0.1 * rng.standard_normal(5000)
+    noise = learn(np.zeros((5000, 2)), errors, np.ones(5000), CONFIG)
+    assert noise.length == pytest.approx(length)
+    assert noise.slow == pytest.approx(0.06)
+    assert noise.white == pytest.approx(0.08, rel=0.03)
