@@ -40,6 +40,15 @@ def test_it_is_the_least_over_all_directions():
         assert abs(overlap(clouds, true + off) - by_loops(clouds, true + off)) < 0.05
 
 
+def test_the_walls_of_a_corridor_share_their_direction_however_the_robot_turned():
+    """Both clouds see its two walls alone: added in one frame these face one way, and what matches across is all of it."""
+    poses = np.array([[0.0, 0.0, 0.4], [1.0, 0.3, 1.6]])
+    clouds, true = scanned(poses, CORRIDOR, 0.0, 1, beams=360, reach=5.0), se2.between(*poses)
+    for off in (0.0, 0.1):
+        pose = se2.compose(true, [0.0, 0.0, off])
+        assert abs(overlap(clouds, pose) - by_loops(clouds, pose)) < 0.05
+
+
 def test_walls_alone_match_in_no_place_of_a_corridor():
     """All points match, but what faces along the corridor is the noise of the normals."""
     clouds = scanned(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), CORRIDOR, 0.01, 2, reach=6.0)

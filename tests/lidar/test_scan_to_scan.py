@@ -1,6 +1,7 @@
 """Tracking: steps between neighbouring clouds are measured, slips are found by a search, blind steps left to the wheels."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from helpers.planted import box
 from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.scan_to_scan import Steps, TrackingConfig, descend, follow, reattached
+from uwblite.lidar.scan_to_scan import _LEAST_SHARE, Steps, TrackingConfig, _searched, descend, follow, reattached
 
 NOISE = np.array([0.01, 0.005, 0.006])
 GATE = 0.5
@@ -145,3 +146,30 @@ def test_keyframes_without_neighbours_on_both_sides_stay(walk):
     found, laid = reattached(clouds, rasterize(clouds, 0.1, GATE), truth, np.arange(len(truth)), tied, GATE, TrackingConfig())
     assert len(laid) == 0
     np.testing.assert_array_equal(found, truth)
+
+
+def test_searches_begin_behind_the_last_step_that_nothing_measured(monkeypatch, walk):
+    """Step 3 is blind; 2, 5, 7 and 8 are doubtful. 5 ends clear and 7 lost: behind that a new sub-map begins, too."""
+    _, clouds, _ = walk
+    count = len(clouds)
+    enough, doubtful = np.ones(count - 1, dtype=bool), np.isin(np.arange(count - 1), [2, 5, 7, 8])
+    enough[3] = False
+    share = np.full(count - 1, _LEAST_SHARE)
+    share[7] -= 0.01
+    steps = Steps(np.arange(count - 1), np.full((count - 1, 3), 0.2), np.full((count - 1, 3), 0.1), share, enough)
+    calls = []
+
+    class Search:
+        def __init__(self, *options):
+            assert options == (clouds, TrackingConfig().distance, TrackingConfig().angle)
+
+        def find(self, k, first, chain, guesses):
+            calls.append((k, first, float(chain[5, 0])))
+            np.testing.assert_array_equal(guesses, [[0.2] * 3, [0.1] * 3, [0.0, 0.0, 0.2]])
+            return SimpleNamespace(clear=k == 5, contradicts=False, pose=np.full(3, 0.7))
+
+    monkeypatch.setattr("uwblite.lidar.scan_to_scan.StepSearch", Search)
+    pose, lost = _searched(clouds, steps.i, steps, doubtful, TrackingConfig())
+    assert calls == [(2, 0, 0.1), (5, 4, 0.1), (7, 4, 0.7), (8, 8, 0.7)]
+    assert np.flatnonzero(lost).tolist() == [7]
+    np.testing.assert_array_equal(pose, np.where(np.arange(count - 1)[:, None] == 5, 0.7, 0.1) * np.ones(3))

@@ -91,3 +91,15 @@ def test_many_closures_of_a_place_that_looks_alike_are_overruled_by_the_odometry
     assert np.hypot(*(solved.poses - truth)[:, :2].T).max() < 3.0 * 0.02 * np.sqrt(15.0)
     assert [c.outcome for c in left.candidates] == ["accepted"] * len(true_records) + ["contradicts-graph"] * len(false_records)
     assert len(left.edges) == len(true_records)
+
+
+@pytest.mark.parametrize(("left", "slides"), [(0.28, True), (0.32, False)])
+def test_the_jump_back_leaves_less_than_a_third(left, slides):
+    """Part of the first jump that is left behind the second; the size stated is the first jump's."""
+    truth, wheels = chain()
+    poses = truth.copy()
+    poses[35:51, 0] += SLIDE
+    poses[51:, 0] += left * SLIDE
+    found = slid(Graph(poses, edges=(wheels,)))
+    assert [(a, b) for a, b, _ in found] == ([(35, 50)] if slides else [])
+    assert all(size == pytest.approx(SLIDE) for *_, size in found)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.odometry.keyframes import KeyframeConfig, dense_trajectory, select, velocity_at
-from uwblite.sensor_log import LaserScans, Odometry
+from uwblite.sensor_log import LaserScans, Odometry, OdometryBreaks
 
 CONFIG = KeyframeConfig(distance=0.4, angle=0.3, scans=2)
 
@@ -192,3 +192,14 @@ def test_what_odometry_misses_is_spread_as_its_errors_grow():
     # Driving takes a share of one in seven of the heading's error: 0.3 m count as 0.03 rad of turning.
     np.testing.assert_allclose(dense[2], [0.22, 0.0, 0.0], atol=0.003)
     np.testing.assert_allclose(dense[4], [0.22, 0.0, 0.22], atol=0.003)
+
+
+def test_a_break_of_the_odometry_has_a_keyframe_at_either_end():
+    """Whatever the spacing: the step that was predicted stands alone between two keyframes."""
+    stamps, truth = drive([(0.5, 0, 0)], [10.0])
+    breaks = OdometryBreaks(stamps[[57, 121]], np.ones((2, 3)))
+    frames = select(Odometry(stamps, truth), KeyframeConfig(distance=2.0), breaks)
+    assert {57, 58, 121, 122} <= set(frames.index.tolist())
+    assert len(frames) <= 4 + 4
+    loose = frames.slack[:, 0] > 0.0
+    assert frames.index[:-1][loose].tolist() == [57, 121]

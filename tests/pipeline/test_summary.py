@@ -10,9 +10,11 @@ from uwblite import se2
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.calibration import CalibrationConfig
 from uwblite.graph.marginals import marginals
+from uwblite.map_result import AnchorEstimate, Notice
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.wheels import with_noise_shown
 from uwblite.pipeline.mapping_config import preset
+from uwblite.pipeline.summary import _distrusted
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -43,6 +45,7 @@ def test_there_is_a_pose_per_odometry_stamp_and_a_covariance_per_keyframe(run):
     assert result.keyframe_covariances.shape == (len(result.keyframe_stamps), 3, 3)
     assert np.all(np.linalg.eigvalsh(result.keyframe_covariances) > -1e-12)
     assert len(result.graph.poses) == len(result.keyframe_stamps)
+    assert result.stages[-1].name == "summary"
 
 
 def test_every_range_has_a_row(run):
@@ -168,3 +171,14 @@ def test_without_lidar_what_ranges_err_alike_is_stated(run):
     one, other = (np.einsum("kii->k", c[1:, :2, :2]) for c in (result.keyframe_covariances, unaware.poses))
     assert np.all(one > other)
     assert all(np.trace(a.covariance) > np.trace(c) for a, c in zip(result.anchors, unaware.anchors, strict=True))
+
+
+def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():
+    def anchor(status):
+        return AnchorEstimate("A", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, status, "" if status == "ok" else "few")
+
+    anchors, part, whole = (anchor("ok"), anchor("unplaced")), Notice("no-closure", "", {}), Notice("halves-disagree", "", {})
+    assert _distrusted(anchors, []) is anchors
+    assert _distrusted(anchors, [part]) is anchors
+    found = _distrusted(anchors, [part, whole])
+    assert [(a.status, a.reason) for a in found] == [("distrusted", "the map is doubted"), ("unplaced", "few")]

@@ -16,7 +16,7 @@ from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio.bootstrap import BootstrapConfig, BootstrapResult, _Bootstrap, bootstrap_graph
 from uwblite.radio.range_measurements import range_edges
-from uwblite.radio.trilateration import TrilaterationConfig
+from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
 
 SIGMA = 0.05
@@ -305,3 +305,30 @@ def test_the_misfit_is_a_median_in_standard_deviations_unless_the_path_is_torn()
         attempt.placed[:] = False
         attempt.poses = truth + tear * (np.arange(12) >= 6)[:, None] * [0.0, 1.0, 0.0]
         assert attempt.misfit() == (attempt.config.agreement if torn else 0.0)
+
+
+def test_the_first_stretch_is_the_one_whose_anchors_are_clearest():
+    """By 1 / (1 + sigma / range_sigma + position_sigma) of each clear anchor; lengths are tried until it is enough."""
+    tried = []
+
+    class Seeded(_Bootstrap):
+        def _search(self, low, high, drift):
+            tried.append((low, high, drift))
+            # The surer anchor scatters three times as much: 1 / (1 + 1 + 1) is less than 1 / (1 + 3 + 0.5) twice.
+            one = AnchorHypothesis(np.ones(2), 0.0, 0.1, 1.0, 1.0)
+            two = AnchorHypothesis(np.ones(2), 0.0, 0.3, 1.0, 0.5)
+            return {0: [one]} if low == 0 else ({0: [two], 1: [two]} if low == 15 else {0: []})
+
+    truth = np.column_stack([np.arange(41.0), np.zeros((41, 2))])
+    ranges_to = plain_ranges(np.arange(41), np.arange(41) % 2, np.ones(41), 0.1)
+    attempt = Seeded(
+        Graph(truth, np.zeros((2, 2))), chained(truth, (0.1, 0.1, 0.1)), ranges_to, np.arange(41.0),
+        BootstrapConfig(range_sigma=0.1), TrilaterationConfig(),
+    )  # fmt: skip
+    length = attempt._seed()
+    # 25 m at both ends and between, then 10 and 4 m, then all: none is worth 0.35 for each of two anchors.
+    assert [(low, high) for low, high, _ in tried[:2]] == [(0, 26), (15, 41)]
+    assert tried[-1][:2] == (0, 41)
+    assert all(abs(drift / 0.015 - (high - low)) <= 1.0 + 1e-9 for low, high, drift in tried)
+    assert (attempt.low, attempt.high, length) == (15, 41, 25.0)
+    assert attempt.placed.tolist() == [True, True]

@@ -13,7 +13,7 @@ from uwblite.graph.solver import optimize
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
-from uwblite.radio.prior_selection import log_marginal_likelihood, select_priors
+from uwblite.radio.prior_selection import _mean_under, log_marginal_likelihood, select_priors
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
@@ -186,3 +186,12 @@ def test_one_of_the_two_may_be_fixed():
     found = widths(select_priors(replace(graph, fixed_calibration=held), (edges,), CONFIG))
     assert found["range_scale"] == pytest.approx(CONFIG.range_scale, rel=1e-12)
     assert found["bias:A02"] > 3 * CONFIG.range_bias_sound
+
+
+def test_the_mean_under_other_priors_is_that_of_the_same_measurements():
+    """Linear measurements again: solved with the other priors from the beginning."""
+    rng = np.random.default_rng(3)
+    a, y, before, after = rng.normal(size=(7, 3)), rng.normal(size=7), np.array([0.3, 1.0, 2.0]), np.array([0.9, 0.2, 5.0])
+    covariance = np.linalg.inv(a.T @ a + np.diag(before**-2.0))
+    expected = np.linalg.solve(a.T @ a + np.diag(after**-2.0), a.T @ y)
+    np.testing.assert_allclose(_mean_under(covariance @ a.T @ y, covariance, before, after), expected)

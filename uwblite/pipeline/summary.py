@@ -1,5 +1,6 @@
 """From the optimised graph to the result: anchors, calibration, doubts, in the user's words."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors
-from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult
+from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
 from ..odometry.wheels import with_noise_shown
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
@@ -59,10 +60,7 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
         "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
     }
     plausibility.judge(estimate, anchors, calibrated, listed, table, grid, covariance.poses, task)
-    if any(notice.kind not in _ABOUT_PARTS for notice in stages.doubts):
-        anchors = tuple(
-            replace(a, status="distrusted", reason="the map is doubted") if a.status == "ok" else a for a in anchors
-        )
+    anchors = _distrusted(anchors, stages.doubts)
     stages.end("summary")
     stamps = [recording.trajectory_stamps for recording in recordings.each]
     return MapResult(
@@ -82,6 +80,13 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
         warnings=tuple(stages.warnings),
         doubts=tuple(stages.doubts),
     )
+
+
+def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Notice]) -> tuple[AnchorEstimate, ...]:
+    """Return the anchors, none of them 'ok' where a doubt is about the whole map."""
+    if all(doubt.kind in _ABOUT_PARTS for doubt in doubts):
+        return anchors
+    return tuple(replace(a, status="distrusted", reason="the map is doubted") if a.status == "ok" else a for a in anchors)
 
 
 def _with_steady_errors(graph: Graph, anchors: int, config: RangeNoiseConfig) -> Graph:
