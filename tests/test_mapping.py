@@ -13,10 +13,17 @@ from simulation.recording import FalseRanges, Settings, simulate
 from uwblite import se2
 from uwblite.errors import Cancelled
 from uwblite.evaluation.trajectory import evaluate_trajectory
+from uwblite.graph.marginals import marginals
+from uwblite.graph.range_edges import RangeEdges
 from uwblite.io.carmen import read_log
 from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_tum
+from uwblite.lidar.joint_refinement import with_fewer_pairs
+from uwblite.lidar.surface_errors import common_range_errors
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.wheels import with_noise_shown
+from uwblite.pipeline.final_stages import at_given_poses
+from uwblite.radio.anchor_covariance import by_alike_errors
 from uwblite.sensor_log import Odometry, UwbRanges
 
 ROOM_ATE = 0.02
@@ -43,6 +50,15 @@ def minute(log):
 def ate(result, truth) -> float:
     """Return the absolute trajectory error, m; some recordings have one odometry pose in 20 s."""
     return evaluate_trajectory(result.stamps, result.trajectory, *truth, max_gap=30.0).ate.rmse
+
+
+def test_anchors_covariances_are_those_of_all_measurements_and_of_what_their_ranges_err_alike(result):
+    stated = with_noise_shown(with_fewer_pairs(result.graph))
+    whole = marginals(stated, common_range_errors(stated)).anchors
+    (ranges,) = [e for e in result.graph.edges if isinstance(e, RangeEdges)]
+    alike = by_alike_errors(at_given_poses(result.graph), ranges, MappingConfig().ranges)
+    assert all(np.abs(own).max() > 1e-4 for own in alike)
+    np.testing.assert_allclose([a.covariance for a in result.anchors], whole + alike, rtol=1e-6)
 
 
 def test_the_room_is_mapped(result, truth):

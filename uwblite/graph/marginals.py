@@ -51,7 +51,7 @@ class Marginals:
     """
 
     def __init__(self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = ()) -> None:
-        self._graph, self._unknowns = graph, normal.unknowns
+        self._graph, self.unknowns = graph, normal.unknowns
         self._factor = _factor(normal)
         unseen = np.append(normal.diagonal <= 0, False)
         blocks = self._block_diagonal(unseen)
@@ -70,7 +70,7 @@ class Marginals:
         These are the consider parameters of Schmidt (Application of state-space methods to navigation problems, 1966). How
         large the errors of each kind are, the residuals say, see variance_components.
         """
-        slopes, (seen, products), kind = self._slopes(common), self._seen(common), common.kind
+        slopes, (seen, products), kind = self.slopes(common), self._seen(common), common.kind
         kinds = int(kind.max(initial=-1)) + 1
         added = {name: np.zeros((kinds, *block.shape)) for name, block in blocks.items()}
         for first in range(0, slopes.shape[1], _COMMON_AT_ONCE):
@@ -86,7 +86,7 @@ class Marginals:
     def _square(self, moves: Floats, kind: Ints, added: dict[str, Floats]) -> None:
         """Add the squares of moves (size, k) of the unknowns to the covariances by kind."""
         moves = np.concatenate([moves, np.zeros((1, moves.shape[1]))])
-        for name, number in self._unknowns.number.items():
+        for name, number in self.unknowns.number.items():
             for g in np.unique(kind):
                 own = moves[number][..., kind == g]
                 added[name][g] += own @ own.transpose(0, 2, 1)
@@ -102,15 +102,15 @@ class Marginals:
         residuals = common.edges.residuals(self._graph).ravel()
         return np.asarray(weighted.T @ residuals), np.asarray((weighted.T @ shifts).todense())
 
-    def _slopes(self, common: CommonErrors) -> sparse.csc_matrix:
-        """Return J^T W s of each error as a column."""
-        size, count = self._unknowns.size, int(common.error.max(initial=-1)) + 1
+    def slopes(self, common: CommonErrors) -> sparse.csc_matrix:
+        """Return J^T W s of each error as a column (unknowns, k)."""
+        size, count = self.unknowns.size, int(common.error.max(initial=-1)) + 1
         weights, right = edge_weights(common.edges, self._graph), sparse.csc_matrix((size, count))
         for name, index, jacobian in common.edges.linearize(self._graph).blocks:
             for first in range(0, len(common.edge), _MET_AT_ONCE):
                 part = slice(first, first + _MET_AT_ONCE)
                 edge = common.edge[part]
-                row = self._unknowns.number[name][index[edge]]
+                row = self.unknowns.number[name][index[edge]]
                 error = np.broadcast_to(common.error[part, None], row.shape)
                 slope = np.einsum("mdk,md,m->mk", jacobian[edge], common.shift[part], weights[edge])
                 free = row >= 0
@@ -119,7 +119,7 @@ class Marginals:
 
     def _block_diagonal(self, unseen: Bools) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
-        numbers = self._unknowns.number
+        numbers = self.unknowns.number
         rows = {name: np.broadcast_to(n[:, :, None], (*n.shape, n.shape[1])) for name, n in numbers.items()}
         columns = {name: np.broadcast_to(n[:, None, :], (*n.shape, n.shape[1])) for name, n in numbers.items()}
         row, column = (np.concatenate([part[name].ravel() for name in numbers]) for part in (rows, columns))
@@ -137,7 +137,7 @@ class Marginals:
         the sum over residuals is what the sum of their squares is expected to be.
         """
         blocks = edges.linearize(self._graph).blocks
-        number = np.concatenate([self._unknowns.number[name][index] for name, index, _ in blocks], axis=1)
+        number = np.concatenate([self.unknowns.number[name][index] for name, index, _ in blocks], axis=1)
         jacobian = np.concatenate([own for *_, own in blocks], axis=2)
         row, column = np.broadcast_arrays(number[:, :, None], number[:, None, :])
         free = (row >= 0) & (column >= 0)
@@ -156,20 +156,20 @@ class Marginals:
         """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the fewer of them."""
         if len(np.unique(i)) < len(np.unique(j)):
             return self._cross(j, i).transpose(0, 2, 1)
-        number = self._unknowns.number["poses"]
+        number = self.unknowns.number["poses"]
         cross = np.zeros((len(i), 3, 3))
         sources = np.unique(j)
         for first in range(0, len(sources), _AT_ONCE // 3):
             part = sources[first : first + _AT_ONCE // 3]
             here = np.nonzero((j >= part[0]) & (j <= part[-1]))[0]
-            columns = self._columns(number[part].ravel())
+            columns = self.columns(number[part].ravel())
             at = 3 * np.searchsorted(part, j[here])[:, None, None] + np.arange(3)
             cross[here] = columns[number[i[here]][:, :, None], at]
         return cross
 
-    def _columns(self, numbers: Ints) -> Floats:
+    def columns(self, numbers: Ints) -> Floats:
         """Return columns (size + 1, m) of the covariance; the last row and the columns of fixed scalars (-1) are 0."""
-        right = np.zeros((self._unknowns.size + 1, len(numbers)))
+        right = np.zeros((self.unknowns.size + 1, len(numbers)))
         right[numbers, np.arange(len(numbers))] = 1.0
         right[-1] = 0.0
         right[:-1] = self._factor.solve(right[:-1])

@@ -68,14 +68,19 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     if task.config.ranges.steady == 0.0:
         return estimate
     estimate = with_range_noise(estimate, task.config, steady=True)
-    graph, own = estimate.graph, estimate.graph.calibration.of_kinds(BIAS, HEIGHT, RANGE_SCALE)
-    fixed = np.asarray(graph.fixed_calibration)
-    with_fixed_poses = replace(graph, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=fixed | ~own)
-    if not any(free.any() for free in free_unknowns(with_fixed_poses).values()):
+    graph, given = estimate.graph, at_given_poses(estimate.graph)
+    if not any(free.any() for free in free_unknowns(given).values()):
         return estimate
-    done = _solved(replace(estimate, graph=with_fixed_poses), task).graph
-    fixed = fixed | (np.asarray(done.fixed_calibration) & own)
+    done = _solved(replace(estimate, graph=given), task).graph
+    # What the search itself has fixed are heights put back to 0.
+    fixed = np.asarray(graph.fixed_calibration) | (np.asarray(done.fixed_calibration) & ~np.asarray(given.fixed_calibration))
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))
+
+
+def at_given_poses(graph: Graph) -> Graph:
+    """Return the graph with anchors and the systematic errors of their ranges free, as far as they were, and nothing else."""
+    fixed = np.asarray(graph.fixed_calibration) | ~graph.calibration.of_kinds(BIAS, HEIGHT, RANGE_SCALE)
+    return replace(graph, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=fixed)
 
 
 def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:

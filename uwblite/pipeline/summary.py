@@ -9,18 +9,20 @@ from ..arrays import Floats, spread_about_median
 from ..graph.calibration import Unknown, unknowns
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
-from ..graph.pose_edges import ScanEdges
+from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
 from ..odometry.wheels import with_noise_shown
+from ..radio.anchor_covariance import by_alike_errors
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
 from . import plausibility
 from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
+from .final_stages import at_given_poses
 from .radio_stages import heights_given, tag_rises
 from .recordings import Recordings
 
@@ -37,6 +39,7 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
     stated = _with_steady_errors(with_noise_shown(with_fewer_pairs(graph)), len(estimate.anchor_ids), task.config.ranges)
     covariance = marginals(stated, common_range_errors(stated))
+    covariance.anchors += _by_alike_ranges(estimate, task.config.ranges)
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
     if ranges is not None and estimate.placed.any():
@@ -100,6 +103,15 @@ def _with_steady_errors(graph: Graph, anchors: int, config: RangeNoiseConfig) ->
     return replace(graph, edges=tuple(
         learn_noise(e, graph, anchors, config, steady=True)[0] if isinstance(e, RangeEdges) else e for e in graph.edges
     ))  # fmt: skip
+
+
+def _by_alike_ranges(estimate: Estimate, config: RangeNoiseConfig) -> Floats:
+    """Return by how much the covariances of anchors (a, 2, 2) differ from the inverse of their weights; 0 without a lidar."""
+    graph, ranges = estimate.graph, estimate.ranges
+    if ranges is None or config.steady == 0.0 or not any(isinstance(e, ScanEdges) for e in graph.edges):
+        return np.zeros((len(graph.anchors), 2, 2))
+    about_anchors = tuple(e for e in graph.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
+    return by_alike_errors(at_given_poses(replace(graph, edges=about_anchors)), ranges, config)
 
 
 def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, Floats]:

@@ -10,6 +10,7 @@ they weigh what one draw of the slow part is worth.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 from scipy.spatial import cKDTree
 
 from ..arrays import Floats, Ints, spread
@@ -166,18 +167,42 @@ def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | No
     """
     if config.steady == 0.0 or len(offsets) == 0:
         return np.zeros(len(offsets))
+    return config.steady * np.sqrt(_alike(_polar(offsets), _STEADY_LENGTH, weights))
+
+
+def steady_sums(offsets: Floats, values: Floats) -> Floats:
+    """Return the sums (m, q) of the values (m, q) of all ranges to an anchor, each by how alike errors steady by direction are.
+
+    Parameters
+    ----------
+    offsets : (m, 2) from the anchor to the tag, m.
+    """
+    return _alike_sums(_polar(offsets), _STEADY_LENGTH, values)
+
+
+_STEADY_LENGTH = 0.5
+"""Half a radian of direction is alike, and half an e-fold of distance."""
+
+
+def _polar(offsets: Floats) -> Floats:
+    """Return points (m, 3) that lie as far apart as directions, rad, and logarithms of distance do."""
     distance = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 0.1)
     bearing = np.arctan2(offsets[:, 1], offsets[:, 0])
-    # Half a radian of direction is alike, and half an e-fold of distance.
-    polar = np.stack([np.cos(bearing), np.sin(bearing), np.log(distance)], axis=1)
-    return config.steady * np.sqrt(_alike(polar, 0.5, weights))
+    return np.stack([np.cos(bearing), np.sin(bearing), np.log(distance)], axis=1)
 
 
 def _alike(positions: Floats, length: float, weights: Floats | None) -> Floats:
-    """Return the sum (m,) of exp(-distance / length) over all ranges, itself included; places binned to length / 4."""
+    """Return the sum (m,) of exp(-distance / length) over all ranges, itself included, at least 1; see _alike_sums."""
+    counts = np.ones(len(positions)) if weights is None else weights
+    return np.maximum(_alike_sums(positions, length, counts[:, None])[:, 0], 1.0)
+
+
+def _alike_sums(positions: Floats, length: float, values: Floats) -> Floats:
+    """Return the sums (m, q) of exp(-distance / length) times values (m, q) over all ranges; places binned to length / 4."""
     cells, inverse = np.unique(np.round(positions * (4.0 / length)).astype(np.int64), axis=0, return_inverse=True)
-    counts = np.bincount(inverse.reshape(-1), weights, len(cells)).astype(np.float64)
+    inverse = inverse.reshape(-1)
     tree = cKDTree(cells / 4.0)
     near = tree.sparse_distance_matrix(tree, 4.0, output_type="coo_matrix")
-    total = np.bincount(near.row, np.exp(-near.data) * counts[near.col], len(cells))
-    return np.maximum(total[inverse.reshape(-1)], 1.0)
+    alike = sparse.csr_matrix((np.exp(-near.data), (near.row, near.col)), shape=near.shape)
+    binned = sparse.csr_matrix((np.ones(len(inverse)), (inverse, np.arange(len(inverse)))), shape=(len(cells), len(inverse)))
+    return np.asarray((alike @ (binned @ values))[inverse])
