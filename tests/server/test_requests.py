@@ -40,6 +40,17 @@ def test_pages_from_elsewhere_may_not_ask(origin):
     assert status(OPEN, host="192.168.0.5:8000", origin=origin) == 403
 
 
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.0.0.1:80"])
+def test_browsers_leave_the_port_of_the_web_out(host):
+    page = SimpleNamespace(host="127.0.0.1:80", names=None)
+    assert status(page, host=host, origin=f"http://{host}") == 200
+    assert status(LOCAL, host=host) == 403
+
+
+def test_an_address_of_version_6_may_be_without_a_port():
+    assert status(SimpleNamespace(host="0.0.0.0:80", names=()), host="[fe80::1]") == 200
+
+
 def test_changes_need_post_json_and_the_token():
     good = {"host": "127.0.0.1:8000", "x_token": TOKEN, "content_type": "application/json; charset=utf-8"}
     assert status(LOCAL, "POST", **good) == 200

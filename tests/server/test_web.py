@@ -103,25 +103,72 @@ def test_events_flow_for_as_long_as_somebody_listens(live):
 
 def test_a_thousand_connections_are_turned_away_and_do_no_harm(live):
     _, server = live
-    streams = []
-    refused = 0
-    for _ in range(1000):
+    lines = []
+    for k in range(1000):
         line = socket.create_connection(server.server_address, timeout=10)
-        streams.append(line)
-        if len(streams) > 20:
-            # The first eight hold the room with half a request each; whoever comes later is refused at once.
-            old = streams.pop(12)
-            refused += old.recv(100).startswith(b"HTTP/1.1 503")
-            old.close()
-    assert refused > 900
+        line.sendall(b"GET / HTTP/1.1\r\nHost: x")
+        lines.append(line)
+        if k >= 8:
+            # Eight have room, each with half a request; the one that has waited longest gives way.
+            assert lines[k - 8].recv(100).startswith(b"HTTP/1.1 503")
+            lines[k - 8].close()
     assert threading.active_count() < 40
+    assert ask(server, "GET", "/", headers={"Host": server.page.host})[0] == 200
+    for line in lines[-8:]:
+        line.close()
+
+
+def test_streams_that_nobody_reads_keep_nobody_out(live):
+    page, server = live
+    streams = []
+    for k in range(12):
+        line = socket.create_connection(server.server_address, timeout=10)
+        line.sendall(f"GET /events HTTP/1.1\r\nHost: {page.host}\r\n\r\n".encode())
+        assert line.recv(15) == b"HTTP/1.1 200 OK"
+        streams.append(line)
+        assert ask(server, "GET", "/")[0] == 200
+        page.show_status({"summary": f"news {k}"})
+    assert sum(_ended(line) for line in streams[:4]) == 4
     for line in streams:
         line.close()
-    for _ in range(200):
-        status = ask(server, "GET", "/")[0]
-        if status == 200:
-            break
-    assert status == 200
+
+
+def _ended(line):
+    """Return whether a stream has come to its end, after what was sent before."""
+    while line.recv(1 << 16):
+        pass
+    return True
+
+
+def test_a_head_has_a_limit_and_the_answer_says_so(live):
+    page, server = live
+    host = f"Host: {page.host}\r\n".encode()
+    for head, code in (
+        (b"GET /" + b"x" * 40_000 + b" HTTP/1.1\r\n", b" 414 "),
+        (b"GET / HTTP/1.1\r\n" + host + b"A: " + b"x" * 40_000 + b"\r\n\r\n", b" 431 "),
+        (b"GET / HTTP/1.1\r\n" + host + b"".join(b"A%d: " % k + b"x" * 900 + b"\r\n" for k in range(40)) + b"\r\n", b" 431 "),
+        (b"GET / HTTP/1.1\r\n" + host + b"A: " + b"x" * 20_000 + b"\r\nConnection: close\r\n\r\n", b" 200 "),
+    ):
+        with socket.create_connection(server.server_address, timeout=10) as line:
+            line.sendall(head)
+            assert code in line.recv(1000).split(b"\r\n")[0]
+
+
+def test_the_limit_of_a_head_holds_for_each_request_of_a_connection(live):
+    _, server = live
+    connection = http.client.HTTPConnection(*server.server_address, timeout=10)
+    for _ in range(3):
+        connection.request("HEAD", "/", headers={"A": "x" * 20_000})
+        answer = connection.getresponse()
+        assert (answer.status, answer.read()) == (200, b"")
+
+
+@pytest.mark.parametrize("target", ["http://[", "//[", "/%00", "/..%2f..%2fetc/passwd", "*", "/run/0/../../c.toml"])
+def test_a_target_that_names_no_page_is_not_found(served, live, target):
+    for _, server in (served, live):
+        with socket.create_connection(server.server_address, timeout=10) as line:
+            line.sendall(f"GET {target} HTTP/1.1\r\nHost: {server.page.host}\r\nConnection: close\r\n\r\n".encode())
+            assert b" 404 " in line.recv(1000).split(b"\r\n")[0]
 
 
 def test_of_a_thousand_bytes_of_nonsense_in_a_length_nothing_is_read(live):

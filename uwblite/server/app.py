@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import unquote, urlsplit
 
 from ..constraints import Constraints
 from ..errors import ConfigError, UwbliteError
@@ -17,7 +16,7 @@ from ..io.stored_result import StoredResult, read_result
 from .edits import edits_text, parse_edits, with_anchor, with_closure
 from .page import page
 from .remap import remap_command
-from .requests import HTML, PNG, Response, json_response, refusal, text_response
+from .requests import HTML, PNG, Response, json_response, path_of, refusal, text_response
 from .runs import Run, described, run_of
 
 _TYPES = {
@@ -73,7 +72,7 @@ class App:
         """
         if refused := refusal(self, self.token, method, headers):
             return refused
-        path = unquote(urlsplit(target).path)
+        path = path_of(target)
         try:
             return self._post(path, body) if method == "POST" else self._get(path)
         except UwbliteError as error:

@@ -4,7 +4,6 @@ import os
 import secrets
 from collections.abc import Mapping
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from ..io.stored_result import StoredResult
 from .advice import SensorState, advice, silent_after
 from .feed import Feed
 from .live_page import live_page
-from .requests import HTML, PNG, Response, refusal, text_response
+from .requests import HTML, PNG, Response, path_of, refusal, text_response
 from .runs import described, run_of
 
 _TRAIL = 300
@@ -63,7 +62,7 @@ class LivePage:
         """Answer a request; nothing can be changed."""
         if refused := refusal(self, self._token, method, headers):
             return refused
-        path = urlsplit(target).path if target.startswith("/") else ""
+        path = path_of(target)
         if path == "/":
             return Response(200, HTML, live_page(self._title).encode())
         if path == "/events":

@@ -12,6 +12,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
+from urllib.parse import unquote
 
 HTML, PNG = "text/html; charset=utf-8", "image/png"
 
@@ -51,8 +52,8 @@ def refusal(page: Page, token: str, method: str, headers: dict[str, str]) -> Res
         return text_response("another page may not ask", 403)
     if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
         return text_response("another page may not ask", 403)
-    if method not in ("GET", "POST"):
-        return text_response("only GET and POST are known", 405)
+    if method not in ("GET", "HEAD", "POST"):
+        return text_response("only GET, HEAD and POST are answered", 405)
     if method == "POST":
         if not secrets.compare_digest(headers.get("x-token", "").encode(), token.encode()):
             return text_response("the token is missing: reload the page", 403)
@@ -63,6 +64,8 @@ def refusal(page: Page, token: str, method: str, headers: dict[str, str]) -> Res
 
 def _is_ours(page: Page, host: str) -> bool:
     """Return whether a host and port are the server's; of one that is open every address is: no foreign name is one."""
+    if host.endswith("]") or ":" not in host:
+        host += ":80"  # which browsers leave out
     name, _, port = host.rpartition(":")
     if port != page.host.rpartition(":")[2]:
         return False
@@ -75,6 +78,11 @@ def _is_address(name: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def path_of(target: str) -> str:
+    """Return the path that a request asks for, "" where it names none."""
+    return unquote(target.partition("?")[0].partition("#")[0]) if target.startswith("/") else ""
 
 
 def json_response(value: Any, status: int = 200) -> Response:

@@ -1,5 +1,12 @@
-"""A page on a socket: the standard library's HTTP server, on the loopback address where nothing else is asked for."""
+"""A page on a socket: the standard library's HTTP server, on the loopback address where nothing else is asked for.
 
+Connections, threads and what a request may bring are bounded. Where all places are taken, the connection that has asked for
+nothing for the longest time gives way: neither half requests nor streams that nobody reads keep others out, and a browser whose
+stream was ended opens it again.
+"""
+
+import io
+import socket
 import threading
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -11,7 +18,9 @@ LOOPBACK = "127.0.0.1"
 MOST_BYTES = 1 << 16
 """Of a request's body."""
 MOST_CONNECTIONS = 64
-"""At one time; each takes a thread. A browser opens six."""
+"""At one time; each takes a thread, and those that gave way keep theirs until they notice. A browser opens six."""
+_MOST_HEAD = 1 << 15
+"""Bytes of a request's first line and headers."""
 _PATIENCE = 10.0
 """s that a connection may stay silent, or not take what is sent to it."""
 _FULL = b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 5\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
@@ -33,26 +42,61 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], page: Page) -> None:
         self.page, self.lock = page, threading.Lock()
-        self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self._room = threading.BoundedSemaphore(2 * MOST_CONNECTIONS)
+        self._open: dict[socket.socket, bool] = {}
+        """Whether each connection has asked for something; the one that has been at rest the longest comes first."""
+        self._order = threading.Lock()
         super().__init__(address, _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False):
-            with suppress(OSError):
-                request.setblocking(False)
-                request.send(_FULL)
+            _turn_away(request, asked=False)
             self.shutdown_request(request)
             return
+        with self._order:
+            self._open[request] = False
+            if len(self._open) > MOST_CONNECTIONS:
+                oldest = next(iter(self._open))
+                _turn_away(oldest, self._open.pop(oldest))
         super().process_request(request, client_address)
+
+    def asked(self, request: socket.socket) -> None:
+        """Note that a connection has asked for something just now."""
+        with self._order:
+            if self._open.pop(request, None) is not None:
+                self._open[request] = True
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
+            with self._order:
+                self._open.pop(request, None)
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing: a client that leaves is no error of ours."""
+
+
+def _turn_away(request: socket.socket, asked: bool) -> None:
+    """End a connection, with a word where no answer has begun."""
+    with suppress(OSError):
+        if not asked:
+            request.send(_FULL, getattr(socket, "MSG_DONTWAIT", 0))
+        request.shutdown(socket.SHUT_RDWR)
+
+
+class _Input(io.BufferedReader):
+    """What a connection sends, with a limit for the lines of a request."""
+
+    left = _MOST_HEAD
+    """Bytes that they may still have."""
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        line = super().readline(self.left + 1)
+        self.left -= len(line)
+        # A line that the standard library refuses, with an answer, stands for any that is too much.
+        return line if self.left >= 0 else b" " * (1 << 17)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -61,6 +105,15 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Server
     protocol_version = "HTTP/1.1"
     timeout = _PATIENCE
+    rbufsize = 0
+
+    def setup(self) -> None:
+        super().setup()
+        self.rfile = self._input = _Input(self.rfile)
+
+    def handle_one_request(self) -> None:
+        self._input.left = _MOST_HEAD
+        super().handle_one_request()
 
     def do_GET(self) -> None:
         self._answer(b"")
@@ -76,6 +129,7 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
 
     def _answer(self, body: bytes) -> None:
+        self.server.asked(self.connection)
         headers = {name.lower(): value for name, value in self.headers.items()}
         with self.server.lock:
             response = self.server.page.handle(self.command, self.path, headers, body)
