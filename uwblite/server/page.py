@@ -1,43 +1,28 @@
-"""The page of `uwblite view`: one file of HTML, styles and script, without a framework and without a network.
+"""The page of `uwblite view`, from which closures and anchors are corrected and the map is made again."""
 
-The script builds everything with text nodes, so that no name out of a recording becomes markup.
-"""
-
-from ..report.page import coloured
-from . import drawing
+from .drawing import document
 
 _STYLE = """
-:root{--paper:#f6f7f9;--card:#fff;--ink:#1f2733;--faint:#6b7482;--line:#d8dde4;--accent:#2563eb;--path:@path@;
---accepted:@accepted@;--rejected:@rejected@;--anchor:@anchor@;--force:@start@;--ban:@anchor@;--warn:#fff4e0}
-@media (prefers-color-scheme:dark){:root{--paper:#14181e;--card:#1d232b;--ink:#e4e8ee;--faint:#98a2b0;--line:#36404c;
---accent:#7aa5ff;--path:@path-dark@;--accepted:@accepted-dark@;--rejected:@rejected-dark@;--anchor:@anchor-dark@;--force:@start-dark@;--ban:@anchor-dark@;
---warn:#3a2f1a}}*{box-sizing:border-box}body{margin:0;
-background:var(--paper);color:var(--ink);font:15px/1.45 system-ui,sans-serif}header{position:sticky;top:0;z-index:2;
-display:flex;flex-wrap:wrap;gap:.6rem 1rem;align-items:center;padding:.6rem 1rem;background:var(--card);
-border-bottom:1px solid var(--line)}h1{font-size:1.1rem;margin:0}h2{font-size:1rem;margin:0 0 .3rem}#say{
-color:var(--faint);flex:1 1 12rem}main{display:grid;gap:1rem;padding:1rem;
-grid-template-columns:repeat(auto-fit,minmax(min(100%,26rem),1fr))}section{background:var(--card);
-border:1px solid var(--line);border-radius:.5rem;padding:.8rem;min-width:0}svg{
-max-height:62vh;touch-action:none}.path{fill:none;stroke:var(--path);stroke-width:2;
-vector-effect:non-scaling-stroke}.p1{stroke:@path1@}.p2{stroke:@path2@}.p3{stroke:@path3@}.closure{
-stroke:var(--accepted);stroke-width:1.6;vector-effect:non-scaling-stroke;cursor:pointer}.closure.no{
-stroke:var(--rejected);stroke-dasharray:4 3}.closure.force{stroke:var(--force);stroke-width:3}.closure.reject{
-stroke:var(--ban);stroke-width:3;stroke-dasharray:2 4}.hit{stroke:transparent;stroke-width:12;
-vector-effect:non-scaling-stroke;cursor:pointer}line.chosen{stroke-width:5}circle.chosen{stroke:var(--ink);
-stroke-width:2;vector-effect:non-scaling-stroke}.hideno .no{display:none}.anchor{cursor:pointer}
-.anchor.pinned{fill:var(--force)}button{font:inherit;padding:.35rem .8rem;border:1px solid var(--line);
-border-radius:.4rem;background:var(--card);color:inherit;cursor:pointer;min-height:2.4rem}button.main{
-background:var(--accent);border-color:var(--accent);color:#fff}button:disabled{opacity:.5;cursor:default}
-@media (prefers-color-scheme:dark){button.main{color:#10151c}}.detail{min-height:5.2rem;padding:.5rem 0;
-border-top:1px solid var(--line);margin-top:.6rem}
-.start,.end{pointer-events:none}.start{fill:var(--force)}.end{fill:#fff;stroke:var(--path);stroke-width:2;
-vector-effect:non-scaling-stroke}.end.p1{stroke:@path1@}.end.p2{stroke:@path2@}.end.p3{stroke:@path3@}
-.doubt{background:var(--warn);border-radius:.3rem;padding:.4rem .6rem;margin:.4rem 0}a{
-color:var(--accent)}table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.15rem .5rem .15rem 0;
-font-weight:400}th{color:var(--faint)}.list{max-height:16rem;overflow:auto;border-top:1px solid var(--line);
-margin-top:.5rem}.list button{min-height:0;padding:.1rem .5rem}.key.p1{color:@path1@}
-.key.p2{color:@path2@}.key.p3{color:@path3@}input{font:inherit;width:6rem;padding:.25rem;border:1px solid var(--line);
-border-radius:.3rem;background:var(--card);color:inherit}
+:root{--accent:#2563eb;--accepted:@accepted@;--rejected:@rejected@}@media (prefers-color-scheme:dark){:root{
+--accent:#7aa5ff;--accepted:@accepted-dark@;--rejected:@rejected-dark@}}
+header{display:flex;flex-wrap:wrap;gap:.6rem 1rem;align-items:center}#say{color:var(--faint);flex:1 1 12rem}
+svg{max-height:62vh;touch-action:none}.closure{stroke:var(--accepted);stroke-width:1.6;cursor:pointer}
+.closure.no{stroke:var(--rejected);stroke-dasharray:4 3}.closure.force{stroke:var(--start);stroke-width:3}
+.closure.reject{stroke:var(--anchor);stroke-width:3;stroke-dasharray:2 4}
+.hit{stroke:transparent;stroke-width:12;cursor:pointer}line.chosen{stroke-width:5}
+circle.chosen{stroke:var(--ink);stroke-width:2}.closure,.hit,circle{vector-effect:non-scaling-stroke}
+.hideno .no{display:none}.anchor{cursor:pointer}.anchor.pinned{fill:var(--start)}
+.start,.end{pointer-events:none}.start{fill:var(--start)}.end{fill:#fff;stroke:var(--path);stroke-width:2}
+.end.p1{stroke:@path1@}.end.p2{stroke:@path2@}.end.p3{stroke:@path3@}
+button,input{font:inherit;border:1px solid var(--line);border-radius:.4rem;background:var(--card);color:inherit}
+button{padding:.35rem .8rem;cursor:pointer;min-height:2.4rem}input{width:6rem;padding:.25rem}
+button.main{background:var(--accent);border-color:var(--accent);color:#fff}button:disabled{opacity:.5;cursor:default}
+@media (prefers-color-scheme:dark){button.main{color:#10151c}}
+.detail{min-height:5.2rem;padding:.5rem 0;border-top:1px solid var(--line);margin-top:.6rem}
+.doubt{background:var(--warn);border-radius:.3rem;padding:.4rem .6rem;margin:.4rem 0}a{color:var(--accent)}
+.list{max-height:16rem;overflow:auto;border-top:1px solid var(--line);margin-top:.5rem}
+.list button{min-height:0;padding:.1rem .5rem}
+.key.p1{color:@path1@}.key.p2{color:@path2@}.key.p3{color:@path3@}
 """
 
 _SCRIPT = r"""
@@ -80,9 +65,9 @@ function card(run, number) {
     {class: "key p" + k, ...(k ? {} : {style: "color:var(--path)"})}), " recording " + (k + 1)));
   const node = el("section", {}, el("h2", {}, run.name), el("div", {class: "faint"}, facts));
   for (const text of run.doubts) node.append(el("div", {class: "doubt"}, "Doubt: " + text));
-  node.append(svg, el("div", {class: "row faint"}, ...paths, key("force", "start", "disc"), key("path", "end", "ring"),
+  node.append(svg, el("div", {class: "row faint"}, ...paths, key("start", "start", "disc"), key("path", "end", "ring"),
     ...(run.anchors.length ? [key("anchor", "anchor", "anchors")] : []), key("accepted", "closure accepted"),
-    el("label", {}, rejected, " ", key("rejected", "rejected")), key("force", "forced, pinned"), key("ban",
+    el("label", {}, rejected, " ", key("rejected", "rejected")), key("start", "forced, pinned"), key("anchor",
       "rejected by you")));
   node.append(detail, el("div", {class: "row"},
     el("button", {class: "main map", onclick: () => ask("/map", {run: number}), ...(busy ? {disabled: ""} : {})},
@@ -95,41 +80,31 @@ function card(run, number) {
 }
 function hint(detail) { detail.replaceChildren(el("span", {class: "faint"}, "Nothing chosen.")); }
 function picture(run, number, detail) {
-  const points = run.paths.flat().concat(run.anchors.filter(a => a.place).map(a => a.place));
-  if (run.image) points.push([run.image.x, run.image.y], [run.image.x + run.image.width, run.image.y + run.image.height]);
-  const xs = points.map(p => p[0]), ys = points.map(p => p[1]);
-  makeRoom(xs, ys, run.anchors);
-  const x0 = Math.min(...xs) - .5, x1 = Math.max(...xs) + .5, y0 = Math.min(...ys) - .5, y1 = Math.max(...ys) + .5;
-  const size = Math.max(x1 - x0, y1 - y0);
-  const svg = shape("svg", {viewBox: [x0, -y1, x1 - x0, y1 - y0].join(" "), class: "hideno", role: "img",
-    "aria-label": "map of " + run.name});
-  if (run.image) svg.append(shape("image", {href: "/run/" + number + "/grid.png", x: run.image.x,
-    y: -run.image.y - run.image.height,
-    width: run.image.width, height: run.image.height, preserveAspectRatio: "none"}));
-  run.paths.forEach((path, k) => svg.append(shape("polyline", {class: "path p" + k % 4,
-    points: path.map(p => p[0] + "," + -p[1]).join(" ")})));
+  const svg = shape("svg", {class: "hideno", role: "img", "aria-label": "map of " + run.name});
+  const placed = run.anchors.filter(a => a.place);
+  const {size, bar} = drawMap(svg, run.paths.flat(), placed, run.image, "/run/" + number + "/grid.png", .5);
+  svg.append(...drawn(run.paths));
   for (const c of run.closures.slice().reverse()) {
-    const [a, b] = c.places, line = {x1: a[0], y1: -a[1], x2: b[0], y2: -b[1]};
+    const [a, b] = c.places, ends = {x1: a[0], y1: -a[1], x2: b[0], y2: -b[1]};
     const mark = " " + (c.accepted || c.wish !== "leave" ? "" : "no") + " " + c.wish;
-    const drawn = shape("line", {...line, class: "closure" + mark, "data-closure": c.number});
-    const hit = shape("line", {...line, class: "hit" + mark});
+    const stroke = shape("line", {...ends, class: "closure" + mark, "data-closure": c.number});
+    const hit = shape("line", {...ends, class: "hit" + mark});
     const open = () => choose(number, detail, d => tellClosure(d, run, number, c.number), `[data-closure="${c.number}"]`);
-    for (const node of [drawn, hit]) node.addEventListener("click", open);
-    svg.append(drawn, hit);
+    for (const node of [stroke, hit]) node.addEventListener("click", open);
+    svg.append(stroke, hit);
   }
   run.paths.forEach((path, k) => {
     const mark = (at, name) => shape("circle", {cx: at[0], cy: -at[1], r: size / 110, class: name});
     if (path.length) svg.append(mark(path[0], "start"), mark(path[path.length - 1], "end p" + k % 4));
   });
-  for (const a of run.anchors) {
-    if (!a.place) continue;
+  for (const a of placed) {
     const node = anchorMark(a.id, a.place, size);
     node.classList.toggle("pinned", Boolean(a.pinned));
     node.dataset.anchor = a.id;
     node.addEventListener("click", () => choose(number, detail, d => tellAnchor(d, run, number, a.id), null));
     svg.append(node);
   }
-  svg.append(scaleBar(x0 + size / 40, -y0 - size / 40, size));
+  svg.append(bar);
   return svg;
 }
 function choose(number, detail, tell, mark) {
@@ -183,9 +158,4 @@ ask("/state");
 
 def page(token: str) -> str:
     """Return the page; the token lets its own posts in, and no other page's."""
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>uwblite view</title><link rel=icon href=data:,><style>{coloured(drawing.STYLE + _STYLE)}</style></head>"
-        f'<body data-token="{token}"><header><h1>uwblite view</h1><span id="say" role="status">loading ...</span></header>'
-        f"<main></main><script>{drawing.SCRIPT}{_SCRIPT}</script></body></html>"
-    )
+    return document("uwblite view", _STYLE, '<span id="say" role="status">loading ...</span>', "", _SCRIPT, token)
