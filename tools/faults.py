@@ -21,6 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -32,7 +33,7 @@ from simulation.recording import Settings
 from trials import ROOT, SHARED, made, table, write_section
 
 from uwblite import se2
-from uwblite.cli.check import examined
+from uwblite.checks.recording import diagnose
 from uwblite.errors import UwbliteError
 from uwblite.io.carmen import read_log
 from uwblite.io.carmen_messages import time_order
@@ -163,29 +164,29 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
     figures = (float("nan"), float("nan"), -np.inf)
     stated: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    check = -1
+    check, seconds = -1, 0.0
+    log, truth = sorted_log(case)
     began = time.process_time()
     signal.signal(signal.SIGPROF, _stopped)
     signal.setitimer(signal.ITIMER_PROF, TIME_BAR)
     try:
-        log, truth = sorted_log(case)
-        check = 3 if checked(log) else 0
-        signal.setitimer(signal.ITIMER_PROF, TIME_BAR)
-        began = time.process_time()
         result = build_map(log)
         figures = judged(result, log.odometry.stamps, truth, case, sensors == "no-lidar")
         stated, warnings = tuple(map(str, result.doubts)), tuple(map(str, result.warnings))
-        code = 3 if result.doubts else 0
+        code, seconds = 3 if result.doubts else 0, time.process_time() - began
+        signal.setitimer(signal.ITIMER_PROF, TIME_BAR)
+        check = checked(log, anchors=result.anchors, calibration=result.calibration, doubts=result.doubts)
     except TimeoutError as error:
         stated, code = (str(error),), 4
     except UwbliteError as error:
         stated, code = (str(error),), 1
+        check = checked(log, refused=str(error))
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         stated, code = (f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})",), 4
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
-    return Outcome(world, name, sensors, *figures, code, stated, check, time.process_time() - began, warnings)
+    return Outcome(world, name, sensors, *figures, code, stated, check, seconds or time.process_time() - began, warnings)
 
 
 WITH_ANOTHER = {"two robots in one log": two_robots, "two buildings in one log": two_buildings}
@@ -209,9 +210,9 @@ def outcomes(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
         yield from pool.map(_numbered, range(len(tasks)))
 
 
-def checked(log: SensorLog) -> bool:
-    """Return whether `uwblite check` finds anything serious."""
-    return bool(examined(log)[0].serious)
+def checked(log: SensorLog, **map_says: Any) -> int:
+    """Return the exit code of `uwblite check`, which makes the same map: 3 where it finds anything serious."""
+    return 3 if diagnose(log, **map_says).serious else 0
 
 
 def clean_cases(worlds: Sequence[str], minutes: float, seed: int) -> dict[str, Case]:
