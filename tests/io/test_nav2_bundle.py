@@ -40,10 +40,15 @@ def test_every_node_finds_the_parameters_that_it_asks_for(bundle):
     info = servers["costmap_filter_info_server"]
     assert (info["type"], info["base"], info["multiplier"]) == (0, 0.0, 1.0)
     assert info["mask_topic"] == servers["filter_mask_server"]["topic_name"]
+    # A costmap looks for a topic without / in a namespace of its own.
+    assert info["mask_topic"].startswith("/")
+    assert info["filter_info_topic"].startswith("/")
     for name in ("global_costmap", "local_costmap"):
         costmap = params[name][name]["ros__parameters"]
-        assert costmap["filters"] == ["keepout_filter"]
+        assert costmap["filters"][0] == "keepout_filter"
         assert costmap["keepout_filter"]["filter_info_topic"] == info["filter_info_topic"]
+    # What comes after the mask sees it: the walls of unknown space are inflated too.
+    assert params["global_costmap"]["global_costmap"]["ros__parameters"]["filters"][-1] == "inflation_layer"
     whole = params["global_costmap"]["global_costmap"]["ros__parameters"]
     assert all(whole[plugin]["plugin"].startswith("nav2_costmap_2d::") for plugin in (*whole["plugins"], *whole["filters"]))
     assert whole["resolution"] == pytest.approx(result.grid.geometry.resolution)

@@ -36,6 +36,10 @@ def test_lines_of_something_else_are_named_and_skipped(capsys):
     assert capsys.readouterr().err.count("is none of uwblite") == 3
 
 
+NOW = 12_300_000_000
+"""ns, of the node's clock."""
+
+
 def message(*parts):
     """Return a class whose objects have these nested fields."""
 
@@ -55,8 +59,8 @@ def message(*parts):
 @pytest.fixture
 def ros(monkeypatch):
     """Stand-ins for the modules of ROS 2; what was sent is noted."""
-    sent = SimpleNamespace(transforms=[], poses=[], ended=[])
-    names = ("rclpy", "rclpy.node", "geometry_msgs", "geometry_msgs.msg", "tf2_ros")
+    sent = SimpleNamespace(transforms=[], poses=[], ended=[], arguments=[])
+    names = ("rclpy", "rclpy.node", "rclpy.executors", "geometry_msgs", "geometry_msgs.msg", "tf2_ros")
     modules = {name: ModuleType(name) for name in (*names, "builtin_interfaces", "builtin_interfaces.msg")}
 
     class Node:
@@ -64,17 +68,20 @@ def ros(monkeypatch):
             self.name = name
 
         def create_publisher(self, kind, topic, depth):
-            assert topic == "/initialpose"
+            assert topic == "initialpose"
             return SimpleNamespace(publish=sent.poses.append)
 
         def get_clock(self):
-            return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
+            return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=NOW))
 
         def destroy_node(self):
             sent.ended.append("node")
 
-    modules["rclpy"].init = lambda: None
-    modules["rclpy"].shutdown = lambda: sent.ended.append("rclpy")
+    modules["rclpy"].init = lambda args: sent.arguments.extend(args)
+    modules["rclpy"].ok = lambda: True
+    modules["rclpy"].spin = lambda _: None
+    modules["rclpy"].try_shutdown = lambda: sent.ended.append("rclpy")
+    modules["rclpy.executors"].ExternalShutdownException = type("ExternalShutdownException", (Exception,), {})
     modules["rclpy.node"].Node = Node
     modules["geometry_msgs.msg"].TransformStamped = message("header", "transform.translation", "transform.rotation")
     modules["geometry_msgs.msg"].PoseWithCovarianceStamped = message("header", "pose.pose.position", "pose.pose.orientation")
@@ -92,13 +99,22 @@ def test_transforms_and_the_initial_pose_are_sent(ros, monkeypatch):
     assert len(ros.transforms) == 2
     first = ros.transforms[0]
     assert (first.header.frame_id, first.child_frame_id) == ("map", "odom")
-    assert (first.header.stamp.sec, first.header.stamp.nanosec) == (1, 500_000_000)
+    assert (first.header.stamp.sec, first.header.stamp.nanosec) == (2, 0)
     assert 2 * np.arctan2(first.transform.rotation.z, first.transform.rotation.w) == pytest.approx(0.4)
     (initial,) = ros.poses
+    assert (initial.header.stamp.sec, initial.header.stamp.nanosec) == (1, 500_000_000)
     matrix = np.reshape(initial.pose.covariance, (6, 6))
     np.testing.assert_array_equal(matrix[np.ix_([0, 1, 5], [0, 1, 5])], COVARIANCE)
     assert not matrix[2:5].any()
     assert ros.ended == ["node", "rclpy"]
+
+
+def test_stamps_are_ahead_of_the_nodes_clock_and_ros_gets_its_arguments(ros, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO(line(1.5, [1.0, 2.0, 0.5], [0.5, 0.0, 0.1])))
+    words = ["--ros-args", "-r", "__ns:=/robot1"]
+    assert node.main(["--transform-tolerance", "0.8", *words]) == 0
+    assert (ros.transforms[0].header.stamp.sec, ros.transforms[0].header.stamp.nanosec) == (13, 100_000_000)
+    assert ros.arguments == words
 
 
 def test_without_ros_it_reports_what_is_missing(monkeypatch, capsys):

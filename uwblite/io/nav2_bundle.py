@@ -33,7 +33,9 @@ _SURE = 4.0
 _PARAMS = """\
 # Written by uwblite convert: parts of nav2's parameters that a map decides. Merge them into those of your robot, and start
 # nav2 in this folder or put its path before the names of the two yaml files. AMCL is not started: map -> odom comes from
-# a localisation of its own. The servers of the mask need a lifecycle manager as in lifecycle_manager_map below.
+# a localisation of its own. The servers of the mask need a lifecycle manager as in lifecycle_manager_map below. Topics of the
+# mask begin with /, because costmaps have namespaces of their own; of several robots each needs its name before them. The
+# global costmap inflates after the mask, so that no part of the robot gets into unknown space.
 map_server:
   ros__parameters:
     yaml_filename: map.yaml
@@ -42,13 +44,13 @@ map_server:
 filter_mask_server:
   ros__parameters:
     yaml_filename: keepout_mask.yaml
-    topic_name: keepout_filter_mask
+    topic_name: /keepout_filter_mask
     frame_id: map
 costmap_filter_info_server:
   ros__parameters:
     type: 0
-    filter_info_topic: costmap_filter_info
-    mask_topic: keepout_filter_mask
+    filter_info_topic: /costmap_filter_info
+    mask_topic: /keepout_filter_mask
     base: 0.0
     multiplier: 1.0
 lifecycle_manager_map:
@@ -61,8 +63,8 @@ global_costmap:
       global_frame: map
       resolution: {resolution:.9g}
       track_unknown_space: true
-      plugins: [static_layer, inflation_layer]
-      filters: [keepout_filter]
+      plugins: [static_layer]
+      filters: [keepout_filter, inflation_layer]
       static_layer:
         plugin: nav2_costmap_2d::StaticLayer
         map_subscribe_transient_local: true
@@ -71,7 +73,7 @@ global_costmap:
       keepout_filter:
         plugin: nav2_costmap_2d::KeepoutFilter
         enabled: true
-        filter_info_topic: costmap_filter_info
+        filter_info_topic: /costmap_filter_info
 local_costmap:
   local_costmap:
     ros__parameters:
@@ -79,7 +81,7 @@ local_costmap:
       keepout_filter:
         plugin: nav2_costmap_2d::KeepoutFilter
         enabled: true
-        filter_info_topic: costmap_filter_info
+        filter_info_topic: /costmap_filter_info
 """
 
 
