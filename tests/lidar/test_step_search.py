@@ -5,7 +5,9 @@ import pytest
 from helpers.laser_walks import CORRIDOR, HALL, scanned
 
 from uwblite import se2
-from uwblite.lidar.step_search import StepSearch, _apart, _chained
+from uwblite.lidar.pair_alignment import Aligned
+from uwblite.lidar.scan_matching import PairFactors
+from uwblite.lidar.step_search import StepSearch, _apart, _chained, _measurably
 
 PATH = np.array([[-1.0 + 0.3 * k, 0.5 + 0.05 * k, 0.05 * k] for k in range(6)])
 STEPS = se2.between(PATH[:-1], PATH[1:])
@@ -71,3 +73,11 @@ def test_places_are_apart_by_distance_or_by_heading():
     here = np.array([1.0, 2.0, 3.0])
     others = se2.compose(here, np.array([[0.1, 0.1, 0.0], [0.11, 0.11, 0.0], [0.0, 0.0, 0.14], [0.0, 0.0, -0.16]]))
     assert _apart(here, others).tolist() == [False, True, False, True]
+
+
+def test_a_place_that_has_not_converged_does_not_differ_from_itself():
+    """Every search has a best place, also among scans that have nothing to do with each other."""
+    poses, count = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.full(2, 100)
+    hessian = np.tile(1000.0 * np.eye(3), (2, 1, 1))
+    factors = PairFactors(hessian, 0.0 * hessian, np.full((2, 3), 500.0), count, count, np.ones(2), np.ones(2))
+    np.testing.assert_array_equal(_measurably(0, Aligned(poses, factors)), [False, True])

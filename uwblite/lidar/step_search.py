@@ -132,7 +132,9 @@ def _measurably(best: int, tried: Aligned) -> Bools:
     factors = PairFactors(*(getattr(tried.factors, f.name)[best : best + 1] for f in fields(PairFactors)))
     z, sqrt_information = measured(factors, tried.pose[best : best + 1], np.full(1, _MATCH_VARIANCE))
     off = se2.between(z[0], tried.pose) @ sqrt_information[0].T
-    return np.asarray(np.sqrt(np.sum(off**2, axis=1)) > _SAME)
+    differs = np.sqrt(np.sum(off**2, axis=1)) > _SAME
+    differs[best] = False  # though an alignment that has not converged would still go far from where it stands
+    return np.asarray(differs)
 
 
 def _chained(steps: Floats, views: Ints) -> Floats:
