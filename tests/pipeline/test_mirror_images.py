@@ -63,6 +63,14 @@ def test_the_path_decides(bend, ambiguous):
     assert np.array_equal(done.graph.anchors, [ANCHOR])
 
 
+def test_a_bend_seen_by_ranges_that_err_alike_decides_nothing():
+    """As many ranges, all worth two of them: what the bend says is within their common errors."""
+    before = estimate(0.5)
+    assert not find_mirror_images(before, TASK).bootstrap.ambiguous.any()
+    alike = replace(before.ranges, weights=np.full(len(before.ranges), 2.0 / len(before.ranges)))
+    assert find_mirror_images(replace(before, ranges=alike), TASK).bootstrap.ambiguous.all()
+
+
 def test_what_the_bootstrap_took_for_ambiguous_is_decided_along_the_final_path():
     before = estimate(3.0)
     unsure = replace(

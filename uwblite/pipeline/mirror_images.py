@@ -18,6 +18,9 @@ from .estimate import Estimate, Task
 _CLEAR = 30.0
 """Difference of chi2 between two places from which on the worse one is excluded. By chance alone 9 would do, but
 poses that are off by decimetres, which chi2 does not count, brought it to 11; the wrong side of a bent path, to hundreds."""
+_LIKELIER = 4.0
+"""The same where ranges that err alike count once, two standard deviations: a hundred ranges that come along one aisle may
+prefer the wrong side of it by 34, and by 1.3 as what they are worth."""
 _APART = 0.5
 """Places nearer to each other than this are the same, m."""
 
@@ -35,7 +38,8 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     starts = (estimate.graph.anchors, _images(estimate, ranges))
     here, there = (_minimum(estimate, ranges, free, start, task) for start in starts)
     apart = np.hypot(*(there.anchors - here.anchors).T)
-    as_well = (apart > _APART) & (_costs(there, ranges) - _costs(here, ranges) < _CLEAR)
+    each, together = (_costs(there, ranges, w) - _costs(here, ranges, w) for w in (ranges.alive, ranges.own_weights))
+    as_well = (apart > _APART) & ((each < _CLEAR) | (together < _LIKELIER))
     ambiguous = np.where(free, as_well, found.ambiguous)
     hypotheses = list(found.hypotheses)
     for k in np.flatnonzero(free & ambiguous).tolist():
@@ -71,10 +75,10 @@ def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Float
     return optimize(alone.with_edges(ranges), task.config.solver)[0]
 
 
-def _costs(graph: Graph, ranges: RangeEdges) -> Floats:
-    """Return the cost (a,) of each anchor's ranges, and of the priors of its bias and height."""
+def _costs(graph: Graph, ranges: RangeEdges, worth: Floats | Bools) -> Floats:
+    """Return the cost (a,) of each anchor's ranges times what each is worth (m,), and of the priors of its bias and height."""
     squared = ranges.residuals(graph)[:, 0] ** 2
-    each = np.where(ranges.alive, ranges.kernel.rho(squared), 0.0)
+    each = ranges.kernel.rho(squared) * worth
     costs: Floats = np.bincount(ranges.anchor, each, len(graph.anchors)).astype(np.float64)
     of_unknown = np.zeros(len(graph.calibration.values))
     for priors in graph.calibration_priors:
