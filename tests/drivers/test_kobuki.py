@@ -187,7 +187,7 @@ def test_odometer_follows_the_emulated_circle(skew):
     assert max(stamps[1000:]) < 0.002
 
 
-def test_the_emulator_tells_versions_and_gains_once_to_hosts_that_ask():
+def test_the_emulator_reports_versions_and_gains_once_to_hosts_that_ask():
     """Requests 09 (flags 1 hardware, 2 firmware, 8 serial number) and 0E, as kobuki_core sends them, in two pieces."""
     device = KobukiDevice(iter([Pose(0.0, 0.0, 0.0, 0.0), Pose(10.0, 2.0, 0.0, 0.0)]), clock := WorldClock())
     clock.start(0.0)

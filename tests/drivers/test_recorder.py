@@ -174,7 +174,7 @@ def test_another_device_at_the_port_gives_no_data_and_that_is_reported(tmp_path,
 
 
 @pytest.mark.parametrize("name", ["line", "gyro-line", "shell", "makerfabs", "scip", "kobuki"])
-def test_a_line_that_never_ends_is_held_in_part_and_counted(name):
+def test_a_line_that_never_ends_is_kept_in_part_and_counted(name):
     columns = {"line": "?columns=t,x,y,theta", "gyro-line": "?columns=t,turn_rate"}.get(name, "")
     session = open_device(DEVICES[name].sensor, f"{name}:/dev/x{columns}")[0]
     actions = session.start(0.0)

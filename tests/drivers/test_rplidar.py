@@ -97,7 +97,7 @@ def test_firmware_without_express_scan_is_read_in_standard_scan():
     assert len(of_kind(actions, LaserScan)) > 5
 
 
-def test_the_emulator_tells_its_scan_modes_to_hosts_that_ask():
+def test_the_emulator_reports_its_scan_modes_to_hosts_that_ask():
     """The maker's SDK asks units from firmware 1.24 on (GET_LIDAR_CONF) and does not scan without an answer."""
     device, _ = emulator("rplidar")
     device.power_up(0.0)

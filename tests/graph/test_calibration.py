@@ -80,7 +80,7 @@ def test_a_height_of_so_much_is_a_prior_on_its_square():
     assert not [s for s in without if s > 1.0]
 
 
-def test_what_is_freed_joins_what_was_free():
+def test_released_unknowns_join_those_that_were_free():
     listed = unknowns(CalibrationConfig(), IDS, GIVEN)
     fixed = np.ones(len(listed), dtype=bool)
     fixed[0] = False

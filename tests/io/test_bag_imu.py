@@ -138,7 +138,7 @@ def test_messages_that_no_gyro_sends_are_left_out_and_counted(tmp_path):
     assert any("3 messages of the IMU" in warning for warning in log.notes.warnings)
 
 
-def test_messages_that_tell_nothing_are_not_used(tmp_path):
+def test_messages_without_a_measurement_are_not_used(tmp_path):
     log = read_bag(bag(tmp_path / "bag", leave_out=("angular_velocity", "orientation")))
     assert log.gyro is None
     assert any("neither angular velocities nor orientations" in warning for warning in log.notes.warnings)

@@ -42,7 +42,7 @@ def test_visits_agree_where_every_pose_is_true(hall):
 
 
 @pytest.mark.parametrize("error", [(2.0, 1.0, 0.0), (0.0, 0.0, 0.5)])
-def test_visits_disagree_where_half_of_the_recording_lies_elsewhere(hall, error):
+def test_visits_are_inconsistent_where_half_of_the_recording_lies_elsewhere(hall, error):
     truth, path, clouds = hall
     poses, half = truth.copy(), len(truth) // 2
     poses[half:] = se2.compose(np.array(error), truth[half:])

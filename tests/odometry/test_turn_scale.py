@@ -69,7 +69,7 @@ def test_wheels_that_freeze_have_no_other_scale():
     assert not frozen.varies
 
 
-def test_a_scale_that_differs_between_stretches_is_told():
+def test_a_scale_that_differs_between_stretches_varies():
     assert found(np.where(np.arange(STEPS) < STEPS // 2, 0.0, 0.5)).varies
 
 

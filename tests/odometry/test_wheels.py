@@ -87,7 +87,7 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
 
 
 def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
-    """Steps in a corridor repeat the wheels' own word along it; across and in heading the wheels err four times as much."""
+    """Steps in a corridor repeat what the wheels count along it; across and in heading the wheels err four times as much."""
     rng = np.random.default_rng(2)
     stamps, truth = wander(rng, 300.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig())

@@ -110,7 +110,7 @@ def test_the_width_of_the_scale_grows_with_what_the_recording_shows():
     assert found[-1] == pytest.approx(CONFIG.range_scale)
 
 
-def test_a_recording_that_cannot_tell_leaves_the_scale_sound():
+def test_a_recording_that_does_not_show_the_scale_leaves_it_sound():
     """A scale that looks 1 % off, give or take 2 %."""
     graph, edges = solved(0, scale=1.01)
     vague = replace(edges, sigma=edges.sigma * 40.0)

@@ -24,7 +24,7 @@ def pairs_of_a_laser_turned_by(angle: float, stuck: float) -> Pairs:
 
 @pytest.mark.parametrize("angle", [np.pi, np.pi / 2, -np.pi / 2, 0.5])
 @pytest.mark.parametrize("stuck", [0.0, 0.2])
-def test_pairs_along_bare_walls_do_not_hide_where_the_laser_looks(angle, stuck):
+def test_pairs_along_bare_walls_do_not_hide_the_direction_of_the_laser(angle, stuck):
     log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), None, None)
     turned, remarks = laser_ahead(log, pairs_of_a_laser_turned_by(angle, stuck))
     assert [r.kind for r in remarks] == ["laser-turned-away"]

@@ -46,7 +46,7 @@ def along(count, speed):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_wheels_that_count_along_a_corridor_are_believed(seed):
+def test_wheels_that_count_along_a_corridor_stay_in_use(seed):
     truth = along(150, SPEED)
     pairs = wheel_motion.compare(seen(truth, corridor(100.0, seed), truth * [0.95, 1.0, 1.0], seed))
     assert pairs.measured.mean() > 0.9

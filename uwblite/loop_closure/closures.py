@@ -62,7 +62,7 @@ class LoopClosureConfig:
     """Matches that together weigh as one: they share the bending of both sub-maps."""
     through: float = setting(0.12, advanced=True)
     """Largest share of one sub-map's points that may stand where the other saw free space. Where sub-maps driven one after
-    the other disagree more, because people walk about, it is by how much these do."""
+    the other have more, because people walk about, their share is the limit."""
     places: ClassVar[int] = 3
     """Places found by a search that are matched before one is chosen."""
 

@@ -11,7 +11,7 @@ wrong by any factor. Whether the wheels' unit is wrong is decided: the likelier 
 where nothing contradicts it, that all are right. The scale of the radios and their biases can be wrong by little or much:
 widths from sound to unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the
 marginal likelihood. A scale that is clearly off floats with the widest. So a scale stays where it is as long as the
-recording cannot tell, moves a part of the way where it leans to one side, and floats where the posterior odds are clear.
+recording does not show it, moves a part of the way where it leans to one side, and floats where the posterior odds are clear.
 
 With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 
