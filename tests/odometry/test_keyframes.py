@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.odometry.keyframes import KeyframeConfig, dense_trajectory, select, velocity_at
+from uwblite.odometry.keyframes import KeyframeConfig, _slack, dense_trajectory, select, velocity_at
 from uwblite.sensor_log import LaserScans, Odometry, OdometryBreaks
 
 CONFIG = KeyframeConfig(distance=0.4, angle=0.3, scans=2)
@@ -203,3 +203,21 @@ def test_a_break_of_the_odometry_has_a_keyframe_at_either_end():
     assert len(frames) <= 4 + 4
     loose = frames.slack[:, 0] > 0.0
     assert frames.index[:-1][loose].tolist() == [57, 121]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_step_has_the_slack_of_every_break_it_has_time_in_common_with(seed):
+    """Squares add; a break reaches from its sample of the odometry to the next one. By a loop."""
+    rng = np.random.default_rng(seed)
+    odometry_stamps = np.cumsum(rng.uniform(0.1, 1.0, 30))
+    stamps = np.sort(rng.choice(odometry_stamps, 8, replace=False)) + rng.choice([0.0, 0.05], 8)
+    at, sigma = np.sort(rng.choice(29, 5, replace=False)), rng.uniform(0.1, 1.0, (5, 3))
+    expected = np.zeros((7, 3))
+    for k, size in zip(at.tolist(), sigma, strict=True):
+        for step in range(7):
+            if stamps[step] < odometry_stamps[k + 1] and stamps[step + 1] > odometry_stamps[k]:
+                expected[step] += size**2
+    # A break before the first keyframe counts for the first step.
+    found = _slack(stamps, odometry_stamps, OdometryBreaks(odometry_stamps[at], sigma))
+    inside = ~np.isin(np.arange(7), [0, 6])
+    np.testing.assert_allclose(found[inside], np.sqrt(expected)[inside])

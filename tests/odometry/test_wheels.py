@@ -173,3 +173,12 @@ def test_a_heading_drifts_for_one_second_of_a_pause():
     slack, duration = np.zeros((4, 3)), np.array([0.4, 3600.0, 0.4, 3600.0])
     slack[:2, 2], slack[2:, 0] = 0.1, 0.1
     assert drift_time(SimpleNamespace(slack=slack, duration=duration)).tolist() == [0.4, 1.0, 0.4, 3600.0]
+
+
+def test_the_slack_of_a_step_adds_to_its_variance():
+    rng = np.random.default_rng(5)
+    frames = select(Odometry(*wander(rng, 10.0)), KeyframeConfig())
+    slack = rng.uniform(0.0, 0.3, (len(frames) - 1, 3))
+    edges = (wheel_edges(f, 0, NOISE, Calibration()) for f in (frames, replace(frames, slack=slack)))
+    plain, loose = (1.0 / np.einsum("eii->ei", e.sqrt_information) ** 2 for e in edges)
+    np.testing.assert_allclose(loose, plain + slack**2)

@@ -1,16 +1,26 @@
 """Recordings become one: which of two recordings says where an anchor is, and which anchors do not join in."""
 
+from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.planted import odometry, ranges, wander
 
 from uwblite import se2
 from uwblite.errors import DataError
+from uwblite.graph.calibration import CalibrationConfig, block, of_recording, prior_edges, unknowns
 from uwblite.graph.graph import Graph
-from uwblite.pipeline.joining import _FIRST_TOLERANCE, _laid_on, _one_bootstrap, _other_name
+from uwblite.odometry.attached import attach_ranges
+from uwblite.odometry.keyframes import KeyframeConfig, select
+from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
+from uwblite.pipeline.estimate import Estimate
+from uwblite.pipeline.joining import _FIRST_TOLERANCE, _laid_on, _one_bootstrap, _one_graph, _other_name, join
 from uwblite.radio.bootstrap import BootstrapResult
+from uwblite.radio.range_measurements import range_edges
+from uwblite.radio.trilateration import TrilaterationConfig
+from uwblite.sensor_log import SensorMounting
 
 STATES = [(False, False), (True, True), (True, False)]
 """Placed, ambiguous."""
@@ -67,3 +77,92 @@ def test_a_moved_anchor_is_called_as_the_earlier_recording_that_found_it_there()
     assert _other_name("A", here, 0.06, 3, placed) == "A#2"
     assert _other_name("A", here, 0.0, 2, placed) == "A#3"
     assert _other_name("A", here + 5.0, 0.0, 3, placed) == "A#4"
+
+
+def mapped(seed, tag, ids):
+    """Return an estimate of one recording whose values are arbitrary, and its number of poses."""
+    rng = np.random.default_rng(seed)
+    stamps, truth = wander(rng, 8.0)
+    wheels = odometry(stamps, truth, rng, noise=0.02, turn_noise=0.02)
+    radio = replace(ranges(rng, stamps, truth, rng.uniform(-6.0, 6.0, (len(ids), 2))), anchor_ids=ids)
+    frames, mounting = select(wheels, KeyframeConfig()), SensorMounting(tag_position=np.array([*tag, 0.3]))
+    listed = unknowns(CalibrationConfig(), ids, np.zeros(len(ids), dtype=bool))
+    priors = prior_edges(listed)
+    priors = replace(priors, sqrt_information=priors.sqrt_information * rng.uniform(0.5, 2.0, (len(listed), 1, 1)))
+    calibration = block(listed)
+    # What recordings share is alike in both.
+    values = np.where([u.key.recording is None for u in listed], 0.02, rng.normal(scale=0.05, size=len(listed)))
+    graph = Graph(frames.odometry, rng.uniform(-6.0, 6.0, (len(ids), 2)), (priors,), replace(calibration, values=values))
+    graph = replace(graph, fixed_calibration=rng.random(len(listed)) < 0.5)
+    attached = attach_ranges(radio, wheels, frames, mounting)
+    edges = range_edges(attached, 0, ids, mounting, calibration, 0.1, TrilaterationConfig())
+    bootstrap = BootstrapResult(graph, np.ones(len(ids), dtype=bool), ((),) * len(ids), np.zeros(len(ids), dtype=bool))
+    wheel = wheel_edges(frames, 0, OdometryNoiseConfig(), calibration)
+    return Estimate(graph, wheel, edges, ids, bootstrap), len(frames)
+
+
+def test_recordings_in_one_graph_have_the_residuals_that_they_had_alone():
+    """A rigid motion of a recording with its anchors changes no residual, wherever its tag sits; the second's come behind."""
+    (one, first), (two, second) = mapped(1, (0.1, -0.2), ("A", "B", "C")), mapped(2, (-0.3, 0.4), ("D", "E", "F"))
+    recordings = SimpleNamespace(each=[SimpleNamespace(first=0), SimpleNamespace(first=first)])
+    motion = np.array([3.0, -1.0, 0.9])
+    joined = _one_graph([one, two], [np.zeros(3), motion], [one.anchor_ids, two.anchor_ids], recordings)
+    assert joined.anchor_ids == ("A", "B", "C", "D", "E", "F")
+    assert len(joined.graph.poses) == first + second
+    np.testing.assert_allclose(joined.graph.poses[first:], se2.compose(motion, two.graph.poses))
+    np.testing.assert_allclose(joined.graph.anchors[3:], se2.transform(motion, two.graph.anchors))
+    for name in ("odometry", "ranges"):
+        both = getattr(joined, name)
+        alone = [getattr(e, name).residuals(e.graph) for e in (one, two)]
+        np.testing.assert_allclose(both.residuals(joined.graph), np.concatenate(alone), atol=1e-9)
+    keys, place = joined.graph.calibration.keys, {key: k for k, key in enumerate(joined.graph.calibration.keys)}
+    assert len(set(keys)) == len(keys)
+    (priors,) = joined.graph.edges
+    for number, estimate in ((1, two), (0, one)):
+        own = np.array([place[of_recording(key, number)] for key in estimate.graph.calibration.keys])
+        shared = np.array([key.recording is None for key in estimate.graph.calibration.keys])
+        (before,) = estimate.graph.edges
+        np.testing.assert_array_equal(joined.graph.calibration.values[own], estimate.graph.calibration.values)
+        if number == 0:  # of what is shared the first recording's prior holds, and it is fixed where both fix it
+            np.testing.assert_array_equal(priors.sqrt_information[own], before.sqrt_information)
+        else:
+            np.testing.assert_array_equal(priors.sqrt_information[own[~shared]], before.sqrt_information[~shared])
+            both = one.graph.fixed_calibration[shared] & two.graph.fixed_calibration[shared]
+            np.testing.assert_array_equal(joined.graph.fixed_calibration[own[shared]], both)
+        np.testing.assert_array_equal(joined.graph.fixed_calibration[own[~shared]], estimate.graph.fixed_calibration[~shared])
+
+
+def test_an_anchor_of_two_recordings_stands_where_the_first_has_it():
+    (one, first), (two, _) = mapped(3, (0.0, 0.0), ("A", "B", "C")), mapped(4, (0.0, 0.0), ("C", "D", "A"))
+    recordings = SimpleNamespace(each=[SimpleNamespace(first=0), SimpleNamespace(first=first)])
+    joined = _one_graph([one, two], [np.zeros(3)] * 2, [("A", "B", "C"), ("C", "D", "A#2")], recordings)
+    assert joined.anchor_ids == ("A", "B", "C", "D", "A#2")
+    np.testing.assert_array_equal(joined.graph.anchors, [*one.graph.anchors, *two.graph.anchors[1:]])
+    names = [joined.anchor_ids[k] for k in joined.ranges.anchor[len(one.ranges) :].tolist()]
+    assert names == [("C", "D", "A#2")[k] for k in two.ranges.anchor.tolist()]
+
+
+def test_a_third_recording_links_two_and_a_moved_anchor_is_named():
+    """The first and the second share no anchor; the third shares two with either, and has one where the first has not."""
+    world = {"A": (0.0, 0.0), "B": (9.0, 1.0), "C": (2.0, 8.0), "D": (-7.0, 3.0), "E": (-4.0, -6.0), "F": (5.0, -8.0)}
+    frames, all_ids = np.array([[0.0, 0.0, 0.0], [2.0, 5.0, 1.1], [-3.0, 1.0, -2.0]]), ("ABC", "DEF", "ABCDE")
+    estimates, poses = [], [0]
+    for number, (frame, ids) in enumerate(zip(frames, all_ids, strict=True)):
+        estimate, count = mapped(10 + number, (0.0, 0.0), tuple(ids))
+        places = np.array([world[name] for name in ids])
+        places[2] += 30.0 if number == 2 else 0.0
+        graph = replace(estimate.graph, anchors=se2.transform(se2.inverse(frame), places))
+        estimates.append(replace(estimate, graph=graph))
+        poses.append(poses[-1] + count)
+    warned = []
+    recordings = SimpleNamespace(each=[SimpleNamespace(first=k, name=f"{k}.log") for k in poses[:3]])
+    stages = SimpleNamespace(warn=lambda kind, text, **figures: warned.append((kind, figures)))
+    joined = join(estimates, SimpleNamespace(recordings=recordings, stages=stages))
+    assert joined.anchor_ids == ("A", "B", "C", "D", "E", "F", "C#3")
+    expected = [*world.values(), (32.0, 38.0)]
+    np.testing.assert_allclose(joined.graph.anchors, expected, atol=1e-6)
+    for number, (first, frame) in enumerate(zip(poses[:3], frames, strict=True)):
+        np.testing.assert_allclose(joined.graph.poses[first], se2.compose(frame, estimates[number].graph.poses[0]), atol=1e-6)
+    (kind, figures), = warned
+    assert (kind, figures["anchor"], figures["recording"], figures["new_id"]) == ("moved-anchor", "C", 3, "C#3")
+    assert figures["distance"] == pytest.approx(np.hypot(30.0, 30.0), abs=1e-3)

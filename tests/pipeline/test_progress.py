@@ -1,0 +1,51 @@
+"""What the stages report: figures with their times, what is forgotten, and a caller who stops."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from uwblite.errors import Cancelled
+from uwblite.pipeline.progress import Stages
+from uwblite.sensor_log import OdometryBreaks, Remark, Screening
+
+
+def test_stages_take_the_time_since_the_one_before():
+    calls, times = [], iter([10.0, 12.5, 13.0])
+    stages = Stages(lambda stage, done, total: calls.append((str(stage), done, total)), lambda: next(times))
+    stages.end("one", edges=3)
+    stages.reporter("two")(4, 9)
+    stages.end("two")
+    assert [(s.name, s.seconds, s.figures) for s in stages.done] == [("one", 2.5, {"edges": 3}), ("two", 0.5, {})]
+    assert calls == [("one", 1, 1), ("two", 4, 9), ("two", 1, 1)]
+    without = Stages(None, None)
+    without.end("one")
+    assert without.done[0].seconds == 0.0
+
+
+def test_a_callback_that_returns_false_stops_and_none_goes_on():
+    Stages(lambda *call: None, None).end("one")
+    with pytest.raises(Cancelled, match="stopped by the caller during one"):
+        Stages(lambda *call: False, None).report("one", 1, 2)
+
+
+def test_stages_that_run_again_are_forgotten():
+    stages = Stages(None, None)
+    stages.warn("a", "first", metres=1.0)
+    stages.doubt("b", "second")
+    mark = stages.mark()
+    stages.warn("c", "third")
+    stages.doubt("d", "fourth")
+    stages.doubt("e", "fifth")
+    stages.back_to(mark)
+    assert [(n.kind, str(n), n.figures) for n in stages.warnings] == [("a", "first", {"metres": 1.0})]
+    assert [(n.kind, n.text) for n in stages.doubts] == [("b", "second")]
+
+
+@pytest.mark.parametrize(("count", "where"), [(1, ""), (2, "recording 2: ")])
+def test_what_the_screening_found_is_taken_over(count, where):
+    remarks = (Remark("jump", "it jumps"), Remark("gap", "it is silent", doubt=True))
+    logs = [SimpleNamespace(screening=None)] * (count - 1)
+    stages = Stages(None, None)
+    stages.note([*logs, SimpleNamespace(screening=Screening(remarks, OdometryBreaks.none()))])
+    assert [(n.kind, n.text) for n in stages.warnings] == [("jump", where + "it jumps")]
+    assert [(n.kind, n.text) for n in stages.doubts] == [("gap", where + "it is silent")]
