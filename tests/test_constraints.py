@@ -9,12 +9,12 @@ from uwblite import se2
 from uwblite.constraints import Clock, Constraints, ForbiddenClosure, GivenAnchor, GivenClosure, GivenDistance, GivenPose
 from uwblite.errors import ConfigError, FormatError
 from uwblite.graph.distance_edges import AnchorDistanceEdges
-from uwblite.graph.graph import Graph
+from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import optimize
 from uwblite.io.constraints_file import parse_constraints, read_anchors
-from uwblite.pipeline.constraint_edges import apply
+from uwblite.pipeline.constraint_edges import apply, consensus
 
 IDS = ("A", "B", "C", "D")
 TRUE = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 6.0], [-1.0, 5.0]])
@@ -243,3 +243,31 @@ def test_the_anchors_of_an_earlier_map(tmp_path):
 def test_numbers_that_nobody_measured_are_refused(field):
     with pytest.raises(ConfigError, match="beyond 1e"):
         parse_constraints(f'[[anchor]]\nid = "A"\n{field}\n')
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_consensus_is_that_of_a_loop_over_pairs(seed):
+    """Of all motions that bring a pair together, the one with most places nearby, 1 - (error / tolerance)^2 each."""
+    rng = np.random.default_rng(seed)
+    here, tolerance = rng.uniform(-8.0, 8.0, (7, 2)), rng.uniform(0.5, 1.5, 7)
+    there = se2.transform([3.0, -1.0, 0.8], here) + rng.normal(scale=0.7, size=(7, 2))
+    there[:2] += 6.0
+    worth, best = -1.0, None
+    for i in range(7):
+        for j in range(i + 1, 7):
+            motion = se2.align(here[[i, j]], there[[i, j]])
+            off = np.hypot(*(se2.transform(motion, here) - there).T) / tolerance
+            total = sum(1.0 - e * e for e in off if e < 1.0)
+            if total > worth:
+                worth, best = total, off < 1.0
+    np.testing.assert_allclose(consensus(here, there, tolerance), se2.align(here[best], there[best]))
+
+
+@pytest.mark.parametrize(("ids", "fixed"), [("", True), ("A", True), ("AB", False)])
+def test_the_heading_of_the_first_pose_is_fixed_where_one_place_leaves_it_open(ids, fixed):
+    edges = apply(Constraints(anchors=surveyed(*ids)), first_estimate(), IDS, ALL, CLOCK).graph.edges
+    priors = [e for e in edges if isinstance(e, PriorEdges) and e.block == "poses"]
+    assert len(priors) == (1 if fixed and ids else 0)
+    for prior in priors:
+        np.testing.assert_array_equal(prior.sqrt_information[0], np.diag([0.0, 0.0, 1e4]))
+        assert prior.index.tolist() == [0]

@@ -13,7 +13,7 @@ from uwblite.graph.graph import Graph
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.odometry.attached import attach_ranges, choose_scans, scan_points
 from uwblite.odometry.keyframes import KeyframeConfig, select
-from uwblite.sensor_log import LaserScans, Odometry, SensorMounting
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting
 
 CONFIG = KeyframeConfig(distance=0.4, angle=0.3, scans=2)
 
@@ -140,3 +140,14 @@ def test_deskewed_points_of_a_turning_robot_lie_on_the_walls():
     on_wall = se2.transform(truth[frames.index][rays.keyframe], rays.points)
     assert len(on_wall) > 500
     assert np.abs(on_wall[:, 0] - 3.0).max() < 0.003
+
+
+@pytest.mark.parametrize(("range_max", "hits"), [(np.inf, 3), (4.0, 2)])
+def test_readings_at_both_ends_of_what_a_lidar_measures_are_points(range_max, hits):
+    lidar = LaserScans(np.zeros(1), np.array([[0.05, 0.1, 4.0, 5.0, 5.5, np.inf]], np.float32), 0.0, 0.1, 0.0, 0.1, 5.0)
+    lidar = replace(lidar, ranges=lidar.ranges, range_min=float(np.float32(0.1)))
+    wheels = Odometry(np.arange(2.0), np.zeros((2, 3)))
+    points = scan_points(
+        SensorLog(wheels, None, lidar), select(wheels, KeyframeConfig()), np.zeros(1, int), np.zeros(1, int), range_max
+    )
+    assert points.ray.tolist() == [1, 2, 3][:hits]

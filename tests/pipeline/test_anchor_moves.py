@@ -1,14 +1,27 @@
 """An anchor that is moved during a recording has two rows, and the map holds."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.room_recording import ANCHORS, recording, two_rounds
 
 from uwblite import se2
+from uwblite.constraints import Constraints
 from uwblite.mapping import build_map
-from uwblite.pipeline.anchor_moves import _alike, _of_all, _renamed, name_and_number
+from uwblite.pipeline import anchor_moves
+from uwblite.pipeline.anchor_moves import (
+    _alike,
+    _of_all,
+    _renamed,
+    first_with_moves_apart,
+    name_and_number,
+    with_moves_apart,
+)
+from uwblite.pipeline.estimate import Task
+from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.pipeline.progress import Stages
 from uwblite.radio.change_points import Move
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting, UwbRanges
 
@@ -100,3 +113,30 @@ def test_moves_of_about_the_same_time_are_one_for_all_anchors():
     assert list(found) == ["A", "B"]
     assert [m.stamp for m in found["A"]] == [m.stamp for m in found["B"]] == [10.0, 100.1]
     assert _of_all(replace(four_ranges(), ranges=None), moves) == {}
+
+
+@pytest.mark.parametrize(("found", "again", "called"), [
+    ({}, {}, None), ({"A": [1.0]}, {}, None), ({"A": [1.0]}, {"B": [2.0]}, ["A", "B", "A", "B", "A", "B@2", "A", "B@2"]),
+])  # fmt: skip
+def test_moves_are_those_of_the_trajectory_that_presumes_none(monkeypatch, found, again, called):
+    """Where one moved, all anchors are apart before and after in a first optimisation, whose warnings are forgotten."""
+    log, seen, stages = four_ranges(), [], Stages(None, None)
+    results = iter([[{k: [moved(t) for t in v] for k, v in moves.items()}] for moves in (found, again)])
+    monkeypatch.setattr(anchor_moves, "_moves_of_all", lambda *args: next(results))
+    monkeypatch.setattr(anchor_moves, "gather", lambda logs, keyframes: seen.append(names(logs[0])))
+    monkeypatch.setattr(anchor_moves, "first_optimisation", lambda task: task.stages.warn("bent", ""))
+    task = Task(None, MappingConfig(), Constraints(), stages)
+    renamed = first_with_moves_apart(None, task, [log])
+    assert (renamed if called is None else names(renamed[0])) == called
+    assert seen == ([["A", "B"] + ["A@2", "B@2"] * 3] if found else [])
+    assert stages.warnings == []
+
+
+def test_names_that_are_already_so_stay(monkeypatch):
+    log, moves = four_ranges(), {"A": [moved(1.0)]}
+    monkeypatch.setattr(anchor_moves, "_moves_of_all", lambda *args: [moves])
+    for now, stays in ((log, False), (four_ranges(**moves), True)):
+        task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=now)]))
+        renamed = with_moves_apart(None, task, [log])
+        assert (renamed is None) is stays
+        assert stays or names(renamed[0]) == ["A", "B", "A@2", "B", "A@2", "B", "A@2", "B"]
