@@ -7,10 +7,10 @@ from helpers.planted_graphs import loop, relative_edges
 
 from uwblite import se2
 from uwblite.errors import ConfigError
-from uwblite.graph.gnc import optimize_gnc, truncated_weight
+from uwblite.graph.gnc import optimize_gnc, tightened, truncated_weight
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import Kernel
-from uwblite.graph.solver import optimize
+from uwblite.graph.solver import SolverConfig, optimize
 
 ODOMETRY, CLOSURES, RANGES = 0, 1, 2
 THRESHOLDS = {CLOSURES: 4.0, RANGES: 3.5}
@@ -116,3 +116,13 @@ def test_thresholds_are_checked():
     for wrong in ({3: 4.0}, {-1: 4.0}, {0: 0.0}):
         with pytest.raises(ConfigError, match="threshold"):
             optimize_gnc(graph, wrong)
+
+
+def test_kernels_that_tighten_are_not_drawn_by_false_closures():
+    """Those of the chosen kinds alone, the last scale in the end."""
+    graph, _, _, clean, truth = spoilt(0)
+    found = tightened(graph, [CLOSURES, RANGES], (30.0, 10.0, 4.0), SolverConfig())
+    assert [e.kernel for e in found.edges] == [graph.edges[0].kernel, *[Kernel("geman-mcclure", 4.0)] * 2]
+    assert ate(found.poses, truth) <= 1.2 * ate(optimize(clean)[0].poses, truth)
+    at_once = tightened(graph, [CLOSURES, RANGES], (4.0,), SolverConfig())
+    assert found.chi2() < at_once.chi2()

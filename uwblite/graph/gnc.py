@@ -12,7 +12,7 @@ Two things are our own: the search starts from the residuals of the estimate it 
 trusts every edge, and one or two Gauss-Newton steps per mu are enough, since the next mu follows closely.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,13 +22,27 @@ from ..errors import ConfigError
 from .graph import Graph, Linearization, linearize
 from .normal_equations import NormalEquations
 from .problem_checks import check
-from .robust import SQUARED
-from .solver import Progress, SolverConfig, SolverSummary, minimise
+from .robust import SQUARED, Kernel
+from .solver import Progress, SolverConfig, SolverSummary, minimise, optimize
 
 _MU_FACTOR = 2.0
 """Factor on mu from step to step; one linear system is solved for each."""
 _REACH = 100.0
 """Residual, in thresholds, beyond which an edge starts with weight 0; it may still come back."""
+
+
+def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], solver: SolverConfig) -> Graph:
+    """Optimise with a Geman-McClure kernel on chosen kinds of edges that is tightened, scale by scale, standard deviations.
+
+    Parameters
+    ----------
+    chosen : their positions in ``graph.edges``.
+    """
+    for scale in scales:
+        kernel = Kernel("geman-mcclure", scale)
+        edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
+        graph = optimize(replace(graph, edges=edges), solver)[0]
+    return graph
 
 
 def truncated_weight(squared: Floats, mu: float) -> Floats:

@@ -81,7 +81,7 @@ _REQUIRED: Mapping[type, tuple[str, ...]] = {
 }
 
 
-def read_anchors(path: str | os.PathLike[str], *, least: int = 1) -> Constraints:
+def read_anchors(path: str | os.PathLike[str]) -> Constraints:
     """Return the placed anchors of an earlier map's anchors.csv as known places; they may have been moved since.
 
     Where the map has an anchor at several places (``5C0B``, later ``5C0B#2``), the last one counts. Sigmas are taken as
@@ -89,7 +89,7 @@ def read_anchors(path: str | os.PathLike[str], *, least: int = 1) -> Constraints
 
     Raises
     ------
-    FormatError : it is not such a file, or fewer than `least` anchors in it have a place.
+    FormatError : it is not such a file, or no anchor in it has a place.
     """
     table = read_csv(path)
     names = table.texts("id")
@@ -104,6 +104,6 @@ def read_anchors(path: str | os.PathLike[str], *, least: int = 1) -> Constraints
             anchor, mark, number = name.rpartition("#")
             name = anchor if mark and number.isdigit() and anchor in names else name
             anchors[name] = GivenAnchor(name, (x, y), sigma, movable=True)
-    if len(anchors) < least:
+    if not anchors:
         raise FormatError("no anchor in it has a place; it must be the anchors.csv of a map", os.fspath(path))
     return Constraints(anchors=tuple(anchors.values()))

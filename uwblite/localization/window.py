@@ -88,10 +88,10 @@ class Window:
         stamps = [r.stamp for r in self.ranges] + [k.stamp for k in self.looks]
         return self if parts == 1 or not stamps else self.since(max(stamps) - (max(stamps) - min(stamps)) / parts)
 
-    def forget(self, way: float, length: float = LENGTH) -> None:
-        """Forget what was measured more than a length ago, m, by the odometer."""
-        self.ranges = [r for r in self.ranges if way - r.way <= length]
-        self.looks = [k for k in self.looks if way - k.way <= length]
+    def forget(self, way: float) -> None:
+        """Forget what was measured more than LENGTH before, m by the odometer."""
+        self.ranges = [r for r in self.ranges if way - r.way <= LENGTH]
+        self.looks = [k for k in self.looks if way - k.way <= LENGTH]
 
     def add_range(self, entry: WindowRange) -> None:
         """Keep a range, unless the robot has hardly moved since the last few to the same anchor."""

@@ -15,10 +15,11 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
+from ..graph.gnc import tightened
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
-from ..graph.solver import SolverConfig, optimize
+from ..graph.solver import SolverConfig
 from ..lidar.correlative_matching import CorrelativeConfig
 from ..lidar.free_space import FreeSpace
 from ..lidar.pair_alignment import Aligned
@@ -137,11 +138,9 @@ def _tightened(graph: Graph, closures: Closures, config: LoopClosureConfig, solv
     """Solve the graph with closures under a kernel that tightens; drop those at odds."""
     if not len(closures.edges):
         return graph, closures
-    solved = graph
-    for scale in (30.0, 10.0, 4.0):
-        edges = replace(closures.edges, kernel=Kernel("geman-mcclure", scale))
-        solved = optimize(solved.with_edges(edges), replace(solver, relative_decrease=1e-5))[0]
-        solved = replace(solved, edges=graph.edges)
+    quick = replace(solver, relative_decrease=1e-5)
+    solved = tightened(graph.with_edges(closures.edges), [len(graph.edges)], (30.0, 10.0, 4.0), quick)
+    solved = replace(solved, edges=graph.edges)
     residuals = closures.edges.residuals(solved)
     squared = np.einsum("ed,ed->e", residuals, residuals)
     kept = squared < config.consistency

@@ -15,11 +15,11 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, spread
 from ..config import setting
+from ..graph.gnc import tightened
 from ..graph.graph import Calibration, Graph
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
-from ..graph.robust import Kernel
-from ..graph.solver import SolverConfig, optimize
+from ..graph.solver import SolverConfig
 from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate
 
 
@@ -279,9 +279,5 @@ class _Bootstrap:
 
 def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:
     """Optimise with the ranges' kernel tightened step by step (graduated non-convexity)."""
-    quick = SolverConfig(max_iterations=15, relative_decrease=1e-4)
-    for scale in schedule:
-        kernel = Kernel("geman-mcclure", scale)
-        edges = tuple(replace(e, kernel=kernel) if isinstance(e, RangeEdges) else e for e in graph.edges)
-        graph = optimize(replace(graph, edges=edges), quick)[0]
-    return graph
+    ranges = [k for k, e in enumerate(graph.edges) if isinstance(e, RangeEdges)]
+    return tightened(graph, ranges, schedule, SolverConfig(max_iterations=15, relative_decrease=1e-4))

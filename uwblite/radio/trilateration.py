@@ -90,15 +90,19 @@ def ambiguous(hypotheses: list[AnchorHypothesis], config: TrilaterationConfig) -
     return len(hypotheses) > 1 and hypotheses[1].cost - hypotheses[0].cost < config.ambiguity
 
 
-def agreement(path: Floats, ranges: Floats, place: Floats, height: Floats | float = 0.0, width: float = 0.4) -> float:
-    """Return the largest share of ranges (m,) that agree with a place (2,) up to one common bias, within a width, m.
+_WITHIN = 0.4
+"""m; width of an interval of errors that agree: four standard deviations of usual ranges."""
+
+
+def agreement(path: Floats, ranges: Floats, place: Floats, height: Floats | float = 0.0) -> float:
+    """Return the largest share of ranges (m,) that agree with a place (2,) up to one common bias, within _WITHIN.
 
     Parameters
     ----------
     path : (m, 2) positions of the tag at the ranges, m. height : of the anchor above the tag, m.
     """
     error = np.sort(ranges - np.hypot(np.hypot(*(place - path).T), height))
-    return float(np.max(np.searchsorted(error, error + width, "right") - np.arange(len(error)))) / len(error)
+    return float(np.max(np.searchsorted(error, error + _WITHIN, "right") - np.arange(len(error)))) / len(error)
 
 
 def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) -> tuple[Floats, Floats, float]:
