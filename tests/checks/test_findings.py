@@ -37,10 +37,10 @@ def test_equal_stamps_are_said_from_a_fiftieth_on(equal, repeats, topic, rank):
 def test_the_rhythm_of_a_slow_sensor_has_its_own_gaps():
     """A reading every 4 s: a silence of 12 s is no gap, one of 21 s is: five periods."""
     found = Findings()
-    stamps = np.array([3.0, 7.0, 11.0, 23.0, 27.0, 31.0, 52.0])
+    stamps = np.array([3.0, 7.0, 11.0, 23.0, 27.0, 31.0, 52.0123])
     figures = timing(stamps, "lidar", found, expected_gap=1.0)
     assert figures == {
-        "count": 7, "duration s": 49.0, "rate Hz": 0.25, "longest gap s": 21.0, "gaps": 1, "share of equal stamps": 0.0,
+        "count": 7, "duration s": 49.012, "rate Hz": 0.25, "longest gap s": 21.012, "gaps": 1, "share of equal stamps": 0.0,
     }  # fmt: skip
     (finding,) = found.ranked()
     assert finding.what == "1 silences longer than 20.0 s; the longest is 21.0 s at t = 28.0 s"

@@ -55,3 +55,10 @@ def test_a_circle_is_fitted_exactly_and_what_lies_outside_the_gate_does_not_pull
     np.testing.assert_allclose(fit_circle(points, np.array([1.02, 1.97]), 0.3, 0.1), (1.0, 2.0), atol=1e-4)
     lone = np.array([[5.0, 5.0]])
     np.testing.assert_array_equal(fit_circle(lone, np.array([1.0, 2.0]), 0.3, 0.1), (1.0, 2.0))
+
+
+def test_three_points_are_enough_for_a_circle():
+    points = circle((1.0, 2.0), 0.3, 0.0, 4.0)[::20][:3]
+    assert len(points) == 3
+    np.testing.assert_allclose(fit_circle(points, np.array([1.02, 1.98]), 0.3, 0.1), (1.0, 2.0), atol=2e-3)
+    np.testing.assert_array_equal(fit_circle(points[:2], np.array([1.02, 1.98]), 0.3, 0.1), (1.02, 1.98))

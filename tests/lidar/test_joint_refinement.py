@@ -9,8 +9,10 @@ from helpers.planted import aligned_error, box
 from scipy import sparse
 
 from uwblite import se2
-from uwblite.graph.graph import Graph
+from uwblite.graph.calibration import scan_indices
+from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
+from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.solver import SolverConfig
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.joint_refinement import (
@@ -213,3 +215,19 @@ def test_fewer_pairs_inform_nearly_as_much():
     ratio = np.sqrt(marginals(fewer).poses[1:, [0, 1, 2], [0, 1, 2]] / marginals(whole).poses[1:, [0, 1, 2], [0, 1, 2]])
     assert np.all(np.median(ratio, axis=0) > 0.9)
     assert np.all(np.median(ratio, axis=0) < 1.7)
+
+
+def test_fewer_pairs_are_every_nth_from_the_middle_of_the_first_and_weigh_as_all():
+    """Steps of one keyframe for those of up to four; of 30 pairs far apart every fourth, where 8 are allowed."""
+    near = [(k, k + d) for k in range(10) for d in (1, 2, 3, 4)]
+    far = [(k, k + 40) for k in range(30)]
+    i, j = np.array(near + far).T
+    still, root = np.zeros((len(i), 3)), np.tile(np.eye(3), (len(i), 1, 1))
+    edges = ScanEdges(i, j, still, root, still, still, scan_indices(Calibration()))
+    (kept,) = with_fewer_pairs(Graph(np.zeros((80, 3)), edges=(edges,)), 8).edges
+    gap = kept.j - kept.i
+    assert kept.i[gap == 1].tolist() == list(range(10))
+    assert kept.i[gap == 40].tolist() == [2, 6, 10, 14, 18, 22, 26]
+    assert set(gap.tolist()) == {1, 40}
+    assert kept.own_weights[gap == 1].sum() == pytest.approx(40.0)
+    assert kept.own_weights[gap == 40].sum() == pytest.approx(30.0)

@@ -148,3 +148,16 @@ def test_the_same_input_gives_the_same_bytes():
         found = align(target, source, TRUTH + 0.05)
         runs.append(found.T_target_source.tobytes() + found.information.tobytes())
     assert runs[0] == runs[1]
+
+
+def test_the_error_of_matches_and_the_overlap_are_those_of_a_loop():
+    """Points of the source within the gate of their nearest one in the target, at the pose found."""
+    rng = np.random.default_rng(8)
+    target = rng.uniform(0.0, 6.0, (300, 2))
+    source = np.concatenate([target[:200] + rng.normal(scale=0.02, size=(200, 2)), rng.uniform(20.0, 30.0, (50, 2))])
+    found = align(make_tree(target), source, np.zeros(3), IcpConfig())
+    moved = se2.transform(found.T_target_source, source)
+    nearest = np.array([np.hypot(*(target - p).T).min() for p in moved])
+    near = nearest < 1.0
+    assert found.overlap == pytest.approx(near.mean(), abs=0.01)
+    assert found.rmse == pytest.approx(np.sqrt(np.mean(nearest[near] ** 2)), rel=0.05)
