@@ -85,7 +85,7 @@ def test_calibration_shows_what_the_recording_shows(run):
     assert all(c.reason or c.state == "estimated" for c in result.calibration)
 
 
-def test_a_run_without_lidar_reports_so_and_no_more(run):
+def test_a_recording_without_lidar_reports_so_and_no_more(run):
     result = run[3]
     assert [w for w in result.warnings if "no lidar" in w.text]
     assert result.grid is None

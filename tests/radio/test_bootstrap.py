@@ -132,7 +132,7 @@ def reversed_in_time(wheels: Odometry, radio: UwbRanges) -> tuple[Odometry, UwbR
 
 
 @pytest.mark.parametrize("seed", [31, pytest.param(32, marks=pytest.mark.slow)])
-def test_the_result_does_not_depend_on_where_the_run_starts(seed):
+def test_the_result_does_not_depend_on_where_the_recording_starts(seed):
     """Forwards, backwards and without its first third, the same recording gives the same places."""
     rng = np.random.default_rng(seed)
     stamps, truth = wander(rng, 150.0)
@@ -156,7 +156,7 @@ def test_the_result_does_not_depend_on_where_the_run_starts(seed):
         assert anchor_error < 2 * WELL
 
 
-def test_a_straight_run_reports_that_its_anchors_are_ambiguous():
+def test_a_straight_path_reports_that_its_anchors_are_ambiguous():
     rng = np.random.default_rng(41)
     stamps = np.arange(800) * 0.1
     truth = np.column_stack([0.3 * stamps, 0.003 * np.sin(stamps), np.zeros(800)])

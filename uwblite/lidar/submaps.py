@@ -41,7 +41,7 @@ class SubmapConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Submaps:
-    """All sub-maps of a run."""
+    """All sub-maps of a graph."""
 
     first: Ints
     """(s,) first keyframe of each."""

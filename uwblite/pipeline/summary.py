@@ -35,7 +35,7 @@ _SHOWN = 0.7
 
 
 def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> MapResult:
-    """Gather the result of a run; see MapResult."""
+    """Gather the result; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
     stated = _with_steady_errors(with_noise_shown(with_fewer_pairs(graph)), len(estimate.anchor_ids), task.config.ranges)
     covariance = marginals(stated, common_range_errors(stated))

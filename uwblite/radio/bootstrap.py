@@ -1,6 +1,6 @@
 """Starting values from nothing: trajectory and anchors together, outwards from the best stretch.
 
-Raw odometry of a long run is too bent to linearise about, and anchors of unknown position cannot straighten it
+Raw odometry of a long recording is too bent to linearise about, and anchors of unknown position cannot straighten it
 before they are placed. So the stretch whose anchors are clearest comes first; from there the interval of known
 poses extends at both ends. Each piece is laid on by the calibrated odometry, pulled onto the anchors already placed
 (graduated kernel: wide first, then tight), and whenever the interval has become longer by a share, all of it is solved
