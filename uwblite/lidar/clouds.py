@@ -16,6 +16,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..config import setting
 from ..odometry.attached import ScanPoints
+from . import beam_gaps
 from .point_cloud import Lines, estimate_normals, make_tree
 
 _BLOCK = 32
@@ -95,7 +96,7 @@ def build(rays: ScanPoints, keyframes: int, config: CloudConfig) -> Clouds:
     rays : points of all keyframes of a block, numbered from 0.
     keyframes : k, number of keyframes.
     """
-    owner, points, origins = _average_cells(rays, config.voxel)
+    owner, points, origins = _average_cells(beam_gaps.filled(rays), config.voxel)
     bearing = se2.bearing(points)
     order = np.lexsort((bearing, owner))
     owner, points, origins = owner[order], points[order], origins[order]

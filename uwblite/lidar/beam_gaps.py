@@ -1,0 +1,72 @@
+"""Surfaces between the beams of a coarse lidar: points on the chord of two beams that hit one straight surface.
+
+With beams a degree apart the hits on a wall are 0.1 m apart at 6 m already, and far more where they graze it: too few for a
+line, and too far apart for a nearest point. Where three beams side by side hit one line, that line is the surface between
+them as well; elsewhere nothing is known of what is between two beams.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+from ..odometry.attached import ScanPoints
+
+_SPACING = 0.1
+"""Distance between points, m, that makes lines: a neighbourhood of 0.2 m holds four others."""
+_WIDEST = 0.6
+"""Wider gaps stay, m: niches and doors hide in them."""
+_REACH = 15.0
+"""Gaps farther away stay, m: the tables of nearest points take memory with the square of a cloud's extent."""
+_NOISE, _BEND = 0.04, 0.08
+"""By how much the next hit may lie off the line through two, m and share of its distance."""
+_LEAST_BESIDE = 0.4
+"""Share of a gap that the one beside it has at least on one line, however much the beams graze it."""
+
+
+def filled(rays: ScanPoints) -> ScanPoints:
+    """Return the points of scans with further ones in the gaps between beams that hit one straight surface."""
+    first = np.flatnonzero(_on_one_line(rays))
+    step = rays.points[first + 1] - rays.points[first]
+    parts = np.ceil(np.hypot(step[:, 0], step[:, 1]) / _SPACING).astype(np.int64)
+    own = np.repeat(np.arange(len(first)), parts - 1)
+    number = np.arange(len(own)) - np.repeat(np.cumsum(parts - 1) - (parts - 1), parts - 1) + 1
+    share = (number / parts[own])[:, None]
+    rows = np.concatenate([np.arange(len(rays.ray)), first[own]])
+    order = np.argsort(rows, kind="stable")
+
+    def column(values: Floats) -> Floats:
+        between = values[first[own]] + share * (values[first[own] + 1] - values[first[own]])
+        return np.concatenate([values, between])[order]
+
+    rows = rows[order]
+    return replace(
+        rays, keyframe=rays.keyframe[rows], points=column(rays.points), origins=column(rays.origins), ray=rays.ray[rows],
+        scan=rays.scan[rows],
+    )  # fmt: skip
+
+
+def _on_one_line(rays: ScanPoints) -> Bools:
+    """Return after which hits (p,) there is a gap to be filled: to the next beam's, on a line with the one before or behind."""
+    step = np.diff(rays.points, axis=0, append=np.nan)
+    beside = _beside(rays.scan, rays.ray)
+    gap = np.hypot(step[:, 0], step[:, 1])
+    short = beside & (gap < _WIDEST)
+    before, after = (np.roll(short, k) & _continues(step, np.roll(step, k, axis=0)) for k in (1, -1))
+    with np.errstate(invalid="ignore"):
+        near = np.hypot(*(rays.points - rays.origins).T) < _REACH
+        return np.asarray(short & (gap > _SPACING) & near & (before | after))
+
+
+def _beside(scan: Ints, ray: Ints) -> Bools:
+    """Return after which hits (p,) the next beam hit something as well."""
+    return np.append((np.diff(scan) == 0) & (np.diff(ray) == 1), False)
+
+
+def _continues(step: Floats, other: Floats) -> Bools:
+    """Return which steps (p, 2) from hit to hit go on along others (p, 2) beside them, whose lengths change little."""
+    length = np.hypot(step[:, 0], step[:, 1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = np.sum(step * other, axis=1) / length
+        across = np.abs(step[:, 0] * other[:, 1] - step[:, 1] * other[:, 0]) / length
+        return np.asarray((along > _LEAST_BESIDE * length) & (across < _NOISE + _BEND * along))
