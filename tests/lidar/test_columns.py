@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblite.lidar.columns import Landmarks, find_columns, fit_circle
+from uwblite.lidar.columns import Landmarks, _scores, find_columns, fit_circle
 
 CELL = 0.05
 
@@ -62,3 +62,14 @@ def test_three_points_are_enough_for_a_circle():
     assert len(points) == 3
     np.testing.assert_allclose(fit_circle(points, np.array([1.02, 1.98]), 0.3, 0.1), (1.0, 2.0), atol=2e-3)
     np.testing.assert_array_equal(fit_circle(points[:2], np.array([1.02, 1.98]), 0.3, 0.1), (1.02, 1.98))
+
+
+def test_a_circle_scores_by_its_arc_less_what_stands_around_it_and_how_far_its_cells_are_off():
+    """A whole circle of points scores 1; half of a second one, three cells further out, costs 0.7 of its share."""
+    rim, around = circle((0.0, 0.0), 0.25), circle((0.0, 0.0), 0.25 + 3.0 * CELL, 0.0, np.pi)
+    for cells, spoilt in ((rim, 0.0), (np.concatenate([rim, around]), 0.5)):
+        score, arc = _scores(np.zeros((1, 2)), cells, 0.25, CELL)
+        assert arc[0] == 1.0
+        assert score[0] == pytest.approx(1.0 - 0.7 * spoilt, abs=0.7 * 2.5 / 24 if spoilt else 0.02)
+    wide = circle((0.0, 0.0), 0.25 + 0.5 * CELL)
+    assert _scores(np.zeros((1, 2)), wide, 0.25, CELL)[0][0] == pytest.approx(0.75, abs=0.02)

@@ -5,7 +5,7 @@ import pytest
 from helpers.planted import box, drive, scans
 
 from uwblite import se2
-from uwblite.lidar.scan_odometry import _FIRST_GATE, misfits, scan_steps
+from uwblite.lidar.scan_odometry import _FIRST_GATE, _points, misfits, scan_steps
 from uwblite.sensor_log import SensorMounting
 
 WALLS = np.concatenate([box(9, 7), box(1, 2) + np.array([2.5, 1.5] * 2)])
@@ -44,3 +44,21 @@ def test_scans_that_see_nothing_match_nothing():
     np.testing.assert_allclose(found, exact)
     assert not share.any()
     assert not misfits(lidar, NOMINAL, FIRST, SECOND, exact).any()
+
+
+@pytest.mark.parametrize("mounting", [NOMINAL, BEHIND])
+def test_rays_are_points_in_the_frame_of_the_base_that_come_from_the_laser(mounting):
+    lidar, _ = seen(mounting)
+    chosen = np.array([4, 1])
+    points = _points(lidar, mounting, chosen, 3.0)
+    np.testing.assert_array_equal(points.origins, np.tile(mounting.T_base_laser[:2], (len(points.points), 1)))
+    expected = []
+    for number, scan in enumerate(chosen):
+        for ray, reading in enumerate(lidar.ranges[scan].tolist()):
+            if lidar.range_min <= reading <= 3.0:
+                bearing = lidar.angles[ray] * (-1.0 if mounting.laser_flipped else 1.0)
+                at = se2.transform(mounting.T_base_laser, reading * np.array([np.cos(bearing), np.sin(bearing)]))
+                expected.append([number, ray, *at])
+    assert len(expected) > 50
+    found = np.column_stack([points.keyframe, points.ray, points.points])
+    np.testing.assert_allclose(found, expected, atol=1e-12)
