@@ -132,18 +132,28 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     factors = np.where(np.abs(factors - 1.0) > _OTHER_UNIT, factors, 1.0)
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:
+            double = abs(abs(np.log2(factor)) - 1.0) < _DOUBLE
+            unclear = double and not (recording.has_scans or len(task.given.anchors) > 1 or task.given.distances)
+            reason = _TWICE if unclear else "the unit of the wheels is wrong; the odometry was multiplied by that"
             whose = f"{recording.name}: " if len(recordings) > 1 else ""
-            task.stages.warn(
-                "odometry-unit",
+            text = (
                 f"{whose}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its "
-                "odometry has: the unit of the wheels is wrong; the odometry was multiplied by that",
-                recording=recording.number + 1, factor=round(factor, 4),
-            )  # fmt: skip
+                f"odometry has: {reason}"
+            )
+            add = task.stages.doubt if unclear else task.stages.warn
+            add("odometry-unit", text, recording=recording.number + 1, factor=round(factor, 4))
     return factors
 
 
 _OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
+_DOUBLE = 0.1
+"""A factor is 2 or 1/2 up to this, by its logarithm to the base 2."""
+_TWICE = (
+    "either the wheels' radius and diameter were mistaken for each other, or the radio reports the way there and back, or half "
+    "of it, and without a lidar or given anchors nothing decides; the map has the radio's lengths: compare one distance "
+    "between two anchors"
+)
 
 
 def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool = False) -> Estimate:
