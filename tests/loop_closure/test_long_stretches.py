@@ -7,10 +7,10 @@ from helpers.laser_walks import returned
 from uwblite import se2
 from uwblite.graph.marginals import JointCovariance
 from uwblite.lidar.correlative_matching import CorrelativeConfig
-from uwblite.lidar.submaps import SubmapConfig
+from uwblite.lidar.submaps import SubmapConfig, of_pieces
 from uwblite.loop_closure.candidates import propose
 from uwblite.loop_closure.closures import LoopClosureConfig
-from uwblite.loop_closure.long_stretches import first_of, likely, stretches, uncertain_pairs
+from uwblite.loop_closure.long_stretches import any_uncertain, cut, first_of, likely, uncertain_pairs
 from uwblite.loop_closure.verification import find
 
 CONFIG = LoopClosureConfig()
@@ -36,7 +36,7 @@ def looked_for(walls):
     """Return truth, stretches and their uncertain pairs of a recording whose way back is known to 4 m."""
     truth, graph, path, clouds = returned(walls, 4.0, SHIFT)
     recording = np.zeros(len(truth), dtype=np.int64)
-    pieces = stretches(clouds, graph.poses, path, recording, SubmapConfig())
+    pieces = of_pieces(clouds, graph.poses, *cut(path, recording), SubmapConfig())
     covariance = JointCovariance(graph, pieces.reference)
     few = propose(graph, covariance, pieces, recording, set(), set(), False, CONFIG)
     assert np.all(few.spread <= CONFIG.search_limit)
@@ -50,7 +50,7 @@ def unlike():
 
 def test_each_stretch_overlaps_the_next_of_its_recording_by_half():
     truth, graph, path, clouds = returned(UNLIKE[:2], 4.0, SHIFT)
-    pieces = stretches(clouds, graph.poses, path, (np.arange(len(truth)) >= 75).astype(np.int64), SubmapConfig())
+    pieces = of_pieces(clouds, graph.poses, *cut(path, (np.arange(len(truth)) >= 75).astype(np.int64)), SubmapConfig())
     own = np.flatnonzero(pieces.last <= 75)
     length = path[pieces.last - 1] - path[pieces.first]
     assert np.all(pieces.first[own[1:]] < pieces.last[own[:-1]])
@@ -64,6 +64,14 @@ def test_only_pairs_beyond_a_search_of_sub_maps_are_listed_the_surest_first(unli
     assert np.all(pairs.spread > CONFIG.search_limit)
     assert np.all(np.diff(pairs.spread) >= 0.0)
     assert len(first_of(pairs, pieces).target) == min(40, len(pairs.target))
+
+
+@pytest.mark.parametrize(("far", "expected"), [(1.0, False), (4.0, True)])
+def test_what_a_search_of_sub_maps_reaches_needs_no_stretches(far, expected):
+    _, graph, path, _ = returned(UNLIKE[:2], far, SHIFT)
+    recording = np.zeros(len(path), dtype=np.int64)
+    reference = cut(path, recording)[2]
+    assert any_uncertain(graph, JointCovariance(graph, reference), reference, recording, CONFIG) == expected
 
 
 def test_a_loop_is_closed_where_pillars_stand_unlike(unlike):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.laser_walks import CORRIDOR, returned
 
-from uwblite.lidar.submaps import SubmapConfig
+from uwblite.lidar.submaps import SubmapConfig, of_pieces
 from uwblite.loop_closure.closures import LoopClosureConfig, no_closures
-from uwblite.loop_closure.long_stretches import stretches
+from uwblite.loop_closure.long_stretches import cut
 from uwblite.pipeline.closure_rounds import _check_open_loops
 from uwblite.pipeline.progress import Stages
 
@@ -18,7 +18,7 @@ def test_places_too_uncertain_for_a_search_are_doubted(far, kinds):
     """A way back known to 1 m is within a search; one known to 40 m is beyond any, and says so as well."""
     truth, graph, path, clouds = returned(CORRIDOR, far, [1.0, 0.0, 0.0])
     recording = np.zeros(len(truth), dtype=np.int64)
-    pieces = stretches(clouds, graph.poses, path, recording, SubmapConfig())
+    pieces = of_pieces(clouds, graph.poses, *cut(path, recording), SubmapConfig())
     recordings = SimpleNamespace(stamps=np.arange(len(truth)) * 1.0, of_keyframe=recording)
     stages = Stages(None, None)
     task = SimpleNamespace(recordings=recordings, config=SimpleNamespace(loop_closure=LoopClosureConfig()), stages=stages)

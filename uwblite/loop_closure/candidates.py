@@ -66,22 +66,16 @@ def propose(
     beyond : pairs whose 3 sigma are no larger, m, are left out; so are those of which a search would see a part only.
     missed : (target, source) that did not match from the graph's guess though the graph may be wrong: searched with slack.
     """
-    s = len(submaps)
     reference = submaps.reference
-    a, b = np.triu_indices(s, 1)
-    apart = (b - a > 1) | (recording[reference[a]] != recording[reference[b]])
-    a, b = a[apart], b[apart]
     poses = graph.poses[reference]
-    distance = np.hypot(*(poses[a, :2] - poses[b, :2]).T)
-    near = distance < config.reach + config.search_limit
-    a, b, distance = a[near], b[near], distance[near]
+    a, b, distance = _near(poses, recording[reference], config)
     if not len(a):
         return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), constrained)
     covariance = marginals.relative(reference[a], reference[b])
     slack = np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
     astray = np.array([(int(x), int(y)) in missed for x, y in zip(a, b, strict=True)])
     covariance = covariance + astray[:, None, None] * slack
-    spread = 3.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
+    spread = _spread(covariance)
     seen = surface_cells(submaps.clouds, poses)
     common = np.asarray((seen @ seen.T).todense())[a, b]
     size = np.maximum(np.diff(seen.indptr), 1)
@@ -94,6 +88,27 @@ def propose(
     kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
     a, b = a[kept], b[kept]
     return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept], constrained)
+
+
+def uncertain(
+    graph: Graph, marginals: JointCovariance, reference: Ints, recording: Ints, config: LoopClosureConfig, beyond: float
+) -> bool:
+    """Return whether any two reference keyframes (s,) so near that they may be tried have 3 sigma beyond a limit, m."""
+    a, b, _ = _near(graph.poses[reference], recording[reference], config)
+    return bool(len(a) and _spread(marginals.relative(reference[a], reference[b])).max() > beyond)
+
+
+def _near(poses: Floats, recording: Ints, config: LoopClosureConfig) -> tuple[Ints, Ints, Floats]:
+    """Return pairs (p,), (p,) of poses (s, 3) that may be tried, and their distances, m; neighbours in time may not."""
+    a, b = np.triu_indices(len(poses), 1)
+    distance = np.hypot(*(poses[a, :2] - poses[b, :2]).T)
+    near = ((b - a > 1) | (recording[a] != recording[b])) & (distance < config.reach + config.search_limit)
+    return a[near], b[near], distance[near]
+
+
+def _spread(covariance: Floats) -> Floats:
+    """Return 3 sigma (p,) of places in the direction in which it is largest, m, by covariances (p, 3, 3)."""
+    return 3.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1], 0.0))
 
 
 def _best_per_submap(a: Ints, b: Ints, worth: Floats, limit: int) -> Ints:

@@ -13,9 +13,8 @@ from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from ..graph.marginals import JointCovariance
 from ..lidar import submaps
-from ..lidar.clouds import Clouds
-from ..lidar.submaps import SubmapConfig, Submaps
-from .candidates import Candidates, propose
+from ..lidar.submaps import Submaps
+from .candidates import Candidates, propose, uncertain
 from .closures import LoopClosureConfig
 
 _LENGTH = 30.0
@@ -27,17 +26,28 @@ _AT_ONCE, _PART = 40, 8
 """Pairs tried before the graph is solved again, and how many stretches there are for each where that is more."""
 
 
-def stretches(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, merging: SubmapConfig) -> Submaps:
-    """Return the trajectory's stretches, each of which overlaps the next by half.
+def cut(path: Floats, recording: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return first keyframe (s,), one past the last (s,) and reference (s,) of stretches, each overlapping the next by half.
 
     Parameters
     ----------
-    clouds : one per keyframe. poses : (k, 3). path : (k,) travelled distance, m. recording : (k,).
+    path : (k,) travelled distance, m. recording : (k,).
     """
     first, last = submaps.cut(path, recording, _LENGTH / 2.0)
     goes_on = recording[first[1:]] == recording[first[:-1]]
     last[:-1] = np.where(goes_on, last[1:], last[:-1])
-    return submaps.of_pieces(clouds, poses, first, last, (first + last - 1) // 2, merging)
+    return first, last, (first + last - 1) // 2
+
+
+def any_uncertain(
+    graph: Graph, covariance: JointCovariance, reference: Ints, recording: Ints, config: LoopClosureConfig
+) -> bool:
+    """Return whether any stretches are too uncertain for a search of sub-maps; see uncertain_pairs, which says which."""
+    return uncertain(graph, covariance, reference, recording, _wide(config, FARTHEST), config.search_limit)
+
+
+def _wide(config: LoopClosureConfig, farthest: float) -> LoopClosureConfig:
+    return replace(config, reach=_LENGTH / 2.0, search_limit=farthest)
 
 
 def uncertain_pairs(
@@ -50,7 +60,7 @@ def uncertain_pairs(
     ----------
     farthest : pairs whose 3 sigma are larger, m, are left out. For the others see candidates.propose.
     """
-    wide = replace(config, reach=_LENGTH / 2.0, search_limit=farthest)
+    wide = _wide(config, farthest)
     found = propose(graph, covariance, pieces, recording, tried, set(), constrained, wide, config.search_limit)
     return found.rows(np.argsort(found.spread, kind="stable"))
 

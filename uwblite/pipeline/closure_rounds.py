@@ -68,13 +68,16 @@ def _with_long_stretches_tied(
     """
     recordings, scans, rules = task.recordings, estimate.scans, task.config.loop_closure
     assert scans is not None
-    pieces = long_stretches.stretches(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, task.config.submaps)
+    first, last, reference = long_stretches.cut(recordings.path, recordings.of_keyframe)
+    covariance = JointCovariance(base.with_edges(found.edges), reference)
+    if not long_stretches.any_uncertain(base, covariance, reference, recordings.of_keyframe, rules):
+        return base, found, None
+    pieces = submaps.of_pieces(scans.clouds, base.poses, first, last, reference, task.config.submaps)
     free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
     pieces = visibility.static_points(pieces, free)
     tried: set[tuple[int, int, bool]] = set()
     accepted = 0
     for _ in range(_WIDE_ROUNDS):
-        covariance = JointCovariance(base.with_edges(found.edges), pieces.reference)
         pairs = long_stretches.uncertain_pairs(
             base, covariance, pieces, recordings.of_keyframe, tried, estimate.ranges is not None, rules
         )
@@ -87,6 +90,7 @@ def _with_long_stretches_tied(
         found = closures.merged(found, new)
         if len(new.edges):
             base, found = verification.reconcile(base, found, rules, task.config.solver)
+            covariance = JointCovariance(base.with_edges(found.edges), reference)
             accepted += len(new.edges)
     if not tried:
         return base, found, None
