@@ -97,6 +97,10 @@ class Estimate:
         lidar = self.steps_and_closures if self.joint is None else (self.joint,)
         return self.graph.with_edges(*self.odometry_and_ranges, *lidar)
 
+    def moved_since(self, poses: Floats) -> float:
+        """Return how far its poses are from earlier ones (k, 3), root mean square, m."""
+        return float(np.sqrt(np.mean(np.sum((self.graph.poses - poses)[:, :2] ** 2, axis=1))))
+
     def with_estimates_of(self, solved: Graph) -> "Estimate":
         """Return the estimate with poses, anchors and calibration of a solved graph."""
         return replace(self, graph=self.graph.with_estimates_of(solved))

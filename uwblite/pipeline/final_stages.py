@@ -32,7 +32,10 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.joint is not None and estimate.ranges is not None:
         for _ in range(_LAPS):
+            before = estimate.graph.poses
             estimate = _solved(with_range_noise(estimate, task.config), task)
+            if estimate.moved_since(before) < _STILL:
+                break
         estimate = _anchors_alone(estimate, task)
     estimate = _with_range_errors(estimate, task)
     # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
@@ -53,7 +56,9 @@ def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
 
 
 _LAPS = 2
-"""Range noise learnt and everything solved so often: the second time on poses that the first has moved."""
+"""Range noise learnt and everything solved so often, at most: the second time on poses that the first has moved."""
+_STILL = 0.001
+"""Root mean square by which poses must have moved for their ranges to show another noise, m."""
 
 
 def _solved(estimate: Estimate, task: Task) -> Estimate:

@@ -203,7 +203,7 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
         refined = _refine(estimate.graph, edges, scans, i, j, settings, task, "joint refinement")
         graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
         estimate = with_range_noise(replace(estimate, graph=graph, joint=refined.edges), config, steady=True)
-        shift = float(np.sqrt(np.mean(np.sum((graph.poses - before)[:, :2] ** 2, axis=1))))
+        shift = estimate.moved_since(before)
         task.stages.end(
             Stage("joint refinement", lap + 1), pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
             sigma=round(refined.sigma, 4), shift=round(shift, 5), **solver_figures(refined.summary),
@@ -218,7 +218,7 @@ def _matched_once_more(estimate: Estimate, scans: ScanClouds, task: Task) -> Est
     config, settings = task.config, replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
     free = with_range_noise(estimate, config)
     moved = free.with_estimates_of(optimize(free.problem, config.solver)[0])
-    shift = float(np.sqrt(np.mean(np.sum((moved.graph.poses - estimate.graph.poses)[:, :2] ** 2, axis=1))))
+    shift = moved.moved_since(estimate.graph.poses)
     if shift < settings.same_pairs:
         return estimate
     i, j = _pairs(moved.graph, scans, settings, task)
