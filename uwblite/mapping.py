@@ -113,6 +113,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         yield lidar_stages.check_map_consistency
     if given.landmark_distances:
         yield landmark_ties.tie_landmarks
+    yield moved_anchors.name_new_and_absent_anchors
     yield final_stages.final_optimisation
     yield mirror_images.find_mirror_images
     yield map_frame.align_axes

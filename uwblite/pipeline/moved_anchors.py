@@ -1,4 +1,4 @@
-"""Anchors that were moved between recordings, found once the lidar constrains all poses."""
+"""Anchors that were moved, added or taken away between recordings, found once all poses are known well."""
 
 from dataclasses import replace
 
@@ -88,3 +88,57 @@ def _places_by_recording(
     edges, _ = learn_noise(edges, optimize(alone.with_edges(edges), solver)[0], len(pairs), noise)
     solved = optimize(alone.with_edges(edges), solver)[0]
     return solved.anchors, marginals(solved).anchors, pairs
+
+
+def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
+    """Warn of anchors that are heard in some recordings alone, though others drove where these heard them."""
+    ranges = estimate.ranges
+    if len(task.recordings) == 1 or ranges is None:
+        return estimate
+    recording_of, number = task.recordings.of_keyframe, len(task.recordings)
+    # Where an anchor was moved, one place follows the other: that is reported, and the anchor is heard all the time.
+    names = np.array([name.split("#")[0] for name in estimate.anchor_ids])
+    alive = np.flatnonzero(ranges.alive)
+    heard_by = np.zeros((len(names), number), dtype=np.int64)
+    np.add.at(heard_by, (ranges.anchor[alive], recording_of[ranges.pose[alive]]), 1)
+    for k in np.flatnonzero(estimate.placed).tolist():
+        heard = heard_by[names == names[k]].sum(axis=0) > 0
+        if heard.all():
+            continue
+        away = np.hypot(*(estimate.graph.poses[:, :2] - estimate.graph.anchors[k]).T)
+        own = ranges.pose[alive[ranges.anchor[alive] == k]]
+        within = away <= np.median(away[own])
+        near = np.bincount(recording_of[within], minlength=number)
+        rate = within[own].sum() / max(int(near[heard].sum()), 1)
+        silent = np.flatnonzero(~heard & (rate * near >= _EXPECTED))
+        first, last = np.flatnonzero(heard)[[0, -1]].tolist()
+        _warn_of_absence(task, estimate.anchor_ids[k], first, last, silent)
+    return estimate
+
+
+_EXPECTED = 10.0
+"""Ranges that a recording should have from the places where others heard an anchor, from which its silence says something."""
+
+
+def _warn_of_absence(task: Task, anchor: str, first: int, last: int, silent: Ints) -> None:
+    """Warn of an anchor that recordings before the first or after the last that heard it (0, 1, ...) should have heard."""
+    before, after = ([int(n) + 1 for n in silent[side]] for side in (silent < first, silent > last))
+    if before:
+        task.stages.warn(
+            "new-anchor",
+            f"anchor {anchor} is heard only from recording {first + 1} on: {_drove_there(before)}, so it is new or was off",
+            anchor=anchor, recording=first + 1, silent=before,
+        )  # fmt: skip
+    if after:
+        task.stages.warn(
+            "absent-anchor",
+            f"anchor {anchor} is not heard any more after recording {last + 1}: {_drove_there(after)}, so it was taken away "
+            "or is off",
+            anchor=anchor, recording=last + 1, silent=after,
+        )  # fmt: skip
+
+
+def _drove_there(numbers: list[int]) -> str:
+    """Return which recordings drove within reach of an anchor without hearing it."""
+    which = ", ".join(map(str, numbers))
+    return f"recording{'s' if len(numbers) > 1 else ''} {which} drove within its reach without hearing it"
