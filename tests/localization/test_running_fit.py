@@ -26,6 +26,13 @@ def test_two_anchors_at_once_contradict_the_pose_and_one_does_not():
     assert not after(*[(0, CONTRADICTS)] * 5).ranges_contradict()
 
 
+def test_the_first_ranges_that_contradict_begin_a_search_and_take_no_pose_away():
+    fit = after((0, CONTRADICTS))
+    assert fit.in_doubt()
+    assert not fit.jumped()
+    assert not after((0, AGREES)).in_doubt()
+
+
 def test_a_moved_anchor_among_others_takes_no_pose_away():
     rounds = [(k % 4, CONTRADICTS if k % 4 == 0 else AGREES) for k in range(100)]
     for count in range(1, 100):
@@ -68,13 +75,13 @@ def test_a_pose_that_is_lost_is_not_lost_again_by_the_same_ranges():
         assert not fit.jumped()
 
 
-def test_a_range_that_agrees_by_chance_does_not_hide_since_when_scans_doubt():
+def test_a_range_that_agrees_by_chance_does_not_hide_since_when_in_doubt():
     fit = after((0, AGREES))
     fit.add_scan(-0.1, True, 2.0)
-    assert not fit.scans_doubt()
+    assert not fit.in_doubt()
     for k in range(20):
         fit.add_scan(-0.5, True, 2.1 + 0.1 * k)
     fit.add_range(1, *AGREES, 4.0)
-    assert fit.scans_doubt()
+    assert fit.in_doubt()
     assert not fit.scans_contradict()
     assert (fit.matched, fit.sound) == (2.0, 4.0)

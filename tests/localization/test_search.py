@@ -6,9 +6,10 @@ from helpers.localization_room import ODD, cast, grid_of
 
 from uwblite import se2
 from uwblite.localization import search
-from uwblite.localization.walls import walls_of
+from uwblite.localization.walls import Rays, walls_of
 from uwblite.localization.window import Ranges
 
+BOUNDS = (np.array([-1.0, -1.0]), np.array([6.0, 5.0]))
 NO_RANGES = Ranges(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
@@ -62,7 +63,7 @@ def test_the_best_pose_is_that_of_trying_every_one(room):
         scores = finished(search._scored(room, 0, offsets, nodes))
         if scores.max() > best:
             best, where = scores.max(), nodes[scores.argmax()]
-    found = finished(search._by_scans(room, points, NO_RANGES))
+    found = finished(search._by_scans(room, points, 1.0, NO_RANGES))
     assert found.complete
     expected = [*(room.origin + (where[:0:-1] + 0.5) * room.cell), se2.wrap_angle(headings[where[0]])]
     np.testing.assert_allclose(found.poses[0], expected, atol=1e-9)
@@ -70,3 +71,28 @@ def test_the_best_pose_is_that_of_trying_every_one(room):
     # A cell and a step of the heading.
     assert np.hypot(*off[:2]) < 0.15
     assert abs(off[2]) < 0.06
+
+
+def ranges_at(pose, anchors, tag):
+    """Return exact ranges of a tag (2,) on the base to anchors (m, 2)."""
+    there = se2.transform(np.asarray(pose), np.asarray(tag))
+    count = len(anchors)
+    return Ranges(np.arange(count), anchors, np.tile(tag, (count, 1)), np.hypot(*(anchors - there).T), np.full(count, 0.15))
+
+
+def test_a_few_points_of_walls_tell_the_heading_where_ranges_tell_the_place(room):
+    pose = np.array([1.0, 2.5, 0.4])
+    points = seen_from(pose, 9)
+    rays = Rays(points, np.zeros_like(points), np.ones(len(points), bool))
+    ranges = ranges_at(pose, np.array([[0.0, 0.0], [5.0, 0.0], [0.0, 4.0], [5.0, 4.0]]), (0.05, 0.0))
+    assert search._FEWEST_BESIDE <= len(search._thinned(rays)) < search._FEWEST_POINTS
+    off = se2.between(pose, finished(search.places(room, rays, ranges, BOUNDS)).poses)
+    near = np.hypot(off[:, 0], off[:, 1]) < 0.2
+    assert np.abs(off[near, 2]).min() < 0.1
+
+
+def test_of_places_that_look_alike_the_one_that_the_ranges_fit_comes_first():
+    poses = np.column_stack([np.linspace(0.0, 6.0, 25), np.zeros((25, 2))])
+    ranges = ranges_at(poses[17], np.array([[0.0, 3.0], [6.0, 3.0]]), (0.0, 0.0))
+    found = finished(search._likeliest(poses, np.linspace(0.9, 0.85, 25), ranges, complete=True))
+    np.testing.assert_allclose(found.poses[0], poses[17], atol=0.26)

@@ -1,8 +1,10 @@
 """How far a robot drives between two searches that agree, by what each kind of measurement says."""
 
+import numpy as np
 import pytest
 
-from uwblite.localization.verdict import ENOUGH_ENDS, RangeFit, confirming_way
+from uwblite.localization import hypotheses
+from uwblite.localization.verdict import ENOUGH_ENDS, RangeFit, confirming_way, doubt
 
 CLEAR = RangeFit(8, 1.0, 4)
 TWO_ANCHORS, ONE_ANCHOR = RangeFit(3, 1.0, 2), RangeFit(3, 1.0, 1)
@@ -27,3 +29,10 @@ def test_in_a_map_in_which_the_robot_was_tracked_ranges_to_two_anchors_need_no_s
 def test_ranges_to_one_anchor_confirm_nothing_in_any_map():
     for fit, ends in ((-0.1, 0.0), (-0.1, ENOUGH_ENDS), (-0.4, ENOUGH_ENDS)):
         assert confirming_way(fit, ends, ONE_ANCHOR, proven=True) == confirming_way(fit, ends, ONE_ANCHOR, proven=False)
+
+
+def test_a_rival_a_hundred_times_less_likely_is_none_in_a_map_in_which_the_robot_was_tracked():
+    bank = hypotheses.started(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), np.tile(0.01 * np.eye(3), (2, 1, 1)), 0)
+    bank = hypotheses.weighed(bank, np.array([0.0, -5.0]))
+    for fitting, proven, certain in ((CLEAR, True, True), (CLEAR, False, False), (ONE_ANCHOR, True, False)):
+        assert (doubt(bank, 0, True, -0.1, ENOUGH_ENDS, fitting, proven) == "") is certain

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Bools, Floats
 from . import hypotheses, range_likelihood, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
@@ -55,8 +55,7 @@ class Comparison:
     @property
     def elsewhere(self) -> bool:
         """Whether another place explains what was measured better than the first hypothesis."""
-        rivals = self.weight[hypotheses.apart(self.bank.poses[0], self.bank.poses)]
-        return self.complete and bool(rivals.max(initial=-np.inf) > self.weight[0] + verdict.CERTAIN)
+        return self.complete and bool(self.weight[1:].max(initial=-np.inf) > self.weight[0] + verdict.CERTAIN)
 
 
 class PlaceSearch:
@@ -112,30 +111,39 @@ class PlaceSearch:
         ranges = window.ranges_since(odom, way)
         rays, ago = window.seen(odom, way, LOOK_BACK)
         recent = rays.rows(ago <= _SEARCH_LOOKS)
-        bank = self._with_places(bank, found.poses, ranges, recent)
+        before, bank = len(bank), hypotheses.joined(bank, self._started(found.poses, ranges, recent))
         weight = range_likelihood.range_likelihood(bank.poses, ranges)
-        fit, known = np.zeros(len(bank)), np.zeros(len(bank))
+        fit, known = np.zeros((2, len(bank)))
         if self.walls is not None and len(rays.hit):
             agreement = self.walls.agreement(bank.poses, rays)
             weight += SCAN_EVIDENCE * (1.0 + float(ago.max())) * agreement.log_likelihood
             fit, known = agreement.log_likelihood, agreement.known
-        return Comparison(bank, found.complete, weight, fit, known, rays, len(np.unique(ago)), ranges)
+        new = _no_repetition(bank.poses, weight, before)
+        looks = len(np.unique(ago))
+        return Comparison(bank.rows(new), found.complete, weight[new], fit[new], known[new], rays, looks, ranges)
 
-    def _with_places(self, bank: Hypotheses, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
-        """Return the hypotheses with new ones where none is near."""
-        for pose in bank.poses:
-            poses = poses[hypotheses.apart(pose, poses)]
-        if not len(poses):
-            return bank
+    def _started(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
+        """Return hypotheses at poses (c, 3) that a search found."""
         scans = self.walls is not None and rays.hit.sum() >= verdict.FEW_ENDS
         covariances = np.tile(np.diag(np.square(_SIGMA_SCAN)), (len(poses), 1, 1))
         if not scans:
             hessian, _ = range_likelihood.range_factors(poses, ranges)
             covariances = np.linalg.inv(hessian + np.diag([0.01, 0.01, 0.1])) + np.diag(np.square(_SIGMA_FLOOR))
         fresh = hypotheses.started(poses, covariances, self.anchors)
-        if scans and self.walls is not None:
+        if self.walls is not None and rays.hit.sum() >= verdict.FEW_BESIDE:
             fresh = hypotheses.matched(fresh, self.walls, rays.spread(TRACK_RAYS), 1.0)
-        return hypotheses.joined(bank, fresh)
+        return fresh
+
+
+def _no_repetition(poses: Floats, weight: Floats, before: int) -> Bools:
+    """Return which poses (h, 3) stay: the first ones, and those of the others that are no earlier one's place.
+
+    One near an earlier one stays if it is far better: what was tracked there has slid along a wall, or was carried so far.
+    """
+    stays = np.ones(len(poses), bool)
+    for k in range(before):
+        stays[before:] &= hypotheses.apart(poses[k], poses[before:]) | (weight[before:] > weight[k] + verdict.CERTAIN)
+    return stays
 
 
 def _bounds(known: KnownMap) -> tuple[Floats, Floats]:

@@ -95,7 +95,8 @@ class PoseEstimator:
 
     def use_scan(self, rays: Rays) -> None:
         """Take a scan's rays, in the present frame of the base."""
-        if self._window.wants_look(self._way) and len(rays.hit):
+        doubted_since = self._running.matched if self._certain and self._running.in_doubt() else -np.inf
+        if self._window.wants_look(self._way, doubted_since) and len(rays.hit):
             self._window.add_look(WindowLook(rays.spread(RAYS), self._odometer.pose.copy(), self._way, self._odometer.stamp))
         walls = self.known.walls
         if not len(self._bank) or walls is None or not len(rays.hit):
@@ -128,7 +129,7 @@ class PoseEstimator:
                 self._decide_by(compared)
             elif compared.elsewhere:
                 self._lose(_SCANS_DIFFER, self._running.matched)
-        if self._places.idle and (not self._certain or self._running.scans_doubt()) and self._due():
+        if self._places.idle and (not self._certain or self._running.in_doubt()) and self._due():
             # Of a pose that is in doubt, places are compared by what was measured since scans fitted there: ranges to a wrong
             # place agree by chance.
             self._searched = self._window.since(self._running.matched) if self._certain else self._window.newest(self._parts)
@@ -189,7 +190,7 @@ class PoseEstimator:
         self._window, self._parts = self._window.since(self._running.agreed() if since is None else since), 1
         self._places.drop()
         self._running.forget_anchors()
-        self._search_way, self._search_stamp = self._way, self._odometer.stamp
+        self._search_stamp = -np.inf
 
     def _decide_by(self, found: Comparison) -> None:
         """Weight all hypotheses again by what a search found, and decide."""
@@ -197,18 +198,19 @@ class PoseEstimator:
             self._bank, self._reason = found.bank, verdict.too_little(found.rays, found.ranges)
             return
         self._bank = found.hypotheses
-        best = int(np.argmax(self._bank.log_weight))
+        best, proven = int(np.argmax(self._bank.log_weight)), self._compared >= _PROVEN
         fit, known, ranges = float(found.fit[best]), float(found.known[best]), found.ranges
-        if known < verdict.FEW_ENDS and len(ranges):
+        fitting = verdict.agreeing(self._bank.poses[best], ranges)
+        if known < (verdict.FEW_BESIDE if proven and fitting.anchors >= 3 else verdict.FEW_ENDS) and len(ranges):
             self._bank = hypotheses.placed(self._bank, best, *range_moments(self._bank.poses[best], ranges))
+            fitting = verdict.agreeing(self._bank.poses[best], ranges)
         pose = self._bank.poses[best].copy()
-        fitting = verdict.agreeing(pose, ranges)
-        self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting) or verdict.other_unit(
-            self.known.walls, pose, found.rays, found.looks, ranges, self._compared < _PROVEN
+        self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting, proven) or verdict.other_unit(
+            self.known.walls, pose, found.rays, found.looks, ranges, not proven
         )
         self._trim(bool(verdict.nowhere(fit, known, fitting)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
-        self._decide(pose, verdict.confirming_way(fit, known, fitting, self._compared >= _PROVEN))
+        self._decide(pose, verdict.confirming_way(fit, known, fitting, proven))
 
     def _trim(self, nowhere: bool) -> None:
         """Choose the part of the window that the next search goes by.

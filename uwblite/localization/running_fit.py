@@ -24,6 +24,8 @@ _RANGES_SOUND, _RECENT = 0.5, 5.0
 for a better one. Rooms that the map holds in part look like that, and people around the robot."""
 _JUMPED = 6.0
 """Log-likelihood, 400 : 1, by which the ranges must be likelier from anywhere than from the pose for it to be lost at once."""
+_DOUBTED = 3.0
+"""The same, 20 : 1, by which the rest of the map is searched for a better place."""
 _MOVED = (0.2, 20.0)
 """Mean weight below which, after so many ranges, an anchor counts as moved."""
 
@@ -86,9 +88,9 @@ class RunningFit:
             if fit > FIT_SOUND:
                 self.sound, self.matched = max(self.sound, stamp), max(self.matched, stamp)
 
-    def scans_doubt(self) -> bool:
-        """Return whether scans fit worse than they should: people may be about, or the robot is elsewhere."""
-        return self.fit < FIT_SOUND
+    def in_doubt(self) -> bool:
+        """Return whether measurements fit worse than they should: people may be about, or the robot is elsewhere."""
+        return self.fit < FIT_SOUND or self._jump() > _DOUBTED
 
     def scans_contradict(self) -> bool:
         """Return whether scans fit so badly that the robot is elsewhere."""
@@ -100,7 +102,11 @@ class RunningFit:
 
     def jumped(self) -> bool:
         """Return whether the ranges, which agreed, now contradict the pose all at once."""
-        return self.before > _RANGES_SOUND and float(self.against.sum()) < -_JUMPED
+        return self._jump() > _JUMPED
+
+    def _jump(self) -> float:
+        """Return by how much, log-likelihood, ranges that agreed contradict the pose since."""
+        return -float(self.against.sum()) if self.before > _RANGES_SOUND else 0.0
 
     def ranges_vouch(self, now: float) -> bool:
         """Return whether recent ranges speak for the pose."""

@@ -41,8 +41,8 @@ _MOST_NODES = 60_000
 """Nodes of a level that are followed up; where more are as good, the search is not complete."""
 _RIVAL = 0.75
 """Poses whose score is this share of the best one's are kept."""
-_FEWEST_POINTS = 12
-"""Points of walls below which scans say nothing."""
+_FEWEST_POINTS, _FEWEST_BESIDE = 12, 4
+"""Points of walls below which scans say nothing; the second where ranges to three anchors tell the place."""
 MOST_PLACES = 32
 """Poses that are returned."""
 
@@ -116,13 +116,15 @@ def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats
     where no scan measures more.
     """
     seen = np.zeros((0, 2)) if field is None else _thinned(rays)
-    if field is not None and len(seen) >= _FEWEST_POINTS:
-        found = yield from _by_scans(field, seen, ranges)
-        if len(found.poses) or not len(ranges):
+    anchors, found = len(np.unique(ranges.anchor)), Places(np.zeros((0, 3)), True)
+    if field is not None and len(seen) >= (_FEWEST_POINTS if anchors < 3 else _FEWEST_BESIDE):
+        found = yield from _by_scans(field, seen, float(rays.hit.mean()), ranges)
+        if len(seen) >= _FEWEST_POINTS and (len(found.poses) or not len(ranges)):
             return found
-    if len(np.unique(ranges.anchor)) < 2:
+    if anchors < 2:
         return Places(np.zeros((0, 3)), False)
-    return (yield from _by_ranges(ranges, bounds))
+    ranged = yield from _by_ranges(ranges, bounds)
+    return Places(np.concatenate([found.poses, ranged.poses]), found.complete and ranged.complete)
 
 
 def _thinned(rays: Rays) -> Floats:
@@ -134,8 +136,8 @@ def _thinned(rays: Rays) -> Floats:
     return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.int64))]] if len(chosen) else points[:0]
 
 
-def _by_scans(field: Field, points: Floats, ranges: Ranges) -> Steps:
-    """Match points (p, 2) by branch and bound where the ranges allow it."""
+def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Steps:
+    """Match points (p, 2), of a share of all rays, by branch and bound where the ranges allow it."""
     top = 2**_LEVELS
     rows, cols = _coarse_cells(field, top)
     centre = field.origin + (np.stack([cols, rows], axis=1) + 0.5 * top) * field.cell
@@ -160,7 +162,25 @@ def _by_scans(field: Field, points: Floats, ranges: Ranges) -> Steps:
     kept = kept[np.argsort(-scores[kept], kind="stable")]
     poses = np.column_stack([field.origin + (nodes[kept, :0:-1] + 0.5) * field.cell, se2.wrap_angle(headings[nodes[kept, 0]])])
     inside = field.free[nodes[kept, 1], nodes[kept, 2]]
-    return _distinct(poses[inside], complete)
+    if not len(ranges):
+        return _distinct(poses[inside], complete)
+    return (yield from _likeliest(poses[inside], share * scores[kept[inside]], ranges, complete))
+
+
+def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) -> Steps:
+    """Return the best of poses (n, 3) by their scores (n,), in whose order they are, and by the ranges together.
+
+    Along a wall scans leave places open that ranges tell apart.
+    """
+    tried, few = poses[:_MOST_RIVALS], _some(ranges)
+    weight = _PER_SCORE * scores[: len(tried)]
+    for start in range(0, len(tried), _RANGED_AT_ONCE):
+        part = slice(start, start + _RANGED_AT_ONCE)
+        weight[part] += range_likelihood(tried[part], few, wider=0.5 * _CELL)
+        yield
+    order = np.argsort(-weight, kind="stable")
+    order = order[weight[order] >= weight[order[:1]] - _RANGE_RIVAL]
+    return _distinct(tried[order], complete and len(tried) == len(poses))
 
 
 def _coarse_cells(field: Field, top: int) -> tuple[Ints, Ints]:
@@ -240,8 +260,7 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     if len(cells) * len(headings) > _MOST_NODES:
         return Places(np.zeros((0, 3)), False)
     poses = np.column_stack([np.repeat(cells, len(headings), axis=0), np.tile(headings, len(cells))])
-    pick = np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.int64))
-    few, cost = chosen(ranges, pick), np.empty(len(poses))
+    few, cost = _some(ranges), np.empty(len(poses))
     for start in range(0, len(poses), _RANGED_AT_ONCE):
         part = slice(start, start + _RANGED_AT_ONCE)
         cost[part] = -range_likelihood(poses[part], few, wider=0.6 * step)
@@ -253,6 +272,13 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     return _distinct(refined_by_ranges(tried, ranges), 0 < len(order) <= _MOST_RIVALS)
 
 
+def _some(ranges: Ranges) -> Ranges:
+    """Return forty of the ranges, for the time that all would take."""
+    return chosen(ranges, np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.int64)))
+
+
+_PER_SCORE = 30.0
+"""Log-likelihood by which a score of 1 is better than one of 0: of fifteen rays, each about ten times likelier on a wall."""
 _RANGED_AT_ONCE, _MOST_RIVALS = 1024, 4096
 """Poses that are tried at once, a unit of work of 2 ms, and that may be as good before the search is not complete."""
 _RANGE_RIVAL = 12.0

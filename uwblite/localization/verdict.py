@@ -14,6 +14,8 @@ from .window import Ranges
 
 CERTAIN = 6.0
 """Log-likelihood by which a place must be better than any other: 400 : 1."""
+_CERTAIN_AGAIN = 4.6
+"""The same in a map that is the right one: 100 : 1."""
 SIGMA_FOUND = (0.25, 0.1)
 """m and rad; a pose that is less sure is not found yet."""
 FIT_BESIDE_RANGES, FIT_ALONE = -0.5, -0.25
@@ -22,8 +24,8 @@ close by -0.5; rooms that are alike in part reach -0.3, other buildings beside r
 RANGES_FOUND, RANGES_ALONE = 0.5, 0.8
 """Share of the ranges that must agree with a start, beside scans and alone: in the right place 0.9 to 1 alone, with anchors of
 another building 0.75 to 0.8."""
-FEW_ENDS = 12
-"""Rays' ends in known space from which a scan counts."""
+FEW_ENDS, FEW_BESIDE = 12, 4
+"""Rays' ends in known space from which a scan counts; the second beside ranges to three anchors."""
 ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
 """Rays' ends, or ranges to two anchors, that a start needs."""
 _FIT_CLEAR, _RANGES_CLEAR, _ANCHORS_CLEAR = -0.3, 0.75, 3
@@ -36,14 +38,17 @@ _UNIT_CLEAR = 0.01
 """The same by scans, from which ranges say nothing against a pose that was found: of four anchors two may have been moved."""
 
 
-def doubt(bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, fitting: "RangeFit") -> str:
+def doubt(
+    bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, fitting: "RangeFit", proven: bool = False
+) -> str:
     """Return why the best hypothesis is not certain yet; "" = it is.
 
     Parameters
     ----------
     complete : the search left no place out. fit : mean log-likelihood of the rays at the best hypothesis.
-    ends : rays' ends in known space. fitting : how the ranges agree there.
+    ends : rays' ends in known space. fitting : how the ranges agree there. proven : the map is the right one.
     """
+    certain = _CERTAIN_AGAIN if proven and fitting.anchors >= 2 else CERTAIN
     sigma = np.sqrt(np.maximum(np.diag(bank.pose_covariances[best]), 0.0))
     rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
     if not complete:
@@ -53,8 +58,8 @@ def doubt(bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, 
         return "too little was measured yet; drive on"
     if why := nowhere(fit, ends, fitting):
         return why
-    if len(rivals) and rivals.max() > -CERTAIN:
-        count = 1 + int((rivals > -CERTAIN).sum())
+    if len(rivals) and rivals.max() > -certain:
+        count = 1 + int((rivals > -certain).sum())
         return f"{count} places are as likely; drive on, around a corner or past another anchor"
     if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
         return "place or heading is not sure yet; drive on"

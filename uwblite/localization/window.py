@@ -99,9 +99,9 @@ class Window:
         if len(own) < _ALIKE or entry.way - own[-_ALIKE].way >= _RANGE_EVERY:
             self.ranges.append(entry)
 
-    def wants_look(self, way: float) -> bool:
-        """Return whether the robot has moved enough for another scan."""
-        return not self.looks or way - self.looks[-1].way >= _LOOK_EVERY
+    def wants_look(self, way: float, after: float = -np.inf) -> bool:
+        """Return whether the robot has moved enough for another scan, or there is none after a time, s."""
+        return not self.looks or way - self.looks[-1].way >= _LOOK_EVERY or self.looks[-1].stamp <= after
 
     def add_look(self, look: WindowLook) -> None:
         """Keep a scan."""
