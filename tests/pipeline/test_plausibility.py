@@ -13,7 +13,13 @@ from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.map_result import AnchorEstimate
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import OUTSIDE
-from uwblite.pipeline.plausibility import check_certainty, check_handedness, check_moved_together, outlier_stretches
+from uwblite.pipeline.plausibility import (
+    check_anchors,
+    check_certainty,
+    check_handedness,
+    check_moved_together,
+    outlier_stretches,
+)
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import SensorMounting
 
@@ -104,6 +110,20 @@ def moved_together(places, lidar=False):
     task = SimpleNamespace(recordings=SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0])), stages=stages)
     check_moved_together(anchors, SimpleNamespace(ranges=edges), task)
     return [notice.kind for notice in stages.doubts]
+
+
+@pytest.mark.parametrize(
+    ("shares", "doubted"), [((1.0, 0.4), False), ((0.4, 0.4), False), ((0.5, 0.1), True), ((0.0, 0.0), True), ((), False)]
+)
+def test_a_map_that_most_ranges_contradict_is_doubted(shares, doubted):
+    """The second anchor has twice the ranges of the first."""
+    anchors = [
+        AnchorEstimate("AB"[k], np.zeros(2), np.eye(2), 50 * (k + 1), share, 0.0, 0.1, 0.1, "ok")
+        for k, share in enumerate(shares)
+    ]
+    stages = Stages(None, None)
+    check_anchors(anchors, SimpleNamespace(stages=stages))
+    assert [d.kind for d in stages.doubts] == ["ranges-disagree"] * doubted
 
 
 A, B, C, ELSEWHERE = (0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 20.0)

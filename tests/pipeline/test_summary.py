@@ -14,7 +14,7 @@ from uwblite.map_result import AnchorEstimate, Notice
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.wheels import with_noise_shown
 from uwblite.pipeline.mapping_config import preset
-from uwblite.pipeline.summary import _distrusted
+from uwblite.pipeline.summary import _distrusted, _reason_to_distrust
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -182,3 +182,19 @@ def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():
     assert _distrusted(anchors, [part]) is anchors
     found = _distrusted(anchors, [part, whole])
     assert [(a.status, a.reason) for a in found] == [("distrusted", "the map is doubted"), ("unplaced", "few")]
+
+
+@pytest.mark.parametrize(
+    ("used", "sigma", "longest", "bias", "reason"),
+    [
+        (0.6, 4.0, 5.0, -1.5, ""),
+        (0.4, 0.1, 5.0, 0.0, "only 40% of its ranges agree"),
+        (1.0, 1e17, 5.0, 0.0, "its place is known to 1e+17 m only, and its longest range is 5.0 m"),
+        (1.0, np.nan, 5.0, 0.0, "its place is known to nan m only"),
+        (1.0, 0.1, 5.0, -1.7, "a constant error of -1.7 m"),
+    ],
+)
+def test_an_anchor_is_distrusted_for_a_reason(used, sigma, longest, bias, reason):
+    found = _reason_to_distrust(used, sigma, longest, bias)
+    assert bool(found) == bool(reason)
+    assert reason in found

@@ -75,7 +75,10 @@ share of 0.02 to 0.06, most of it the unit of length."""
 
 
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
-    """Name anchors that are not ok; where none of those in reach has one place alone, their mirror ambiguity is a doubt."""
+    """Name anchors that are not ok, and doubt a map with which most ranges disagree.
+
+    Where no anchor in reach has one place alone, their mirror ambiguity is a doubt, too.
+    """
     unclear = not any(anchor.status == "ok" for anchor in anchors)
     for anchor in anchors:
         if anchor.status != "ok":
@@ -85,6 +88,18 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     if anchors and all(a.status == "unplaced" for a in anchors):
         text = "no anchor could be placed: the trajectory rests on odometry and lidar alone"
         task.stages.doubt("no-anchor", text)
+    count = sum(a.ranges for a in anchors if a.status != "unplaced")
+    agreeing = sum(a.used_share * a.ranges for a in anchors if a.status != "unplaced")
+    if agreeing < _MOST_AGREE * count:
+        text = (
+            f"only {agreeing / count:.0%} of the ranges agree with the map: they are no distances to anchors that stand still, "
+            "or the trajectory is wrong"
+        )
+        task.stages.doubt("ranges-disagree", text, share=agreeing / count)
+
+
+_MOST_AGREE = 0.3
+"""Share of ranges that agree with any map worth the name: where a radio reports every other range as 0, it is 0.4."""
 
 
 def check_moved_together(anchors: Sequence[AnchorEstimate], estimate: Estimate, task: Task) -> None:

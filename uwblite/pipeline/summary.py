@@ -28,6 +28,8 @@ from .recordings import Recordings
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not speak against all anchors."""
+_AGREE = 0.5
+"""Share of an anchor's ranges that must agree with the map."""
 _NO_BIAS = 1.6
 """Constant error of an anchor's ranges, m, twice that of the worst radios: rather its place is what is wrong."""
 _SHOWN = 0.7
@@ -142,15 +144,30 @@ def _anchor(
     if found.ambiguous[k] and len(found.hypotheses[k]) > 1:
         status, alternative = "mirror-ambiguous", found.hypotheses[k][1].position
         reason = "the path past it is too straight: a mirrored place explains its ranges about as well"
-    if used < 0.5:
-        few = f"only {used:.0%} of its ranges agree with the map"
-        status, reason = ("distrusted", few) if status == "ok" else (status, f"{few}; {reason}")
-    elif status == "ok" and abs(bias) > _NO_BIAS:
-        status, reason = "distrusted", f"its ranges fit only with a constant error of {bias:.1f} m, which no radio has"
+    sigma, longest = float(np.sqrt(np.trace(covariance.anchors[k]))), float(ranges.ranges[ranges.anchor == k].max())
+    if doubtful := _reason_to_distrust(used, sigma, longest, bias):
+        status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, spread_about_median(own), status, reason,
         alternative,
     )
+
+
+def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float) -> str:
+    """Return why an anchor is distrusted, '' where it is not.
+
+    Parameters
+    ----------
+    used : share of its ranges that agree with the map. sigma : standard deviation of its place, m. longest : its longest
+        range, m: it stands nearer than that, and a place known worse than so is none. bias : constant error of its ranges, m.
+    """
+    if used < _AGREE:
+        return f"only {used:.0%} of its ranges agree with the map"
+    if not sigma < longest:
+        return f"its place is known to {sigma:.3g} m only, and its longest range is {longest:.1f} m"
+    if abs(bias) > _NO_BIAS:
+        return f"its ranges fit only with a constant error of {bias:.1f} m, which no radio has"
+    return ""
 
 
 def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:
