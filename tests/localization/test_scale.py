@@ -7,6 +7,8 @@ import pytest
 from helpers.localization_room import ANCHORS, ODD, ROUND, cast, grid_of, known, path, robot
 
 from uwblite import se2
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.localization.scale import SCAN_LIMIT, range_scale, scan_scale
 from uwblite.localization.walls import Rays, walls_of
 from uwblite.localization.window import Ranges
@@ -46,6 +48,24 @@ def test_scans_tell_how_much_larger_the_map_is_whatever_the_wheels_count(factor,
     # Half a cell at the mean distance of 3 m, either side.
     assert abs(found.error - (factor - 1.0)) < 0.009
     assert found.off(SCAN_LIMIT) == (abs(factor - 1.0) > 0.04)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_single_wall_fits_every_metre_and_none_is_certain(seed):
+    rng = np.random.default_rng(seed)
+    log_odds = np.full((200, 300), -4.0, dtype=np.float32)
+    log_odds[158:160], log_odds[160:] = 4.0, 0.0
+    walls = walls_of(OccupancyGrid(GridGeometry(0.05, np.zeros(2), 200, 300), log_odds))
+    poses = np.column_stack([np.linspace(4.0, 7.0, 9), np.full(9, 3.3), np.full(9, 0.6)])
+    angles = np.linspace(-0.2, 1.6, 14)
+    ends, origins = [], []
+    for pose in poses:
+        far = (7.9 - pose[1]) / np.sin(angles + pose[2]) + rng.normal(0.0, 0.03, len(angles))
+        there = se2.between(poses[-1], pose)
+        ends.append(se2.transform(there, far[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)))
+        origins.append(np.tile(there[:2], (len(angles), 1)))
+    rays = Rays(np.concatenate(ends), np.concatenate(origins), np.ones(9 * len(angles), dtype=bool))
+    assert not scan_scale(walls, poses[-1] + rng.normal(0.0, [0.03, 0.03, 0.01]), rays, 9).off(SCAN_LIMIT)
 
 
 def ranges_at(poses, factor, moved=0.0):
