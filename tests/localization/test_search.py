@@ -73,6 +73,20 @@ def test_the_best_pose_is_that_of_trying_every_one(room):
     assert abs(off[2]) < 0.06
 
 
+def test_a_search_with_more_pauses_finds_the_same(room, monkeypatch):
+    points = seen_from((1.0, 2.5, 0.4), 30)
+    found = finished(search._by_scans(room, points, 1.0, NO_RANGES))
+    monkeypatch.setattr(search, "_MANY", 0)
+    again = finished(search._by_scans(room, points, 1.0, NO_RANGES))
+    np.testing.assert_array_equal(again.poses, found.poses)
+
+
+def test_the_highest_scores_are_the_first_of_a_stable_sort():
+    scores = np.random.default_rng(1).integers(0, 40, 1000) / 40.0
+    for part in (scores, scores[:64], scores[:5], np.zeros(200)):
+        np.testing.assert_array_equal(search._highest(part), np.argsort(-part, kind="stable")[:64])
+
+
 def ranges_at(pose, anchors, tag):
     """Return exact ranges of a tag (2,) on the base to anchors (m, 2)."""
     there = se2.transform(np.asarray(pose), np.asarray(tag))

@@ -143,11 +143,12 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
     centre = field.origin + (np.stack([cols, rows], axis=1) + 0.5 * top) * field.cell
     rows, cols = (v[_allowed(centre, 0.75 * top * field.cell, ranges)] for v in (rows, cols))
     headings = np.arange(0.0, 2.0 * np.pi - 0.5 * _HEADING, _HEADING)
-    offsets = _offsets(field, points, headings)
-    turn = np.repeat(np.arange(len(headings)), len(rows))
-    nodes = np.column_stack([turn, np.tile(rows, len(headings)), np.tile(cols, len(headings))])
-    if not len(nodes):
+    if not len(rows):
         return Places(np.zeros((0, 3)), False)
+    offsets = _offsets(field, points, headings)
+    yield from _pause(len(headings) * len(rows))
+    nodes = np.stack(np.broadcast_arrays(np.arange(len(headings))[:, None], rows, cols), axis=-1).reshape(-1, 3)
+    yield from _pause(len(nodes))
     complete, least = True, 0.0
     scores = yield from _scored(field, _LEVELS, offsets, nodes)
     for level in range(_LEVELS, 0, -1):
@@ -162,6 +163,7 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
     kept = kept[np.argsort(-scores[kept], kind="stable")]
     poses = np.column_stack([field.origin + (nodes[kept, :0:-1] + 0.5) * field.cell, se2.wrap_angle(headings[nodes[kept, 0]])])
     inside = field.free[nodes[kept, 1], nodes[kept, 2]]
+    yield from _pause(MOST_PLACES * len(kept))
     if not len(ranges):
         return _distinct(poses[inside], complete)
     return (yield from _likeliest(poses[inside], share * scores[kept[inside]], ranges, complete))
@@ -217,13 +219,31 @@ _AT_ONCE = 4096
 
 def _dive(field: Field, level: int, offsets: Ints, nodes: Ints, scores: Floats) -> Generator[None, None, float]:
     """Return the score of a good pose, found by following the best nodes down: a lower bound of the best one's."""
-    best = nodes[np.argsort(-scores, kind="stable")[:64]]
+    best = nodes[_highest(scores)]
+    yield from _pause(len(scores))
     found = np.zeros(0)
     for below in range(level - 1, -1, -1):
         best = _children(best, 2**below)
         found = yield from _scored(field, below, offsets, best)
-        best = best[np.argsort(-found, kind="stable")[:64]]
+        best = best[_highest(found)]
     return float(found.max(initial=0.0))
+
+
+def _pause(count: int) -> Generator[None, None, None]:
+    """Pause after work on so many nodes or poses, if that was a unit of work by itself."""
+    if count > _MANY:
+        yield
+
+
+_MANY = 50_000
+"""Nodes or poses that take 1 ms or more to make, to compare or to sort."""
+
+
+def _highest(scores: Floats, count: int = 64) -> Ints:
+    """Return the indices of the highest scores, the first of equal ones, best first; without sorting them all."""
+    least = np.partition(scores, -count)[-count] if len(scores) > count else -np.inf
+    some = np.flatnonzero(scores >= least)
+    return some[np.argsort(-scores[some], kind="stable")[:count]]
 
 
 def _children(nodes: Ints, half: int) -> Ints:
@@ -291,8 +311,8 @@ def _distinct(poses: Floats, complete: bool) -> Places:
     left = poses
     while len(left) and len(kept) < MOST_PLACES:
         kept = np.concatenate([kept, left[:1]])
-        off = se2.between(left[0], left)
-        left = left[(np.hypot(off[:, 0], off[:, 1]) > _SAME[0]) | (np.abs(off[:, 2]) > _SAME[1])]
+        x, y, turn = (left - left[0]).T
+        left = left[(np.hypot(x, y) > _SAME[0]) | (np.abs(se2.wrap_angle(turn)) > _SAME[1])]
     return Places(kept, complete and not len(left))
 
 
