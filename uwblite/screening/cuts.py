@@ -1,7 +1,8 @@
 """Moments at which the robot is suddenly elsewhere: it was carried, or the log was cut, and no sensor counted the way.
 
 Neighbouring scans differ little. Where one differs from the next by far more than its neighbours do, and no motion
-near the wheels' brings the two together, the robot is somewhere else; so it is where ranges to several anchors jump.
+near the wheels' brings the two together, the robot is somewhere else; so it is where ranges to several anchors jump and
+the scans do not contradict them: along a smooth tunnel every scan matches every other one.
 After a fast turn two scans may show little in common: the surfaces of the one then stand beside or behind what the other
 saw. Of scans from different places, many points stand in the free space of the other.
 """
@@ -10,7 +11,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..lidar.scan_odometry import in_free_space, scan_steps
+from ..lidar.scan_odometry import directional_shares, in_free_space, scan_steps
 from ..sensor_log import SensorLog
 from . import range_motion
 
@@ -26,30 +27,52 @@ _MOST = 40
 """Candidates looked at, the largest first."""
 _SAME_PLACE = 0.55
 """Scans that match by a larger share are of one place."""
+_EVERYWHERE = 0.5
+"""Least share of the points that face the way fewest do by which scans are of one place."""
+_ONE_CUT = 3.0
+"""The moment of a cut by ranges is known to so much, s."""
 _THROUGH = 0.12
 """Share in free space that a true place does not have; people and doors leave less."""
 _MOST_CHANGE = 1.0
 """A reading that differs more counts as so much, m."""
 
 
-def found(log: SensorLog) -> Floats:
-    """Return the times (c,) of cuts, s."""
+def found(log: SensorLog, jumps: Floats) -> Floats:
+    """Return the times (c,) of cuts, s.
+
+    Parameters
+    ----------
+    jumps : (b,) times at which the odometry jumps, s.
+    """
     by_lidar = _by_lidar(log)
-    if log.scans is not None and len(log.scans.stamps) > 20:
-        return by_lidar
-    return np.array(range_motion.cuts(log))
+    by_ranges = [_nearest(jumps, t) for t in range_motion.cuts(log, jumps)]
+    more = [t for t in by_ranges if not same_place(log, t, t) and np.all(np.abs(by_lidar - t) > _ONE_CUT)]
+    return np.sort(np.concatenate([by_lidar, more]))
+
+
+def _nearest(jumps: Floats, time: float) -> float:
+    """Return the jump that is the same moment as a cut by ranges, s; the cut's own time where there is none."""
+    near = jumps[np.abs(jumps - time) < _ONE_CUT]
+    return float(near[np.argmin(np.abs(near - time))]) if len(near) else time
 
 
 def same_place(log: SensorLog, before: float, after: float) -> bool | None:
-    """Return whether the last scan before a time and the first after another show one place; None where there are none."""
+    """Return whether the last scan before a time and the first after another show one place.
+
+    None where there are none, and where nothing would tell it from places along a smooth wall.
+    """
     if log.scans is None or len(log.scans.stamps) < 2:
         return None
     middle = log.scans.middles
     first, second = int(np.searchsorted(middle, before, "right")) - 1, int(np.searchsorted(middle, after))
     if first < 0 or second >= len(middle) or middle[second] - after > 2.0 or before - middle[first] > 2.0:
         return None
-    share = _matched(log, np.array([first]), np.array([second]))[1][0]
-    return bool(share >= _SAME_PLACE) if share > 0.0 else None
+    pair = np.array([first]), np.array([second])
+    motion, share = _matched(log, *pair)
+    if not 0.0 < share[0] < _SAME_PLACE:
+        everywhere = share[0] > 0.0 and directional_shares(log.scans, log.mounting, *pair, motion)[0] >= _EVERYWHERE
+        return True if everywhere else None
+    return False
 
 
 def _by_lidar(log: SensorLog) -> Floats:

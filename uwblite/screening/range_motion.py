@@ -49,19 +49,24 @@ def excess(log: SensorLog, start: float, end: float) -> float:
     return _agreed(found)
 
 
-def cuts(log: SensorLog) -> list[float]:
-    """Return the times, s, at which the ranges to several anchors jump together, and for good, by more than the robot drove."""
-    votes: list[tuple[float, float, float]] = []
-    by_anchor = _by_anchor(log)
+def cuts(log: SensorLog, jumps: Floats) -> list[float]:
+    """Return the times, s, at which the ranges to several anchors jump together, and for good, by more than the robot drove.
+
+    Parameters
+    ----------
+    jumps : (b,) times at which the odometry jumps, s: there one anchor is enough, where no other one is in reach.
+    """
+    spans, by_anchor = [np.zeros((0, 3))], _by_anchor(log)
     for stamps, ranges in by_anchor:
         if len(ranges) < 4 * _LONG:
             continue
         way, margin = _travelled(log, stamps), _MARGIN + _TIMES_NOISE * _noise(ranges)
-        short, long = (_jumps(ranges, way, window) for window in (_WINDOW, _LONG))
-        over = np.minimum(short, long) - margin
-        over[:-1][np.diff(stamps) > _SILENCE * np.median(np.diff(stamps))] = 0.0
-        votes += [(float(stamps[k]), float(stamps[k + 1]), float(over[k])) for k in np.flatnonzero(over > 0.0)]
-    return _together(votes, len(by_anchor))
+        over = np.minimum(*(_jumps(ranges, way, window)[:-1] for window in (_WINDOW, _LONG))) - margin
+        heard = np.isfinite(over) & (np.diff(stamps) <= _SILENCE * np.median(np.diff(stamps)))
+        spans.append(np.column_stack([stamps[:-1], stamps[1:], over])[heard])
+    # Where nothing else would show a cut, neighbouring readings of one anchor count as well.
+    seen = log.scans is not None and len(log.scans.stamps) > 0
+    return _together(spans, jumps, np.inf if seen else max(_LEAST_VOTES, len(by_anchor) // 2))
 
 
 def _jumps(ranges: Floats, way: Floats, window: int) -> Floats:
@@ -74,16 +79,25 @@ def _jumps(ranges: Floats, way: Floats, window: int) -> Floats:
     return found
 
 
-def _together(votes: list[tuple[float, float, float]], anchors: int) -> list[float]:
-    """Return the middles of the times, s, in which enough anchors jump."""
-    if not votes:
-        return []
+def _together(spans: list[Floats], jumps: Floats, readings: float) -> list[float]:
+    """Return the middles of the times, s, in which enough of the anchors in reach jump.
+
+    Parameters
+    ----------
+    spans : of each anchor (n, 3) two neighbouring readings' stamps, s, and by how much they differ beyond what is plausible, m.
+    readings : so many that jump are enough, whatever anchors they are of.
+    """
     found: list[float] = []
-    for start, end, _ in sorted(votes, key=lambda v: -v[2]):
-        same = [v for v in votes if v[0] <= end and v[1] >= start]
-        apart = all(abs(0.5 * (start + end) - t) > 10.0 for t in found)
-        if apart and len(same) >= max(_LEAST_VOTES, anchors // 2):
-            found.append(0.5 * (max(v[0] for v in same) + min(v[1] for v in same)))
+    votes = np.concatenate(spans)
+    votes = votes[votes[:, 2] > 0.0]
+    for start, end in votes[np.argsort(-votes[:, 2], kind="stable"), :2].tolist():
+        during = [own[(own[:, 0] <= end) & (own[:, 1] >= start)] for own in spans]
+        agreeing = [own[own[:, 2] > 0.0] for own in during]
+        same, (anchors, reached) = np.concatenate(agreeing), (sum(len(own) > 0 for own in k) for k in (agreeing, during))
+        least = 1 if np.any((jumps >= start) & (jumps <= end)) else _LEAST_VOTES
+        enough = anchors >= max(least, reached // 2) or len(same) >= readings
+        if enough and all(abs(0.5 * (start + end) - t) > 10.0 for t in found):
+            found.append(0.5 * float(same[:, 0].max() + same[:, 1].min()))
     return sorted(found)
 
 

@@ -65,7 +65,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     log, pairs, turned = _looking_ahead(log)
     log, pairs, lost, standing = _lost_wheels(log, pairs)
     remarks += [*more, *turned, *standing]
-    cut, more = _cuts(log, OdometryBreaks.of_all([gaps, lost]).stamps)
+    cut, more = _cuts(log, jumps.stamps, OdometryBreaks.of_all([gaps, lost]).stamps)
     if pairs is not None:
         more += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]))
     more += _hardly_moving(log.odometry)
@@ -186,13 +186,14 @@ def _unknown_steps(odometry: Odometry, stretches: list[tuple[float, float]]) -> 
     return OdometryBreaks(odometry.stamps[before], sigma)
 
 
-def _cuts(log: SensorLog, others: Floats) -> tuple[OdometryBreaks, list[Remark]]:
-    """Find moments at which the robot is suddenly elsewhere, away from breaks (b,) that are known, s."""
-    times = cuts.found(log)
-    times = times[[not np.any(np.abs(others - t) < _APART) for t in times]] if len(times) else times
+def _cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks, list[Remark]]:
+    """Find moments at which the robot is suddenly elsewhere, away from breaks (b,) that are known, s; jumps may be such."""
+    times = cuts.found(log, jumps)
+    stamps, start = log.odometry.stamps, log.odometry.stamps[0]
+    ends = stamps[np.minimum(np.searchsorted(stamps, others, "right"), len(stamps) - 1)]
+    times = times[~np.any((times[:, None] > others - _APART) & (times[:, None] < ends + _APART), axis=1)]
     if not len(times):
         return OdometryBreaks.none(), []
-    stamps, start = log.odometry.stamps, log.odometry.stamps[0]
     before = stamps[np.clip(np.searchsorted(stamps, times) - 1, 0, len(stamps) - 1)]
     where = ", ".join(f"t = {t - start:.0f} s" for t in times[:4])
     text = (
