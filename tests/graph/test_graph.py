@@ -8,7 +8,7 @@ from helpers.planted_graphs import every_kind
 from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_cost
-from uwblite.graph.pose_edges import RelativePoseEdges
+from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
 
@@ -81,7 +81,7 @@ def test_wheels_that_count_more_than_ten_times_what_they_do_divide_by_a_tenth(sc
     assert_jacobians_equal_differences(graph, edges)
     off = se2.between(edges.corrected(graph), se2.between(graph.poses[edges.i], graph.poses[edges.j]))
     own = off / np.maximum([1.0 + scale, 1.0 + scale, 1.0 + turn], 0.1)
-    np.testing.assert_allclose(edges.residuals(graph), np.einsum("eij,ej->ei", edges.sqrt_information, own), atol=1e-12)
+    np.testing.assert_allclose(edges.residuals(graph), np.einsum("eij,ej->ei", edges.end_sqrt_information, own), atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -113,6 +113,49 @@ def test_calibrated_odometry_stretches_and_turns_the_motion():
     extra = k * turn + b * edges.length[0] + g * edges.duration[0]
     straight = se2.rotate(extra / 2, np.array([x, y]) * (1 + s))
     np.testing.assert_allclose(edges.corrected(graph)[0], [*straight, turn + extra], atol=1e-12)
+
+
+def covariance_of_the_end(motion, sqrt_information):
+    """Return the covariance (3, 3) of the last pose of a chain of steps straight on from the origin, none of which turns."""
+    poses = [np.zeros(3)]
+    for step in motion:
+        poses.append(se2.compose(poses[-1], step))
+    n = len(motion)
+    edges = OdometryEdges(
+        np.arange(n), np.arange(1, n + 1), motion, np.hypot(*motion[:, :2].T), np.ones(n), sqrt_information,
+        np.full((n, 4), -1),
+    )  # fmt: skip
+    jacobian = np.zeros((3 * n, 3 * (n + 1)))
+    for _, index, block in edges.linearize(Graph(np.array(poses))).blocks:
+        for k in range(n):
+            jacobian[3 * k : 3 * k + 3, 3 * index[k] : 3 * index[k] + 3] += block[k]
+    return np.linalg.inv(jacobian[:, 3:].T @ jacobian[:, 3:])[-3:, -3:]
+
+
+@pytest.mark.parametrize("way", [(0.6, 0.0), (0.5, -0.3), (-0.4, 0.2)])
+def test_a_long_step_is_as_uncertain_as_the_short_ones_of_which_it_consists(way):
+    """Straight on: along, in heading and in what ties place to heading; across, short steps know of a bend in between."""
+    n, length, sigma = 8, np.hypot(*way), np.array([0.01, 0.01, 0.02])
+    root = np.diag(1.0 / sigma)
+    short = covariance_of_the_end(np.tile([*way, 0.0], (n, 1)) / n, np.tile(root * np.sqrt(n), (n, 1, 1)))
+    long = covariance_of_the_end(np.array([[*way, 0.0]]), root[None])
+    across = np.array([-way[1], way[0], 0.0]) / length
+    # The sum of the squares of the ways from the short steps' middles to that of the whole.
+    bend = sigma[2] ** 2 * length**2 / 12.0 * (1.0 - 1.0 / n**2)
+    np.testing.assert_allclose(short - bend * np.outer(across, across), long, rtol=1e-9, atol=1e-15)
+    assert across @ long[:, 2] == pytest.approx(0.5 * length * sigma[2] ** 2)
+
+
+def test_the_end_of_a_step_is_displaced_by_half_the_way_times_the_heading_of_the_middle():
+    rng = np.random.default_rng(3)
+    motion, e = np.array([[0.7, -0.2, 1.1]]), 1e-6 * rng.standard_normal(3)
+    half = np.append(se2.rotate(-motion[0, 2], 0.5 * motion[0, :2]), 0.0)
+    root = rng.normal(size=(1, 3, 3))
+    edges = OdometryEdges(
+        np.zeros(1, dtype=int), np.ones(1, dtype=int), motion, np.ones(1), np.ones(1), root, np.full((1, 4), -1)
+    )
+    end = se2.compose(motion[0], se2.between(half, se2.compose(e, half)))
+    np.testing.assert_allclose(edges.residuals(Graph(np.array([np.zeros(3), end])))[0], root[0] @ e, rtol=1e-4, atol=1e-11)
 
 
 def test_scan_poses_follow_the_base_for_the_delay_and_carry_the_mounting():

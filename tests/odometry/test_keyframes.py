@@ -77,12 +77,24 @@ def test_a_robot_that_stands_has_its_first_and_last_sample(samples):
     assert len(frames.motion) == len(frames) - 1
 
 
-def test_velocity_is_the_twist_that_is_driven():
+@pytest.mark.parametrize("window", [(0.0, 0.1), (0.1, 0.3)])
+def test_velocity_is_the_twist_that_is_driven(window):
     stamps, truth = drive([(0.4, 0.1, 0.7)], [5.0])
     wheels = Odometry(stamps, truth)
-    stated = velocity_at(wheels, np.array([0.0, 0.02, 2.5, 5.0]))
-    np.testing.assert_allclose(stated, np.tile([0.4, 0.1, 0.7], (4, 1)), atol=1e-9)
+    stated = velocity_at(wheels, np.array([0.0, 0.02, 0.2, 2.5, 4.9, 5.0]), window)
+    np.testing.assert_allclose(stated, np.tile([0.4, 0.1, 0.7], (6, 1)), atol=1e-9)
     assert np.all(velocity_at(Odometry(stamps[:1], truth[:1]), np.array([0.0])) == 0.0)
+
+
+def test_what_places_a_scan_has_no_part_in_the_velocity_of_its_keyframe():
+    stamps, truth = drive([(0.4, 0.0, 0.7)], [5.0])
+    frames = select(Odometry(stamps, truth), KeyframeConfig())
+    at = frames.stamps[len(frames) // 2]
+    poses = truth.copy()
+    poses[np.abs(stamps - at) < 0.09] += [0.01, -0.01, 0.01]
+    assert np.abs(stamps - at).min() < 0.09
+    shaken = velocity_at(Odometry(stamps, poses), frames.stamps, (0.1, 0.3))[len(frames) // 2]
+    np.testing.assert_allclose(shaken, frames.twist[len(frames) // 2], atol=1e-12)
 
 
 def test_keyframes_are_scans_where_there_are_any():

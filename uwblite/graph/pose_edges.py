@@ -82,6 +82,9 @@ class OdometryEdges(EdgeTable):
     (dx, dy, dtheta) is taken as ``(R(delta / 2) (1 + s) (dx, dy), dtheta + delta)``. The error is divided by 1 + s in
     x and y and by 1 + k in heading: it is the odometry's own, before the correction. Without that, noise alone would
     draw s and k towards smaller motions (errors in variables).
+
+    The error is that of the middle of the step: a heading that errs anywhere along the way displaces the end by half the
+    way times it, in the mean, and what is left across is independent of it.
     """
 
     i: Ints
@@ -93,7 +96,7 @@ class OdometryEdges(EdgeTable):
     duration: Floats
     """(e,) s."""
     sqrt_information: Floats
-    """(e, 3, 3)."""
+    """(e, 3, 3), of the error in the middle of the step."""
     calibration: Ints
     """(e, 4) indices of s, k, b (rad/m), g (rad/s) in the calibration block; -1 = not an unknown (taken as 0)."""
     kernel: Kernel = SQUARED
@@ -108,6 +111,14 @@ class OdometryEdges(EdgeTable):
         s, k, _, _ = np.append(graph.calibration.values, 0.0)[self.calibration].T
         return np.maximum(np.stack([1.0 + s, 1.0 + s, 1.0 + k], axis=1), _LEAST_SCALE)
 
+    @property
+    def end_sqrt_information(self) -> Floats:
+        """(e, 3, 3), of the error of pose j in its own frame."""
+        x, y = 0.5 * se2.rotate(-self.motion[:, 2], self.motion[:, :2]).T
+        root = self.sqrt_information.copy()
+        root[:, :, 2] += y[:, None] * root[:, :, 0] - x[:, None] * root[:, :, 1]
+        return root
+
     def _corrected(self, graph: Graph) -> tuple[Floats, Floats, Floats]:
         padded = np.append(graph.calibration.values, 0.0)
         s, k, b, g = padded[self.calibration].T
@@ -119,14 +130,14 @@ class OdometryEdges(EdgeTable):
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
         d = se2.between(graph.poses[self.i], graph.poses[self.j])
-        return whiten(self.sqrt_information, se2.between(self.corrected(graph), d) / self.own_scale(graph))
+        return whiten(self.end_sqrt_information, se2.between(self.corrected(graph), d) / self.own_scale(graph))
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses and the calibration in use."""
         xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
         z, direction, s = self._corrected(graph)
         stretch = self.own_scale(graph)
-        axes = _map_axes(self.sqrt_information / stretch[:, None, :], xi[2] + z[:, 2])
+        axes = _map_axes(self.end_sqrt_information / stretch[:, None, :], xi[2] + z[:, 2])
         residuals, m = _relative_residuals(axes, z.T, xi, xj)
         by_i, by_j = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, xj)), _by_pose(*axes)
         blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]

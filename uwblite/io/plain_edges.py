@@ -95,7 +95,7 @@ def _between_bases(edges: RelativePoseEdges | OdometryEdges | ScanEdges, graph: 
     if isinstance(edges, RelativePoseEdges):
         return edges.T_i_j, edges.sqrt_information
     if isinstance(edges, OdometryEdges):
-        return edges.corrected(graph), edges.sqrt_information / edges.own_scale(graph)[:, None, :]
+        return edges.corrected(graph), edges.end_sqrt_information / edges.own_scale(graph)[:, None, :]
     # S = X o A, so Z' = A_i Z A_j^-1 and, to first order, e' = A_j e A_j^-1 = M e.
     calibration = np.append(graph.calibration.values, 0.0)
     correction, delay = calibration[edges.calibration[:3]], calibration[edges.calibration[3]]

@@ -104,7 +104,7 @@ def _keyframes(odometry: Odometry, stamps: Floats, index: Ints, breaks: Odometry
     poses = np.where((odometry.stamps[index] == stamps)[:, None], odometry.poses[index], between)
     length, path, turned = (np.diff(way) for way in _travelled(odometry, stamps, index))
     motion, alone = se2.between(poses[:-1], poses[1:]), np.zeros(len(stamps), dtype=bool)
-    twist, slack = velocity_at(odometry, stamps), _slack(stamps, odometry.stamps, breaks)
+    twist, slack = velocity_at(odometry, stamps, _BESIDE_SCANS), _slack(stamps, odometry.stamps, breaks)
     return Keyframes(index, stamps, poses, motion, length, path, turned, np.diff(stamps), twist, slack, alone)
 
 
@@ -201,18 +201,21 @@ def _reached(ways: Floats, here: int, most: float) -> int:
     return min(int(np.searchsorted(way, way[here] + most, "right")) for way in ways) - 1
 
 
-_HALF_WINDOW = 0.1
+_WINDOW = (0.0, 0.1)
 """Time before and after a stamp over which the velocity is a mean, s: two readings of a base at 20 Hz."""
+_BESIDE_SCANS = (0.1, 0.3)
+"""The same at keyframes, s. What lies nearer places the second scan of a cloud: its noise, in the cloud and in the velocity,
+would look like an offset of the lidar's clock."""
 
 
-def velocity_at(odometry: Odometry, stamps: Floats) -> Floats:
+def velocity_at(odometry: Odometry, stamps: Floats, window: tuple[float, float] = _WINDOW) -> Floats:
     """Return the velocity (m, 3) of the base in its own frame at the stamps (m,), m/s, m/s, rad/s."""
-    before = se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps - _HALF_WINDOW)
-    after = se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps + _HALF_WINDOW)
-    start, end = odometry.stamps[0], odometry.stamps[-1]
-    span = np.clip(stamps + _HALF_WINDOW, start, end) - np.clip(stamps - _HALF_WINDOW, start, end)
-    motion = se2.log(se2.between(before, after))
-    return np.where(span[:, None] > 0, motion / np.where(span > 0, span, 1.0)[:, None], 0.0)
+    near, far = window
+    moments = np.clip(stamps + np.array([[-far], [-near], [near], [far]]), odometry.stamps[0], odometry.stamps[-1])
+    poses = [se2.interpolate_trajectory(odometry.stamps, odometry.poses, at) for at in moments]
+    motion = se2.log(se2.between(poses[0], poses[1])) + se2.log(se2.between(poses[2], poses[3]))
+    span = (moments[1] - moments[0] + moments[3] - moments[2])[:, None]
+    return np.where(span > 0, motion / np.where(span > 0, span, 1.0), 0.0)
 
 
 def dense_trajectory(odometry: Odometry, keyframes: Keyframes, poses: Floats, stamps: Floats | None = None) -> Floats:

@@ -72,7 +72,7 @@ def reestimate_wheel_noise(wheels: OdometryEdges, steps: RelativePoseEdges, grap
         return wheels
     own = np.searchsorted(wheels.i, steps.i)
     off = se2.between(steps.T_i_j, wheels.corrected(graph)[own]) / wheels.own_scale(graph)[own]
-    off = np.abs(np.einsum("eij,ej->ei", wheels.sqrt_information[own], off))
+    off = np.abs(np.einsum("eij,ej->ei", wheels.end_sqrt_information[own], off))
     information = np.swapaxes(steps.sqrt_information, 1, 2) @ steps.sqrt_information
     onto = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ information
     seen = np.einsum("eii->ei", onto) > 0.9

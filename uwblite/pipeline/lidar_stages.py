@@ -12,6 +12,7 @@ from .. import se2
 from ..arrays import Ints
 from ..graph.calibration import LASER, RADIO, with_free, with_nonnegative_heights
 from ..graph.graph import Edges, Graph
+from ..graph.marginals import marginals
 from ..graph.robust import SQUARED
 from ..graph.solver import optimize
 from ..lidar import joint_refinement, scan_to_scan, visibility
@@ -41,13 +42,12 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     estimate, steps = _without_contradicted(*_descended(estimate, task), task)
     estimate = _match_neighbours(estimate, steps, task.following(estimate))
     for _ in range(_RETIMINGS):
-        delay = estimate.graph.calibration.get("laser_delay")
-        late = abs(delay - estimate.scans.delay) if estimate.scans is not None else 0.0
-        if late < _CLOCK_TOLERANCE:
+        late = _late(estimate)
+        if late == 0.0:
             break
-        estimate = _at_delay(estimate, delay, task)
+        estimate = _at_delay(estimate, late, task)
         now = task.following(estimate)
-        if late < _SAME_STEPS:
+        if abs(late) < _SAME_STEPS:
             gate = task.config.refinement.later_gate
             estimate = _refined_neighbours(estimate, estimate.graph, gate, now)
         else:
@@ -55,11 +55,22 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
     return estimate
 
 
-def _at_delay(estimate: Estimate, delay: float, task: Task) -> Estimate:
-    """Return the estimate with keyframes and clouds made for a lidar whose clock is late by `delay` s."""
+def _late(estimate: Estimate) -> float:
+    """Return by how much the lidar's clock is later than that with which the clouds were made, s; 0 where noise explains it."""
     assert estimate.scans is not None
-    before = task.following(estimate).recordings
-    estimate = with_keyframes(estimate, before, later(before, delay - estimate.scans.delay))
+    calibration = estimate.graph.calibration
+    late = calibration.get("laser_delay") - estimate.scans.delay
+    if abs(late) < _CLOCK_TOLERANCE:
+        return 0.0
+    sigma = marginals(_with_inflated_ranges(estimate).problem).calibration[calibration.index("laser_delay")]
+    return late if abs(late) > _SIGNIFICANT * sigma else 0.0
+
+
+def _at_delay(estimate: Estimate, late: float, task: Task) -> Estimate:
+    """Return the estimate with keyframes and clouds made for a lidar whose clock is later by `late` s."""
+    assert estimate.scans is not None
+    before, delay = task.following(estimate).recordings, estimate.scans.delay + late
+    estimate = with_keyframes(estimate, before, later(before, late))
     estimate = replace(estimate, scans=scan_clouds.make(task.following(estimate).recordings, task.config, delay))
     task.stages.end("clouds made again", laser_delay=round(delay, 4))
     return estimate
@@ -111,6 +122,8 @@ _CUTS = 4
 """Keyframes added within a step that the clouds contradict, at most."""
 _CLOCK_TOLERANCE = 0.004
 """Offset of the lidar's clock that clouds may have, s: an odometry that is wrong by 0.3 rad/s then costs 0.07 degrees."""
+_SIGNIFICANT = 3.0
+"""Standard deviations from which an offset of the lidar's clock is no noise."""
 _SAME_STEPS = 0.015
 """Offset up to which the steps measured before serve again, s: the robot's velocity hardly changes in that time."""
 _RETIMINGS = 4

@@ -105,7 +105,7 @@ def check_slips(estimate: Estimate, task: Task) -> None:
     if not len(wheels) or not estimate.placed.any():
         return
     whitened = wheels.residuals(graph)
-    off = np.abs(np.einsum("eij,ej->ei", np.linalg.inv(wheels.sqrt_information), whitened))
+    off = np.abs(np.einsum("eij,ej->ei", np.linalg.inv(wheels.end_sqrt_information), whitened))
     far = (np.abs(whitened).max(axis=1) > _JUMP) & (1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK)
     far &= ~np.isin(wheels.i, _measured_by_lidar(graph))
     at = np.flatnonzero(far)
