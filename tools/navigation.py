@@ -217,6 +217,9 @@ class Driver:
             if gap < 0.0:
                 tally.touched += 1
                 return
+        else:
+            print(f"goal {tally.goals} is given up: not reached in {MOST_SECONDS:.0f} s", file=sys.stderr, flush=True)
+            return
         true = se2.transform(self.T_truth_map, goal)
         error = float(np.hypot(*(self.robot.pose[:2] - true)))
         tally.errors.append(error)
