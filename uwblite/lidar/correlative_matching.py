@@ -146,10 +146,11 @@ def _source_image(
 
 def _peaks(scores: Singles, config: CorrelativeConfig) -> Ints:
     """Return indices (c, 3) of local maxima, the best first, none within the separation of a better one."""
-    around = scores
+    around = scores.copy()
     for axis in range(3):
-        low, high = np.roll(around, 1, axis), np.roll(around, -1, axis)
-        around = np.maximum(around, np.maximum(low, high))
+        now, before = np.moveaxis(around, axis, 0), np.moveaxis(around.copy(), axis, 0)
+        np.maximum(now[1:], before[:-1], out=now[1:])
+        np.maximum(now[:-1], before[1:], out=now[:-1])
     best = scores.max(initial=0.0)
     peaks = np.argwhere((scores == around) & (scores >= config.least_share * best) & (scores > 0.0))
     peaks = peaks[np.argsort(-scores[tuple(peaks.T)], kind="stable")]
