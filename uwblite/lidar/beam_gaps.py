@@ -14,6 +14,9 @@ from ..odometry.attached import ScanPoints
 
 _SPACING = 0.1
 """Distance between points, m, that makes lines: a neighbourhood of 0.2 m holds four others."""
+_COARSE = 0.0075
+"""Angle between two beams, rad (0.43 degrees), from which on they are coarse. Finer beams that hit far apart graze a surface;
+what bends it between them nobody has seen, and where they do not graze it they are dense enough."""
 _WIDEST = 0.6
 """Wider gaps stay, m: niches and doors hide in them."""
 _REACH = 15.0
@@ -53,9 +56,11 @@ def _on_one_line(rays: ScanPoints) -> Bools:
     gap = np.hypot(step[:, 0], step[:, 1])
     short = beside & (gap < _WIDEST)
     before, after = (np.roll(short, k) & _continues(step, np.roll(step, k, axis=0)) for k in (1, -1))
+    beam = rays.points - rays.origins
+    reach = np.hypot(beam[:, 0], beam[:, 1])
     with np.errstate(invalid="ignore"):
-        near = np.hypot(*(rays.points - rays.origins).T) < _REACH
-        return np.asarray(short & (gap > _SPACING) & near & (before | after))
+        coarse = np.abs(step[:, 0] * beam[:, 1] - step[:, 1] * beam[:, 0]) > _COARSE * reach * reach
+        return np.asarray(short & (gap > _SPACING) & coarse & (reach < _REACH) & (before | after))
 
 
 def _beside(scan: Ints, ray: Ints) -> Bools:
