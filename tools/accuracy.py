@@ -481,6 +481,11 @@ def solved(graph: Graph, trial: Trial, stamps: np.ndarray) -> float:
     return math.sqrt(float(np.mean(np.sum((laid - truth) ** 2, axis=1))))
 
 
+NAMES = {
+    "simulated": ROWS, "oracle": ORACLE_ROWS, "real": REAL, "benchmark": BENCHMARK, "ablation": ABLATION_RECORDINGS, "raw": RAW,
+}  # fmt: skip
+"""Recordings of each part."""
+
 HEAD = "# Accuracy\n\nLengths in metres. The tables are written by tools; do not edit them.\n"
 
 
@@ -504,6 +509,8 @@ def main(argv: list[str] | None = None) -> int:
         args.out.write_text(HEAD)
     wanted = set(args.parts or PARTS)
     wanted |= {"benchmark"} if "real" in wanted else set()
+    if args.only and (strange := set(args.only.split(",")) - {name for part in wanted for name in NAMES.get(part, ())}):
+        p.error(f"--only: no recording of these parts is called {', '.join(sorted(strange))}")
     for part in (p for p in PARTS if p in wanted):
         text = made_by[part](args)
         if args.print:

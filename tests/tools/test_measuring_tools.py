@@ -137,3 +137,9 @@ def test_tables_report_what_is_not_known():
 def test_what_is_left_out_of_recordings_of_others_has_settings():
     assert set(accuracy.WITHOUT_RADIO) <= set(accuracy.INGREDIENTS)
     assert accuracy.WITHOUT_RADIO[0] == next(iter(accuracy.INGREDIENTS))
+
+
+def test_recordings_that_no_part_has_are_named(capsys):
+    with pytest.raises(SystemExit):
+        accuracy.main(["simulated", "--only", "hall,bungalow", "--print"])
+    assert "bungalow" in capsys.readouterr().err
