@@ -90,7 +90,7 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
         task.stages.doubt("no-anchor", text)
     count = sum(a.ranges for a in anchors if a.status != "unplaced")
     agreeing = sum(a.used_share * a.ranges for a in anchors if a.status != "unplaced")
-    if agreeing < _MOST_AGREE * count:
+    if agreeing < _LEAST_AGREEING * count:
         text = (
             f"only {agreeing / count:.0%} of the ranges agree with the map: they are no distances to anchors that stand still, "
             "or the trajectory is wrong"
@@ -98,8 +98,8 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
         task.stages.doubt("ranges-disagree", text, share=agreeing / count)
 
 
-_MOST_AGREE = 0.3
-"""Share of ranges that agree with any map worth the name: where a radio reports every other range as 0, it is 0.4."""
+_LEAST_AGREEING = 0.3
+"""Least share of ranges that agree with a map that is right: where a radio reports every other range as 0, it is 0.4."""
 
 
 def check_moved_together(anchors: Sequence[AnchorEstimate], estimate: Estimate, task: Task) -> None:
