@@ -64,6 +64,10 @@ class Lines:
     """(n,) rad^2, variance of the normal's angle by the scatter about the line; 0 where there is no line."""
 
 
+_ROUNDING = 1e-12
+"""Share of the scatter of a neighbourhood that differences of sums leave, though there is none."""
+
+
 def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbours: int = 2) -> Lines:
     """Fit a line to the neighbours of every point: principal axes of the 2x2 covariance, in closed form.
 
@@ -93,7 +97,9 @@ def estimate_normals(points: Floats, tree: cKDTree, radius: float, min_neighbour
     b = (np.bincount(i, xy, n) + np.bincount(j, xy, n)) / count - mx * my
     c = (np.bincount(i, dy, n) + np.bincount(j, dy, n)) / count - my * my
     trace, gap = a + c, np.hypot(a - c, 2.0 * b)
-    large, small = 0.5 * (trace + gap), np.maximum(0.5 * (trace - gap), 0.0)
+    large, small = 0.5 * (trace + gap), 0.5 * (trace - gap)
+    # Of points on one line rounding alone remains, which depends on the order of the pairs.
+    small = np.where(small > _ROUNDING * trace, small, 0.0)
     valid = (both >= min_neighbours) & (large > 0.0)
     ratio = np.divide(small, large, out=np.ones(n), where=valid)
     angle = 0.5 * np.arctan2(2.0 * b, a - c)
