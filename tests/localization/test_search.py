@@ -5,7 +5,7 @@ import pytest
 from helpers.localization_room import ODD, cast, grid_of
 
 from uwblite import se2
-from uwblite.localization import search
+from uwblite.localization import likelihood_field, search
 from uwblite.localization.walls import Rays, walls_of
 from uwblite.localization.window import Ranges
 
@@ -15,7 +15,7 @@ NO_RANGES = Ranges(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np
 
 @pytest.fixture(scope="module")
 def room():
-    return search.field_of(walls_of(grid_of(ODD)))
+    return likelihood_field.field_of(walls_of(grid_of(ODD)))
 
 
 def finished(steps):

@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
-from . import hypotheses, range_likelihood, search, verdict
+from . import hypotheses, likelihood_field, range_likelihood, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
 from .sensing import TRACK_RAYS
@@ -63,7 +63,7 @@ class PlaceSearch:
 
     def __init__(self, known: KnownMap) -> None:
         self.walls, self.anchors = known.walls, len(known.anchors.ids)
-        self._field = None if known.walls is None else search.field_of(known.walls)
+        self._field = None if known.walls is None else likelihood_field.field_of(known.walls)
         self._bounds = _bounds(known)
         self._odom = np.zeros(3)
         self._steps: search.Steps | None = None

@@ -15,28 +15,18 @@ from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
+from .likelihood_field import CELL, FARTHEST, LEVELS, Field
 from .range_likelihood import chosen, range_likelihood, refined_by_ranges
-from .walls import Rays, Walls
+from .walls import Rays
 from .window import Ranges
 
-_CELL = 0.1
-"""m; cell of the likelihood field."""
-_LEVELS = 3
-"""Levels above the field; the coarsest has cells of 0.8 m."""
-_SPREAD = 0.15
-"""m; of a point about its wall: the cell, and 0.05 rad at 3 m."""
 _HEADING = 0.05
 """rad; step of the heading."""
 _POINTS = 72
 """Points of the scans that are matched."""
-_FARTHEST = 12.0
-"""m; points farther away are not matched: 0.05 rad is there 0.6 m."""
-_MOST_FIELD = 3_000_000
-"""Cells of the field (one byte, four levels); a larger map gets coarser ones."""
 _MOST_NODES = 60_000
 """Nodes of a level that are followed up; where more are as good, the search is not complete."""
 _RIVAL = 0.75
@@ -48,22 +38,6 @@ MOST_PLACES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Field:
-    """The walls' likelihood, one byte a cell, and its maxima over squares of cells."""
-
-    cell: float
-    """m."""
-    origin: Floats
-    """(2,) lower left corner, m."""
-    levels: tuple[NDArray[np.uint8], ...]
-    """(rows, cols) each; level k holds the maximum over 2^k x 2^k cells to the upper right."""
-    free: Bools
-    """(rows, cols) cells in which a robot may stand."""
-    margin: int
-    """Cells around the map, so that points outside of it find a cell."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Places:
     """Where the robot may be."""
 
@@ -71,31 +45,6 @@ class Places:
     """(c, 3)."""
     complete: bool
     """No place that is as good was left out."""
-
-
-def field_of(walls: Walls) -> Field:
-    """Return the likelihood field of walls."""
-    g = walls.geometry
-    size = np.array([g.cols, g.rows]) * g.resolution
-    cell = max(_CELL, float(np.sqrt((size[0] + 2 * _FARTHEST) * (size[1] + 2 * _FARTHEST) / _MOST_FIELD)))
-    margin = int(np.ceil(_FARTHEST / cell)) + 2 ** (_LEVELS + 1)
-    wide, high = (np.ceil(size / cell).astype(int) + 2 * margin).tolist()
-    origin = g.origin - margin * cell
-    x, y = origin[0] + (np.arange(wide) + 0.5) * cell, origin[1] + (np.arange(high) + 0.5) * cell
-    likelihood, free = np.empty((high, wide), np.uint8), np.empty((high, wide), bool)
-    for row in range(high):
-        distance = np.minimum(walls.distances(x, np.full(wide, y[row])), 10.0)
-        likelihood[row] = np.rint(255.0 * np.exp(-0.5 * np.square(distance / max(_SPREAD, cell))))
-        free[row] = walls.state_at(x, np.full(wide, y[row])) == 0
-    levels = [likelihood]
-    for k in range(_LEVELS):
-        below, reach = levels[-1], 2**k
-        wider = below.copy()
-        wider[:, :-reach] = np.maximum(below[:, :-reach], below[:, reach:])
-        higher = wider.copy()
-        higher[:-reach] = np.maximum(wider[:-reach], wider[reach:])
-        levels.append(higher)
-    return Field(cell, origin, tuple(levels), free, margin)
 
 
 Steps = Generator[None, None, Places]
@@ -129,16 +78,16 @@ def places(field: Field | None, rays: Rays, ranges: Ranges, bounds: tuple[Floats
 
 def _thinned(rays: Rays) -> Floats:
     """Return points (p, 2) on walls, no two in one cell of the field, at most _POINTS of them."""
-    near = rays.hit & (np.hypot(*rays.ends.T) < _FARTHEST)
+    near = rays.hit & (np.hypot(*rays.ends.T) < FARTHEST)
     points = rays.ends[near]
-    _, first = np.unique(np.floor(points / (1.5 * _CELL)).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(np.floor(points / (1.5 * CELL)).astype(np.int64), axis=0, return_index=True)
     chosen = np.sort(first)
     return points[chosen[np.unique(np.linspace(0, len(chosen) - 1, _POINTS).astype(np.int64))]] if len(chosen) else points[:0]
 
 
 def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Steps:
     """Match points (p, 2), of a share of all rays, by branch and bound where the ranges allow it."""
-    top = 2**_LEVELS
+    top = 2**LEVELS
     rows, cols = _coarse_cells(field, top)
     centre = field.origin + (np.stack([cols, rows], axis=1) + 0.5 * top) * field.cell
     rows, cols = (v[_allowed(centre, 0.75 * top * field.cell, ranges)] for v in (rows, cols))
@@ -150,8 +99,8 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
     nodes = np.stack(np.broadcast_arrays(np.arange(len(headings))[:, None], rows, cols), axis=-1).reshape(-1, 3)
     yield from _pause(len(nodes))
     complete, least = True, 0.0
-    scores = yield from _scored(field, _LEVELS, offsets, nodes)
-    for level in range(_LEVELS, 0, -1):
+    scores = yield from _scored(field, LEVELS, offsets, nodes)
+    for level in range(LEVELS, 0, -1):
         least = max(least, _RIVAL * (yield from _dive(field, level, offsets, nodes, scores)))
         kept = np.flatnonzero(scores >= least)
         if len(kept) > _MOST_NODES:
@@ -178,7 +127,7 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
     weight = _PER_SCORE * scores[: len(tried)]
     for start in range(0, len(tried), _RANGED_AT_ONCE):
         part = slice(start, start + _RANGED_AT_ONCE)
-        weight[part] += range_likelihood(tried[part], few, wider=0.5 * _CELL)
+        weight[part] += range_likelihood(tried[part], few, wider=0.5 * CELL)
         yield
     order = np.argsort(-weight, kind="stable")
     order = order[weight[order] >= weight[order[:1]] - _RANGE_RIVAL]
