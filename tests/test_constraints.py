@@ -14,7 +14,7 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import optimize
 from uwblite.io.constraints_file import parse_constraints, read_anchors
-from uwblite.pipeline.constraint_edges import apply, consensus
+from uwblite.pipeline.constraint_edges import _gauge, apply, consensus
 
 IDS = ("A", "B", "C", "D")
 TRUE = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 6.0], [-1.0, 5.0]])
@@ -71,6 +71,15 @@ def test_one_anchor_leaves_the_heading_as_it_was():
     solved, summary = optimize(done.graph)
     assert summary.converged
     np.testing.assert_allclose(solved.anchors, TRUE, atol=1e-6)
+
+
+@pytest.mark.parametrize(("ids", "moved", "fixed"), [("B", 0, True), ("AB", 0, False), ("ABCD", 3, True), ("ABCD", 2, False)])
+def test_the_heading_is_fixed_where_one_anchor_alone_is_given(ids, moved, fixed):
+    """Anchors that were moved since say nothing about it."""
+    edges = _gauge(Constraints(anchors=surveyed(*ids)), first_estimate(), dict.fromkeys(IDS[:moved], 1.0))
+    assert [(e.block, e.index.tolist(), np.flatnonzero(e.sqrt_information[0]).tolist()) for e in edges] == (
+        [("poses", [0], [8])] if fixed else []
+    )
 
 
 def test_solving_keeps_what_was_given_and_the_first_pose_is_free():

@@ -207,3 +207,11 @@ def test_public_pose_graphs_are_certified(name, shared_data):
     certified = certify(graph)
     assert certified.is_global
     assert certified.lower_bound == pytest.approx(graph.chi2(), abs=2e-3)
+
+
+def test_an_edge_that_measures_no_turn_is_as_good_as_any():
+    graph, truth = ring(0)
+    across = relative_edges(truth, np.array([0, 5]), np.array([10, 15]), [0.03, 0.03, 0.03])
+    places = replace(across, sqrt_information=across.sqrt_information * [[1.0], [1.0], [0.0]])
+    certified = certify(optimize(graph.with_edges(places))[0])
+    assert certified.is_global, certified.reason

@@ -9,6 +9,7 @@ from helpers.planted_graphs import loop, random_poses, relative_edges
 from uwblite import se2
 from uwblite.graph.chordal_start import chordal_start
 from uwblite.graph.graph import Graph
+from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.solver import optimize
 
 
@@ -37,3 +38,14 @@ def test_a_chain_and_an_open_pose_have_none():
     graph = loop(0)[0]
     assert chordal_start(replace(graph, edges=graph.edges[:1])) is None
     assert chordal_start(replace(graph, poses=np.append(graph.poses, np.zeros((1, 3)), axis=0))) is None
+
+
+def test_parallel_edges_are_averaged_by_their_information():
+    """Headings, as unit complex numbers, by the information on turns; places by the mean of that on x and y."""
+    T = np.array([[1.0, 2.0, 0.1], [3.0, 1.0, 0.4], [2.0, 5.0, -0.3]])
+    L = np.stack([np.diag(d) for d in ([1.0, 3.0, 2.0], [2.0, 0.5, 1.0], [1.0, 1.0, 3.0])])
+    edges = RelativePoseEdges(np.zeros(3, int), np.ones(3, int), T, L, weights=np.array([1.0, 0.5, 2.0]))
+    start = chordal_start(Graph(np.zeros((2, 3)), edges=(edges,), fixed_poses=np.array([True, False])))
+    turns, places = np.array([4.0, 0.5, 18.0]), np.array([5.0, 0.5 * 2.125, 2.0])
+    np.testing.assert_allclose(start.poses[1, :2], places @ T[:, :2] / places.sum())
+    np.testing.assert_allclose(start.poses[1, 2], np.angle(turns @ np.exp(1j * T[:, 2])))

@@ -5,14 +5,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.planted_graphs import plain_ranges
 from helpers.room_recording import ANCHORS, recording, two_rounds
 
 from uwblite import se2
 from uwblite.constraints import Constraints
+from uwblite.graph.graph import Graph
 from uwblite.mapping import build_map
 from uwblite.pipeline import anchor_moves
 from uwblite.pipeline.anchor_moves import (
     _alike,
+    _moves,
     _of_all,
     _renamed,
     first_with_moves_apart,
@@ -140,3 +143,26 @@ def test_names_that_are_already_so_stay(monkeypatch):
         renamed = with_moves_apart(None, task, [log])
         assert (renamed is None) is stays
         assert stays or names(renamed[0]) == ["A", "B", "A@2", "B", "A@2", "B", "A@2", "B"]
+
+
+def test_moves_are_sought_in_the_level_part_of_usable_ranges(monkeypatch):
+    """The second recording's ranges alone, without those that measure nothing: sqrt(range^2 - height^2) at the tag's places."""
+    asked = {}
+
+    def found(places, level, stamps, *rest):
+        asked[stamps[0]] = places, level
+
+    monkeypatch.setattr(anchor_moves, "find_moves", found)
+    poses = np.array([[9.0, 9.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, np.pi / 2]])
+    edges = plain_ranges(np.array([0, 1, 1, 2, 2]), np.array([1, 0, 1, 0, 1]), np.array([4.0, 5.0, 2.0, np.nan, 1.0]), 0.1)
+    edges = replace(edges, stamps=np.arange(5.0), height=np.array([0.0, 3.0, 0.0, 0.0, 2.0]), tag=np.array([0.5, 0.0]))
+    estimate = SimpleNamespace(ranges=edges, bootstrap=True, graph=Graph(poses), tag_positions=edges.tag_positions)
+    ranges = UwbRanges(np.arange(1.0, 5.0), np.array([0, 1, 0, 1]), np.ones(4), np.ones(4), ("A", "B"))
+    second = SimpleNamespace(rows=slice(1, 3))
+    task = SimpleNamespace(config=MappingConfig())
+    assert _moves(second, SensorLog(four_ranges().odometry, ranges), estimate, task) == {}
+    assert sorted(asked) == [1.0, 2.0]
+    np.testing.assert_allclose(asked[1.0][0], [[0.5, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(asked[2.0][0], [[0.5, 0.0], [1.0, 0.5]], atol=1e-12)
+    np.testing.assert_allclose(asked[1.0][1], [4.0])
+    np.testing.assert_allclose(asked[2.0][1], [2.0, 0.01])

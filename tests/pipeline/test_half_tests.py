@@ -8,11 +8,15 @@ import pytest
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
+from uwblite.constraints import Constraints
+from uwblite.graph.graph import PriorEdges
 from uwblite.mapping import build_map
 from uwblite.pipeline import half_tests
+from uwblite.pipeline.estimate import Task
+from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.se2 import chain as chained
-from uwblite.sensor_log import Odometry
+from uwblite.sensor_log import Odometry, SensorLog, UwbRanges
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +78,26 @@ def test_halves_differ_by_their_limit_and_four_standard_deviations(kind, limit):
         stages = Stages(None, None)
         half_tests._compare(one, other, SimpleNamespace(stages=stages))
         assert [n.kind for n in stages.doubts] == (["halves-disagree"] if doubted else [])
+
+
+@pytest.mark.parametrize(("count", "every"), [(1500, 1), (1501, 2), (3000, 2), (3001, 3)])
+def test_a_half_is_bootstrapped_with_evenly_thinned_ranges(monkeypatch, count, every):
+    """1,500 at most, the first of them and each k-th from then on."""
+    stamps, taken = np.linspace(0.0, 99.0, count), []
+    ranges = UwbRanges(stamps, np.zeros(count, int), np.ones(count), np.ones(count), ("A",))
+    log = SensorLog(Odometry(np.arange(100.0), np.zeros((100, 3))), ranges)
+
+    def gathered(logs, config):
+        taken.append(logs[0].ranges.stamps)
+        raise StopIteration
+
+    monkeypatch.setattr(half_tests, "gather", gathered)
+    with pytest.raises(StopIteration):
+        half_tests._anchors_alone(SimpleNamespace(log=log), -np.inf, np.inf, Task(None, MappingConfig(), Constraints(), None))
+    np.testing.assert_array_equal(taken[0], stamps[::every])
+
+
+def test_a_prior_on_the_unit_of_the_wheels_is_twenty_times_as_wide():
+    priors = PriorEdges("calibration", np.array([2, 0, 1]), np.zeros((3, 1)), np.array([5.0, 6.0, 7.0])[:, None, None])
+    loose = half_tests._loose(priors, 0)
+    np.testing.assert_allclose(loose.sqrt_information[:, 0, 0], [5.0, 0.3, 7.0])

@@ -171,6 +171,12 @@ def test_the_likeliest_unit_of_length_is_the_wrong_one(scale, unit, wide):
     assert found["odometry_scale"] == pytest.approx(expected, rel=1e-12)
 
 
+def test_a_scale_that_no_radio_has_is_no_scale():
+    """Ranges 15 % too long, and nothing else whose unit could be wrong: the radio's scale stays with its sound prior."""
+    graph, edges = solved(1, scale=1.15)
+    assert widths(select_priors(graph, (edges,), CONFIG))["range_scale"] == pytest.approx(CONFIG.range_scale_sound)
+
+
 def test_nothing_free_leaves_the_graph_alone():
     graph, edges = solved(0)
     held = replace(graph, fixed_calibration=np.ones(len(graph.calibration.values), dtype=bool))
