@@ -158,6 +158,15 @@ def test_stamps_of_several_recordings_are_distinguished():
         apply(Constraints(poses=(GivenPose(300.0, (0, 0, 0), recording=2),)), first_estimate(), IDS, ALL, clock)
 
 
+def test_a_stamp_outside_the_only_recording_is_said_to_be_outside_the_recording():
+    """A second before the first pose and after the last one are taken for the ends."""
+    for stamp in (STAMPS[0] - 1.0, STAMPS[-1] + 1.0):
+        assert CLOCK.nearest(float(stamp), 1) in (0, 39)
+    for stamp in (STAMPS[0] - 1.1, STAMPS[-1] + 1.1):
+        with pytest.raises(ConfigError, match=r"lies outside the recording \(100 to 119.5 s\)"):
+            CLOCK.nearest(float(stamp), 1)
+
+
 def test_of_a_moved_anchor_the_last_place_counts(tmp_path):
     file = tmp_path / "anchors.csv"
     file.write_text("id,x,y,sigma_x,sigma_y,status\nA,1,2,0.1,0.1,ok\nA#2,5,6,0.1,0.1,ok\nB#7,3,4,0.1,0.1,ok\n")

@@ -352,6 +352,7 @@ def test_the_map_does_not_depend_on_the_executor(pool):
     alone = from_scans(poses, scans, last=poses + 0.01, progress=lambda done, total: steps.append((done, total)))
     assert steps[-1][0] == steps[-1][1]
     total = steps.pop()[1]
+    assert total == 2 * alone.scans_used
     steps.clear()
     with pool(2) as executor:
         split = from_scans(

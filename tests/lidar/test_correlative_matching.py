@@ -58,6 +58,25 @@ def test_scores_equal_brute_force():
                 assert scores[k, i, j] == pytest.approx(each.sum() / len(source.points), abs=1e-5)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_points_count_that_only_a_far_shift_brings_onto_a_long_field(axis):
+    """Of a wall along either axis half is seen, and the guess is off by most of the other half: the scores are a loop's."""
+    rng, along = np.random.default_rng(3), np.eye(2)[axis]
+    walls = np.array([[*(-4.0 * along), *(4.0 * along)]])
+    target, source = pair(walls, np.zeros(3), rng, np.array([0.3, 0.3]), spacing=0.2)
+    config = CorrelativeConfig(resolution=0.1, angle_step=0.05, spread=0.1)
+    guess = np.array([*(3.7 * along), 0.0])
+    scores, headings, shift_x, shift_y = score_grid(target, source, guess, (1.5, 1.5, 0.0), config)
+    field, origin = _field(target, config)
+    cells = np.floor((se2.transform([*guess[:2], headings[0]], source.points) - origin) / config.resolution).astype(int)
+    for i, dy in enumerate(shift_y):
+        for j, dx in enumerate(shift_x):
+            column, row = (cells + np.array([dx, dy])).T
+            inside = (row >= 0) & (row < field.shape[0]) & (column >= 0) & (column < field.shape[1])
+            value = field[row[inside], column[inside]] * (source.normals[inside] @ [1.0, -1.0j])
+            assert scores[0, i, j] == pytest.approx(value.real.sum() / len(source.points), abs=1e-5)
+
+
 def test_the_field_is_the_likelihood_of_the_nearest_point():
     rng = np.random.default_rng(1)
     config = CorrelativeConfig(resolution=0.05, spread=0.1)

@@ -142,6 +142,16 @@ def test_turns_are_compared_between_too_small_to_see_and_too_large_to_overlap(sp
     assert len(first) <= 2 * 50
 
 
+@pytest.mark.parametrize(("gap", "across"), [(1.9, True), (2.6, False)])
+def test_scans_before_and_after_a_gap_of_seconds_are_no_pair(gap, across):
+    """A pair is five scans of a tenth of a second apart, or, over the gap, as much longer."""
+    stamps, truth = drive([(0.0, 0.0, 0.2)], [20.0])
+    seen = np.concatenate([np.arange(0.0, 9.0, 0.1), np.arange(9.0 - 0.5 + gap, 19.0, 0.1)])
+    lidar = LaserScans(seen, np.ones((len(seen), 100), dtype=np.float32), -1.0, 0.02, 0.0, 0.1, 5.0)
+    first, second = _turning_pairs(recording(odometry(stamps, truth), None, lidar), lidar, 1000)
+    assert np.any(seen[second] - seen[first] > 1.0) == across
+
+
 def test_pairs_of_turns_on_the_spot_come_first_and_where_there_are_few_those_that_drive_least():
     """On the spot for 5 s, then in an arc, whose 0.5 m in half a second are more than 0.15 m + 0.3 times the turn."""
     stamps, truth = drive([(0.0, 0.0, 0.4), (1.0, 0.0, 0.4)], [5.0, 5.0])

@@ -6,6 +6,7 @@ from helpers import registration_worlds as worlds
 from helpers.laser_walks import ROOM, scanned
 
 from uwblite import se2
+from uwblite.lidar import pair_alignment
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined, make_cloud
 from uwblite.lidar.pair_alignment import align_pairs
@@ -45,6 +46,17 @@ def test_no_step_is_longer_than_allowed(world):
     ratio = np.maximum(np.hypot(taken[:, 0], taken[:, 1]) / 0.3, np.abs(taken[:, 2]) / 0.15)
     np.testing.assert_allclose(ratio[long], 1.0)
     np.testing.assert_allclose(np.cross(taken, step), 0.0, atol=1e-9)
+
+
+def test_a_step_that_turns_too_far_is_shortened_as_a_whole(world, monkeypatch):
+    """By 0.6 rad, four times what is allowed; by half of what is allowed; 0.6 m and 0.3 rad, both twice as far."""
+    clouds, raster, points, exact = world
+    steps = np.array([[0.04, 0.0, -0.6], [0.1, 0.0, 0.075], [0.0, 0.6, 0.3]])
+    monkeypatch.setattr(pair_alignment, "nondegenerate_step", lambda factors: (steps, None))
+    found = align_pairs(clouds, raster, I, J, exact, points, 0.8, 0.8, iterations=1)
+    taken = se2.wrap_angle(found.pose[:, 2] - exact[:, 2])
+    np.testing.assert_allclose(taken, [-0.15, 0.075, 0.15])
+    np.testing.assert_allclose((found.pose - exact)[:, :2], [[0.01, 0.0], [0.1, 0.0], [0.0, 0.3]], atol=1e-12)
 
 
 def test_pairs_go_on_at_the_last_gate_until_none_moves(world):

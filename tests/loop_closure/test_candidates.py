@@ -1,10 +1,14 @@
 """Which pairs of sub-maps are tried: the best partners of each."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.loop_closure.candidates import _best_per_submap
+from uwblite.loop_closure.candidates import Candidates, _best_per_submap, _near, missed, uncertain
+from uwblite.loop_closure.closures import LoopClosureConfig
 
 
 @given(st.integers(0, 10_000), st.integers(1, 4))
@@ -20,3 +24,41 @@ def test_every_submap_keeps_its_best_partners(seed, limit):
             own = np.flatnonzero(one == submap)
             kept |= set(own[np.argsort(-worth[own])][:limit].tolist())
     assert _best_per_submap(a, b, worth, limit).tolist() == sorted(k for k in kept if worth[k] > 0.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pairs_that_may_be_tried_are_those_of_a_loop(seed):
+    """Near enough to be matched or searched for, and no neighbours in time of one recording."""
+    rng, config = np.random.default_rng(seed), LoopClosureConfig()
+    poses = rng.uniform(-15.0, 15.0, (30, 3))
+    recording = np.sort(rng.integers(0, 3, 30))
+    expected = []
+    for a in range(30):
+        for b in range(a + 1, 30):
+            apart = np.hypot(*(poses[a, :2] - poses[b, :2]))
+            if apart < config.reach + config.search_limit and (b - a > 1 or recording[a] != recording[b]):
+                expected.append((a, b, pytest.approx(apart)))
+    assert list(zip(*(part.tolist() for part in _near(poses, recording, config)), strict=True)) == expected
+
+
+@pytest.mark.parametrize(("sigma", "found"), [(1.0 / 3.0 + 1e-6, True), (1.0 / 3.0 - 1e-6, False)])
+def test_places_are_uncertain_from_three_sigma_in_the_worst_direction(sigma, found):
+    """Of places alone, not headings, and of pairs alone that may be tried."""
+    axes = np.array([[0.6, -0.8], [0.8, 0.6]])
+    covariance = np.diag([0.0, 0.0, 9.0])
+    covariance[:2, :2] = axes @ np.diag([sigma**2, 1e-4]) @ axes.T
+    joint = SimpleNamespace(relative=lambda i, j: np.tile(covariance, (len(i), 1, 1)))
+    poses = np.column_stack([[0.0, 1.0, 0.5, 900.0], np.zeros(4), np.zeros(4)])
+    graph, recording = SimpleNamespace(poses=poses), np.zeros(4, dtype=np.int64)
+    assert uncertain(graph, joint, np.array([0, 1, 2]), recording, LoopClosureConfig(), 1.0) is found
+    assert uncertain(graph, joint, np.array([0, 3]), recording, LoopClosureConfig(), 1.0) is False
+
+
+def test_missed_are_pairs_of_the_graph_s_own_guess_that_share_too_little():
+    config = LoopClosureConfig()
+    spread = np.array([config.direct, config.direct, 1.01 * config.direct])
+    ends, none = np.array([3, 4, 5]), np.zeros((3, 3, 3))
+    candidates = Candidates(ends, ends + 10, np.zeros((3, 3)), none, spread, np.zeros(6, dtype=bool))
+    overlap = (config.overlap, config.overlap - 0.01, 0.0)
+    closures = SimpleNamespace(candidates=tuple(SimpleNamespace(overlap=share) for share in overlap))
+    assert missed(candidates, closures, config) == {(4, 14)}

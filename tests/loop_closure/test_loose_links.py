@@ -156,6 +156,14 @@ def test_a_link_is_untied_until_scan_edges_of_another_visit_join_its_sides(walk,
     assert untied_links(wheels, graph, blind).tolist() == []
 
 
+@pytest.mark.parametrize(("link", "untied"), [(4, False), (5, True)])
+def test_a_side_of_fewer_than_six_keyframes_is_no_part_of_a_map(walk, link, untied):
+    truth, _, clouds = walk
+    graph, wheels = broken(truth, np.zeros(3), link)
+    assert clouds.counts[: link + 2].min() >= _LEAST_POINTS
+    assert untied_links(wheels, graph, clouds).tolist() == ([link] if untied else [])
+
+
 def test_pieces_end_at_the_next_link(walk):
     """Of links behind keyframes 10 and 14: six keyframes before and behind each, as far as no other link lies between."""
     _, _, clouds = walk

@@ -99,3 +99,9 @@ def test_turns_that_slip_each_by_another_amount_are_no_change_of_the_scale():
         one = found(slip, seed=seed, same_way=40)
         assert not one.varies
         assert abs(one.value) < 4.0 * one.sigma
+
+
+def test_noise_of_single_steps_is_not_taken_for_errors_that_last_a_turn():
+    """However long the turns are, the standard deviation is that of single steps: 0.2 up to the scatter of a correlation."""
+    sigma = {n: np.median([found(0.3, seed=seed, same_way=n).sigma for seed in range(9)]) for n in (1, 8)}
+    assert sigma[8] == pytest.approx(sigma[1], rel=0.3)

@@ -2,11 +2,18 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from helpers.room_recording import recording, two_rounds
 
+from uwblite import se2
+from uwblite.graph.calibration import CalibrationConfig, block, unknowns
+from uwblite.graph.graph import Graph
 from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.keyframes import KeyframeConfig
+from uwblite.pipeline.final_stages import _sweeps
+from uwblite.pipeline.recordings import gather
 
 
 @pytest.fixture(scope="module")
@@ -23,3 +30,20 @@ def test_a_map_larger_than_allowed_is_drawn_coarser_and_reported(room, most, kin
     edge = result.grid.geometry.resolution
     assert notice.figures == {"resolution": edge, "asked": 0.05}
     assert f"cells of {edge:g} m instead of 0.05 m" in notice.text
+
+
+def test_sweeps_begin_and_end_where_the_laser_was_by_its_corrected_mounting_and_clock(room):
+    """At the first ray and at the last one, ray count less one increments later, each by the delay after its stamp."""
+    scans = replace(room.scans, time_increment=0.001)
+    calibration = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
+    values = calibration.values.copy()
+    correction = {"laser_x": 0.1, "laser_y": -0.05, "laser_theta": 0.2, "laser_delay": 0.03}
+    for name, value in correction.items():
+        values[calibration.index(name)] = value
+    (one,) = gather([replace(room, scans=scans)], KeyframeConfig()).each
+    graph = Graph(one.frames.odometry, calibration=replace(calibration, values=values))
+    sweeps = _sweeps(one, graph)
+    mount = se2.compose(np.array([0.1, -0.05, 0.2]), room.mounting.T_base_laser)
+    for found, later in ((sweeps.first, 0.03), (sweeps.last, 0.03 + 0.001 * (scans.ranges.shape[1] - 1))):
+        base = one.dense_trajectory(graph.poses, scans.stamps + later)
+        np.testing.assert_allclose(found, se2.compose(base, mount), atol=1e-12)

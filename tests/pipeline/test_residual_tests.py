@@ -11,10 +11,16 @@ from helpers.room_recording import recording, two_rounds
 from uwblite import se2
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
-from uwblite.graph.pose_edges import ScanEdges
+from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.mapping import build_map
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.residual_tests import check_odometry_jumps, check_odometry_steps, check_slips
+from uwblite.pipeline.residual_tests import (
+    check_odometry_jumps,
+    check_odometry_steps,
+    check_scales,
+    check_slips,
+    check_support,
+)
 
 
 @pytest.fixture(scope="module")
@@ -141,3 +147,49 @@ def test_a_single_step_far_off_is_named_unless_the_lidar_measures_it(way, kind, 
     said = [("doubt", n) for n in stages.doubts] + [("warning", n) for n in stages.warnings]
     assert [rank for rank, _ in said] == ([] if lidar or kind is None else [kind])
     assert all(n.figures["way"] == pytest.approx(way, abs=0.05) for _, n in said)
+    assert all(abs(n.figures["turn"]) < 1e-9 for _, n in said)
+
+
+def test_a_slip_is_the_longest_way_and_turn_of_all_steps_that_slipped():
+    truth = np.column_stack([np.arange(40) * 0.3, np.zeros(40), np.zeros(40)])
+    wheels = chained(truth, np.array([0.01, 0.01, 0.01]))
+    wheels.motion[10] += [0.0, 0.3, 0.1]
+    wheels.motion[20] += [0.4, 0.3, 0.05]
+    stages = Stages(None, None)
+    check_slips(
+        SimpleNamespace(odometry=wheels, graph=Graph(truth), placed=np.array([True])),
+        SimpleNamespace(recordings=SimpleNamespace(stamps=100.0 + np.arange(40.0)), stages=stages),
+    )
+    (notice,) = stages.doubts + stages.warnings
+    assert notice.figures["way"] == pytest.approx(0.5, abs=0.01)
+    assert notice.figures["turn"] == pytest.approx(0.1, abs=0.001)
+    assert "at t = 10, 20 s" in notice.text
+
+
+@pytest.mark.parametrize(("ratios", "said"), [
+    ((), None), ((np.nan, 1.0), None), ((1.0, 1.16), 1.16), ((0.84, 2.0), 0.84), ((1.14, 0.86), None),
+])  # fmt: skip
+def test_a_lidar_whose_ways_differ_by_more_than_15_percent_from_the_wheels_is_named(ratios, said):
+    """By the first such recording; recordings that compare nothing do not count."""
+    each = [SimpleNamespace(log=SimpleNamespace(screening=SimpleNamespace(lidar_by_wheels=r))) for r in ratios]
+    each.append(SimpleNamespace(log=SimpleNamespace(screening=None)))
+    stages = Stages(None, None)
+    check_scales(
+        SimpleNamespace(graph=Graph(np.zeros((3, 3))), placed=np.zeros(0, dtype=bool)),
+        SimpleNamespace(recordings=SimpleNamespace(each=each, have_scans=True), stages=stages),
+    )
+    assert [n.figures["lidar_by_wheels"] for n in stages.doubts] == ([] if said is None else [said])
+
+
+@pytest.mark.parametrize(("poses", "edges", "alive", "doubted"), [
+    (3, (), None, True), (2, (), None, False), (3, (), False, True), (3, (), True, False), (3, ("ties",), None, False),
+])  # fmt: skip
+def test_a_trajectory_that_only_the_odometry_counts_is_a_doubt(poses, edges, alive, doubted):
+    """From three poses on, unless a range that counts, a scan or a closure says more."""
+    none = np.zeros((0, 3))
+    ties = RelativePoseEdges(np.zeros(0, int), np.zeros(0, int), none, np.zeros((0, 3, 3)))
+    stages = Stages(None, None)
+    ranges = None if alive is None else SimpleNamespace(alive=np.array([False, alive]))
+    graph = Graph(np.zeros((poses, 3)), edges=(ties,) * len(edges))
+    check_support(SimpleNamespace(ranges=ranges, graph=graph), SimpleNamespace(stages=stages))
+    assert [n.kind for n in stages.doubts] == (["odometry-alone"] if doubted else [])

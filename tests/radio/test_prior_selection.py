@@ -13,6 +13,7 @@ from uwblite.graph.solver import optimize
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
+from uwblite.radio import prior_selection
 from uwblite.radio.prior_selection import _mean_under, log_marginal_likelihood, select_priors
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
@@ -175,6 +176,13 @@ def test_a_scale_that_no_radio_has_is_no_scale():
     """Ranges 15 % too long, and nothing else whose unit could be wrong: the radio's scale stays with its sound prior."""
     graph, edges = solved(1, scale=1.15)
     assert widths(select_priors(graph, (edges,), CONFIG))["range_scale"] == pytest.approx(CONFIG.range_scale_sound)
+
+
+def test_where_no_width_is_possible_the_graph_is_left_alone(monkeypatch):
+    """Rounding may leave a posterior that is no normal distribution under any of the widths."""
+    graph, edges = solved(1)
+    monkeypatch.setattr(prior_selection, "log_marginal_likelihood", lambda *args: -np.inf)
+    assert select_priors(graph, (edges,), CONFIG) is graph
 
 
 def test_nothing_free_leaves_the_graph_alone():

@@ -20,7 +20,7 @@ from ..lidar.point_cloud import make_tree
 from ..lidar.point_to_point import IcpConfig, Registration, align
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
-from .closures import Closures, LoopClosureConfig, no_closures
+from .closures import Closures, LoopClosureConfig
 from .parallel import in_order
 
 _CELL = 0.5
@@ -45,8 +45,6 @@ def find(
     executor : any concurrent.futures executor; the result does not depend on it.
     """
     target, source = candidates(graph.poses, submaps, recording, config.partners)
-    if not len(target):
-        return no_closures()
     i, j = submaps.reference[target], submaps.reference[source]
     guess = se2.between(graph.poses[i], graph.poses[j])
     results: list[Registration] = []
