@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblite.arrays import MAD_TO_SIGMA, sigma_of_median, spread, spread_about_median
+from uwblite.arrays import MAD_TO_SIGMA, renumbered, rms_length, runs_of, sigma_of_median, spread, spread_about_median
 
 
 def test_the_factor_is_that_of_normal_errors():
@@ -30,3 +30,19 @@ def test_the_median_of_many_samples_scatters_as_stated():
     samples = np.random.default_rng(2).normal(3.0, 0.5, (2000, 101))
     medians = np.median(samples, axis=1)
     assert np.mean([sigma_of_median(row) for row in samples]) == pytest.approx(medians.std(), rel=0.06)
+
+
+def test_lengths_of_vectors_not_of_their_parts_are_averaged():
+    assert rms_length(np.array([[3.0, 4.0], [0.0, 0.0], [0.0, 5.0]])) == pytest.approx(np.sqrt(50.0 / 3.0))
+
+
+def test_renumbered_values_are_those_of_either_array_once():
+    used, one, other = renumbered(np.array([7, 3, 7]), np.array([9, 3, 3]))
+    assert used.tolist() == [3, 7, 9]
+    assert (used[one].tolist(), used[other].tolist()) == ([7, 3, 7], [9, 3, 3])
+    assert [a.size for a in renumbered(np.zeros(0, int), np.zeros(0, int))] == [0, 0, 0]
+
+
+def test_runs_are_those_of_set_flags():
+    assert runs_of(np.array([True, False, True, True])) == [(0, 1), (2, 4)]
+    assert runs_of(np.zeros(3, dtype=bool)) == runs_of(np.zeros(0, dtype=bool)) == []

@@ -13,6 +13,18 @@ _SIGMA_OF_MEDIAN = 1.2533
 """Standard deviation of a median of normal values / that of their mean: sqrt(pi / 2)."""
 
 
+def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return the values that stand in either of two arrays (e,), (e,), ascending, and where among them those of both stand."""
+    used, number = np.unique(np.concatenate([one, other]), return_inverse=True)
+    where = number.reshape(-1).astype(np.int64)
+    return used, where[: len(one)], where[len(one) :]
+
+
+def rms_length(vectors: Floats) -> float:
+    """Return the root mean square length of vectors (n, d)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
 def runs_of(flags: Bools) -> list[tuple[int, int]]:
     """Return first and one past the last of each run of set flags (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int64)))

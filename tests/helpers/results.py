@@ -8,7 +8,8 @@ from uwblite import se2
 from uwblite.graph.graph import Graph, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
-from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.map_result import AnchorEstimate, CalibrationEstimate, LoopClosure, MapResult, Notice, StageSummary
 from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 

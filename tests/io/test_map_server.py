@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwblite.errors import FormatError
-from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridGeometry, OccupancyGrid
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png, encode_png
 from uwblite.io.tum import write_tum

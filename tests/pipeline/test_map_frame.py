@@ -11,7 +11,8 @@ from uwblite import se2
 from uwblite.errors import ConfigError, DataError
 from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
-from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.pipeline.map_frame import ALIGNMENTS, alignment, cropped, moved, wall_direction
 
 RNG = np.random.default_rng(2)

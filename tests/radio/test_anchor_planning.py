@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from uwblite.errors import ConfigError
-from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.radio.anchor_planning import (
     SIGMA_BEHIND_WALLS,
     SIGMA_LINE_OF_SIGHT,

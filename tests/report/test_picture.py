@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uwblite.grid.occupancy_grid import GridGeometry, OccupancyGrid
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.io.png import decode_png, encode_png
 from uwblite.report.bitmap_font import HEIGHT, WIDTH, text_mask
 from uwblite.report.canvas import Canvas

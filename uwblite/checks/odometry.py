@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Floats
 from ..screening.units import heading_agreement
 from ..sensor_log import Odometry
@@ -17,7 +16,7 @@ STRAIGHT = 0.02
 def check_odometry(odometry: Odometry, found: Findings) -> dict[str, Any]:
     """Check the wheels and return their figures."""
     figures: dict[str, Any] = timing(odometry.stamps, "odometry", found, expected_gap=0.5)
-    steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
+    steps = odometry.steps
     length = np.hypot(steps[:, 0], steps[:, 1])
     span = np.diff(odometry.stamps)
     moving = (length > 1e-6) & (span > 0)

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Floats, spread
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.units import LONGEST
@@ -25,7 +24,7 @@ def check_ranges(log: SensorLog, found: Findings) -> dict[str, Any]:
     if len(positive) > FEW and np.quantile(positive, 0.95) < 0.1:
         found.warning("radio", f"95 % of the ranges are below {np.quantile(positive, 0.95):.3f} m", "check the unit: metres")
     travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
-    where = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, ranges.stamps)[:, :2]
+    where = log.odometry.at(ranges.stamps)[:, :2]
     figures["anchors"] = {}
     for index, anchor_id in enumerate(ranges.anchor_ids):
         mine = ranges.anchor == index

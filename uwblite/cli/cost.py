@@ -80,7 +80,7 @@ def seen_size(log: "SensorLog") -> "Floats":
     points = [log.odometry.poses[:, :2]]
     if log.scans is not None:
         scans = log.scans.rows(slice(None, None, -(-len(log.scans.stamps) // _SCANS_LOOKED_AT) or 1))
-        bases = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps)
+        bases = log.odometry.at(scans.stamps)
         lasers = se2.compose(bases, log.mounting.T_base_laser)
         hit = (scans.ranges >= scans.range_min) & (scans.ranges <= scans.range_max)
         rows, beams = np.nonzero(hit)

@@ -31,8 +31,6 @@ from .geometry import GridGeometry, central_box
 from .ray_counter import WEIGHT_UNIT, Counts, RayCounter
 from .scan_rays import ScanRays, empty_reach, extent, moved_scans, scan_rays, seen_reach
 
-__all__ = ["GridConfig", "GridGeometry", "OccupancyGrid", "RayCounter", "Sweeps", "from_counts", "from_sweeps"]
-
 Progress = Callable[[int, int], None]
 """Called as progress(scans done, scans in all)."""
 
@@ -119,7 +117,7 @@ class OccupancyGrid:
         return self.geometry.centre_of(row.astype(np.int64), col.astype(np.int64))
 
 
-def from_counts(counter: RayCounter, config: GridConfig, scans_used: int = 0) -> OccupancyGrid:
+def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
     """Return the map that counted hits and misses make: additive log-odds, clamped."""
     per_hit = np.float32(math.log(config.p_hit / (1.0 - config.p_hit)))
     per_miss = np.float32(math.log(config.p_miss / (1.0 - config.p_miss)) / WEIGHT_UNIT)
@@ -128,7 +126,7 @@ def from_counts(counter: RayCounter, config: GridConfig, scans_used: int = 0) ->
     for rows in counter.geometry.strips():
         part = counter.hits[rows] * per_hit + counter.misses[rows] * per_miss
         log_odds[rows] = np.clip(part, -config.clamp, config.clamp)
-    return OccupancyGrid(counter.geometry, log_odds, scans_used)
+    return OccupancyGrid(counter.geometry, log_odds)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,7 +197,8 @@ def from_sweeps(
     trace(None, 0)
     if clears:
         trace(walls_of(from_counts(counter, config)), count)
-    return replace(from_counts(counter if geometry else counter.cropped(), config, count), scans_astray=astray)
+    drawn = from_counts(counter if geometry else counter.cropped(), config)
+    return replace(drawn, scans_used=count, scans_astray=astray)
 
 
 def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":

@@ -92,7 +92,7 @@ def scan_lines(log: SensorLog) -> Iterator[bytes]:
     scans = log.scans
     if scans is None:
         return
-    robot = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps)
+    robot = log.odometry.at(scans.stamps)
     robot = np.round(robot, 6)
     laser = se2.compose(robot, log.mounting.T_base_laser)
     beams = scans.ranges.shape[1]

@@ -161,12 +161,17 @@ def _one(points: Floats, normals: Floats, variance: Floats) -> Clouds:
 
 def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:
     """Return owner, mean point and mean origin of each cell of each keyframe."""
-    cell = np.floor(rays.points / size).astype(np.int64)
-    cell -= cell.min(axis=0, initial=0)
-    wide, high = cell.max(axis=0, initial=0) + 1
-    key = (rays.keyframe * wide + cell[:, 0]) * high + cell[:, 1]
+    key = cell_number(rays.keyframe, rays.points, size)
     one, mean = mean_by_key(key, np.concatenate([rays.points, rays.origins], axis=1))
     return rays.keyframe[one], mean[:, :2], mean[:, 2:]
+
+
+def cell_number(owner: Ints, points: Floats, size: float) -> Ints:
+    """Return a number (p,) that points (p, 2) have in common which have one owner (p,) and lie in one square."""
+    cell = np.floor(points / size).astype(np.int64)
+    cell -= cell.min(axis=0, initial=0)
+    wide, high = cell.max(axis=0, initial=0) + 1
+    return (owner * wide + cell[:, 0]) * high + cell[:, 1]
 
 
 def mean_by_key(key: Ints, values: Floats) -> tuple[Ints, Floats]:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, rms_length
 from ..config import setting
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph, linearize
@@ -216,7 +216,7 @@ def refine(
         solved, summary = minimise(problem, linearize(problem), normal, brief)
         graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
         before, T_i_j = T_i_j, probe.relative(graph)
-        moved = float(np.sqrt(np.mean(np.sum((T_i_j - before)[used, :2] ** 2, axis=1)))) if used.any() else 0.0
+        moved = rms_length((T_i_j - before)[used, :2]) if used.any() else 0.0
         rounds += 1
         if on_round is not None:
             on_round(rounds, config.rounds)

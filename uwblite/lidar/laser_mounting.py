@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, sigma_of_median
+from ..arrays import Floats, Ints, renumbered, sigma_of_median
 from ..sensor_log import LaserScans, SensorLog
 
 PAIRS = 1000
@@ -132,8 +132,7 @@ def _turning_pairs(log: SensorLog, scans: LaserScans, pairs: int) -> tuple[Ints,
     first = np.arange(len(scans.stamps) - step)
     second = first + step
     near = scans.stamps[second] - scans.stamps[first] < 2.0
-    start, end = (se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps[k]) for k in (first, second))
-    motion = se2.between(start, end)
+    motion = log.odometry.motion(scans.stamps[first], scans.stamps[second])
     turn, travel = np.abs(motion[:, 2]), np.hypot(motion[:, 0], motion[:, 1])
     view = abs(scans.angle_increment) * scans.ranges.shape[1]
     clear = near & (turn > 0.05) & (turn < 0.4 * view)
@@ -153,7 +152,7 @@ def _wheel_turn(log: SensorLog, scans: LaserScans, first: Ints, second: Ints, la
 
 def _laser_shift(log: SensorLog, scans: LaserScans, first: Ints, second: Ints) -> Floats:
     """Return where the laser is at the second scan in its own frame at the first (p, 2), m, by the wheels."""
-    base = (se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps[k]) for k in (first, second))
+    base = (log.odometry.at(scans.stamps[k]) for k in (first, second))
     start, end = (se2.compose(pose, log.mounting.T_base_laser) for pose in base)
     return se2.between(start, end)[:, :2]
 
@@ -167,11 +166,11 @@ def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -
     every = max(1, scans.ranges.shape[1] // 180)
     reach = min(scans.range_max, 12.0)
     angles = scans.angles[::every]
-    used, place = np.unique(np.concatenate([first, second]), return_inverse=True)
+    used, one, other = renumbered(first, second)
     profile = np.nan_to_num(scans.ranges[used, ::every].astype(np.float64), nan=reach, posinf=reach)
     profile = np.where(profile < scans.range_min, reach, np.minimum(profile, reach))
-    before = _seen_from(profile[place[: len(first)]], angles, shift, reach)
-    after = profile[place[len(first) :]]
+    before = _seen_from(profile[one], angles, shift, reach)
+    after = profile[other]
     beams, most = len(angles), int(0.4 * len(angles))
     turns = range(-most, most + 1)
     cost = np.empty((len(first), len(turns)))
@@ -185,7 +184,7 @@ def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -
     # Scans that see nothing fit every turn alike, to the bit, and a lone wall fits best where it leaves the view.
     clear = 1.0 - (middle + _NOISE) / (np.median(cost, axis=1) + _NOISE)
     seen = np.mean(profile < reach, axis=1) > _LEAST_SEEN
-    clear *= seen[place[: len(first)]] & seen[place[len(first) :]]
+    clear *= seen[one] & seen[other]
     return np.asarray(fine * every * scans.angle_increment, dtype=np.float64), clear
 
 

@@ -7,7 +7,7 @@ finds the place.
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, renumbered
 from ..odometry.attached import ScanPoints
 from ..sensor_log import LaserScans, SensorMounting
 from . import cloud_rasters, clouds, scan_matching
@@ -96,8 +96,7 @@ def _pairs(
 ) -> tuple[Clouds, CloudRasters, Ints, Ints, PairPoints]:
     """Return the clouds of pairs of scans, their rasters, which clouds each pair (e,) is of, and the points to be matched."""
     config = CloudConfig()
-    chosen, where = np.unique(np.concatenate([first, second]), return_inverse=True)
-    i, j = np.split(where.reshape(-1), 2)
+    chosen, i, j = renumbered(first, second)
     built = clouds.build(_points(scans, mounting, chosen, config.range_max), len(chosen), config)
     raster = cloud_rasters.rasterize(built, config.raster, _FIRST_GATE)
     points = scan_matching.pair_points(built, j, _POINTS)

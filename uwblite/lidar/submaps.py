@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Floats, Ints
 from ..config import setting
-from .clouds import Clouds, joined, mean_by_key
+from .clouds import Clouds, cell_number, joined, mean_by_key
 from .point_cloud import radius_outlier_filter, statistical_outlier_filter
 
 _AT_ONCE = 32
@@ -128,12 +128,9 @@ def _merge(
     owner: Ints, points: Floats, normals: Floats, scatter: NDArray[np.floating], size: float
 ) -> tuple[Ints, Floats, Floats, Floats]:
     """Average points, normals and their variances by cell; the two sides of a wall stay apart by facing."""
-    cell = np.floor(points / size).astype(np.int64)
-    cell -= cell.min(axis=0, initial=0)
     # Four facings, not two: noise must not turn a normal from one side's facing into the other's, whatever way the wall runs.
     facing = np.floor(se2.bearing(normals) * (2.0 / np.pi) + 0.5).astype(np.int64) % 4
-    wide, high = cell.max(axis=0, initial=0) + 1
-    key = ((owner * wide + cell[:, 0]) * high + cell[:, 1]) * 4 + facing
+    key = cell_number(owner, points, size) * 4 + facing
     one, mean = mean_by_key(key, np.concatenate([points, normals, scatter[:, None]], axis=1))
     length = np.hypot(mean[:, 2], mean[:, 3])
     clear = length > 0.5

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, renumbered
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
@@ -91,8 +91,7 @@ def _batches(
 ) -> Iterator[_Batch]:
     for first in range(0, len(candidates.target), _AT_ONCE):
         part = candidates.rows(slice(first, first + _AT_ONCE))
-        used, number = np.unique(np.concatenate([part.target, part.source]), return_inverse=True)
-        target, source = np.split(number.reshape(-1).astype(np.int64), 2)
+        used, target, source = renumbered(part.target, part.source)
         spaces = None if free is None else [free[k] for k in used.tolist()]
         yield _Batch(part.renumbered(target, source), clouds.chosen(used), spaces, config, search_config)
 

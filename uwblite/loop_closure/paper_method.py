@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, renumbered
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges
 from ..lidar.clouds import Clouds
@@ -118,8 +118,7 @@ class _Batch:
 def _batches(clouds: Clouds, target: Ints, source: Ints, guess: Floats, icp: IcpConfig) -> Iterator[_Batch]:
     for first in range(0, len(target), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
-        used, number = np.unique(np.concatenate([target[rows], source[rows]]), return_inverse=True)
-        own_target, own_source = np.split(number.reshape(-1).astype(np.int64), 2)
+        used, own_target, own_source = renumbered(target[rows], source[rows])
         yield _Batch(clouds.chosen(used), own_target, own_source, guess[rows], icp)
 
 

@@ -139,11 +139,20 @@ def walk_back(before: Ints, first: int, last: int) -> Ints:
 
 def _divided(line: Floats, step: float) -> Floats:
     """Return the corners (n, 2) of a line whose pieces are cut into equal ones no longer than the step, m."""
-    ways = np.diff(line, axis=0)
-    pieces = np.maximum(np.ceil(np.hypot(*ways.T) / step - 1e-9), 1).astype(np.int64)
-    owner = np.repeat(np.arange(len(ways)), pieces)
-    share = (np.arange(len(owner)) - (np.cumsum(pieces) - pieces)[owner]) / pieces[owner]
-    return np.concatenate([line[owner] + share[:, None] * ways[owner], line[-1:]])
+    piece, number, cuts = _cuts(line, step)
+    return _at(line, piece, number / cuts)
+
+
+def _cuts(line: Floats, step: float) -> tuple[Ints, Ints, Ints]:
+    """Return, of all equal cuts (k,) of a line's pieces, the piece, the cut's number in it, and how many it is cut into."""
+    cuts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / step - 1e-9), 1).astype(np.int64)
+    piece = np.repeat(np.arange(len(cuts)), cuts)
+    return piece, np.arange(len(piece)) - (np.cumsum(cuts) - cuts)[piece], cuts[piece]
+
+
+def _at(line: Floats, piece: Ints, share: Floats) -> Floats:
+    """Return places (k + 1, 2) by shares (k,) of some pieces of a line, and its end."""
+    return np.concatenate([line[piece] + share[:, None] * np.diff(line, axis=0)[piece], line[-1:]])
 
 
 def _straightened(line: Floats) -> Floats:
@@ -162,15 +171,11 @@ def _graded(line: Floats, step: float) -> tuple[Floats, Ints]:
     places : (k, 2) m.
     piece : (k - 1,) number of the line's piece on which the way to the next place lies.
     """
-    ways = np.diff(line, axis=0)
-    pieces = np.maximum(np.ceil(np.hypot(*ways.T) / step - 1e-9), 1).astype(np.int64)
-    owner = np.repeat(np.arange(len(ways)), pieces)
-    number = np.arange(len(owner)) - (np.cumsum(pieces) - pieces)[owner]
-    away = np.minimum(number, pieces[owner] - number)
+    piece, number, cuts = _cuts(line, step)
+    away = np.minimum(number, cuts - number)
     coarseness = 2 ** np.log2(np.maximum(away / _PLACES_PER_OCTAVE, 1.0)).astype(np.int64)
     kept = away % coarseness == 0
-    piece, share = owner[kept], (number / pieces[owner])[kept]
-    return np.concatenate([line[piece] + share[:, None] * ways[piece], line[-1:]]), piece
+    return _at(line, piece[kept], (number / cuts)[kept]), piece[kept]
 
 
 def sampled(line: Floats, step: float, heading: float | None = None) -> tuple[Floats, Floats]:

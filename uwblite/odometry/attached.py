@@ -67,7 +67,7 @@ def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframe
     goes into the lever arm.
     """
     keyframe = np.clip(np.searchsorted(keyframes.stamps, log_ranges.stamps, "right") - 1, 0, len(keyframes) - 1)
-    base = se2.interpolate_trajectory(odometry.stamps, odometry.poses, log_ranges.stamps)
+    base = odometry.at(log_ranges.stamps)
     arm = se2.between(keyframes.odometry[keyframe], base)
     twist = velocity_at(odometry, log_ranges.stamps)
     which = np.zeros(len(arm), dtype=np.int64) if log_ranges.tag is None else log_ranges.tag
@@ -119,9 +119,8 @@ def scan_points(
     beams = scans.ranges.shape[1]
     start, end = scans.stamps[chosen], scans.stamps[chosen] + scans.time_increment * (beams - 1)
     anchor = keyframes.odometry[owner]
-    trajectory = (log.odometry.stamps, log.odometry.poses)
-    first = se2.between(anchor, se2.interpolate_trajectory(*trajectory, start))
-    sweep = se2.between(first, se2.between(anchor, se2.interpolate_trajectory(*trajectory, end)))
+    first = se2.between(anchor, log.odometry.at(start))
+    sweep = se2.between(first, se2.between(anchor, log.odometry.at(end)))
     readings = scans.ranges[chosen]
     upper = min(range_max, scans.range_max)
     scan, ray = np.nonzero((readings >= scans.range_min) & (readings <= upper))

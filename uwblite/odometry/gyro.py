@@ -69,7 +69,7 @@ def heading_from_gyro(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     gyro, odometry = log.gyro, log.odometry
     if gyro is None or len(gyro.stamps) < 2 or len(odometry.stamps) < 2:
         return log, []
-    steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
+    steps = odometry.steps
     factor, why = reading_of(gyro, odometry)
     if not factor:
         return log, [Remark("gyro", why)]

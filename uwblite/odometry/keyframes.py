@@ -100,7 +100,7 @@ def at(log: SensorLog, stamps: Floats, alone: Bools) -> Keyframes:
 
 def _keyframes(odometry: Odometry, stamps: Floats, index: Ints, breaks: OdometryBreaks | None) -> Keyframes:
     """Return keyframes at given moments (k,), s, the last odometry samples (k,) before them being known."""
-    between = se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps)
+    between = odometry.at(stamps)
     poses = np.where((odometry.stamps[index] == stamps)[:, None], odometry.poses[index], between)
     length, path, turned = (np.diff(way) for way in _travelled(odometry, stamps, index))
     motion, alone = se2.between(poses[:-1], poses[1:]), np.zeros(len(stamps), dtype=bool)
@@ -141,7 +141,7 @@ def _travelled(odometry: Odometry, moments: Floats, sample: Ints) -> tuple[Float
     ----------
     sample : (m,) the last odometry sample before each.
     """
-    steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
+    steps = odometry.steps
     forward = np.where(steps[:, 0] >= 0, 1.0, -1.0) * np.hypot(steps[:, 0], steps[:, 1])
     span = np.append(np.diff(odometry.stamps), 0.0)[sample]
     fraction = np.clip((moments - odometry.stamps[sample]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
@@ -212,7 +212,7 @@ def velocity_at(odometry: Odometry, stamps: Floats, window: tuple[float, float] 
     """Return the velocity (m, 3) of the base in its own frame at the stamps (m,), m/s, m/s, rad/s."""
     near, far = window
     moments = np.clip(stamps + np.array([[-far], [-near], [near], [far]]), odometry.stamps[0], odometry.stamps[-1])
-    poses = [se2.interpolate_trajectory(odometry.stamps, odometry.poses, at) for at in moments]
+    poses = [odometry.at(moment) for moment in moments]
     motion = se2.log(se2.between(poses[0], poses[1])) + se2.log(se2.between(poses[2], poses[3]))
     span = (moments[1] - moments[0] + moments[3] - moments[2])[:, None]
     return np.where(span > 0, motion / np.where(span > 0, span, 1.0), 0.0)
@@ -225,7 +225,7 @@ def dense_trajectory(odometry: Odometry, keyframes: Keyframes, poses: Floats, st
     arise: of the position by the distance travelled, of the heading by the turn, and little by time.
     """
     query = odometry.stamps if stamps is None else stamps
-    base = odometry.poses if stamps is None else se2.interpolate_trajectory(odometry.stamps, odometry.poses, stamps)
+    base = odometry.poses if stamps is None else odometry.at(stamps)
     left = np.clip(np.searchsorted(keyframes.stamps, query, "right") - 1, 0, max(len(keyframes) - 2, 0))
     since = se2.between(keyframes.odometry[left], base)
     if len(keyframes) == 1:

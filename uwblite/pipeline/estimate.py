@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, rms_length
 from ..constraints import Constraints
 from ..graph.graph import Edges, Graph
 from ..graph.pose_edges import OdometryEdges, ScanEdges
@@ -99,7 +99,7 @@ class Estimate:
 
     def moved_since(self, poses: Floats) -> float:
         """Return how far its poses are from earlier ones (k, 3), root mean square, m."""
-        return float(np.sqrt(np.mean(np.sum((self.graph.poses - poses)[:, :2] ** 2, axis=1))))
+        return rms_length((self.graph.poses - poses)[:, :2])
 
     def with_estimates_of(self, solved: Graph) -> "Estimate":
         """Return the estimate with poses, anchors and calibration of a solved graph."""

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats
+from ..arrays import Floats, rms_length
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph, PriorEdges
 from ..graph.marginals import marginals
@@ -139,4 +139,4 @@ def _anchors_alone(recording: Recording, start: float, end: float, task: Task) -
 
 def _misfit(p: Floats, q: Floats) -> float:
     """Return the rms distance of points (n, 2) after the best rigid motion, m."""
-    return float(np.sqrt(np.mean(np.sum(np.square(se2.transform(se2.align(p, q), p) - q), axis=1))))
+    return rms_length(se2.transform(se2.align(p, q), p) - q)

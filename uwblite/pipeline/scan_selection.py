@@ -41,7 +41,7 @@ def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorL
     if scans is None or not len(scans.stamps) or grid.move_distance <= 0.0:
         return log
     _, near = choose_scans(scans, keyframes.of(log, frames), frames)
-    base = se2.interpolate_trajectory(log.odometry.stamps, log.odometry.poses, scans.stamps)
+    base = log.odometry.at(scans.stamps)
     laser = se2.compose(base, log.mounting.T_base_laser)
     traced = moved_scans(laser, grid.move_distance / _STEPS, grid.move_angle / _STEPS)
     kept = np.union1d(near, traced)

@@ -9,7 +9,6 @@ saw. Of scans from different places, many points stand in the free space of the 
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..lidar.scan_odometry import directional_shares, in_free_space, scan_steps
 from ..sensor_log import SensorLog
@@ -120,6 +119,6 @@ def _elsewhere(log: SensorLog, first: Ints, second: Ints) -> tuple[Bools, Floats
 def _matched(log: SensorLog, first: Ints, second: Ints) -> tuple[Floats, Floats]:
     """Return the motions (e, 3) at which scans match best near the wheels' guess, and how well (e,), 0..1."""
     assert log.scans is not None
-    middle, odometry = log.scans.middles, log.odometry
-    at = (se2.interpolate_trajectory(odometry.stamps, odometry.poses, middle[k]) for k in (first, second))
-    return scan_steps(log.scans, log.mounting, first, second, se2.between(*at), searches=len(first))
+    middle = log.scans.middles
+    guess = log.odometry.motion(middle[first], middle[second])
+    return scan_steps(log.scans, log.mounting, first, second, guess, searches=len(first))

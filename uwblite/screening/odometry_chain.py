@@ -46,7 +46,7 @@ class Motion:
     @staticmethod
     def of(odometry: Odometry) -> "Motion":
         """Take the steps of an odometry."""
-        steps, span = se2.between(odometry.poses[:-1], odometry.poses[1:]), np.diff(odometry.stamps)
+        steps, span = odometry.steps, np.diff(odometry.stamps)
         length, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
         most = []
         for size, least in ((length, _LEAST_SPEED), (turn, _LEAST_TURN_RATE)):

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .. import se2
 from ..arrays import Bools, Floats, Ints, runs_of, sigma_of_median, spread_about_median
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import Odometry, Remark, SensorLog
@@ -74,7 +73,7 @@ class Pairs:
 
 def standing(odometry: Odometry, least: float = _LEAST_STANDING) -> list[tuple[float, float]]:
     """Return the stretches (first and last stamp, s) in which the wheels count nothing."""
-    steps, stamps = se2.between(odometry.poses[:-1], odometry.poses[1:]), odometry.stamps
+    steps, stamps = odometry.steps, odometry.stamps
     way, turn = (np.concatenate([[0.0], np.cumsum(s)]) for s in (np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])))
     before, after = (np.interp(stamps + d, stamps, np.arange(len(stamps))) for d in (-_HALF, _HALF))
     number = np.arange(len(stamps))
@@ -96,7 +95,7 @@ def compare(log: SensorLog) -> Pairs | None:
     first, second = _chosen(log, middle)
     if not len(first):
         return None
-    wheels = _wheels(log.odometry, middle, first, second)
+    wheels = log.odometry.motion(middle[first], middle[second])
     by_wheels, good = scan_steps(scans, log.mounting, first, second, wheels)
     poor = np.flatnonzero(good < _CLEAR_SHARE)
     by_rest, rest = scan_steps(scans, log.mounting, first[poor], second[poor], np.zeros((len(poor), 3)))
@@ -131,16 +130,11 @@ def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
 
 def _span(odometry: Odometry) -> float:
     """Return the time between the scans of a pair, s, in which the robot usually drives a little way."""
-    steps, span = se2.between(odometry.poses[:-1], odometry.poses[1:]), np.diff(odometry.stamps)
+    steps, span = odometry.steps, np.diff(odometry.stamps)
     length = np.hypot(steps[:, 0], steps[:, 1])
     moving = (length > 1e-4) & (span > 0)
     speed = float(np.median(length[moving] / span[moving])) if moving.any() else 0.3
     return float(np.clip(_APART / max(speed, 1e-3), 0.1, 1.0))
-
-
-def _wheels(odometry: Odometry, middle: Floats, first: Ints, second: Ints) -> Floats:
-    at = (se2.interpolate_trajectory(odometry.stamps, odometry.poses, middle[k]) for k in (first, second))
-    return se2.between(*at)
 
 
 def seen(pairs: Pairs, start: float, end: float) -> bool:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import DataError
 
@@ -26,6 +27,19 @@ class Odometry:
     def travelled(self) -> Floats:
         """(n,) m, distance since the first stamp."""
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T))])
+
+    @property
+    def steps(self) -> Floats:
+        """(n - 1, 3) motion from each reading to the next, m, m, rad."""
+        return se2.between(self.poses[:-1], self.poses[1:])
+
+    def at(self, stamps: Floats) -> Floats:
+        """Return the poses (..., 3) at stamps (...), s; see se2.interpolate_trajectory."""
+        return se2.interpolate_trajectory(self.stamps, self.poses, stamps)
+
+    def motion(self, start: Floats, end: Floats) -> Floats:
+        """Return the motions (..., 3) between stamps (...), (...), s; m, m, rad."""
+        return se2.between(self.at(start), self.at(end))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
