@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+from typing import ClassVar
 
 import pytest
 from helpers.example_settings import Outer
@@ -97,3 +98,25 @@ def test_a_message_that_quotes_a_broken_file_stays_short():
     with pytest.raises(ConfigError, match=r"unknown setting 'AAA.* \.\.\. A*'; `uwblite config` lists all settings$") as caught:
         merge(MappingConfig(), {"A" * 100_000: 1})
     assert len(str(caught.value)) < 1000
+
+
+@dataclasses.dataclass(frozen=True)
+class Moved:
+    """Settings of which a table and one value have other names now."""
+
+    RENAMED: ClassVar[dict[str, str]] = {"icp": "matching", "gate": "reach"}
+    reach: float = 1.0
+    """Farthest match, m."""
+
+
+@pytest.mark.parametrize(("name", "now"), [("icp", "matching"), ("icp.rounds", "matching.rounds"), ("gate", "reach")])
+def test_an_old_name_is_answered_with_the_new_one(name, now):
+    data = {name: 1} if "." not in name else {"icp.rounds": 1}
+    assert f"the setting '{name}' is called '{now}' now" in refused(data)
+    assert "is called" not in refused({"gates": 1})
+
+
+def refused(data):
+    with pytest.raises(ConfigError) as error:
+        from_dict(Moved, data)
+    return str(error.value)

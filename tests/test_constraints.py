@@ -1,5 +1,9 @@
 """What is known beforehand: frames found, moved anchors named, edges right, files strict."""
 
+from contextlib import nullcontext
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +18,11 @@ from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import optimize
 from uwblite.io.constraints_file import parse_constraints, read_anchors
-from uwblite.pipeline.constraint_edges import _gauge, apply, consensus
+from uwblite.pipeline.constraint_edges import _gauge, apply, apply_given, consensus
+from uwblite.pipeline.estimate import Estimate, Task
+from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.pipeline.progress import Stages
+from uwblite.radio.bootstrap import BootstrapResult
 
 IDS = ("A", "B", "C", "D")
 TRUE = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 6.0], [-1.0, 5.0]])
@@ -80,6 +88,17 @@ def test_the_heading_is_fixed_where_one_anchor_alone_is_given(ids, moved, fixed)
     assert [(e.block, e.index.tolist(), np.flatnonzero(e.sqrt_information[0]).tolist()) for e in edges] == (
         [("poses", [0], [8])] if fixed else []
     )
+
+
+@pytest.mark.parametrize("align", ["odometry", "walls"])
+def test_given_places_and_an_alignment_exclude_each_other(align):
+    graph = first_estimate()
+    found = BootstrapResult(graph, ALL, (), ~ALL)
+    estimate = Estimate(replace(graph, edges=()), graph.edges[0], graph.edges[1], IDS, found)
+    for places, refused in ((Constraints(anchors=surveyed("A", "B")), align == "walls"), (Constraints(), False)):
+        task = Task(SimpleNamespace(clock=CLOCK), MappingConfig(align=align), places, Stages(None, None))
+        with pytest.raises(ConfigError, match="leave out align") if refused else nullcontext():
+            assert apply_given(estimate, task).graph.chi2() < 1e-6
 
 
 def test_solving_keeps_what_was_given_and_the_first_pose_is_free():

@@ -392,3 +392,17 @@ def test_ranges_through_walls_move_no_anchor(tmp_path, seed):
     places = {row[0]: np.array(row[1:3], dtype=float) for row in rows}
     off = np.array([se2.transform(laid, a.position) - places[a.id] for a in result.anchors])
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.2
+
+
+def test_one_recording_may_stand_alone_and_several_in_any_sequence(minute, monkeypatch):
+    asked = []
+
+    def prepared(log, config):
+        asked.append(log)
+        raise Cancelled("enough")
+
+    monkeypatch.setattr("uwblite.mapping.scan_selection.prepared", prepared)
+    for logs in (minute, [minute], (minute, minute)):
+        with pytest.raises(Cancelled):
+            build_map(logs)
+    assert [log is minute for log in asked] == [True] * 3

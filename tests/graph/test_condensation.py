@@ -7,7 +7,7 @@ import pytest
 from helpers.planted_graphs import loop, plain_ranges, relative_edges
 
 from uwblite import se2
-from uwblite.graph.condensation import _damped, solve_condensed
+from uwblite.graph.condensation import Condensed, _damped, solve_condensed
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.partition import split
 from uwblite.graph.robust import Kernel
@@ -94,6 +94,11 @@ def test_what_a_part_sends_does_not_grow_with_its_length():
         sent.append(solve_condensed(*split(graph, part)).sent)
     assert sent[0][2:] == sent[1][2:]
     assert max(sent[1]) < 5000
+
+
+def test_a_part_sends_one_triangle_a_vector_a_diagonal_and_its_numbers():
+    """Three scalars: 6 + 3 + 3 numbers of 8 bytes and 3 of 4."""
+    assert Condensed(np.arange(3), np.eye(3), np.zeros(3), np.ones(3)).size == 108
 
 
 def test_one_part_alone_shares_nothing():

@@ -170,6 +170,15 @@ def test_too_large_a_map_gets_larger_cells(size):
     assert grid.resolution > 0.05
 
 
+def test_the_smallest_grid_is_a_cell_with_two_around_it_on_every_side():
+    """A point lies in four cells at most; with fewer than 6 x 6 there is no map."""
+    point = np.array([0.01, 0.01])
+    assert GridGeometry.around(point, point, 0.05, 36).cells == 25
+    assert GridGeometry.around(point - 0.02, point, 0.05, 36).cells == 36
+    with pytest.raises(ConfigError, match=r"grid\.max_cells"):
+        GridGeometry.around(point - 0.02, point, 0.05, 35)
+
+
 def test_a_map_without_a_size_is_refused():
     with pytest.raises(ConfigError, match="no map of nan"):
         GridGeometry.around(np.zeros(2), np.array([np.nan, 1.0]), 0.05, 10**6)

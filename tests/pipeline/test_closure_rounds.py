@@ -19,9 +19,11 @@ def test_places_too_uncertain_for_a_search_are_doubted(far, kinds):
     truth, graph, path, clouds = returned(CORRIDOR, far, [1.0, 0.0, 0.0])
     recording = np.zeros(len(truth), dtype=np.int64)
     pieces = of_pieces(clouds, graph.poses, *cut(path, recording), SubmapConfig())
-    recordings = SimpleNamespace(stamps=np.arange(len(truth)) * 1.0, of_keyframe=recording)
+    recordings = SimpleNamespace(stamps=100.0 + np.arange(len(truth)), of_keyframe=recording)
     stages = Stages(None, None)
     task = SimpleNamespace(recordings=recordings, config=SimpleNamespace(loop_closure=LoopClosureConfig()), stages=stages)
     _check_open_loops(graph, no_closures(), pieces, False, task)
     assert [notice.kind for notice in stages.doubts] == kinds
-    assert all(abs(notice.figures["sigma"] - far) < 0.5 * far for notice in stages.doubts)
+    for notice in stages.doubts:
+        assert abs(notice.figures["sigma"] - far) < 0.5 * far
+        assert 0.0 <= notice.figures["first"] < notice.figures["second"] < len(truth)  # since the beginning, s

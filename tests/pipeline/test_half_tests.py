@@ -101,3 +101,25 @@ def test_a_prior_on_the_unit_of_the_wheels_is_twenty_times_as_wide():
     priors = PriorEdges("calibration", np.array([2, 0, 1]), np.zeros((3, 1)), np.array([5.0, 6.0, 7.0])[:, None, None])
     loose = half_tests._loose(priors, 0)
     np.testing.assert_allclose(loose.sqrt_information[:, 0, 0], [5.0, 0.3, 7.0])
+
+
+LEFT, RIGHT = np.array([[0.0, 0.0], [6.0, 0.0], [5.0, 4.0], [1.0, 5.0]]), np.array([1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("mirrored", "missing", "doubted"), [(False, 0, False), (True, 0, True), (True, 1, True), (True, 2, False)]
+)
+def test_anchors_of_both_halves_that_are_mirror_images_are_a_doubt(monkeypatch, mirrored, missing, doubted):
+    """By the anchors that both halves place, three at least; where either half lies does not matter."""
+    places = dict(zip("ABCD", LEFT, strict=True))
+    other = {name: se2.transform([3.0, -2.0, 0.7], place * (RIGHT if mirrored else 1.0)) for name, place in places.items()}
+    for name in "AD"[:missing]:
+        del other[name]
+    halves = iter([places, other | {"Z": np.zeros(2)}])
+    monkeypatch.setattr(half_tests, "_anchors_alone", lambda *args: next(halves))
+    stages = Stages(None, None)
+    half_tests._check_sign_of_turns(
+        SimpleNamespace(frames=SimpleNamespace(stamps=np.arange(9.0))), SimpleNamespace(stages=stages)
+    )
+    assert [n.kind for n in stages.doubts] == (["halves-disagree"] if doubted else [])
+    assert all(n.figures["apart"] > 1.0 and n.figures["mirrored"] < 1e-9 for n in stages.doubts)

@@ -13,9 +13,12 @@ from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.map_result import AnchorEstimate
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import OUTSIDE
+from uwblite.pipeline import plausibility
 from uwblite.pipeline.plausibility import (
     check_anchors,
     check_certainty,
+    check_closures,
+    check_fit,
     check_handedness,
     check_moved_together,
     outlier_stretches,
@@ -215,3 +218,56 @@ def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
     reported = stated(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
     assert len(reported) == (radio_scale != 1.0)
     assert all("scale of the wheels" in text for text in reported)
+
+
+@pytest.mark.parametrize("ranges_used", [False, True])
+def test_every_check_is_made_once(monkeypatch, ranges_used):
+    """Ranges that stayed outliers for long are looked for where there are ranges."""
+    made = []
+    for name in [name for name in vars(plausibility) if name.startswith("check_")]:
+        monkeypatch.setattr(plausibility, name, lambda *args, name=name: made.append(name))
+    table = {"residual": np.ones(3)} if ranges_used else {}
+    plausibility.judge(SimpleNamespace(anchor_ids=()), (), (), {}, table, None, None, None)
+    expected = {name for name in vars(plausibility) if name.startswith("check_")}
+    assert sorted(made) == sorted(expected - ({"check_sustained_outliers"} if not ranges_used else set()))
+
+
+@pytest.mark.parametrize(("statuses", "warnings", "doubts"), [
+    (("ok", "mirror-ambiguous"), ["anchor-mirror-ambiguous"], []),
+    (("mirror-ambiguous", "distrusted"), ["anchor-distrusted"], ["anchor-mirror-ambiguous"]),
+    (("unplaced", "unplaced"), ["anchor-unplaced"] * 2, ["no-anchor"]), (("ok", "ok"), [], []),
+])  # fmt: skip
+def test_anchors_that_are_not_ok_are_named(statuses, warnings, doubts):
+    """Mirror images are a doubt where no anchor has one place alone."""
+    anchors = [AnchorEstimate(f"A{k}", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, s, "why") for k, s in enumerate(statuses)]
+    stages = Stages(None, None)
+    check_anchors(anchors, SimpleNamespace(stages=stages))
+    assert [n.kind for n in stages.warnings] == warnings
+    assert [n.kind for n in stages.doubts] == doubts
+
+
+@pytest.mark.parametrize(("accepted", "contradicted", "other", "placed", "grid", "kind"), [
+    (0, 0, 3, True, True, "warning no-closure"), (0, 0, 3, False, True, "doubt no-closure"), (0, 0, 3, False, False, None),
+    (1, 0, 3, False, True, None), (0, 0, 0, False, True, None), (5, 5, 0, True, True, None),
+    (5, 6, 0, True, True, "doubt contradicting-closures"), (1, 4, 0, True, True, None),
+    (1, 5, 0, True, True, "doubt contradicting-closures"),
+])  # fmt: skip
+def test_a_map_without_closures_or_with_more_that_contradict_is_named(accepted, contradicted, other, placed, grid, kind):
+    outcomes = ["accepted"] * accepted + ["contradicts-closures"] * contradicted + ["too-few-matches"] * other
+    found = tuple(SimpleNamespace(outcome=o, accepted=o == "accepted") for o in outcomes)
+    anchors = [SimpleNamespace(status="unplaced"), *([SimpleNamespace(status="ok")] if placed else [])]
+    stages = Stages(None, None)
+    estimate = SimpleNamespace(closures=SimpleNamespace(candidates=found))
+    check_closures(estimate, anchors, object() if grid else None, SimpleNamespace(stages=stages))
+    said = [f"doubt {n.kind}" for n in stages.doubts] + [f"warning {n.kind}" for n in stages.warnings]
+    assert said == ([] if kind is None else [kind])
+
+
+@pytest.mark.parametrize(("fits", "doubted"), [((), False), ((9.0, 3.99), False), ((1.0, 4.01), True)])
+def test_residuals_twice_as_large_as_noise_allows_after_the_last_optimisation_are_a_doubt(fits, doubted):
+    stages = Stages(None, None)
+    for fit in fits:
+        stages.end("optimisation", chi2_per_dof=fit)
+    stages.end("summary")
+    check_fit(SimpleNamespace(stages=stages))
+    assert [n.figures["chi2_per_dof"] for n in stages.doubts] == ([fits[-1]] if doubted else [])

@@ -233,3 +233,14 @@ def test_two_recordings_through_a_simulated_hall(tmp_path):
     result = build_map(logs)
     assert joint_ate(result, truths)[0] <= max(single) + 0.002
     assert result.warnings == ()
+
+
+def test_recordings_lie_a_kilometre_apart_on_the_way():
+    """So that keyframes of two are never taken for one visit, however near their places are."""
+    logs = [drive(seed, lidar=False, length=8.0)[0] for seed in (1, 2, 3)]
+    together = gather(logs, MappingConfig().keyframes)
+    for number in (1, 2):
+        (last,), (first,) = (np.flatnonzero(together.of_keyframe == n)[[end]] for n, end in ((number - 1, -1), (number, 0)))
+        assert together.path[first] - together.path[last] == pytest.approx(1000.0)
+    assert together.travelled == pytest.approx(together.path[-1] - 2000.0)
+    assert np.all(np.diff(together.path) >= 0.0)
