@@ -50,6 +50,13 @@ def test_transform_follows_compose(a, b, p):
     np.testing.assert_allclose(se2.transform(se2.compose(a, b), p), se2.transform(a, se2.transform(b, p)), atol=1e-9)
 
 
+def test_points_of_several_poses_are_transformed_as_one_by_one():
+    rng = np.random.default_rng(0)
+    poses, owner, points = rng.normal(size=(7, 3)) * 4.0, rng.integers(7, size=50), rng.normal(size=(50, 2))
+    one_by_one = np.array([se2.transform(poses[k], p) for k, p in zip(owner, points, strict=True)])
+    np.testing.assert_allclose(se2.transform_each(poses, owner, points), one_by_one, rtol=1e-13, atol=1e-13)
+
+
 @given(poses, poses)
 def test_compose_is_the_product_of_matrices(a, b):
     np.testing.assert_allclose(matrix(se2.compose(a, b)), matrix(a) @ matrix(b), atol=1e-9)

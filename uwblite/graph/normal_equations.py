@@ -8,6 +8,7 @@ are numbered in the order of elimination, so that vectors need no permutation.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,9 @@ class NormalEquations:
             node[name] = np.where(mask, first + np.cumsum(mask) - 1, -1)
             first += count
         touched = [[(node[name][index], name != "calibration") for name, index, _ in lin.blocks] for lin in linearized]
+        # What is fixed for all edges of a kind, as the calibration often is, has no products.
+        self._free = [[bool(np.any(a >= 0)) for a, _ in nodes] for nodes in touched]
+        touched = [list(compress(nodes, free)) for nodes, free in zip(touched, self._free, strict=True)]
         pairs, which = self._pairs(touched)
         among_poses = pairs[(pairs < counts[0]).all(axis=1)]
         late = None if last is None else node["poses"][last]
@@ -141,13 +145,13 @@ class NormalEquations:
         """
         following = iter(which)
         self._places: list[list[_Places]] = []
-        for lin, nodes in zip(linearized, touched, strict=True):
-            widths = [jac.shape[2] for _, _, jac in lin.blocks]
+        for lin, nodes, free in zip(linearized, touched, self._free, strict=True):
+            widths = [jac.shape[2] for _, _, jac in compress(lin.blocks, free)]
             blocks = [self._blocks_of(nodes[: p + 1], following) for p in range(len(nodes))]
             self._places.append(
                 [
                     self._place_some(widths, [a[part] for a, _ in nodes], [[b[part] for b in row] for row in blocks], corner)
-                    for part in _parts(len(lin.residuals))
+                    for part in (_parts(len(lin.residuals)) if nodes else ())
                 ]
             )
 
@@ -189,9 +193,10 @@ class NormalEquations:
     def fill(self, linearized: Sequence[Linearization], weights: Sequence[Floats | None]) -> None:
         """Fill H and g from whitened Jacobians and a weight per edge."""
         self.values, self.gradient = np.zeros(self._trash + 1), np.zeros(self.unknowns.size)
-        for lin, weight, places in zip(linearized, weights, self._places, strict=True):
-            for part, place in zip(_parts(len(lin.residuals)), places, strict=True):
-                self._add(_stacked(lin, part), lin.residuals[part], None if weight is None else weight[part], place)
+        for lin, weight, places, free in zip(linearized, weights, self._places, self._free, strict=True):
+            jacobians = [jac for _, _, jac in compress(lin.blocks, free)]
+            for part, place in zip(_parts(len(lin.residuals)) if jacobians else (), places, strict=True):
+                self._add(_stacked(jacobians, part), lin.residuals[part], None if weight is None else weight[part], place)
 
     def _add(self, jacobian: Floats, residuals: Floats, weight: Floats | None, places: _Places) -> None:
         """Add the products of some edges' Jacobian columns (d, k, e) and residuals (e, d)."""
@@ -243,15 +248,11 @@ def _parts(edges: int) -> list[slice]:
     return [slice(first, first + _AT_ONCE) for first in range(0, max(edges, 1), _AT_ONCE)]
 
 
-def _stacked(lin: Linearization, part: slice) -> Floats:
-    """Return the Jacobians of some edges side by side, (d, k, e): the edges, over which everything runs, come last."""
-    residuals = lin.residuals[part]
-    stacked = np.empty((residuals.shape[1], sum(jac.shape[2] for _, _, jac in lin.blocks), len(residuals)))
-    first = 0
-    for _, _, jac in lin.blocks:
-        stacked[:, first : first + jac.shape[2]] = jac[part].transpose(1, 2, 0)
-        first += jac.shape[2]
-    return stacked
+def _stacked(jacobians: Sequence[Floats], part: slice) -> Floats:
+    """Return Jacobians (e, d, k) of some edges side by side, (d, k, e): the edges, over which everything runs, come last."""
+    parts = [jac[part].transpose(1, 2, 0) for jac in jacobians]
+    stacked = np.empty((parts[0].shape[0], sum(p.shape[1] for p in parts), parts[0].shape[2]))
+    return np.concatenate(parts, axis=1, out=stacked)
 
 
 def _contract(a: Floats, b: Floats, out: Floats) -> None:

@@ -106,9 +106,9 @@ def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
     cell, facing = np.empty((len(usable), 2), dtype=np.int32), np.empty(len(usable), dtype=np.int8)
     for first in range(0, len(usable), _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
-        own = poses[clouds.owner[usable[part]]]
-        cell[part] = np.floor(se2.transform(own, clouds.points[usable[part]]) / _SURFACE_CELL)
-        bearing = se2.bearing(se2.rotate(own[:, 2], clouds.normals[usable[part]]))
+        owner = clouds.owner[usable[part]]
+        cell[part] = np.floor(se2.transform_each(poses, owner, clouds.points[usable[part]]) / _SURFACE_CELL)
+        bearing = se2.bearing(se2.rotate_each(poses[:, 2], owner, clouds.normals[usable[part]]))
         facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
     cell -= cell.min(axis=0, initial=0)
     wide = int(cell[:, 1].max(initial=0)) + 1

@@ -109,9 +109,9 @@ def _built(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference: In
     rows = slice(int(clouds.offsets[keyframes.start]), int(clouds.offsets[keyframes.stop]))
     piece = np.repeat(np.arange(len(first)), last - first)
     owner = clouds.owner[rows] - keyframes.start
-    relative = se2.between(poses[reference[piece]], poses[keyframes])[owner]
-    points = se2.transform(relative, clouds.points[rows])
-    normals = se2.rotate(relative[:, 2], clouds.normals[rows])
+    relative = se2.between(poses[reference[piece]], poses[keyframes])
+    points = se2.transform_each(relative, owner, clouds.points[rows])
+    normals = se2.rotate_each(relative[:, 2], owner, clouds.normals[rows])
     scatter = clouds.normal_variance[rows]
     number, points, normals, scatter = _merge(piece[owner], points, normals, scatter, config.voxel)
     kept = np.ones(len(number), dtype=bool)

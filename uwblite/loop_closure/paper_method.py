@@ -94,7 +94,7 @@ def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> 
 def _shared(poses: Floats, submaps: Submaps) -> Floats:
     """Return (s, s) which share of the squares of the smaller sub-map the larger one has points in, too."""
     owner = submaps.clouds.owner
-    points = se2.transform(poses[owner], submaps.clouds.points)
+    points = se2.transform_each(poses, owner, submaps.clouds.points)
     cell = np.floor(points / _CELL).astype(np.int64)
     cell -= cell.min(axis=0, initial=0)
     _, column = np.unique(cell[:, 0] * (cell[:, 1].max(initial=0) + 1) + cell[:, 1], return_inverse=True)

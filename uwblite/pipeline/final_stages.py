@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, optimize_with_heights
+from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE
 from ..graph.graph import Graph
 from ..graph.unknowns import free_unknowns
 from ..grid import occupancy_grid as grids
@@ -13,6 +13,7 @@ from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid, Sweeps
 from ..lidar.surface_errors import with_range_errors
 from .estimate import Estimate, Task
+from .lidar_stages import solved
 from .map_frame import cropped
 from .progress import Stage
 from .radio_stages import with_range_noise
@@ -23,19 +24,13 @@ _LARGE_GRID = 5_000_000
 
 
 def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
-    """Put every measurement into the graph; where the lidar has refined it, poses and anchors get the weights that suit each.
+    """Put every measurement into the graph; where the lidar has refined the poses, give anchors the weights that suit them.
 
-    What all ranges from one direction are wrong by alike moves an anchor, and no number of them averages it out; but it
-    gives a pose nothing false, since the anchor's place absorbs it. So the ranges weigh by their own errors while poses are
-    estimated, and by the common ones as well where anchors are: without feedback from anchors to poses (M. Plummer, Cuts in
-    Bayesian graphical models, 2015). The outliers stay those that were found while all ranges weighed little.
+    Poses are estimated with ranges that weigh by their own errors (lidar_stages.refine_jointly), anchors with those that all
+    ranges from one direction have in common as well, without feedback from anchors to poses (M. Plummer, Cuts in Bayesian
+    graphical models, 2015). The outliers stay those that were found while all ranges weighed little.
     """
     if estimate.joint is not None and estimate.ranges is not None:
-        for _ in range(_LAPS):
-            before = estimate.graph.poses
-            estimate = _solved(with_range_noise(estimate, task.config), task)
-            if estimate.moved_since(before) < _STILL:
-                break
         estimate = _anchors_alone(estimate, task)
     estimate = _with_range_errors(estimate, task)
     # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
@@ -55,19 +50,6 @@ def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, joint=joint, steps=estimate.steps if steps is None else steps)
 
 
-_LAPS = 2
-"""Range noise learnt and everything solved so often, at most: the second time on poses that the first has moved."""
-_STILL = 0.001
-"""Root mean square by which poses must have moved for their ranges to show another noise, m."""
-
-
-def _solved(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate at the optimum of all of its measurements."""
-    solved = optimize_with_heights(estimate.problem, task.config.solver)[0]
-    graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
-    return replace(estimate, graph=graph.with_estimates_of(solved))
-
-
 def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     """Estimate anchors and their calibration once more at the poses found, errors steady by direction counted as well."""
     if task.config.ranges.steady == 0.0:
@@ -76,7 +58,7 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     graph, given = estimate.graph, at_given_poses(estimate.graph)
     if not any(free.any() for free in free_unknowns(given).values()):
         return estimate
-    done = _solved(replace(estimate, graph=given), task).graph
+    done = solved(replace(estimate, graph=given), task).graph
     # What the search itself has fixed are heights put back to 0.
     fixed = np.asarray(graph.fixed_calibration) | (np.asarray(done.fixed_calibration) & ~np.asarray(given.fixed_calibration))
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))

@@ -57,7 +57,7 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
     ------
     ConfigError : no cloud has anything there, or no column of that radius.
     """
-    points = se2.transform(poses[clouds.owner], clouds.points)
+    points = se2.transform_each(poses, clouds.owner, clouds.points)
     place = np.array(landmark.position)
     near = np.abs(np.hypot(*(points - place).T)) < landmark.radius + _NEAR
     where = f"constraints: landmark {landmark.name!r} at {place[0]:g}, {place[1]:g}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Ints
-from ..graph.calibration import LASER, RADIO, with_free, with_nonnegative_heights
+from ..graph.calibration import LASER, RADIO, optimize_with_heights, with_free, with_nonnegative_heights
 from ..graph.graph import Edges, Graph
 from ..graph.marginals import marginals
 from ..graph.robust import SQUARED
@@ -223,22 +223,46 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
         )  # fmt: skip
         if shift < config.refinement.same_pairs:
             break
-    return estimate if estimate.ranges is None or estimate.joint is None else _matched_once_more(estimate, scans, task)
+    return estimate if estimate.ranges is None or estimate.joint is None else _by_own_errors(estimate, scans, task)
 
 
-def _matched_once_more(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimate:
-    """Match again where ranges that weigh by their own errors alone move poses: there the lidar hardly constrains them."""
-    config, settings = task.config, replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
-    free = with_range_noise(estimate, config)
-    moved = free.with_estimates_of(optimize(free.problem, config.solver)[0])
-    shift = moved.moved_since(estimate.graph.poses)
-    if shift < settings.same_pairs:
+def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimate:
+    """Solve everything with ranges that weigh by their own errors alone.
+
+    What all ranges from one direction are wrong by alike moves an anchor, and no number of them averages it out; but it
+    gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
+    constrains these, and it is matched again.
+    """
+    before = estimate.graph.poses
+    estimate = solved(with_range_noise(estimate, task.config), task)
+    if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:
+        estimate = _matched_once_more(estimate, scans, shift, task)
+        before = estimate.graph.poses
+        estimate = solved(with_range_noise(estimate, task.config), task)
+    if estimate.moved_since(before) < _STILL:
         return estimate
-    i, j = _pairs(moved.graph, scans, settings, task)
-    refined = _refine(moved.graph, free.odometry_and_ranges, scans, i, j, settings, task, "joint refinement")
+    return solved(with_range_noise(estimate, task.config), task)
+
+
+_STILL = 0.001
+"""Root mean square by which poses must have moved for their ranges to show another noise, m."""
+
+
+def _matched_once_more(estimate: Estimate, scans: ScanClouds, shift: float, task: Task) -> Estimate:
+    """Match all clouds again after the poses moved by a shift, m, and solve with what they measure."""
+    settings = replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
+    i, j = _pairs(estimate.graph, scans, settings, task)
+    refined = _refine(estimate.graph, estimate.odometry_and_ranges, scans, i, j, settings, task, "joint refinement")
     task.stages.end("matched once more", pairs=len(i), used=int(refined.used.sum()), shift=round(shift, 5))
-    graph = with_nonnegative_heights(moved.graph.with_estimates_of(refined.graph))
-    return replace(moved, graph=graph, joint=refined.edges)
+    graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
+    return replace(estimate, graph=graph, joint=refined.edges)
+
+
+def solved(estimate: Estimate, task: Task) -> Estimate:
+    """Return the estimate at the optimum of all of its measurements."""
+    found = optimize_with_heights(estimate.problem, task.config.solver)[0]
+    graph = replace(estimate.graph, fixed_calibration=found.fixed_calibration)
+    return replace(estimate, graph=graph.with_estimates_of(found))
 
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:

@@ -66,7 +66,7 @@ def alignment_of(estimate: Estimate, task: Task) -> Floats:
     graph, normals = estimate.graph, np.zeros((0, 2))
     if task.config.align == "walls" and estimate.scans is not None:
         clouds = estimate.scans.clouds
-        normals = se2.rotate(graph.poses[clouds.owner, 2], clouds.normals)
+        normals = se2.rotate_each(graph.poses[:, 2], clouds.owner, clouds.normals)
     return alignment(task.config.align, graph, estimate.placed, normals)
 
 

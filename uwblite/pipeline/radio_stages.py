@@ -163,7 +163,7 @@ def with_range_noise(estimate: Estimate, config: MappingConfig, *, steady: bool 
     graph, through = estimate.graph, None
     if (steady or estimate.joint is not None) and estimate.scans is not None and config.ranges.learn:
         seen = estimate.scans.clouds
-        surfaces = se2.transform(graph.poses[seen.owner], seen.points)
+        surfaces = se2.transform_each(graph.poses, seen.owner, seen.points)
         tags = estimate.ranges.tag_positions(graph.poses)
         through = blocked(tags, graph.anchors[estimate.ranges.anchor], surfaces)
     ranges, _ = learn_noise(estimate.ranges, graph, len(estimate.anchor_ids), config.ranges, steady=steady, blocked=through)

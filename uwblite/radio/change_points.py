@@ -86,31 +86,53 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     if alone < _WORSE * len(ranges):
         return None
     starts = np.unique(np.linspace(_LEAST_RANGES, len(ranges) - _LEAST_RANGES, _SPLITS).astype(np.int64)).tolist()
-    best, split, before, after = min((_converged(path, ranges, k, width, config) for k in starts), key=lambda found: found[0])
-    if best > (1.0 - _EXPLAINED) * alone:
+    tried: dict[int, _Split] = {}
+    best = min((_converged(path, ranges, k, width, config, tried) for k in starts), key=lambda found: found.unexplained)
+    if best.unexplained > (1.0 - _EXPLAINED) * alone:
         return None
-    move = Move(float(stamps[split]), before.position, after.position)
-    return move if move.distance > max(_LEAST_MOVE, _SIGMAS * np.hypot(before.position_sigma, after.position_sigma)) else None
+    move = Move(float(stamps[best.moment]), best.before.position, best.after.position)
+    sigma = np.hypot(best.before.position_sigma, best.after.position_sigma)
+    return move if move.distance > max(_LEAST_MOVE, _SIGMAS * sigma) else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Split:
+    """The places that suit the ranges before and after a moment, and the moment that suits these places best."""
+
+    before: AnchorHypothesis
+    after: AnchorHypothesis
+    moment: int
+    """First range from the second place."""
+    unexplained: float
+    """How many ranges the two places leave unexplained with it."""
 
 
 def _converged(
-    path: Floats, ranges: Floats, split: int, width: float, config: TrilaterationConfig
-) -> tuple[float, int, AnchorHypothesis, AnchorHypothesis]:
-    """Return how many ranges two places leave unexplained, the first range of the second one, and both places.
+    path: Floats, ranges: Floats, first: int, width: float, config: TrilaterationConfig, tried: dict[int, _Split]
+) -> _Split:
+    """Find places and moment in turn, from a first moment on (k-means with two clusters in a row).
 
-    From a first moment on, the places that suit the ranges before and after it and the moment that suits the two places
-    are found in turn: the cost of every moment follows from running sums (k-means with two clusters in a row).
+    Parameters
+    ----------
+    tried : moments split at before; searches from several first moments meet. New ones are added.
     """
-    low, high = _LEAST_RANGES, len(ranges) - _LEAST_RANGES
     for _ in range(_ROUNDS):
-        before, after = (_fitted(path[part], ranges[part], width, config) for part in (slice(0, split), slice(split, None)))
-        by_one, by_other = (_misfit(path, ranges, place, width) for place in (before, after))
-        cost = np.concatenate([[0.0], np.cumsum(by_one - by_other)])[low : high + 1] + by_other.sum()
-        best = low + int(np.argmin(cost))
-        if best == split:
+        if first not in tried:
+            tried[first] = _split(path, ranges, first, width, config)
+        if (found := tried[first]).moment == first:
             break
-        split = best
-    return float(cost[best - low]), best, before, after
+        first = found.moment
+    return found
+
+
+def _split(path: Floats, ranges: Floats, first: int, width: float, config: TrilaterationConfig) -> _Split:
+    """Fit places to the ranges before and after a moment; the cost of every other moment follows from running sums."""
+    low, high = _LEAST_RANGES, len(ranges) - _LEAST_RANGES
+    before, after = (_fitted(path[part], ranges[part], width, config) for part in (slice(0, first), slice(first, None)))
+    by_one, by_other = (_misfit(path, ranges, place, width) for place in (before, after))
+    cost = np.concatenate([[0.0], np.cumsum(by_one - by_other)])[low : high + 1] + by_other.sum()
+    best = int(np.argmin(cost))
+    return _Split(before, after, low + best, float(cost[best]))
 
 
 def _fitted(path: Floats, ranges: Floats, width: float, config: TrilaterationConfig) -> AnchorHypothesis:

@@ -41,8 +41,9 @@ def blocked(tags: Floats, anchors: Floats, surfaces: Floats) -> Bools:
         row = np.repeat(part, count[part])
         begins = np.cumsum(count[part]) - count[part]
         along = _NEAR_TAG + 0.5 * cell * (np.arange(len(row)) + np.repeat(first[part] - begins, count[part]))
-        place = tags[row] + way[row] * (along / length[row])[:, None]
-        through[row[_look_up(place, low, cell, occupied)]] = True
+        along /= length.take(row)
+        x, y = (tag.take(row) + ahead.take(row) * along for tag, ahead in zip(tags.T, way.T, strict=True))
+        through[row[_look_up(x, y, low, cell, occupied)]] = True
     return through
 
 
@@ -61,20 +62,21 @@ def _over_map(start: Floats, ahead: Floats, length: Floats, cell: float, size: F
 
 def _occupied(surfaces: Floats) -> tuple[Floats, float, Bools]:
     """Return the lower corner (2,) of the map, the side of its cells and which of them (x, y) hold a surface."""
-    low, high = surfaces.min(axis=0), surfaces.max(axis=0)
+    x, y = np.ascontiguousarray(surfaces.T)  # reductions along pairs are slow
+    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     cell = max(_CELL, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
-    place = _cells(surfaces, low, cell)
-    shape = place.max(axis=0) + 1
-    hits = np.bincount(place[:, 0] * shape[1] + place[:, 1], minlength=int(shape.prod()))
+    column, row = _cells(x, low[0], cell), _cells(y, low[1], cell)
+    shape = int(column.max()) + 1, int(row.max()) + 1
+    hits = np.bincount(column * shape[1] + row, minlength=shape[0] * shape[1])
     return low, cell, (hits >= _LEAST_POINTS).reshape(shape)
 
 
-def _cells(places: Floats, low: Floats, cell: float) -> Ints:
+def _cells(places: Floats, low: float, cell: float) -> Ints:
     return np.floor((places - low) / cell).astype(np.int64)
 
 
-def _look_up(places: Floats, low: Floats, cell: float, occupied: Bools) -> Bools:
-    """Return which places (s,) lie in a cell with a surface."""
-    x, y = _cells(places, low, cell).T
-    inside = (x >= 0) & (y >= 0) & (x < occupied.shape[0]) & (y < occupied.shape[1])
-    return np.asarray(inside & occupied[np.where(inside, x, 0), np.where(inside, y, 0)])
+def _look_up(x: Floats, y: Floats, low: Floats, cell: float, occupied: Bools) -> Bools:
+    """Return which places x, y (s,) lie in a cell with a surface."""
+    column, row = _cells(x, low[0], cell), _cells(y, low[1], cell)
+    inside = (column >= 0) & (row >= 0) & (column < occupied.shape[0]) & (row < occupied.shape[1])
+    return np.asarray(inside & occupied[np.where(inside, column, 0), np.where(inside, row, 0)])

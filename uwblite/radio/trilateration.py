@@ -112,18 +112,23 @@ def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) ->
     step = float(np.max(high - low)) / config.raster
     axes = [np.arange(low[k] + step / 2, high[k] + step / 2, step) for k in (0, 1)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    distance = np.sqrt(((cells[:, None, :] - path[None, :, :]) ** 2).sum(axis=2))
-    error = ranges - distance
+    across, along = ((axis[:, None] - place) ** 2 for axis, place in zip(axes, path.T, strict=True))
+    error = ranges - np.sqrt(across[:, None] + along).reshape(len(cells), -1)
     bias = np.clip(np.median(error, axis=1), -config.bias_sigma - step, 3.0 * config.bias_sigma + step)
     cost = np.minimum(((error - bias[:, None]) / (0.7 * step)) ** 2, 1.0).mean(axis=1)
     cost += 0.05 * (bias / (config.bias_sigma + step)) ** 2
-    best: list[int] = []
-    for cell in np.argsort(cost, kind="stable")[:200]:
-        if all(np.abs(cells[cell] - cells[other]).max() > 1.5 * step for other in best):
-            best.append(int(cell))
-        if len(best) == 10:
-            break
+    likely = np.argsort(cost, kind="stable")[:_CELLS_LOOKED_AT]
+    best, apart = list[int](), np.ones(len(likely), dtype=bool)
+    while len(best) < _MOST_STARTS and apart.any():
+        best.append(int(likely[np.argmax(apart)]))
+        apart &= np.abs(cells[likely] - cells[best[-1]]).max(axis=1) > 1.5 * step
     return cells[best], bias[best], step
+
+
+_CELLS_LOOKED_AT = 200
+"""Cells of the raster, the best first, among which starts are chosen."""
+_MOST_STARTS = 10
+"""Cells from which descent starts."""
 
 
 def _starts(cells: Floats, bias: Floats, step: float) -> Floats:
