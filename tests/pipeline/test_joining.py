@@ -16,7 +16,7 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.pipeline.estimate import Estimate
-from uwblite.pipeline.joining import _FIRST_TOLERANCE, _laid_on, _one_bootstrap, _one_graph, _other_name, join
+from uwblite.pipeline.joining import _FIRST_TOLERANCE, _laid_on, _one_bootstrap, _one_graph, _other_name, join, radio_name
 from uwblite.radio.bootstrap import BootstrapResult
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
@@ -77,6 +77,20 @@ def test_a_moved_anchor_is_called_as_the_earlier_recording_that_found_it_there()
     assert _other_name("A", here, 0.06, 3, placed) == "A#2"
     assert _other_name("A", here, 0.0, 2, placed) == "A#3"
     assert _other_name("A", here + 5.0, 0.0, 3, placed) == "A#4"
+
+
+def test_an_anchor_that_was_moved_while_recorded_is_called_so_in_later_recordings():
+    """The second recording hears it under its first name, where the first one heard it last."""
+    placed = {"A": (np.array([9.0, 0.0]), 0.0), "B@2": (np.zeros(2), 0.0), "A@2": (np.zeros(2), 0.0)}
+    assert _other_name("A", np.array([0.3, 0.3]), 0.0, 1, placed) == "A@2"
+    assert _other_name("A@2", np.array([9.2, 0.3]), 0.0, 1, placed) == "A"
+    assert _other_name("A", np.array([0.4, 0.4]), 0.0, 1, placed) == "A#2"
+
+
+@pytest.mark.parametrize("anchor", ["5C0B", "5C0B#2", "5C0B@2", "5C0B@12#3"])
+def test_all_places_of_an_anchor_have_one_radio_name(anchor):
+    assert radio_name(anchor) == "5C0B"
+    assert radio_name("a@b#c") == "a@b#c"
 
 
 def mapped(seed, tag, ids):

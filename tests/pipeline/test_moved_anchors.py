@@ -104,8 +104,10 @@ def test_an_anchor_is_not_named_where(beginnings, heard):
     assert said(beginnings, heard) == []
 
 
-def test_the_second_place_of_a_moved_anchor_is_no_new_anchor():
-    assert said([HERE, HERE], [("A",), ("A#2",)], ("A", "A#2")) == []
+@pytest.mark.parametrize("other", ["A#2", "A@2", "A@2#2"])
+def test_the_second_place_of_a_moved_anchor_is_no_new_anchor(other):
+    """Moved between recordings, while one was recorded, or both."""
+    assert said([HERE, HERE], [("A",), (other,)], ("A", other)) == []
 
 
 def test_ranges_that_do_not_count_are_no_hearing():

@@ -6,6 +6,7 @@ the other; one that was moved in between does not join in, gets a place of its o
 Systematic errors of odometry, tag and ranges stay each recording's own, see calibration.unknowns.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -82,11 +83,15 @@ def numbered(anchor: str, recording: int) -> str:
     return f"{anchor}#{recording + 1}"
 
 
+def radio_name(anchor: str) -> str:
+    """Return what the radio calls an anchor, given the id of one of its places, as ``5C0B@2#3``."""
+    return re.sub(r"(@\d+)?(#\d+)?$", "", anchor)
+
+
 def _other_name(name: str, here: Floats, spread: float, number: int, placed: dict[str, tuple[Floats, float]]) -> str:
     """Return what to call an anchor that does not stand at its first place: as a recording that found it here does."""
-    for earlier in range(1, number):
-        other = numbered(name, earlier)
-        if other in placed and np.hypot(*(placed[other][0] - here)) < _tolerance(spread, placed[other][1]):
+    for other, (place, sigma) in placed.items():
+        if radio_name(other) == radio_name(name) and np.hypot(*(place - here)) < _tolerance(spread, sigma):
             return other
     return numbered(name, number)
 

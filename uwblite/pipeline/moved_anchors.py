@@ -13,7 +13,7 @@ from ..graph.solver import SolverConfig, optimize
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
 from .estimate import Estimate, Task
-from .joining import numbered, warn_of_moved_anchor
+from .joining import numbered, radio_name, warn_of_moved_anchor
 from .lidar_stages import refine_jointly
 
 _LEAST_MOVE = 0.25
@@ -97,7 +97,7 @@ def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     recording_of, number = task.recordings.of_keyframe, len(task.recordings)
     # Where an anchor was moved, one place follows the other: that is reported, and the anchor is heard all the time.
-    names = np.array([name.split("#")[0] for name in estimate.anchor_ids])
+    names = np.array([radio_name(name) for name in estimate.anchor_ids])
     alive = np.flatnonzero(ranges.alive)
     heard_by = np.zeros((len(names), number), dtype=np.int64)
     np.add.at(heard_by, (ranges.anchor[alive], recording_of[ranges.pose[alive]]), 1)
