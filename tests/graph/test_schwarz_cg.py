@@ -63,6 +63,16 @@ def test_the_number_of_iterations_hardly_grows_with_the_length():
     assert counts[1] < 1.5 * counts[0]
 
 
+def test_pieces_end_with_their_chains():
+    """Two chains of a piece and a half and of half a piece: three pieces, none of which goes across."""
+    first, count = _PIECE + _PIECE // 2, 2 * _PIECE
+    places = np.arange(3 * count).reshape(count, 3)
+    pieces = cut(places, np.zeros((count, 3)), 3 * count, np.arange(count - 1) != first - 1)
+    owner = [np.unique(own[own < 3 * count] // 3) for own in pieces.number]
+    assert [(own[0], own[-1] + 1) for own in owner] == [(0, _PIECE), (_PIECE, first), (first, count)]
+    assert pieces.basis.shape == (3 * count, 9)
+
+
 def test_the_minimum_is_that_of_the_factorisation(monkeypatch):
     graph, truth = tied(700, 20)
     found, summary = optimize(graph)
@@ -88,7 +98,7 @@ def test_the_coarse_level_moves_pieces_as_rigid_bodies_and_all_else_on_its_own()
     count, size = 2 * _PIECE, 6 * _PIECE + 4
     poses, places = rng.normal(size=(count, 3)), rng.permutation(size)
     number, others = places[: 3 * count].reshape(count, 3), np.sort(places[3 * count :])
-    basis = cut(number, poses, size).basis.toarray()
+    basis = cut(number, poses, size, np.ones(count - 1, dtype=bool)).basis.toarray()
     motion, step = rng.normal(size=(2, 3)), 1e-6
     moved = basis @ np.concatenate([motion.ravel(), rng.normal(size=4)])
     for k in range(2):

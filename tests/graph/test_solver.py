@@ -12,7 +12,7 @@ from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
-from uwblite.graph.solver import SolverConfig, _as_much_again, _extrapolated, _linked, _relaxed, _step, _trial, optimize
+from uwblite.graph.solver import SolverConfig, _as_much_again, _extrapolated, _relaxed, _step, _trial, optimize
 from uwblite.graph.unknowns import moved, moved_along
 from uwblite.io.g2o import read_g2o
 
@@ -585,12 +585,6 @@ def test_a_step_takes_whichever_way_costs_less(way):
     aimed = graph.with_edges(PriorEdges("poses", np.arange(4), ends[way].poses, everywhere))
     assert not np.allclose(ends[moved].poses, ends[moved_along].poses)
     assert np.allclose(_trial(aimed, unknowns, step, linked).poses, ends[way].poses)
-
-
-def test_linked_is_a_pose_that_is_measured_from_the_one_before_it():
-    poses = random_poses(np.random.default_rng(5), 5)
-    edges = relative_edges(poses, np.array([0, 1, 3, 2]), np.array([1, 3, 4, 1]), np.ones(3))
-    assert _linked(5, linearize(Graph(poses, np.zeros((0, 2)), (edges,)))).tolist() == [True, False, False, True]
 
 
 @pytest.mark.parametrize(

@@ -18,11 +18,13 @@ from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
     _best_views,
+    _surfaces_moved,
     choose_pairs,
     refine,
     surface_cells,
     with_fewer_pairs,
 )
+from uwblite.lidar.scan_matching import PairFactors
 
 CONFIG = RefinementConfig()
 NOISE = np.array([0.01, 0.005, 0.006])
@@ -91,6 +93,16 @@ def test_a_corridor_leaves_the_way_along_it_to_the_wheels():
     crooked = solved[:, 1] - truth[:, 1] - np.polyval(line, truth[:, 0])
     assert np.abs(crooked).max() < 0.02
     assert np.ptp(solved[:, 0]) == pytest.approx(1.05 * 12, rel=0.005)
+
+
+def test_poses_that_creep_along_a_wall_move_no_surface():
+    """One pair that sees a wall along x: 3 mm along it count for nothing, 3 mm across it are 3 mm; a whole turn is none."""
+    hessian = np.diag([0.0, 40.0, 10.0])[None]
+    factors = PairFactors(hessian, 0 * hessian, np.zeros((1, 3)), *(np.array([40]) for _ in range(4)))
+    yes = np.ones(1, dtype=bool)
+    for change, moved in (([0.003, 0.0, 0.0], 0.0), ([0.0, 0.003, 2 * np.pi], 0.003), ([0.0, 0.0, 0.004], 0.002)):
+        assert _surfaces_moved(factors, yes, np.array([change])) == pytest.approx(moved, abs=1e-12)
+    assert _surfaces_moved(factors, ~yes, np.ones((1, 3))) == 0.0
 
 
 def test_pairs_are_ordered_unique_and_overlap():

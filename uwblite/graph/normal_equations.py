@@ -19,7 +19,7 @@ from .factorization import Factor, choose_ordering
 from .graph import Graph, Linearization, edge_weights, linearize
 from .matrix_layout import Blocks, IterativeLayout, Layout, SparseLayout, make_layout
 from .schwarz_cg import cut
-from .unknowns import WIDTHS, Unknowns, free_unknowns
+from .unknowns import WIDTHS, Unknowns, free_unknowns, linked_poses
 
 _AT_ONCE = 1 << 15
 """Edges whose products are in memory at once; a bound on the memory."""
@@ -81,8 +81,9 @@ class NormalEquations:
         self._place_products(linearized, touched, which, corner)
         if ordering.iterative:
             number = self.unknowns.number["poses"]
-            chain = number[:, 0] >= 0
-            self._layout: Layout = IterativeLayout(blocks, cut(number[chain], graph.poses[chain], self.unknowns.size))
+            chain = np.flatnonzero(number[:, 0] >= 0)
+            linked = (np.diff(chain) == 1) & linked_poses(len(number), linearized)[chain[:-1]]
+            self._layout: Layout = IterativeLayout(blocks, cut(number[chain], graph.poses[chain], self.unknowns.size, linked))
         else:
             self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
         self.values: Floats = np.zeros(self._trash + 1)

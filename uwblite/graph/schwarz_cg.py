@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
 
 _PIECE = 24
@@ -34,17 +34,24 @@ class Pieces:
     """(n, c) motions of the coarse level: three of each piece as a rigid body, and each unknown that is no pose."""
 
 
-def cut(number: Ints, poses: Floats, size: int) -> Pieces:
-    """Cut the free poses of a graph into pieces.
+def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
+    """Cut the free poses of a graph into pieces, none of which goes on from one chain to another.
+
+    Two chains in one piece, as the end of a recording and the begin of the next, move apart, which the coarse level would
+    not know: every such piece costs tens of iterations.
 
     Parameters
     ----------
     number : (k, 3) place of each pose's x, y, theta in the vector of unknowns, in the order of the chain.
     poses : (k, 3) about which they move.
     size : n, length of the vector.
+    linked : (k - 1,) which poses share an edge with the next one.
     """
-    piece, within = np.divmod(np.arange(len(number)), _PIECE)
-    pieces = len(number) // _PIECE + (len(number) % _PIECE > 0)
+    each = np.arange(len(number))
+    begin = np.maximum.accumulate(np.where(np.append(True, ~linked), each, 0))
+    within = (each - begin) % _PIECE
+    piece = np.cumsum(within == 0) - 1
+    pieces = int(piece[-1]) + 1
     places = np.full((pieces, 3 * _PIECE), size)
     places[piece[:, None], 3 * within[:, None] + np.arange(3)] = number
     centre = np.stack([np.bincount(piece, column) for column in poses[:, :2].T], axis=1) / np.bincount(piece)[:, None]

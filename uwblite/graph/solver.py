@@ -46,7 +46,7 @@ from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost, kernel_weights, linearize
 from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
-from .unknowns import Unknowns, moved, moved_along
+from .unknowns import Unknowns, linked_poses, moved, moved_along
 
 Progress = Callable[[int, int], None]
 """Called as progress(iterations done, most iterations)."""
@@ -153,7 +153,7 @@ class _Descent:
         """To be used again; None = factorise."""
         self.damping, self.raised_by, self.last_decrease = config.initial_damping, 2.0, np.inf
         self.scale = np.zeros(normal.unknowns.size)
-        self.linked = _linked(len(graph.poses), linearized)
+        self.linked = linked_poses(len(graph.poses), linearized)
         robust = any(edges.kernel.name != "none" for edges in graph.edges)
         self.to_come = _as_much_again if robust else _extrapolated
 
@@ -283,16 +283,6 @@ def _trial(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Gra
     along = moved_along(graph, unknowns, step, linked)
     costs = [sum(edge_cost(e, e.residuals(g)) for e in g.edges) for g in (straight, along)]
     return straight if not costs[1] < costs[0] else along
-
-
-def _linked(poses: int, linearized: list[Linearization]) -> Bools:
-    """Return which poses (n - 1,) are measured from the one before them."""
-    linked = np.zeros(max(poses - 1, 0), dtype=bool)
-    for lin in linearized:
-        ends = [number for name, number, _ in lin.blocks if name == "poses"]
-        if len(ends) == 2:
-            linked[ends[0][ends[1] == ends[0] + 1]] = True
-    return linked
 
 
 def _cost(graph: Graph, linearized: list[Linearization]) -> float:

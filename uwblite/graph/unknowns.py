@@ -1,12 +1,13 @@
 """Free scalars of a graph as one vector, and what a step along it does to the estimates."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from .graph import Graph
+from .graph import Graph, Linearization
 
 WIDTHS = {"poses": 3, "anchors": 2, "calibration": 1}
 """Blocks of unknowns, and the scalars of one unknown."""
@@ -65,6 +66,21 @@ def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -
     poses[:, :2] = start[first, :2] + _since(way, first)
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     return _moved_to(graph, unknowns, step, np.where(free[:, None], poses, start))
+
+
+def linked_poses(poses: int, linearized: Sequence[Linearization]) -> Bools:
+    """Return which poses (n - 1,) hang together with the next one, in chains.
+
+    Where edges of one kind all join neighbours, as odometry does, only these count: where one recording ends and another
+    begins, clouds may be paired as well, and even with no weight.
+    """
+    ends = [[index for name, index, _ in lin.blocks if name == "poses"] for lin in linearized]
+    pairs = [pair for pair in ends if len(pair) == 2]
+    chains = [(a, b) for a, b in pairs if np.all(b == a + 1)]
+    linked = np.zeros(max(poses - 1, 0), dtype=bool)
+    for a, b in chains or pairs:
+        linked[a[b == a + 1]] = True
+    return linked
 
 
 def _since(values: Floats, first: Ints) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, rms_length
+from ..arrays import Bools, Floats, Ints
 from ..config import setting
 from ..graph.calibration import scan_indices
 from ..graph.graph import Graph, linearize
@@ -73,8 +73,8 @@ class RefinementConfig:
     correlation: float = setting(4.0, advanced=True)
     """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
     convergence: float = setting(0.0002, advanced=True)
-    """Rounds end early when the places of clouds in the frames of their partners change by less than this (root mean
-    square) at the last gate, m."""
+    """Rounds end early when the surfaces of clouds move against those of their partners by less than this (root mean square)
+    at the last gate, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,7 +216,7 @@ def refine(
         solved, summary = minimise(problem, linearize(problem), normal, brief)
         graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
         before, T_i_j = T_i_j, probe.relative(graph)
-        moved = rms_length((T_i_j - before)[used, :2]) if used.any() else 0.0
+        moved = _surfaces_moved(factors, used, T_i_j - before)
         rounds += 1
         if on_round is not None:
             on_round(rounds, config.rounds)
@@ -224,6 +224,16 @@ def refine(
         if rounds >= config.rounds or (last and moved < config.convergence):
             return RefinementResult(graph, replace(edges.rows(used), weights=None), i, j, factors, used, sigma, rounds, summary)
         gate = max(gate * config.shrink, config.last_gate)
+
+
+def _surfaces_moved(factors: PairFactors, used: Bools, change: Floats) -> float:
+    """Return how far changes (e, 3) of relative poses move matched points off their lines, root mean square, m.
+
+    Along what the scans do not see, poses may creep on from round to round; no match changes by that.
+    """
+    change, hessian = np.column_stack([change[used, :2], se2.wrap_angle(change[used, 2])]), factors.hessian[used]
+    squared = np.einsum("ei,eij,ej->", change, hessian, change, optimize=True)
+    return float(np.sqrt(max(squared, 0.0) / max(factors.weight[used].sum(), 1.0)))
 
 
 def with_fewer_pairs(graph: Graph, most: int = 12000) -> Graph:

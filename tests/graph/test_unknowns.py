@@ -1,0 +1,24 @@
+"""Which poses hang together with the next one."""
+
+import numpy as np
+from helpers.planted_graphs import random_poses, relative_edges
+
+from uwblite.graph.graph import Graph, linearize
+from uwblite.graph.unknowns import linked_poses
+
+POSES = random_poses(np.random.default_rng(5), 5)
+
+
+def linked(*ends):
+    """Return which of five poses are linked by these kinds of edges."""
+    edges = tuple(relative_edges(POSES, np.array(i), np.array(j), np.ones(3)) for i, j in ends)
+    return linked_poses(5, linearize(Graph(POSES, np.zeros((0, 2)), edges))).tolist()
+
+
+def test_linked_is_a_pose_that_is_measured_from_the_one_before_it():
+    assert linked(([0, 1, 3, 2], [1, 3, 4, 1])) == [True, False, False, True]
+
+
+def test_where_odometry_is_a_chain_only_its_links_count():
+    """Two recordings, of three and two poses, and clouds matched within and across them."""
+    assert linked(([0, 1, 3], [1, 2, 4]), ([2, 0, 1], [3, 4, 2])) == [True, True, False, True]
