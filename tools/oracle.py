@@ -159,7 +159,7 @@ class Oracle:
         return x
 
     def poses(self) -> Floats:
-        """Return the poses (k, 3), the first held at its true place."""
+        """Return the poses (k, 3), the first fixed at its true place."""
         return np.concatenate([self.truth[:1], self.x[self.layout.poses[1:].ravel()].reshape(-1, 3)])
 
     def solve(self) -> OracleFigures:
@@ -191,7 +191,7 @@ class Oracle:
         return matrix, gradient
 
     def _rows(self, columns: Ints, values: Floats) -> sparse.csr_matrix:
-        """Return rows (m,) that are non-zero in these columns (m, c); a column below 0 is held."""
+        """Return rows (m,) that are non-zero in these columns (m, c); a column below 0 is fixed."""
         row = np.broadcast_to(np.arange(len(columns))[:, None], columns.shape)
         free = columns >= 0
         return sparse.csr_matrix((values[free], (row[free], columns[free])), shape=(len(columns), self.layout.size))

@@ -18,7 +18,7 @@ SPECS = {name: f"{name}:port" for name in BOARDS} | {
     "line": "line:port?columns=t,id,range,quality&prefix=UWB&unit=0.001&time_unit=0.001"
 }
 SEEN = SPREAD + SPEED * MOST_GAP + 0.1
-"""m; a wrong range that lies so near to the one before cannot be told from a right one; that one may be a little wrong, too."""
+"""m; a wrong range so near to the one before cannot be distinguished from a right one; that may be a little wrong, too."""
 
 
 def flip(data, rate, rng):

@@ -37,7 +37,7 @@ def test_transcript_in_every_split_and_among_noise(name):
         return protocol
 
     expected = good(make().feed(b"".join(groups), 1.0))
-    # A capsule is decoded when the next one has come, and the first two tell how far apart they stand.
+    # A capsule is decoded when the next one has come, and the first two show how far apart they stand.
     assert len(expected) >= len(groups) - 2 * (name == "rplidar")
     assert all(isinstance(event, Samples) for event in expected)
     check_transcript(make, groups, expected, NOISES, splits=30)

@@ -19,7 +19,7 @@ def seen(rng, variances, noise, measurements=300, unknowns=30, each=40):
 @pytest.mark.parametrize("noise", [0.05, 1.0])
 @pytest.mark.parametrize("variances", [(1.0,), (0.1, 0.5), (2.0, 0.02)])
 def test_planted_variances_are_found(variances, noise):
-    """40 errors of a kind tell their variance to sqrt(2 / 40) = 22 %: the mean over ten draws to 7 %, and the prior, of 1.4 in
+    """40 errors of a kind show their variance to sqrt(2 / 40) = 22 %: the mean over ten draws to 7 %, and the prior, of 1.4 in
     the logarithm, draws it by 2.5 % of its own distance."""
     rng = np.random.default_rng(1)
     found = np.mean([variances_of_kinds(*seen(rng, variances, noise)) for _ in range(10)], axis=0)

@@ -119,8 +119,8 @@ def test_the_optimum_of_the_file_is_that_of_the_graph(tmp_path, write, read):
 
 def test_fixed_vertices_stay_fixed(tmp_path):
     graph = plain_graph()
-    held = {"fixed_poses": np.arange(9) % 4 == 1, "fixed_anchors": np.arange(3) == 2}
-    graph = Graph(graph.poses, graph.anchors, graph.edges[:1], **held)
+    fixed = {"fixed_poses": np.arange(9) % 4 == 1, "fixed_anchors": np.arange(3) == 2}
+    graph = Graph(graph.poses, graph.anchors, graph.edges[:1], **fixed)
     write_g2o(tmp_path / "a", graph)
     back = read_g2o(tmp_path / "a").graph
     np.testing.assert_array_equal(back.fixed_poses, graph.fixed_poses)
@@ -336,8 +336,8 @@ def test_names_of_vertices_survive(tmp_path, ending, there, capsys):
         f"EDGE_SE2 0 {i} {j} 1 0 0 0.01 0 0 0.01 0 0.01\n" for i, j in (("A225", "A226"), ("A225", "b7"))
     )
     g2o = "VERTEX_SE2 225 0 0 0\nVERTEX_SE2 300 1 0 0\nVERTEX_XY 226 3 3\nEDGE_SE2 225 300 1 0 0 9 0 0 9 0 9\n"
-    sight = {"pyfg": "EDGE_RANGE 0 A225 L9 4 0.01\nEDGE_RANGE 1 A226 L9 4 0.01\n", "g2o": "EDGE_SE2_XY 225 226 3 3 1 0 1\n"}
-    (tmp_path / f"in.{ending}").write_text({"pyfg": pyfg, "g2o": g2o}[ending] + sight[ending])
+    landmarks = {"pyfg": "EDGE_RANGE 0 A225 L9 4 0.01\nEDGE_RANGE 1 A226 L9 4 0.01\n", "g2o": "EDGE_SE2_XY 225 226 3 3 1 0 1\n"}
+    (tmp_path / f"in.{ending}").write_text({"pyfg": pyfg, "g2o": g2o}[ending] + landmarks[ending])
     assert main(["optimize", str(tmp_path / f"in.{ending}"), "--out", str(tmp_path / f"out.{there}")]) == 0
     lines = lines_of(tmp_path / f"out.{there}", "VERTEX")
     names = {line.split()[1 + (there == "pyfg" and "_XY" not in line)] for line in lines}

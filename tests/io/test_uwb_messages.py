@@ -257,7 +257,7 @@ CASES = {
 }  # fmt: skip
 ROS = (1, 2)
 SPACING = 100.0
-"""s between the messages of two cases, by which their ranges are told apart in one recording."""
+"""s between the messages of two cases, by which their ranges are distinguished in one recording."""
 
 
 def bags_of(cases):

@@ -42,7 +42,7 @@ def rays_of(poses, way=1.0):
 
 @pytest.mark.parametrize("factor", [0.9, 0.97, 1.0, 1.05, 1.1])
 @pytest.mark.parametrize("way", [1.0, 1.04])
-def test_scans_tell_how_much_larger_the_map_is_whatever_the_wheels_count(factor, way):
+def test_scans_measure_how_much_larger_the_map_is_whatever_the_wheels_count(factor, way):
     walls = enlarged(known(), factor).walls
     found = scan_scale(walls, POSES[-1] * [factor, factor, 1.0], rays_of(POSES, way), len(POSES))
     # Half a cell at the mean distance of 3 m, either side.
@@ -77,7 +77,7 @@ def ranges_at(poses, factor, moved=0.0):
     return Ranges(np.tile(np.arange(4), len(poses)), where, tags, true, np.full(len(true), 0.1))
 
 
-def test_ranges_tell_it_too_and_a_moved_anchor_is_no_other_unit():
+def test_ranges_measure_it_too_and_a_moved_anchor_is_no_other_unit():
     poses = path(((1.0, 1.0), (6.0, 1.0), (6.0, 5.0), (2.0, 5.0)))[::5]
     for factor in (0.9, 1.0, 1.1):
         found = range_scale(poses[-1] * [factor, factor, 1.0], ranges_at(poses, factor))

@@ -94,7 +94,7 @@ def ranges_at(pose, anchors, tag):
     return Ranges(np.arange(count), anchors, np.tile(tag, (count, 1)), np.hypot(*(anchors - there).T), np.full(count, 0.15))
 
 
-def test_a_few_points_of_walls_tell_the_heading_where_ranges_tell_the_place(room):
+def test_a_few_points_of_walls_give_the_heading_where_ranges_fix_the_place(room):
     pose = np.array([1.0, 2.5, 0.4])
     points = seen_from(pose, 9)
     rays = Rays(points, np.zeros_like(points), np.ones(len(points), bool))

@@ -50,7 +50,7 @@ def system(graph, edges, anchor):
 
 
 def test_the_stated_covariance_is_that_of_estimates_from_errors_that_are_alike():
-    """Planted errors have a scatter of their own, which only residuals tell; the weights know nothing of it.
+    """Planted errors have a scatter of their own, which only residuals show; the weights do not count it.
 
     A variance from n draws scatters by sqrt(2 / n). The median of few independent residuals and places binned to a quarter of
     the correlation length change the stated one by up to a fifth; that of the weights is off by several times.

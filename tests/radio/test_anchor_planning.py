@@ -45,7 +45,7 @@ def test_the_error_is_that_of_least_squares():
 def test_out_of_reach_informs_nothing_and_walls_inform_less():
     point, anchor = np.zeros((1, 2)), np.array([[5.0, 0.0]])
     cases = ((True, 9.0), (False, 9.0), (True, 4.0))
-    near, behind, far = (_information(point, anchor, np.array([[sight]]), reach)[0, 0] for sight, reach in cases)
+    near, behind, far = (_information(point, anchor, np.array([[free]]), reach)[0, 0] for free, reach in cases)
     assert near[0] / behind[0] == pytest.approx((SIGMA_BEHIND_WALLS / SIGMA_LINE_OF_SIGHT) ** 2)
     assert not far.any()
 

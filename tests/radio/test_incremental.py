@@ -70,8 +70,8 @@ def test_pose_graphs_need_no_ranges():
 
 def test_surveyed_anchors_hold_the_path_from_the_start():
     graph, truth, anchors = lawn(3, n=400)
-    held = replace(graph, anchors=anchors, fixed_anchors=np.ones(16, dtype=bool))
-    found, _ = optimize_incrementally(held)
+    fixed = replace(graph, anchors=anchors, fixed_anchors=np.ones(16, dtype=bool))
+    found, _ = optimize_incrementally(fixed)
     np.testing.assert_array_equal(found.anchors, anchors)
     assert rms(found.poses, truth) < 0.15
     prior = PriorEdges("anchors", np.arange(16), anchors, np.tile(np.eye(2) / 0.05, (16, 1, 1)))

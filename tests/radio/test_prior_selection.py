@@ -58,9 +58,9 @@ def solved(seed, bias=(0.0,) * 4, scale=1.0):
     listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
     attached = attach_ranges(radio, wheels, frames, LEVEL)
     edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
-    held = np.array([u.key.kind not in ("range_scale", "bias") for u in listed])
+    constant = np.array([u.key.kind not in ("range_scale", "bias") for u in listed])
     fixed = np.ones(len(frames), dtype=bool)
-    graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, None, held)
+    graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, None, constant)
     done = optimize(graph.with_edges(edges))[0]
     return graph.updated(done.poses, done.anchors, done.calibration.values), edges
 
@@ -146,8 +146,8 @@ def driven(seed, scale=1.0, unit=1.0):
     attached = attach_ranges(radio, wheels, frames, LEVEL)
     edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
     steps = wheel_edges(frames, 0, OdometryNoiseConfig(), block(listed))
-    held = np.array([u.key.kind not in ("range_scale", "bias", "odometry_scale") for u in listed])
-    graph = Graph(frames.odometry, PLACES / unit, (prior_edges(listed),), block(listed), None, None, held)
+    constant = np.array([u.key.kind not in ("range_scale", "bias", "odometry_scale") for u in listed])
+    graph = Graph(frames.odometry, PLACES / unit, (prior_edges(listed),), block(listed), None, None, constant)
     done = optimize(graph.with_edges(edges, steps))[0]
     return graph.updated(done.poses, done.anchors, done.calibration.values), (edges, steps)
 
@@ -187,17 +187,17 @@ def test_where_no_width_is_possible_the_graph_is_left_alone(monkeypatch):
 
 def test_nothing_free_leaves_the_graph_alone():
     graph, edges = solved(0)
-    held = replace(graph, fixed_calibration=np.ones(len(graph.calibration.values), dtype=bool))
-    assert select_priors(held, (edges,), CONFIG) is held
+    constant = replace(graph, fixed_calibration=np.ones(len(graph.calibration.values), dtype=bool))
+    assert select_priors(constant, (edges,), CONFIG) is constant
 
 
 @pytest.mark.filterwarnings("error")
 def test_one_of_the_two_may_be_fixed():
     graph, edges = solved(1, bias=(0.9, 0.4, 1.3, 0.7))
     scale = graph.calibration.index("range_scale")
-    held = np.asarray(graph.fixed_calibration).copy()
-    held[scale] = True
-    found = widths(select_priors(replace(graph, fixed_calibration=held), (edges,), CONFIG))
+    constant = np.asarray(graph.fixed_calibration).copy()
+    constant[scale] = True
+    found = widths(select_priors(replace(graph, fixed_calibration=constant), (edges,), CONFIG))
     assert found["range_scale"] == pytest.approx(CONFIG.range_scale, rel=1e-12)
     assert found["bias:A02"] > 3 * CONFIG.range_bias_sound
 

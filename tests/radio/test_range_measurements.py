@@ -130,8 +130,8 @@ def test_an_anchor_in_the_wrong_place_goes_where_its_ranges_agree_and_others_sta
     found = relocate(edges, graph, np.ones(len(places), dtype=bool), TrilaterationConfig())
     assert np.hypot(*(found.anchors[0] - places[0])) < 0.05
     np.testing.assert_array_equal(found.anchors[1:], wrong[1:])
-    held = relocate(edges, graph, np.zeros(len(places), dtype=bool), TrilaterationConfig())
-    np.testing.assert_array_equal(held.anchors, wrong)
+    fixed = relocate(edges, graph, np.zeros(len(places), dtype=bool), TrilaterationConfig())
+    np.testing.assert_array_equal(fixed.anchors, wrong)
 
 
 def test_ranges_of_weight_zero_move_no_anchor_and_teach_no_noise():
@@ -182,8 +182,8 @@ def test_ranges_through_something_weigh_together_as_one_draw_of_their_delay():
     # Their common delay of 0.4 m, spread() of which is 1.4826 times as much, at the least.
     assert information[through].sum() < 1.0 / 0.4**2
     poses, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig(), blocked=through)
-    told = poses.weights / poses.sigma**2
-    assert information[through].sum() < told[through].sum() < 0.2 * told[~through].sum()
+    for_poses = poses.weights / poses.sigma**2
+    assert information[through].sum() < for_poses[through].sum() < 0.2 * for_poses[~through].sum()
     none, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig(), blocked=np.zeros(len(edges), dtype=bool))
     plain, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig())
     np.testing.assert_array_equal(none.weights, plain.weights)

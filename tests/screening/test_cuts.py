@@ -60,7 +60,7 @@ def test_a_log_of_a_tunnel_with_a_minute_cut_out(anchors):
     done = screen(tunnel(18.0, anchors))
     assert carried(done) == ["carried"]
     sigma = done.screening.breaks.sigma[np.abs(done.screening.breaks.stamps - CUT) < 0.15]
-    assert sigma.max() >= 18.0, "the ranges alone tell how the sides lie"
+    assert sigma.max() >= 18.0, "the ranges alone show how the sides lie"
 
 
 def test_a_robot_carried_along_a_tunnel_while_the_wheels_go_on():

@@ -1,4 +1,4 @@
-"""The tools that measure the live pose: what they count, on a world small enough to be told by hand."""
+"""The tools that measure the live pose: what they count, on a world small enough to be counted by hand."""
 
 import grounds
 import localization

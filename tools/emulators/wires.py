@@ -34,7 +34,7 @@ class PtyWire:
         self.master, slave = os.openpty()
         tty.setraw(slave)
         self.path = os.ttyname(slave)
-        os.close(slave)  # from now on a hang-up tells that no host has it open
+        os.close(slave)  # from now on a hang-up says that no host has it open
         os.set_blocking(self.master, False)
         if self.link:
             with contextlib.suppress(FileNotFoundError):

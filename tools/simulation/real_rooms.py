@@ -154,6 +154,6 @@ def legs(walk: Floats, stride: Floats) -> Floats:
 
 
 def unseen_glass(rooms: RealRooms, glass: Bools, surface: NDArray[np.int64], cosine: Floats) -> Bools:
-    """Return which rays (k, beams) go through glass; glass (w,) tells which walls are."""
+    """Return which rays (k, beams) go through glass; glass (w,): which walls are."""
     wall = (surface >= 0) & (surface < len(glass))
     return wall & glass[np.where(wall, surface, 0)] & (cosine < rooms.glass_cosine)

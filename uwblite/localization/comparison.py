@@ -13,7 +13,7 @@ from .sensing import TRACK_RAYS
 from .walls import Rays
 from .window import Ranges, Window
 
-SCAN_EVIDENCE = 15.0
+INDEPENDENT_RAYS = 15.0
 """Rays per metre of driving that count as independent when places are compared."""
 LOOK_BACK = 4.0
 """m driven, of whose scans places are compared."""
@@ -50,7 +50,7 @@ class Comparison:
     @property
     def hypotheses(self) -> Hypotheses:
         """All places, weighted by this alone."""
-        return hypotheses.weighed(Hypotheses(self.bank.mean, self.bank.covariance, np.zeros(len(self.bank))), self.weight)
+        return hypotheses.reweighted(Hypotheses(self.bank.mean, self.bank.covariance, np.zeros(len(self.bank))), self.weight)
 
     @property
     def elsewhere(self) -> bool:
@@ -116,7 +116,7 @@ class PlaceSearch:
         fit, known = np.zeros((2, len(bank)))
         if self.walls is not None and len(rays.hit):
             agreement = self.walls.agreement(bank.poses, rays)
-            weight += SCAN_EVIDENCE * (1.0 + float(ago.max())) * agreement.log_likelihood
+            weight += INDEPENDENT_RAYS * (1.0 + float(ago.max())) * agreement.log_likelihood
             fit, known = agreement.log_likelihood, agreement.known
         new = _no_repetition(bank.poses, weight, before)
         looks = len(np.unique(ago))

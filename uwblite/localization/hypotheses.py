@@ -246,7 +246,7 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypothe
     return Hypotheses(mean, _symmetric(covariance), bank.log_weight)
 
 
-def weighed(bank: Hypotheses, log_likelihood: Floats) -> Hypotheses:
+def reweighted(bank: Hypotheses, log_likelihood: Floats) -> Hypotheses:
     """Return the hypotheses with weights changed by a log-likelihood (h,), the best one's being 0 again."""
     weight = bank.log_weight + log_likelihood
     return replace(bank, log_weight=weight - weight.max(initial=-np.inf) if len(weight) else weight)

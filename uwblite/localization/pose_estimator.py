@@ -12,7 +12,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats
 from . import hypotheses, verdict
-from .comparison import LOOK_BACK, SCAN_EVIDENCE, Comparison, PlaceSearch
+from .comparison import INDEPENDENT_RAYS, LOOK_BACK, Comparison, PlaceSearch
 from .hypotheses import RangeFacts
 from .known_map import KnownMap
 from .odometer import Odometer
@@ -89,7 +89,7 @@ class PoseEstimator:
             return
         arm = se2.transform(se2.between(self._odometer.pose, then), tag)
         bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, fact, arm)
-        self._bank = hypotheses.weighed(bank, likelihood if len(bank) > 1 else np.zeros(1))
+        self._bank = hypotheses.reweighted(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = int(np.argmax(bank.log_weight))
         self._running.add_range(fact.anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)
 
@@ -110,7 +110,7 @@ class PoseEstimator:
             # What does not agree as a whole must not move the pose: walls that the map does not hold lie near others.
             self._bank = before
         if len(self._bank) > 1:
-            self._bank = hypotheses.weighed(self._bank, SCAN_EVIDENCE * min(driven, 1.0) * found.log_likelihood)
+            self._bank = hypotheses.reweighted(self._bank, INDEPENDENT_RAYS * min(driven, 1.0) * found.log_likelihood)
         best = int(np.argmax(self._bank.log_weight))
         if self._certain:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])

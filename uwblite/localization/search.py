@@ -5,7 +5,7 @@ remains the scans of the last metres, laid together by the odometry, are matched
 walls' likelihood field, of which each level bounds the one below (W. Hess et al., Real-time loop closure in 2D lidar SLAM,
 ICRA 2016); unlike there, all poses near the best score are kept, not the best alone: a place that looks like another one is
 not decided here. Where no wall is visible, headings and places are tried by the ranges alone. What is found is refined and
-weighed by everything that the window holds.
+compared by everything that the window holds.
 
 The functions are generators that pause after every unit of work, a few thousand places: whoever has to keep pace with a lidar
 does some units between two scans.
@@ -32,7 +32,7 @@ _MOST_NODES = 60_000
 _RIVAL = 0.75
 """Poses whose score is this share of the best one's are kept."""
 _FEWEST_POINTS, _FEWEST_BESIDE = 12, 4
-"""Points of walls below which scans say nothing; the second where ranges to three anchors tell the place."""
+"""Points of walls below which scans say nothing; the second where ranges to three anchors fix the place."""
 MOST_PLACES = 32
 """Poses that are returned."""
 
@@ -121,7 +121,7 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
 def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) -> Steps:
     """Return the best of poses (n, 3) by their scores (n,), in whose order they are, and by the ranges together.
 
-    Along a wall scans leave places open that ranges tell apart.
+    Along a wall scans leave places open that ranges distinguish.
     """
     tried, few = poses[:_MOST_RIVALS], _some(ranges)
     weight = _PER_SCORE * scores[: len(tried)]

@@ -54,7 +54,7 @@ def doubt(
     if not complete:
         return "too many places are as likely; drive on"
     # Rays and ranges err independently: half of what either needs is enough where there is half of the other as well.
-    if evidence_of(ends) + fitting.evidence < 1.0:
+    if share_of_needed(ends) + fitting.share_of_needed < 1.0:
         return "too little was measured yet; drive on"
     if why := nowhere(fit, ends, fitting):
         return why
@@ -68,7 +68,7 @@ def doubt(
 
 def nowhere(fit: float, ends: float, fitting: "RangeFit") -> str:
     """Return what contradicts even the best place; "" = nothing does."""
-    seen = evidence_of(ends)
+    seen = share_of_needed(ends)
     if seen and fit < (FIT_BESIDE_RANGES if fitting.enough else FIT_ALONE):
         return "the scans fit the walls nowhere well; is this the right map?"
     if fitting.count >= ENOUGH_RANGES and fitting.share < RANGES_ALONE + seen * (RANGES_FOUND - RANGES_ALONE):
@@ -110,13 +110,13 @@ class RangeFit:
     """To which ranges agree."""
 
     @property
-    def evidence(self) -> float:
+    def share_of_needed(self) -> float:
         """Ranges to two anchors or more that agree, as a share of what a start needs."""
         return self.share * self.count / ENOUGH_RANGES if self.anchors >= 2 else 0.0
 
     @property
     def enough(self) -> bool:
-        return self.evidence >= 1.0
+        return self.share_of_needed >= 1.0
 
 
 def confirming_way(fit: float, ends: float, fitting: RangeFit, proven: bool) -> float:
@@ -135,10 +135,10 @@ def confirming_way(fit: float, ends: float, fitting: RangeFit, proven: bool) -> 
     clear = fitting.anchors >= _ANCHORS_CLEAR and fitting.share >= _RANGES_CLEAR
     if fit < _FIT_CLEAR:
         return _CONFIRM_BUSY if clear else _CONFIRM_ALONE
-    return 0.0 if clear and evidence_of(ends) + fitting.evidence >= 2.0 else _CONFIRM
+    return 0.0 if clear and share_of_needed(ends) + fitting.share_of_needed >= 2.0 else _CONFIRM
 
 
-def evidence_of(ends: float) -> float:
+def share_of_needed(ends: float) -> float:
     """Return rays' ends in known space as a share of what a start needs."""
     return min(ends / ENOUGH_ENDS, 1.0) if ends >= FEW_ENDS else 0.0
 

@@ -67,7 +67,7 @@ class Agreement:
     known: Floats
     """(h,) ends in known space."""
     met: Floats
-    """(h,) rays that end in known space or pass a wall: those that can tell a place from another one."""
+    """(h,) rays that end in known space or pass a wall: those that distinguish one place from another."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,7 @@
 
 Candidates of shortcuts join corners that are 1, 2, 4, 8 ... apart; those that keep the clearance are steps of a graph
 whose cheapest path is the new line. It is cut into short pieces and shortened again until that gains nothing. A shortcut is
-weighed by its cost and not by its length, so that the line stays as far from obstacles as the search wanted.
+compared by its cost and not by its length, so that the line stays as far from obstacles as the search wanted.
 """
 
 from typing import NamedTuple

@@ -16,7 +16,7 @@ _COARSE = 0.4
 _SAME_STEP = 1e-4
 """s; no clock is as even."""
 _JUMP = 10.0
-"""A clock that was set forward by less is not told from a sensor that was silent, s."""
+"""A clock that was set forward by less cannot be distinguished from a sensor that was silent, s."""
 _SAME_END = 2.0
 """Sensors of one recording end within so much of each other, s."""
 _SOME, _MOST = 0.02, 0.5

@@ -58,7 +58,7 @@ def _nearest(jumps: Floats, time: float) -> float:
 def same_place(log: SensorLog, before: float, after: float) -> bool | None:
     """Return whether the last scan before a time and the first after another show one place.
 
-    None where there are none, and where nothing would tell it from places along a smooth wall.
+    None where there are none, and where nothing would distinguish it from places along a smooth wall.
     """
     if log.scans is None or len(log.scans.stamps) < 2:
         return None

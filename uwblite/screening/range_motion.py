@@ -62,8 +62,8 @@ def cuts(log: SensorLog, jumps: Floats) -> list[float]:
             continue
         way, margin = _travelled(log, stamps), _MARGIN + _TIMES_NOISE * _noise(ranges)
         over = np.minimum(*(_jumps(ranges, way, window)[:-1] for window in (_WINDOW, _LONG))) - margin
-        heard = np.isfinite(over) & (np.diff(stamps) <= _SILENCE * np.median(np.diff(stamps)))
-        spans.append(np.column_stack([stamps[:-1], stamps[1:], over])[heard])
+        close = np.isfinite(over) & (np.diff(stamps) <= _SILENCE * np.median(np.diff(stamps)))
+        spans.append(np.column_stack([stamps[:-1], stamps[1:], over])[close])
     # Where nothing else would show a cut, neighbouring readings of one anchor count as well.
     seen = log.scans is not None and len(log.scans.stamps) > 0
     return _together(spans, jumps, np.inf if seen else max(_LEAST_VOTES, len(by_anchor) // 2))
