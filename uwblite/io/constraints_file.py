@@ -19,6 +19,7 @@ from ..constraints import (
 )
 from ..errors import ConfigError, FormatError
 from ..sensor_log import MOST_METRES, MOST_SECONDS
+from ..sensor_log.anchor_names import last_places
 from .csv_table import read_csv
 
 _TABLES: Mapping[str, tuple[type, str]] = {
@@ -84,7 +85,7 @@ _REQUIRED: Mapping[type, tuple[str, ...]] = {
 def read_anchors(path: str | os.PathLike[str]) -> Constraints:
     """Return the placed anchors of an earlier map's anchors.csv as known places; they may have been moved since.
 
-    Where the map has an anchor at several places (``5C0B``, later ``5C0B#2``), the last one counts. Sigmas are taken as
+    Where the map has an anchor at several places (``5C0B``, later ``5C0B@2``), the last one counts. Sigmas are taken as
     the larger of x and y, and at least 2 cm: an earlier map's own frame is not surer than that.
 
     Raises
@@ -97,13 +98,12 @@ def read_anchors(path: str | os.PathLike[str]) -> Constraints:
         table.texts(column)
     values = table.numbers("x", "y", "sigma_x", "sigma_y", default=np.nan)
     status = table.texts("status", default="ok")
-    anchors: dict[str, GivenAnchor] = {}
+    found: dict[str, tuple[tuple[float, float], float]] = {}
     for name, (x, y, sigma_x, sigma_y), state in zip(names, values.tolist(), status, strict=True):
         if np.isfinite(x) and np.isfinite(y) and state == "ok":
             sigma = float(np.nanmax([sigma_x, sigma_y, 0.02]))
-            anchor, mark, number = name.rpartition("#")
-            name = anchor if mark and number.isdigit() and anchor in names else name
-            anchors[name] = GivenAnchor(name, (x, y), sigma, movable=True)
-    if not anchors:
+            found[name] = (x, y), sigma
+    last = {radio: name for radio, name in last_places(names).items() if name in found}
+    if not last:
         raise FormatError("no anchor in it has a place; it must be the anchors.csv of a map", os.fspath(path))
-    return Constraints(anchors=tuple(anchors.values()))
+    return Constraints(anchors=tuple(GivenAnchor(radio, *found[name], movable=True) for radio, name in last.items()))

@@ -1,0 +1,23 @@
+"""Names of anchors that were moved: a map has one for each of their places."""
+
+import re
+from collections.abc import Collection
+
+_PLACE = re.compile(r"(.+?)(?:@(\d+))?(?:#(\d+))?", re.DOTALL)
+"""``ID@2``: the second place within a recording; ``ID#2``: the second one of several recordings."""
+
+
+def _parts(name: str, names: Collection[str]) -> tuple[str, int, int]:
+    """Return the radio's name of an anchor, and the numbers of its place in the order of time.
+
+    A radio may be called ``ID@2`` itself: that is another place of ``ID`` only where there is an ``ID``.
+    """
+    found = _PLACE.fullmatch(name)
+    if found is None or found[1] not in names:
+        return name, 1, 1
+    return found[1], int(found[3] or 1), int(found[2] or 1)
+
+
+def last_places(names: Collection[str]) -> dict[str, str]:
+    """Return of each anchor of a map, by its radio's name, the name of its last place."""
+    return {_parts(name, names)[0]: name for name in sorted(names, key=lambda n: _parts(n, names)[1:])}
