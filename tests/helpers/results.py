@@ -15,7 +15,7 @@ from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRan
 
 FILES = {
     "anchors.csv", "config.toml", "graph.g2o", "graph.pyfg", "graph_stamps.csv", "map.pgm", "map.png", "map.yaml",
-    "report.html", "report.json", "trajectory.tum", "trajectory_covariance.csv",
+    "range_errors.csv", "report.html", "report.json", "trajectory.tum", "trajectory_covariance.csv",
 }  # fmt: skip
 """What `uwblite map` writes of one recording with lidar."""
 
@@ -94,6 +94,10 @@ def small_result(*, evil: str = "", lidar: bool = True, each: int = 1, seconds: 
             "residual": rng.normal(0, 0.05, 2 * k),
             "weight": agrees,
             "agrees": agrees,
+            "x": poses[pose, 0],
+            "y": poses[pose, 1],
+            "theta": poses[pose, 2],
+            "recording": np.repeat(np.arange(each), 24)[pose].astype(np.float64),
         },
         OccupancyGrid(geometry, log_odds, 24) if lidar else None,
         (StageSummary("first optimisation", seconds, {"chi2": 40.0, "dof": 50, "iterations": 7, "note": "x" + evil}),),

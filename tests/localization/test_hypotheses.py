@@ -4,14 +4,16 @@ import numpy as np
 
 from uwblite import se2
 from uwblite.localization import hypotheses
-from uwblite.localization.hypotheses import FIRST_ANCHOR, SLOW_LENGTH, RangeFacts
+from uwblite.localization.hypotheses import FIRST_ANCHOR, PATTERN, SLOW_LENGTH, RangeFacts
+from uwblite.localization.range_errors import RangeErrors
+from uwblite.radio.range_noise import RangeNoise
 
 
 def a_bank(seed, anchors=2):
     rng = np.random.default_rng(seed)
     n = FIRST_ANCHOR + anchors
     root = rng.normal(size=(1, n, n)) * 0.01
-    mean = np.concatenate([rng.normal(size=3), 0.02 * rng.normal(size=3), 0.05 * rng.normal(size=anchors)])[None]
+    mean = np.concatenate([rng.normal(size=3), 0.02 * rng.normal(size=3), 0.05 * rng.normal(size=n - 6)])[None]
     return hypotheses.Hypotheses(mean, root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(n), np.zeros(1))
 
 
@@ -37,19 +39,25 @@ def test_a_step_moves_the_covariance_by_the_numeric_jacobian_of_the_mean():
 
 
 def test_a_range_corrects_as_a_kalman_filter_with_the_numeric_jacobian():
-    fact = RangeFacts(1, np.array([4.0, -2.0]), 0.0, 0.5, 0.1, 0.01)
+    field = RangeErrors(np.array([[0.5, 0.5]]), np.array([20.0]), RangeNoise(0.05, 0.08, 2.0))
+    fact = RangeFacts(1, np.array([4.0, -2.0]), 0.0, 0.5, 0.1, 0.01, field)
     tag = np.array([0.3, -0.1])
     for seed in range(3):
         bank = a_bank(seed)
 
-        def expected(x):
+        tagged = se2.transform(bank.mean[0, :3], tag)
+        towards = np.arctan2(*(fact.place - tagged)[::-1]) - bank.mean[0, 2]
+        waves = np.array([np.cos(towards * np.array([1, 2, 3])), np.sin(towards * np.array([1, 2, 3]))]).ravel()
+        known = 20.0 * (0.08**2 * np.exp(-np.hypot(*(tagged - field.places[0])) / 2.0) + 0.1**2)
+
+        def expected(x, waves=waves, known=known):
             place = x[:2] + se2.rotate(x[2], tag)
             distance = np.sqrt(np.sum((place - fact.place) ** 2) + fact.square)
-            return np.array([(1.0 + fact.scale) * distance + x[FIRST_ANCHOR + fact.anchor]])
+            return np.array([(1.0 + fact.scale) * distance + x[FIRST_ANCHOR + fact.anchor] + waves @ x[PATTERN] + known])
 
         H, P = numeric(expected, bank.mean[0]), bank.covariance[0]
         measured = float(expected(bank.mean[0])[0]) + 0.05
-        late = RangeFacts(fact.anchor, fact.place, measured, fact.square, fact.sigma, fact.scale)
+        late = RangeFacts(fact.anchor, fact.place, measured, fact.square, fact.sigma, fact.scale, field)
         found, weight, _, _ = hypotheses.ranged(bank, late, tag)
         gain = P @ H.T / (H @ P @ H.T + fact.sigma**2 / weight[0])
         np.testing.assert_allclose(found.mean[0], bank.mean[0] + gain[:, 0] * 0.05, atol=1e-8)

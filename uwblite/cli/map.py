@@ -30,7 +30,8 @@ examples:
   uwblite map run.log --out map/ --dry-run             read, check and estimate only
 
 files in --out: map.png (picture), report.html, map.yaml + map.pgm (map_server, nav2), trajectory.tum (evo),
-  trajectory_covariance.csv, anchors.csv, graph.g2o, graph.pyfg, graph_stamps.csv, config.toml, report.json
+  trajectory_covariance.csv, anchors.csv, range_errors.csv, graph.g2o, graph.pyfg, graph_stamps.csv, config.toml,
+  report.json
 exit code 3: the files are written, but the result should not be trusted; the reasons are named
 """
 

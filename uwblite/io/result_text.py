@@ -104,6 +104,25 @@ def anchors_csv(result: MapResult) -> str:
     return "\n".join(lines) + "\n"
 
 
+def range_errors_csv(result: MapResult) -> str:
+    """Return the error of every range to an anchor that has a place, with the tag's place and the base's heading, as CSV.
+
+    The error is measured minus expected, the anchor's bias taken off.
+    """
+    lines, table = ["stamp,anchor,range,error,weight,x,y,theta,recording"], result.range_table
+    columns = [np.asarray(table[name]).tolist() for name in _RANGE_COLUMNS] if table else []
+    for stamp, anchor, metres, residual, weight, x, y, theta, recording in zip(*columns, strict=True):
+        of = result.anchors[int(anchor)]
+        if np.isfinite(residual) and np.isfinite(of.position).all():
+            name = csv_field(of.id)
+            values = f"{metres:.4f},{-residual:.4f},{weight:.4f},{x:.4f},{y:.4f},{theta:.5f},{int(recording) + 1}"
+            lines.append(f"{stamp:.6f},{name},{values}")
+    return "\n".join(lines) + "\n"
+
+
+_RANGE_COLUMNS = ("stamp", "anchor", "range", "residual", "weight", "x", "y", "theta", "recording")
+
+
 def summary(logs: Sequence[SensorLog], result: MapResult, record: RunRecord, hashes: dict[str, str]) -> dict[str, Any]:
     """Return the result as report.json has it (JSON-ready); see docs/formats.md."""
     grid = result.grid

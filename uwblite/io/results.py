@@ -5,6 +5,7 @@
 | trajectory.tum | pose at every odometry stamp, map frame; trajectory_2.tum ... for further recordings |
 | trajectory_covariance.csv | stamp, covariance and recording of every keyframe |
 | anchors.csv | anchors with sigmas, biases, shares of ranges used |
+| range_errors.csv | by how much each range was wrong, and where |
 | map.pgm, map.yaml | the map for map_server and nav2 |
 | map.png | picture of the map with path, anchors, closures |
 | graph.g2o, graph.pyfg | the optimised pose graph; graph_stamps.csv has the time and the recording of each pose |
@@ -44,6 +45,7 @@ from .result_text import (
     base_name,
     covariance_csv,
     json_lines,
+    range_errors_csv,
     recording_figures,
     settings_line,
     stamps_csv,
@@ -52,7 +54,7 @@ from .result_text import (
 from .tum import write_tum
 
 _CONTRACT = re.compile(
-    r"trajectory(_\d+)?\.tum|trajectory_covariance\.csv|anchors\.csv|map\.(pgm|yaml|png)|map_scale\.(png|yaml)"
+    r"trajectory(_\d+)?\.tum|trajectory_covariance\.csv|anchors\.csv|range_errors\.csv|map\.(pgm|yaml|png)|map_scale\.(png|yaml)"
     r"|graph\.(g2o|pyfg)|graph_stamps\.csv|config\.toml|report\.(html|json)"
 )
 
@@ -107,6 +109,8 @@ def write_result(folder: str | os.PathLike[str], logs: Sequence[SensorLog], resu
         frames = (result.keyframe_stamps, result.keyframe_covariances, result.keyframe_recording)
         write_text(waiting / "trajectory_covariance.csv", covariance_csv(*frames))
         write_text(waiting / "anchors.csv", anchors_csv(result))
+        if result.range_table:
+            write_text(waiting / "range_errors.csv", range_errors_csv(result))
         grid_png = None
         if result.grid is not None:
             write_map(waiting, result.grid)

@@ -37,6 +37,20 @@ class StoredAnchor:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class StoredRanges:
+    """The ranges of a result, with their errors."""
+
+    anchors: tuple[str, ...]
+    """(m,) as in the table of the anchors."""
+    errors: Floats
+    """(m,) m, measured minus expected, the anchor's bias taken off."""
+    tags: Floats
+    """(m, 2) m, map frame: where the tag was."""
+    headings: Floats
+    """(m,) rad, of the base."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class StoredClosure:
     """A candidate of a loop closure."""
 
@@ -111,6 +125,21 @@ def read_result(folder: str | os.PathLike[str]) -> StoredResult:
         report,
     )
     return _with_closures(result)
+
+
+def read_range_errors(folder: str | os.PathLike[str]) -> StoredRanges:
+    """Read the errors of a result's ranges; none where it has no such table, as those of earlier versions have not.
+
+    Raises
+    ------
+    FormatError : the table is not what it should be.
+    """
+    path = Path(folder) / "range_errors.csv"
+    if not path.is_file():
+        return StoredRanges((), np.zeros(0), np.zeros((0, 2)), np.zeros(0))
+    table = read_csv(path)
+    values = table.numbers("error", "x", "y", "theta")
+    return StoredRanges(table.texts("anchor"), values[:, 0], values[:, 1:3], values[:, 3])
 
 
 def _report(path: Path) -> dict[str, Any]:

@@ -14,11 +14,15 @@ from scipy.special import ndtr
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
+from .range_errors import HARMONICS, PATTERN_SIGMA, RangeErrors, pattern_waves
 from .walls import Rays, Walls
 
 POSE, WHEELS = slice(0, 3), slice(3, 6)
 """Of the state: x, y, theta; relative error of distance, of turned angle, and heading per metre, rad/m."""
-FIRST_ANCHOR = 6
+FIRST_ANCHOR = 6 + 2 * HARMONICS
+PATTERN = slice(6, FIRST_ANCHOR)
+"""Of the state: m, by how much ranges err by the direction of the anchor in the robot's frame (range_errors.pattern_waves): the
+tag's radiation pattern and the shadow of the robot's own body, the same for all anchors."""
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
 SLOW_SIGMA = 0.12
@@ -48,9 +52,9 @@ class Hypotheses:
     """Places where the robot may be."""
 
     mean: Floats
-    """(h, 6 + a)."""
+    """(h, 12 + a)."""
     covariance: Floats
-    """(h, 6 + a, 6 + a)."""
+    """(h, 12 + a, 12 + a)."""
     log_weight: Floats
     """(h,) the largest is 0."""
 
@@ -85,7 +89,7 @@ def started(poses: Floats, covariances: Floats, anchors: int) -> Hypotheses:
     mean, covariance = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
     mean[:, POSE] = poses
     covariance[:, POSE, POSE] = covariances
-    prior = np.concatenate([WHEEL_SIGMA, np.full(anchors, SLOW_SIGMA)]) ** 2
+    prior = np.concatenate([WHEEL_SIGMA, np.full(2 * HARMONICS, PATTERN_SIGMA), np.full(anchors, SLOW_SIGMA)]) ** 2
     covariance[:, np.arange(3, n), np.arange(3, n)] = prior
     return Hypotheses(mean, covariance, np.zeros(len(poses)))
 
@@ -160,6 +164,8 @@ class RangeFacts:
     """m, white part of the noise."""
     scale: float
     """Relative error of all ranges."""
+    errors: RangeErrors | None = None
+    """By the tag's place, as the map knows it."""
 
 
 def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses, Floats, Floats, Floats]:
@@ -173,14 +179,23 @@ def ranged(bank: Hypotheses, fact: RangeFacts, tag: Floats) -> tuple[Hypotheses,
     -------
     The hypotheses, and for each the weight (h,), 0..1, that the range got, its log-likelihood (h,), 0 = the likeliest, and
     that of a range from anywhere (h,).
+
+    Notes
+    -----
+    How the pattern and the place's error change with the pose is left out of the Jacobian: 0.1 m per radian, 0.05 m per metre.
     """
     theta = bank.mean[:, 2]
     lever = se2.rotate(theta, np.broadcast_to(tag, (len(bank), 2)))
     offset = bank.mean[:, :2] + lever - fact.place
     distance = np.sqrt(np.maximum(np.sum(offset**2, axis=1) + fact.square, 1e-4))
     column = FIRST_ANCHOR + fact.anchor
-    error = fact.range - (1.0 + fact.scale) * distance - bank.mean[:, column]
+    waves = pattern_waves(np.arctan2(-offset[:, 1], -offset[:, 0]) - theta)
+    shift = np.einsum("hk,hk->h", waves, bank.mean[:, PATTERN]) + bank.mean[:, column]
+    if fact.errors is not None:
+        shift += fact.errors.at(offset + fact.place)
+    error = fact.range - (1.0 + fact.scale) * distance - shift
     jacobian = np.zeros(bank.mean.shape)
+    jacobian[:, PATTERN] = waves
     unit = (1.0 + fact.scale) * offset / distance[:, None]
     jacobian[:, :2] = unit
     jacobian[:, 2] = -unit[:, 0] * lever[:, 1] + unit[:, 1] * lever[:, 0]

@@ -1,6 +1,6 @@
 """What a live localisation is given: anchors with their calibration, walls, and where the laser sits on the robot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,9 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
-from ..io.stored_result import StoredAnchor, StoredResult
+from ..io.stored_result import StoredAnchor, StoredResult, read_range_errors
+from ..sensor_log.anchor_names import last_places
+from .range_errors import RangeErrors, range_errors
 from .walls import Walls, walls_of
 
 
@@ -27,6 +29,8 @@ class KnownAnchors:
     """(a,) m, spread of the map's range residuals."""
     scale: float = 0.0
     """Relative error of all ranges, 1."""
+    errors: tuple[RangeErrors, ...] = ()
+    """(a,) what remains, by the tag's place; empty where the map does not say it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +60,7 @@ def from_result(result: StoredResult) -> KnownMap:
     DataError : it holds neither an anchor with a place nor a grid.
     """
     calibration = _calibration(result.report)
-    anchors = known_anchors(result.anchors, calibration)
+    anchors = _with_errors(known_anchors(result.anchors, calibration), result)
     if not anchors.ids and result.grid is None:
         raise DataError(f"{result.folder} holds neither an anchor with a place nor map.yaml: no robot can be localized in it")
     correction = np.array([calibration.get(f"laser_{name}", 0.0) for name in ("x", "y", "theta")])
@@ -71,12 +75,9 @@ def known_map(anchors: tuple[StoredAnchor, ...], grid: OccupancyGrid | None) -> 
 
 def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float]) -> KnownAnchors:
     """Return the anchors that have a sure place; of one that was moved, the last place."""
-    names = {a.id for a in stored}
-    last: dict[str, StoredAnchor] = {}
-    for anchor in stored:
-        name, mark, number = anchor.id.rpartition("#")
-        if anchor.status == "ok" and np.isfinite(anchor.position).all():
-            last[name if mark and number.isdigit() and name in names else anchor.id] = anchor
+    by_name = {a.id: a for a in stored}
+    places = {radio: by_name[name] for radio, name in last_places(by_name).items()}
+    last = {radio: a for radio, a in places.items() if a.status == "ok" and np.isfinite(a.position).all()}
     sigma = np.array([a.residual_rms if np.isfinite(a.residual_rms) else _SIGMA for a in last.values()])
     return KnownAnchors(
         tuple(last),
@@ -86,6 +87,20 @@ def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float
         np.maximum(sigma, _LEAST_SIGMA),
         calibration.get("range_scale", 0.0),
     )
+
+
+def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
+    """Return the anchors with what the result's own ranges to them left over."""
+    stored = read_range_errors(result.folder)
+    index = {name: k for k, name in enumerate(map(last_places({a.id for a in result.anchors}).get, anchors.ids))}
+    anchor = np.array([index.get(name, -1) for name in stored.anchors], dtype=np.int64)
+    own = np.flatnonzero(anchor >= 0)
+    if not len(own):
+        return anchors
+    anchor, tags = anchor[own], stored.tags[own]
+    away = anchors.positions[anchor] - tags
+    bearings = np.arctan2(away[:, 1], away[:, 0]) - stored.headings[own]
+    return replace(anchors, errors=range_errors(anchor, tags, bearings, stored.errors[own], len(anchors.ids)))
 
 
 def _calibration(report: dict[str, Any]) -> dict[str, float]:

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats, spread_about_median
+from .. import se2
+from ..arrays import Bools, Floats, spread_about_median
 from ..graph.calibration import Unknown, unknowns
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
@@ -60,10 +61,7 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     calibrated = tuple(
         _calibration(k, listed[key], graph, covariance, by_steps.get(key.label)) for k, key in enumerate(graph.calibration.keys)
     )
-    table = {} if ranges is None else {
-        "stamp": ranges.stamps, "anchor": ranges.anchor.astype(np.float64), "range": ranges.ranges,
-        "residual": residuals, "weight": weights, "agrees": (np.abs(residuals) < limit).astype(np.float64),
-    }
+    table = {} if ranges is None else _range_table(ranges, graph, residuals, weights, np.abs(residuals) < limit, recordings)
     plausibility.judge(estimate, anchors, calibrated, listed, table, grid, covariance.poses, task)
     anchors = _distrusted(anchors, stages.doubts)
     stages.end("summary")
@@ -122,6 +120,19 @@ def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, F
         return np.zeros(0), np.zeros(0)
     whitened = ranges.residuals(graph)[:, 0]
     return whitened * ranges.sigma, ranges.own_weights * ranges.kernel.weight(whitened**2)
+
+
+def _range_table(
+    ranges: RangeEdges, graph: Graph, residuals: Floats, weights: Floats, agrees: Bools, recordings: Recordings
+) -> dict[str, Floats]:
+    """Return what is known of every range; see MapResult.range_table."""
+    x, y = ranges.tag_positions(graph.poses).T
+    return {
+        "stamp": ranges.stamps, "anchor": ranges.anchor.astype(np.float64), "range": ranges.ranges,
+        "residual": residuals, "weight": weights, "agrees": agrees.astype(np.float64),
+        "x": x, "y": y, "theta": se2.wrap_angle(graph.poses[ranges.pose, 2] + ranges.turn),
+        "recording": recordings.of_keyframe[ranges.pose].astype(np.float64),
+    }  # fmt: skip
 
 
 def _anchor(
