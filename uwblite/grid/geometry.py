@@ -12,6 +12,8 @@ BYTES_PER_CELL = 12
 """Memory of a map while it is made: two counts and the log-odds."""
 _STRIP = 256
 """Rows of a map that are computed with at a time."""
+_MARGIN = 2
+"""Cells added on every side of what a map must hold."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +65,7 @@ class GridGeometry:
         return GridGeometry(self.resolution, self.origin + self.resolution * np.array([col, row]), rows, cols)
 
     @staticmethod
-    def around(low: Floats, high: Floats, resolution: float, max_cells: int, margin: int = 2) -> "GridGeometry":
+    def around(low: Floats, high: Floats, resolution: float, max_cells: int) -> "GridGeometry":
         """Return the grid that holds a box, with cell edges at multiples of the resolution.
 
         Parameters
@@ -71,7 +73,6 @@ class GridGeometry:
         low, high : (2,) corners of the box, m.
         resolution : edge of a cell, m; larger by quarters of it where there would be too many cells.
         max_cells : most cells allowed.
-        margin : cells added on every side.
 
         Raises
         ------
@@ -79,12 +80,12 @@ class GridGeometry:
         """
         finest, extent = resolution, high - low
         while True:
-            first = np.floor(low / resolution) - margin
-            last = np.floor(high / resolution) + 1 + margin
+            first = np.floor(low / resolution) - _MARGIN
+            last = np.floor(high / resolution) + 1 + _MARGIN
             width, height = (last - first).tolist()
             if width * height <= max_cells:
                 break
-            if not np.isfinite(extent).all() or max_cells < (2 * margin + 2) ** 2:
+            if not np.isfinite(extent).all() or max_cells < (2 * _MARGIN + 2) ** 2:
                 raise ConfigError(
                     f"no map of {extent[0]:g} x {extent[1]:g} m fits into {max_cells} cells; raise grid.max_cells, or set a "
                     "smaller grid.max_range"

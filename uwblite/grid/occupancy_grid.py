@@ -172,14 +172,14 @@ def from_sweeps(
     if not any(len(sweeps.first) for sweeps in recordings):
         raise DataError("there are no scans to make a map of")
     tasks = [_task(sweeps, config) for sweeps in recordings if len(sweeps.first)]
-    count = sum(len(task.chosen) for task in tasks)
+    chosen = sum(len(task.chosen) for task in tasks)
     low, high = _around([task.extent() for task in tasks])
     if geometry is None and np.prod((high - low) / config.resolution) > config.max_cells:
         # Without the scans that lie far from all others.
         box = central_box(np.concatenate([task.first[:, :2] for task in tasks]))
         tasks = [task for task in (task.within(*box) for task in tasks) if len(task.chosen)]
         low, high = _around([task.extent() for task in tasks])
-    astray, count = count - sum(len(task.chosen) for task in tasks), sum(len(task.chosen) for task in tasks)
+    count = sum(len(task.chosen) for task in tasks)
     grid = geometry or GridGeometry.around(low, high, config.resolution, config.max_cells)
     if announce is not None:
         announce(grid)
@@ -198,7 +198,7 @@ def from_sweeps(
     if clears:
         trace(walls_of(from_counts(counter, config)), count)
     drawn = from_counts(counter if geometry else counter.cropped(), config)
-    return replace(drawn, scans_used=count, scans_astray=astray)
+    return replace(drawn, scans_used=count, scans_astray=chosen - count)
 
 
 def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":
@@ -280,8 +280,7 @@ def _trace(
             _insert(counter, rays, walls)
             report(done)
         return
-    parts = task.split(_TASKS)
-    done = 0
+    parts, done = task.split(_TASKS), 0
     same: tuple[list[GridGeometry], list[Bools | None]] = [counter.geometry] * len(parts), [walls] * len(parts)
     for part, counts in zip(parts, executor.map(_count, parts, *same), strict=True):
         counter.add(*counts)

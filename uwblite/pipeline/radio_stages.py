@@ -21,7 +21,7 @@ from ..graph.calibration import (
     with_nonnegative_heights,
 )
 from ..graph.graph import Graph
-from ..graph.solver import optimize
+from ..graph.solver import SolverConfig, optimize
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.wheels import wheel_edges
@@ -179,14 +179,17 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     config, steps = task.config, estimate.steps
     if estimate.ranges is None or steps is None:
         return estimate
-    roughly = replace(config.solver, max_iterations=min(config.solver.max_iterations, _ROUGH_ITERATIONS))
-    for solver in (roughly, config.solver):
+    for solver in (_rough(config.solver), config.solver):
         graph = relocate(estimate.ranges, estimate.graph, ~np.asarray(estimate.graph.fixed_anchors), config.trilateration)
         estimate = with_range_noise(replace(estimate, graph=graph), config)
         problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
         estimate = estimate.with_estimates_of(optimize(problem, solver)[0])
     task.stages.end("ranges re-estimated")
     return replace(estimate, graph=with_nonnegative_heights(estimate.graph))
+
+
+def _rough(solver: SolverConfig) -> SolverConfig:
+    return replace(solver, max_iterations=min(solver.max_iterations, _ROUGH_ITERATIONS))
 
 
 _ROUGH_ITERATIONS = 12
@@ -197,10 +200,9 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors."""
     if estimate.ranges is None:
         return estimate
-    roughly = replace(task.config.solver, max_iterations=min(task.config.solver.max_iterations, _ROUGH_ITERATIONS))
     for _ in range(_NOISE_ROUNDS - 1):
         # The marginal likelihood is one about the optimum of the very weights that it is computed with.
         estimate = with_range_noise(estimate, task.config, steady=True)
         edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
-        estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*edges), roughly)[0])
+        estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*edges), _rough(task.config.solver))[0])
     return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))
