@@ -90,6 +90,11 @@ def test_the_heading_is_fixed_where_one_anchor_alone_is_given(ids, moved, fixed)
     )
 
 
+def test_a_given_pose_fixes_the_heading_itself():
+    constraints = Constraints(anchors=surveyed("B"), poses=(GivenPose(float(STAMPS[7]), (0.0, 0.0, 0.0)),))
+    assert _gauge(constraints, first_estimate(), {}) == []
+
+
 @pytest.mark.parametrize("align", ["odometry", "walls"])
 def test_given_places_and_an_alignment_exclude_each_other(align):
     graph = first_estimate()

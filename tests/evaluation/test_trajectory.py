@@ -94,6 +94,20 @@ def test_stretches_are_the_shortest_that_are_long_enough():
     assert len(stretches(points, 1000.0)) == 1
 
 
+@pytest.mark.parametrize(("length", "stretches_of_delta"), [(0.9, 0), (1.0, 1), (1.9, 1), (2.0, 2)])
+def test_a_single_stretch_has_relative_errors_already(length, stretches_of_delta):
+    """Along a line, an estimate that is 2 % too long: 2 cm per stretch of a metre."""
+    way = np.arange(0.0, length + 0.05, 0.1)
+    truth = np.column_stack([way, np.zeros((len(way), 2))])
+    found = evaluate_trajectory(way, truth * [1.02, 1.0, 1.0], way, truth, rpe_delta=1.0, truth_has_heading=True)
+    if stretches_of_delta:
+        assert found.rpe_position.rmse == pytest.approx(0.02)
+        assert found.rpe_heading.max == pytest.approx(0.0, abs=1e-12)
+    else:
+        assert found.rpe_position is None
+        assert found.rpe_heading is None
+
+
 def test_anchors_are_compared_by_name():
     motion = np.array([1.0, 2.0, 0.5])
     true = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]])

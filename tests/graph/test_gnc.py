@@ -103,6 +103,8 @@ def test_progress_is_reported():
     optimize_gnc(graph, THRESHOLDS, progress=lambda done, most: calls.append((done, most)))
     assert calls[-1][0] == calls[-1][1]
     assert all(a[0] < b[0] for a, b in pairwise(calls))
+    assert calls[0][0] == 1
+    assert len(calls) > 2
 
 
 def test_results_are_the_same_every_time():

@@ -1,7 +1,11 @@
 """Points between the beams of a coarse lidar: on walls, and only there."""
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from uwblite import se2
 from uwblite.lidar.beam_gaps import filled
 from uwblite.odometry.attached import ScanPoints
 
@@ -55,3 +59,15 @@ def test_dense_and_empty_scans_stay_as_they_are():
     dense = scan_of(box, beams=721)
     assert filled(dense).points.tolist() == dense.points.tolist()
     assert len(filled(scan_of([])).points) == 0
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.9, np.pi / 2, 2.5])
+@pytest.mark.parametrize(("beams", "dense"), [(181, True), (361, True), (601, False)])
+def test_gaps_are_filled_between_coarse_beams_whatever_way_they_look(turn, beams, dense):
+    """Beams 1 and 0.5 degrees apart, and 0.3, of which nothing is made up."""
+    rays = scan_of([(0.0, 13.0)], beams=beams)
+    turned = replace(rays, points=se2.rotate(turn, rays.points))
+    found = filled(turned)
+    assert (len(found.points) > 1.2 * len(rays.points)) is dense
+    assert dense or len(found.points) == len(rays.points)
+    np.testing.assert_allclose(found.points @ [np.cos(turn), np.sin(turn)], 13.0, atol=1e-9)

@@ -252,3 +252,13 @@ def test_fewer_pairs_are_every_nth_from_the_middle_of_the_first_and_weigh_as_all
     assert set(gap.tolist()) == {1, 40}
     assert kept.own_weights[gap == 1].sum() == pytest.approx(40.0)
     assert kept.own_weights[gap == 40].sum() == pytest.approx(30.0)
+
+
+@pytest.mark.parametrize("steps", [0, 1])
+def test_a_single_step_or_none_weighs_as_all_pairs_near_it(steps):
+    near = [(k, k + 3) for k in range(5)] + [(20, 21)] * steps
+    i, j = np.array(near + [(k, k + 40) for k in range(30)]).T
+    still, root = np.zeros((len(i), 3)), np.tile(np.eye(3), (len(i), 1, 1))
+    edges = ScanEdges(i, j, still, root, still, still, scan_indices(Calibration()))
+    (kept,) = with_fewer_pairs(Graph(np.zeros((80, 3)), edges=(edges,)), 8).edges
+    assert kept.own_weights[kept.j - kept.i == 1].tolist() == [6.0] * steps

@@ -5,7 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 from helpers.laser_walks import HALL, scanned
 
+from uwblite import se2
+from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.loop_closure import matching
+from uwblite.loop_closure.candidates import Candidates
 from uwblite.loop_closure.closures import LoopClosureConfig
 
 
@@ -29,3 +32,18 @@ def test_free_space_is_asked_with_the_points_of_both_sub_maps(monkeypatch):
     assert asked == [("a", "b", "first"), ("b", "c", "last")]
     batch.free = None
     assert matching._free_space_violations(batch, best).tolist() == [0.0] * 4
+
+
+def test_stretches_are_compared_by_the_direction_in_which_fewest_points_match(monkeypatch):
+    """Where the uncertainty is wider than a search of sub-maps; others by the share of all points."""
+    truth = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])
+    clouds, config = scanned(truth, HALL), LoopClosureConfig()
+    ends, guess = np.array([0, 0]), np.tile(se2.between(truth[0], truth[1]), (2, 1))
+    spread = config.search_limit * np.array([1.01, 0.99])
+    candidates = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), spread, False)
+    monkeypatch.setattr(matching, "_guesses", lambda batch: (np.arange(2), guess))
+    monkeypatch.setattr(matching, "directional_overlap", lambda *args: np.full(len(args[2]), 0.37))
+    found = matching._fit(matching._Batch(candidates, clouds, None, config, CorrelativeConfig()))
+    assert found.everywhere.tolist() == [0.37, 1.0]
+    np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
+    assert found.found.all()

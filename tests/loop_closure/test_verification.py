@@ -92,6 +92,11 @@ def test_pairs_that_missed_are_searched_with_slack(hall, closures):
     again = propose(graph, covariances, pieces, recording, sure.names(CONFIG), gone, True, replace(CONFIG, partners=99))
     for a, b, spread in zip(again.target.tolist(), again.source.tolist(), again.spread, strict=True):
         assert (a, b) not in gone or spread > 3 * CONFIG.slip * 0.99
+    reference = pieces.reference
+    known = covariances.relative(reference[again.target], reference[again.source])
+    slack = np.diag([CONFIG.slip, CONFIG.slip, CONFIG.slip_angle]) ** 2
+    astray = np.array([pair in gone for pair in zip(again.target.tolist(), again.source.tolist(), strict=True)])
+    np.testing.assert_allclose(again.covariance - known, astray[:, None, None] * slack, atol=1e-12)
     assert gone & set(zip(again.target.tolist(), again.source.tolist(), strict=True))
     assert len(truth) == len(graph.poses)
 

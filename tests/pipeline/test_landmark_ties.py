@@ -1,6 +1,7 @@
 """Distances between landmarks: edges that are right, landmarks that are found, a map that becomes as long as it is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from uwblite.io.constraints_file import parse_constraints
 from uwblite.lidar import clouds
 from uwblite.lidar.scan_to_scan import TrackingConfig
 from uwblite.mapping import MappingConfig
-from uwblite.pipeline.landmark_ties import observations, ties
+from uwblite.pipeline.landmark_ties import _column_in, observations, outcome, ties
+from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import Odometry
 
 LONG, SCALE = 24.0, 0.96
@@ -193,6 +195,27 @@ def test_a_column_is_found_beside_its_given_place():
     np.testing.assert_allclose(plain.position, [[4.15, 0.9]], atol=1e-12)
     with pytest.raises(ConfigError, match=r"no column of radius 0\.6"):
         observations(GivenLandmark("c", given, 0.6), one_cloud(ring), pose, np.zeros(1))
+
+
+def test_a_cloud_s_own_column_is_what_it_saw_near_the_place():
+    """Another column a metre away does not count, on whichever side of the place it stands."""
+    angle = np.linspace(0, 2 * np.pi, 40)
+    ring = 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
+    for far in (1.05, -1.05):
+        both = np.concatenate([ring + np.array([2.0, 1.0]), ring + np.array([2.0, 1.0 + far])])
+        np.testing.assert_allclose(_column_in(both, np.array([2.1, 0.95]), 0.3), [2.0, 1.0], atol=1e-3)
+
+
+@pytest.mark.parametrize(("length", "named"), [(3.0, False), (3.29, False), (3.31, True), (2.69, True)])
+def test_a_distance_off_by_more_than_three_sigma_is_a_warning(length, named):
+    edges = PointDistanceEdges(*(np.array([k]) for k in (0, 1)), *np.zeros((2, 1, 2)), np.array([3.0]), np.array([0.1]))
+    stages = Stages(None, None)
+    distance = GivenLandmarkDistance(("a", "b"), 3.0, 0.1)
+    task = SimpleNamespace(given=Constraints(landmark_distances=(distance,)), stages=stages)
+    graph = Graph(np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]]))
+    (figures,) = outcome(task, SimpleNamespace(edges=edges, measured=np.array([0])), graph)
+    assert figures == {"landmarks": "a - b", "measured": 3.0, "map": length}
+    assert [n.kind for n in stages.warnings] == (["landmark-distance"] if named else [])
 
 
 def test_all_ties_of_a_distance_weigh_as_much_as_it_does():

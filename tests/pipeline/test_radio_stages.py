@@ -1,14 +1,19 @@
 """When the odometry's unit is another one, and what is said of it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.planted_graphs import loop
 
 from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.graph.graph import Calibration, UnknownKey
+from uwblite.pipeline import radio_stages
+from uwblite.pipeline.estimate import Estimate, Task
+from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.radio_stages import odometry_unit_factors
+from uwblite.pipeline.radio_stages import odometry_unit_factors, select_range_priors
 from uwblite.pipeline.recordings import Recordings
 
 
@@ -51,3 +56,19 @@ def test_a_factor_of_two_that_nothing_else_decides_is_a_doubt(factor, lidar, giv
     factors = odometry_unit_factors(SimpleNamespace(graph=SimpleNamespace(calibration=calibration)), task)
     assert factors == pytest.approx([factor if warned or doubted else 1.0])
     assert (len(stages.warnings), len(stages.doubts)) == (warned, doubted)
+
+
+def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(monkeypatch):
+    """The priors are those of the optimum of the last weights; without ranges nothing is done."""
+    made, graph = [], loop()[0]
+    estimate = Estimate(graph, graph.edges[0], None, ())
+    assert select_range_priors(estimate, None) is estimate
+    monkeypatch.setattr(radio_stages, "with_range_noise", lambda e, config, steady: made.append(f"noise {steady}") or e)
+    monkeypatch.setattr(
+        radio_stages, "optimize", lambda problem, solver: made.append(f"solve {solver.max_iterations}") or (graph, None)
+    )
+    monkeypatch.setattr(radio_stages.prior_selection, "select_priors", lambda graph, *rest: made.append("priors") or graph)
+    config = MappingConfig()
+    task = Task(None, replace(config, solver=replace(config.solver, max_iterations=7)), Constraints(), None)
+    select_range_priors(replace(estimate, ranges=graph.edges[2]), task)
+    assert made == ["noise True", "solve 7"] * 2 + ["priors"]

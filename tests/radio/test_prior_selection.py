@@ -178,6 +178,14 @@ def test_a_scale_that_no_radio_has_is_no_scale():
     assert widths(select_priors(graph, (edges,), CONFIG))["range_scale"] == pytest.approx(CONFIG.range_scale_sound)
 
 
+@pytest.mark.parametrize("covariance", [np.diag([1e-320] * 20), np.full((20, 20), np.nan), -np.eye(20)])
+def test_a_posterior_without_an_information_matrix_leaves_the_graph_alone(monkeypatch, covariance):
+    """One whose inverse overflows, one that was not computed, one that is no covariance."""
+    graph, edges = solved(1)
+    monkeypatch.setattr(prior_selection, "calibration_covariance", lambda graph: covariance)
+    assert select_priors(graph, (edges,), CONFIG) is graph
+
+
 def test_where_no_width_is_possible_the_graph_is_left_alone(monkeypatch):
     """Rounding may leave a posterior that is no normal distribution under any of the widths."""
     graph, edges = solved(1)

@@ -90,8 +90,7 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task)
     moves = {}
     for k, name in enumerate(ranges.anchor_ids):
         own = of_recording[(ranges.anchor == k) & usable[of_recording]]
-        level = np.sqrt(np.maximum(edges.ranges[own] ** 2 - edges.height[own] ** 2, 1e-4))
-        found = find_moves(positions[own], level, edges.stamps[own], sigma, task.config.trilateration)
+        found = find_moves(positions[own], edges.rows(own).planar_ranges(), edges.stamps[own], sigma, task.config.trilateration)
         if found:
             moves[name] = found
     return moves

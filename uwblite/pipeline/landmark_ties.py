@@ -59,7 +59,7 @@ def observations(landmark: GivenLandmark, clouds: Clouds, poses: Floats, path: F
     """
     points = se2.transform_each(poses, clouds.owner, clouds.points)
     place = np.array(landmark.position)
-    near = np.abs(np.hypot(*(points - place).T)) < landmark.radius + _NEAR
+    near = np.hypot(*(points - place).T) < landmark.radius + _NEAR
     where = f"constraints: landmark {landmark.name!r} at {place[0]:g}, {place[1]:g}"
     if landmark.radius > 0.0:
         column = Landmarks((landmark.name,), place[None], np.array([landmark.radius]))
