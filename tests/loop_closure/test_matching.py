@@ -27,14 +27,15 @@ def test_free_space_is_asked_with_the_points_of_both_sub_maps(monkeypatch):
     share, rms = np.array([least, least - 0.01, 1.0, 1.0]), np.array([config.sigma, 0.0, config.sigma * 1.01, 0.0])
     candidates = SimpleNamespace(target=np.array([0, 0, 0, 1]), source=np.array([1, 1, 2, 2]))
     best = SimpleNamespace(share=share, rms=rms, pose=["first", "few", "far", "last"])
-    batch = SimpleNamespace(candidates=candidates, config=config, free=["a", "b", "c"], clouds=clouds)
-    assert matching._free_space_violations(batch, best).tolist() == [0.25, 0.0, 0.0, 0.25]
+    promising = matching._promising(best, np.full(4, np.inf), config)
+    batch = SimpleNamespace(candidates=candidates, free=["a", "b", "c"], clouds=clouds)
+    assert matching._free_space_violations(batch, best, promising).tolist() == [0.25, 0.0, 0.0, 0.25]
     assert asked == [("a", "b", "first"), ("b", "c", "last")]
     batch.free = None
-    assert matching._free_space_violations(batch, best).tolist() == [0.0] * 4
+    assert matching._free_space_violations(batch, best, promising).tolist() == [0.0] * 4
 
 
-def test_stretches_are_compared_by_the_direction_in_which_fewest_points_match(monkeypatch):
+def test_stretches_are_compared_by_the_surface_that_speaks_for_a_place(monkeypatch):
     """Where the uncertainty is wider than a search of sub-maps; others by the share of all points."""
     truth = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])
     clouds, config = scanned(truth, HALL), LoopClosureConfig()
@@ -42,8 +43,16 @@ def test_stretches_are_compared_by_the_direction_in_which_fewest_points_match(mo
     spread = config.search_limit * np.array([1.01, 0.99])
     candidates = Candidates(ends, ends + 1, guess, np.zeros((2, 3, 3)), spread, False)
     monkeypatch.setattr(matching, "_guesses", lambda batch: (np.arange(2), guess))
-    monkeypatch.setattr(matching, "directional_overlap", lambda *args: np.full(len(args[2]), 0.37))
-    found = matching._fit(matching._Batch(candidates, clouds, None, config, CorrelativeConfig()))
-    assert found.everywhere.tolist() == [0.37, 1.0]
+    monkeypatch.setattr(matching, "net_overlap", lambda *args: np.full(len(args[3]), 13.7))
+    found = matching._fit(matching._Batch(candidates, clouds, 0.02, None, config, CorrelativeConfig()))
+    assert found.net.tolist() == [13.7, np.inf]
     np.testing.assert_allclose(found.best.pose, guess, atol=1e-3)
     assert found.found.all()
+
+
+def test_of_a_wide_search_the_net_overlap_is_enough():
+    """Stretches that meet for a third of their length are a promising pair; long walls alone are none."""
+    config = LoopClosureConfig()
+    best = SimpleNamespace(share=np.array([0.3, 0.9]), rms=np.zeros(2))
+    net = config.net_overlap + np.array([0.1, -0.1])
+    assert matching._promising(best, net, config).tolist() == [True, False]

@@ -109,7 +109,7 @@ def test_neighbours_in_time_are_candidates_only_across_recordings(hall):
     assert np.all(half[pieces.reference[candidates.target[close]]] != half[pieces.reference[candidates.source[close]]])
 
 
-GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "everywhere": 1.0, "spread": 7.0, "off": 0.0,
+GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3, "net": np.inf, "spread": 7.0, "off": 0.0,
         "constrained": True, "along": 1e4, "strength": 1e4}  # fmt: skip
 """Figures of a match that no rule objects to, found by a search."""
 
@@ -127,8 +127,8 @@ GOOD = {"share": 0.9, "rms": 0.02, "found": True, "through": 0.0, "second": 0.3,
     ({"along": 0.0, "strength": 1.1}, "accepted"),
     ({"second": CONFIG.uniqueness + 0.001}, "ambiguous"),
     ({"second": CONFIG.uniqueness + 0.001, "spread": 0.0}, "accepted"),
-    ({"everywhere": CONFIG.overlap_everywhere - 0.001}, "ambiguous"),
-    ({"everywhere": CONFIG.overlap_everywhere + 0.001}, "accepted"),
+    ({"net": CONFIG.net_overlap - 0.001, "spread": 20.0}, "few-matches"),
+    ({"net": CONFIG.net_overlap + 0.001, "share": 0.2, "spread": 20.0}, "accepted"),
     ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 1.01}, "contradicts-graph"),
     ({"off": 0.1 * np.sqrt(CONFIG.consistency) * 0.97}, "accepted"),
     ({"off": 5.0, "constrained": False}, "accepted"),
@@ -137,7 +137,7 @@ def test_each_rule_rejects_by_its_own_limit(figures, outcome):
     """A guess known to 0.1 m and 0.1 rad, a measurement to 0.01 where the matched surfaces see that."""
     f = {**GOOD, **figures}
     best = SimpleNamespace(share=np.array([f["share"]]), rms=np.array([f["rms"]]))
-    fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through", "everywhere")})
+    fits = ClosureMatches(best, **{name: np.array([f[name]]) for name in ("found", "second", "through", "net")})
     guess, covariance = np.array([[f["off"], 0.0, 0.0]]), 0.01 * np.eye(3)[None]
     candidates = Candidates(np.array([0]), np.array([5]), guess, covariance, np.array([f["spread"]]), f["constrained"])
     root = np.sqrt(np.diag([f["along"], f["strength"], 1e4]))[None]

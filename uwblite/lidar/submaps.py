@@ -51,6 +51,8 @@ class Submaps:
     """(s,) keyframe in whose frame its points stand."""
     clouds: Clouds
     """s clouds, in the frames of the reference keyframes."""
+    spacing: float
+    """Distance between neighbouring points of a cloud, m."""
 
     def __len__(self) -> int:
         return len(self.first)
@@ -90,7 +92,7 @@ def of_pieces(clouds: Clouds, poses: Floats, first: Ints, last: Ints, reference:
     parts = []
     for rows in _together(first, last):
         parts.append(_built(clouds, poses, first[rows], last[rows], reference[rows], config))
-    return Submaps(first, last, reference, joined(parts))
+    return Submaps(first, last, reference, joined(parts), config.voxel)
 
 
 def _together(first: Ints, last: Ints) -> Iterator[slice]:

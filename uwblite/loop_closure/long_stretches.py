@@ -2,7 +2,7 @@
 
 A search narrower than the uncertainty may miss the true place, and one as wide finds many places at which one sub-map of a
 corridor fits. Stretches of tens of metres fit at one place only, where doors and pillars match as well as walls do
-(directional_overlap). The surest pairs come first: a loop that is closed makes the others surer.
+(net_overlap). The surest pairs come first: a loop that is closed makes the others surer.
 """
 
 from dataclasses import replace

@@ -15,10 +15,11 @@ from ..arrays import Bools, Floats, Ints, renumbered
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
-from ..lidar.directional_overlap import directional_overlap
 from ..lidar.free_space import FreeSpace
+from ..lidar.net_overlap import net_overlap
 from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.scan_matching import PairFactors, match, pair_points
+from ..lidar.submaps import Submaps
 from ..lidar.visibility import violates_free_space
 from .candidates import Candidates
 from .closures import LoopClosureConfig
@@ -46,8 +47,8 @@ class ClosureMatches:
     """(c,) what share of its matches another place reaches."""
     through: Floats
     """(c,) share of its points that would stand in free space."""
-    everywhere: Floats
-    """(c,) least share over all directions that matches, see directional_overlap; 1 where no wide search was made."""
+    net: Floats
+    """(c,) m, surface that speaks for the place, see net_overlap; inf where no wide search was made."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,13 +58,14 @@ class _Batch:
     candidates: Candidates
     """Numbers of sub-maps are those of the batch."""
     clouds: Clouds
+    spacing: float
     free: Sequence[FreeSpace] | None
     config: LoopClosureConfig
     search: CorrelativeConfig
 
 
 def fit(
-    candidates: Candidates, clouds: Clouds, config: LoopClosureConfig, search_config: CorrelativeConfig,
+    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: CorrelativeConfig,
     free: Sequence[FreeSpace] | None = None, progress: Callable[[int, int], None] | None = None,
     executor: Executor | None = None,
 ) -> ClosureMatches:
@@ -74,26 +76,27 @@ def fit(
     free : what each sub-map saw to be free; None = not asked.
     """
     total, done, parts = len(candidates.target), 0, []
-    for part in in_order(_fit, _batches(candidates, clouds, config, search_config, free), executor):
+    for part in in_order(_fit, _batches(candidates, submaps, config, search_config, free), executor):
         parts.append(part)
         done += len(part.found)
         if progress is not None:
             progress(done, total)
     factors = (np.concatenate([getattr(p.best.factors, f.name) for p in parts]) for f in fields(PairFactors))
     best = Aligned(np.concatenate([p.best.pose for p in parts]), PairFactors(*factors))
-    names = ("found", "second", "through", "everywhere")
+    names = ("found", "second", "through", "net")
     return ClosureMatches(best, *(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 def _batches(
-    candidates: Candidates, clouds: Clouds, config: LoopClosureConfig, search_config: CorrelativeConfig,
+    candidates: Candidates, submaps: Submaps, config: LoopClosureConfig, search_config: CorrelativeConfig,
     free: Sequence[FreeSpace] | None,
 ) -> Iterator[_Batch]:
     for first in range(0, len(candidates.target), _AT_ONCE):
         part = candidates.rows(slice(first, first + _AT_ONCE))
         used, target, source = renumbered(part.target, part.source)
         spaces = None if free is None else [free[k] for k in used.tolist()]
-        yield _Batch(part.renumbered(target, source), clouds.chosen(used), spaces, config, search_config)
+        clouds = submaps.clouds.chosen(used)
+        yield _Batch(part.renumbered(target, source), clouds, submaps.spacing, spaces, config, search_config)
 
 
 def _fit(batch: _Batch) -> ClosureMatches:
@@ -106,16 +109,18 @@ def _fit(batch: _Batch) -> ClosureMatches:
     wide = candidates.spread > config.search_limit
     score, some = tries.share, np.flatnonzero(wide[row])
     target, source = candidates.target[row[some]], candidates.source[row[some]]
-    score[some] = directional_overlap(clouds, raster, target, source, tries.pose[some], _MANY_POINTS, config.gate)
+    poses = tries.pose[some]
+    score[some] = net_overlap(clouds, raster, batch.free, target, source, poses, _MANY_POINTS, config.gate, batch.spacing)
     place, second = _best_places(row, tries.pose, score, len(candidates.target))
     found, pose = place >= 0, candidates.guess.copy()
-    everywhere = np.ones(len(place))
-    everywhere[wide & found] = score[place[wide & found]]
+    net = np.full(len(place), np.inf)
+    net[wide & found] = score[place[wide & found]]
     pose[found] = tries.pose[place[found]]
     points = pair_points(clouds, candidates.source, config.points)
     factors = match(clouds, raster, candidates.target, pose, points, config.gate, config.gate / 2.0)
     best = Aligned(pose, factors)
-    return ClosureMatches(best, found, second, _free_space_violations(batch, best), everywhere)
+    through = _free_space_violations(batch, best, _promising(best, net, config))
+    return ClosureMatches(best, found, second, through, net)
 
 
 def _guesses(batch: _Batch) -> tuple[Ints, Floats]:
@@ -169,13 +174,21 @@ def _prepare(clouds: Clouds, k: int, prepared: dict[int, Clouds]) -> Clouds:
     return prepared[k]
 
 
-def _free_space_violations(batch: _Batch, best: Aligned) -> Floats:
-    """Return the larger share of points (c,) of either sub-map that would stand in what the other saw to be free."""
-    candidates, config, free = batch.candidates, batch.config, batch.free
+def _promising(best: Aligned, net: Floats, config: LoopClosureConfig) -> Bools:
+    """Return which matches (c,), with net overlaps (c,), have enough and near points."""
+    enough = best.share >= min(config.overlap, config.overlap_after_search)
+    return np.asarray(np.where(np.isfinite(net), net >= config.net_overlap, enough) & (best.rms <= config.sigma))
+
+
+def _free_space_violations(batch: _Batch, best: Aligned, promising: Bools) -> Floats:
+    """Return the larger share of points (c,) of either sub-map that would stand in what the other saw to be free.
+
+    0 for those that are not promising (c,) and will be rejected anyway.
+    """
+    candidates, free = batch.candidates, batch.free
     through = np.zeros(len(candidates.target))
     if free is None:
         return through
-    promising = (best.share >= min(config.overlap, config.overlap_after_search)) & (best.rms <= config.sigma)
     for k in np.flatnonzero(promising):
         a, b = int(candidates.target[k]), int(candidates.source[k])
         through[k] = violates_free_space(free[a], batch.clouds.cloud(a)[0], free[b], batch.clouds.cloud(b)[0], best.pose[k])

@@ -46,7 +46,7 @@ def find(
     """
     if not len(candidates.target):
         return no_closures()
-    fits = fit(candidates, submaps.clouds, config, search_config, free, progress, executor)
+    fits = fit(candidates, submaps, config, search_config, free, progress, executor)
     result = fits.best
     variance = np.full(len(result.pose), config.match_sigma**2 * config.correlation)
     z, sqrt_information = measured(result.factors, result.pose, variance)
@@ -58,7 +58,7 @@ def _judge(
     candidates: Candidates, fits: ClosureMatches, z: Floats, sqrt_information: Floats, config: LoopClosureConfig
 ) -> list[tuple[str, str]]:
     """Return the outcome of each candidate so far, one of map_result.OUTCOMES, and its reason in words."""
-    result, searched = fits.best, candidates.spread > config.direct
+    result, searched, wide = fits.best, candidates.spread > config.direct, candidates.spread > config.search_limit
     error = se2.between(z, candidates.guess)
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
     seen = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
@@ -74,7 +74,10 @@ def _judge(
         least = config.overlap_after_search if searched[k] else config.overlap
         if not fits.found[k]:
             verdict = "not-found", "the search found no place for it"
-        elif result.share[k] < least:
+        elif fits.net[k] < config.net_overlap:
+            text = f"only {fits.net[k]:.1f} m of surface speak for it in one direction (least {config.net_overlap:g} m)"
+            verdict = "few-matches", text
+        elif result.share[k] < least and not wide[k]:
             verdict = "few-matches", f"only {result.share[k]:.0%} of its points match (least {least:.0%})"
         elif result.rms[k] > config.sigma:
             verdict = "far-matches", f"matches lie {result.rms[k]:.3f} m apart (most {config.sigma:g} m)"
@@ -85,8 +88,6 @@ def _judge(
             verdict = "degenerate", "the surfaces fix neither position nor heading"
         elif searched[k] and fits.second[k] > config.uniqueness:
             verdict = "ambiguous", f"another place matches {fits.second[k]:.0%} as well"
-        elif fits.everywhere[k] < config.overlap_everywhere:
-            verdict = "ambiguous", f"only {fits.everywhere[k]:.0%} match in one direction, as where walls look alike"
         elif distance[k] > most:
             text = f"contradicts the graph: squared Mahalanobis distance {distance[k]:.1f} (most {most:g})"
             verdict = "contradicts-graph", text

@@ -1,0 +1,89 @@
+"""Surface that speaks for a place: by a loop over points, where clouds meet in part, and out of view, where nothing does."""
+
+import numpy as np
+import pytest
+from helpers.laser_walks import CORRIDOR, HALL, scanned
+
+from uwblite import se2
+from uwblite.lidar.cloud_rasters import rasterize
+from uwblite.lidar.free_space import free_space, seen_beyond
+from uwblite.lidar.net_overlap import _AGAINST, _MARGIN, net_overlap
+from uwblite.lidar.visibility import nearest_by_bearing
+
+GATE, SPACING = 0.15, 0.02
+POSES = np.array([[0.0, 0.0, 0.7], [1.0, 0.5, 1.1]])
+NICHES = np.array([[x, y, x + 0.5, y] for x, y in ((-4.0, -0.8), (-1.5, 0.8), (2.2, -0.7), (3.1, 0.8), (6.0, -0.8))])
+NICHES = np.concatenate([CORRIDOR, NICHES, [[x, y, x, np.sign(y)] for x0, y, x1, _ in NICHES for x in (x0, x1)]])
+"""A corridor along x with pillars at irregular places."""
+
+
+def spaces(clouds):
+    nearest = nearest_by_bearing(clouds)
+    return [free_space(np.zeros((1, 3)), nearest[k : k + 1]) for k in range(len(clouds))]
+
+
+def net(clouds, pose, free, limit=10_000):
+    raster, pair = rasterize(clouds, 0.05, 0.5), (np.array([0]), np.array([1]))
+    return float(net_overlap(clouds, raster, free, *pair, np.array([pose]), limit, GATE, SPACING)[0])
+
+
+def by_loops(clouds, pose, free):
+    """Return the least surface of 3,600 directions, each by every point's nearest one."""
+    (p, n), (q, m) = clouds.cloud(0), clouds.cloud(1)
+    moved = se2.transform(pose, q), se2.rotate(np.full(len(m), pose[2]), m)
+    total = np.zeros((2, 2))
+    for (own, normals), (other, facing), space, frame in (
+        ((p, n), moved, free[1], se2.inverse(pose)), (moved, (p, n), free[0], np.zeros(3)),
+    ):  # fmt: skip
+        for point, normal in zip(own, normals, strict=True):
+            if not normal.any():
+                continue
+            distance = np.hypot(*(other - point).T)
+            k = np.argmin(distance)
+            good = distance[k] <= GATE and normal @ facing[k] > np.sqrt(0.5)
+            seen = seen_beyond(space, se2.transform(frame, point[None]), _MARGIN)[1][0] > 0
+            total += np.outer(normal, normal) * (1.0 if good else -_AGAINST * seen)
+    angle = np.linspace(0.0, np.pi, 3600)
+    u = np.stack([np.cos(angle), np.sin(angle)])
+    return SPACING * np.min(np.einsum("an,ab,bn->n", u, total, u))
+
+
+@pytest.mark.parametrize("off", [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.4, 0.05]])
+def test_it_is_the_least_over_all_directions(off):
+    """A raster's cell is 5 cm, so points within that of the gate may count otherwise: one metre of 30 here."""
+    clouds = scanned(POSES, HALL, 0.01, 1, beams=360, reach=9.0)
+    pose, free = se2.between(*POSES) + off, spaces(clouds)
+    assert abs(net(clouds, pose, free) - by_loops(clouds, pose, free)) < 1.0
+
+
+def test_points_left_out_count_by_those_looked_up():
+    clouds = scanned(POSES, HALL, 0.01, 1, beams=720, reach=9.0)
+    true, free = se2.between(*POSES), spaces(clouds)
+    whole = net(clouds, true, free)
+    assert abs(net(clouds, true, free, limit=len(clouds.points) // 4) - whole) < 0.15 * whole
+
+
+def test_clouds_that_meet_in_part_speak_for_the_true_place_alone():
+    """Two scans in a corridor share some faces of pillars; slid along it, walls match as before and pillars contradict."""
+    clouds = scanned(np.array([[0.0, 0.0, 0.0], [1.5, 0.0, 0.0]]), NICHES, 0.01, 2, beams=720, reach=6.0)
+    free = spaces(clouds)
+    right = net(clouds, [1.5, 0.0, 0.0], free)
+    assert right > 1.0  # both ways; each sees 0.3 m of the ends of three pillars that the other sees, and of some a part
+    for slid in (-2.0, 0.0, 0.6, 2.4, 4.4, 6.0):
+        assert net(clouds, [slid, 0.0, 0.0], free) < 0.3 * right
+
+
+def test_where_free_space_is_not_asked_all_points_count_as_in_view():
+    clouds = scanned(np.array([[-1.0, 0.0, 0.0], [4.0, 0.0, 0.0]]), NICHES, 0.01, 2, beams=720, reach=6.0)
+    true = [5.0, 0.0, 0.0]
+    assert net(clouds, true, None) < net(clouds, true, spaces(clouds))
+
+
+def test_clouds_out_of_each_others_view_say_nothing():
+    clouds = scanned(POSES, HALL, 0.01, 1, beams=360, reach=9.0)
+    assert net(clouds, [90.0, 0.0, 0.0], spaces(clouds)) == 0.0
+    assert net(clouds, [90.0, 0.0, 0.0], None) < 0.0
+
+
+def test_clouds_without_any_point_say_nothing():
+    assert net(scanned(np.zeros((2, 3)), HALL, reach=0.1), np.zeros(3), None) == 0.0
