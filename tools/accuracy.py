@@ -110,7 +110,6 @@ INGREDIENTS: dict[str, tuple[str, ...]] = {
     "scan-to-scan matching": ("scan_to_scan.on=false",),
     "loop closures of sub-maps": ("loop_closure.rounds=0",),
     "joint refinement": ("refinement.rounds=0",),
-    "pairs chosen again": ("refinement.selections=1",),
     "second scan per keyframe": ("keyframes.scans=1",),
     "corners": ("clouds.linearity=0.85",),
     "deskewing": ("deskew",),
@@ -394,7 +393,7 @@ def ablation(args: argparse.Namespace) -> str:
 WITHOUT_RADIO = (
     "nothing (the defaults)", "calibration of the wheels", "calibration of the laser's place", "calibration of the clocks",
     "robust kernels of wheels and ranges", "scan-to-scan matching", "loop closures of sub-maps", "joint refinement",
-    "pairs chosen again", "second scan per keyframe", "corners", "deskewing",
+    "second scan per keyframe", "corners", "deskewing",
 )  # fmt: skip
 """Ingredients that matter to recordings of wheels and lidar."""
 RAW = ("kummerle/mit-csail", "kummerle/fr079", "intel_raw", "carmen/freiburg-101", "carmen/belgioioso")

@@ -7,55 +7,11 @@ import numpy as np
 import pytest
 from helpers.planted_graphs import loop
 
-from uwblite.constraints import Constraints
 from uwblite.graph.graph import Calibration, UnknownKey
-from uwblite.graph.solver import optimize
-from uwblite.lidar.joint_refinement import RefinementResult
 from uwblite.pipeline import lidar_stages
-from uwblite.pipeline.estimate import Estimate, ScanClouds, Task
-from uwblite.pipeline.lidar_stages import check_map_consistency, refine_jointly
-from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.pipeline.estimate import Estimate, ScanClouds
+from uwblite.pipeline.lidar_stages import check_map_consistency
 from uwblite.pipeline.progress import Stages
-
-SUMMARY = optimize(loop()[0])[1]
-SAME = MappingConfig().refinement.same_pairs
-
-
-@pytest.fixture
-def laps(monkeypatch):
-    """Return a function that refines jointly, each lap moving all poses by the next shift, m; it returns gates and stages."""
-
-    def run(*shifts):
-        gates, left = [], iter(shifts)
-
-        def refined(graph, edges, scans, i, j, settings, task, stage):
-            gates.append(settings.first_gate)
-            moved = graph.poses + np.array([next(left), 0.0, 0.0])
-            none = np.zeros(0, dtype=int)
-            return RefinementResult(
-                replace(graph, poses=moved), None, none, none, None, none.astype(bool), 1, 0.01, SUMMARY
-            )  # fmt: skip
-
-        monkeypatch.setattr(lidar_stages, "_refine", refined)
-        monkeypatch.setattr(lidar_stages, "_pairs", lambda *args: (np.zeros(0, dtype=int), np.zeros(0, dtype=int)))
-        graph = loop()[0]
-        estimate = Estimate(graph, graph.edges[0], None, (), scans=ScanClouds(None, None, 0.0))
-        stages = Stages(None, None)
-        refine_jointly(estimate, Task(None, MappingConfig(), Constraints(), stages))
-        return gates, [s.figures["shift"] for s in stages.done]
-
-    return run
-
-
-def test_pairs_are_chosen_again_until_no_pose_moves(laps):
-    """Matches are sought far at first, and near the estimate on later laps; a lap that moves nothing is the last one."""
-    rules = MappingConfig().refinement
-    assert laps(0.9 * SAME) == ([rules.first_gate], [round(0.9 * SAME, 5)])
-    gates, shifts = laps(5.0 * SAME, 0.9 * SAME)
-    assert gates == [rules.first_gate, rules.later_gate]
-    assert shifts == pytest.approx([5.0 * SAME, 0.9 * SAME], abs=1e-5)
-    most = rules.selections
-    assert len(laps(*(most + 1) * [2.0 * SAME])[0]) == most
 
 
 @pytest.mark.parametrize(("share", "visits", "doubted"), [(0.051, 5, True), (0.05, 5, False), (0.9, 4, False), (0.0, 9, False)])

@@ -38,18 +38,16 @@ _CLOUDS_AT_ONCE = 128
 class RefinementConfig:
     """Matching of clouds in the joint refinement."""
 
-    rounds: int = 12
+    rounds: int = 30
     """Most rounds of matching and solving; 0 = no joint refinement (the paper)."""
     track_rounds: ClassVar[int] = 12
     """Most rounds of matching neighbouring clouds before loops are sought."""
-    selections: int = setting(3, advanced=True)
-    """How often, at most, the pairs are chosen again and refined."""
     same_pairs: ClassVar[float] = 0.04
-    """The pairs are not chosen again when the poses moved by less than this (root mean square) since they were, m."""
+    """Clouds are not matched again when ranges move the poses by less than this (root mean square), m."""
     first_gate: float = setting(0.5, advanced=True)
     """Farthest match in the first round, m."""
     later_gate: ClassVar[float] = 0.2
-    """Farthest match in the first round where poses are good already: after matching scan to scan, and in later selections."""
+    """Farthest match in the first round where poses are good already: after matching scan to scan, or once matched."""
     last_gate: ClassVar[float] = 0.12
     """Farthest match in the last rounds, m."""
     shrink: ClassVar[float] = 0.7

@@ -21,7 +21,7 @@ from ..lidar.scan_to_scan import Steps
 from . import scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
-from .progress import Stage, solver_figures
+from .progress import solver_figures
 from .radio_stages import with_range_noise
 from .recordings import denser, later
 
@@ -207,22 +207,15 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
     assert scans is not None
     if estimate.ranges is not None:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
-    for lap in range(config.refinement.selections):
-        settings, before = config.refinement, estimate.graph.poses
-        i, j = _pairs(estimate.graph, scans, settings, task)
-        if lap > 0:
-            settings = replace(settings, first_gate=settings.later_gate)
-        edges = estimate.odometry_and_ranges
-        refined = _refine(estimate.graph, edges, scans, i, j, settings, task, "joint refinement")
-        graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
-        estimate = with_range_noise(replace(estimate, graph=graph, joint=refined.edges), config, steady=True)
-        shift = estimate.moved_since(before)
-        task.stages.end(
-            Stage("joint refinement", lap + 1), pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
-            sigma=round(refined.sigma, 4), shift=round(shift, 5), **solver_figures(refined.summary),
-        )  # fmt: skip
-        if shift < config.refinement.same_pairs:
-            break
+    before, edges = estimate.graph.poses, estimate.odometry_and_ranges
+    i, j = _pairs(estimate.graph, scans, config.refinement, task)
+    refined = _refine(estimate.graph, edges, scans, i, j, config.refinement, task, "joint refinement")
+    graph = with_nonnegative_heights(estimate.graph.with_estimates_of(refined.graph))
+    estimate = with_range_noise(replace(estimate, graph=graph, joint=refined.edges), config, steady=True)
+    task.stages.end(
+        "joint refinement", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
+        sigma=round(refined.sigma, 4), shift=round(estimate.moved_since(before), 5), **solver_figures(refined.summary),
+    )  # fmt: skip
     return estimate if estimate.ranges is None or estimate.joint is None else _by_own_errors(estimate, scans, task)
 
 
