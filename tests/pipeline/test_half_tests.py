@@ -54,18 +54,23 @@ def test_turns_that_change_their_sign_half_way(sound):
 
 @pytest.mark.parametrize("missing", [None, 0, 1])
 def test_halves_are_compared_where_both_decide(monkeypatch, missing):
-    """Poses 10 to 31 of the second recording: 10 to 20 and 20 to 31; a recording with a lidar is not examined."""
-    asked, compared = [], []
+    """Poses 10 to 31 of the second recording: 10 to 20 and 20 to 31; a recording with a lidar is not examined.
+
+    Halves are bootstrapped alone only where the ranges are distances."""
+    asked, compared, alone, stages = [], [], [], Stages(None, None)
+    if missing == 0:
+        stages.doubt("range-scatter", "")
 
     def calibrated(estimate, recording, rows, task):
         asked.append((rows.start, rows.stop))
         return None if missing == len(asked) - 1 else len(asked)
 
     monkeypatch.setattr(half_tests, "_calibration", calibrated)
-    monkeypatch.setattr(half_tests, "_check_sign_of_turns", lambda *args: None)
+    monkeypatch.setattr(half_tests, "_check_sign_of_turns", lambda recording, task: alone.append(recording))
     monkeypatch.setattr(half_tests, "_compare", lambda one, other, task: compared.append((one, other)))
     each = [SimpleNamespace(has_scans=True), SimpleNamespace(has_scans=False, rows=slice(10, 31))]
-    half_tests.check_halves(SimpleNamespace(ranges=1), SimpleNamespace(recordings=SimpleNamespace(each=each)))
+    half_tests.check_halves(SimpleNamespace(ranges=1), SimpleNamespace(recordings=SimpleNamespace(each=each), stages=stages))
+    assert alone == ([] if missing == 0 else each[1:])
     assert asked == [(10, 20), (20, 31)]
     assert compared == ([(1, 2)] if missing is None else [])
 

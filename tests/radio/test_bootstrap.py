@@ -1,6 +1,7 @@
 """Starting values from nothing: planted worlds are recovered from bent odometry and unknown anchors."""
 
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from uwblite.graph.graph import Graph
 from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
+from uwblite.radio import bootstrap
 from uwblite.radio.bootstrap import BootstrapConfig, BootstrapResult, _Bootstrap, bootstrap_graph
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
@@ -218,7 +220,7 @@ class Scheduled(_Bootstrap):
     def __init__(self, poses, agrees, found):
         self.path, self.config, self.hypotheses = np.arange(float(poses)), BootstrapConfig(), {}
         self.placed, self.agrees, self.found = np.ones(1, dtype=bool), iter(agrees), iter(found)
-        self.taken = []
+        self.taken, self.low, self.high = [], 0, 0
 
     def _seed(self):
         self.low, self.high = 0, 20
@@ -242,11 +244,14 @@ class Scheduled(_Bootstrap):
 
 def test_pieces_grow_while_the_ranges_agree_and_all_is_solved_from_time_to_time():
     """The first piece is 0.3 of the first stretch. It grows by half where the ranges agreed, shrinks by a fifth where they did
-    not, never below 0.3 of the first; all is solved at 1.35 times the poses and at the end, twice where an anchor came."""
+    not, never below 0.3 of the first; all is solved at 1.35 times the poses and at the end, twice where an anchor came. What
+    is left at a distance goes on as if it had never been left."""
     one = Scheduled(32, [True, False, True], [True, False])
     one.run()
     assert one.taken == [(10.0, 20), 6.0, 9.0, (6.0, 28), (6.0, 28), 7.2, (6.0, 32)]
     slow = Scheduled(56, [False] * 9, [False] * 9)
+    slow.run(21.0)
+    assert slow.high == 24
     slow.run()
     pieces = [t for t in slow.taken if isinstance(t, float)]
     assert pieces == [6.0, 4.8, 3.84, 3.072, 2.4576, 1.96608, 1.8, 1.8, 1.8]
@@ -332,3 +337,53 @@ def test_the_first_stretch_is_the_one_whose_anchors_are_clearest():
     assert all(abs(drift / 0.015 - (high - low)) <= 1.0 + 1e-9 for low, high, drift in tried)
     assert (attempt.low, attempt.high, length) == (15, 41, 25.0)
     assert attempt.placed.tolist() == [True, True]
+
+
+class Tried(_Bootstrap):
+    """An attempt over 400 m whose misfit is given for 50, 100, 200 m and the end, by its heading error."""
+
+    misfits: ClassVar[dict[float, tuple[float, ...]]] = {}
+    known: ClassVar[dict[float, float]] = {}
+
+    def __init__(self, graph, odometry, ranges, path, config, search):
+        self.path, self.config, self.low, self.high = np.arange(401.0), config, 0, 0
+        self.heading = float(graph.calibration.values[0])
+
+    def run(self, enough=np.inf):
+        self.high = int(min(enough, 400.0)) + 1
+        self.known[self.heading] = self.high - 1
+
+    def _place_the_rest(self):
+        pass
+
+    def misfit(self):
+        return self.misfits.get(self.heading, (9.0,) * 4)[(51, 101, 201, 401).index(self.high)]
+
+    def estimate(self):
+        return self.heading
+
+
+@pytest.mark.parametrize(
+    ("misfits", "wins", "known"),
+    [
+        ({0.0: (1.5, 1.5, 1.5, 1.9)}, 0.0, {0.0: 400}),
+        # Nobody begins clearly better than the heading as it is: all others are left where they began.
+        ({0.0: (5.0, 5.0, 5.0, 9.0), 1.0: (4.1,) * 4}, 0.0, {0.0: 400, 1.0: 50}),
+        # One begins better; it wins where it ends clearly better, too.
+        ({0.0: (5.0, 5.0, 5.0, 9.0), 1.0: (3.0, 3.0, 3.0, 7.1)}, 1.0, {1.0: 400, -0.5: 50}),
+        ({0.0: (5.0, 5.0, 5.0, 9.0), 1.0: (3.0, 3.0, 3.0, 7.3)}, 0.0, {1.0: 400}),
+        # The best beginning is left as soon as it disagrees; the next agrees to the end, and nobody else is tried.
+        (
+            {0.0: (9.0,) * 4, -0.3: (0.5, 1.0, 2.1, 0.1), 0.4: (1.0, 1.0, 1.0, 1.9), 1.0: (1.5,) * 4}, 0.4,
+            {-0.3: 200, 0.4: 400, 1.0: 50},
+        ),
+    ],
+)  # fmt: skip
+def test_a_heading_error_is_given_up_where_it_cannot_win(monkeypatch, misfits, wins, known):
+    monkeypatch.setattr(bootstrap, "_Bootstrap", Tried)
+    monkeypatch.setattr(Tried, "misfits", misfits)
+    monkeypatch.setattr(Tried, "known", {})
+    turns = [u for u in unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)) if u.key.kind == "heading_scale"]
+    graph = Graph(np.zeros((2, 3)), np.zeros((0, 2)), (), block(turns))
+    assert bootstrap_graph(graph, None, None, None, BootstrapConfig(), None) == wins
+    assert {heading: Tried.known[heading] for heading in known} == known

@@ -39,7 +39,9 @@ def check_halves(estimate: Estimate, task: Task) -> None:
     for recording in task.recordings.each:
         if recording.has_scans or estimate.ranges is None:
             continue
-        _check_sign_of_turns(recording, task)
+        if not any(doubt.kind == "range-scatter" for doubt in task.stages.doubts):
+            # Ranges that are no distances give no anchors by either half, however long one tries.
+            _check_sign_of_turns(recording, task)
         rows, middle = recording.rows, (recording.rows.start + recording.rows.stop) // 2
         halves = [_calibration(estimate, recording, slice(*ends), task) for ends in ((rows.start, middle), (middle, rows.stop))]
         if halves[0] is None or halves[1] is None:

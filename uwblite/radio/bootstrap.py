@@ -44,6 +44,8 @@ class BootstrapConfig:
     base's settings is the commonest gross fault, and a factor of two the commonest value."""
     agreement: ClassVar[float] = 2.0
     """Ranges agree when their median error is below so many standard deviations."""
+    enough: ClassVar[float] = 50.0
+    """Travelled distance over which a heading error is tried before it is worth the whole path, m."""
     tear: ClassVar[float] = 1.0
     """No slip throws a step between keyframes off by more than this, m or rad: then a piece was laid on mirrored or in the
     wrong place, however well its ranges agree."""
@@ -75,8 +77,9 @@ def bootstrap_graph(
 ) -> BootstrapResult:
     """Estimate poses and anchor positions without any guess of the anchors.
 
-    Where the ranges do not agree in the end, the bootstrap is tried again with other hypotheses of a gross heading error;
-    the one that the ranges like best wins.
+    Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path.
+    In the order of their misfit there, each goes on as long as the ranges agree; the first that comes to the end wins. Where
+    none does, the best of them is carried on if it began clearly better than the heading as it is, and wins if it ends so.
 
     Parameters
     ----------
@@ -85,21 +88,25 @@ def bootstrap_graph(
     ranges : all ranges; those that cannot be distances must have weight 0.
     path : (k,) travelled distance at each pose, m.
     """
-    best: _Bootstrap | None = None
-    least = np.inf
-    for heading_scale in config.heading_scales:
-        calibration = _with(graph.calibration, "heading_scale", heading_scale)
-        if calibration is None:
-            continue
-        attempt = _Bootstrap(replace(graph, calibration=calibration), odometry, ranges, path, config, search)
-        attempt.run()
-        misfit = attempt.misfit()
-        if best is None or misfit < 0.8 * least:
-            best, least = attempt, misfit
-        if misfit < config.agreement:
-            break
-    assert best is not None
-    return best.estimate()
+    first, *others = (
+        _Bootstrap(replace(graph, calibration=calibration), odometry, ranges, path, config, search)
+        for heading_scale in config.heading_scales
+        if (calibration := _with(graph.calibration, "heading_scale", heading_scale)) is not None
+    )
+    first.run(config.enough)
+    begun = first.misfit()
+    first.run()
+    if first.misfit() < config.agreement or not others:
+        return first.estimate()
+    for attempt in others:
+        attempt.run(config.enough)
+    others.sort(key=_Bootstrap.misfit)
+    hopeful = others[0] if others[0].misfit() < 0.8 * begun else first
+    for attempt in others:
+        if attempt.agrees_to_the_end():
+            return attempt.estimate()
+    hopeful.run()
+    return (hopeful if hopeful.misfit() < 0.8 * first.misfit() else first).estimate()
 
 
 def _with(calibration: Calibration, name: str, value: float) -> Calibration | None:
@@ -127,23 +134,48 @@ class _Bootstrap:
         self.placed = np.zeros(len(graph.anchors), dtype=bool)
         self.sigma = np.full(len(graph.anchors), config.range_sigma)
         self.hypotheses: dict[int, list[AnchorHypothesis]] = {}
-        self.low = self.high = 0
+        self.low = self.high = self.solved = 0
+        self.piece = self.smallest = 0.0
 
-    def run(self) -> None:
-        """Extend from the clearest stretch to the whole path."""
-        piece = self.config.piece * self._seed()
-        smallest = 0.3 * piece
+    @property
+    def complete(self) -> bool:
+        """Whether all poses are known."""
+        return self.low == 0 and self.high == len(self.path)
+
+    def run(self, enough: float = np.inf) -> None:
+        """Extend from the clearest stretch, or from where it was left, to a travelled distance, m, or to the whole path."""
+        if self.high == 0:
+            self._begin()
+        while self.placed.any() and not self.complete and self.path[self.high - 1] - self.path[self.low] < enough:
+            agreed = self._extend(self.piece)
+            self.piece = 1.5 * self.piece if agreed else max(0.8 * self.piece, self.smallest)
+            if self.high - self.low >= self.config.resolve_factor * self.solved or self.complete:
+                self._solve((6.0, 3.0))
+                self.solved = self.high - self.low
+                if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
+                    self._solve((6.0, 3.0))
+        if np.isinf(enough):
+            self._place_the_rest()
+
+    def agrees_to_the_end(self) -> bool:
+        """Extend as long as the ranges agree; return whether they do over the whole path."""
+        length = self.config.enough
+        while not self.complete and self.misfit() < self.config.agreement:
+            length *= 2.0
+            self.run(length)
+        if self.complete:
+            self._place_the_rest()
+        return self.complete and self.misfit() < self.config.agreement
+
+    def _begin(self) -> None:
+        """Solve the clearest stretch."""
+        self.piece = self.config.piece * self._seed()
+        self.smallest, self.solved = 0.3 * self.piece, self.high - self.low
         if self.placed.any():
             self._solve((10.0, 3.0))
-            solved = self.high - self.low
-            while not self._complete():
-                agreed = self._extend(piece)
-                piece = 1.5 * piece if agreed else max(0.8 * piece, smallest)
-                if self.high - self.low >= self.config.resolve_factor * solved or self._complete():
-                    self._solve((6.0, 3.0))
-                    solved = self.high - self.low
-                    if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
-                        self._solve((6.0, 3.0))
+
+    def _place_the_rest(self) -> None:
+        """Put the anchors that stay unclear where they are likeliest."""
         self.doubtful = np.array([self._unclear(self.hypotheses.get(k, [])) for k in range(len(self.placed))], dtype=bool)
         for anchor, hypotheses in self.hypotheses.items():
             if hypotheses and not self.placed[anchor]:
@@ -156,19 +188,17 @@ class _Bootstrap:
         return BootstrapResult(final, self.placed, found, self.doubtful)
 
     def misfit(self) -> float:
-        """Return the median error of all ranges to placed anchors, in assumed standard deviations; 0 without any.
+        """Return the median error of ranges to placed anchors, in assumed standard deviations, as far as poses are known.
 
-        A trajectory that is torn somewhere never agrees.
+        A trajectory that is torn somewhere never agrees; without any anchor the misfit is 0.
         """
-        part = self._part(0, len(self.path))
+        low, high = self.low, self.high or len(self.path)
+        part = self._part(low, high)
         errors = [np.abs(e.residuals(part)[:, 0] * e.sigma) for e in part.edges if isinstance(e, RangeEdges)]
         median = float(np.median(errors[0])) / (0.6745 * self.config.range_sigma) if errors else 0.0
-        steps = self.odometry.corrected(replace(self.graph, calibration=self.calibration))
-        off = se2.between(steps, se2.between(self.poses[:-1], self.poses[1:]))
+        steps = self.odometry.corrected(replace(self.graph, calibration=self.calibration))[low : high - 1]
+        off = se2.between(steps, se2.between(self.poses[low : high - 1], self.poses[low + 1 : high]))
         return max(median, self.config.agreement) if np.any(np.abs(off) > self.config.tear) else median
-
-    def _complete(self) -> bool:
-        return self.low == 0 and self.high == len(self.path)
 
     def _unclear(self, hypotheses: list[AnchorHypothesis]) -> bool:
         return len(hypotheses) > 0 and ambiguous(hypotheses, self.search)
