@@ -120,3 +120,10 @@ def refused(data):
     with pytest.raises(ConfigError) as error:
         from_dict(Moved, data)
     return str(error.value)
+
+
+@pytest.mark.parametrize(("length", "shown"), [(58, "'" + 58 * "x" + "'"), (59, "'" + 56 * "x" + "...")])
+def test_what_is_not_understood_is_shown_up_to_sixty_characters(length, shown):
+    with pytest.raises(ConfigError) as error:
+        from_dict(Moved, {"reach": length * "x"})
+    assert str(error.value).endswith(f"not {shown}")

@@ -7,7 +7,7 @@ import pytest
 from helpers.planted_graphs import loop, plain_ranges, relative_edges
 
 from uwblite import se2
-from uwblite.graph.condensation import Condensed, _damped, solve_condensed
+from uwblite.graph.condensation import Condensed, _damped, _motion, solve_condensed
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.partition import split
 from uwblite.graph.robust import Kernel
@@ -110,3 +110,15 @@ def test_one_part_alone_shares_nothing():
 
 def test_what_nothing_measures_is_damped_as_one():
     assert _damped(np.array([4.0, 0.5, 0.0]), 0.5).tolist() == [2.0, 0.25, 0.5]
+
+
+def test_a_motion_is_the_largest_of_any_pose_or_anchor():
+    """In metres or radians, angles the short way round; graphs without anchors or poses have none."""
+    before = Graph(np.array([[0.0, 0.0, 3.1], [1.0, 1.0, 0.0]]), np.zeros((1, 2)))
+    assert _motion(before, before) == 0.0
+    assert _motion(before, replace(before, poses=before.poses - np.array([0.0, 0.2, 0.0]))) == pytest.approx(0.2)
+    assert _motion(before, replace(before, poses=before.poses - np.array([0.0, 0.0, 0.1]))) == pytest.approx(0.1)
+    turned = np.array([[0.0, 0.0, -3.1], [1.0, 1.0, 0.0]])
+    assert _motion(before, replace(before, poses=turned)) == pytest.approx(2.0 * np.pi - 6.2)
+    assert _motion(before, replace(before, anchors=np.array([[0.0, 0.3]]))) == pytest.approx(0.3)
+    assert _motion(Graph(np.zeros((0, 3))), Graph(np.zeros((0, 3)))) == 0.0

@@ -92,6 +92,15 @@ def test_an_indefinite_matrix_is_refused():
         normal.factor(-2.0 * np.asarray(normal.diagonal))
 
 
+def test_a_direction_that_costs_nothing_or_less_is_refused():
+    """The pieces and the coarse level may be positive definite where the whole matrix is not."""
+    normal = system(tied(600, 20)[0])
+    factor = normal.factor(np.zeros(normal.unknowns.size))
+    factor._matrix = -factor._matrix
+    with pytest.raises(SolverError, match="singular"):
+        factor.solve(np.ones(normal.unknowns.size))
+
+
 def test_the_coarse_level_moves_pieces_as_rigid_bodies_and_all_else_on_its_own():
     """A small motion of a piece about its middle, in differences; an unknown that is no pose has a column of its own."""
     rng = np.random.default_rng(3)

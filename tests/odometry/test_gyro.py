@@ -10,7 +10,7 @@ from helpers import planted
 from uwblite import se2
 from uwblite.io.carmen import read_log, write_log
 from uwblite.mapping import build_map
-from uwblite.odometry.gyro import GAP, LEFT_OF_BIAS, _covered, heading_from_gyro, settings
+from uwblite.odometry.gyro import GAP, LEFT_OF_BIAS, WINDOW, _changes, _covered, heading_from_gyro, reading_of, settings
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.sensor_log import Gyro, Odometry, SensorLog
 
@@ -127,3 +127,25 @@ def test_a_step_is_covered_where_the_gyro_was_read_throughout(seed):
     covered = _covered(Gyro(read, np.zeros(40)), stamps)
     np.testing.assert_array_equal(covered, np.array(expected, dtype=bool))
     assert 5 < covered.sum() < 58
+
+
+def test_changes_are_those_between_the_ends_of_windows_that_overlap_by_half():
+    """Of a robot that drives an arc through x and y: chords, not turns, and headings unwrapped."""
+    stamps = np.arange(0.0, 20.0, 0.1)
+    theta = 0.3 * stamps
+    arc = np.column_stack([2.0 * np.sin(theta), 2.0 - 2.0 * np.cos(theta), se2.wrap_angle(theta)])
+    gyro = Gyro(stamps, -0.1 * stamps)
+    turned, by_wheels, way = _changes(gyro, Odometry(stamps, arc), 4.0)
+    assert len(way) == 8
+    np.testing.assert_allclose(turned, -0.4)
+    np.testing.assert_allclose(by_wheels, 1.2)
+    np.testing.assert_allclose(way, 4.0 * np.sin(0.6), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("seconds", "read"), [(2.4, False), (2.6, True)])
+def test_four_windows_show_what_a_gyro_reads(seconds, read):
+    """One that counts the other way round; three windows are too few to say so."""
+    stamps = np.arange(0.0, WINDOW + 0.5 * WINDOW * 3.0 + seconds - 2.5, 0.01)
+    heading = np.where(stamps < 6.0, 0.2 * stamps, 1.2 - 0.3 * (stamps - 6.0))
+    wheels = Odometry(stamps, np.column_stack([stamps, np.zeros(len(stamps)), heading]))
+    assert (reading_of(Gyro(stamps, -heading), wheels)[0] == -1.0) is read

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.odometry.keyframes import KeyframeConfig, _slack, dense_trajectory, select, velocity_at
+from uwblite.odometry.keyframes import KeyframeConfig, _broken_steps, _slack, dense_trajectory, select, velocity_at
 from uwblite.sensor_log import LaserScans, Odometry, OdometryBreaks
 
 CONFIG = KeyframeConfig(distance=0.4, angle=0.3, scans=2)
@@ -233,3 +233,10 @@ def test_a_step_has_the_slack_of_every_break_it_has_time_in_common_with(seed):
     found = _slack(stamps, odometry_stamps, OdometryBreaks(odometry_stamps[at], sigma))
     inside = ~np.isin(np.arange(7), [0, 6])
     np.testing.assert_allclose(found[inside], np.sqrt(expected)[inside])
+
+
+def test_a_break_belongs_to_the_sample_before_it_that_has_a_step_behind_it():
+    stamps = np.array([1.0, 2.0, 3.0, 4.0])
+    breaks = OdometryBreaks(np.array([0.0, 1.0, 2.5, 3.0, 4.0, 9.0]), np.zeros((6, 3)))
+    assert _broken_steps(stamps, breaks).tolist() == [0, 0, 1, 2, 2, 2]
+    assert _broken_steps(stamps[:1], breaks).tolist() == [0] * 6

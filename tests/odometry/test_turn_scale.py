@@ -8,7 +8,7 @@ from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, odometry_indices, scan_indices, unknowns
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import ScanEdges
-from uwblite.odometry.turn_scale import _independent, turn_scales
+from uwblite.odometry.turn_scale import _independent, _scale, turn_scales
 
 STEPS, NOISE = 400, 0.01
 CALIBRATION = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
@@ -105,3 +105,14 @@ def test_noise_of_single_steps_is_not_taken_for_errors_that_last_a_turn():
     """However long the turns are, the standard deviation is that of single steps: 0.2 up to the scatter of a correlation."""
     sigma = {n: np.median([found(0.3, seed=seed, same_way=n).sigma for seed in range(9)]) for n in (1, 8)}
     assert sigma[8] == pytest.approx(sigma[1], rel=0.3)
+
+
+def test_stretches_of_different_scales_scatter_as_a_sample_of_four():
+    """Without noise of steps: the standard deviation of the mean of four directions, by the slope of the tangent there."""
+    scales = np.array([0.9, 1.2, 1.0, 1.05])
+    wheels = np.tile([0.2, -0.3], 200)
+    found = _scale(np.repeat(scales, 100) * wheels, wheels, np.arange(400))
+    np.testing.assert_allclose(found.stretches, scales - 1.0, atol=1e-12)
+    middle = np.arctan(1.0 + found.value)
+    error = np.sqrt(np.sum((np.arctan(scales) - np.arctan(scales).mean()) ** 2) / 3.0 / 4.0)
+    assert found.sigma == pytest.approx(error * (1.0 + np.tan(middle) ** 2))

@@ -128,3 +128,22 @@ def test_anchors_of_both_halves_that_are_mirror_images_are_a_doubt(monkeypatch, 
     )
     assert [n.kind for n in stages.doubts] == (["halves-disagree"] if doubted else [])
     assert all(n.figures["apart"] > 1.0 and n.figures["mirrored"] < 1e-9 for n in stages.doubts)
+
+
+@pytest.mark.parametrize(("wide", "ranged", "found"), [(0.11, True, ["A"]), (0.09, True, []), (0.11, False, [])])
+def test_a_half_says_where_anchors_are_that_it_shows_well(monkeypatch, wide, ranged, found):
+    """From a path a tenth as wide as it is long, with eight ranges that count to an anchor that was placed."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
+    poses = np.column_stack([np.cos(angle), wide * np.sin(angle), angle])
+    anchor = np.repeat([0, 1, 2], [8, 7, 9])
+    ranges = SimpleNamespace(anchor=anchor, alive=np.ones(24, dtype=bool)) if ranged else None
+    graph = SimpleNamespace(poses=poses, anchors=np.arange(6.0).reshape(3, 2))
+    estimate = SimpleNamespace(graph=graph, ranges=ranges, anchor_ids=("A", "B", "C"), placed=np.array([True, True, False]))
+    monkeypatch.setattr(half_tests, "bootstrapped", lambda *args: estimate)
+    monkeypatch.setattr(half_tests, "dead_reckoning", lambda *args: None)
+    measured = UwbRanges(np.linspace(0.0, 99.0, 50), np.zeros(50, int), np.ones(50), np.ones(50), ("A",))
+    log = SensorLog(Odometry(np.arange(100.0), np.zeros((100, 3))), measured)
+    task = Task(None, MappingConfig(), Constraints(), None)
+    places = half_tests._anchors_alone(SimpleNamespace(log=log), -np.inf, np.inf, task)
+    assert list(places) == found
+    assert all(place.tolist() == [0.0, 1.0] for place in places.values())

@@ -5,16 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted import odometry, ranges, recording, wander
+from helpers.planted_graphs import loop
 
 from uwblite import se2
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.calibration import CalibrationConfig
 from uwblite.graph.marginals import marginals
+from uwblite.graph.pose_edges import ScanEdges
 from uwblite.map_result import AnchorEstimate, Notice
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.wheels import with_noise_shown
 from uwblite.pipeline.mapping_config import preset
-from uwblite.pipeline.summary import _distrusted, _reason_to_distrust
+from uwblite.pipeline.summary import _distrusted, _reason_to_distrust, _with_steady_errors
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -198,3 +200,21 @@ def test_an_anchor_is_distrusted_for_a_reason(used, sigma, longest, bias, reason
     found = _reason_to_distrust(used, sigma, longest, bias)
     assert bool(found) == bool(reason)
     assert reason in found
+
+
+@pytest.mark.parametrize(("steady", "lidar", "counted"), [(0.1, False, True), (0.0, False, False), (0.1, True, False)])
+def test_what_ranges_err_alike_counts_in_covariances_where_no_lidar_holds_the_poses(monkeypatch, steady, lidar, counted):
+    asked = []
+
+    def learnt(edges, graph, anchors, config, *, steady):
+        asked.append((edges, anchors, steady))
+        return edges, ()
+
+    monkeypatch.setattr("uwblite.pipeline.summary.learn_noise", learnt)
+    graph = loop()[0]
+    i, none = np.zeros(1, dtype=int), np.zeros((1, 3))
+    scans = ScanEdges(i, i + 1, none, np.eye(3)[None], none, none, np.full(4, -1))
+    graph = graph.with_edges(scans) if lidar else graph
+    found = _with_steady_errors(graph, 3, replace(MappingConfig().ranges, steady=steady))
+    assert found.edges == graph.edges
+    assert asked == ([(graph.edges[2], 3, True)] if counted else [])

@@ -192,3 +192,16 @@ def test_ranges_through_something_weigh_together_as_one_draw_of_their_delay():
     none, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig(), blocked=np.zeros(len(edges), dtype=bool))
     plain, _ = learn_noise(noisy, graph, 1, RangeNoiseConfig())
     np.testing.assert_array_equal(none.weights, plain.weights)
+
+
+@pytest.mark.parametrize(("clear", "least", "most"), [(30, 0.0, 0.2), (29, 0.5, 2.0)])
+def test_noise_is_learnt_from_clear_ranges_where_there_are_thirty(clear, least, most):
+    """Of others, that went through something, the delays scatter by a metre; where fewer are clear, all count."""
+    _, truth, frames, places, _, edges = world(9, 150.0, 1, sigma=0.0, rate=4.0)
+    rng, graph = np.random.default_rng(7), Graph(truth[frames.index], places)
+    blocked = np.ones(len(edges), dtype=bool)
+    blocked[np.linspace(0, len(edges) - 1, clear).astype(int)] = False
+    error = np.where(blocked, rng.normal(0.0, 1.0, len(edges)), rng.normal(0.0, 0.06, len(edges)))
+    noisy = replace(edges, ranges=edges.distances(graph) + error)
+    _, (noise,) = learn_noise(noisy, graph, 1, RangeNoiseConfig(), blocked=blocked)
+    assert least < noise.sigma < most

@@ -7,7 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.radio.trilateration import TrilaterationConfig, _raster_search, _score, agreement, ambiguous, trilaterate, usable
+from uwblite.radio.trilateration import (
+    TrilaterationConfig,
+    _raster_search,
+    _refine,
+    _score,
+    agreement,
+    ambiguous,
+    trilaterate,
+    usable,
+)
 
 CONFIG = TrilaterationConfig()
 
@@ -177,3 +186,17 @@ def test_the_score_of_a_place_is_its_truncated_cost_with_that_of_its_bias():
     assert (scored.sigma, scored.bias) == (0.5, 0.3)
     assert scored.position_sigma == pytest.approx(0.5 * 0.2)
     assert _score(path, ranges, state, -covariance, 0.5, 0.1, CONFIG).position_sigma == 0.0
+
+
+def test_covariances_are_those_of_least_squares_with_the_bias_under_its_prior():
+    """Of exact ranges, weighed fully: J^T J, the prior of a bias whose sigma is a multiple of the noise, and a thousandth."""
+    rng, drift = np.random.default_rng(4), 0.3
+    path, anchor = loop_path(rng), np.array([4.0, -2.5])
+    state, covariance, _ = _refine(path, np.hypot(*(path - anchor).T), np.array([[4.2, -2.6, 0.0]]), 0.5, drift, CONFIG)
+    np.testing.assert_allclose(state, [[*anchor, 0.0]], atol=1e-3)
+    away = anchor - path
+    jacobian = np.column_stack([away / np.hypot(*away.T)[:, None], np.ones(len(path))])
+    normal = jacobian.T @ jacobian
+    normal[2, 2] += (drift / CONFIG.bias_sigma) ** 2
+    normal += 1e-3 * np.diag(np.diag(normal))
+    np.testing.assert_allclose(covariance[0], np.linalg.inv(normal), rtol=1e-3, atol=1e-6)
