@@ -67,3 +67,11 @@ def test_scans_at_the_ends_are_answered_though_the_clock_is_late():
     ends = Relations(stamps[:1], stamps[-1:], np.zeros((1, 3)))
     for delay in (-0.15, 0.15):
         assert evaluate_relations(stamps, np.zeros((len(stamps), 3)), ends, delay).answered.all()
+
+
+@pytest.mark.parametrize(("delay", "answered"), [(0.0, [True, True]), (0.5, [False, True]), (-0.5, [True, False])])
+def test_gaps_are_those_at_the_lidars_clock(delay, answered):
+    """Between 9 and 40 s there are no poses: one of 8.9 s, taken half a second later, falls between."""
+    stamps = np.concatenate([np.arange(0.0, 10.0), np.arange(40.0, 50.0)])
+    relations = Relations(np.array([8.9, 40.2]), np.array([5.0, 45.0]), np.zeros((2, 3)))
+    assert evaluate_relations(stamps, np.zeros((20, 3)), relations, delay=delay).answered.tolist() == answered

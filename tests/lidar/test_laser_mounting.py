@@ -142,6 +142,15 @@ def test_turns_are_compared_between_too_small_to_see_and_too_large_to_overlap(sp
     assert len(first) <= 2 * 50
 
 
+@pytest.mark.parametrize(("speed", "compared"), [(1.9, True), (2.1, False)])
+def test_scans_a_metre_and_more_apart_show_too_little_of_the_same(speed, compared):
+    """Half a second of an arc, where the robot never turns on the spot."""
+    stamps, truth = drive([(speed, 0.0, 0.4)], [20.0])
+    lidar = LaserScans(np.arange(0.0, 19.0, 0.1), np.ones((190, 100), dtype=np.float32), -1.0, 0.02, 0.0, 0.1, 5.0)
+    first, _ = _turning_pairs(recording(odometry(stamps, truth), None, lidar), lidar, 50)
+    assert (len(first) > 0) is compared
+
+
 @pytest.mark.parametrize(("gap", "across"), [(1.9, True), (2.6, False)])
 def test_scans_before_and_after_a_gap_of_seconds_are_no_pair(gap, across):
     """A pair is five scans of a tenth of a second apart, or, over the gap, as much longer."""

@@ -77,3 +77,13 @@ def test_what_the_bootstrap_took_for_ambiguous_is_decided_along_the_final_path()
         before.bootstrap, ambiguous=np.array([True]), hypotheses=((Hypothesis(ANCHOR), Hypothesis(ANCHOR * (1, -1))),)
     )
     assert not find_mirror_images(replace(before, bootstrap=unsure), TASK).bootstrap.ambiguous.any()
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_an_anchor_that_is_fixed_keeps_what_was_said_of_it(fixed):
+    """Along a straight line, where one that is free is ambiguous."""
+    before = estimate(0.0)
+    graph = replace(before.graph, fixed_anchors=np.array([fixed]))
+    done = find_mirror_images(replace(before, graph=graph), TASK)
+    assert done.bootstrap.ambiguous.tolist() == [not fixed]
+    assert (done.bootstrap is before.bootstrap) is fixed
