@@ -6,9 +6,10 @@ from helpers.planted_graphs import dense_system, loop, relative_edges
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights
-from uwblite.graph.marginals import CommonErrors, JointCovariance, calibration_covariance, marginals
+from uwblite.graph.marginals import CommonErrors, JointCovariance, calibration_covariance, marginals, with_common_errors
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import optimize
+from uwblite.graph.unknowns import Unknowns, moved
 from uwblite.graph.variance_components import variances_of_kinds
 
 
@@ -184,8 +185,8 @@ def dense_jacobian(graph):
 
 
 @pytest.mark.parametrize(("table", "count"), [(0, 40), (1, 9)], ids=["odometry", "robust closures"])
-def test_common_errors_add_what_they_move_squared_with_the_variances_that_the_residuals_show(table, count):
-    """Against dense P = 1 - J (J^T J)^-1 J^T: what is handed to the estimate, and that it scales each kind's share."""
+def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(table, count):
+    """Against the dense normal equations with the errors among the unknowns: covariances, and where the estimates move to."""
     graph, _ = calibrated(n=40)
     graph = replace(graph, poses=graph.poses + 0.01 * np.random.default_rng(1).normal(size=graph.poses.shape))
     edges, rng = graph.edges[table], np.random.default_rng(0)
@@ -197,16 +198,28 @@ def test_common_errors_add_what_they_move_squared_with_the_variances_that_the_re
     shifts *= np.sqrt(edge_weights(edges, graph))[:, None, None]
     whole = np.zeros((len(residuals), count))
     whole[parts[table]] = shifts.reshape(-1, count)
-    moved = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ whole)
-    seen = whole.T @ residuals - moved.T @ (jacobian.T @ residuals)
-    scales = variances_of_kinds(seen, whole.T @ whole - whole.T @ jacobian @ moved, common.kind)
-    before, after = marginals(graph), marginals(graph, [common])
-    number, moves = dense_system(graph)[2], np.vstack([moved, np.zeros((1, count))]) * np.sqrt(scales[common.kind])
-    for name, one, other in (("poses", before.poses, after.poses), ("anchors", before.anchors, after.anchors)):
-        own = moves[number[name]]
-        np.testing.assert_allclose(other - one, own @ own.transpose(0, 2, 1), rtol=1e-4, atol=1e-12)
-    own = np.square(moves[number["calibration"][:, 0]]).sum(axis=1)
-    np.testing.assert_allclose(after.calibration**2 - before.calibration**2, own, rtol=1e-4, atol=1e-12)
+    moves = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ whole)
+    seen = whole.T @ residuals - moves.T @ (jacobian.T @ residuals)
+    scales = variances_of_kinds(seen, whole.T @ whole - whole.T @ jacobian @ moves, common.kind)
+
+    both, size = np.hstack([jacobian, whole]), jacobian.shape[1]
+    information = both.T @ both
+    information[np.arange(size, size + count), np.arange(size, size + count)] += 1.0 / scales[common.kind]
+    covariance = np.zeros((size + 1, size + 1))
+    covariance[:-1, :-1] = np.linalg.inv(information)[:size, :size]
+    found, number = marginals(graph, [common]), dense_system(graph)[2]
+    for name, blocks in (("poses", found.poses), ("anchors", found.anchors)):
+        own = number[name]
+        np.testing.assert_allclose(blocks, covariance[own[:, :, None], own[:, None, :]], rtol=1e-4, atol=1e-10)
+    np.testing.assert_allclose(found.calibration**2, np.diag(covariance)[number["calibration"][:, 0]], rtol=1e-4)
+
+    without = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residuals)
+    step = without - np.linalg.solve(information, both.T @ residuals)[:size]
+    expected, estimated = moved(graph, Unknowns(number, size), step), with_common_errors(graph, [common])
+    for name in ("poses", "anchors"):
+        np.testing.assert_allclose(getattr(estimated, name), getattr(expected, name), atol=1e-7)
+    np.testing.assert_allclose(estimated.calibration.values, expected.calibration.values, atol=1e-7)
+    assert np.abs(estimated.poses - graph.poses).max() > 1e-4
 
 
 def test_redundancy_is_the_diagonal_of_the_dense_projection():

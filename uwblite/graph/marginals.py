@@ -16,6 +16,7 @@ from ..errors import SolverError
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
+from .unknowns import moved
 from .variance_components import variances_of_kinds
 
 _COMMON_AT_ONCE = 32
@@ -43,53 +44,36 @@ class CommonErrors:
     """(k,) kind of each error: those of one have one variance, of which 1 is a guess."""
 
 
-class Marginals:
-    """Covariances of the unknowns of a graph given all its measurements.
+class _Solved:
+    """A graph's measurements, linearised and factorised."""
 
-    Zero where an unknown is fixed, infinite on the diagonal where no edge touches it. A direction that edges
-    leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
-    """
-
-    def __init__(self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = ()) -> None:
-        self._graph, self.unknowns = graph, normal.unknowns
+    def __init__(self, graph: Graph, normal: NormalEquations) -> None:
+        self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
         self._factor = _factor(normal)
-        unseen = np.append(normal.diagonal <= 0, False)
-        blocks = self._block_diagonal(unseen)
-        for errors in common:
-            self._consider(errors, normal.gradient, blocks)
-        self.poses = blocks["poses"]
-        """(n, 3, 3) of x, y, theta, map frame, m and rad."""
-        self.anchors = blocks["anchors"]
-        """(a, 2, 2) m^2, map frame."""
-        self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
-        """(c,) standard deviations, unit by name."""
 
-    def _consider(self, common: CommonErrors, gradient: Floats, blocks: dict[str, Floats]) -> None:
-        """Add to the covariances what errors that nothing estimates make: H^-1 J^T W s of each, squared.
+    def estimated(self, common: CommonErrors) -> tuple[sparse.csc_matrix, Floats, Floats]:
+        """Estimate errors that edges have in common: J^T W s of each as a column, their values (k,) and covariance (k, k).
 
-        These are the consider parameters of Schmidt (Application of state-space methods to navigation problems, 1966). How
-        large the errors of each kind are, the residuals say, see variance_components.
+        The errors u are unknowns with the prior N(0, G); how large those of each kind are, the residuals say, see
+        variance_components. With S^T P r and A = S^T P S as there, u = -(A + G^-1)^-1 S^T P r.
         """
         slopes, (seen, products), kind = self.slopes(common), self._seen(common), common.kind
-        kinds = int(kind.max(initial=-1)) + 1
-        added = {name: np.zeros((kinds, *block.shape)) for name, block in blocks.items()}
         for first in range(0, slopes.shape[1], _COMMON_AT_ONCE):
             some = slice(first, first + _COMMON_AT_ONCE)
             moves = self._factor.solve(slopes[:, some].toarray())
-            seen[some] -= moves.T @ gradient
+            seen[some] -= moves.T @ self._gradient
             products[:, some] -= slopes.T @ moves
-            self._square(moves, kind[some], added)
-        scales = variances_of_kinds(seen, products, kind)
-        for name, block in blocks.items():
-            block += np.tensordot(scales, added[name], axes=1)
+        variances = variances_of_kinds(seen, products, kind)[kind]
+        # As products of roots of G: a kind that is hardly there has no inverse.
+        root = np.sqrt(variances)
+        inside = np.linalg.inv(root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root)))
+        covariance = root[:, None] * inside * root
+        return slopes, -covariance @ seen, covariance
 
-    def _square(self, moves: Floats, kind: Ints, added: dict[str, Floats]) -> None:
-        """Add the squares of moves (size, k) of the unknowns to the covariances by kind."""
-        moves = np.concatenate([moves, np.zeros((1, moves.shape[1]))])
-        for name, number in self.unknowns.number.items():
-            for g in np.unique(kind):
-                own = moves[number][..., kind == g]
-                added[name][g] += own @ own.transpose(0, 2, 1)
+    def shift(self, common: CommonErrors) -> Floats:
+        """Return by how much (size,) the unknowns at the optimum change when common errors are estimated with them."""
+        slopes, errors, _ = self.estimated(common)
+        return -np.asarray(self._factor.solve(slopes @ errors))
 
     def _seen(self, common: CommonErrors) -> tuple[Floats, Floats]:
         """Return S^T W r (k,) and S^T W S (k, k)."""
@@ -116,6 +100,38 @@ class Marginals:
                 free = row >= 0
                 right = right + sparse.csc_matrix((slope[free], (row[free], error[free])), shape=right.shape)
         return right
+
+
+class Marginals(_Solved):
+    """Covariances of the unknowns of a graph given all its measurements.
+
+    Zero where an unknown is fixed, infinite on the diagonal where no edge touches it. A direction that edges
+    leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
+    """
+
+    def __init__(self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = ()) -> None:
+        super().__init__(graph, normal)
+        unseen = np.append(normal.diagonal <= 0, False)
+        blocks = self._block_diagonal(unseen)
+        for errors in common:
+            self._add_common(errors, blocks)
+        self.poses = blocks["poses"]
+        """(n, 3, 3) of x, y, theta, map frame, m and rad."""
+        self.anchors = blocks["anchors"]
+        """(a, 2, 2) m^2, map frame."""
+        self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
+        """(c,) standard deviations, unit by name."""
+
+    def _add_common(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
+        """Add to the covariances what the uncertainty of estimated common errors makes: that of u times H^-1 J^T W S."""
+        slopes, _, covariance = self.estimated(common)
+        root = np.linalg.cholesky(covariance + _DEPENDENT * np.eye(len(covariance)))
+        for first in range(0, len(root), _COMMON_AT_ONCE):
+            moves = self._factor.solve(slopes @ root[:, first : first + _COMMON_AT_ONCE])
+            moves = np.concatenate([moves, np.zeros((1, moves.shape[1]))])
+            for name, number in self.unknowns.number.items():
+                own = moves[number]
+                blocks[name] += own @ own.transpose(0, 2, 1)
 
     def _block_diagonal(self, unseen: Bools) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
@@ -244,6 +260,16 @@ def marginals(graph: Graph, common: Sequence[CommonErrors] = ()) -> Marginals:
     Those of single unknowns contain what common errors add.
     """
     return Marginals(graph, filled(graph, subtrees=True), common)
+
+
+def with_common_errors(graph: Graph, common: Sequence[CommonErrors]) -> Graph:
+    """Return an optimised graph at the optimum that it has when common errors are estimated with everything else.
+
+    To first order, as errors of a centimetre are; what edges have in common changes no other weight. (Best linear unbiased
+    prediction: C. R. Henderson, Biometrics 31, 1975.)
+    """
+    solved = _Solved(graph, filled(graph, subtrees=True))
+    return moved(graph, solved.unknowns, sum((solved.shift(errors) for errors in common), np.zeros(solved.unknowns.size)))
 
 
 def calibration_covariance(graph: Graph) -> Floats:

@@ -188,7 +188,7 @@ class ScanEdges(EdgeTable):
     weights: Floats | None = None
     by_surface: Floats | None = None
     """(e, 4, 3) change of e by an error of the ranges to surfaces that face each quarter of the map, m/m and rad/m; None = not
-    known. Only covariances take it into account (lidar/surface_errors.py)."""
+    known. Counts where common errors are estimated, not in the residuals (lidar/surface_errors.py)."""
 
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 

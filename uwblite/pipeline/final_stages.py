@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE
+from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_nonnegative_heights
 from ..graph.graph import Graph
+from ..graph.marginals import with_common_errors
 from ..graph.unknowns import free_unknowns
 from ..grid import occupancy_grid as grids
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid, Sweeps
-from ..lidar.surface_errors import with_range_errors
+from ..lidar.joint_refinement import with_fewer_pairs
+from ..lidar.surface_errors import common_range_errors, with_range_errors
+from ..odometry.wheels import with_noise_shown
 from .estimate import Estimate, Task
 from .lidar_stages import solved
 from .map_frame import cropped
@@ -32,14 +35,14 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.joint is not None and estimate.ranges is not None:
         estimate = _anchors_alone(estimate, task)
-    estimate = _with_range_errors(estimate, task)
+    estimate = _without_range_errors(_with_range_errors(estimate, task))
     # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
     scans = estimate.scans if task.config.align == "walls" else None
     return replace(estimate, graph=estimate.problem, scans=scans, steps=None, joint=None)
 
 
 def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate with what errors of ranges to surfaces do to its scan edges, for the covariances."""
+    """Return the estimate with what errors of ranges to surfaces do to its scan edges."""
     scans = estimate.scans
     if scans is None:
         return estimate
@@ -48,6 +51,15 @@ def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
         for edges in (estimate.joint, estimate.steps if estimate.joint is None else None)
     )
     return replace(estimate, joint=joint, steps=estimate.steps if steps is None else steps)
+
+
+def _without_range_errors(estimate: Estimate) -> Estimate:
+    """Return the estimate moved by what errors of ranges to surfaces did to it, as far as these show."""
+    stated = with_noise_shown(with_fewer_pairs(estimate.problem))
+    common = common_range_errors(stated)
+    if not common:
+        return estimate
+    return estimate.with_estimates_of(with_nonnegative_heights(with_common_errors(stated, common)))
 
 
 def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
