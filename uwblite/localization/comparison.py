@@ -1,6 +1,7 @@
 """Places in the map against one another: how well each explains what was measured during the last metres."""
 
-from dataclasses import dataclass
+from collections.abc import Generator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +24,8 @@ _SIGMA_SCAN = (0.2, 0.2, 0.06)
 """m, m, rad; of a place that the search found by scans."""
 _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, on top of what ranges say of a place."""
+_AT_ONCE = 8
+"""Places whose rays are compared with the map at once, a unit of work of 3 ms."""
 _RADIO_REACH = 15.0
 """m beyond the outermost anchors; where a robot may be in a map without a grid."""
 
@@ -59,20 +62,24 @@ class Comparison:
 
 
 class PlaceSearch:
-    """The whole map, ready to be searched, a little at a time."""
+    """The whole map, ready to be searched, a little at a time.
+
+    A search and the comparison of what it found are made in the frame that the robot had at their beginning.
+    """
 
     def __init__(self, known: KnownMap) -> None:
         self.walls, self.anchors = known.walls, len(known.anchors.ids)
         self._field = None if known.walls is None else likelihood_field.field_of(known.walls)
         self._bounds = _bounds(known)
         self._odom = np.zeros(3)
-        self._steps: search.Steps | None = None
-        self._found: search.Places | None = None
+        self._present = np.zeros((0, 3))
+        """(h, 3) poses of the present hypotheses, as of that time."""
+        self._steps: Generator[None, None, Comparison] | None = None
 
     @property
     def idle(self) -> bool:
         """Whether no search is under way."""
-        return self._steps is None and self._found is None
+        return self._steps is None
 
     def begin(self, window: Window, odom: Floats, way: float) -> None:
         """Begin to search the whole map for what a window holds.
@@ -81,46 +88,68 @@ class PlaceSearch:
         ----------
         odom : (3,) present pose in the odometry frame. way : the odometer now, m.
         """
-        rays = window.seen(odom, way, _SEARCH_LOOKS)[0]
         self._odom = odom.copy()
-        self._steps = search.places(self._field, rays, window.ranges_since(odom, way), self._bounds)
+        self._steps = self._compared(window.ranges_since(odom, way), *window.seen(odom, way, LOOK_BACK))
 
     def drop(self) -> None:
         """Leave a search that is under way."""
-        self._steps = self._found = None
+        self._steps = None
 
-    def advance(self, odom: Floats) -> search.Places | None:
-        """Do a unit of the work; return where the robot may be now, if the search had ended before.
+    def advance(self, bank: Hypotheses, odom: Floats) -> Comparison | None:
+        """Do a unit of the work; return how well each place explains what the window held, if that was the last one.
 
         Parameters
         ----------
+        bank : the present hypotheses, row by row the same ones from the beginning of the search on.
         odom : (3,) present pose in the odometry frame.
         """
-        if self._found is not None:
-            found, self._found = self._found, None
-            return search.Places(se2.compose(found.poses, se2.between(self._odom, odom)), found.complete)
+        if self._steps is None:
+            return None
+        self._present = se2.compose(bank.poses, se2.between(odom, self._odom))
         try:
-            if self._steps is not None:
-                next(self._steps)
+            next(self._steps)
         except StopIteration as end:
-            self._steps, self._found = None, end.value
+            self._steps = None
+            return self._brought(end.value, bank, odom)
         return None
 
-    def compared(self, found: search.Places, bank: Hypotheses, window: Window, odom: Floats, way: float) -> Comparison:
-        """Weight the places that a search found together with the present hypotheses by what a window holds."""
-        ranges = window.ranges_since(odom, way)
-        rays, ago = window.seen(odom, way, LOOK_BACK)
+    def _compared(self, ranges: Ranges, rays: Rays, ago: Floats) -> Generator[None, None, Comparison]:
+        """Search for places and weight them, and the present hypotheses, as of the search's beginning.
+
+        Parameters
+        ----------
+        rays : of the last metres. ago : (p,) m driven since each.
+
+        Returns
+        -------
+        The comparison, in whose bank are the new places alone.
+        """
         recent = rays.rows(ago <= _SEARCH_LOOKS)
-        before, bank = len(bank), hypotheses.joined(bank, self._started(found.poses, ranges, recent))
-        weight = range_likelihood.range_likelihood(bank.poses, ranges)
-        fit, known = np.zeros((2, len(bank)))
+        found = yield from search.places(self._field, recent, ranges, self._bounds)
+        yield
+        started = self._started(found.poses, ranges, recent)
+        yield
+        before, poses = len(self._present), np.concatenate([self._present, started.poses])
+        weight = range_likelihood.range_likelihood(poses, ranges)
+        fit, known = np.zeros((2, len(poses)))
         if self.walls is not None and len(rays.hit):
-            agreement = self.walls.agreement(bank.poses, rays)
-            weight += INDEPENDENT_RAYS * (1.0 + float(ago.max())) * agreement.log_likelihood
-            fit, known = agreement.log_likelihood, agreement.known
-        new = _no_repetition(bank.poses, weight, before)
-        looks = len(np.unique(ago))
-        return Comparison(bank.rows(new), found.complete, weight[new], fit[new], known[new], rays, looks, ranges)
+            for start in range(0, len(poses), _AT_ONCE):
+                part = slice(start, start + _AT_ONCE)
+                agreement = self.walls.agreement(poses[part], rays)
+                fit[part], known[part] = agreement.log_likelihood, agreement.known
+                yield
+            weight += INDEPENDENT_RAYS * (1.0 + float(ago.max())) * fit
+        new, looks = _no_repetition(poses, weight, before), len(np.unique(ago))
+        places = started.rows(new[before:])
+        return Comparison(places, found.complete, weight[new], fit[new], known[new], rays, looks, ranges)
+
+    def _brought(self, found: Comparison, bank: Hypotheses, odom: Floats) -> Comparison:
+        """Return a comparison in the present frame of the robot, with the present hypotheses as they are now first."""
+        back, mean = se2.between(odom, self._odom), found.bank.mean.copy()
+        mean[:, hypotheses.POSE] = se2.compose(found.bank.poses, se2.between(self._odom, odom))
+        ranges = replace(found.ranges, tags=se2.transform(back, found.ranges.tags))
+        both = hypotheses.joined(bank, replace(found.bank, mean=mean))
+        return replace(found, bank=both, rays=found.rays.moved(back), ranges=ranges)
 
     def _started(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:
         """Return hypotheses at poses (c, 3) that a search found."""

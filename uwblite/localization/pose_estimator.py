@@ -123,8 +123,7 @@ class PoseEstimator:
         elif not self._certain and self._running.jumped():
             self._lose("the ranges do not fit what was measured before; was the robot carried?")
         odom = self._odometer.pose
-        if (found := self._places.advance(odom)) is not None:
-            compared = self._places.compared(found, self._bank, self._searched, odom, self._way)
+        if (compared := self._places.advance(self._bank, odom)) is not None:
             if not self._certain:
                 self._decide_by(compared)
             elif compared.elsewhere:

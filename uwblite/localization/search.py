@@ -15,6 +15,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
@@ -96,8 +97,7 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
         return Places(np.zeros((0, 3)), False)
     offsets = _offsets(field, points, headings)
     yield from _pause(len(headings) * len(rows))
-    nodes = np.stack(np.broadcast_arrays(np.arange(len(headings))[:, None], rows, cols), axis=-1).reshape(-1, 3)
-    yield from _pause(len(nodes))
+    nodes = yield from _top_nodes(len(headings), rows, cols)
     complete, least = True, 0.0
     scores = yield from _scored(field, LEVELS, offsets, nodes)
     for level in range(LEVELS, 0, -1):
@@ -142,6 +142,18 @@ def _coarse_cells(field: Field, top: int) -> tuple[Ints, Ints]:
     return row.astype(np.int64) * top, col.astype(np.int64) * top
 
 
+def _top_nodes(headings: int, rows: Ints, cols: Ints) -> Generator[None, None, NDArray[np.int32]]:
+    """Return every heading with every square of the coarsest level, as nodes (n, 3): heading, row, column."""
+    nodes = np.empty((headings, len(rows), 3), dtype=np.int32)
+    at_once = max(1, _MANY // len(rows))
+    for start in range(0, headings, at_once):
+        part = nodes[start : start + at_once]
+        part[..., 0] = np.arange(start, start + len(part))[:, None]
+        part[..., 1], part[..., 2] = rows, cols
+        yield from _pause(part.size)
+    return nodes.reshape(-1, 3)
+
+
 def _offsets(field: Field, points: Floats, headings: Floats) -> Ints:
     """Return by how many cells of the flat field (h, p) each point lies from the robot's cell."""
     laid = se2.rotate(headings[:, None], points[None])
@@ -149,14 +161,14 @@ def _offsets(field: Field, points: Floats, headings: Floats) -> Ints:
     return cells[..., 1] * field.free.shape[1] + cells[..., 0]
 
 
-def _scored(field: Field, level: int, offsets: Ints, nodes: Ints) -> Generator[None, None, Floats]:
+def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -> Generator[None, None, Floats]:
     """Return the bounds (n,) of nodes: mean likelihood of the points, 0..1."""
     flat, wide = field.levels[level].reshape(-1), field.free.shape[1]
     scores = np.empty(len(nodes))
-    base = nodes[:, 1] * wide + nodes[:, 2]
     for start in range(0, len(nodes), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        values = flat.take(offsets[nodes[part, 0]] + base[part, None], mode="clip")
+        heading, row, col = nodes[part].T.astype(np.int64)
+        values = flat.take(offsets[heading] + (row * wide + col)[:, None], mode="clip")
         scores[part] = values.sum(axis=1, dtype=np.int64)
         yield
     return np.asarray(scores / (255.0 * offsets.shape[1]))
@@ -166,7 +178,7 @@ _AT_ONCE = 4096
 """Nodes scored at once, a unit of work of 2 ms: what fits into a processor's cache."""
 
 
-def _dive(field: Field, level: int, offsets: Ints, nodes: Ints, scores: Floats) -> Generator[None, None, float]:
+def _dive(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32], scores: Floats) -> Generator[None, None, float]:
     """Return the score of a good pose, found by following the best nodes down: a lower bound of the best one's."""
     best = nodes[_highest(scores)]
     yield from _pause(len(scores))
@@ -195,9 +207,9 @@ def _highest(scores: Floats, count: int = 64) -> Ints:
     return some[np.argsort(-scores[some], kind="stable")[:count]]
 
 
-def _children(nodes: Ints, half: int) -> Ints:
+def _children(nodes: NDArray[np.int32], half: int) -> NDArray[np.int32]:
     """Return the four quarters of each node."""
-    shift = np.array([[0, 0, 0], [0, 0, half], [0, half, 0], [0, half, half]])
+    shift = np.array([[0, 0, 0], [0, 0, half], [0, half, 0], [0, half, half]], dtype=np.int32)
     return (nodes[:, None] + shift).reshape(-1, 3)
 
 
