@@ -70,7 +70,7 @@ class PlaceSearch:
     def __init__(self, known: KnownMap) -> None:
         self.walls, self.anchors = known.walls, len(known.anchors.ids)
         self._field = None if known.walls is None else likelihood_field.field_of(known.walls)
-        self._bounds = _bounds(known)
+        self._bounds, self._slow = _bounds(known), known.anchors.slow_sigma
         self._odom = np.zeros(3)
         self._present = np.zeros((0, 3))
         """(h, 3) poses of the present hypotheses, as of that time."""
@@ -158,7 +158,7 @@ class PlaceSearch:
         if not scans:
             hessian, _ = range_likelihood.range_factors(poses, ranges)
             covariances = np.linalg.inv(hessian + np.diag([0.01, 0.01, 0.1])) + np.diag(np.square(_SIGMA_FLOOR))
-        fresh = hypotheses.started(poses, covariances, self.anchors)
+        fresh = hypotheses.started(poses, covariances, self.anchors, self._slow)
         if self.walls is not None and rays.hit.sum() >= verdict.FEW_BESIDE:
             fresh = hypotheses.matched(fresh, self.walls, rays.spread(TRACK_RAYS), 1.0)
         return fresh

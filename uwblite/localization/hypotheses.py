@@ -27,6 +27,8 @@ WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
 SLOW_SIGMA = 0.12
 """m; what ranges to one anchor err alike, as the spread of RangeNoiseConfig: multipath, antennas, the anchor's place."""
+SLOW_LEFT = 0.08
+"""m; the same where the map says by how much ranges err at a place: what a few ranges nearby leave of it."""
 SLOW_LENGTH = 5.0
 """m; the distance over which it stays alike: fields of a room's size last longer than the 1.5 m of single reflections."""
 _DISTANCE, _HEADING_PER_METRE, _HEADING_PER_TURN = 0.02, 0.02, 0.03
@@ -82,14 +84,19 @@ def none(anchors: int) -> Hypotheses:
     return Hypotheses(np.zeros((0, n)), np.zeros((0, n, n)), np.zeros(0))
 
 
-def started(poses: Floats, covariances: Floats, anchors: int) -> Hypotheses:
-    """Return hypotheses at poses (h, 3) with these covariances (h, 3, 3) and nothing learnt yet."""
+def started(poses: Floats, covariances: Floats, anchors: int, slow: float = SLOW_SIGMA) -> Hypotheses:
+    """Return hypotheses at poses (h, 3) with these covariances (h, 3, 3) and nothing learnt yet.
+
+    Parameters
+    ----------
+    slow : standard deviation of what ranges to one anchor err alike, m.
+    """
     empty = none(anchors)
     n = empty.mean.shape[1]
     mean, covariance = np.zeros((len(poses), n)), np.zeros((len(poses), n, n))
     mean[:, POSE] = poses
     covariance[:, POSE, POSE] = covariances
-    prior = np.concatenate([WHEEL_SIGMA, np.full(2 * HARMONICS, PATTERN_SIGMA), np.full(anchors, SLOW_SIGMA)]) ** 2
+    prior = np.concatenate([WHEEL_SIGMA, np.full(2 * HARMONICS, PATTERN_SIGMA), np.full(anchors, slow)]) ** 2
     covariance[:, np.arange(3, n), np.arange(3, n)] = prior
     return Hypotheses(mean, covariance, np.zeros(len(poses)))
 
@@ -108,13 +115,13 @@ def placed(bank: Hypotheses, which: int, pose: Floats, covariance: Floats) -> Hy
     return Hypotheses(mean, whole, bank.log_weight)
 
 
-def moved(bank: Hypotheses, step: Floats, slack: float = 0.0) -> Hypotheses:
+def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float = SLOW_SIGMA) -> Hypotheses:
     """Drive every hypothesis by one step of the odometry.
 
     Parameters
     ----------
     step : (3,) pose of the base in the frame that it had before, by the wheels. slack : m and rad, standard deviation of
-        motion that the wheels did not see.
+        motion that the wheels did not see. slow_sigma : standard deviation of what ranges to one anchor err alike, m.
 
     Notes
     -----
@@ -142,7 +149,7 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0) -> Hypotheses:
     noise = np.zeros(n)
     noise[:2] = _STANDING**2 + _DISTANCE**2 * way + slack**2
     noise[2] = _STANDING**2 + _HEADING_PER_METRE**2 * way + _HEADING_PER_TURN**2 * abs(turn) + slack**2
-    noise[slow] = SLOW_SIGMA**2 * (1.0 - fade**2)
+    noise[slow] = slow_sigma**2 * (1.0 - fade**2)
     covariance = f @ bank.covariance @ f.transpose(0, 2, 1)
     covariance[:, np.arange(n), np.arange(n)] += noise
     return Hypotheses(mean, _symmetric(covariance), bank.log_weight)

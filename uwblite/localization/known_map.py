@@ -10,6 +10,7 @@ from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
 from ..io.stored_result import StoredAnchor, StoredResult, read_range_errors
 from ..sensor_log.anchor_names import last_places
+from .hypotheses import SLOW_LEFT, SLOW_SIGMA
 from .range_errors import RangeErrors, range_errors
 from .walls import Walls, walls_of
 
@@ -31,6 +32,11 @@ class KnownAnchors:
     """Relative error of all ranges, 1."""
     errors: tuple[RangeErrors, ...] = ()
     """(a,) what remains, by the tag's place; empty where the map does not say it."""
+
+    @property
+    def slow_sigma(self) -> float:
+        """Standard deviation of what ranges to one anchor err alike besides, m."""
+        return SLOW_LEFT if self.errors else SLOW_SIGMA
 
 
 @dataclass(frozen=True, slots=True, eq=False)

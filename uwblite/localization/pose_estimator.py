@@ -73,12 +73,12 @@ class PoseEstimator:
 
     def move(self, step: Floats) -> None:
         """Drive by one step (3,) of the odometry, m, m, rad."""
-        self._bank = hypotheses.moved(self._bank, step)
+        self._bank = hypotheses.moved(self._bank, step, 0.0, self.known.anchors.slow_sigma)
         self._way += way_of(step)
 
     def wander(self, sigma: float) -> None:
         """Let the pose become unsure by a standard deviation, m and rad, of motion that nothing has measured."""
-        self._bank = hypotheses.moved(self._bank, np.zeros(3), sigma)
+        self._bank = hypotheses.moved(self._bank, np.zeros(3), sigma, self.known.anchors.slow_sigma)
 
     def use_range(self, fact: RangeFacts, tag: Floats, stamp: float) -> None:
         """Take a range of the tag at a place (2,) of the base, m, at a time, s."""
