@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import groupby
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from simulation import logfile
 from simulation.recording import FalseRanges, Settings, simulate
 
 from uwblite import se2
+from uwblite.constraints import Constraints
 from uwblite.errors import Cancelled
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.marginals import marginals
@@ -20,8 +22,9 @@ from uwblite.io.csv_table import read_csv
 from uwblite.io.tum import read_tum
 from uwblite.lidar.joint_refinement import with_fewer_pairs
 from uwblite.lidar.surface_errors import common_range_errors
-from uwblite.mapping import MappingConfig, build_map
+from uwblite.mapping import MappingConfig, _stages, build_map
 from uwblite.odometry.wheels import with_noise_shown
+from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.final_stages import at_given_poses
 from uwblite.radio.anchor_covariance import by_alike_errors
 from uwblite.sensor_log import Odometry, UwbRanges
@@ -406,3 +409,14 @@ def test_one_recording_may_stand_alone_and_several_in_any_sequence(minute, monke
         with pytest.raises(Cancelled):
             build_map(logs)
     assert [log is minute for log in asked] == [True] * 3
+
+
+def test_the_joint_refinement_is_a_stage_where_rounds_are_asked_for():
+    recordings = SimpleNamespace(have_scans=True)
+    for rounds in (12, 0):
+        config = MappingConfig()
+        config = replace(config, refinement=replace(config.refinement, rounds=rounds))
+        names = [s.__name__ for s in _stages(Task(recordings, config, Constraints(), None))]
+        assert ("refine_jointly" in names) is (rounds > 0)
+        assert names[0] == "make_clouds"
+        assert names[-3:] == ["final_optimisation", "find_mirror_images", "align_axes"]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.odometry.keyframes import KeyframeConfig, _broken_steps, _slack, dense_trajectory, select, velocity_at
+from uwblite.odometry.keyframes import KeyframeConfig, _broken_steps, _slack, _travelled, dense_trajectory, select, velocity_at
 from uwblite.sensor_log import LaserScans, Odometry, OdometryBreaks
 
 CONFIG = KeyframeConfig(distance=0.4, angle=0.3, scans=2)
@@ -240,3 +240,15 @@ def test_a_break_belongs_to_the_sample_before_it_that_has_a_step_behind_it():
     breaks = OdometryBreaks(np.array([0.0, 1.0, 2.5, 3.0, 4.0, 9.0]), np.zeros((6, 3)))
     assert _broken_steps(stamps, breaks).tolist() == [0, 0, 1, 2, 2, 2]
     assert _broken_steps(stamps[:1], breaks).tolist() == [0] * 6
+
+
+def test_ways_between_samples_are_shares_of_the_step_by_time():
+    """Forwards 0.4 m in 0.2 s, backwards 0.1 m in 0.5 s, turning by 0.2 rad on the spot in 1 s."""
+    odometry = Odometry(
+        np.array([1.0, 1.2, 1.7, 2.7]), np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.2]])
+    )
+    moments = np.array([1.0, 1.05, 1.2, 1.3, 2.2, 2.7, 9.0])
+    signed, path, turned = _travelled(odometry, moments, np.array([0, 0, 1, 1, 2, 3, 3]))
+    np.testing.assert_allclose(signed, [0.0, 0.1, 0.4, 0.38, 0.3, 0.3, 0.3])
+    np.testing.assert_allclose(path, [0.0, 0.1, 0.4, 0.42, 0.5, 0.5, 0.5])
+    np.testing.assert_allclose(turned, [0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.2], atol=1e-12)
