@@ -214,9 +214,9 @@ def test_rounds_are_reported_and_bounded():
 
 
 
-@pytest.mark.parametrize(("convergence", "rounds"), [(1e9, 5), (0.0, 8)])
+@pytest.mark.parametrize(("convergence", "rounds"), [(1e9, 2), (0.0, 8)])
 def test_rounds_end_at_the_last_gate_where_nothing_moves(convergence, rounds):
-    """0.5 m shrinks by 0.7 to 0.12 m: 0.5, 0.35, 0.245, 0.17 and 0.12 m; else as often as allowed."""
+    """From the truth the first round moves no cloud by 0.04 m, so the second has the last gate; else as often as allowed."""
     truth, path, clouds = room(7, 0.01, 6.0)
     config = replace(CONFIG, rounds=8, convergence=convergence)
     result = refined(Graph(truth).with_edges(chained(truth, NOISE)), clouds, path, config, selections=1)

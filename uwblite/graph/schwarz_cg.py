@@ -18,7 +18,7 @@ from ..errors import SolverError
 
 _PIECE = 24
 """Poses of a piece."""
-_ENOUGH = 1e-4
+_ENOUGH = 1e-3
 """Error of a solution as a share of it: the next step of the descent takes it up."""
 _MOST = 300
 """Iterations; what is found by then is still a step downhill."""

@@ -51,7 +51,7 @@ class RefinementConfig:
     last_gate: ClassVar[float] = 0.12
     """Farthest match in the last rounds, m."""
     shrink: ClassVar[float] = 0.7
-    """Gate of a round as a share of the one before."""
+    """Gate of a round as a share of the one before, at most."""
     partners: int = 6
     """Clouds from other times that each cloud is matched with; fewer, but two at least, where that makes too many."""
     most: ClassVar[int] = 40_000
@@ -210,8 +210,9 @@ def refine(
         edges = replace(probe, T_i_j=z, sqrt_information=sqrt_information, weights=used.astype(np.float64))
         problem = graph.with_edges(edges)
         check(problem)
-        normal = normal or NormalEquations(problem, linearize(problem))
-        solved, summary = minimise(problem, linearize(problem), normal, brief)
+        linearized = linearize(problem)
+        normal = normal or NormalEquations(problem, linearized)
+        solved, summary = minimise(problem, linearized, normal, brief)
         graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
         before, T_i_j = T_i_j, probe.relative(graph)
         moved = _surfaces_moved(factors, used, T_i_j - before)
@@ -221,7 +222,14 @@ def refine(
         last = gate <= config.last_gate * 1.001
         if rounds >= config.rounds or (last and moved < config.convergence):
             return RefinementResult(graph, replace(edges.rows(used), weights=None), i, j, factors, used, sigma, rounds, summary)
-        gate = max(gate * config.shrink, config.last_gate)
+        # After a step that failed or was braked, as much may be left as before.
+        whole = used.any() and summary.chi2_history[0] < summary.chi2_initial
+        farthest = float(np.hypot(*(T_i_j - before)[used, :2].T).max()) if whole else gate
+        gate = max(min(gate * config.shrink, _GATE_PER_SHIFT * farthest), config.last_gate)
+
+
+_GATE_PER_SHIFT = 3.0
+"""Gate of a round by the farthest that the one before moved a cloud in the frame of its partner: less than that is left."""
 
 
 def _surfaces_moved(factors: PairFactors, used: Bools, change: Floats) -> float:
