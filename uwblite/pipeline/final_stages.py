@@ -35,10 +35,19 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     """
     if estimate.joint is not None and estimate.ranges is not None:
         estimate = _anchors_alone(estimate, task)
-    estimate = _without_range_errors(_with_range_errors(estimate, task))
+    estimate = _with_range_errors(estimate, task)
     # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
     scans = estimate.scans if task.config.align == "walls" else None
     return replace(estimate, graph=estimate.problem, scans=scans, steps=None, joint=None)
+
+
+def without_range_errors(estimate: Estimate) -> Estimate:
+    """Return the estimate moved by what errors of ranges to surfaces did to it, as far as these show."""
+    stated = with_noise_shown(with_fewer_pairs(estimate.graph))
+    common = common_range_errors(stated)
+    if not common:
+        return estimate
+    return estimate.with_estimates_of(with_nonnegative_heights(with_common_errors(stated, common)))
 
 
 def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
@@ -51,15 +60,6 @@ def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:
         for edges in (estimate.joint, estimate.steps if estimate.joint is None else None)
     )
     return replace(estimate, joint=joint, steps=estimate.steps if steps is None else steps)
-
-
-def _without_range_errors(estimate: Estimate) -> Estimate:
-    """Return the estimate moved by what errors of ranges to surfaces did to it, as far as these show."""
-    stated = with_noise_shown(with_fewer_pairs(estimate.problem))
-    common = common_range_errors(stated)
-    if not common:
-        return estimate
-    return estimate.with_estimates_of(with_nonnegative_heights(with_common_errors(stated, common)))
 
 
 def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
