@@ -23,6 +23,7 @@ from uwblite.loop_closure.loose_links import (
     loosened,
     propose,
     spanned,
+    untied_breaks,
     untied_links,
 )
 from uwblite.loop_closure.verification import find, reconcile
@@ -176,3 +177,43 @@ def test_pieces_end_at_the_next_link(walk):
     expected = {(b, a + n, a + n, a + n + 1) for b, a in ((10, 11), (14, 15)) for n in range(3) if enough[a + n]}
     expected |= {(a, b - n, b - n, b - n + 1) for b, a in ((10, 11), (14, 15)) for n in range(3) if enough[b - n]}
     assert single == expected
+
+
+def one_edge(truth, i, j, root):
+    none = np.zeros((1, 3))
+    z = se2.between(truth[[i]], truth[[j]])
+    return ScanEdges(np.array([i]), np.array([j]), z, np.diag(root)[None], none, none, scan_indices(Calibration()))
+
+
+ALL, ALONG = (100.0, 100.0, 300.0), (5.0, 100.0, 300.0)
+"""What a match fixes, 1/m, 1/m, 1/rad: everything, or the way along a wall to 0.2 m only."""
+
+
+@pytest.mark.parametrize(
+    ("across", "found"),
+    [
+        ([], True),
+        ([(30, 31, ALONG)], True),
+        ([(30, 31, ALL)], False),
+        ([(28, 32, ALL)], False),
+        # Keyframes 3 m apart were laid onto each other where the chain had put them; another visit was searched for.
+        ([(27, 33, ALL)], True),
+        ([(5, 55, ALONG)], True),
+        ([(5, 55, ALL)], False),
+    ],
+)
+def test_a_break_is_tied_by_scans_that_leave_no_direction_free(across, found):
+    truth = np.column_stack([0.5 * np.arange(60.0), np.zeros((60, 2))])
+    wheels, measured = chained(truth, NOISE), np.arange(59) != LINK
+    edges = [scan_edges(truth, np.flatnonzero(measured)), *(one_edge(truth, *edge) for edge in across)]
+    graph = Graph(truth).with_edges(wheels, *edges)
+    assert untied_breaks(wheels, graph, measured, truth[:, 0]).tolist() == ([LINK] if found else [])
+
+
+def test_keyframes_between_two_breaks_are_no_part_and_a_few_at_the_ends_neither():
+    truth = np.column_stack([0.5 * np.arange(60.0), np.zeros((60, 2))])
+    wheels = chained(truth, NOISE)
+    for breaks, found in (([30, 32], [32]), ([2], []), ([30, 56], [30]), (np.arange(59), [])):
+        measured = ~np.isin(np.arange(59), breaks)
+        graph = Graph(truth).with_edges(wheels, scan_edges(truth, np.flatnonzero(measured)))
+        assert untied_breaks(wheels, graph, measured, truth[:, 0]).tolist() == found

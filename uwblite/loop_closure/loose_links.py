@@ -9,18 +9,20 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Ints
-from ..graph.graph import Graph
-from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
+from ..arrays import Bools, Floats, Ints
+from ..graph.graph import Edges, Graph
+from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..lidar import submaps
 from ..lidar.clouds import Clouds
 from ..lidar.submaps import SubmapConfig, Submaps
 from .candidates import Candidates
 from .closures import LoopClosureConfig
-from .slid_stretches import directions_constrained, tied_parts
+from .slid_stretches import NEAR, directions_constrained, tied_parts
 
 _LEAST_CONSTRAINED = 2
 """Directions that scans fix in a sound link: a bare corridor leaves the way along it to the odometry."""
+_ALL = 3
+"""Directions of a pose."""
 _VIEWS = 6
 """Keyframes of one side that make its sub-map; fewer are no part of a map."""
 _SINGLE = 3
@@ -31,6 +33,8 @@ _DISTANCE = 1.2
 """Half-width of the search, m: an odometry that stands still while the robot turns fast is not wrong by more in one step."""
 _EXCEPTIONS, _SHARE = 5, 0.02
 """Links, and share of all steps, up to which they are exceptions; a lidar that loses more sees too little for a search."""
+_ANOTHER_VISIT = 10.0
+"""Travelled distance between two visits, m."""
 _FAR = 10.0
 """Standard deviations from which a match contradicts the odometry."""
 
@@ -54,6 +58,33 @@ def untied_links(wheels: OdometryEdges, graph: Graph, clouds: Clouds) -> Ints:
     large = np.minimum(size[part[i]], size[part[j]]) >= _VIEWS
     seen = np.minimum(clouds.counts[i], clouds.counts[j]) >= _LEAST_POINTS
     return links[(part[i] != part[j]) & large & seen]
+
+
+def untied_breaks(wheels: OdometryEdges, graph: Graph, measured: Bools, path: Floats) -> Ints:
+    """Return the steps (b,) that no odometry measured (e,) and scan edges, of all visits, leave free in some direction.
+
+    Along a bare corridor a lidar alone does not see how far the robot went. Clouds that are neither neighbours nor of another
+    visit were laid onto each other where the chain had put them, and say no more than it.
+
+    Parameters
+    ----------
+    path : (k,) travelled distance, m.
+    """
+    part = tied_parts(wheels, replace(graph, edges=tuple(_near_or_again(e, path) for e in graph.edges)), _ALL, measured)
+    large = np.flatnonzero(np.bincount(part)[part] >= _VIEWS)
+    if not len(large):
+        return large
+    # A few keyframes between two breaks are no part of their own: they count to the part before.
+    of = part[large[np.maximum(np.searchsorted(large, np.arange(len(part)), "right") - 1, 0)]]
+    return np.flatnonzero(~measured & (of[wheels.i] != of[wheels.j]))
+
+
+def _near_or_again(edges: Edges, path: Floats) -> Edges:
+    """Return the scan edges between neighbours and between visits; other edges as they are."""
+    if not isinstance(edges, ScanEdges):
+        return edges
+    near, again = np.abs(edges.i - edges.j) <= NEAR, np.abs(path[edges.i] - path[edges.j]) > _ANOTHER_VISIT
+    return edges.rows(np.flatnonzero(near | again))
 
 
 def spanned(wheels: OdometryEdges, ties: RelativePoseEdges) -> Bools:

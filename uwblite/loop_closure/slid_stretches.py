@@ -17,7 +17,7 @@ _JUMP = 0.5
 """m; errors of one step of the odometry that are no noise."""
 _TORN = 10.0
 """Standard deviations of the same."""
-_NEAR = 4
+NEAR = 4
 """Keyframes that a scan edge of the same visit spans, at most."""
 _CLEAR_PLACE, _CLEAR_HEADING = 0.05, 0.02
 """Standard deviations, m and rad, up to which a scan edge fixes a pose in every direction; none does along a bare corridor."""
@@ -47,7 +47,7 @@ def scans_fixing(graph: Graph) -> Ints:
     count = np.zeros(len(graph.poses) + 1, dtype=np.int64)
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
-            good = (np.abs(edges.i - edges.j) <= _NEAR) & (_fixed(edges) == _ALL) & _agrees(edges, graph)
+            good = (np.abs(edges.i - edges.j) <= NEAR) & (_fixed(edges) == _ALL) & _agrees(edges, graph)
             np.add.at(count, np.minimum(edges.i, edges.j)[good], 1)
             np.add.at(count, np.maximum(edges.i, edges.j)[good], -1)
     return np.cumsum(count)[:-1]
@@ -59,20 +59,22 @@ def directions_constrained(graph: Graph) -> Ints:
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
             first, span = np.minimum(edges.i, edges.j), np.abs(edges.i - edges.j)
-            agrees = (span <= _NEAR) & _agrees(edges, graph)
+            agrees = (span <= NEAR) & _agrees(edges, graph)
             fixed = _fixed(edges)
-            for k in range(_NEAR):
+            for k in range(NEAR):
                 over = agrees & (span > k)
                 np.maximum.at(constrained, first[over] + k, fixed[over])
     return constrained
 
 
-def tied_parts(wheels: OdometryEdges, graph: Graph, least: int) -> Ints:
+def tied_parts(wheels: OdometryEdges, graph: Graph, least: int, sound: Bools | None = None) -> Ints:
     """Return the part (k,) each keyframe belongs to: scan edges of any visits tie those of one in `least` directions or more.
 
-    Steps that such edges of the same visit hold together tie, too.
+    Steps that such edges of the same visit hold together tie, too, and so do steps of the odometry that are sound (e,).
     """
     constrained = directions_constrained(graph)[wheels.i] >= least
+    if sound is not None:
+        constrained |= sound
     i, j = [wheels.i[constrained]], [wheels.j[constrained]]
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):

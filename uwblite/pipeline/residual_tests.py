@@ -11,7 +11,7 @@ from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
-from ..loop_closure.loose_links import untied_links
+from ..loop_closure.loose_links import untied_breaks, untied_links
 from ..loop_closure.slid_stretches import jumps, scans_fixing
 from ..radio.range_noise import short_term_sigma
 from .estimate import Estimate, Task
@@ -49,6 +49,7 @@ def check_residuals(estimate: Estimate, residuals: Floats, task: Task) -> None:
     check_odometry_steps(estimate, task)
     check_odometry_jumps(estimate, task)
     check_loose_links(estimate, task)
+    check_untied_breaks(estimate, task)
     check_slips(estimate, task)
     check_scales(estimate, task)
     check_support(estimate, task)
@@ -188,6 +189,24 @@ def check_loose_links(estimate: Estimate, task: Task) -> None:
             f"at t = {', '.join(f'{when:.0f}' for when in at[:5])}{' ...' if len(at) > 5 else ''} s no scan measures the "
             "odometry's step, and no later visit ties what was mapped before it to what was mapped after: the two parts may "
             "lie wrong to each other",
+            at=at,
+        )  # fmt: skip
+
+
+def check_untied_breaks(estimate: Estimate, task: Task) -> None:
+    """Doubt a map with a break of the odometry across which scans leave a direction free, as along a bare wall."""
+    wheels, stamps = estimate.odometry, task.recordings.stamps
+    if estimate.placed.any() or not task.recordings.have_scans:
+        return
+    measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
+    links = untied_breaks(wheels, estimate.graph, measured, task.recordings.path)
+    at = (stamps[wheels.i[links]] - stamps[0]).tolist()
+    if at:
+        task.stages.doubt(
+            "loose-links",
+            f"at t = {', '.join(f'{when:.0f}' for when in at[:5])}{' ...' if len(at) > 5 else ''} s odometry breaks off where "
+            "the lidar does not see how far the robot went, as along a bare wall, and no later visit ties what was mapped "
+            "before to what was mapped after: the two parts may lie wrong to each other",
             at=at,
         )  # fmt: skip
 
