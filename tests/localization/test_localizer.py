@@ -235,6 +235,42 @@ def test_a_silent_odometry_makes_the_pose_unsure():
     assert np.trace(after.covariance) > 10 * np.trace(before.covariance)
 
 
+@pytest.mark.parametrize("kind", ["range", "scan", "odometry"])
+def test_one_stamp_far_ahead_changes_nothing_and_is_counted(kind, drive):
+    poses, states = drive
+    odd = robot(known())
+    odd.along(poses[:20])
+    if kind == "range":
+        odd.localizer.add_ranges(odd.stamp + 3600.0, ["A", "B"], [5.0, 6.0])
+    elif kind == "scan":
+        odd.localizer.add_scan(odd.stamp + 1e6, np.full(181, 2.0), SCANNER)
+    else:
+        odd.localizer.add_odometry(odd.stamp + 1000.0, *poses[20])
+    again = odd.along(poses[20:30])
+    np.testing.assert_array_equal(again[-1].pose, states[29].pose)
+    assert odd.localizer.refused == (2 if kind == "range" else 1)
+
+
+def test_after_all_sensors_were_silent_the_odometry_goes_on():
+    poses = path(ROUND)
+    drive = robot(known())
+    drive.along(poses[:30])
+    drive.stamp += 60.0
+    after = drive.along(poses[30:40])[-1]
+    assert after.stamp > 60.0 and not after.lost
+    np.testing.assert_allclose(after.pose, poses[39], atol=0.05)
+    assert drive.localizer.refused == 0
+
+
+def test_sensors_that_go_on_show_that_the_odometry_was_silent_for_long():
+    poses = path(ROUND)
+    drive = robot(known())
+    before = drive.along(poses[:30])[-1]
+    for k in range(8):
+        after = drive.localizer.add_ranges(drive.stamp + 60.0 + 0.2 * k, ["A"], [50.0])
+    assert after.stamp > before.stamp + 59.0 and np.trace(after.covariance) > 10 * np.trace(before.covariance)
+
+
 def test_a_map_of_nothing_is_refused(tmp_path):
     (tmp_path / "trajectory.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     from uwblite.io.stored_result import read_result

@@ -20,7 +20,7 @@ from .known_map import KnownMap
 from .odometer import Odometer
 from .pose_estimator import PoseEstimator
 from .records import LocalizerState, Scanner
-from .sensing import Range, Scan, Waiting, scan_rays
+from .sensing import LEAD, Range, Scan, Waiting, scan_rays
 
 _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent."""
@@ -46,12 +46,19 @@ class Localizer:
         self._laser = replace(self.mounting, T_base_laser=se2.compose(known.laser_correction, self.mounting.T_base_laser))
         self._odometer, self._turns, self._waiting = Odometer(), GyroTurns(), Waiting()
         self._wheels = np.full(3, np.nan)
+        self._leap: tuple[float, Floats] | None = None
+        self._leaps = 0
         self._estimator = PoseEstimator(known, self._odometer)
         self._names = {name: k for k, name in enumerate(known.anchors.ids)}
         heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
         self._square = np.square(heights) + known.anchors.rise
         self.strangers: dict[str, int] = {}
         """Ranges to anchors that are not in the map, by id."""
+
+    @property
+    def refused(self) -> int:
+        """Measurements that were left out, of whatever kind: stamped seconds ahead of all others."""
+        return self._waiting.refused + self._leaps
 
     @property
     def ends(self) -> Floats:
@@ -61,11 +68,17 @@ class Localizer:
     def add_odometry(self, stamp: float, x: float, y: float, theta: float) -> LocalizerState:
         """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
         wheels = np.array([x, y, theta], dtype=np.float64)
-        step = self._odometer.add(stamp, self._turns.turned(stamp, wheels))
-        if self._odometer.stamp == stamp:
-            self._wheels = wheels
-        if step is not None:
-            self._estimator.move(step)
+        leap, self._leap = self._leap, None
+        if leap is not None and stamp > leap[0]:
+            self._move(*leap)
+        elif leap is not None:
+            self._leaps += 1
+        if len(self._odometer) and np.isfinite(stamp) and stamp > self._odometer.stamp + LEAD:
+            # After a silence or by a fault: the next one decides.
+            self._leap = (stamp, wheels)
+            return self.state()
+        self._move(stamp, wheels)
+        self._waiting.refuse(self._odometer.stamp)
         self._work_off()
         return self.state()
 
@@ -111,6 +124,14 @@ class Localizer:
         """Return the pose at the time of the last odometry."""
         return self._estimator.state(self._wheels)
 
+    def _move(self, stamp: float, wheels: Floats) -> None:
+        """Move the pose to a later one (3,) of the wheels."""
+        step = self._odometer.add(stamp, self._turns.turned(stamp, wheels))
+        if self._odometer.stamp == stamp:
+            self._wheels = wheels
+        if step is not None:
+            self._estimator.move(step)
+
     def _work_off(self) -> None:
         """Use the measurements that the odometry has reached."""
         if not len(self._odometer):
@@ -125,9 +146,10 @@ class Localizer:
 
     def _bridge_silence(self) -> None:
         """Where the odometry has fallen silent, let the robot stand, and the pose become unsure."""
-        gap = self._waiting.latest - self._odometer.stamp
+        latest = self._waiting.latest(self._odometer.stamp)
+        gap = latest - self._odometer.stamp
         if gap > _PATIENCE:
-            self._odometer.add(self._waiting.latest - 0.1, self._odometer.pose.copy())
+            self._odometer.add(latest - 0.1, self._odometer.pose.copy())
             self._estimator.wander(_UNSEEN_SPEED * min(gap, 3.0))
 
     def _use_range(self, entry: Range, stamp: float) -> None:

@@ -16,6 +16,10 @@ _CLEAR = 3.0
 """m; up to here a ray that saw nothing would have seen a wall, as grid.max_clear_distance."""
 TRACK_RAYS = 180
 """Rays of a scan that are matched."""
+LEAD = 5.0
+"""s; a stamp that is farther ahead of the odometry is not believed before others confirm it: one alone is a clock's fault."""
+_CONFIRMED = 4
+"""Different stamps, all so far ahead, after which the odometry was silent for so long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +54,25 @@ class Waiting:
 
     def __init__(self) -> None:
         self._entries: list[tuple[float, Range | Scan]] = []
+        self.refused = 0
+        """Measurements that were left out: so far ahead of an odometry that was not silent."""
 
     def add(self, until: float, entry: Range | Scan) -> None:
         """Keep a measurement until the odometry has reached a time, s."""
         if np.isfinite(until):
             self._entries.append((until, entry))
 
-    @property
-    def latest(self) -> float:
-        """When the last of them was complete, s; -inf = none waits."""
-        return max((until for until, _ in self._entries), default=-np.inf)
+    def latest(self, now: float) -> float:
+        """Return until when sensors have measured, s, where the odometry's last stamp is now; -inf = not beyond it."""
+        ahead = {until for until, _ in self._entries if until > now}
+        near = [until for until in ahead if until <= now + LEAD]
+        return max(near) if near else min(ahead) if len(ahead) >= _CONFIRMED else -np.inf
+
+    def refuse(self, now: float) -> None:
+        """Leave out what is too far ahead of an odometry that has just been measured."""
+        kept = [w for w in self._entries if w[0] <= now + LEAD]
+        self.refused += len(self._entries) - len(kept)
+        self._entries = kept
 
     def reached(self, now: float) -> list[tuple[float, Range | Scan]]:
         """Return those that the odometry has reached, in the order of their times, and keep the others."""
