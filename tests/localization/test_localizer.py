@@ -257,7 +257,8 @@ def test_after_all_sensors_were_silent_the_odometry_goes_on():
     drive.along(poses[:30])
     drive.stamp += 60.0
     after = drive.along(poses[30:40])[-1]
-    assert after.stamp > 60.0 and not after.lost
+    assert after.stamp > 60.0
+    assert not after.lost
     np.testing.assert_allclose(after.pose, poses[39], atol=0.05)
     assert drive.localizer.refused == 0
 
@@ -268,7 +269,8 @@ def test_sensors_that_go_on_show_that_the_odometry_was_silent_for_long():
     before = drive.along(poses[:30])[-1]
     for k in range(8):
         after = drive.localizer.add_ranges(drive.stamp + 60.0 + 0.2 * k, ["A"], [50.0])
-    assert after.stamp > before.stamp + 59.0 and np.trace(after.covariance) > 10 * np.trace(before.covariance)
+    assert after.stamp > before.stamp + 59.0
+    assert np.trace(after.covariance) > 10 * np.trace(before.covariance)
 
 
 def test_a_map_of_nothing_is_refused(tmp_path):
