@@ -98,6 +98,7 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "clock of the lidar forward 0.5 s half-way": (logs.time_jump("lidar", 0.5), LIDAR),
     "all stamps in whole seconds": (logs.whole_stamps("odometry radio lidar", 1.0), ALL),
     "30 s not recorded, the robot drives on": (logs.cut_out(30.0), ALL),
+    "the USB hub resets every 45 s": (logs.hub_resets(45.0, 2.0, 0.8), ALL),
     "odometry times 0.93": (wheels.rescaled(0.93, 0.93, 1.0), WHEELS),
     "odometry times 1.1": (wheels.rescaled(1.1, 1.1, 1.0), WHEELS),
     "wheels' radius drifts to 0.85 times": (wheels.drifting_radius(0.85), WHEELS),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from uwblite import se2
 from uwblite.sensor_log import Odometry, UwbRanges
 
-from .case import Case, Fault, Floats, Ints, Rng, kept, rows, shifted
+from .case import Case, Fault, Floats, Ints, Rng, kept, rows, shifted, with_odometry
 
 
 def clock_back(kinds: str) -> Fault:
@@ -182,3 +182,21 @@ def cut_out(seconds: float) -> Fault:
 def lost(share: float) -> Fault:
     """A share of all readings is lost."""
     return lambda case, rng: kept(case, lambda t: rng.random(len(t)) >= share)
+
+
+def hub_resets(every: float, gap: float, late: float) -> Fault:
+    """All devices are gone for a while, s, again and again; the base then counts from zero, and the lidar's stamps are late."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        first = case.log.odometry.stamps[0]
+        case = kept(case, lambda t: (t < first + every) | ((t - first) % every >= gap))
+
+        def restarted(stamps: Floats, poses: Floats) -> Floats:
+            for part in np.split(np.arange(len(stamps)), 1 + np.flatnonzero(np.diff((stamps - first) // every))):
+                if stamps[part[0]] >= first + every:
+                    poses[part] = se2.between(np.broadcast_to(poses[part[0]], (len(part), 3)), poses[part])
+            return poses
+
+        return shifted(with_odometry(case, restarted), lambda t: np.where(t >= first + every, late, 0.0), "lidar")
+
+    return fault

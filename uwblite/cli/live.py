@@ -177,8 +177,9 @@ class Tracker:
         strangers = {} if self.localizer is None else self.localizer.strangers
         if strangers:
             console.note(f"uwblite: ranges to anchors that are not in the map: {_counted(strangers)}")
-        if self.localizer is not None and self.localizer.refused:
-            console.note(f"uwblite: {self.localizer.refused} measurements were left out: their stamps are seconds ahead of all others")
+        ahead = 0 if self.localizer is None else self.localizer.refused
+        if ahead:
+            console.note(f"uwblite: {ahead} measurements were left out, stamped seconds ahead of all others")
         if interrupted:
             return 130
         if self.state is None:
