@@ -1,26 +1,10 @@
 """The filter's steps against numeric derivatives of what they model."""
 
 import numpy as np
+from helpers.hypotheses import a_bank, numeric
 
-from uwblite import se2
 from uwblite.localization import hypotheses
-from uwblite.localization.hypotheses import FIRST_ANCHOR, PATTERN, SLOW_LENGTH, RangeFacts
-from uwblite.localization.range_errors import RangeErrors
-from uwblite.radio.range_noise import RangeNoise
-
-
-def a_bank(seed, anchors=2):
-    rng = np.random.default_rng(seed)
-    n = FIRST_ANCHOR + anchors
-    root = rng.normal(size=(1, n, n)) * 0.01
-    mean = np.concatenate([rng.normal(size=3), 0.02 * rng.normal(size=3), 0.05 * rng.normal(size=n - 6)])[None]
-    return hypotheses.Hypotheses(mean, root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(n), np.zeros(1))
-
-
-def numeric(function, x, step=1e-6):
-    """Return the derivatives (m, n) of a function of x (n,)."""
-    eye = np.eye(len(x)) * step
-    return np.stack([(function(x + e) - function(x - e)) / (2 * step) for e in eye], axis=1)
+from uwblite.localization.hypotheses import SLOW_LENGTH
 
 
 def test_a_step_moves_the_covariance_by_the_numeric_jacobian_of_the_mean():
@@ -36,40 +20,3 @@ def test_a_step_moves_the_covariance_by_the_numeric_jacobian_of_the_mean():
         noise = hypotheses.moved(still, step).covariance[0]
         np.testing.assert_allclose(hypotheses.moved(bank, step).covariance[0] - noise, F @ bank.covariance[0] @ F.T, atol=1e-9)
         assert np.isclose(F[-1, -1], np.exp(-np.hypot(*step[:2]) / SLOW_LENGTH))
-
-
-def test_a_range_corrects_as_a_kalman_filter_with_the_numeric_jacobian():
-    field = RangeErrors(np.array([[0.5, 0.5]]), np.array([20.0]), RangeNoise(0.05, 0.08, 2.0))
-    fact = RangeFacts(1, np.array([4.0, -2.0]), 0.0, 0.5, 0.1, 0.01, field)
-    tag = np.array([0.3, -0.1])
-    for seed in range(3):
-        bank = a_bank(seed)
-
-        tagged = se2.transform(bank.mean[0, :3], tag)
-        towards = np.arctan2(*(fact.place - tagged)[::-1]) - bank.mean[0, 2]
-        waves = np.array([np.cos(towards * np.array([1, 2, 3])), np.sin(towards * np.array([1, 2, 3]))]).ravel()
-        known = 20.0 * (0.08**2 * np.exp(-np.hypot(*(tagged - field.places[0])) / 2.0) + 0.1**2)
-
-        def expected(x, waves=waves, known=known):
-            place = x[:2] + se2.rotate(x[2], tag)
-            distance = np.sqrt(np.sum((place - fact.place) ** 2) + fact.square)
-            return np.array([(1.0 + fact.scale) * distance + x[FIRST_ANCHOR + fact.anchor] + waves @ x[PATTERN] + known])
-
-        H, P = numeric(expected, bank.mean[0]), bank.covariance[0]
-        measured = float(expected(bank.mean[0])[0]) + 0.05
-        late = RangeFacts(fact.anchor, fact.place, measured, fact.square, fact.sigma, fact.scale, field)
-        found, weight, _, _ = hypotheses.ranged(bank, late, tag)
-        gain = P @ H.T / (H @ P @ H.T + fact.sigma**2 / weight[0])
-        np.testing.assert_allclose(found.mean[0], bank.mean[0] + gain[:, 0] * 0.05, atol=1e-8)
-        np.testing.assert_allclose(found.covariance[0], P - gain @ H @ P, atol=1e-9)
-        assert 0.5 < weight[0] <= 1.0
-
-
-def test_a_range_that_is_metres_late_moves_nothing():
-    bank = a_bank(1)
-    fact = RangeFacts(0, np.array([4.0, -2.0]), 60.0, 0.0, 0.1, 0.0)
-    found, weight, likelihood, anywhere = hypotheses.ranged(bank, fact, np.zeros(2))
-    # 0.05 of such ranges over 60 m, against one over 30 m: the likelihood of one that comes from anywhere is 40 times as large.
-    np.testing.assert_allclose(anywhere - likelihood, np.log(40.0), atol=1e-6)
-    assert weight[0] < 1e-3
-    np.testing.assert_array_equal(found.mean, bank.mean)

@@ -15,10 +15,10 @@ from ..arrays import Floats
 from ..radio.trilateration import TrilaterationConfig, usable
 from ..sensor_log import SensorMounting
 from .gyro_turns import GyroTurns
-from .hypotheses import RangeFacts
 from .known_map import KnownMap
 from .odometer import Odometer
 from .pose_estimator import PoseEstimator
+from .range_update import RangeFacts
 from .records import LocalizerState, Scanner
 from .sensing import LEAD, Range, Scan, Waiting, scan_rays
 

@@ -13,10 +13,10 @@ from .. import se2
 from ..arrays import Floats
 from . import hypotheses, verdict
 from .comparison import INDEPENDENT_RAYS, LOOK_BACK, Comparison, PlaceSearch
-from .hypotheses import RangeFacts
 from .known_map import KnownMap
 from .odometer import Odometer
 from .range_likelihood import range_moments
+from .range_update import RangeFacts, ranged
 from .records import LocalizerState
 from .running_fit import FIT_LOST, FIT_SOUND, full_agreement
 from .walls import Rays
@@ -88,7 +88,7 @@ class PoseEstimator:
         if not len(self._bank):
             return
         arm = se2.transform(se2.between(self._odometer.pose, then), tag)
-        bank, weight, likelihood, anywhere = hypotheses.ranged(self._bank, fact, arm)
+        bank, weight, likelihood, anywhere = ranged(self._bank, fact, arm)
         self._bank = hypotheses.reweighted(bank, likelihood if len(bank) > 1 else np.zeros(1))
         best = int(np.argmax(bank.log_weight))
         self._running.add_range(fact.anchor, float(weight[best]), float(likelihood[best] - anywhere[best]), stamp)

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from .hypotheses import RangeFacts
+from .range_update import RangeFacts
 from .walls import Rays
 
 LENGTH = 10.0
