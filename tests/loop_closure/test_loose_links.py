@@ -152,9 +152,9 @@ def test_a_link_is_untied_until_scan_edges_of_another_visit_join_its_sides(walk,
     j = again.i + 20
     again = replace(again, j=j, T_i_j=se2.between(graph.poses[again.i], graph.poses[j]))
     found = graph.with_edges(again) if revisited else graph
-    assert untied_links(wheels, found, clouds.counts).tolist() == ([] if revisited else [LINK])
+    assert untied_links(wheels, found, clouds).tolist() == ([] if revisited else [LINK])
     blind = replace(clouds, offsets=np.concatenate([clouds.offsets[: LINK + 1], clouds.offsets[LINK:-1]]))
-    assert untied_links(wheels, graph, blind.counts).tolist() == []
+    assert untied_links(wheels, graph, blind).tolist() == []
 
 
 @pytest.mark.parametrize(("link", "untied"), [(4, False), (5, True)])
@@ -162,7 +162,7 @@ def test_a_side_of_fewer_than_six_keyframes_is_no_part_of_a_map(walk, link, unti
     truth, _, clouds = walk
     graph, wheels = broken(truth, np.zeros(3), link)
     assert clouds.counts[: link + 2].min() >= _LEAST_POINTS
-    assert untied_links(wheels, graph, clouds.counts).tolist() == ([link] if untied else [])
+    assert untied_links(wheels, graph, clouds).tolist() == ([link] if untied else [])
 
 
 def test_pieces_end_at_the_next_link(walk):

@@ -130,21 +130,6 @@ def test_a_jump_that_only_closures_make_is_a_doubt(placed, measured):
     assert all(n.figures["at"] == 39.0 and abs(n.figures["metres"] - 3.0) < 1e-6 for n in stages.doubts)
 
 
-def test_links_that_nothing_ties_are_sought_among_the_clouds_of_the_final_map(sound, monkeypatch):
-    """The clouds themselves are given up before the judgement; how much each keyframe saw is known all the same."""
-    asked = []
-
-    def first_link(wheels, graph, points):
-        asked.append((len(graph.poses), points))
-        return np.array([4])
-
-    monkeypatch.setattr("uwblite.pipeline.residual_tests.untied_links", first_link)
-    assert "loose-links" in doubts(replace(sound, ranges=None))
-    poses, points = asked[-1]
-    assert len(points) == poses
-    assert points.min() > 30
-
-
 @pytest.mark.parametrize(("way", "kind"), [(3.0, "doubt"), (0.4, "warning"), (0.05, None)])
 @pytest.mark.parametrize("lidar", [False, True])
 def test_a_single_step_far_off_is_named_unless_the_lidar_measures_it(way, kind, lidar):

@@ -68,8 +68,6 @@ class Estimate:
     """None without ranges."""
     scans: ScanClouds | None = None
     """None without lidar, and again after the final optimisation."""
-    seen: Ints | None = None
-    """(k,) points of the keyframes' clouds; None before the final optimisation, and without lidar."""
     steps: ScanEdges | None = None
     """Between neighbouring clouds; None before scan-to-scan matching."""
     closures: Closures = field(default_factory=no_closures)

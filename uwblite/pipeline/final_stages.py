@@ -38,8 +38,7 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     estimate = _with_range_errors(estimate, task)
     # What only matching needs is most of the memory; walls are needed once more where the axes follow them.
     scans = estimate.scans if task.config.align == "walls" else None
-    seen = None if estimate.scans is None else estimate.scans.clouds.counts
-    return replace(estimate, graph=estimate.problem, scans=scans, seen=seen, steps=None, joint=None)
+    return replace(estimate, graph=estimate.problem, scans=scans, steps=None, joint=None)
 
 
 def without_range_errors(estimate: Estimate) -> Estimate:

@@ -179,9 +179,9 @@ def check_loose_links(estimate: Estimate, task: Task) -> None:
     Where a lidar sees enough and yet does not know the next place, the robot turned fast or was carried.
     """
     wheels, stamps = estimate.odometry, task.recordings.stamps
-    if estimate.placed.any() or estimate.seen is None:
+    if estimate.placed.any() or estimate.scans is None:
         return
-    links = untied_links(wheels, estimate.graph, estimate.seen)
+    links = untied_links(wheels, estimate.graph, estimate.scans.clouds)
     if len(links):
         at = (stamps[wheels.i[links]] - stamps[0]).tolist()
         task.stages.doubt(
