@@ -24,7 +24,6 @@ from uwblite.loop_closure.loose_links import (
     propose,
     spanned,
     untied_breaks,
-    untied_links,
 )
 from uwblite.loop_closure.verification import find, reconcile
 from uwblite.odometry.wheels import OdometryNoiseConfig
@@ -142,27 +141,6 @@ def test_pieces_reach_over_no_other_link(walk, border):
     assert np.all(((ends[:, :1] <= links) & (ends[:, 1:] > links)).any(axis=0))
     assert np.array_equal(candidates.source, candidates.target + 1)
     assert pieces.first[pieces.last == border + 1].size > 0
-
-
-@pytest.mark.parametrize("revisited", [False, True])
-def test_a_link_is_untied_until_scan_edges_of_another_visit_join_its_sides(walk, revisited):
-    truth, _, clouds = walk
-    graph, wheels = broken(truth, np.zeros(3))
-    again = scan_edges(truth, np.array([LINK - 5]))
-    j = again.i + 20
-    again = replace(again, j=j, T_i_j=se2.between(graph.poses[again.i], graph.poses[j]))
-    found = graph.with_edges(again) if revisited else graph
-    assert untied_links(wheels, found, clouds).tolist() == ([] if revisited else [LINK])
-    blind = replace(clouds, offsets=np.concatenate([clouds.offsets[: LINK + 1], clouds.offsets[LINK:-1]]))
-    assert untied_links(wheels, graph, blind).tolist() == []
-
-
-@pytest.mark.parametrize(("link", "untied"), [(4, False), (5, True)])
-def test_a_side_of_fewer_than_six_keyframes_is_no_part_of_a_map(walk, link, untied):
-    truth, _, clouds = walk
-    graph, wheels = broken(truth, np.zeros(3), link)
-    assert clouds.counts[: link + 2].min() >= _LEAST_POINTS
-    assert untied_links(wheels, graph, clouds).tolist() == ([link] if untied else [])
 
 
 def test_pieces_end_at_the_next_link(walk):

@@ -45,21 +45,6 @@ def loose_links(wheels: OdometryEdges, graph: Graph) -> Ints:
     return links if len(links) <= max(_EXCEPTIONS, _SHARE * len(wheels)) else links[:0]
 
 
-def untied_links(wheels: OdometryEdges, graph: Graph, clouds: Clouds) -> Ints:
-    """Return the steps of the odometry (l,) that alone hold two parts of a map together although clouds stand on both sides.
-
-    Parameters
-    ----------
-    graph : final; holds the scan edges of all visits. clouds : one per keyframe.
-    """
-    links = loose_links(wheels, graph)
-    part = tied_parts(wheels, graph, _LEAST_CONSTRAINED)
-    size, i, j = np.bincount(part), wheels.i[links], wheels.j[links]
-    large = np.minimum(size[part[i]], size[part[j]]) >= _VIEWS
-    seen = np.minimum(clouds.counts[i], clouds.counts[j]) >= _LEAST_POINTS
-    return links[(part[i] != part[j]) & large & seen]
-
-
 def untied_breaks(wheels: OdometryEdges, graph: Graph, measured: Bools, path: Floats) -> Ints:
     """Return the steps (b,) that no odometry measured (e,) and scan edges, of all visits, leave free in some direction.
 

@@ -67,14 +67,12 @@ def directions_constrained(graph: Graph) -> Ints:
     return constrained
 
 
-def tied_parts(wheels: OdometryEdges, graph: Graph, least: int, sound: Bools | None = None) -> Ints:
+def tied_parts(wheels: OdometryEdges, graph: Graph, least: int, sound: Bools) -> Ints:
     """Return the part (k,) each keyframe belongs to: scan edges of any visits tie those of one in `least` directions or more.
 
     Steps that such edges of the same visit hold together tie, too, and so do steps of the odometry that are sound (e,).
     """
-    constrained = directions_constrained(graph)[wheels.i] >= least
-    if sound is not None:
-        constrained |= sound
+    constrained = (directions_constrained(graph)[wheels.i] >= least) | sound
     i, j = [wheels.i[constrained]], [wheels.j[constrained]]
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):

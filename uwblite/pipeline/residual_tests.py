@@ -11,7 +11,7 @@ from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
-from ..loop_closure.loose_links import untied_breaks, untied_links
+from ..loop_closure.loose_links import untied_breaks
 from ..loop_closure.slid_stretches import jumps, scans_fixing
 from ..radio.range_noise import short_term_sigma
 from .estimate import Estimate, Task
@@ -48,7 +48,6 @@ def check_residuals(estimate: Estimate, residuals: Floats, task: Task) -> None:
     check_range_scatter(estimate, residuals, task)
     check_odometry_steps(estimate, task)
     check_odometry_jumps(estimate, task)
-    check_loose_links(estimate, task)
     check_untied_breaks(estimate, task)
     check_slips(estimate, task)
     check_scales(estimate, task)
@@ -171,26 +170,6 @@ def check_odometry_jumps(estimate: Estimate, task: Task) -> None:
 
 _FAR = 1.0
 """m; no wheel slips by that within one step between keyframes."""
-
-
-def check_loose_links(estimate: Estimate, task: Task) -> None:
-    """Doubt a map whose parts one step of the odometry holds together: clouds on both sides match neither each other nor later.
-
-    Where a lidar sees enough and yet does not know the next place, the robot turned fast or was carried.
-    """
-    wheels, stamps = estimate.odometry, task.recordings.stamps
-    if estimate.placed.any() or estimate.scans is None:
-        return
-    links = untied_links(wheels, estimate.graph, estimate.scans.clouds)
-    if len(links):
-        at = (stamps[wheels.i[links]] - stamps[0]).tolist()
-        task.stages.doubt(
-            "loose-links",
-            f"at t = {', '.join(f'{when:.0f}' for when in at[:5])}{' ...' if len(at) > 5 else ''} s no scan measures the "
-            "odometry's step, and no later visit ties what was mapped before it to what was mapped after: the two parts may "
-            "lie wrong to each other",
-            at=at,
-        )  # fmt: skip
 
 
 def check_untied_breaks(estimate: Estimate, task: Task) -> None:
