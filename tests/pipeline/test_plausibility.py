@@ -97,8 +97,11 @@ def test_three_given_anchors_decide_the_sign_and_two_do_not(given, doubted, lida
     assert len(handedness(graph, lidar)) == doubted
 
 
-def moved_together(places, lidar=False):
-    """Return the doubts about a map in which the anchors A, B, ... have these places one after the other, from 0 and 100 s."""
+def moved_together(places, lidar=False, agree_until=None):
+    """Return the doubts about a map in which the anchors A, B, ... have these places one after the other, from 0 and 100 s.
+
+    Ranges to those that `agree_until` names agree with the map up to that time, s.
+    """
     anchors, stamps, anchor = [], [], []
     for name, own in zip("ABCD", places, strict=False):
         for number, place in enumerate(own):
@@ -109,9 +112,11 @@ def moved_together(places, lidar=False):
             stamps.append(measured)
             anchor.append(np.full(len(measured), len(anchors) - 1))
     stages = Stages(None, None)
-    edges = SimpleNamespace(stamps=np.concatenate(stamps), anchor=np.concatenate(anchor))
+    table = {"stamp": np.concatenate(stamps), "anchor": np.concatenate(anchor).astype(np.float64)}
+    until = np.array([(agree_until or {}).get(a.id, np.inf) for a in anchors])
+    table["agrees"] = (table["stamp"] < until[np.concatenate(anchor)]).astype(np.float64)
     task = SimpleNamespace(recordings=SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0])), stages=stages)
-    check_moved_together(anchors, SimpleNamespace(ranges=edges), task)
+    check_moved_together(anchors, table, task)
     return [notice.kind for notice in stages.doubts]
 
 
@@ -137,6 +142,13 @@ def test_anchors_that_were_moved_together_are_rather_another_change():
     assert moved_together([[A, ELSEWHERE]]) == ["anchors-moved-together"]
     assert not moved_together([[A, ELSEWHERE], [B], [C]])
     assert not moved_together([[A, ELSEWHERE], [B, (4.0, 9.0)], [C]], lidar=True)
+
+
+@pytest.mark.parametrize(("until", "doubted"), [(105.0, True), (130.0, True), (170.0, False), (20.0, False)])
+def test_an_anchor_whose_ranges_agree_on_one_side_of_a_move_counts_as_moved(until, doubted):
+    """A was moved at 100 s, B and C were not; ranges to B agree up to a time, of those after the move at most a half."""
+    found = moved_together([[A, ELSEWHERE], [B], [C]], agree_until={"B": until})
+    assert found == ["anchors-moved-together"] * doubted
 
 
 def test_anchors_that_changed_places_were_only_renamed():

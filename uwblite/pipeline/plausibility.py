@@ -41,7 +41,7 @@ def judge(
     """
     check_certainty(estimate, covariances, task)
     check_anchors(anchors, task)
-    check_moved_together(anchors, estimate, task)
+    check_moved_together(anchors, table, task)
     check_sensors(grid, task)
     check_closures(estimate, anchors, grid, task)
     check_calibration(calibrated, usual, task)
@@ -102,31 +102,44 @@ _LEAST_AGREEING = 0.3
 """Least share of ranges that agree with a map that is right: where a radio reports every other range as 0, it is 0.4."""
 
 
-def check_moved_together(anchors: Sequence[AnchorEstimate], estimate: Estimate, task: Task) -> None:
-    """Doubt a map without lidar in which half of the anchors were moved at one time, unless they changed places only.
+def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> None:
+    """Doubt a map without lidar in which half of the anchors changed at one time, unless they changed places only.
 
-    Wheels that were swapped, or a radio that changed, look the same, and nothing but the odometry ties before to after.
+    Wheels that were swapped, or a radio that changed, look the same, and nothing but the odometry ties before to after. An
+    anchor has changed where it was moved, and where its ranges agree with the map on one side of that time only.
     """
-    if task.recordings.have_scans or estimate.ranges is None:
+    if task.recordings.have_scans or not table or not anchors:
         return
-    ranges, names = estimate.ranges, [name_and_number(anchor.id) for anchor in anchors]
-    base = np.array([name for name, _ in names])[ranges.anchor] if anchors else np.zeros(0, dtype=str)
+    names, stamps = [name_and_number(anchor.id) for anchor in anchors], table["stamp"]
+    base = np.array([name for name, _ in names])[table["anchor"].astype(np.int64)]
     moves = sorted((a.since, k) for k, a in enumerate(anchors) if np.isfinite(a.since) and names[k][1] > 1)
     for start, _ in moves:
         these = [k for since, k in moves if start <= since < start + _ONE_TIME]
-        before, after = base[ranges.stamps < start], base[ranges.stamps > start + _ONE_TIME]
-        measured = len(set(before.tolist()) & set(after.tolist()))
-        if len({names[k][0] for k in these}) >= max(0.5 * measured, min(2, measured)) and not _exchanged(these, anchors, names):
+        early, late = stamps < start, stamps > start + _ONE_TIME
+        both = set(base[early].tolist()) & set(base[late].tolist())
+        one_sided = {n for n in both if _one_sided(table["agrees"], early & (base == n), late & (base == n))}
+        changed = {names[k][0] for k in these} | one_sided
+        renamed = _exchanged(these, anchors, names) and not one_sided
+        if len(changed) >= max(0.5 * len(both), min(2, len(both))) and not renamed:
             when = float(start - task.recordings.stamps[0])
             task.stages.doubt(
                 "anchors-moved-together",
-                f"{len(these)} of {measured} anchors were moved at about t = {when:.0f} s: rather the wheels, tag or radio "
+                f"{len(changed)} of {len(both)} anchors were moved at about t = {when:.0f} s: rather the wheels, tag or radio "
                 "changed then, and nothing but the odometry ties the two parts of the map",
-                at=when, moved=len(these), measured=measured,
+                at=when, moved=len(changed), measured=len(both),
             )  # fmt: skip
             return
 
 
+def _one_sided(agrees: Floats, early: Bools, late: Bools) -> bool:
+    """Return whether the early or the late ones alone of ranges (m,) agree with the map, 1 or 0; a few show nothing."""
+    if min(early.sum(), late.sum()) < _FEW_ON_A_SIDE:
+        return False
+    return bool(abs(agrees[early].mean() - agrees[late].mean()) > _ONE_SIDED)
+
+
+_FEW_ON_A_SIDE, _ONE_SIDED = 10, 0.6
+"""Ranges, and the difference of the shares that agree: behind furniture they fall by half."""
 _ONE_TIME = 30.0
 """Moves within so much of each other are of one time, s."""
 _SAME_PLACE = 1.5
