@@ -299,7 +299,7 @@ find a column in. *ATE* is the root mean square error of the trajectory after al
 NOTES = """
 Why it differs where it does: the rooms err as data sheets and papers say (tools/simulation/real_rooms.py), the floor so much
 that odometry alone is as far off in the hall as in the paper; the rest is not fitted to the paper's figures. With it the full
-method of preset paper comes out at 0.14 m, not at the paper's 0.2 m: four anchors in range nearly everywhere average
+method of preset paper comes out at 0.13 m, not at the paper's 0.2 m: four anchors in range nearly everywhere average
 errors of 4 to 12 cm each to that, and a larger one would need figures that no source gives. The fitness score of the
 paper counts every point of a sub-map, also those that the other never saw, so most of the pairs that overlap in part are
 rejected. The defaults match neighbouring scans in every method, also in *odometry* and *odometry + UWB*: there only what
