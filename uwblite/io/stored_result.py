@@ -81,6 +81,8 @@ class StoredResult:
     """(k, 3, 3) m, m, rad, map frame."""
     anchors: tuple[StoredAnchor, ...]
     closures: tuple[StoredClosure, ...]
+    ranges: StoredRanges
+    """None of them where the folder has no table of their errors, as those of earlier versions have not."""
     grid: OccupancyGrid | None = None
     report: dict[str, Any] = field(default_factory=dict)
     """report.json, as it stands there; empty where there is none."""
@@ -121,20 +123,14 @@ def read_result(folder: str | os.PathLike[str]) -> StoredResult:
         covariances,
         _anchors(path / "anchors.csv"),
         (),
+        _ranges(path / "range_errors.csv"),
         read_map(path / "map.yaml") if (path / "map.yaml").exists() else None,
         report,
     )
     return _with_closures(result)
 
 
-def read_range_errors(folder: str | os.PathLike[str]) -> StoredRanges:
-    """Read the errors of a result's ranges; none where it has no such table, as those of earlier versions have not.
-
-    Raises
-    ------
-    FormatError : the table is not what it should be.
-    """
-    path = Path(folder) / "range_errors.csv"
+def _ranges(path: Path) -> StoredRanges:
     if not path.is_file():
         return StoredRanges((), np.zeros(0), np.zeros((0, 2)), np.zeros(0))
     table = read_csv(path)

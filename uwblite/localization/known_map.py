@@ -8,7 +8,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import DataError
 from ..grid.occupancy_grid import OccupancyGrid
-from ..io.stored_result import StoredAnchor, StoredResult, read_range_errors
+from ..io.stored_result import StoredAnchor, StoredResult
 from ..sensor_log.anchor_names import last_places
 from .hypotheses import SLOW_LEFT, SLOW_SIGMA
 from .range_errors import RangeErrors, range_errors
@@ -97,7 +97,7 @@ def known_anchors(stored: tuple[StoredAnchor, ...], calibration: dict[str, float
 
 def _with_errors(anchors: KnownAnchors, result: StoredResult) -> KnownAnchors:
     """Return the anchors with what the result's own ranges to them left over."""
-    stored = read_range_errors(result.folder)
+    stored = result.ranges
     index = {name: k for k, name in enumerate(map(last_places({a.id for a in result.anchors}).get, anchors.ids))}
     anchor = np.array([index.get(name, -1) for name in stored.anchors], dtype=np.int64)
     own = np.flatnonzero(anchor >= 0)

@@ -33,7 +33,7 @@ _DISTANCE = 1.2
 """Half-width of the search, m: an odometry that stands still while the robot turns fast is not wrong by more in one step."""
 _EXCEPTIONS, _SHARE = 5, 0.02
 """Links, and share of all steps, up to which they are exceptions; a lidar that loses more sees too little for a search."""
-_ANOTHER_VISIT = 10.0
+ANOTHER_VISIT = 10.0
 """Travelled distance between two visits, m."""
 _FAR = 10.0
 """Standard deviations from which a match contradicts the odometry."""
@@ -68,7 +68,7 @@ def _near_or_again(edges: Edges, path: Floats) -> Edges:
     """Return the scan edges between neighbours and between visits; other edges as they are."""
     if not isinstance(edges, ScanEdges):
         return edges
-    near, again = np.abs(edges.i - edges.j) <= NEAR, np.abs(path[edges.i] - path[edges.j]) > _ANOTHER_VISIT
+    near, again = np.abs(edges.i - edges.j) <= NEAR, np.abs(path[edges.i] - path[edges.j]) > ANOTHER_VISIT
     return edges.rows(np.flatnonzero(near | again))
 
 

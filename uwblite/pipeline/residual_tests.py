@@ -11,7 +11,7 @@ from ..arrays import Bools, Floats, Ints, spread_about_median
 from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
-from ..loop_closure.loose_links import untied_breaks
+from ..loop_closure.loose_links import ANOTHER_VISIT, untied_breaks
 from ..loop_closure.slid_stretches import jumps, scans_fixing
 from ..radio.range_noise import short_term_sigma
 from .estimate import Estimate, Task
@@ -29,8 +29,6 @@ _WINDOW, _MOST = 10, 0.6
 """Steps in a row, and the share of them that must be off."""
 _MEASURED_BREAK = 0.15
 """Steps more uncertain than that, m, are no measurements."""
-_ANOTHER_VISIT = 10.0
-"""Travelled distance between two visits, m."""
 _REDUNDANT = 2
 """Scan edges that have to fix a step: one alone has nothing to agree with."""
 _MOVING = 0.05
@@ -140,7 +138,7 @@ def _confirmed(graph: Graph, path: Floats) -> Bools:
     confirmed = np.zeros(len(path), dtype=bool)
     for edges in graph.edges:
         if isinstance(edges, ScanEdges):
-            again = np.abs(path[edges.i] - path[edges.j]) > _ANOTHER_VISIT
+            again = np.abs(path[edges.i] - path[edges.j]) > ANOTHER_VISIT
             confirmed[edges.i[again]] = confirmed[edges.j[again]] = True
     return confirmed
 
