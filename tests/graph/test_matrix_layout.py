@@ -7,22 +7,20 @@ from uwblite.graph.matrix_layout import BandedLayout, Blocks, SparseLayout
 
 
 def planted(seed):
-    """Return blocks of 3 and 2 rows with two full rows below, their values, and the matrix they stand for."""
+    """Return blocks of 3, 2 and 1 rows, their values, and the matrix they stand for."""
     rng = np.random.default_rng(seed)
-    heights = rng.permutation([3, 3, 3, 2, 2])
+    heights = np.append(rng.permutation([3, 3, 3, 2, 2]), [1, 1])
     first = np.concatenate([[0], np.cumsum(heights)])
-    inner, size = int(first[-1]), int(first[-1]) + 2
-    pairs = [(a, b) for a in range(5) for b in range(a + 1) if a == b or rng.random() < 0.5]
+    pairs = [(a, b) for a in range(7) for b in range(a + 1) if a == b or rng.random() < 0.5]
     shapes = np.array([(heights[a], heights[b]) for a, b in pairs])
     start = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))])
     row, column = (np.array([first[p[k]] for p in pairs]) for k in (0, 1))
-    blocks = Blocks(row, column, *shapes.T, start[:-1], size, 2, int(start[-1]))
-    values = rng.normal(size=start[-1] + 2 * size)
-    whole = np.zeros((size, size))
+    blocks = Blocks(row, column, *shapes.T, start[:-1], int(first[-1]))
+    values = rng.normal(size=start[-1])
+    whole = np.zeros((blocks.size, blocks.size))
     for k, (r, c) in enumerate(zip(row, column, strict=True)):
         h, w = shapes[k]
         whole[r : r + h, c : c + w] = values[start[k] : start[k + 1]].reshape(h, w)
-    whole[inner:] = values[start[-1] :].reshape(2, size)
     lower = np.tril(whole)
     return blocks, values, lower + np.tril(lower, -1).T
 
@@ -47,7 +45,7 @@ def test_compressed_columns_hold_both_triangles(seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_band_solves_the_matrix_inside(seed):
     blocks, values, matrix = planted(seed)
-    inner = blocks.size - blocks.full
+    inner = blocks.size - 2
     inside = blocks.inside(inner)
     # Stronger on the diagonal, so that the matrix is positive definite.
     strong = values.copy()

@@ -4,6 +4,7 @@ The places are found once; each factorisation then gathers the values with one i
 """
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +25,7 @@ class Layout(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blocks:
-    """The lower triangle of a symmetric matrix as one array: blocks row by row, then full rows at the end."""
+    """The lower triangle of a symmetric matrix as one array of blocks, each row by row."""
 
     row: Ints
     """(b,) first row of each block; a block on the diagonal is square and only its lower triangle counts."""
@@ -38,26 +39,21 @@ class Blocks:
     """(b,) place of the first value."""
     size: int
     """Rows of the matrix."""
-    full: int
-    """How many of them, the last, are full."""
-    full_start: int
-    """Place of the first value of the full rows."""
+
+    @property
+    def places(self) -> int:
+        """Length of the array."""
+        return int(np.max(self.start + self.height * self.width, initial=0))
 
     def inside(self, size: int) -> "Blocks":
         """Return the blocks within the first rows and columns; no block lies across."""
         keep = self.row < size
         row, column, height, width, start = (a[keep] for a in (self.row, self.column, self.height, self.width, self.start))
-        return Blocks(row, column, height, width, start, size, 0, 0)
-
-    def full_entries(self) -> tuple[Ints, Ints, Ints]:
-        """Return row, column and place of every value of the full rows in the lower triangle."""
-        row, column = np.divmod(np.arange(self.full * self.size), self.size)
-        inside = column <= row + self.size - self.full
-        return row[inside] + self.size - self.full, column[inside], self.full_start + np.nonzero(inside)[0]
+        return Blocks(row, column, height, width, start, size)
 
     def entries(self) -> tuple[Ints, Ints, Ints]:
         """Return row, column and place of every value in the lower triangle."""
-        found = [self.full_entries()]
+        found = []
         for i, j in np.ndindex(3, 3):
             has = (i < self.height) & (j < self.width) & (self.row + i >= self.column + j)
             found.append((self.row[has] + i, self.column[has] + j, self.start[has] + i * self.width[has] + j))
@@ -65,8 +61,8 @@ class Blocks:
         return rows, columns, places
 
 
-_SHAPES = ((3, 3), (2, 3), (3, 2), (2, 2))
-"""Shapes of blocks between poses and anchors."""
+_SHAPES = tuple(product((3, 2, 1), repeat=2))
+"""Shapes of blocks between poses, anchors and calibration values."""
 
 
 def _both_triangles(blocks: Blocks) -> tuple[Ints, ...]:
@@ -85,16 +81,16 @@ class SparseLayout:
 
     def __init__(self, blocks: Blocks) -> None:
         """Find for every entry of the compressed columns its place among the values."""
-        n, inner = blocks.size, blocks.size - blocks.full
+        n = blocks.size
         row, column, height, width, start, down, across = _both_triangles(blocks)
         own = row == column
         above = np.cumsum(height) - height
         above -= np.maximum.accumulate(np.where(np.diff(column, prepend=-1) > 0, above, 0))
         in_blocks = np.bincount(column, height, n).astype(np.int64)
-        tall = np.full(n, n)
+        tall = np.empty(n, dtype=np.int64)
         for k in range(3):
             has = own & (k < width)
-            tall[column[has] + k] = in_blocks[column[has]] + blocks.full
+            tall[column[has] + k] = in_blocks[column[has]]
         indptr = np.concatenate([[0], np.cumsum(tall)])
         indices, source = np.empty(indptr[-1], dtype=np.int32), np.empty(indptr[-1], dtype=np.int32)
         for h, w in _SHAPES:
@@ -107,16 +103,6 @@ class SparseLayout:
                 if i < j:
                     place = np.where(own_some, start[some] + (j * down[some] + i * across[some]), place)
                 source[at] = place
-        full = blocks.full_start + np.arange(blocks.full)[:, None] * n
-        each = np.arange(n)
-        for f in range(blocks.full):
-            at = indptr[1 : inner + 1] - blocks.full + f
-            indices[at], source[at] = inner + f, full[f] + each[:inner]
-            at = indptr[inner + f] + each
-            indices[at], source[at] = (
-                each,
-                np.where(each <= inner + f, full[f] + each, full[np.maximum(each - inner, 0), 0] + inner + f),
-            )
         self._source = source
         self._matrix = sparse.csc_matrix((np.zeros(len(indices)), indices, indptr), shape=(n, n))
 
@@ -136,7 +122,7 @@ class IterativeLayout:
     def __init__(self, blocks: Blocks, pieces: Pieces) -> None:
         """Find the places of the values in the matrix, and of its entries in the pieces' blocks."""
         self._sparse, self._pieces = SparseLayout(blocks), pieces
-        self._local = LocalPlaces(self._sparse.matrix(np.zeros(blocks.full_start + blocks.full * blocks.size + 1)), pieces)
+        self._local = LocalPlaces(self._sparse.matrix(np.zeros(blocks.places)), pieces)
 
     def factor(self, values: Floats) -> TwoLevelFactor:
         """Prepare to solve with these values, up to the next call."""

@@ -1,9 +1,9 @@
 """Normal equations of a graph: where every product of Jacobians lands is analysed once, the values are filled often.
 
 A *node* is one free unknown: a pose (3 scalars), an anchor (2) or a calibration value (1). The lower triangle of
-H = J^T W J is kept as one array: the blocks between nodes that share an edge, one after the other, then the *border*,
-full rows for the calibration values, which touch nearly every pose and therefore take no part in the ordering. Scalars
-are numbered in the order of elimination, so that vectors need no permutation.
+H = J^T W J is kept as one array: the blocks between nodes that share an edge, one after the other. Anchors and calibration
+values touch many poses and therefore take no part in the ordering: they come last. Scalars are numbered in the order of
+elimination, so that vectors need no permutation.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ _AT_ONCE = 1 << 15
 """Edges whose products are in memory at once; a bound on the memory."""
 _NONE = np.zeros(0, dtype=np.int64)
 _Touched = tuple[Ints, bool]
-"""Node (e,) touched by each edge, -1 = fixed; and whether it takes part in the ordering."""
+"""Node (e,) touched by each edge, -1 = fixed; and whether it is a calibration value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,17 +56,17 @@ class NormalEquations:
         """
         free = free_unknowns(graph)
         counts = [int(mask.sum()) for mask in free.values()]
-        self._inner = counts[0] + counts[1]
+        self._values = sum(counts[:2])
         width = np.repeat(list(WIDTHS.values()), counts)
         node, first = {}, 0
         for (name, mask), count in zip(free.items(), counts, strict=True):
             node[name] = np.where(mask, first + np.cumsum(mask) - 1, -1)
             first += count
-        touched = [[(node[name][index], name != "calibration") for name, index, _ in lin.blocks] for lin in linearized]
+        touched = [[(node[name][index], name == "calibration") for name, index, _ in lin.blocks] for lin in linearized]
         # What is fixed for all edges of a kind, as the calibration often is, has no products.
         self._free = [[bool(np.any(a >= 0)) for a, _ in nodes] for nodes in touched]
         touched = [list(compress(nodes, free)) for nodes, free in zip(touched, self._free, strict=True)]
-        pairs, which = self._pairs(touched)
+        pairs, which = self._pairs(touched, len(width))
         among_poses = pairs[(pairs < counts[0]).all(axis=1)]
         late = None if last is None else node["poses"][last]
         ordering = choose_ordering(among_poses, counts[0], int(width[counts[0] :].sum()), subtrees, late)
@@ -89,21 +89,29 @@ class NormalEquations:
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
 
-    def _pairs(self, touched: list[list[_Touched]]) -> tuple[Ints, list[Ints]]:
-        """Return the pairs (b, 2) of inner nodes that share an edge, every node with itself first; and each edge's pair."""
-        m = self._inner
+    def _pairs(self, touched: list[list[_Touched]], nodes: int) -> tuple[Ints, list[Ints]]:
+        """Return the pairs (b, 2) of nodes that share an edge, every node with itself first; and each edge's pair."""
+        m, valued = self._values, np.zeros((nodes - self._values + 1, nodes + 1), dtype=bool)
         keys = [np.array([m * m])]
-        for nodes in touched:
-            for p, (a, a_inner) in enumerate(nodes):
-                for b, b_inner in nodes[:p]:
-                    if a_inner and b_inner:
-                        low, high = np.minimum(a, b), np.maximum(a, b)
-                        keys.append(np.where((low >= 0) & (low < high), low * m + high, m * m))
+        for low, high, by_value in _meetings(touched):
+            if by_value:
+                valued[np.where(low >= 0, high - m, -1), low] = True
+            else:
+                keys.append(np.where((low >= 0) & (low < high), low * m + high, m * m))
         unique, which = np.unique(np.concatenate(keys), return_inverse=True)
         apart = np.stack(np.divmod(unique[:-1], max(m, 1)), axis=1)
-        pairs = np.concatenate([np.repeat(np.arange(m), 2).reshape(m, 2), apart])
-        ends = np.cumsum([len(k) for k in keys])
-        return pairs, [part + m for part in np.split(which, ends)[1:-1]]
+        # Every range and step meets several calibration values: a table finds these pairs faster than sorting.
+        valued[-1] = valued[:, -1] = valued[np.arange(nodes - m), np.arange(m, nodes)] = False
+        value, other = np.nonzero(valued)
+        place = np.zeros(valued.shape, dtype=np.int32)
+        place[value, other] = nodes + len(apart) + np.arange(len(value))
+        pairs = np.concatenate([np.repeat(np.arange(nodes), 2).reshape(nodes, 2), apart, np.stack([other, value + m], axis=1)])
+        which = np.where(which < len(apart), which + nodes, 0)
+        following = iter(np.split(which, np.cumsum([len(k) for k in keys])[:-1])[1:])
+        return pairs, [
+            place[np.where(low >= 0, high - m, -1), low].astype(np.int64) if by_value else next(following)
+            for low, high, by_value in _meetings(touched)
+        ]
 
     def _place_blocks(self, pairs: Ints, corner: Ints, width: Ints) -> Blocks:
         """Lay the blocks out in the array of values."""
@@ -111,28 +119,13 @@ class NormalEquations:
         lower, left = np.where(swap, pairs[:, 1], pairs[:, 0]), np.where(swap, pairs[:, 0], pairs[:, 1])
         height, across = width[lower], width[left]
         ends = np.cumsum(height * across)
-        full = len(width) - self._inner
-        blocks = Blocks(
-            corner[lower],
-            corner[left],
-            height,
-            across,
-            ends - height * across,
-            int(width.sum()),
-            full,
-            int(np.sum(height * across)),
-        )
-        first_full = blocks.size - blocks.full
-        self._base = np.append(
-            blocks.start - blocks.row * blocks.width - blocks.column, blocks.full_start - first_full * blocks.size
-        )
-        self._stride = np.append(blocks.width, blocks.size)
-        self._trash = blocks.full_start + blocks.full * blocks.size
+        blocks = Blocks(corner[lower], corner[left], height, across, ends - height * across, int(width.sum()))
+        self._base, self._stride = blocks.start - blocks.row * blocks.width - blocks.column, blocks.width
+        self._trash = blocks.places
         each = np.repeat(np.arange(len(width)), width)
         scalar = np.repeat(corner[:-1] - np.cumsum(width) + width, width) + np.arange(blocks.size)
-        block = np.where(each < self._inner, each, len(pairs))
         self._diagonal = np.empty(blocks.size, dtype=np.int64)
-        self._diagonal[scalar] = self._base[block] + scalar * (self._stride[block] + 1)
+        self._diagonal[scalar] = self._base[each] + scalar * (self._stride[each] + 1)
         return blocks
 
     def _place_products(
@@ -148,20 +141,13 @@ class NormalEquations:
         self._places: list[list[_Places]] = []
         for lin, nodes, free in zip(linearized, touched, self._free, strict=True):
             widths = [jac.shape[2] for _, _, jac in compress(lin.blocks, free)]
-            blocks = [self._blocks_of(nodes[: p + 1], following) for p in range(len(nodes))]
+            blocks = [[*(np.where(a == b, a, next(following)) for b, _ in nodes[:p]), a] for p, (a, _) in enumerate(nodes)]
             self._places.append(
                 [
                     self._place_some(widths, [a[part] for a, _ in nodes], [[b[part] for b in row] for row in blocks], corner)
                     for part in (_parts(len(lin.residuals)) if nodes else ())
                 ]
             )
-
-    def _blocks_of(self, nodes: list[_Touched], following: Iterator[Ints]) -> list[Ints]:
-        """Return the block (e,) in which the last of the nodes meets each one up to itself."""
-        a, a_inner = nodes[-1]
-        full = np.full(len(a), len(self._base) - 1)
-        meet = [np.where(a == b, a, next(following)) if a_inner and b_inner else full for b, b_inner in nodes[:-1]]
-        return [*meet, a if a_inner else full]
 
     def _place_some(self, widths: list[int], nodes: list[Ints], blocks: list[list[Ints]], corner: Ints) -> _Places:
         """Find the places of some edges' products; nodes are (e,), the block of nodes p and q is blocks[p][q] (e,)."""
@@ -242,6 +228,14 @@ def filled(graph: Graph, subtrees: bool = False, last: Ints | None = None) -> No
     normal = NormalEquations(graph, linearized, subtrees, last)
     normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
     return normal
+
+
+def _meetings(touched: list[list[_Touched]]) -> Iterator[tuple[Ints, Ints, bool]]:
+    """Yield the lower and the higher node (e,) of every two that each edge touches, -1 = fixed; and whether one is a value."""
+    for nodes in touched:
+        for p, (a, a_value) in enumerate(nodes):
+            for b, b_value in nodes[:p]:
+                yield np.minimum(a, b), np.maximum(a, b), a_value or b_value
 
 
 def _parts(edges: int) -> list[slice]:

@@ -106,8 +106,7 @@ class TwoLevelFactor:
             self._local = np.linalg.inv(local.blocks(matrix.data))
         except np.linalg.LinAlgError as problem:
             raise SolverError(f"{_SINGULAR} ({problem})") from None
-        # A third of the entries are zeros in the rows of calibration. Symmetric: its columns serve as rows, which multiply
-        # faster.
+        # Pairs of clouds that do not count left zeros. Symmetric: its columns serve as rows, which multiply faster.
         columns = matrix.copy()
         columns.eliminate_zeros()
         self._matrix = columns.T
