@@ -1,12 +1,14 @@
 """Relations: the metric against numbers by hand, clocks, gaps, and relations without an answer."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from helpers.planted import wander
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.evaluation.relations import Relations, evaluate_relations
+from uwblite.evaluation.relations import Relations, _answered, evaluate_relations
 
 
 def related(stamps, poses, pairs):
@@ -69,9 +71,17 @@ def test_scans_at_the_ends_are_answered_though_the_clock_is_late():
         assert evaluate_relations(stamps, np.zeros((len(stamps), 3)), ends, delay).answered.all()
 
 
-@pytest.mark.parametrize(("delay", "answered"), [(0.0, [True, True]), (0.5, [False, True]), (-0.5, [True, False])])
-def test_gaps_are_those_at_the_lidars_clock(delay, answered):
-    """Between 9 and 40 s there are no poses: one of 8.9 s, taken half a second later, falls between."""
-    stamps = np.concatenate([np.arange(0.0, 10.0), np.arange(40.0, 50.0)])
-    relations = Relations(np.array([8.9, 40.2]), np.array([5.0, 45.0]), np.zeros((2, 3)))
-    assert evaluate_relations(stamps, np.zeros((20, 3)), relations, delay=delay).answered.tolist() == answered
+@pytest.mark.parametrize("delay", [0.0, 0.5, -0.5])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_scan_is_answered_between_poses_at_most_10_s_apart_at_the_lidars_clock(seed, delay):
+    """One by one; the ends may be overhung by the delay and a rounded stamp."""
+    rng = np.random.default_rng(seed)
+    stamps = 100.0 + np.cumsum(np.append(0.0, rng.choice([0.5, 10.0, 10.5, 30.0], 12)))
+    scans = np.concatenate([rng.uniform(99.0, stamps[-1] + 1.0, 200), stamps[:-1] + 0.3, stamps - 0.9e-3, stamps + 0.9e-3])
+    expected = []
+    for at in scans + delay:
+        inside = stamps[0] - abs(delay) - 1e-3 <= at <= stamps[-1] + abs(delay) + 1e-3
+        gap = next((b - a for a, b in pairwise(stamps) if at <= b), stamps[-1] - stamps[-2])
+        expected.append(inside and gap <= 10.0)
+    assert _answered(stamps, scans, delay).tolist() == expected
+    assert _answered(stamps[:1], np.array([100.0, 99.6, 98.9]), 0.5).tolist() == [True, True, False]

@@ -5,16 +5,25 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import plain_ranges
+from helpers.planted_graphs import plain_ranges, random_poses
 
-from uwblite.graph.graph import Graph
+from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.solver import SolverConfig
 from uwblite.pipeline import moved_anchors
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.mapping_config import MappingConfig
-from uwblite.pipeline.moved_anchors import _LEAST_MOVE, _MOVED, _differ, name_new_and_absent_anchors, separate_moved_anchors
+from uwblite.pipeline.moved_anchors import (
+    _LEAST_MOVE,
+    _MOVED,
+    _differ,
+    _places_by_recording,
+    name_new_and_absent_anchors,
+    separate_moved_anchors,
+)  # fmt: skip
 from uwblite.pipeline.progress import Stages
 from uwblite.radio.bootstrap import BootstrapResult
+from uwblite.radio.range_noise import RangeNoiseConfig
 
 
 @pytest.mark.parametrize(("metres", "sigmas", "differ"), [(1.01, 1.01, True), (0.99, 1.01, False), (1.01, 0.99, False)])
@@ -51,6 +60,31 @@ def test_an_anchor_that_stands_elsewhere_in_a_recording_is_another_one_there(mon
     assert [(w.figures["anchor"], w.figures["recording"], w.figures["new_id"]) for w in stages.warnings] == [
         ("B", 2, "B#2"), ("B", 3, "B#2"),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("wild", [0.0, 0.1])
+def test_each_recording_s_ranges_determine_its_anchors_with_the_poses_fixed(wild):
+    """Three anchors heard in three recordings, one of them not in the last; the second is moved by 4 m in between."""
+    rng = np.random.default_rng(3)
+    poses = random_poses(rng, 240, 6.0)
+    recording, anchor = np.repeat(np.arange(3), 80), rng.integers(0, 3, 240)
+    stood = np.tile([[0.0, 9.0], [7.0, -4.0], [-8.0, 1.0]], (3, 1, 1))
+    stood[1:, 1] += [0.0, -4.0]
+    heard = (anchor < 2) | (recording < 2)
+    pose = np.flatnonzero(heard)
+    distance = np.hypot(*(poses[pose, :2] - stood[recording[pose], anchor[pose]]).T)
+    off = 0.05 * rng.standard_normal(len(pose)) + np.where(rng.random(len(pose)) < wild, 3.0, 0.0)
+    bias, free = Calibration((UnknownKey("bias", "A"),), np.array([0.7])), np.zeros(1, dtype=bool)
+    graph = Graph(poses, stood[0] + rng.normal(size=(3, 2)), (), bias, fixed_calibration=free)
+    yes, ranges = np.ones(3, dtype=bool), plain_ranges(pose, anchor[pose], distance + off, 0.05)
+    estimate = Estimate(graph, None, ranges, ("A", "B", "C"), BootstrapResult(graph, yes, ((),) * 3, ~yes))
+    place, covariance, pairs = _places_by_recording(estimate, recording[pose], SolverConfig(), RangeNoiseConfig())
+    assert pairs.tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2], [2, 0], [2, 1]]
+    error = place - stood[pairs[:, 1], pairs[:, 0]]
+    # Sixteen degrees of freedom: chi2 of 40 or more by chance in one of 1,000 worlds.
+    assert np.einsum("ki,kij,kj->", error, np.linalg.inv(covariance), error) < 40.0
+    # 27 ranges of 5 cm at all bearings know a coordinate to 0.05 sqrt(2 / 27) = 1.4 cm; the errors in common assumed add 4 cm.
+    np.testing.assert_allclose(np.sqrt(np.einsum("kii->k", covariance) / 2.0), 0.043, rtol=0.2)
 
 
 STEPS = 40

@@ -85,6 +85,8 @@ def test_calibration_shows_what_the_recording_shows(run):
     assert values["laser_x"].reason
     assert all(c.state in ("estimated", "prior") and c.unit and c.meaning for c in result.calibration)
     assert all(c.reason or c.state == "estimated" for c in result.calibration)
+    biases = [(values[f"bias:{a.id}"].value, values[f"bias:{a.id}"].sigma) for a in result.anchors]
+    assert biases == [(a.bias, a.bias_sigma) for a in result.anchors]
 
 
 def test_a_recording_without_lidar_reports_so_and_no_more(run):

@@ -159,8 +159,9 @@ def test_an_anchor_in_a_wrong_place_leaves(joined_at, left):
     state = _with_wrong_anchor(joined_at)
     part = state._solve(200, 400)
     assert not part.fits
-    # One that has no place yet does not join because others leave.
+    # One that has no place yet does not join because others leave; one that is given is never accused of having come late.
     state.joined[12], state.joined_at[12] = False, len(state.guess)
+    state.ranged[2], state.joined_at[2] = False, 399
     found = state._without_outliers(part, 200, 400)
     assert found.fits
     assert set(np.flatnonzero(~state.joined)) == left | {12}

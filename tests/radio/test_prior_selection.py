@@ -47,6 +47,12 @@ def test_the_prior_in_use_is_the_measure_of_others():
     assert log_marginal_likelihood(np.array([0.3, -0.1]), covariance, width, width) == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("precision", [1.0, 0.5])
+def test_a_prior_under_which_the_unknowns_are_not_determined_is_impossible(precision):
+    """The prior in use is all that holds them, or more than that by roundoff; the other one says nothing."""
+    assert log_marginal_likelihood(np.ones(1), np.full((1, 1), 1.0 / precision), np.ones(1), np.full(1, np.inf)) == -np.inf
+
+
 def solved(seed, bias=(0.0,) * 4, scale=1.0):
     """Return the graph of a path whose poses are known, solved for anchors, scale and biases, and its edges."""
     rng = np.random.default_rng(seed)

@@ -19,7 +19,8 @@ _FACTOR = np.log(4.0)
 _NOISE = np.log(10.0)
 """The same of the scale of the noise, whose variances are careful guesses."""
 _UNSEEN = 1e-9
-"""Share of the largest eigenvalue of A below which a direction was seen by nothing."""
+"""Eigenvalue of A, or share of a largest one above 1, below which a direction was seen by nothing: of an error of the size
+assumed it says that much compared with the noise."""
 _ROUNDS, _NEGLIGIBLE, _LONGEST = 50, 1e-3, 1.0
 """Most rounds; change of all logarithms that ends them; longest step in a logarithm."""
 
@@ -35,7 +36,7 @@ def variances_of_kinds(y: Floats, a: Floats, kind: Ints) -> Floats:
     """
     kinds = int(kind.max(initial=-1)) + 1
     values, vectors = np.linalg.eigh(a)
-    seen = values > _UNSEEN * max(float(values.max(initial=0.0)), 1e-300)
+    seen = values > _UNSEEN * values.max(initial=1.0)
     if not seen.any():
         return np.ones(kinds)
     root = np.sqrt(values[seen])

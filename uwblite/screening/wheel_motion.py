@@ -233,8 +233,8 @@ def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
         middle = np.array([np.median(ratio[p]) for p in parts])
         sigma = np.array([sigma_of_median(ratio[p]) for p in parts])
         usual = float(np.median(middle))
-        sigma = np.hypot(sigma, spread_about_median(middle))
-        off = np.abs(middle - usual) > np.maximum(_OTHER_RATIO * usual, _RATIO_SIGMAS * sigma)
+        scatter = np.hypot(sigma, spread_about_median(middle))
+        off = np.abs(middle - usual) > np.maximum(_OTHER_RATIO * usual, _RATIO_SIGMAS * scatter)
         # Half of the recording may be the other half's exception: then the parts scatter, each sharply.
         halves = [np.median(middle[h]) for h in np.array_split(np.arange(len(middle)), 2)]
         if abs(halves[0] - halves[1]) > max(_OTHER_RATIO * usual, _RATIO_SIGMAS * float(np.median(sigma))):

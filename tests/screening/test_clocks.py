@@ -1,0 +1,133 @@
+"""Clocks: where the words begin, and what stamps become."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwblite.errors import DataError
+from uwblite.screening import clocks
+from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
+
+
+def moving(stamps):
+    return Odometry(
+        np.asarray(stamps, dtype=float), np.column_stack([np.arange(float(len(stamps))), np.zeros((len(stamps), 2))])
+    )
+
+
+def scans(stamps):
+    return LaserScans(np.asarray(stamps, dtype=float), np.ones((len(stamps), 4), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 9.0)
+
+
+def ranges(stamps):
+    n = len(stamps)
+    return UwbRanges(np.asarray(stamps, dtype=float), np.zeros(n, dtype=int), np.ones(n), np.full(n, 100.0), ("A",))
+
+
+def test_only_a_moving_robot_needs_times():
+    for odometry, refused in (
+        (moving([3.0, 3.0, 3.0]), True), (moving([3.0, 3.0]), False), (moving([3.0, 3.0, 3.1]), False),
+        (Odometry(np.full(3, 3.0), np.ones((3, 3))), False),
+    ):  # fmt: skip
+        with pytest.raises(DataError, match="all 3 of the odometry are of t = 3 s") if refused else nullcontext():
+            clocks.refuse_without_stamps(SensorLog(odometry))
+
+
+def even(period, count, uneven=0.0):
+    return period * np.arange(count) + uneven * (np.arange(count) == 5)
+
+
+@pytest.mark.parametrize(
+    ("odometry", "lidar", "period"),
+    [
+        (even(0.5, 20), even(0.5, 20), "0.5"), (even(0.5, 19), even(0.5, 20), None), (even(0.5, 20), even(0.5, 19), None),
+        (even(0.39, 20), even(0.5, 20), None), (even(0.5, 20), even(0.39, 20), None), (even(0.4, 40), even(0.5, 40), "0.4"),
+        (even(0.5, 20, 4e-5), even(0.5, 20, 4e-5), "0.5"), (even(0.5, 20, 6e-5), even(0.5, 20), None),
+        (even(0.5, 20), even(0.5, 20, 6e-5), None),
+    ],
+)  # fmt: skip
+def test_stamps_are_made_up_where_both_sensors_are_slow_and_even(odometry, lidar, period):
+    found = clocks.made_up(SensorLog(moving(odometry), None, scans(lidar)))
+    assert len(found) == (period is not None)
+    assert all(f"every {period} s" in r.text for r in found)
+    assert clocks.made_up(SensorLog(moving(odometry))) == []
+
+
+def test_a_clock_set_back_by_more_than_a_second_is_named_with_its_sensor():
+    found = clocks.set_back(
+        SensorLog(moving([0.0, 1.0]), notes=LogNotes(set_back={"radio": 1.0, "lidar": 1.1, "odometry": 30.0}))
+    )
+    assert [r.text.split(":")[0] for r in found] == [
+        "the clock of the lidar was set back by up to 1.1 s", "the clock of the odometry was set back by up to 30.0 s",
+    ]  # fmt: skip
+    assert all(r.doubt for r in found)
+
+
+@pytest.mark.parametrize(
+    ("by", "early", "undone"),
+    [(10.1, 0.0, True), (9.9, 0.0, False), (30.0, 1.9, True), (30.0, 2.1, False), (30.0, -1.9, True), (30.0, -2.1, False)],
+)
+@pytest.mark.parametrize("which", ["scans", "ranges", "odometry"])
+def test_a_jump_forward_is_undone_where_the_sensors_end_together_without_it(which, by, early, undone):
+    """Ten seconds at least; the sensor that jumped ends earlier or later than the other by up to two seconds."""
+    end = 100.0 - early if which == "odometry" else 100.0
+    other = np.linspace(0.0, end, 401)
+    own = np.linspace(0.0, 100.0 - early if which != "odometry" else 100.0, 201)
+    if which == "odometry":
+        jumping = other + by * (np.arange(401) > 100)
+        log = SensorLog(moving(jumping), None, scans(own))
+        done, remarks = clocks.without_jumps(log)
+        at, moved, what = 25.0 * end / 100.0, by, "odometry"
+        expected, found = own + by * (own > at), done.scans.stamps
+    else:
+        jumped = own + by * (np.arange(201) > 50)
+        log = SensorLog(moving(other), **{which: (scans if which == "scans" else ranges)(jumped)})
+        done, remarks = clocks.without_jumps(log)
+        at, moved, what = own[50], -by, {"scans": "lidar", "ranges": "radio"}[which]
+        expected, found = own, getattr(done, which).stamps
+    if not undone:
+        assert (done, remarks) == (log, [])
+        return
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    (remark,) = remarks
+    assert f"the clock of the {what} was set forward by {by:.1f} s at t = {at:.0f} s" in remark.text
+    assert f"moved by {moved:+.1f} s" in remark.text
+
+
+def test_a_few_stamps_show_no_jump():
+    for count, undone in ((20, True), (19, False)):
+        stamps = np.linspace(0.0, 100.0, count) + 50.0 * (np.arange(count) > 8)
+        done, _ = clocks.without_jumps(SensorLog(moving(np.linspace(0.0, 100.0, 401)), None, scans(stamps)))
+        assert (done.scans.stamps[-1] < 101.0) == undone
+
+
+@pytest.mark.parametrize(
+    ("outside", "said", "doubt"), [(0, False, False), (1, False, False), (2, True, False), (50, True, False), (51, True, True)]
+)
+def test_scans_outside_the_odometry_s_time_are_left_out_and_ranges_counted(outside, said, doubt):
+    """From 2 % of the scans on, and one range; a half second beyond either end is the odometry's own period."""
+    stamps = np.linspace(0.0, 10.0, 100 - outside)
+    late = np.append(stamps, np.full(outside, 12.0))
+    log = SensorLog(moving(np.linspace(0.0, 10.0, 50)), ranges(late), scans(late))
+    done, remarks = clocks.within_odometry(log)
+    assert done.ranges is log.ranges
+    assert len(done.scans.stamps) == 100 - outside if said else done.scans is log.scans
+    by_kind = {r.kind: r for r in remarks}
+    assert set(by_kind) == ({"ranges-outside-odometry"} if outside else set()) | ({"scans-outside-odometry"} if said else set())
+    for name, remark in by_kind.items():
+        assert remark.doubt == doubt
+        assert remark.text.startswith(f"{outside} of 100 {name.split('-')[0]} ")
+        assert ("clocks differ by about 7 s" in remark.text) == doubt
+
+
+def test_the_time_of_the_odometry_begins_and_ends_a_little_beyond_its_stamps():
+    edge = clocks.OUTSIDE
+    stamps = np.array([-1.01, -1.0, 0.0, 11.0, 11.01]) * [edge, edge, 1.0, 1.0, 1.0]
+    stamps[3:] = [10.0 + edge, 10.0 + 1.01 * edge]
+    done, (remark,) = clocks.within_odometry(SensorLog(moving(np.linspace(0.0, 10.0, 50)), None, scans(stamps)))
+    np.testing.assert_array_equal(done.scans.stamps, stamps[1:4])
+    assert remark.text.startswith("2 of 5 scans")
+    late = replace(scans(stamps[1:4]), stamps=stamps[1:4])
+    assert clocks.within_odometry(SensorLog(moving(np.linspace(0.0, 10.0, 50)), None, late))[1] == []

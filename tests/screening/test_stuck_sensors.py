@@ -1,0 +1,222 @@
+"""Readings that repeat themselves: each rule against a loop over readings, at its limits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwblite.screening.stuck_sensors import (
+    _in_runs,
+    _mark,
+    _repeats,
+    _spread,
+    _when,
+    without_bursts,
+    without_lidar_marks,
+    without_marks,
+    without_repeated_ranges,
+    without_repeated_scans,
+)
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, UwbRanges
+
+
+def driving(speed=1.0, seconds=100.0):
+    stamps = np.arange(0.0, seconds + 0.05, 0.1)
+    return Odometry(stamps, np.column_stack([speed * stamps, np.zeros((len(stamps), 2))]))
+
+
+def ranges(stamps, values, anchor=None, ids=("A", "B")):
+    n = len(stamps)
+    anchor = np.zeros(n, dtype=int) if anchor is None else anchor
+    return UwbRanges(np.asarray(stamps, float), anchor, np.asarray(values, float), np.full(n, 100.0), ids)
+
+
+def scans(readings, stamps=None, nearest=0.05, farthest=30.0):
+    readings = np.asarray(readings, dtype=np.float32)
+    stamps = np.arange(float(len(readings))) if stamps is None else np.asarray(stamps, float)
+    return LaserScans(stamps, readings, 0.0, 0.01, 0.0, nearest, farthest)
+
+
+@pytest.mark.parametrize(("size", "bursts", "spread"), [(4, 5, True), (3, 5, False), (4, 4, False), (7, 30, True)])
+def test_bursts_are_spread_over_the_time_since_the_one_before(size, bursts, spread):
+    """The last of each keeps its stamp; after a pause they are spread over the usual time."""
+    at = 10.0 + np.arange(bursts) * 2.0 + 30.0 * (np.arange(bursts) >= 3)
+    late = np.repeat(at, size)
+    found = _spread(late)
+    assert (found is not None) == spread
+    if found:
+        stamps, usual, between = found
+        assert (usual, between) == (size, 2.0)
+        np.testing.assert_allclose(stamps, (at[:, None] - 2.0 + 2.0 * np.arange(1, size + 1) / size).ravel())
+
+
+def test_bursts_of_both_sensors_are_named_and_single_stamps_stay():
+    late = np.repeat(np.arange(1.0, 11.0), 5)
+    odometry = Odometry(late, np.zeros((50, 3)))
+    done, remarks = without_bursts(SensorLog(odometry, None, scans(np.ones((50, 3)), late)))
+    np.testing.assert_allclose(done.odometry.stamps, 0.2 * np.arange(1, 51))
+    np.testing.assert_allclose(done.scans.stamps, 0.2 * np.arange(1, 51))
+    assert [r.text.split(",")[0] for r in remarks] == [
+        "odometry readings come in bursts of about 5 with one stamp", "scans come in bursts of about 5 with one stamp",
+    ]  # fmt: skip
+    assert "every 1.00 s" in remarks[0].text
+    even = SensorLog(driving(), None, scans(np.ones((50, 3))))
+    assert without_bursts(even) == (even, [])
+
+
+@pytest.mark.parametrize("beams", [3, 32, 200])
+def test_scans_are_the_same_to_the_last_digit_or_not(beams):
+    rng = np.random.default_rng(beams)
+    readings = np.round(rng.uniform(1.0, 1.3, (300, beams)), 1)
+    readings[rng.random(readings.shape) < 0.1] = np.nan
+    again = rng.random(300) < 0.6
+    for k in np.flatnonzero(again[1:]) + 1:
+        readings[k] = readings[k - 1]
+        if k % 4 == 0:
+            readings[k, rng.integers(beams)] = 7.0
+    expected = [k > 0 and np.array_equal(readings[k], readings[k - 1], equal_nan=True) for k in range(300)]
+    assert _repeats(readings).tolist() == expected
+
+
+@pytest.mark.parametrize("least", [1, 2, 4])
+def test_runs_of_at_least_so_many(least):
+    flags = np.random.default_rng(least).random(200) < 0.7
+    text = "".join("x" if f else "." for f in flags)
+    expected = "".join(run if len(run) >= least else "." * len(run) for run in _runs(text))
+    assert "".join("x" if f else "." for f in _in_runs(flags, least)) == expected
+
+
+def _runs(text):
+    import re
+
+    return re.findall(r"x+|\.+", text)
+
+
+@pytest.mark.parametrize(("repeats", "seen", "left_out"), [(2, 10, 2), (1, 10, 0), (2, 9, 0), (5, 40, 5)])
+def test_a_scan_that_stands_three_times_was_not_measured_again(repeats, seen, left_out):
+    rng = np.random.default_rng(1)
+    readings = np.full((20, 40), np.inf)
+    readings[:, :seen] = rng.uniform(1.0, 2.0, (20, seen))
+    readings[5 : 6 + repeats] = readings[5]
+    log = SensorLog(driving(), None, scans(readings))
+    done, remarks = without_repeated_scans(log)
+    np.testing.assert_array_equal(done.scans.stamps, np.delete(np.arange(20.0), np.arange(6, 6 + left_out)))
+    assert [r.text.split(" to the")[0] for r in remarks] == [f"{left_out} of 20 scans repeat the one before"] * bool(left_out)
+    assert all(f"t = 6 to {5 + left_out} s" in r.text for r in remarks)
+
+
+def test_a_scan_written_twice_is_left_out_without_a_word():
+    readings = np.random.default_rng(2).uniform(1.0, 2.0, (10, 40))
+    log = SensorLog(driving(), None, scans(np.repeat(readings, 2, axis=0), np.repeat(np.arange(10.0), 2)))
+    done, remarks = without_repeated_scans(log)
+    np.testing.assert_array_equal(done.scans.stamps, np.arange(10.0))
+    assert remarks == []
+    few = SensorLog(driving(), None, scans(np.ones((2, 40)), [1.0, 1.0]))
+    assert without_repeated_scans(few) == (few, [])
+    assert (
+        len(without_repeated_scans(SensorLog(driving(), None, scans(np.ones((3, 40)), [1.0, 1.0, 2.0])))[0].scans.stamps) == 2
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "speed", "value", "left_out"),
+    [(13, 0.05, 4.2, True), (12, 0.05, 4.2, False), (13, 0.04, 4.2, False), (13, 0.05, 0.0, False), (30, 1.0, 4.2, True)],
+)
+def test_a_range_that_stands_while_the_robot_moves(count, speed, value, left_out):
+    """Thirteen in a row, the first with twelve repeats, over more than half a metre: at a second each, 0.05 m/s make 0.55 m."""
+    values = 5.0 + 0.01 * np.arange(60)
+    values[10 : 10 + count] = value
+    other = 3.0 + 0.01 * np.arange(60)
+    stamps, anchor = np.repeat(np.arange(60.0), 2), np.tile([0, 1], 60)
+    log = SensorLog(driving(speed), ranges(stamps, np.stack([values, other], axis=1).ravel(), anchor))
+    done, remarks = without_repeated_ranges(log)
+    wrong = (anchor == 0) & (stamps >= 10) & (stamps < 10 + count) & left_out
+    np.testing.assert_array_equal(done.ranges.stamps, stamps[~wrong])
+    np.testing.assert_array_equal(done.ranges.anchor, anchor[~wrong])
+    said = f"anchor A repeats one range to the last digit while the robot moves (t = 10 to {9 + count} s)"
+    assert [r.text.split(";")[0] for r in remarks] == [said] * left_out
+
+
+def test_ranges_written_twice_count_once_and_where_all_are_stuck_none_is_left():
+    log = SensorLog(driving(), ranges([1.0, 1.0, 1.0, 2.0, 2.0], [5.0, 5.0, 6.0, 6.0, 6.0]))
+    done, remarks = without_repeated_ranges(log)
+    np.testing.assert_array_equal(done.ranges.stamps, [1.0, 1.0, 2.0])
+    np.testing.assert_array_equal(done.ranges.ranges, [5.0, 6.0, 6.0])
+    assert remarks == []
+    done, remarks = without_repeated_ranges(SensorLog(driving(), ranges(np.arange(20.0), np.full(20, 4.2), ids=("A",))))
+    assert done.ranges is None
+    assert len(remarks) == 1
+    one = SensorLog(driving(), ranges([1.0], [5.0]))
+    assert without_repeated_ranges(one) == (one, [])
+
+
+@pytest.mark.parametrize(
+    ("marks", "others", "usual", "found"),
+    [(20, 20, 1, True), (19, 20, 1, False), (24, 776, 1, True), (24, 777, 1, False), (32, 20, 4, True), (31, 20, 4, False)],
+)
+def test_a_mark_is_twenty_readings_three_percent_and_eight_times_as_frequent_as_others(marks, others, usual, found):
+    values = np.concatenate([np.full(marks, 6.5), np.repeat(1.0 + 0.001 * np.arange(others), usual)])
+    assert _mark(values) == (6.5 if found else None)
+    assert _mark(np.full(50, 6.5)) is None
+
+
+def at_places(count, standing=False):
+    """Return a recording of that many seconds at 1 m/s with a mark of two anchors at each second, among other ranges."""
+    stamps = np.repeat(np.arange(float(count)), 4)
+    anchor = np.tile([0, 1, 0, 1], count)
+    values = 2.0 + 0.001 * np.arange(4.0 * count)
+    values[2::4] = values[3::4] = 65.5
+    return SensorLog(driving(0.0 if standing else 1.0), ranges(stamps, values, anchor)), values
+
+
+def test_a_mark_counts_once_at_each_place_and_of_each_anchor():
+    log, values = at_places(10)
+    done, (remark,) = without_marks(log)
+    np.testing.assert_array_equal(done.ranges.ranges, values[values < 60.0])
+    assert remark.text.startswith("20 of 40 ranges are 65.5 m")
+    for other in (at_places(9)[0], at_places(40, standing=True)[0]):
+        assert without_marks(other) == (other, [])
+    # What one anchor alone repeats is stuck; no reading at all is another matter.
+    one = replace(log, ranges=log.ranges.rows(log.ranges.anchor == 0))
+    longer, _ = at_places(30)
+    one = replace(longer, ranges=longer.ranges.rows(longer.ranges.anchor == 0))
+    assert without_marks(one) == (one, [])
+    zeros = replace(log, ranges=replace(log.ranges, ranges=np.where(values > 60.0, 0.0, values)))
+    assert without_marks(zeros) == (zeros, [])
+
+
+def test_readings_of_the_lidar_that_are_marks():
+    """Twenty places, at each of them a tenth of the beams; inside the limits that the lidar states."""
+    rng = np.random.default_rng(4)
+    for places, found in ((20, True), (19, False)):
+        readings = rng.uniform(1.0, 9.0, (places, 50)).astype(np.float32)
+        readings[:, ::10] = 5.5
+        log = SensorLog(driving(), None, scans(readings))
+        done, remarks = without_lidar_marks(log)
+        assert len(remarks) == found
+        if found:
+            assert remarks[0].text.startswith(f"{places * 5} of {places * 50} readings of the lidar are 5.5 m")
+            assert "a mark, or the robot itself" in remarks[0].text
+            assert np.isnan(done.scans.ranges[:, ::10]).all()
+            assert done.scans.range_max == 30.0
+            np.testing.assert_array_equal(np.delete(done.scans.ranges, np.s_[::10], 1), np.delete(readings, np.s_[::10], 1))
+            farthest = replace(log, scans=replace(log.scans, ranges=np.where(readings == 5.5, np.float32(9.5), readings)))
+            done, remarks = without_lidar_marks(farthest)
+            assert "marks with it what it did not see" in remarks[0].text
+            assert np.isposinf(done.scans.ranges[:, ::10]).all()
+            assert done.scans.range_max == 9.5
+            for limits in ({"range_max": 9.4}, {"range_min": 9.6, "range_max": 30.0}):
+                beyond = replace(farthest, scans=replace(farthest.scans, **limits))
+                assert without_lidar_marks(beyond) == (beyond, [])
+    standing = SensorLog(driving(0.0), None, scans(np.tile(readings, (5, 1))))
+    assert without_lidar_marks(standing) == (standing, [])
+
+
+def test_when_is_said_of_three_stretches():
+    flags = np.zeros(100, dtype=bool)
+    for first in (10, 30, 50):
+        flags[first : first + 5] = True
+    stamps = 2.0 * np.arange(100.0)
+    assert _when(stamps, flags, 4.0) == "t = 16 to 24 s, t = 56 to 64 s, t = 96 to 104 s"
+    flags[[70, 80]] = True
+    assert _when(stamps, flags, 4.0).endswith("104 s, and 2 more stretches")

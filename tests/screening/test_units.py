@@ -1,0 +1,142 @@
+"""Units: where the words begin, at each limit; and the agreement of heading and path against its definition."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwblite.errors import DataError
+from uwblite.screening.units import heading_agreement, refuse_degrees, refuse_wrong_lengths
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, UwbRanges
+
+
+def straight(speed=0.3, seconds=20.0, period=0.1):
+    stamps = period * np.arange(round(seconds / period) + 1)
+    return Odometry(stamps, np.column_stack([speed * stamps, np.zeros((len(stamps), 2))]))
+
+
+def said(log):
+    try:
+        refuse_wrong_lengths(log)
+    except DataError as error:
+        return str(error)
+    return ""
+
+
+def factor(text):
+    return text.rsplit(" ", 1)[-1].rstrip(")")
+
+
+@pytest.mark.parametrize(("speed", "unit"), [(8.99, ""), (9.01, "0.01"), (89.9, "0.01"), (90.1, "0.001"), (-90.1, "0.001")])
+def test_speeds_of_the_odometry(speed, unit):
+    text = said(SensorLog(straight(speed)))
+    assert factor(text) == unit
+    assert f"usual speed would be {abs(speed):.0f} m/s" in text or not unit
+
+
+def test_speed_is_taken_over_a_second_of_those_that_move():
+    """Two robots by turns jump to and fro between readings; a robot that mostly stands is fast when it moves."""
+    odometry = straight(0.3)
+    to_and_fro = replace(odometry, poses=odometry.poses + np.outer(np.arange(len(odometry.stamps)) % 2, [5.0, 0.0, 0.0]))
+    assert said(SensorLog(to_and_fro)) == ""
+    x = 95.0 * np.maximum(odometry.stamps - 17.5, 0.0)
+    assert factor(said(SensorLog(replace(odometry, poses=np.column_stack([x, 0 * x, 0 * x]))))) == "0.001"
+    # Ten readings that move are enough; the last second has no reading a second later.
+    for seconds, unit in ((1.4, "0.01"), (1.2, "")):
+        assert factor(said(SensorLog(straight(20.0, seconds)))) == unit
+
+
+def ranges(values):
+    n = len(values)
+    return UwbRanges(np.linspace(0.0, 20.0, n), np.zeros(n, dtype=int), np.asarray(values, float), np.full(n, 100.0), ("A",))
+
+
+@pytest.mark.parametrize(
+    ("values", "unit"),
+    [
+        ([200.0] * 10, ""), ([200.1] * 10, "0.01"), ([1500.0] * 10, "0.01"), ([1500.1] * 10, "0.001"), ([5000.0] * 9, ""),
+        ([0.0] * 30 + [5000.0] * 10, "0.001"), ([-1.0] * 30 + [5000.0] * 10, "0.001"), ([0.5] * 30 + [5000.0] * 10, ""),
+    ],
+)  # fmt: skip
+def test_usual_ranges(values, unit):
+    assert factor(said(SensorLog(straight(), ranges(values)))) == unit
+
+
+def scans(value, count=1, beams=100, view=4.0, nearest=0.05, farthest=1e6):
+    readings = np.full((count, beams), value, dtype=np.float32)
+    return LaserScans(np.arange(float(count)), readings, -0.5 * view, view / (beams - 1), 0.0, nearest, farthest)
+
+
+@pytest.mark.parametrize(("value", "unit"), [(150.0, ""), (150.1, "0.01"), (500.0, "0.01"), (500.1, "0.001"), (np.nan, "")])
+def test_usual_readings_of_the_laser(value, unit):
+    assert factor(said(SensorLog(straight(), None, scans(value)))) == unit
+    assert factor(said(SensorLog(straight(), None, scans(value, 1000)))) == unit
+
+
+def test_readings_outside_the_laser_s_own_limits_count_for_nothing():
+    assert said(SensorLog(straight(), None, scans(600.0, farthest=599.0))) == ""
+    assert said(SensorLog(straight(), None, scans(600.0, nearest=601.0))) == ""
+    assert factor(said(SensorLog(straight(), None, scans(600.0, nearest=600.0, farthest=600.0)))) == "0.001"
+    assert factor(said(SensorLog(straight(), None, scans(600.0, beams=10)))) == "0.001"
+    assert said(SensorLog(straight(), None, scans(600.0, beams=9))) == ""
+
+
+@pytest.mark.parametrize(("view", "named"), [(6.37, False), (6.39, True), (-6.39, True)])
+def test_a_laser_sees_at_most_one_turn(view, named):
+    assert ("angles must be radians" in said(SensorLog(straight(), None, scans(1.0, view=view)))) == named
+
+
+def test_all_that_is_wrong_is_said_at_once():
+    text = said(SensorLog(straight(100.0), ranges([5000.0] * 10), scans(600.0)))
+    assert [part.split()[1] for part in text.split("; the ")] == ["odometry's", "look", "readings"]
+
+
+def arc(turn=1.5, metres=30.0, step=0.05):
+    """Return a path that turns by so many rad to and fro per 10 m, heading along it."""
+    s = np.arange(0.0, metres, step)
+    heading = turn * np.sin(2.0 * np.pi * s / 10.0)
+    xy = np.cumsum(step * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+    return Odometry(0.1 * np.arange(len(s)), np.column_stack([xy, heading]))
+
+
+def with_heading(odometry, heading):
+    return replace(odometry, poses=np.column_stack([odometry.poses[:, :2], heading]))
+
+
+def test_a_heading_along_the_path_agrees_forwards_and_backwards():
+    path = arc()
+    heading = path.poses[:, 2]
+    for other in (heading, heading + np.pi, np.angle(np.exp(1j * (heading + 3.0)))):
+        agreement, varied = heading_agreement(with_heading(path, other))
+        assert agreement == pytest.approx(1.0, abs=0.01)
+        assert varied
+    assert heading_agreement(with_heading(path, -heading), -1.0)[0] == pytest.approx(1.0, abs=0.01)
+    assert heading_agreement(with_heading(path, 0.5 * heading), 2.0)[0] == pytest.approx(1.0, abs=0.01)
+    assert heading_agreement(with_heading(path, -heading))[0] < 0.5
+    assert not heading_agreement(arc(turn=0.1))[1]
+
+
+def test_agreement_is_a_mean_over_the_way_and_not_over_the_readings():
+    """Half the way sideways, at a tenth of the speed."""
+    stamps = np.arange(0.0, 44.0, 0.1)
+    x = np.where(stamps < 4.0, 2.5 * stamps, 10.0 + 0.25 * (stamps - 4.0))
+    heading = np.where(stamps < 4.0, 0.0, np.pi / 4)
+    agreement, varied = heading_agreement(Odometry(stamps, np.column_stack([x, 0 * x, heading])))
+    # Two equal halves whose doubled angles are a right angle apart.
+    assert agreement == pytest.approx(np.sqrt(0.5), abs=0.01)
+    assert not varied
+    short = heading_agreement(Odometry(stamps[:3], np.zeros((3, 3))))
+    assert short == (1.0, False)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_degrees_are_refused_and_radians_are_not(wrapped):
+    path = arc()
+    degrees = np.degrees(path.poses[:, 2])
+    degrees = (degrees + 180.0) % 360.0 - 180.0 if wrapped else degrees
+    with pytest.raises(DataError, match=r"as such it agrees with the path to 1\.00 of 1, as radians to 0"):
+        refuse_degrees(with_heading(path, degrees))
+    # A heading against the path is another fault; and one that hardly turns shows none.
+    for heading in (path.poses[:, 2], -path.poses[:, 2], 0.01 * degrees):
+        refuse_degrees(with_heading(path, heading))
+    refuse_degrees(with_heading(arc(0.05), np.degrees(arc(0.05).poses[:, 2])))

@@ -1,0 +1,215 @@
+"""Wheels against lidar: where wheels stand, which pairs are compared, and what a sustained disagreement is."""
+
+import numpy as np
+import pytest
+
+from uwblite import se2
+from uwblite.screening.wheel_motion import (
+    Pairs,
+    _chosen,
+    _factor,
+    _ratios,
+    _span,
+    _within,
+    compare,
+    disagreeing,
+    seen,
+    standing,
+    unmatched,
+    way_ratio,
+)
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog
+
+
+def driven(speed, turn_rate, period=0.1):
+    """Return an odometry with these speeds (n,), m/s, and turn rates (n,), rad/s, one per period."""
+    steps = period * np.column_stack([speed, np.zeros(len(speed)), turn_rate])
+    return Odometry(period * np.arange(len(speed) + 1), se2.chain(np.zeros(3), steps))
+
+
+@pytest.mark.parametrize(
+    ("speed", "turn_rate", "stands"),
+    [(0.0, 0.0, True), (0.0049, 0.0, True), (0.0051, 0.0, False), (0.0, 0.0099, True), (0.0, -0.0101, False)],
+)
+def test_wheels_stand_where_they_count_less_within_a_second(speed, turn_rate, stands):
+    """From 5 to 9 s. Half a second on either side sees the motion around; nearly all of it belongs to the stand."""
+    time = 0.1 * np.arange(150)
+    rests = (time >= 4.95) & (time < 8.95)
+    found = standing(driven(np.where(rests, speed, 0.3), np.where(rests, turn_rate, 0.3)))
+    assert len(found) == stands
+    if stands:
+        np.testing.assert_allclose(found, [(5.05, 8.95)], atol=1e-9)
+
+
+def test_stands_at_the_ends_are_within_the_recording_and_short_ones_none():
+    time = 0.1 * np.arange(100)
+    rests = (time < 2.95) | (time > 7.95)
+    np.testing.assert_allclose(standing(driven(np.where(rests, 0.0, 0.3), 0.0 * time)), [(0.0, 2.95), (8.05, 10.0)], atol=1e-9)
+    for last, count in ((6.45, 1), (6.35, 0)):
+        rests = (time > 4.85) & (time < last)
+        assert len(standing(driven(np.where(rests, 0.0, 0.3), 0.0 * time))) == count
+    assert standing(driven(0.0 * time, 0.0 * time), 10.0) == [(0.0, 10.0)]
+    assert standing(driven(0.0 * time, 0.0 * time), 10.1) == []
+
+
+@pytest.mark.parametrize(("speed", "span"), [(0.4, 0.25), (0.05, 1.0), (5.0, 0.1), (0.0, 1.0 / 3.0)])
+def test_the_scans_of_a_pair_are_a_tenth_of_a_metre_apart(speed, span):
+    """As the robot usually drives when it moves; a third of a second where it never does, a tenth and a whole one at most."""
+    speeds = np.where(np.arange(200) % 3 == 0, 0.0, speed)
+    assert _span(driven(speeds, 0.0 * speeds)) == pytest.approx(span)
+
+
+def scanned(odometry, stamps, beams=40):
+    return SensorLog(
+        odometry, None, LaserScans(stamps, np.ones((len(stamps), beams), dtype=np.float32), 0.0, 0.01, 0.0, 0.1, 9.0)
+    )
+
+
+def test_pairs_are_spread_over_the_recording_and_over_stands():
+    """Of a lidar of 10 Hz at 0.2 m/s each pair is five scans apart; none beyond the odometry, none across a silence."""
+    time = 0.1 * np.arange(10000)
+    rests = (time > 500.0) & (time < 504.0)
+    odometry = driven(np.where(rests, 0.0, 0.2), 0.0 * time)
+    stamps = np.arange(-5.0, 1005.0, 0.1)
+    stamps = stamps[(stamps < 300.0) | (stamps > 310.0)]
+    first, second = _chosen(scanned(odometry, stamps), stamps)
+    assert set(second - first) == {5}
+    assert np.all((stamps[first] >= 0.0) & (stamps[second] <= odometry.stamps[-1]))
+    assert np.all(stamps[second] - stamps[first] < 1.5)
+    possible = np.sum((stamps[:-5] >= 0.0) & (stamps[5:] <= odometry.stamps[-1]) & (stamps[5:] - stamps[:-5] < 1.5))
+    inside = (stamps[first] > 500.0) & (stamps[second] < 504.0)
+    # Every 39th of 9,900 makes 254; of the 35 or so within the stand every fourth besides.
+    assert len(first) - inside.sum() == pytest.approx(possible / (possible // 250), abs=2)
+    assert 8 <= inside.sum() <= 12
+
+
+@pytest.mark.parametrize(("count", "beams", "compared"), [(19, 40, False), (20, 29, False), (20, 30, True)])
+def test_a_few_scans_or_beams_are_not_compared(count, beams, compared):
+    odometry = driven(np.full(100, 0.2), np.zeros(100))
+    assert (compare(scanned(odometry, np.arange(count) * 0.4, beams)) is not None) == compared
+    assert compare(scanned(odometry, 100.0 + np.arange(40.0))) is None
+    assert compare(SensorLog(odometry)) is None
+
+
+def pairs(count=100, way=0.1, turn=0.0, **more):
+    wheels = np.column_stack([np.full(count, way), np.zeros(count), np.full(count, turn)])
+    start = np.arange(float(count))
+    given = {"start": start, "end": start + 0.5, "lidar": wheels.copy(), "wheels": wheels, "share": np.ones(count)}
+    return Pairs(**{**given, **more})
+
+
+def test_only_pairs_within_a_time_that_match_measure_it():
+    share = np.ones(10)
+    share[[3, 4]] = 0.6, 0.59
+    found = pairs(10, share=share)
+    assert np.flatnonzero(_within(found, 2.0, 6.5)).tolist() == [2, 3, 5, 6]
+    assert np.flatnonzero(_within(found, 2.1, 6.4)).tolist() == [3, 5]
+    assert (seen(found, 2.0, 5.5), seen(found, 2.1, 5.5)) == (True, False)
+
+
+def test_ratios_are_those_along_the_wheels_of_clear_motions():
+    rng = np.random.default_rng(1)
+    wheels, lidar = rng.normal(size=(50, 2)) * 0.1, rng.normal(size=(50, 2))
+    rows, ratio = _ratios(wheels, lidar, 0.08)
+    expected = [k for k in range(50) if np.hypot(*wheels[k]) > 0.08]
+    assert rows.tolist() == expected
+    # The factor by which the wheels' motion comes nearest to the lidar's.
+    np.testing.assert_allclose(ratio, [np.linalg.lstsq(wheels[k, :, None], lidar[k], rcond=None)[0][0] for k in expected])
+    assert _factor(wheels, lidar, 0.08) == np.median(ratio)
+    assert _factor(wheels[expected][:12], lidar[expected][:12], 0.0) == np.median(ratio[:12])
+    assert (_factor(wheels[:11], lidar[:11], 0.0), _factor(wheels[:11], lidar[:11], 0.0, 7.0)) == (1.0, 7.0)
+
+
+def test_the_way_ratio_is_of_measured_pairs_with_a_clear_way():
+    found = pairs(40)
+    found.lidar[:, :2] *= 1.1
+    found.lidar[:10, :2] *= 5.0
+    found.share[:10] = 0.5
+    found.wheels[10:15, 0] = 0.05
+    assert way_ratio(found) == pytest.approx(1.1)
+    assert np.isnan(way_ratio(found.rows(np.arange(40) < 20)))
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.39, True), (0.41, False)])
+def test_scans_do_not_match_where_one_pair_in_ten_does_not_either(share, said):
+    shares = np.linspace(0.0, share / 0.9, 301)[1:]
+    found = unmatched(pairs(400, share=np.append(shares, np.zeros(100))))
+    assert len(found) == said
+    assert all(f"less than {100 * share:.0f} %" in r.text for r in found)
+    assert len(unmatched(pairs(24, share=np.full(24, 0.1)))) == 1
+    assert unmatched(pairs(24, share=np.append(np.full(23, 0.1), 0.0))) == []
+
+
+@pytest.mark.parametrize(
+    ("off", "said"),
+    [
+        # 0.05 m and 0.35 of the larger of both ways: of 0.1 m against 0.23 m 0.1305 m; 0.06 rad and 0.35 of the larger turn.
+        ((0.129, 0.0, 0.0), False), ((0.135, 0.0, 0.0), True), ((-0.084, 0.0, 0.0), False), ((-0.086, 0.0, 0.0), True),
+        ((0.0, 0.091, 0.0), False), ((0.0, 0.1, 0.0), True), ((0.0, 0.0, 0.092), False), ((0.0, 0.0, -0.093), True),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("factor", [1.0, 0.8])
+def test_a_motion_that_noise_does_not_explain_for_long_is_a_doubt(off, said, factor):
+    """Of ten pairs in a row, a second apart; the one factor between all ways is taken out before."""
+    found = pairs(wheels=pairs().wheels / [factor, 1.0, 1.0])
+    found.lidar[40:50] += off
+    if not said:
+        assert disagreeing(found, 0.0) == []
+        return
+    (remark,) = disagreeing(found, 10.0)
+    assert remark.doubt
+    first, last = (int(word) for word in (remark.text.split("t = ")[1].split()[0], remark.text.split(" to ")[1].split()[0]))
+    assert abs(first - 30) <= 2
+    assert abs(last - 40) <= 2
+
+
+@pytest.mark.parametrize(("count", "said"), [(4, False), (9, True)])
+def test_a_disagreement_lasts_six_seconds_and_pairs_that_do_not_match_say_nothing(count, said):
+    found = pairs()
+    found.lidar[40 : 40 + count, 1] = 0.5
+    assert len(disagreeing(found, 0.0)) == said
+    quick = pairs(start=0.5 * np.arange(100.0), end=0.5 * np.arange(100.0) + 0.2)
+    quick.lidar[40 : 40 + count, 1] = 0.5
+    assert disagreeing(quick, 0.0) == []
+    found.share[40 : 40 + count] = 0.5
+    assert disagreeing(found, 0.0) == []
+    few = pairs(23)
+    few.lidar[:12, 1] = 0.5
+    assert disagreeing(few, 0.0) == []
+
+
+def test_of_many_stretches_three_are_said():
+    found = pairs(400)
+    for first in range(20, 400, 80):
+        found.lidar[first : first + 12, 1] = 0.5
+    (remark,) = disagreeing(found, 0.0)
+    assert remark.text.count("t = ") == 3
+    assert "and 2 more stretches" in remark.text
+
+
+@pytest.mark.parametrize("kind", ["way", "turn"])
+@pytest.mark.parametrize(("ratio", "said"), [(1.13, False), (1.17, True), (0.87, False), (0.83, True)])
+@pytest.mark.parametrize(("first", "last"), [(120, 156), (0, 120)])
+def test_another_ratio_for_a_stretch_is_a_doubt(kind, ratio, said, first, last):
+    """A tyre that loses air, a floor on which the wheels slip evenly; half of a recording may be the other's exception."""
+    found = pairs(240, turn=0.2 if kind == "turn" else 0.0, way=0.1 if kind == "way" else 0.0)
+    rng = np.random.default_rng(0)
+    found.lidar[:] *= 1.0 + 0.01 * rng.standard_normal((240, 1))
+    found.lidar[first:last] *= ratio
+    remarks = disagreeing(found, 0.0)
+    assert len(remarks) == said
+    if said:
+        stretch = [int(word) for word in remarks[0].text.split("t = ")[1].split(" s)")[0].split(" to ")]
+        assert stretch in ([first, last - 1], [first, last], [120, 239], [120, 240])
+
+
+def test_ratios_that_scatter_everywhere_show_no_stretch():
+    rng = np.random.default_rng(1)
+    found = pairs(240)
+    found.lidar[:, :2] *= 1.0 + 0.25 * rng.standard_normal((240, 1))
+    assert disagreeing(found, 0.0) == []
+    # Fewer than three dozen clear ways say nothing either.
+    few = pairs(240, way=0.04)
+    few.wheels[:35, 0] = few.lidar[:35, 0] = 0.1
+    few.lidar[:12, 0] = 0.13
+    assert disagreeing(few, 0.0) == []
