@@ -23,7 +23,7 @@ from .graph import Graph, Linearization, linearize
 from .normal_equations import NormalEquations
 from .problem_checks import check
 from .robust import SQUARED, Kernel
-from .solver import Progress, SolverConfig, SolverSummary, minimise, optimize
+from .solver import Progress, SolverConfig, SolverSummary, minimise
 
 _MU_FACTOR = 2.0
 """Factor on mu from step to step; one linear system is solved for each."""
@@ -38,10 +38,16 @@ def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], so
     ----------
     chosen : their positions in ``graph.edges``.
     """
+    normal: NormalEquations | None = None
     for scale in scales:
         kernel = Kernel("geman-mcclure", scale)
         edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
-        graph = optimize(replace(graph, edges=edges), solver)[0]
+        graph = replace(graph, edges=edges)
+        check(graph)
+        linearized = linearize(graph)
+        # Kernels change no pattern.
+        normal = normal or NormalEquations(graph, linearized)
+        graph = minimise(graph, linearized, normal, solver)[0]
     return graph
 
 

@@ -43,7 +43,8 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
         new = _without_forbidden(new, task)
         missed |= set() if with_ranges else closure_candidates.missed(candidates, new, config.loop_closure)
         found = closures.merged(found, new)
-        base, found = verification.reconcile(base, found, config.loop_closure, config.solver)
+        if len(new.edges):
+            base, found = verification.reconcile(base, found, config.loop_closure, config.solver)
         task.stages.end(
             Stage("loop closure", lap + 1), submaps=len(pieces), candidates=len(candidates.target),
             accepted=len(new.edges), kept=len(found.edges),
