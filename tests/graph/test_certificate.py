@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted_graphs import every_kind, loop, plain_ranges, relative_edges
+from scipy import sparse
 
 from uwblite import se2
-from uwblite.graph.certificate import certificate_matrix, certify
+from uwblite.graph.certificate import _gap, _is_positive, certificate_matrix, certify
 from uwblite.graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.point_edges import LandmarkEdges
@@ -215,3 +216,29 @@ def test_an_edge_that_measures_no_turn_is_as_good_as_any():
     places = replace(across, sqrt_information=across.sqrt_information * [[1.0], [1.0], [0.0]])
     certified = certify(optimize(graph.with_edges(places))[0])
     assert certified.is_global, certified.reason
+
+
+@pytest.mark.parametrize("below", [0.0, 0.3, 4.0, 49.0, 51.0])
+def test_the_gap_is_what_must_be_added_to_all_headings_together(below):
+    """Five numbers of headings and one of a place; the eigenvalues of the headings begin at a given one."""
+    headings = np.random.default_rng(1).normal(size=(5, 5))
+    vectors = np.linalg.qr(headings)[0]
+    S = np.zeros((6, 6))
+    S[:5, :5], S[5, 5] = vectors @ np.diag([-below, 1.0, 2.0, 3.0, 4.0]) @ vectors.T, 7.0
+    D = np.array([1.0] * 5 + [0.0])
+    found = _gap(sparse.csc_matrix(S), D, 0.01, 250.0)
+    expected = 0.01 if below == 0.0 else 5.0 * below if below < 50.0 else np.inf
+    assert found == pytest.approx(expected, rel=0.02)
+    assert expected <= found * (1.0 + 1e-9)
+    # What is negligible already exceeds the whole cost: there is nothing between.
+    assert _gap(sparse.csc_matrix(S), D, 1000.0, 250.0) == 1000.0
+    assert _gap(sparse.csc_matrix(S - 300.0 * np.eye(6)), D, 1000.0, 250.0) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("matrix", "positive"),
+    [(np.eye(3), True), (-np.eye(3), False), (np.zeros((2, 2)), False), ([[0, 1], [1, 0]], False), ([[2, 1], [1, 2]], True)],
+)
+def test_a_matrix_is_positive_or_not(matrix, positive):
+    assert _is_positive(sparse.csc_matrix(np.array(matrix, dtype=float)), np.zeros(len(matrix))) is positive
+    assert _is_positive(sparse.csc_matrix(np.array(matrix, dtype=float)), np.full(len(matrix), 1.5)) is True

@@ -49,3 +49,11 @@ def test_parallel_edges_are_averaged_by_their_information():
     turns, places = np.array([4.0, 0.5, 18.0]), np.array([5.0, 0.5 * 2.125, 2.0])
     np.testing.assert_allclose(start.poses[1, :2], places @ T[:, :2] / places.sum())
     np.testing.assert_allclose(start.poses[1, 2], np.angle(turns @ np.exp(1j * T[:, 2])))
+
+
+def test_a_step_from_a_pose_of_uncertain_heading_keeps_its_length():
+    """Edges that contradict each other make the mean of unit numbers shorter than 1; a step taken there is none the shorter."""
+    T = np.array([[1.0, 2.0, 0.9], [1.0, 2.0, -0.7], [2.0, 5.0, 0.1], [3.0, -1.0, 0.4]])
+    edges = RelativePoseEdges(np.array([0, 0, 0, 1]), np.array([1, 1, 1, 2]), T, np.tile(np.eye(3), (4, 1, 1)))
+    poses = chordal_start(Graph(np.zeros((3, 3)), edges=(edges,), fixed_poses=np.arange(3) == 0)).poses
+    np.testing.assert_allclose(se2.between(poses[1], poses[2]), T[3])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.lidar.beam_gaps import filled
+from uwblite.lidar.beam_gaps import _on_one_line, filled
 from uwblite.odometry.attached import ScanPoints
 
 
@@ -71,3 +71,50 @@ def test_gaps_are_filled_between_coarse_beams_whatever_way_they_look(turn, beams
     assert (len(found.points) > 1.2 * len(rays.points)) is dense
     assert dense or len(found.points) == len(rays.points)
     np.testing.assert_allclose(found.points @ [np.cos(turn), np.sin(turn)], 13.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_gap_is_filled_by_the_rules_for_each_hit(seed):
+    """Hit by hit: the next beam of the same scan, a gap that is wide but not too wide, beams that are coarse there and not too
+    long, and one of the neighbouring gaps on the same line."""
+    rng = np.random.default_rng(seed)
+    count = 400
+    angle = np.cumsum(rng.choice([0.004, 0.006, 0.01, 0.017], count))
+    ranges = np.repeat(rng.uniform(2.0, 17.0, count // 8), 8) * (1.0 + 0.003 * rng.standard_normal(count))
+    points = ranges[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    origins = np.tile([0.1, -0.2], (count, 1))
+    ray, scan = np.cumsum(rng.choice([1, 2], count, p=[0.95, 0.05])), np.arange(count) // 100
+    rays = ScanPoints(scan, points, origins, ray, scan)
+
+    def joined(k):
+        return 0 <= k < count - 1 and scan[k + 1] == scan[k] and ray[k + 1] == ray[k] + 1
+
+    def on(k, other):
+        """Whether the step from hit k goes on along the step from another one."""
+        if not joined(other) or np.hypot(*(points[other + 1] - points[other])) >= 0.6:
+            return False
+        step, beside = points[k + 1] - points[k], points[other + 1] - points[other]
+        length = np.hypot(*step)
+        along, across = step @ beside / length, abs(step[0] * beside[1] - step[1] * beside[0]) / length
+        return along > 0.4 * length and across < 0.04 + 0.08 * along
+
+    expected = []
+    for k in range(count):
+        if not joined(k):
+            expected.append(False)
+            continue
+        step, beam = points[k + 1] - points[k], points[k] - origins[k]
+        turn = abs(step[0] * beam[1] - step[1] * beam[0]) / (beam @ beam)
+        wide, near = 0.1 < np.hypot(*step) < 0.6, np.hypot(*beam) < 15.0
+        expected.append(bool(wide and near and turn > 0.0075 and (on(k, k - 1) or on(k, k + 1))))
+    assert _on_one_line(rays).tolist() == expected
+    assert sum(expected) > 10
+    done = filled(rays)
+    # Each gap is divided into equal parts of at most 0.1 m, in the order of the beams.
+    parts = [int(np.ceil(np.hypot(*(points[k + 1] - points[k])) / 0.1)) if gap else 1 for k, gap in enumerate(expected)]
+    filled_up = [np.linspace(points[k], points[min(k + 1, count - 1)], n, endpoint=False) for k, n in enumerate(parts)]
+    np.testing.assert_allclose(done.points, np.concatenate(filled_up))
+    np.testing.assert_array_equal(done.ray, np.repeat(ray, parts))
+    np.testing.assert_array_equal(done.scan, np.repeat(scan, parts))
+    np.testing.assert_array_equal(done.keyframe, done.scan)
+    np.testing.assert_allclose(done.origins, [[0.1, -0.2]] * len(done.ray))

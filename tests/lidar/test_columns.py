@@ -73,3 +73,30 @@ def test_a_circle_scores_by_its_arc_less_what_stands_around_it_and_how_far_its_c
         assert score[0] == pytest.approx(1.0 - 0.7 * spoilt, abs=0.7 * 2.5 / 24 if spoilt else 0.02)
     wide = circle((0.0, 0.0), 0.25 + 0.5 * CELL)
     assert _scores(np.zeros((1, 2)), wide, 0.25, CELL)[0][0] == pytest.approx(0.75, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fitted_circle_is_where_tukey_s_cost_is_least(seed):
+    """Of noisy points all around and some astray: its numeric slope vanishes there."""
+    rng = np.random.default_rng(seed)
+    points = circle((1.0, 2.0), 0.3, 0.0, 5.0)[::4]
+    points = np.concatenate([points + 0.02 * rng.standard_normal(points.shape), rng.uniform((0.5, 1.5), (1.5, 2.5), (6, 2))])
+
+    def cost(centre, gate=0.1):
+        residual = np.hypot(*(points - centre).T) - 0.3
+        return np.sum(1.0 - np.maximum(1.0 - (residual / gate) ** 2, 0.0) ** 3)
+
+    found = fit_circle(points, np.array([1.02, 1.97]), 0.3, 0.1)
+    assert max(abs(cost(found + step) - cost(found - step)) / 2e-4 for step in 1e-4 * np.eye(2)) < 0.05
+    assert cost(found) < min(cost(found + 0.01 * np.array([np.cos(a), np.sin(a)])) for a in np.arange(8) * np.pi / 4)
+
+
+@pytest.mark.parametrize(("share", "is_found"), [(0.26, False), (0.36, True)])
+def test_a_third_of_the_circle_is_too_little(share, is_found):
+    part = circle((2.0, -1.0), 0.25, 0.0, share * 2.0 * np.pi)
+    assert np.isfinite(find_columns(part, expected((2.0, -1.0), radius=0.25)).positions).all() == is_found
+
+
+def test_of_two_columns_that_look_alike_the_nearer_one_is_taken():
+    both = np.concatenate([circle((1.5, -1.0), 0.25), circle((2.6, -1.0), 0.25)])
+    np.testing.assert_allclose(find_columns(both, expected((2.0, -1.0))).positions, [(1.5, -1.0)], atol=1e-3)

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.planted_graphs import plain_ranges
 
-from uwblite.graph.graph import Graph
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import SolverConfig
-from uwblite.pipeline.mirror_images import find_mirror_images
+from uwblite.pipeline.mirror_images import _costs, _images, find_mirror_images
 
 ANCHOR = np.array([4.0, 3.0])
 
@@ -87,3 +88,48 @@ def test_an_anchor_that_is_fixed_keeps_what_was_said_of_it(fixed):
     done = find_mirror_images(replace(before, graph=graph), TASK)
     assert done.bootstrap.ambiguous.tolist() == [not fixed]
     assert (done.bootstrap is before.bootstrap) is fixed
+
+
+def test_the_other_place_is_mirrored_at_the_line_that_fits_the_tag_s_places_best():
+    """Of each anchor's own ranges that count; where the bootstrap has a second place, that one."""
+    rng = np.random.default_rng(3)
+    tags = np.column_stack([rng.normal(size=40), 0.1 * rng.normal(size=40)]) @ np.array([[0.6, 0.8], [-0.8, 0.6]])
+    anchor = np.repeat([0, 1, 2, 3], 10)
+    alive = np.arange(40) % 5 != 0
+    ranges = replace(plain_ranges(np.arange(40), anchor, np.ones(40), 0.1), weights=alive.astype(float))
+    places = rng.normal(size=(4, 2)) * 5.0
+    second = Hypothesis(np.array([7.0, 7.0]))
+    graph = Graph(np.column_stack([tags, np.zeros(40)]), places.copy())
+    found = Bootstrap(
+        np.array([True, True, False, True]), np.array([False, True, False, True]), ((), (second, second), (), (second,))
+    )
+    images = _images(Estimate(graph, ranges, found, found.placed), ranges)
+    np.testing.assert_array_equal(images[[1, 2]], [[7.0, 7.0], places[2]])
+    for k in (0, 3):
+        own = tags[(anchor == k) & alive]
+        middle, (_, _, (along, across)) = own.mean(axis=0), np.linalg.svd(own - own.mean(axis=0))
+        np.testing.assert_allclose((images[k] - middle) @ along, (places[k] - middle) @ along)
+        np.testing.assert_allclose((images[k] - middle) @ across, -(places[k] - middle) @ across)
+    np.testing.assert_array_equal(graph.anchors, places)
+
+
+def test_costs_are_those_of_the_ranges_and_of_the_priors_of_bias_and_height():
+    """Each prior once for every anchor whose ranges use it."""
+    rng = np.random.default_rng(1)
+    columns = np.full((6, 6), -1)
+    columns[:, 1], columns[:, 2] = [0, 0, 1, 1, 1, 1], [2, 2, 2, 2, -1, -1]
+    anchor = np.array([0, 0, 1, 1, 1, 2])
+    ranges = replace(plain_ranges(np.zeros(6, int), anchor, rng.uniform(1.0, 9.0, 6), 0.5), calibration=columns)
+    calibration = Calibration(
+        (UnknownKey("bias", "A"), UnknownKey("bias", "B"), UnknownKey("height2")), np.array([0.3, -0.2, 0.4])
+    )
+    prior = PriorEdges("calibration", np.arange(3), np.zeros((3, 1)), np.array([2.0, 3.0, 5.0])[:, None, None])
+    graph = Graph(np.zeros((1, 3)), rng.normal(size=(3, 2)), (prior,), calibration)
+    worth = rng.uniform(size=6)
+    squared, of_priors = ranges.residuals(graph)[:, 0] ** 2 * worth, np.array([0.6, 0.6, 2.0]) ** 2
+    expected = [
+        squared[:2].sum() + of_priors[[0, 2]].sum(),
+        squared[2:5].sum() + of_priors[[1, 2]].sum(),
+        squared[5] + of_priors[1],
+    ]
+    np.testing.assert_allclose(_costs(graph, ranges, worth), expected)

@@ -21,6 +21,7 @@ from uwblite.pipeline.plausibility import (
     check_fit,
     check_handedness,
     check_moved_together,
+    check_sustained_outliers,
     outlier_stretches,
 )
 from uwblite.pipeline.progress import Stages
@@ -174,17 +175,16 @@ def test_ranges_without_odometry_are_left_out_and_counted():
     _, _, log = run()
     late = log.ranges.stamps > log.odometry.stamps[-1] - 20.0
     # A robot that drove on without odometry: these ranges were made who knows where.
-    cut = replace(log, odometry=replace(
-        log.odometry, stamps=log.odometry.stamps[:-200], poses=log.odometry.poses[:-200]
-    ))
+    cut = replace(log, odometry=replace(log.odometry, stamps=log.odometry.stamps[:-200], poses=log.odometry.poses[:-200]))
     outside = cut.ranges.stamps > cut.odometry.stamps[-1] + OUTSIDE
     assert 30 < outside.sum() <= late.sum()
     result = build_map(cut)
     assert stated(result.warnings, f"{outside.sum()} of {len(outside)} ranges were stamped outside the odometry's time")
     np.testing.assert_array_equal(result.range_table["weight"][outside], 0.0)
-    without = replace(cut, ranges=replace(cut.ranges, **{
-        n: getattr(cut.ranges, n)[~outside] for n in ("stamps", "anchor", "ranges", "quality")
-    }))
+    without = replace(
+        cut,
+        ranges=replace(cut.ranges, **{n: getattr(cut.ranges, n)[~outside] for n in ("stamps", "anchor", "ranges", "quality")}),
+    )
     np.testing.assert_allclose(build_map(without).trajectory, result.trajectory, atol=1e-6)
 
 
@@ -283,3 +283,26 @@ def test_residuals_twice_as_large_as_noise_allows_after_the_last_optimisation_ar
     stages.end("summary")
     check_fit(SimpleNamespace(stages=stages))
     assert [n.figures["chi2_per_dof"] for n in stages.doubts] == ([fits[-1]] if doubted else [])
+
+
+def test_an_anchor_that_disagrees_for_long_is_named_with_the_times_since_the_beginning():
+    """Of three anchors the second disagrees from 200 s on and in four more stretches; ranges without weight do not count."""
+    stamps = np.tile(1000.0 + np.arange(1000.0), 3)
+    anchor = np.repeat([0.0, 1.0, 2.0], 1000)
+    wrong = np.zeros(3000, dtype=bool)
+    for first in (200, 400, 500, 600, 700):
+        wrong |= (anchor == 1) & (stamps >= 1000 + first) & (stamps < 1050 + first)
+    table = {
+        "stamp": stamps, "anchor": anchor, "agrees": np.where(wrong | (anchor == 2), 0.0, 1.0),
+        "weight": np.where(anchor == 2, 0.0, 1.0),
+    }  # fmt: skip
+    stages = Stages(None, None)
+    check_sustained_outliers(
+        table, "ABC", SimpleNamespace(recordings=SimpleNamespace(stamps=np.array([1000.0, 9e3])), stages=stages)
+    )
+    (notice,) = stages.warnings
+    assert (notice.kind, notice.figures["anchor"], len(notice.figures["stretches"])) == ("sustained-outliers", "B", 5)
+    assert (
+        "anchor B disagrees with the map for long (t = 200 to 249 s, 400 to 449 s, 500 to 549 s, 600 to 649 s ...)"
+        in notice.text
+    )

@@ -6,21 +6,24 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
+from helpers.planted_graphs import plain_ranges
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.graph.calibration import scan_indices
-from uwblite.graph.graph import Calibration, Graph
+from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.mapping import build_map
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.residual_tests import (
     check_odometry_jumps,
     check_odometry_steps,
+    check_range_scatter,
     check_scales,
     check_slips,
     check_support,
 )
+from uwblite.radio.range_noise import RangeNoiseConfig
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +78,7 @@ def steps_that_slip(spans, doubts=(), degenerate=False, standing=False):
     stages = Stages(None, None)
     for kind in doubts:
         stages.doubt(kind, "")
-    recordings = SimpleNamespace(stamps=np.arange(80.0), path=np.arange(80.0))
+    recordings = SimpleNamespace(stamps=50.0 + np.arange(80.0), path=np.arange(80.0))
     check_odometry_steps(
         SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,))),
         SimpleNamespace(recordings=recordings, stages=stages),
@@ -124,7 +127,7 @@ def test_a_jump_that_only_closures_make_is_a_doubt(placed, measured):
     stages = Stages(None, None)
     check_odometry_jumps(
         SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(wheels, scan)), placed=np.array([placed])),
-        SimpleNamespace(recordings=SimpleNamespace(stamps=np.arange(80.0)), stages=stages),
+        SimpleNamespace(recordings=SimpleNamespace(stamps=50.0 + np.arange(80.0)), stages=stages),
     )
     assert [n.kind for n in stages.doubts] == ([] if placed or measured else ["odometry-jumps"])
     assert all(n.figures["at"] == 39.0 and abs(n.figures["metres"] - 3.0) < 1e-6 for n in stages.doubts)
@@ -142,7 +145,7 @@ def test_a_single_step_far_off_is_named_unless_the_lidar_measures_it(way, kind, 
     stages = Stages(None, None)
     check_slips(
         SimpleNamespace(odometry=wheels, graph=Graph(truth, edges=(ties,) if lidar else ()), placed=np.array([True])),
-        SimpleNamespace(recordings=SimpleNamespace(stamps=np.arange(40.0)), stages=stages),
+        SimpleNamespace(recordings=SimpleNamespace(stamps=50.0 + np.arange(40.0)), stages=stages),
     )
     said = [("doubt", n) for n in stages.doubts] + [("warning", n) for n in stages.warnings]
     assert [rank for rank, _ in said] == ([] if lidar or kind is None else [kind])
@@ -193,3 +196,49 @@ def test_a_trajectory_that_only_the_odometry_counts_is_a_doubt(poses, edges, ali
     graph = Graph(np.zeros((poses, 3)), edges=(ties,) * len(edges))
     check_support(SimpleNamespace(ranges=ranges, graph=graph), SimpleNamespace(stages=stages))
     assert [n.kind for n in stages.doubts] == (["odometry-alone"] if doubted else [])
+
+
+@pytest.mark.parametrize(("scale", "placed", "lidar", "said"), [
+    (1.119, True, True, None), (1.121, True, True, "1.12 times the distances on the map: lidar or radio has a wrong unit"),
+    (0.879, True, False, "0.88 times the distances on the map: a radio measures time of flight"), (2.0, False, True, None),
+])  # fmt: skip
+def test_ranges_of_another_scale_are_named_where_anchors_are_placed(scale, placed, lidar, said):
+    calibration = Calibration((UnknownKey("bias", "A"), UnknownKey("range_scale")), np.array([5.0, scale - 1.0]))
+    estimate = SimpleNamespace(graph=Graph(np.zeros((3, 3)), calibration=calibration), placed=np.array([placed]))
+    stages = Stages(None, None)
+    check_scales(estimate, SimpleNamespace(recordings=SimpleNamespace(each=[], have_scans=lidar), stages=stages))
+    assert [n.figures["range_scale"] for n in stages.doubts] == ([] if said is None else [scale])
+    assert all(f"the ranges are {said}" in n.text for n in stages.doubts)
+    other = replace(estimate.graph, calibration=Calibration((UnknownKey("bias", "A"),), np.array([5.0])))
+    estimate.graph = other
+    check_scales(estimate, SimpleNamespace(recordings=SimpleNamespace(each=[], have_scans=lidar), stages=Stages(None, None)))
+
+
+@pytest.mark.parametrize(("placed", "outcome"), [(True, "the ranges agree with the wheels"), (False, "nothing shows which")])
+def test_whether_ranges_speak_for_the_wheels_is_said(placed, outcome):
+    each = [SimpleNamespace(log=SimpleNamespace(screening=SimpleNamespace(lidar_by_wheels=1.3)))]
+    stages = Stages(None, None)
+    estimate = SimpleNamespace(graph=Graph(np.zeros((3, 3))), placed=np.array([placed]))
+    check_scales(estimate, SimpleNamespace(recordings=SimpleNamespace(each=each, have_scans=True), stages=stages))
+    (notice,) = stages.doubts
+    assert f"measures 1.30 times the distance that the wheels count, and {outcome}" in notice.text
+
+
+@pytest.mark.parametrize(("off", "steps", "said"), [
+    (0.29, 0.0, None), (0.31, 0.0, "the ranges lie 0.31 m (typically) off the map, and only 0.0"), (0.31, 0.2, None),
+    (1.6, 0.6, "the ranges scatter by 1.6 m: they are no distances"), (1.4, 0.6, None),
+])  # fmt: skip
+def test_ranges_scatter_more_than_from_one_to_the_next(off, steps, said):
+    """Three anchors whose residuals, of either sign for a whole half, are off by so much; the typical one counts."""
+    stamps, anchor = np.arange(600.0), np.arange(600) % 3
+    rng = np.random.default_rng(0)
+    # The median absolute deviation of two values, one each half, is half their distance: in sigmas 1.4826 times that.
+    residuals = np.where(stamps < 300.0, -1.0, 1.0) * off / 1.4826 * np.array([1.0, 0.2, 5.0])[anchor]
+    values = 10.0 + residuals + steps * rng.standard_normal(600)
+    ranges = replace(plain_ranges(np.arange(600), anchor, values, 0.1), weights=np.where(stamps == 7.0, 0.0, 1.0))
+    object.__setattr__(ranges, "stamps", stamps)
+    stages = Stages(None, None)
+    task = SimpleNamespace(config=SimpleNamespace(ranges=RangeNoiseConfig()), stages=stages)
+    check_range_scatter(SimpleNamespace(ranges=ranges), residuals, task)
+    assert len(stages.doubts) == (said is not None)
+    assert all(said in n.text for n in stages.doubts)

@@ -1,22 +1,35 @@
 """The result in the user's words: anchors with status and reason, calibration with state, warnings and doubts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.planted import odometry, ranges, recording, wander
-from helpers.planted_graphs import loop
+from helpers.planted_graphs import loop, plain_ranges
 
 from uwblite import se2
 from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.graph.calibration import CalibrationConfig
+from uwblite.graph.calibration import CalibrationConfig, Unknown
+from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.map_result import AnchorEstimate, Notice
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.wheels import with_noise_shown
+from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.mapping_config import preset
-from uwblite.pipeline.summary import _distrusted, _reason_to_distrust, _with_steady_errors
+from uwblite.pipeline.summary import (
+    _anchor,
+    _calibration,
+    _distrusted,
+    _range_table,
+    _reason_to_distrust,
+    _with_steady_errors,
+    _with_times,
+)
+from uwblite.radio.bootstrap import BootstrapResult
+from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.sensor_log import SensorMounting
 
 PLACES = np.array([[6.5, 1.0], [-5.5, 5.0], [-2.0, -6.5], [1.0, 7.0]])
@@ -220,3 +233,131 @@ def test_what_ranges_err_alike_counts_in_covariances_where_no_lidar_holds_the_po
     found = _with_steady_errors(graph, 3, replace(MappingConfig().ranges, steady=steady))
     assert found.edges == graph.edges
     assert asked == ([(graph.edges[2], 3, True)] if counted else [])
+
+
+def anchor_of(found=None, ranges=None, recordings=None, k=1, limit=0.2):
+    """Judge anchor B of two whose places and residuals are given; its first two ranges of three are within the limit."""
+    graph = Graph(np.zeros((3, 3)), np.array([[9.0, 9.0], [3.0, 4.0]]), (), Calibration(BIASES, np.array([0.7, 0.2, 0.3])))
+    covariance = SimpleNamespace(anchors=np.array([np.eye(2), np.diag([0.04, 0.09])]), calibration=np.array([0.5, 0.6, 0.7]))
+    estimate = Estimate(graph, None, ranges, ("A", "B"), found)
+    return _anchor(k, estimate, recordings, covariance, np.array([5.0, 0.1, -0.19, 0.21]), limit)
+
+
+BIASES = (UnknownKey("bias", "A"), UnknownKey("bias", "B"), UnknownKey("bias", "B", 1))
+
+
+def measured(bias=(0, 2, 1, 2)):
+    columns = np.full((4, 6), -1)
+    columns[:, 1] = bias
+    return replace(
+        plain_ranges(np.zeros(4, int), np.array([0, 1, 1, 1]), np.array([90.0, 5.0, 7.0, 6.0]), 0.1), calibration=columns
+    )
+
+
+def bootstrapped(placed=(True, True), ambiguous=(False, False)):
+    places = tuple(AnchorHypothesis(np.array([float(k), -4.0]), 0.0, 0.1, 0.0, 0.1) for k in range(2))
+    return BootstrapResult(None, np.array(placed), ((), places), np.array(ambiguous))
+
+
+def test_an_anchor_is_summed_up_from_its_own_ranges():
+    found = anchor_of(bootstrapped(), measured())
+    assert (found.id, found.ranges, found.status, found.reason) == ("B", 3, "ok", "")
+    np.testing.assert_array_equal(found.position, [3.0, 4.0])
+    np.testing.assert_array_equal(found.covariance, np.diag([0.04, 0.09]))
+    assert found.used_share == pytest.approx(2 / 3)
+    # The bias in the first recording with ranges to it.
+    assert (found.bias, found.bias_sigma) == (0.2, 0.6)
+    assert found.residual_rms == pytest.approx(1.4826 * 0.11)
+    assert found.alternative is None
+    without = anchor_of(bootstrapped(), measured(bias=(-1, -1, -1, -1)))
+    assert (without.bias, without.bias_sigma) == (0.0, 0.0)
+
+
+def test_an_anchor_with_a_mirror_image_says_where_and_what_else_is_wrong():
+    found = anchor_of(bootstrapped(ambiguous=(False, True)), measured())
+    assert (found.status, found.alternative.tolist()) == ("mirror-ambiguous", [1.0, -4.0])
+    assert found.reason.startswith("the path past it is too straight")
+    wild = anchor_of(bootstrapped(ambiguous=(False, True)), measured(), limit=0.01)
+    assert (wild.status, wild.reason.split(";")[0]) == ("mirror-ambiguous", "only 0% of its ranges agree with the map")
+    assert "too straight" in wild.reason
+    assert anchor_of(bootstrapped(), measured(), limit=0.01).status == "distrusted"
+    # One hypothesis alone has no mirror image; the place of another anchor is no concern.
+    assert anchor_of(bootstrapped(ambiguous=(True, False)), measured()).status == "ok"
+
+
+def test_an_anchor_without_a_place_says_how_many_ranges_it_has():
+    for found in (bootstrapped(placed=(True, False)), None):
+        anchor = anchor_of(found, measured())
+        assert (anchor.status, anchor.ranges, anchor.used_share) == ("unplaced", 3, 0.0)
+        assert "3 ranges" in anchor.reason
+        assert np.isnan(
+            [*anchor.position, *anchor.covariance.ravel(), anchor.bias, anchor.bias_sigma, anchor.residual_rms]
+        ).all()
+    # Where no range could be used at all, the recordings say how many there are.
+    each = [
+        SimpleNamespace(anchor_ids=("B", "A"), log=SimpleNamespace(ranges=SimpleNamespace(anchor=np.array([0, 0, 1])))),
+        SimpleNamespace(anchor_ids=("A",), log=SimpleNamespace(ranges=SimpleNamespace(anchor=np.array([0])))),
+        SimpleNamespace(anchor_ids=("A", "B"), log=SimpleNamespace(ranges=SimpleNamespace(anchor=np.array([1, 1, 1, 0])))),
+        SimpleNamespace(anchor_ids=("B",), log=SimpleNamespace(ranges=None)),
+    ]
+    assert anchor_of(recordings=SimpleNamespace(each=each)).ranges == 5
+
+
+def test_places_of_a_moved_anchor_say_from_when_on_they_hold():
+    def named(*ids):
+        return tuple(AnchorEstimate(i, np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for i in ids)
+
+    ranges = plain_ranges(np.zeros(6, int), np.array([0, 1, 1, 2, 2, 2]), np.ones(6), 0.1)
+    ranges = replace(ranges, stamps=np.array([7.0, 9.0, 8.0, 30.0, 20.0, 25.0]))
+    moved = _with_times(named("A", "B", "B@2", "C"), ranges)
+    np.testing.assert_array_equal([a.since for a in moved], [np.nan, 8.0, 20.0, np.nan])
+    for alike in (named("A", "B", "C"), named("A", "B@2")):
+        assert _with_times(alike, ranges) is alike
+    pair = named("A", "A@2")
+    assert _with_times(pair, None) is pair
+    unheard = _with_times(named("A", "B", "C", "C@2"), ranges)
+    np.testing.assert_array_equal([a.since for a in unheard], [np.nan, np.nan, 20.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("value", "fixed", "sigma", "by_steps", "state", "shown", "reason"),
+    [
+        (0.3, False, 0.69, None, "estimated", 0.69, ""), (0.3, False, 0.71, None, "prior", 0.71, "does not show it better"),
+        (0.3, True, 0.1, None, "prior", 1.0, "fixed"), (0.0, True, 0.1, None, "prior", 1.0, "no measurement of it"),
+        (0.3, True, 0.1, 0.05, "estimated", 0.05, ""),
+    ],
+)  # fmt: skip
+def test_a_value_is_estimated_where_the_recording_shows_it_better_than_the_prior(
+    value, fixed, sigma, by_steps, state, shown, reason
+):
+    graph = Graph(
+        np.zeros((1, 3)),
+        calibration=Calibration(BIASES, np.array([9.0, value, 9.0])),
+        fixed_calibration=np.array([False, fixed, False]),
+    )
+    found = _calibration(
+        1, Unknown(BIASES[1], 1.0, "m", "what"), graph, SimpleNamespace(calibration=np.array([9.0, sigma, 9.0])), by_steps
+    )
+    assert (found.key, found.value, found.unit, found.meaning) == (BIASES[1], value, "m", "what")
+    assert (found.state, found.sigma) == (state, shown)
+    assert reason in found.reason
+    assert bool(found.reason) == (state == "prior")
+
+
+def test_the_table_of_ranges_says_where_each_was_taken():
+    rng = np.random.default_rng(0)
+    poses = rng.normal(size=(4, 3))
+    ranges = replace(
+        plain_ranges(np.array([3, 0, 2]), np.array([1, 0, 1]), np.array([4.0, 5.0, 6.0]), 0.1), turn=np.array([0.0, 3.0, 0.5])
+    )
+    recordings = SimpleNamespace(of_keyframe=np.array([0, 0, 1, 2]))
+    table = _range_table(ranges, Graph(poses), np.arange(3.0), np.ones(3), np.array([True, False, True]), recordings)
+    np.testing.assert_allclose(np.column_stack([table["x"], table["y"]]), ranges.tag_positions(poses))
+    np.testing.assert_allclose(se2.wrap_angle(table["theta"] - poses[[3, 0, 2], 2] - ranges.turn), 0.0, atol=1e-12)
+    assert np.abs(table["theta"]).max() <= np.pi
+    assert [table[n].tolist() for n in ("recording", "agrees", "anchor", "residual")] == [
+        [2, 0, 1],
+        [1, 0, 1],
+        [1, 0, 1],
+        [0, 1, 2],
+    ]
