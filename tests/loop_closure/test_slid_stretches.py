@@ -10,7 +10,18 @@ from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.graph.solver import SolverConfig
 from uwblite.loop_closure.closures import Closures, LoopClosureConfig
-from uwblite.loop_closure.slid_stretches import jumps, moved_by, scans_fixing, slid
+from uwblite.loop_closure.slid_stretches import (
+    _AGREES,
+    _CLEAR_HEADING,
+    _CLEAR_PLACE,
+    NEAR,
+    directions_constrained,
+    jumps,
+    moved_by,
+    scans_fixing,
+    slid,
+    tied_parts,
+)
 from uwblite.loop_closure.verification import _tightened, reconcile
 from uwblite.map_result import LoopClosure
 from uwblite.odometry.wheels import OdometryNoiseConfig
@@ -103,3 +114,47 @@ def test_the_jump_back_leaves_less_than_a_third(left, slides):
     found = slid(Graph(poses, edges=(wheels,)))
     assert [(a, b) for a, b, _ in found] == ([(35, 50)] if slides else [])
     assert all(size == pytest.approx(SLIDE) for *_, size in found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_scan_edges_fix_is_counted_step_by_step(seed):
+    """Edges over up to so many keyframes that agree with the map: how many fix each step wholly, and what the best one fixes.
+
+    A direction is fixed where its sigma is within the limit; parts are tied by edges of any length and by sound steps.
+    """
+    rng = np.random.default_rng(seed)
+    truth, wheels = chain()
+    size = 80
+    i, j = rng.integers(0, KEYFRAMES, (2, size))
+    j = np.where(rng.random(size) < 0.8, np.clip(i + rng.integers(-NEAR - 1, NEAR + 2, size), 0, KEYFRAMES - 1), j)
+    i, j = i[i != j], j[i != j]
+    size = len(i)
+    wide = rng.random((size, 3)) < 0.35
+    limits = np.array([_CLEAR_PLACE, _CLEAR_PLACE, _CLEAR_HEADING])
+    root = np.eye(3) / (limits * np.where(wide, 1.01, 0.99))[:, None, :]
+    off = np.where(rng.random(size) < 0.2, 1.05, 0.95) * _AGREES
+    T = se2.between(truth[i], truth[j])
+    T[:, 0] += off / root[:, 0, 0]
+    none = np.zeros((size, 3))
+    edges = ScanEdges(i, j, T, root, none, none, scan_indices(Calibration()))
+    graph = Graph(truth, edges=(wheels, edges))
+    agrees = np.abs(edges.residuals(graph)).max(axis=1) < _AGREES
+    fixed = (~wide).sum(axis=1)
+    count, best = np.zeros((2, KEYFRAMES), dtype=int)
+    for a, b, f in zip(np.minimum(i, j)[agrees], np.maximum(i, j)[agrees], fixed[agrees], strict=True):
+        if b - a <= NEAR:
+            count[a:b] += f == 3
+            best[a:b] = np.maximum(best[a:b], f)
+    assert 0 < agrees.sum() < size
+    np.testing.assert_array_equal(scans_fixing(graph), count)
+    np.testing.assert_array_equal(directions_constrained(graph), best)
+    sound = rng.random(len(wheels)) < 0.3
+    for least in (2, 3):
+        part = np.arange(KEYFRAMES)
+        ties = [(int(w), int(v)) for w, v, s in zip(wheels.i, wheels.j, sound, strict=True) if s or best[w] >= least]
+        ties += [(int(a), int(b)) for a, b, f, ok in zip(i, j, fixed, agrees, strict=True) if ok and f >= least]
+        for _ in range(KEYFRAMES):
+            for a, b in ties:
+                part[[a, b]] = min(part[a], part[b])
+        found = tied_parts(wheels, graph, least, sound)
+        np.testing.assert_array_equal(found[:, None] == found, part[:, None] == part)

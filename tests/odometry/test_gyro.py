@@ -149,3 +149,24 @@ def test_four_windows_show_what_a_gyro_reads(seconds, read):
     heading = np.where(stamps < 6.0, 0.2 * stamps, 1.2 - 0.3 * (stamps - 6.0))
     wheels = Odometry(stamps, np.column_stack([stamps, np.zeros(len(stamps)), heading]))
     assert (reading_of(Gyro(stamps, -heading), wheels)[0] == -1.0) is read
+
+
+@pytest.mark.parametrize(("gyro_turns", "wheel_turns"), [(0.0, 1.0), (1.0, 0.0), (1e-3, 1.0), (1.0, 1e-3)])
+def test_a_gyro_beside_which_nothing_turns_is_taken_as_it_is(gyro_turns, wheel_turns):
+    """However the two correlate: what neither has turned shows no sign and no unit."""
+    stamps = np.arange(0.0, 120.0, 0.05)
+    heading = 2.0 * np.sin(0.3 * stamps)
+    wheels = Odometry(stamps, np.column_stack([stamps, np.zeros(len(stamps)), wheel_turns * heading]))
+    assert reading_of(Gyro(stamps, -gyro_turns * heading), wheels) == (1.0, "")
+    short = Odometry(stamps[:50], wheels.poses[:50])
+    assert reading_of(Gyro(stamps[:50], -heading[:50]), short) == (1.0, "")
+
+
+@pytest.mark.parametrize(
+    ("factor", "read"), [(1.0, 1.0), (-1.0, -1.0), (180.0 / np.pi, np.pi / 180.0), (1.4, 1.0), (-180.0 / np.pi, -np.pi / 180.0)]
+)
+def test_a_gyro_is_read_in_the_unit_and_with_the_sign_that_the_wheels_have(factor, read):
+    stamps = np.arange(0.0, 120.0, 0.05)
+    heading = 2.0 * np.sin(0.3 * stamps)
+    wheels = Odometry(stamps, np.column_stack([stamps, np.zeros(len(stamps)), heading]))
+    assert reading_of(Gyro(stamps, factor * heading + 0.01 * stamps), wheels)[0] == pytest.approx(read)

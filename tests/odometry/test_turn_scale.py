@@ -1,5 +1,7 @@
 """The scale of turns by steps: recovered where it is constant, not bent by one bad turn, and reported where it varies."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.laser_walks import chained
@@ -116,3 +118,23 @@ def test_stretches_of_different_scales_scatter_as_a_sample_of_four():
     middle = np.arctan(1.0 + found.value)
     error = np.sqrt(np.sum((np.arctan(scales) - np.arctan(scales).mean()) ** 2) / 3.0 / 4.0)
     assert found.sigma == pytest.approx(error * (1.0 + np.tan(middle) ** 2))
+
+
+def test_drifts_by_way_and_time_are_no_scale():
+    """Wheels that turn by so much per metre and second besides, which the calibration knows, have the scale of their turns."""
+    rng = np.random.default_rng(4)
+    motion = np.column_stack([rng.uniform(0.0, 0.4, STEPS), np.zeros(STEPS), rng.uniform(0.1, 0.35, STEPS)])
+    truth = se2.chain(np.zeros(3), motion)
+    wheels = chained(truth, np.full(3, NOISE))
+    duration = rng.uniform(0.1, 2.0, STEPS)
+    stated = motion[:, 2] / 1.1 - 0.2 * wheels.length - 0.05 * duration
+    wheels = replace(wheels, motion=np.column_stack([motion[:, :2], stated]), duration=duration)
+    object.__setattr__(wheels, "calibration", odometry_indices(CALIBRATION, STEPS))
+    values = np.zeros(len(CALIBRATION.values))
+    values[wheels.calibration[0, 2:]] = 0.2, 0.05
+    none = np.zeros((STEPS, 3))
+    k = np.arange(STEPS)
+    seen = ScanEdges(k, k + 1, motion, none[:, None] + np.eye(3), none, none, scan_indices(CALIBRATION))
+    scale = turn_scales(wheels, seen, Graph(truth, calibration=replace(CALIBRATION, values=values)))[INDEX]
+    assert scale.value == pytest.approx(0.1, abs=1e-9)
+    np.testing.assert_allclose(scale.stretches, 0.1)

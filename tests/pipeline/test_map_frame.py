@@ -1,6 +1,7 @@
 """Alignment and cropping: angles are found, chi2 stays, cells keep their places."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
-from uwblite.pipeline.map_frame import ALIGNMENTS, alignment, cropped, moved, wall_direction
+from uwblite.pipeline.map_frame import ALIGNMENTS, _quarter, alignment, alignment_of, cropped, moved, wall_direction
 
 RNG = np.random.default_rng(2)
 
@@ -105,3 +106,28 @@ def test_cropping_keeps_the_cells_where_they_are():
         with pytest.raises(ConfigError, match="holds no cell; the map reaches from"):
             cropped(grid, box)
     assert replace(grid, scans_used=3).scans_used == 3
+
+
+@given(st.floats(-10.0, 10.0))
+def test_an_angle_is_moved_by_quarter_turns(angle):
+    found = float(_quarter(np.array(angle)))
+    assert -np.pi / 4 < found <= np.pi / 4 + 1e-12
+    quarters = (angle - found) / (np.pi / 2)
+    assert abs(quarters - round(quarters)) < 1e-9
+
+
+def test_the_walls_of_all_clouds_are_taken_as_the_poses_lie():
+    """Each cloud's normals turned by its own pose's heading; without any the walls cannot be aligned with."""
+    angle, headings = 0.2, np.array([0.3, 1.9, -2.0])
+    each = [walls(angle - heading, n=400) for heading in headings]
+    clouds = SimpleNamespace(owner=np.repeat(np.arange(3), 400), normals=np.concatenate(each))
+    poses = np.column_stack([RNG.normal(size=(3, 2)), headings])
+    estimate = SimpleNamespace(graph=Graph(poses), placed=np.zeros(0, dtype=bool), scans=SimpleNamespace(clouds=clouds))
+    motion = alignment_of(estimate, SimpleNamespace(config=SimpleNamespace(align="walls")))
+    turned = se2.compose(motion, poses)
+    np.testing.assert_allclose(turned[0, :2], 0.0, atol=1e-12)
+    assert abs(np.exp(4j * (motion[2] + angle)) - 1.0) < 4 * np.radians(0.5)
+    np.testing.assert_array_equal(alignment_of(estimate, SimpleNamespace(config=SimpleNamespace(align="odometry"))), 0.0)
+    estimate.scans = None
+    with pytest.raises(DataError, match="no walls"):
+        alignment_of(estimate, SimpleNamespace(config=SimpleNamespace(align="walls")))

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from uwblite.radio.change_points import find_move, find_moves
+from uwblite.radio.change_points import _split, find_move, find_moves
 from uwblite.radio.trilateration import TrilaterationConfig
 
 STAMPS = np.arange(0.0, 200.0, 1.0)
@@ -68,3 +68,29 @@ def test_a_short_move_cannot_be_distinguished_from_a_blocked_line_of_sight(seed)
     place = np.array([-2.0, 1.0])
     ranges = measured(seed, place, place + np.array([0.0, 0.65]), share=0.0)
     assert find_move(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig()) is None
+
+
+@pytest.mark.parametrize(("wild", "found"), [(0.4, True), (0.7, False)])
+def test_two_places_must_explain_half_of_what_one_does_not(wild, found):
+    """A share of the ranges from the second place lies metres off any."""
+    rng = np.random.default_rng(2)
+    ranges = measured(2, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), share=0.0)
+    ranges += (rng.random(len(STAMPS)) < wild) * rng.uniform(3.0, 30.0, len(STAMPS))
+    move = find_move(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig())
+    assert (move is not None) == found
+
+
+def test_the_moment_is_the_one_at_which_both_places_explain_most():
+    """Every moment tried, the misfit of each range written out."""
+    ranges = measured(3, np.array([-2.0, 1.0]), np.array([1.0, 4.0]), 90)
+    width = 0.24
+    split = _split(PATH, ranges, 110, width, TrilaterationConfig())
+
+    def misfit(place):
+        off = np.abs(ranges - np.hypot(*(PATH - place.position).T) - place.bias)
+        return np.minimum(off / width, 1.0) ** 2
+
+    before, after = misfit(split.before), misfit(split.after)
+    costs = {k: before[:k].sum() + after[k:].sum() for k in range(20, 181)}
+    assert split.moment == min(costs, key=costs.get)
+    assert split.unexplained == pytest.approx(costs[split.moment])

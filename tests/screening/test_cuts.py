@@ -91,3 +91,36 @@ def test_scans_of_a_room_contradict_ranges_that_all_jump():
     log = replace(log, ranges=replace(log.ranges, ranges=log.ranges.ranges + 6.0 * late))
     assert len(cuts.found(log.without(lidar=True), np.zeros(0))) == 1
     assert len(cuts.found(log, np.zeros(0))) == 0
+
+
+def test_a_cut_is_the_moment_of_the_jump_that_is_nearest_to_it():
+    jumps = np.array([10.0, 20.0, 24.0])
+    assert [cuts._nearest(jumps, t) for t in (12.9, 13.1, 21.9, 22.1, 27.5)] == [10.0, 13.1, 20.0, 24.0, 27.5]
+    assert cuts._nearest(np.zeros(0), 5.0) == 5.0
+
+
+def test_scans_change_by_the_mean_difference_of_their_readings():
+    """A metre at most each; what is not seen lies at the reach; a hundred beams or so of many."""
+    readings = np.array([[1.0, 2.0, np.nan, np.inf], [1.5, 2.0, 9.5, 8.0], [9.0, 2.0, -np.inf, 10.0]], dtype=np.float32)
+    log = SensorLog(
+        Odometry(np.arange(3.0), np.zeros((3, 3))), None, LaserScans(np.arange(3.0), readings, 0.0, 0.1, 0.0, 0.1, 10.0)
+    )
+    np.testing.assert_allclose(cuts._changes(log), [(0.5 + 0.0 + 0.5 + 1.0) / 4, (1.0 + 0.0 + 1.0 + 1.0) / 4])
+    far = replace(log, scans=replace(log.scans, range_max=80.0, ranges=np.where(np.isfinite(readings), 29.5, readings)))
+    np.testing.assert_allclose(cuts._changes(far)[0], 0.25)
+    wide = np.zeros((2, 360), dtype=np.float32)
+    wide[1, ::3] = 0.5
+    many = replace(log, scans=replace(log.scans, ranges=wide, stamps=np.arange(2.0)))
+    np.testing.assert_allclose(cuts._changes(many), [0.5])
+
+
+@pytest.mark.parametrize(("before", "after", "known"), [(49.0, 51.0, True), (-1.0, 51.0, False), (49.0, 500.0, False)])
+def test_scans_beside_a_time_show_one_place_or_another_or_nothing(before, after, known):
+    """Of a room: the robot on the spot, or elsewhere by the odometry's own count; no scan in time on either side."""
+    poses = two_rounds()
+    log = recording(poses)
+    start = log.odometry.stamps[0]
+    assert cuts.same_place(log, start + before, start + after) is (True if known else None)
+    silent = replace(log, scans=log.scans.rows(np.abs(log.scans.stamps - start - 50.0) > 2.5))
+    assert cuts.same_place(silent, start + 49.9, start + 50.1) is None
+    assert cuts.same_place(log.without(lidar=True), start + 49.9, start + 50.1) is None

@@ -49,11 +49,6 @@ class PairPoints:
     row: NDArray[np.int32]
     """(e, n) rows in the clouds' arrays, a pair's own in front; -1 behind them where a pair has fewer than others."""
 
-    @property
-    def count(self) -> Ints:
-        """(e,) points of each pair."""
-        return np.asarray((self.row >= 0).sum(axis=1))
-
     def of(self, pair: int) -> Ints:
         """Return the rows of one pair."""
         rows = self.row[pair]
