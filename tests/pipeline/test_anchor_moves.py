@@ -26,6 +26,7 @@ from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.radio.change_points import Move
+from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting, UwbRanges
 
 
@@ -71,8 +72,9 @@ def test_anchors_that_change_names_at_once_are_distinguished():
         assert np.hypot(*(by_id[f"{names[following[k]]}@2"].position - ANCHORS[name])) < 0.3
 
 
-def moved(stamp, far=1.0):
-    return Move(stamp, np.zeros(2), np.array([far, 0.0]))
+def moved(stamp, far=1.0, left=None):
+    places = (AnchorHypothesis(np.array([x, 0.0]), 0.0, 0.1, 0.0, 0.1) for x in (0.0, far))
+    return Move(stamp if left is None else left, stamp, *places)
 
 
 def four_ranges(**moves):
@@ -99,6 +101,17 @@ def test_ranges_have_another_name_from_each_move_on():
     assert names(four_ranges()) == ["A", "B"] * 4
 
 
+def test_readings_of_an_anchor_that_is_carried_are_no_distances():
+    log = four_ranges(A=[moved(3.0, left=1.0)])
+    assert names(log) == ["A", "B"] * 3 + ["A@2", "B"]
+    assert log.ranges.ranges.tolist() == [1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 1.0, 1.0]
+    said = "moved by 1.0 m between t = 1 and 3 s (its 2 ranges meanwhile were left out); from then on it is called A@2"
+    assert log.screening.remarks[0].text == f"anchor A was {said}"
+    # Where it was put down is looked for in all ranges again.
+    assert not _alike(four_ranges(A=[moved(3.0)]).ranges, log.ranges, {})
+    assert _alike(four_ranges(A=[moved(3.0)]).ranges, log.ranges, {"A": [moved(3.0)]})
+
+
 def test_two_ranges_at_each_move_may_be_called_otherwise():
     one, none = four_ranges(A=[moved(1.0)]).ranges, four_ranges().ranges
     moves = {"A": [moved(1.0)]}
@@ -111,10 +124,10 @@ def test_two_ranges_at_each_move_may_be_called_otherwise():
 
 def test_moves_of_about_the_same_time_are_one_for_all_anchors():
     """Each is compared with the one before it: 10, 40 and 70 s are one, 100.1 s is another."""
-    moves = {"A": [moved(40.0), moved(100.1)], "B": [moved(10.0), moved(70.0)]}
+    moves = {"A": [moved(40.0), moved(100.1)], "B": [moved(10.0, left=3.0), moved(70.0)]}
     found = _of_all(four_ranges(), moves)
     assert list(found) == ["A", "B"]
-    assert [m.stamp for m in found["A"]] == [m.stamp for m in found["B"]] == [10.0, 100.1]
+    assert [m.stamp for m in found["A"]] == [m.left for m in found["B"]] == [10.0, 100.1]
     assert _of_all(replace(four_ranges(), ranges=None), moves) == {}
 
 
@@ -157,7 +170,9 @@ def test_moves_are_sought_in_the_level_part_of_usable_ranges(monkeypatch):
     edges = plain_ranges(np.array([0, 1, 1, 2, 2]), np.array([1, 0, 1, 0, 1]), np.array([4.0, 5.0, 2.0, np.nan, 1.0]), 0.1)
     edges = replace(edges, stamps=np.arange(5.0), height=np.array([0.0, 3.0, 0.0, 0.0, 2.0]), tag=np.array([0.5, 0.0]))
     estimate = SimpleNamespace(ranges=edges, bootstrap=True, graph=Graph(poses), tag_positions=edges.tag_positions)
-    ranges = UwbRanges(np.arange(1.0, 5.0), np.array([0, 1, 0, 1]), np.ones(4), np.ones(4), ("A", "B"))
+    # As recorded: what the graph leaves out, because the anchor was carried then, is looked at again.
+    as_recorded, edges = np.nan_to_num(edges.ranges[1:]), replace(edges, ranges=np.where(np.arange(5) == 2, 0.0, edges.ranges))
+    ranges = UwbRanges(np.arange(1.0, 5.0), np.array([0, 1, 0, 1]), as_recorded, np.ones(4), ("A", "B"))
     second = SimpleNamespace(rows=slice(1, 3))
     task = SimpleNamespace(config=MappingConfig())
     assert _moves(second, SensorLog(four_ranges().odometry, ranges), estimate, task) == {}

@@ -62,6 +62,39 @@ def test_two_moves_are_found_in_the_order_of_time():
         np.testing.assert_allclose([move.before, move.after], [before, after], atol=0.5)
 
 
+def test_ranges_made_while_an_anchor_is_carried_belong_to_neither_place():
+    before, after = np.array([1.0, -1.0]), np.array([9.0, 8.0])
+    place = before + np.clip((STAMPS[:, None] - 70.0) / 50.0, 0.0, 1.0) * (after - before)
+    ranges = np.hypot(*(place - PATH).T) + 0.2 + np.random.default_rng(2).normal(0.0, SIGMA, len(STAMPS))
+    move = find_move(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig())
+    assert move is not None
+    # At the ends of the way it is still near both places.
+    assert 70.0 <= move.left <= 80.0 < 110.0 <= move.stamp <= 120.0
+    np.testing.assert_allclose([move.before, move.after], [before, after], atol=0.3)
+
+
+@pytest.mark.parametrize(("back", "number"), [(188, 2), (196, 1)])
+def test_an_anchor_that_is_brought_back_needs_few_ranges_to_show_it(back, number):
+    """The place is known from before: a dozen ranges show it, four do not."""
+    before, after = np.array([1.0, -1.0]), np.array([9.0, 8.0])
+    ranges = measured(4, before, after, 90, share=0.0)
+    ranges[back:] = measured(4, before, share=0.0)[back:]
+    moves = find_moves(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig())
+    assert len(moves) == number
+    if number == 2:
+        assert abs(moves[1].stamp - back) <= 2.0
+        np.testing.assert_array_equal([moves[1].before, moves[1].after], [moves[0].after, moves[0].before])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_rack_passed_on_the_way_towards_an_anchor_does_not_move_it(seed):
+    """From afar on a straight line, 0.4 m more explains the ranges as well as a place 4 m aside does; then the robot turns."""
+    path = np.concatenate([np.column_stack([0.15 * STAMPS, 0.0 * STAMPS]), PATH + np.array([36.0, 0.0])])
+    stamps, rng = np.concatenate([STAMPS, STAMPS + 200.0]), np.random.default_rng(seed)
+    ranges = np.hypot(*(np.array([55.0, -0.6]) - path).T) + 0.4 * (stamps < 200.0) + rng.normal(0.0, SIGMA, len(stamps))
+    assert find_move(path, ranges, stamps, SIGMA, TrilaterationConfig()) is None
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_short_move_cannot_be_distinguished_from_a_blocked_line_of_sight(seed):
     """Two places 0.65 m apart explain these ranges clearly better than one; the least move is 0.8 m."""

@@ -54,6 +54,8 @@ def _of_all(log: SensorLog, moves: Moves) -> Moves:
     """Return all moves as moves of all anchors; one of several at about the same time stands for them."""
     every = sorted((move for found in moves.values() for move in found), key=lambda move: move.stamp)
     apart = [m for k, m in enumerate(every) if k == 0 or m.stamp - every[k - 1].stamp > _TOGETHER]
+    # What was carried is only known of its own anchor.
+    apart = [replace(move, left=move.stamp) for move in apart]
     return {} if log.ranges is None else dict.fromkeys(log.ranges.anchor_ids, apart)
 
 
@@ -62,10 +64,11 @@ _TOGETHER = 30.0
 
 
 def _alike(a: UwbRanges | None, b: UwbRanges | None, moves: Moves) -> bool:
-    """Return whether ranges are called the same, but for a few at each move."""
+    """Return whether ranges are called the same and left out alike, but for a few at each move."""
     if a is None or b is None:
         return True
     differ = np.asarray(a.anchor_ids)[a.anchor] != np.asarray(b.anchor_ids)[b.anchor]
+    differ |= (a.ranges > 0.0) != (b.ranges > 0.0)
     return int(differ.sum()) <= _FEW * sum(map(len, moves.values()))
 
 
@@ -82,8 +85,11 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task)
     edges, ranges = estimate.ranges, log.ranges
     if ranges is None or edges is None or estimate.bootstrap is None:
         return {}
-    # The recording's ranges stand in the edges in their own order.
+    # The recording's ranges stand in the edges in their own order; some may have been left out there.
     of_recording = np.flatnonzero((edges.pose >= recording.rows.start) & (edges.pose < recording.rows.stop))
+    measured = edges.ranges.copy()
+    measured[of_recording] = ranges.ranges
+    edges = replace(edges, ranges=measured)
     positions = edges.tag_positions(estimate.graph.poses)
     usable = np.isfinite(edges.ranges) & (edges.ranges > _SHORTEST) & (edges.ranges < task.config.trilateration.max_range)
     sigma = short_term_sigma(edges.stamps[usable], edges.anchor[usable], edges.ranges[usable], task.config.ranges)
@@ -97,12 +103,15 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task)
 
 
 def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
-    """Return a recording with the ranges of moved anchors under another name from each move on, and remarks that say so."""
+    """Return a recording with the ranges of moved anchors under another name from each move on, and remarks that say so.
+
+    Readings made while an anchor was carried are set to 0, which is no distance.
+    """
     ranges = log.ranges
     if ranges is None or not moves:
         return log
     names = np.asarray(ranges.anchor_ids)[ranges.anchor].astype(object)
-    heights = dict(log.mounting.anchor_heights)
+    measured, heights = ranges.ranges.copy(), dict(log.mounting.anchor_heights)
     remarks: list[Remark] = []
     for name, found in moves.items():
         base, number = name_and_number(name)
@@ -113,14 +122,18 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
             names[own & (ranges.stamps >= move.stamp)] = other
             if name in heights:
                 heights[other] = heights[name]
-            when = f"t = {move.stamp - log.odometry.stamps[0]:.0f} s"
-            text = f"anchor {name} was moved by {move.distance:.1f} m at about {when}; from then on it is called {other}"
+            carried = own & (ranges.stamps >= move.left) & (ranges.stamps < move.stamp)
+            measured[carried] = 0.0
+            start, end = (moment - log.odometry.stamps[0] for moment in (move.left, move.stamp))
+            when = f"between t = {start:.0f} and {end:.0f} s" if carried.any() else f"at about t = {end:.0f} s"
+            less = f" (its {carried.sum()} ranges meanwhile were left out)" if carried.any() else ""
+            text = f"anchor {name} was moved by {move.distance:.1f} m {when}{less}; from then on it is called {other}"
             remarks.append(Remark("moved-anchor", text))
     ids, anchor = np.unique(names.astype(str), return_inverse=True)
     before = log.screening or Screening((), OdometryBreaks.none())
     return replace(
         log,
-        ranges=replace(ranges, anchor=anchor.astype(np.int64), anchor_ids=tuple(ids.tolist())),
+        ranges=replace(ranges, ranges=measured, anchor=anchor.astype(np.int64), anchor_ids=tuple(ids.tolist())),
         mounting=replace(log.mounting, anchor_heights=heights),
         screening=replace(before, remarks=(*before.remarks, *remarks)),
     )

@@ -1,8 +1,10 @@
 """Anchors that were moved during a recording: two places explain what one place cannot.
 
 With the path of the tag known well enough, all ranges to an anchor are explained by one place, or those until some moment
-by one place and those after it by another. The second explanation has three numbers and the moment more, and must be
-worth them.
+by one place and those from that or a later moment on by another: an anchor that is carried is at neither meanwhile. What
+competes with a move is a change of the constant error: a robot that drives towards an anchor from afar, with a rack in between
+or a path that is wrong by some decimetres, has ranges that a place metres aside explains as well. So two places must explain
+clearly more ranges than one place with another constant error from then on.
 """
 
 from dataclasses import dataclass
@@ -14,32 +16,45 @@ from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate
 
 _SPLITS = 7
 """Moments tried first, evenly spread over the ranges."""
+_LIKELY = 2
+"""Of them those, the best first, from which the search goes on."""
 _ROUNDS = 6
 """Times, at most, that places and moment are found in turn; two or three are usual."""
 _LEAST_RANGES = 20
 """Ranges on either side of a moment."""
 _LEAST_MOVE = 0.8
 """Shorter moves cannot be distinguished from a blocked line of sight, m."""
-_SIGMAS = 5.0
-"""Standard deviations of the two places, together, that a move must exceed."""
-_WORSE = 0.3
-"""Share of ranges that one place must leave unexplained before two are tried."""
-_EXPLAINED = 0.5
-"""Share of those that two places must explain."""
+_GAIN, _FEWEST = 0.1, 6.0
+"""Share and number of the ranges that two places must explain and one place does not; of anchors that stood still, it is up
+to 0.09 (with blocked lines of sight for minutes)."""
+_STEP = 0.5
+"""Change of a constant error that a line of sight blocked from some moment on explains, m."""
 _WIDTH = 4.0
 """Ranges farther from a place than so many of their standard deviations are not explained by it."""
+_CARRIED = 0.5
+"""A range between two places counts for so many that neither explains: less explained, it was made on the way."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
     """An anchor at two places."""
 
+    left: float
+    """First range that is not from the first place any more, s."""
     stamp: float
-    """First range from the second place, s."""
-    before: Floats
-    """(2,) m."""
-    after: Floats
-    """(2,) m."""
+    """First range from the second place, s; the same, where the anchor was not measured on its way."""
+    first: AnchorHypothesis
+    second: AnchorHypothesis
+
+    @property
+    def before(self) -> Floats:
+        """First place (2,), m."""
+        return self.first.position
+
+    @property
+    def after(self) -> Floats:
+        """Second place (2,), m."""
+        return self.second.position
 
     @property
     def distance(self) -> float:
@@ -59,7 +74,30 @@ def find_moves(path: Floats, ranges: Floats, stamps: Floats, sigma: float, confi
         until = moves[k + 1].stamp if k + 1 < len(moves) else np.inf
         own = (stamps >= since) & (stamps < until)
         moves[k] = find_move(path[own], ranges[own], stamps[own], sigma, config) or moves[k]
-    return moves
+    ends = [*(move.left for move in moves[1:]), np.inf][: len(moves)]
+    parts = [(stamps >= move.stamp) & (stamps < end) for move, end in zip(moves, ends, strict=True)]
+    width = _width(sigma)
+    returns = [_returned(path[own], ranges[own], stamps[own], m, width) for own, m in zip(parts, moves, strict=True)]
+    return [move for pair in zip(moves, returns, strict=True) for move in pair if move is not None]
+
+
+def _returned(path: Floats, ranges: Floats, stamps: Floats, move: Move, width: float) -> Move | None:
+    """Return the move back to the place before, None where there is none; a known place needs few ranges.
+
+    Parameters
+    ----------
+    path, ranges, stamps : of the ranges since a move.
+    """
+    gain = _misfit(path, ranges, move.second, width) - _misfit(path, ranges, move.first, width)
+    until_end = np.cumsum(gain[::-1])[::-1]
+    first = int(np.argmax(until_end))
+    if until_end[first] < _FEWEST or first == 0:
+        return None
+    return Move(float(stamps[first]), float(stamps[first]), move.second, move.first)
+
+
+def _width(sigma: float) -> float:
+    return _WIDTH * max(sigma, 0.05)
 
 
 def _parted(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig) -> list[Move]:
@@ -81,58 +119,79 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     """
     if len(ranges) < 2 * _LEAST_RANGES:
         return None
-    width = _WIDTH * max(sigma, 0.05)
+    width, gain = _width(sigma), max(_GAIN * len(ranges), _FEWEST)
     alone = float(_misfit(path, ranges, _fitted(path, ranges, width, config), width).sum())
-    if alone < _WORSE * len(ranges):
+    if alone < gain:
         return None
     starts = np.unique(np.linspace(_LEAST_RANGES, len(ranges) - _LEAST_RANGES, _SPLITS).astype(np.int64)).tolist()
-    tried: dict[int, _Split] = {}
-    best = min((_converged(path, ranges, k, width, config, tried) for k in starts), key=lambda found: found.unexplained)
-    if best.unexplained > (1.0 - _EXPLAINED) * alone:
+    tried = {(k, k): _split(path, ranges, k, k, width, config) for k in starts}
+    likely = sorted(tried, key=lambda at: tried[at].cost)[:_LIKELY]
+    best = min((_converged(path, ranges, at, width, config, tried) for at in likely), key=lambda found: found.cost)
+    move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
+    if alone - best.unexplained < gain or move.distance <= _LEAST_MOVE:
         return None
-    move = Move(float(stamps[best.moment]), best.before.position, best.after.position)
-    sigma = np.hypot(best.before.position_sigma, best.after.position_sigma)
-    return move if move.distance > max(_LEAST_MOVE, _SIGMAS * sigma) else None
+    return move if _with_step(path, ranges, best, width, config) - best.unexplained >= gain else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Split:
-    """The places that suit the ranges before and after a moment, and the moment that suits these places best."""
+    """The places that suit the ranges before and after some moments, and the moments that suit these places best."""
 
     before: AnchorHypothesis
     after: AnchorHypothesis
+    left: int
+    """First range that is not from the first place any more."""
     moment: int
     """First range from the second place."""
+    cost: float
+    """What the moments were chosen by: ranges left unexplained by their place, with those on the way."""
     unexplained: float
-    """How many ranges the two places leave unexplained with it."""
+    """How many ranges the two places leave unexplained; those on the way by the better one of both."""
 
 
 def _converged(
-    path: Floats, ranges: Floats, first: int, width: float, config: TrilaterationConfig, tried: dict[int, _Split]
+    path: Floats, ranges: Floats, at: tuple[int, int], width: float, config: TrilaterationConfig,
+    tried: dict[tuple[int, int], _Split],
 ) -> _Split:
-    """Find places and moment in turn, from a first moment on (k-means with two clusters in a row).
+    """Find places and moments in turn, from first moments on (k-means with two clusters in a row).
 
     Parameters
     ----------
     tried : moments split at before; searches from several first moments meet. New ones are added.
     """
     for _ in range(_ROUNDS):
-        if first not in tried:
-            tried[first] = _split(path, ranges, first, width, config)
-        if (found := tried[first]).moment == first:
+        if at not in tried:
+            tried[at] = _split(path, ranges, *at, width, config)
+        found = tried[at]
+        if (found.left, found.moment) == at:
             break
-        first = found.moment
+        at = found.left, found.moment
     return found
 
 
-def _split(path: Floats, ranges: Floats, first: int, width: float, config: TrilaterationConfig) -> _Split:
-    """Fit places to the ranges before and after a moment; the cost of every other moment follows from running sums."""
+def _split(path: Floats, ranges: Floats, left: int, first: int, width: float, config: TrilaterationConfig) -> _Split:
+    """Fit places to the ranges before and after two moments; the costs of all other moments follow from running sums."""
     low, high = _LEAST_RANGES, len(ranges) - _LEAST_RANGES
-    before, after = (_fitted(path[part], ranges[part], width, config) for part in (slice(0, first), slice(first, None)))
+    before, after = (_fitted(path[part], ranges[part], width, config) for part in (slice(0, left), slice(first, None)))
     by_one, by_other = (_misfit(path, ranges, place, width) for place in (before, after))
-    cost = np.concatenate([[0.0], np.cumsum(by_one - by_other)])[low : high + 1] + by_other.sum()
-    best = int(np.argmin(cost))
-    return _Split(before, after, low + best, float(cost[best]))
+    until, since = (np.concatenate([[0.0], np.cumsum(by - _CARRIED)])[low : high + 1] for by in (by_one, by_other))
+    best = int(np.argmin(np.minimum.accumulate(until) - since))
+    start, end = low + int(np.argmin(until[: best + 1])), low + best
+    cost = until[start - low] - since[best] + float(np.sum(by_other - _CARRIED)) + _CARRIED * len(ranges)
+    unexplained = by_one[:start].sum() + np.minimum(by_one, by_other)[start:end].sum() + by_other[end:].sum()
+    return _Split(before, after, start, end, float(cost), float(unexplained))
+
+
+def _with_step(path: Floats, ranges: Floats, split: _Split, width: float, config: TrilaterationConfig) -> float:
+    """Return how many ranges one place leaves unexplained whose constant error changes at the moment of a split."""
+    late = np.arange(len(ranges)) >= split.moment
+    unexplained = []
+    for place, others in ((split.before, late), (split.after, ~late)):
+        off = ranges - np.hypot(*(place.position - path).T) - place.bias
+        level = ranges - others * np.clip(np.median(off[others]), -_STEP, _STEP)
+        places = (place, _fitted(path, level, width, config))
+        unexplained.append(min(float(_misfit(path, level, at, width).sum()) for at in places))
+    return min(unexplained)
 
 
 def _fitted(path: Floats, ranges: Floats, width: float, config: TrilaterationConfig) -> AnchorHypothesis:
