@@ -90,15 +90,16 @@ class _Solved:
         """Return J^T W s of each error as a column (unknowns, k)."""
         size, count = self.unknowns.size, int(common.error.max(initial=-1)) + 1
         weights, right = edge_weights(common.edges, self._graph), sparse.csc_matrix((size, count))
-        for name, index, jacobian in common.edges.linearize(self._graph).blocks:
-            for first in range(0, len(common.edge), _MET_AT_ONCE):
-                part = slice(first, first + _MET_AT_ONCE)
-                edge = common.edge[part]
-                row = self.unknowns.number[name][index[edge]]
-                error = np.broadcast_to(common.error[part, None], row.shape)
-                slope = np.einsum("mdk,md,m->mk", jacobian[edge], common.shift[part], weights[edge])
-                free = row >= 0
-                right = right + sparse.csc_matrix((slope[free], (row[free], error[free])), shape=right.shape)
+        blocks = common.edges.linearize(self._graph).blocks
+        for first in range(0, len(common.edge), _MET_AT_ONCE):
+            part = slice(first, first + _MET_AT_ONCE)
+            edge = common.edge[part]
+            row = np.concatenate([self.unknowns.number[name][index[edge]] for name, index, _ in blocks], axis=1)
+            jacobian = np.concatenate([own[edge] for *_, own in blocks], axis=2)
+            slope = np.einsum("mdk,md->mk", jacobian, common.shift[part] * weights[edge, None])
+            error = np.broadcast_to(common.error[part, None], row.shape)
+            free = row >= 0
+            right = right + sparse.csc_matrix((slope[free], (row[free], error[free])), shape=right.shape)
         return right
 
 

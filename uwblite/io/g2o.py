@@ -167,10 +167,10 @@ def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:
 
 def _rows(tag: str, ids: Sequence[Ints], *columns: Floats) -> Iterator[str]:
     """Yield lines of one tag: whole numbers, then numbers, written so that they read back as they were."""
-    numbers = np.concatenate(columns, axis=1)
+    numbers = np.concatenate(columns, axis=1) + 0.0
     names = zip(*(column.tolist() for column in ids), strict=True)
     for vertex, row in zip(names, numbers.tolist(), strict=True):
-        yield " ".join([tag, *map(str, vertex), *(repr(value + 0.0) for value in row)]) + "\n"
+        yield " ".join([tag, *map(str, vertex), *map(repr, row)]) + "\n"
 
 
 def _together(a: Records, b: Records) -> Records:

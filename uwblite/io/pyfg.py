@@ -164,11 +164,11 @@ def _lines(graph: Graph, stamps: Floats, poses: NDArray[np.str_], anchors: NDArr
 
 def _rows(tag: str, stamps: Floats | None, names: list[NDArray[np.str_]], *columns: Floats) -> Iterator[str]:
     """Yield lines of one tag; numbers are written so that they read back as they were."""
-    numbers = np.concatenate(columns, axis=1).tolist()
+    numbers = (np.concatenate(columns, axis=1) + 0.0).tolist()
     times = [""] * len(numbers) if stamps is None else [f" {stamp:.6f}" for stamp in stamps.tolist()]
     ends = zip(*(column.tolist() for column in names), strict=True)
     for time, name, row in zip(times, ends, numbers, strict=True):
-        yield f"{tag}{time} {' '.join(name)} {' '.join(repr(value + 0.0) for value in row)}\n"
+        yield f"{tag}{time} {' '.join(name)} {' '.join(map(repr, row))}\n"
 
 
 def _covariances(information: Floats) -> Floats:

@@ -29,7 +29,7 @@ _LEAST_BESIDE = 0.4
 
 def filled(rays: ScanPoints) -> ScanPoints:
     """Return the points of scans with further ones in the gaps between beams that hit one straight surface."""
-    first = np.flatnonzero(_on_one_line(rays))
+    first = _on_one_line(rays)
     step = rays.points[first + 1] - rays.points[first]
     parts = np.ceil(np.hypot(step[:, 0], step[:, 1]) / _SPACING).astype(np.int64)
     own = np.repeat(np.arange(len(first)), parts - 1)
@@ -49,18 +49,19 @@ def filled(rays: ScanPoints) -> ScanPoints:
     )  # fmt: skip
 
 
-def _on_one_line(rays: ScanPoints) -> Bools:
-    """Return after which hits (p,) there is a gap to be filled: to the next beam's, on a line with the one before or behind."""
+def _on_one_line(rays: ScanPoints) -> Ints:
+    """Return the hits behind which there is a gap to be filled: to the next beam's, on a line with the one before or behind."""
     step = np.diff(rays.points, axis=0, append=np.nan)
-    beside = _beside(rays.scan, rays.ray)
     gap = np.hypot(step[:, 0], step[:, 1])
-    short = beside & (gap < _WIDEST)
-    before, after = (np.roll(short, k) & _continues(step, np.roll(step, k, axis=0)) for k in (1, -1))
-    beam = rays.points - rays.origins
+    short = _beside(rays.scan, rays.ray) & (gap < _WIDEST)
+    wide = np.flatnonzero(short & (gap > _SPACING))
+    beam = rays.points[wide] - rays.origins[wide]
     reach = np.hypot(beam[:, 0], beam[:, 1])
-    with np.errstate(invalid="ignore"):
-        coarse = np.abs(step[:, 0] * beam[:, 1] - step[:, 1] * beam[:, 0]) > _COARSE * reach * reach
-        return np.asarray(short & (gap > _SPACING) & coarse & (reach < _REACH) & (before | after))
+    coarse = np.abs(step[wide, 0] * beam[:, 1] - step[wide, 1] * beam[:, 0]) > _COARSE * reach * reach
+    wide = wide[coarse & (reach < _REACH)]
+    # No gap is behind the last hit, and none before the first: the last stands for what is before it.
+    before, after = (short[wide + k] & _continues(step[wide], step[wide + k]) for k in (-1, 1))
+    return np.asarray(wide[before | after])
 
 
 def _beside(scan: Ints, ray: Ints) -> Bools:

@@ -103,7 +103,7 @@ def _boxes(clouds: Clouds) -> tuple[Floats, Floats]:
     return low, high
 
 
-def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> Ints:
+def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.signedinteger]:
     """Return the number (e, n) of the point of cloud i (e,) nearest to each x, y (e, n), m; -1 where none is near."""
     per_cell = 1.0 / raster.cell
     # Truncation takes what lies up to a cell below the raster into its rim, which names no point.
@@ -113,10 +113,9 @@ def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> Ints:
     inside = (cx.view(np.uint32) < wide) & (cy.view(np.uint32) < high)
     cell = cx * raster.shape[i, 1:] + cy
     cell += raster.start[i, None]
+    # The first cell of all is in the rim of a raster, as what lies outside of any.
     cell *= inside
-    if not len(raster.nearest):
-        return np.full(x.shape, NOBODY, dtype=np.int64)
-    return np.where(inside, raster.nearest.take(cell), NOBODY).astype(np.int64)
+    return raster.nearest.take(cell) if len(raster.nearest) else np.full(x.shape, NOBODY)
 
 
 def surface_field(clouds: Clouds, raster: CloudRasters, spread: float) -> NDArray[np.complex64]:

@@ -53,9 +53,8 @@ def seen_beyond(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, I
     """
     local = se2.transform(se2.inverse(free.poses)[:, None, :], points[None, :, :])
     distance, parts = np.hypot(local[..., 0], local[..., 1]), free.ranges.shape[1]
-    turns = np.remainder(se2.bearing(local) + np.pi, 2.0 * np.pi)
-    bins = (turns / (2.0 * np.pi / parts)).astype(np.int64)
-    until = free.ranges[np.arange(len(free.poses))[:, None], np.minimum(bins, parts - 1)]
+    bins = ((se2.bearing(local) + np.pi) / (2.0 * np.pi / parts)).astype(np.int64) % parts
+    until = free.ranges[np.arange(len(free.poses))[:, None], bins]
     reach = until > 0.0
     return (reach & (distance < until - margin)).sum(axis=0), (reach & (distance < until + margin)).sum(axis=0)
 

@@ -69,7 +69,7 @@ def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
     if len(first) < LEAST_PAIRS:
         return None
     middle = 0.5 * scans.time_increment * scans.ranges.shape[1]
-    wheels = np.stack([_wheel_turn(log, scans, first, second, middle + lag) for lag in _LAGS])
+    wheels = _wheel_turns(log, scans, first, second, middle + _LAGS)
     sign = -1.0 if log.mounting.laser_flipped else 1.0
     as_given, other = (_Agreement.of(log, scans, first, second, wheels, s * sign) for s in (1.0, -1.0))
     right = other if other.misfit.min() < 0.5 * as_given.misfit.min() else as_given
@@ -144,9 +144,10 @@ def _turning_pairs(log: SensorLog, scans: LaserScans, pairs: int) -> tuple[Ints,
     return first[chosen], second[chosen]
 
 
-def _wheel_turn(log: SensorLog, scans: LaserScans, first: Ints, second: Ints, lag: float) -> Floats:
+def _wheel_turns(log: SensorLog, scans: LaserScans, first: Ints, second: Ints, lags: Floats) -> Floats:
+    """Return the turns (lags, pairs) by the wheels between scans, each as late as the lag says, rad."""
     heading = np.unwrap(log.odometry.poses[:, 2])
-    at = [np.interp(scans.stamps[k] + lag, log.odometry.stamps, heading) for k in (first, second)]
+    at = [np.interp(scans.stamps[k] + lags[:, None], log.odometry.stamps, heading) for k in (first, second)]
     return np.asarray(at[1] - at[0], dtype=np.float64)
 
 

@@ -162,9 +162,11 @@ def _condensed(clouds: Clouds, found: Correspondences, scale: float) -> PairFact
     weighted[:, 2] = wy * rx - wx * ry
     weighted[:, 3] = root * r
     summed = weighted @ weighted.transpose(0, 2, 1)
-    weighted[:, 2] = wx * rx + wy * ry
     # The tangent (-ny, nx) stands where the normal stood; its variance weighs it once more.
-    tangent = np.stack([-wy, wx, weighted[:, 2]], axis=1)
+    tangent = np.empty((len(row), 3, row.shape[1]))
+    np.negative(wy, out=tangent[:, 0])
+    tangent[:, 1] = wx
+    np.add(wx * rx, wy * ry, out=tangent[:, 2])
     scatter = clouds.normal_variance.take(found.target) + clouds.normal_variance.take(row)
     spurious = (tangent * scatter[:, None]) @ tangent.transpose(0, 2, 1)
     return PairFactors(

@@ -1,6 +1,7 @@
 """Text from files and file names as a terminal, a page and a table may have it."""
 
 import math
+import re
 
 
 def printable(text: str) -> str:
@@ -13,7 +14,7 @@ def printable(text: str) -> str:
 
 def encodable(text: str) -> str:
     """Return text that UTF-8 can hold: bytes of file names that are not UTF-8 written as escapes."""
-    return "".join(_escape(c) if "\ud800" <= c <= "\udfff" else c for c in text) if not text.isascii() else text
+    return re.sub("[\ud800-\udfff]", lambda found: _escape(found[0]), text)
 
 
 def csv_field(text: str) -> str:
