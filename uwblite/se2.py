@@ -12,7 +12,6 @@ Laws, up to rounding, for all poses a, b, c and points p (angles compared modulo
 Angles are kept in (-pi, pi].
 """
 
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -71,9 +71,7 @@ def examined(log: "SensorLog") -> "tuple[Diagnosis, float]":
     return diagnose(log, anchors=made.anchors, calibration=made.calibration, doubts=made.doubts), seconds
 
 
-def expected_cost(
-    log: "SensorLog", seconds: float | None = None, config: "MappingConfig | None" = None
-) -> dict[str, float]:
+def expected_cost(log: "SensorLog", seconds: float | None = None, config: "MappingConfig | None" = None) -> dict[str, float]:
     """Return the time and memory that `uwblite map` is expected to need on this computer, and the size of the map.
 
     They are those of the recording as a map repairs it; empty where it refuses the recording. Where no time is given, the map

@@ -36,8 +36,6 @@ def record_into(args: argparse.Namespace, take: Callable[[bytes], None], stoppin
     """Read devices until asked to stop, and hand on what `uwblite record` would write."""
     links = device_links(args)
     offset = time.time() - time.monotonic()
-    recorder = Recorder(
-        links, LinesTo(take), monotonic=time.monotonic, wall_offset=offset, host=host_name(), on_note=show_note
-    )
+    recorder = Recorder(links, LinesTo(take), monotonic=time.monotonic, wall_offset=offset, host=host_name(), on_note=show_note)
     recorder.begin([])
     recorder.run(duration=None, stopping=stopping)

@@ -63,9 +63,7 @@ def make(
     began = time.perf_counter()
     kept = [prepared(logs.pop(0), config) for _ in range(len(logs))]
     log = kept[0] if len(kept) == 1 else kept
-    result = build_map(
-        log, config, constraints=constraints, progress=progress, executor=executor, clock=time.perf_counter
-    )
+    result = build_map(log, config, constraints=constraints, progress=progress, executor=executor, clock=time.perf_counter)
     record = RunRecord(
         command=repeat_command(args),
         config=config_text(config),

@@ -44,7 +44,6 @@ _PAGE_NICENESS = 10
 """Of the page beside the recorder."""
 
 
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     devices = parser.add_argument_group("devices")

@@ -60,10 +60,7 @@ def landmark_errors(found: Landmarks, truth: Landmarks, pairs: tuple[tuple[str, 
 
 
 def landmark_errors_along(
-    truth: Landmarks,
-    true_poses: Floats,
-    poses: Floats,
-    pairs: tuple[tuple[str, str], ...] | None = None,
+    truth: Landmarks, true_poses: Floats, poses: Floats, pairs: tuple[tuple[str, str], ...] | None = None
 ) -> LandmarkErrors:
     """Compare distances between columns as a trajectory would draw them with the true ones.
 
@@ -87,10 +84,7 @@ def landmark_errors_along(
 
 
 def _distance_errors(
-    observations: dict[str, Floats],
-    truth: Landmarks,
-    pairs: tuple[tuple[str, str], ...] | None,
-    missing: tuple[str, ...],
+    observations: dict[str, Floats], truth: Landmarks, pairs: tuple[tuple[str, str], ...] | None, missing: tuple[str, ...]
 ) -> LandmarkErrors:
     if pairs is None:
         pairs = tuple((a, b) for i, a in enumerate(truth.names) for b in truth.names[i + 1 :])
@@ -105,13 +99,7 @@ def _distance_errors(
 
 
 def wall_errors(
-    occupied: Floats,
-    walls: Floats,
-    columns: Floats,
-    viewpoints: Floats,
-    *,
-    tolerance: float = 0.10,
-    reach: float = REACH,
+    occupied: Floats, walls: Floats, columns: Floats, viewpoints: Floats, *, tolerance: float = 0.10, reach: float = REACH
 ) -> WallErrors:
     """Compare occupied cells with the true surfaces.
 

@@ -20,13 +20,7 @@ theirs, more than the rounding errors, and ties are lifted by the nudge."""
 
 
 def mark_rays(
-    marks: NDArray[np.uint8],
-    start: Ints,
-    d_row: Ints,
-    d_col: Ints,
-    stride: int,
-    value: int,
-    walls: Bools | None = None,
+    marks: NDArray[np.uint8], start: Ints, d_row: Ints, d_col: Ints, stride: int, value: int, walls: Bools | None = None
 ) -> None:
     """Write a value into every cell of the rays, first cell included, last cell excluded.
 
@@ -63,9 +57,7 @@ def mark_rays(
         here[:r] += along[:r]
 
 
-def _strides(
-    start: Ints, d_row: Ints, d_col: Ints, steps: Ints, stride: int
-) -> tuple[Ints, Ints, Ints, NDArray[np.floating]]:
+def _strides(start: Ints, d_row: Ints, d_col: Ints, steps: Ints, stride: int) -> tuple[Ints, Ints, Ints, NDArray[np.floating]]:
     """Return the first cell, the flat steps along the longer and across to the shorter axis, and the slope d / n."""
     steep = np.abs(d_row) > np.abs(d_col)
     row_step, col_step = np.sign(d_row) * stride, np.sign(d_col)

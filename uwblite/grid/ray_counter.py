@@ -38,12 +38,7 @@ class RayCounter:
         self._scratch = np.zeros(0, dtype=np.uint8)
 
     def insert_rays(
-        self,
-        origins: Floats,
-        endpoints: Floats,
-        hit: Bools,
-        scan: Ints | None = None,
-        walls: Bools | None = None,
+        self, origins: Floats, endpoints: Floats, hit: Bools, scan: Ints | None = None, walls: Bools | None = None
     ) -> None:
         """Trace rays; within one scan every cell counts once.
 
@@ -91,9 +86,7 @@ class RayCounter:
             self._trace_batch(slot[rays] - first, hit[rays], cells[:, rays], low[first:last], size[first:last], walls)
             first = last
 
-    def _trace_batch(
-        self, slot: Ints, hit: Bools, cells: Ints, low: Ints, size: Ints, walls: Bools | None
-    ) -> None:
+    def _trace_batch(self, slot: Ints, hit: Bools, cells: Ints, low: Ints, size: Ints, walls: Bools | None) -> None:
         """Trace each scan into a window of its own, then add the windows to the grid."""
         height, width = size.max(axis=0).tolist()
         window = height * width

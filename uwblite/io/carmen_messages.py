@@ -52,9 +52,7 @@ _CONFIRMED = 0.5
 """s; a recorder may hold a range back until the next one confirms it."""
 
 
-def time_order(
-    stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None
-) -> NDArray[np.int64]:
+def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None) -> NDArray[np.int64]:
     """Return the order (n,) that sorts stamps; equal stamps keep their places. Warn when some come late.
 
     Parameters

@@ -39,9 +39,7 @@ class Block:
         array = np.frombuffer(text + b"\n" * (-len(text) % 8), dtype=np.uint8)
         return Block(text, array, np.flatnonzero(array[: len(text)] <= 32))
 
-    def decode_rows(
-        self, beams: int, pending: list[Pending]
-    ) -> tuple[NDArray[np.float32], list[ValueError | None]]:
+    def decode_rows(self, beams: int, pending: list[Pending]) -> tuple[NDArray[np.float32], list[ValueError | None]]:
         """Return the readings (k, beams) of messages, the quick ways first, and by message what is wrong with it."""
         errors: list[ValueError | None] = [None] * len(pending)
         first = np.array([p.first for p in pending], dtype=np.int64)
@@ -67,9 +65,7 @@ class Block:
                 errors[row] = error
         return values, errors
 
-    def _decode_equal_widths(
-        self, beams: int, first: Ints, begins: Ints, ends: Ints
-    ) -> tuple[NDArray[np.float32], Bools]:
+    def _decode_equal_widths(self, beams: int, first: Ints, begins: Ints, ends: Ints) -> tuple[NDArray[np.float32], Bools]:
         """Decode rows of numbers that are all as wide as the first one of all."""
         width, decimals = self._form(begins[0], self.gaps[first[0]])
         fits = ends - begins == beams * (width + 1) - 1
@@ -80,9 +76,7 @@ class Block:
             fits[:] = False
         return values, fits
 
-    def _decode_fixed_point(
-        self, beams: int, first: Ints, begins: Ints, ends: Ints
-    ) -> tuple[NDArray[np.float32], Bools]:
+    def _decode_fixed_point(self, beams: int, first: Ints, begins: Ints, ends: Ints) -> tuple[NDArray[np.float32], Bools]:
         """Decode rows of numbers with as many decimals as the first one of all."""
         _, decimals = self._form(begins[0], self.gaps[first[0]])
         if not 1 <= decimals <= 6:

@@ -19,9 +19,7 @@ _LONGEST = 8
 """Characters in one word."""
 
 
-def decode_fixed_point(
-    text: Bytes, ends: Ints, begins: Ints, decimals: int
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def decode_fixed_point(text: Bytes, ends: Ints, begins: Ints, decimals: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Decode the tokens text[begins:ends], each written as digits, a dot and `decimals` digits.
 
     Parameters

@@ -20,9 +20,7 @@ _OTHERS = re.compile(
 """Types that hold no ranges to anchors, whatever a field of theirs is called."""
 _OTHER_RANGE = re.compile(r"sonar|ultra.?sonic|infra.?red|\bir\b|cliff|bumper|proximity|altitude|height|lidar|tof", re.I)
 """In the name of a topic of sensor_msgs/Range: not a radio."""
-_RANGE = re.compile(
-    r"((measured|raw|uwb)_)?(ranges?|distances?|dist|dis)(_?arr(ay)?)?(_?(mm|cm|m|raw|meas|met(er|re)s?))?"
-)
+_RANGE = re.compile(r"((measured|raw|uwb)_)?(ranges?|distances?|dist|dis)(_?arr(ay)?)?(_?(mm|cm|m|raw|meas|met(er|re)s?))?")
 """Name of a field with a distance."""
 _ID = re.compile(
     r"((anchor|dest(ination)?|responder|remote|target|beacon|node|peer|mac|uwb)_?)?(device_?)?(id2?|addr(ess)?|mac|dest|name)"

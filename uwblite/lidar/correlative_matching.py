@@ -91,11 +91,7 @@ def search(
 
 
 def score_grid(
-    target: Clouds,
-    source: Clouds,
-    T_target_source: Floats,
-    window: tuple[float, float, float],
-    config: CorrelativeConfig,
+    target: Clouds, source: Clouds, T_target_source: Floats, window: tuple[float, float, float], config: CorrelativeConfig
 ) -> tuple[Singles, Floats, Ints, Ints]:
     """Score every pose of the grid.
 

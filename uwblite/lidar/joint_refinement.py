@@ -118,9 +118,7 @@ def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
     return seen
 
 
-def choose_pairs(
-    clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: RefinementConfig
-) -> tuple[Ints, Ints]:
+def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:
     """Choose the pairs (i < j) of clouds to be matched: following keyframes, and the best views from other times.
 
     Parameters

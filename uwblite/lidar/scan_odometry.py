@@ -72,9 +72,7 @@ def misfits(scans: LaserScans, mounting: SensorMounting, first: Ints, second: In
     return (found.squared + _FIRST_GATE**2 * (found.asked - found.matched)) / np.maximum(found.asked, 1)
 
 
-def directional_shares(
-    scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats
-) -> Floats:
+def directional_shares(scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, motion: Floats) -> Floats:
     """Return what share (e,) of two scans matches at a motion (e, 3) in the direction in which fewest points do, 0..1.
 
     Along a corridor a scan matches the next one best where the robot stood, ray by ray: only the few surfaces that face

@@ -96,9 +96,7 @@ class Steps:
         return Steps(begins[order], *columns)
 
 
-def descend(
-    clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: float, config: TrackingConfig
-) -> Steps:
+def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: float, config: TrackingConfig) -> Steps:
     """Measure the steps from keyframes i (e,) to the next by their clouds, each from its guess (e, 3).
 
     Parameters
@@ -111,8 +109,7 @@ def descend(
 
 
 def follow(
-    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float,
-    config: TrackingConfig,
+    clouds: Clouds, raster: CloudRasters, wheels: OdometryEdges, graph: Graph, steps: Steps, gate: float, config: TrackingConfig
 ) -> ScanOdometry:
     """Turn steps between neighbouring keyframes into edges, searching where the guess may have been bad.
 
@@ -176,9 +173,7 @@ def _lines_of(clouds: Clouds) -> Ints:
     return np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
 
 
-def _searched(
-    clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig
-) -> tuple[Floats, Bools]:
+def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig) -> tuple[Floats, Bools]:
     """Search for doubtful steps (e,), each against the sub-map of those before it.
 
     Returns

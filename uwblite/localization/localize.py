@@ -44,9 +44,7 @@ class Localization:
     doubts: tuple[Notice, ...]
 
 
-def localize(
-    log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progress: Progress | None = None
-) -> Localization:
+def localize(log: SensorLog, known: KnownMap, *, turn_laser: bool = True, progress: Progress | None = None) -> Localization:
     """Find the trajectory of a recording in an earlier map.
 
     Parameters

@@ -105,9 +105,7 @@ def _collect(
     i, j = submaps.reference[candidates.target], submaps.reference[candidates.source]
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
     records = tuple(
-        LoopClosure(
-            int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), outcome, reason
-        )
+        LoopClosure(int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), outcome, reason)
         for k, (outcome, reason) in enumerate(verdicts)
     )
     good = np.array([closure.accepted for closure in records], dtype=bool)

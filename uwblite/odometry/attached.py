@@ -104,9 +104,7 @@ def choose_scans(scans: LaserScans, keyframes: Keyframes, config: KeyframeConfig
     return owner[kept].astype(np.int64), kept
 
 
-def scan_points(
-    log: SensorLog, keyframes: Keyframes, owner: Ints, chosen: Ints, range_max: float = np.inf
-) -> ScanPoints:
+def scan_points(log: SensorLog, keyframes: Keyframes, owner: Ints, chosen: Ints, range_max: float = np.inf) -> ScanPoints:
     """Turn chosen scans into points in the frame of their keyframes, each ray moved by the odometry at its own time.
 
     Parameters

@@ -262,9 +262,7 @@ def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
     """Compare the free space of one visit to a place with the points of another; doubt a map that contradicts itself."""
     assert estimate.scans is not None
     recordings, poses = task.recordings, estimate.graph.poses
-    share, visits = visibility.free_space_violation(
-        estimate.scans.clouds, poses, recordings.path, recordings.of_keyframe
-    )
+    share, visits = visibility.free_space_violation(estimate.scans.clouds, poses, recordings.path, recordings.of_keyframe)
     task.stages.end("map consistency", visits=visits, free_space_violation=round(share, 4))
     if share > _VIOLATION and visits >= _ENOUGH_VISITS:
         task.stages.doubt(

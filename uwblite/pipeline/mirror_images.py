@@ -69,9 +69,7 @@ def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Float
     own = graph.calibration.of_kinds(BIAS, HEIGHT)
     fixed = np.zeros(len(own), dtype=bool) if graph.fixed_calibration is None else np.asarray(graph.fixed_calibration)
     priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block != "poses")
-    alone = Graph(
-        graph.poses, anchors, priors, graph.calibration, np.ones(len(graph.poses), dtype=bool), ~free, fixed | ~own
-    )
+    alone = Graph(graph.poses, anchors, priors, graph.calibration, np.ones(len(graph.poses), dtype=bool), ~free, fixed | ~own)
     return optimize(alone.with_edges(ranges), task.config.solver)[0]
 
 

@@ -82,9 +82,7 @@ def _places_by_recording(
     alone = Graph(graph.poses, graph.anchors[pairs[:, 0]], graph.calibration_priors, graph.calibration, all_poses, None, fixed)
     # Outliers of the joint map may be of an anchor that was moved: first all ranges count alike.
     alike = np.ones(len(alive))
-    edges = replace(
-        ranges.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5), weights=alike
-    )
+    edges = replace(ranges.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5), weights=alike)
     edges, _ = learn_noise(edges, optimize(alone.with_edges(edges), solver)[0], len(pairs), noise)
     solved = optimize(alone.with_edges(edges), solver)[0]
     return solved.anchors, marginals(solved).anchors, pairs

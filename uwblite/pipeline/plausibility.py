@@ -167,9 +167,7 @@ def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:
         task.stages.warn("empty-scans", "the lidar saw nothing in any scan: the map is empty")
 
 
-def check_closures(
-    estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task
-) -> None:
+def check_closures(estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task) -> None:
     """Name a map without loop closures, or one that more of them contradict than hold together."""
     candidates = estimate.closures.candidates
     accepted = sum(c.accepted for c in candidates)
@@ -183,9 +181,7 @@ def check_closures(
         task.stages.doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
 
 
-def check_calibration(
-    calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task
-) -> None:
+def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task) -> None:
     """Warn of each calibration value far outside what is usual.
 
     Parameters

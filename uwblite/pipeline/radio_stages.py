@@ -11,15 +11,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats
 from ..graph import calibration
-from ..graph.calibration import (
-    BIAS,
-    ODOMETRY,
-    RADIO,
-    RANGE_SCALE,
-    optimize_with_heights,
-    with_free,
-    with_nonnegative_heights,
-)
+from ..graph.calibration import BIAS, ODOMETRY, RADIO, RANGE_SCALE, optimize_with_heights, with_free, with_nonnegative_heights
 from ..graph.graph import Graph
 from ..graph.solver import SolverConfig, optimize
 from ..odometry import gyro

@@ -114,9 +114,7 @@ def gather(logs: Sequence[SensorLog], config: KeyframeConfig) -> Recordings:
 def later(recordings: Recordings, shift: float) -> Recordings:
     """Return the recordings with all keyframes of those with lidar later by a shift, s: its clock is late by so much more."""
     shifts = [shift if s.has_scans else 0.0 for s in recordings.each]
-    frames = [
-        keyframes.at(s.log, s.frames.stamps + t, s.frames.alone) for s, t in zip(recordings.each, shifts, strict=True)
-    ]
+    frames = [keyframes.at(s.log, s.frames.stamps + t, s.frames.alone) for s, t in zip(recordings.each, shifts, strict=True)]
     return _joined([s.log for s in recordings.each], frames)
 
 

@@ -48,8 +48,4 @@ def thinned(log: SensorLog, frames: KeyframeConfig, grid: GridConfig) -> SensorL
     if len(kept) == len(scans.stamps):
         return log
     left_out = log.notes.scans_left_out + len(scans.stamps) - len(kept)
-    return replace(
-        log,
-        scans=scans.rows(kept),
-        notes=replace(log.notes, scans_left_out=left_out),
-    )
+    return replace(log, scans=scans.rows(kept), notes=replace(log.notes, scans_left_out=left_out))

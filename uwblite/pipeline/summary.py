@@ -199,9 +199,7 @@ def _count(name: str, recordings: Recordings) -> int:
     return sum(int(np.sum(ranges.anchor == k)) for ranges, k in measured if ranges is not None)
 
 
-def _calibration(
-    k: int, unknown: Unknown, graph: Graph, covariance: Marginals, by_steps: float | None
-) -> CalibrationEstimate:
+def _calibration(k: int, unknown: Unknown, graph: Graph, covariance: Marginals, by_steps: float | None) -> CalibrationEstimate:
     """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (turn_checks)."""
     value, fixed = float(graph.calibration.values[k]), graph.fixed_calibration
     if by_steps is not None:

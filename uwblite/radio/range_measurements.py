@@ -81,8 +81,7 @@ _CLEARLY = 0.1
 
 
 def learn_noise(
-    edges: RangeEdges, graph: Graph, anchors: int, config: RangeNoiseConfig, steady: bool = False,
-    blocked: Bools | None = None,
+    edges: RangeEdges, graph: Graph, anchors: int, config: RangeNoiseConfig, steady: bool = False, blocked: Bools | None = None
 ) -> tuple[RangeEdges, tuple[RangeNoise, ...]]:
     """Give every range the standard deviation that its anchor's residuals show, and a weight that counts slow errors once.
 

@@ -120,9 +120,7 @@ class SensorLog:
         )
 
 
-def _check(
-    values: Floats, name: str, shape: tuple[int | None, ...], ordered: bool = False, most: float = MOST_SECONDS
-) -> None:
+def _check(values: Floats, name: str, shape: tuple[int | None, ...], ordered: bool = False, most: float = MOST_SECONDS) -> None:
     if values.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, values.shape, strict=True)):
         raise DataError(f"{name} has shape {values.shape}, expected {shape}")
     bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))

@@ -77,9 +77,7 @@ def _about_sensors(sensors: Mapping[str, SensorState], recorded: float, at_rest:
 
 
 def _about_anchors(result: StoredResult) -> list[str]:
-    found = [
-        f"anchor {a.id} may be mirrored: drive a curve near it" for a in result.anchors if a.status == "mirror-ambiguous"
-    ]
+    found = [f"anchor {a.id} may be mirrored: drive a curve near it" for a in result.anchors if a.status == "mirror-ambiguous"]
     found += [
         f"anchor {a.id} has no place yet: drive around it, within its reach" for a in result.anchors if a.status == "unplaced"
     ]

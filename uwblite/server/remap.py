@@ -21,9 +21,7 @@ def missing_recordings(report: dict[str, Any], recordings: dict[str, Path]) -> l
     return [str(i.get("source", "?")) for i in report.get("inputs") or () if i.get("sha256") not in recordings]
 
 
-def remap_command(
-    report: dict[str, Any], folder: Path, recordings: dict[str, Path], constraints: Path, out: Path
-) -> list[str]:
+def remap_command(report: dict[str, Any], folder: Path, recordings: dict[str, Path], constraints: Path, out: Path) -> list[str]:
     """Return the arguments of `uwblite` that map a result's recordings again, in their order.
 
     Parameters
