@@ -7,7 +7,7 @@
 Liu et al., Cost-effective Mapping of Mobile Robot Based on the Fusion of UWB and Short-range 2D LiDAR (CITATION.cff):
 table I (methods), II (UWB nodes), III (sub-map size), IV (iterations of ICP), the grid of fitness threshold and outlier
 distance, V (time per stage) and the maps. Its recordings are not public; the simulated ones have its sensors, its
-driving time and, for the hall, its drift.
+driving time and, for the hall, its drift and two of four UWB nodes without line of sight.
 """
 
 import argparse
@@ -41,8 +41,17 @@ PAPER_METHODS = {"odometry": 1.37, "odometry + UWB + closures": 0.199}
 """m; the paper's mean errors that are quoted here."""
 PAPER_SECONDS = {"loop closure": 523.0, "everything": 529.0}
 """s, of the paper's recording of 31 min."""
-ROOMS = RealRooms()
-"""Rooms whose errors stay with places, walls and floors, as those of the paper's hall did."""
+ROOMS = replace(RealRooms(), patch_turn=0.0068)
+"""Rooms whose errors stay with places, walls and floors. The floor is the one constant set by a figure of the paper: so uneven
+that odometry alone is off by its 1.37 m on average over `DRIVES` recordings. One drive says little, they differ by 0.4 m."""
+HALL = Settings(world="hall", nlos="heavy", nlos_anchors=(3, 4), rooms=ROOMS)
+"""The paper's table II is of a hall in which nodes 3 and 4 have no line of sight, and its table I of the same hall. How late
+their ranges are: concrete (relative permittivity 5.24, ITU-R P.2040) adds (sqrt(5.24) - 1) times the way through it, 0.71 m for
+the mean chord of a column of 0.35 m radius, 0.55 m; behind a board, users of DW1000 modules saw 0.3 to 0.5 m over 5 m (Qorvo
+forum, topic 14184). Level "heavy", 0.8 m on average, is on the unkind side of these."""
+DRIVES = 20
+"""Recordings of the hall for the methods of preset paper that use no lidar."""
+WITHOUT_LIDAR = ("odometry", "odometry + UWB")
 NODES = ((1,), (2,), (3,), (4,), (3, 4), (2, 3, 4), (1, 2, 3, 4))
 EPSILONS = (0.0, 3.0, 6.0, 9.0, 12.0)
 ITERATIONS = (10, 30, 100, 300, 1000)
@@ -121,16 +130,18 @@ def planned(args: argparse.Namespace, pictures: Path) -> list[Task]:
     tasks = []
     for seed in seeds:
         runs = _methods("hall", seed, pictures if seed == 1 else None)
-        tasks.append(Task(Settings(world="hall", seed=seed, minutes=minutes, rooms=ROOMS), runs))
+        tasks.append(Task(replace(HALL, seed=seed, minutes=minutes), runs))
+    for seed in range(seeds.stop, 0 if args.quick else DRIVES + 1):
+        runs = tuple(Run(("I", m, "paper", "hall", str(seed)), "paper", METHODS[m]) for m in WITHOUT_LIDAR)
+        tasks.append(Task(replace(HALL, seed=seed, without=("laser",)), runs))
     for world in ("corridor", "lab"):
         tasks.append(Task(Settings(world=world, seed=1, minutes=minutes, rooms=ROOMS), _methods(world, 1, pictures)))
-    nlos = Settings(world="hall", seed=1, minutes=minutes, nlos="heavy", nlos_anchors=(3, 4), rooms=ROOMS)
+    hall = replace(HALL, seed=1, minutes=minutes)
     # fmt: off
-    tasks.append(Task(nlos, tuple(
+    tasks.append(Task(hall, tuple(
         Run(("II", "+".join(map(str, n)), p), p, QUICK_WITHOUT_MAP, n) for n in NODES for p in PRESETS
     )))
     # fmt: on
-    hall = Settings(world="hall", seed=1, minutes=minutes, rooms=ROOMS)
     tasks += [Task(hall, runs) for runs in (_sizes(args.quick), _grid("paper", "icp.fitness_sigma", args.quick))]
     tasks.append(Task(hall, _grid("default", "loop_closure.sigma", args.quick)))
     return tasks
@@ -188,19 +199,40 @@ def table_1(results: Results, seeds: Sequence[str]) -> str:
             row: list[object] = [world, method, PAPER_METHODS.get(method, float("nan")) if world == "hall" else float("nan")]
             for p in PRESETS:
                 runs = [f for k, f in results.items() if k[:4] == ("I", method, p, world)]
-                found = sum(not math.isnan(e) for f in runs for _, _, e, _ in f.pairs)
-                asked = sum(len(f.pairs) for f in runs)
+                drawn = [f for f in runs if f.missing or not math.isnan(f.column)]
+                found = sum(not math.isnan(e) for f in drawn for _, _, e, _ in f.pairs)
+                asked = sum(len(f.pairs) for f in drawn)
                 row += [mean([f.column for f in runs]), f"{found}/{asked}", mean([f.drawn for f in runs])]
                 row.append(mean([f.ate for f in runs]))
             rows.append(row)
     head = ["building", "method", "paper"] + [f"{p}: {x}" for p in PRESETS for x in ("in the map", "found", "as drawn", "ATE")]
-    text = table(head, rows)
+    text = table(head, rows) + "\n" + spread(results) + "\n"
     rows = []
     first = {(m, p): results["I", m, p, "hall", seeds[0]] for m in METHODS for p in PRESETS}
     for n, (a, b, _, _) in enumerate(first["odometry", "paper"].pairs):
         rows.append([f"{a} - {b}"] + [first[m, p].pairs[n][3] for p in PRESETS for m in METHODS])
     head = ["pair"] + [f"{p}: {m}" for p in PRESETS for m in METHODS]
     return text + "\nThe ten pairs of the hall, first recording, as drawn:\n\n" + table(head, rows)
+
+
+def drives(results: Results, method: str) -> list[float]:
+    """Return the error of the columns as drawn, m, of every recording of the hall that preset paper mapped in this way."""
+    return [f.drawn for k, f in results.items() if k[:4] == ("I", method, "paper", "hall")]
+
+
+def standard_error(values: Sequence[float]) -> float:
+    """Return the standard error of the mean; inf of a single value."""
+    return float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.inf
+
+
+def spread(results: Results) -> str:
+    """Say by how much the recordings of the hall differ in the methods without lidar."""
+    lines = []
+    for method in WITHOUT_LIDAR:
+        e = drives(results, method)
+        size = f"{mean(e):.3f} m with a standard error of {standard_error(e):.3f} m, from {min(e):.3f} to {max(e):.3f} m"
+        lines.append(f"- preset paper, {method}, {len(e)} recordings of the hall, as drawn: {size}.\n")
+    return "".join(lines)
 
 
 def by_row(results: Results, name: str, first: str, presets: Sequence[str] = PRESETS) -> str:
@@ -267,8 +299,12 @@ def differences(results: Results, seeds: Sequence[str]) -> str:
         full, *others = sorted(e.values(), key=lambda v: v != e["odometry + UWB + closures"])
         holds = max(e, key=lambda m: e[m]) == "odometry" and all(full < v for v in others)
         lines.append(verdict(f"Preset {p}, hall: odometry worst, all together best", holds, listed(e)))
+    alone = drives(results, "odometry")
+    around, figure = 2.0 * standard_error(alone), PAPER_METHODS["odometry"]
+    size = f"{mean(alone):.3f} m, two standard errors {around:.3f} m"
+    lines.append(verdict(f"Preset paper, hall: {figure:g} m for odometry alone", abs(mean(alone) - figure) < around, size))
     full = error("odometry + UWB + closures", "paper")
-    lines.append(verdict("Preset paper, hall: 0.2 m for the full method", 0.1 < full < 0.3, f"{full:.3f} m as drawn"))
+    lines.append(verdict("Preset paper, hall: 0.2 to 0.3 m for the full method", 0.2 <= full <= 0.3, f"{full:.3f} m as drawn"))
     nodes = {n: results["II", n, "paper"].drawn for n in ("3+4", "2+3+4", "1+2+3+4")}
     falling = nodes["3+4"] >= nodes["2+3+4"] >= nodes["1+2+3+4"]
     lines.append(verdict("Preset paper: more UWB nodes, less error", falling, listed(nodes)))
@@ -297,11 +333,13 @@ find a column in. *ATE* is the root mean square error of the trajectory after al
 """
 
 NOTES = """
-Why it differs where it does: the rooms err as data sheets and papers say (tools/simulation/real_rooms.py), the floor so much
-that odometry alone is as far off in the hall as in the paper; the rest is not fitted to the paper's figures. With it the full
-method of preset paper comes out at 0.13 m, not at the paper's 0.2 m: four anchors in range nearly everywhere average
-errors of 4 to 12 cm each to that, and a larger one would need figures that no source gives. The fitness score of the
-paper counts every point of a sub-map, also those that the other never saw, so most of the pairs that overlap in part are
+Why it differs where it does: the rooms err as data sheets and papers say (tools/simulation/real_rooms.py). Two choices are the
+paper's own hall: the floor, so uneven that odometry alone is as far off on average as in the paper, and nodes 3 and 4, which
+have no line of sight (its table II). Nothing is fitted to the error of its full method. With a line of sight to all four nodes
+that error is 0.13 m, since errors of 4 to 12 cm each average; with two of four late by decimetres, which preset paper neither
+models nor weighs down, it is above 0.2 m. Anchors 1.9 m above the tag (2.44 and 0.57 m, Qorvo forum, topic 5059), which preset
+paper takes for level with it, would add another 0.02 m: the paper does not say, so here all are level. The fitness score of
+the paper counts every point of a sub-map, also those that the other never saw, so most of the pairs that overlap in part are
 rejected. The defaults match neighbouring scans in every method, also in *odometry* and *odometry + UWB*: there only what
 would join different times is left out. GMapping, the fifth method of its table, is not repeated: it is another
 program.
@@ -310,13 +348,15 @@ program.
 
 def document(results: Results, args: argparse.Namespace) -> str:
     """Return the page."""
-    seeds = sorted({k[4] for k in results if k[0] == "I" and k[3] == "hall"})
+    seeds = sorted({k[4] for k in results if k[0] == "I" and k[1] not in WITHOUT_LIDAR and k[3] == "hall"})
     minutes = "of 6 min" if args.quick else "of 31 min (hall) and 20 min (corridor, lab)"
     parts = [
         HEAD.format(recordings=f"{len(seeds)} of the hall, one of a corridor loop and one of a cluttered lab, {minutes}"),
         "## What reproduces\n\n" + differences(results, seeds) + "\n" + NOTES,
-        "## Table I: methods\n\nHall: mean of the recordings.\n\n" + table_1(results, seeds),
-        "## Table II: which UWB nodes\n\nHall, heavy NLOS on nodes 3 and 4.\n\n" + by_row(results, "II", "nodes"),
+        "## Table I: methods\n\nHall: mean of the recordings. In preset paper odometry and odometry + UWB use no\n"
+        f"lidar; their last two columns are means of {len(drives(results, 'odometry'))}.\n\n" + table_1(results, seeds),
+        "## Table II: which UWB nodes\n\nThe hall's first recording; nodes 3 and 4 have no line of sight.\n\n"
+        + by_row(results, "II", "nodes"),
         "## Table III: size of sub-maps\n\nSub-maps of 0 m are single keyframes; the paper's preset then tries the best four "
         "partners of each only.\n\n" + by_row(results, "III", "epsilon, m"),
         "## Table IV: iterations\n\nOf ICP, preset paper:\n\n" + by_row(results, "IV", "iterations", ("paper",))

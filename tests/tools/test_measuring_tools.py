@@ -62,7 +62,7 @@ def test_consistency_goes_on_where_an_earlier_call_stopped(tmp_path, monkeypatch
     call = ["--only", "warehouse", "--first", "5", "--minutes", "2", "--keep", str(tmp_path / "rows"), "--jobs", "1", "--print"]
     for runs in ("1", "3"):
         assert consistency.main([*call, "--runs", runs]) == 0
-    assert asked == [("warehouse", seed, 4.5) for seed in (5, 6, 7)]
+    assert asked == [("warehouse", seed, 6.0) for seed in (5, 6, 7)]
     assert "| warehouse | 3 |" in capsys.readouterr().out
 
 
