@@ -61,3 +61,15 @@ def test_a_robot_that_moves_across_its_heading_is_named(swing, said):
 def test_three_places_have_a_width_and_two_have_none():
     assert straightness(np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])) == pytest.approx(1.0)
     assert straightness(np.array([[0.0, 0.0], [1.0, 3.0]])) == 0.0
+
+
+def test_a_robot_that_never_moves_has_no_speed():
+    figures, _ = checked(np.ones((50, 3)), 10.0)
+    assert (figures["speed m/s"], figures["path m"], figures["turned rad"]) == (0.0, 0.0, 0.0)
+
+
+def test_figures_are_rounded_to_what_they_are_worth():
+    poses = np.column_stack([0.0123456 * np.arange(50), 0.0003 * np.sin(np.arange(50)), 0.0123456 * np.arange(50)])
+    figures, _ = checked(poses, 10.0)
+    for name, digits in (("path m", 3), ("turned rad", 3), ("speed m/s", 4), ("width of the path by its length", 4)):
+        assert figures[name] == round(figures[name], digits) != round(figures[name], digits - 1)

@@ -102,6 +102,7 @@ def test_progress_is_reported():
     graph, _, _, _, _ = spoilt(1)
     optimize_gnc(graph, THRESHOLDS, progress=lambda done, most: calls.append((done, most)))
     assert calls[-1][0] == calls[-1][1]
+    assert len({most for _, most in calls}) == 1
     assert all(a[0] < b[0] for a, b in pairwise(calls))
     assert calls[0][0] == 1
     assert len(calls) > 2
@@ -128,3 +129,13 @@ def test_kernels_that_tighten_are_not_drawn_by_false_closures():
     assert ate(found.poses, truth) <= 1.2 * ate(optimize(clean)[0].poses, truth)
     at_once = tightened(graph, [CLOSURES, RANGES], (4.0,), SolverConfig())
     assert found.chi2() < at_once.chi2()
+
+
+def test_the_end_of_all_steps_is_reported_behind_the_last_one():
+    """Where weights stay between 0 and 1 until the last step that is planned."""
+    graph, _, _, _, _ = spoilt(1)
+    calls = []
+    norms = np.sqrt(np.sum(graph.edges[RANGES].residuals(graph) ** 2, axis=1))
+    optimize_gnc(graph, {RANGES: float(norms.max())}, progress=lambda done, most: calls.append((done, most)))
+    assert [done for done, _ in calls] == [*range(1, len(calls)), calls[-1][1]]
+    assert len(calls) <= calls[-1][1]

@@ -118,6 +118,8 @@ def test_fitness_is_the_mean_squared_distance_of_all_points():
     points = np.array([[0.0, 0.1], [1.0, 0.2], [4.0, 4.0]])
     assert fitness_score(target, points, np.zeros(3)) == pytest.approx((0.01 + 0.04 + 25.0) / 3.0)
     assert fitness_score(make_tree(np.zeros((0, 2))), points, np.zeros(3)) == np.inf
+    assert fitness_score(target, np.zeros((0, 2)), np.zeros(3)) == np.inf
+    assert fitness_score(make_tree(points[:1]), points[:1] + np.array([0.3, 0.4]), np.zeros(3)) == pytest.approx(0.25)
 
 
 @settings(max_examples=60, deadline=None)

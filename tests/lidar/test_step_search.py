@@ -7,7 +7,7 @@ from helpers.laser_walks import CORRIDOR, HALL, scanned
 from uwblite import se2
 from uwblite.lidar.pair_alignment import Aligned
 from uwblite.lidar.scan_matching import PairFactors
-from uwblite.lidar.step_search import StepSearch, _apart, _chained, _measurably
+from uwblite.lidar.step_search import FoundStep, StepSearch, _apart, _chained, _measurably
 
 PATH = np.array([[-1.0 + 0.3 * k, 0.5 + 0.05 * k, 0.05 * k] for k in range(6)])
 STEPS = se2.between(PATH[:-1], PATH[1:])
@@ -81,3 +81,12 @@ def test_a_place_that_has_not_converged_does_not_differ_from_itself():
     hessian = np.tile(1000.0 * np.eye(3), (2, 1, 1))
     factors = PairFactors(hessian, 0.0 * hessian, np.full((2, 3), 500.0), count, count, np.ones(2), np.ones(2))
     np.testing.assert_array_equal(_measurably(0, Aligned(poses, factors)), [False, True])
+
+
+@pytest.mark.parametrize(
+    ("score", "second", "clear"),
+    [(0.45, -1.0, True), (0.4499, -1.0, False), (0.75, 0.66, True), (0.75, 0.68, False), (0.58, 0.5, False)],
+)
+def test_a_step_is_clear_where_enough_matches_and_no_distinct_place_nearly_as_well(score, second, clear):
+    assert FoundStep(np.zeros(3), score, second, 0.0).clear is clear
+    assert [FoundStep(np.zeros(3), score, second, t).contradicts for t in (0.12, 0.121)] == [False, True]

@@ -8,7 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
-from uwblite.odometry.keyframes import KeyframeConfig, _broken_steps, _slack, _travelled, dense_trajectory, select, velocity_at
+from uwblite.odometry.keyframes import (
+    KeyframeConfig,
+    _broken_steps,
+    _moments,
+    _slack,
+    _travelled,
+    dense_trajectory,
+    select,
+    velocity_at,
+)
 from uwblite.sensor_log import LaserScans, Odometry, OdometryBreaks
 
 CONFIG = KeyframeConfig(distance=0.4, angle=0.3, scans=2)
@@ -252,3 +261,27 @@ def test_ways_between_samples_are_shares_of_the_step_by_time():
     np.testing.assert_allclose(signed, [0.0, 0.1, 0.4, 0.38, 0.3, 0.3, 0.3])
     np.testing.assert_allclose(path, [0.0, 0.1, 0.4, 0.42, 0.5, 0.5, 0.5])
     np.testing.assert_allclose(turned, [0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.2], atol=1e-12)
+
+
+def test_moments_are_those_of_the_odometry_and_of_scans_strictly_within_it():
+    """Each with the last sample before it; a scan at a sample is that sample, and preferred."""
+    stamps = np.array([1.0, 2.0, 3.0, 5.0])
+    odometry = Odometry(stamps, np.zeros((4, 3)))
+    begin = np.array([0.5, 1.0, 1.5, 1.6, 2.0, 4.0, 4.9, 5.0, 5.5])
+    lidar = LaserScans(begin, np.ones((9, 3), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 5.0)
+    moments, sample, preferred = _moments(odometry, lidar)
+    np.testing.assert_array_equal(moments, [1.0, 1.5, 1.6, 2.0, 3.0, 4.0, 4.9, 5.0])
+    np.testing.assert_array_equal(sample, [0, 0, 0, 1, 2, 2, 2, 3])
+    np.testing.assert_array_equal(preferred, [True, True, True, True, False, True, True, True])
+    moments, sample, preferred = _moments(odometry, None)
+    assert (moments.tolist(), sample.tolist(), preferred.all()) == (stamps.tolist(), [0, 1, 2, 3], True)
+
+
+@pytest.mark.parametrize(("rate", "window"), [(20.0, (0.0, 0.1)), (3.0, (0.1, 0.3)), (20.0, (0.1, 0.3))])
+def test_a_velocity_at_the_ends_is_that_of_the_half_which_is_there(rate, window):
+    """And none where the odometry is a single sample."""
+    stamps, truth = drive([(0.4, 0.0, 0.5)], [6.0], rate=rate)
+    for stamp in (stamps[0], stamps[-1], stamps[0] + 0.5 * window[1], stamps[3]):
+        found = velocity_at(Odometry(stamps, truth), np.array([stamp]), window)
+        np.testing.assert_allclose(found, [[0.4, 0.0, 0.5]], atol=0.02)
+    np.testing.assert_array_equal(velocity_at(Odometry(stamps[:1], truth[:1]), np.array([stamps[0]]), window), 0.0)

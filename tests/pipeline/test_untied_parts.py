@@ -82,3 +82,9 @@ def test_what_bridges_the_silence():
 
 def test_a_robot_that_stands_needs_no_scans():
     assert untied(scans_at=WITHOUT, poses=0.01 * POSES) == []
+
+
+@pytest.mark.parametrize(("first", "last", "named"), [(6, 20, True), (5, 20, False), (80, 94, True), (80, 95, False)])
+def test_a_part_of_a_few_keyframes_is_too_small_for_a_word(first, last, named):
+    """At either end: so many keyframes before the silence, or behind it."""
+    assert len(untied(scans_at=np.concatenate([np.arange(0.0, first), np.arange(last, 100.0)]))) == named

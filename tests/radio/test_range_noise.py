@@ -125,7 +125,7 @@ def test_thirty_ranges_are_enough():
 @pytest.mark.parametrize("count", [0, 5, 29])
 def test_too_few_ranges_leave_the_assumption(count):
     rng = np.random.default_rng(0)
-    noise = learn(rng.uniform(0, 5, (count, 2)), rng.standard_normal(count), np.ones(count), CONFIG)
+    noise = learn(rng.uniform(0, 1, (count, 2)), rng.standard_normal(count), np.ones(count), CONFIG)
     assert (noise.white, noise.slow, noise.length) == (assumed(CONFIG).white, assumed(CONFIG).slow, assumed(CONFIG).length)
 
 
@@ -208,8 +208,10 @@ def test_short_term_noise_bears_outliers():
 
 def test_short_term_noise_needs_neighbours_and_keeps_its_bounds():
     assert short_term_sigma(np.zeros(0), np.zeros(0, dtype=int), np.zeros(0), CONFIG) == CONFIG.sigma
-    few = np.arange(15)
-    assert short_term_sigma(few * 1.0, np.zeros(15, dtype=int), few * 1.0, CONFIG) == CONFIG.sigma
+    for count, learnt in ((15, False), (21, False), (22, True)):  # two readings more than triples
+        few = np.arange(count)
+        sigma = short_term_sigma(few * 1.0, np.zeros(count, dtype=int), few * 1.0, CONFIG)
+        assert sigma == (CONFIG.min_sigma if learnt else CONFIG.sigma)
     many = np.arange(100)
     assert short_term_sigma(many * 1.0, np.zeros(100, dtype=int), many * 0.1, CONFIG) == CONFIG.min_sigma
     assert short_term_sigma(np.zeros(100), np.zeros(100, dtype=int), many * 0.1, CONFIG) == CONFIG.sigma
