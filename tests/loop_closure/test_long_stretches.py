@@ -97,3 +97,21 @@ def test_what_lies_beyond_one_sigma_is_not_likely(unlike):
     kept = likely(pairs)
     assert 0 < len(kept.target) <= len(pairs.target)
     assert len(kept.target) == np.sum(distance < 15.0 + pairs.spread / 3.0)
+
+
+def test_stretches_of_thirty_metres_begin_in_the_middle_of_the_one_before():
+    """Two recordings of 75 m and 40 m, which no stretch has both of."""
+    path = np.concatenate([np.arange(0.0, 75.0, 0.5), 1000.0 + np.arange(0.0, 40.0, 0.5)])
+    recording = np.repeat([0, 1], [150, 80])
+    first, last, reference = cut(path, recording)
+    assert np.all(recording[first] == recording[last - 1])
+    covered = path[last - 1] - path[first]
+    begins = np.diff(path[first])[np.diff(recording[first]) == 0]
+    # A rest at the end of a recording is shorter.
+    assert np.median(begins) == 15.0
+    assert begins.max() <= 17.5
+    inner = np.append(recording[first[1:]] == recording[first[:-1]], False)
+    assert np.median(covered[inner]) == 29.5
+    assert covered.max() <= 32.5
+    np.testing.assert_array_equal(reference, (first + last - 1) // 2)
+    assert set(np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])) == set(range(230))

@@ -14,6 +14,7 @@ from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
 from uwblite.mapping import build_map
+from uwblite.pipeline import residual_tests
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.residual_tests import (
     check_odometry_jumps,
@@ -242,3 +243,13 @@ def test_ranges_scatter_more_than_from_one_to_the_next(off, steps, said):
     check_range_scatter(SimpleNamespace(ranges=ranges), residuals, task)
     assert len(stages.doubts) == (said is not None)
     assert all(said in n.text for n in stages.doubts)
+
+
+def test_every_check_is_made_once(monkeypatch):
+    made = []
+    names = [n for n in vars(residual_tests) if n.startswith("check_") and n != "check_residuals"]
+    for name in names:
+        monkeypatch.setattr(residual_tests, name, lambda *given, name=name: made.append((name, *given)))
+    residual_tests.check_residuals("estimate", "residuals", "task")
+    assert sorted(n for n, *_ in made) == sorted(names)
+    assert {tuple(given) for _, *given in made} == {("estimate", "task"), ("estimate", "residuals", "task")}

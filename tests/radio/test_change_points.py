@@ -127,3 +127,11 @@ def test_the_moment_is_the_one_at_which_both_places_explain_most():
     costs = {k: before[:k].sum() + after[k:].sum() for k in range(20, 181)}
     assert split.moment == min(costs, key=costs.get)
     assert split.unexplained == pytest.approx(costs[split.moment])
+
+
+@pytest.mark.parametrize(("count", "found"), [(39, False), (40, True)])
+def test_forty_ranges_show_a_move(count, found):
+    """Half from either place, which is the one moment that leaves twenty on each side."""
+    few = np.linspace(0, 199, count).astype(int)
+    ranges = measured(1, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), int(few[20]), share=0.0)[few]
+    assert (find_move(PATH[few], ranges, STAMPS[few], SIGMA, TrilaterationConfig()) is not None) == found

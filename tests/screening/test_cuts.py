@@ -124,3 +124,28 @@ def test_scans_beside_a_time_show_one_place_or_another_or_nothing(before, after,
     silent = replace(log, scans=log.scans.rows(np.abs(log.scans.stamps - start - 50.0) > 2.5))
     assert cuts.same_place(silent, start + 49.9, start + 50.1) is None
     assert cuts.same_place(log.without(lidar=True), start + 49.9, start + 50.1) is None
+
+
+@pytest.mark.parametrize(
+    ("scans", "beams", "jump", "asked"),
+    [
+        (18, 30, 8, [([8], [9]), ([7], [10])]), (18, 30, 1, [([1], [2]), ([0], [3])]),
+        (18, 30, 15, [([15], [16]), ([14], [17])]),
+        (18, 30, 0, []), (18, 30, 16, []), (17, 30, 8, []), (18, 29, 8, []),
+    ],
+)  # fmt: skip
+def test_a_cut_is_where_a_scan_and_those_beside_it_are_elsewhere(monkeypatch, scans, beams, jump, asked):
+    """A few scans or beams show none."""
+    readings = np.ones((scans, beams), dtype=np.float32)
+    readings[jump + 1 :] = 3.0
+    odometry = Odometry(np.arange(20.0), np.zeros((20, 3)))
+    log = SensorLog(odometry, None, LaserScans(np.arange(float(scans)), readings, 0.0, 0.1, 0.0, 0.1, 10.0))
+    pairs = []
+
+    def elsewhere(log, first, second):
+        pairs.append((first.tolist(), second.tolist()))
+        return np.ones(len(first), dtype=bool), np.full(len(first), 0.3)
+
+    monkeypatch.setattr(cuts, "_elsewhere", elsewhere)
+    assert cuts._by_lidar(log).tolist() == ([jump + 0.5] if asked else [])
+    assert pairs == asked

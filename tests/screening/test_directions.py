@@ -8,7 +8,7 @@ import pytest
 from uwblite import se2
 from uwblite.screening.directions import laser_ahead
 from uwblite.screening.wheel_motion import Pairs
-from uwblite.sensor_log import Odometry, SensorLog
+from uwblite.sensor_log import Odometry, SensorLog, SensorMounting
 
 
 def pairs_of_a_laser_turned_by(angle: float, stuck: float) -> Pairs:
@@ -37,3 +37,24 @@ def test_directions_that_do_not_agree_leave_the_laser_as_given():
     assert laser_ahead(log, pairs) == (log, [])
     anyhow = replace(pairs, lidar=np.random.default_rng(1).normal(0.0, 0.1, pairs.lidar.shape))
     assert laser_ahead(log, anyhow) == (log, [])
+
+
+@pytest.mark.parametrize("angle", [np.pi, np.pi / 2, -0.6])
+@pytest.mark.parametrize("around", [False, True])
+def test_turns_show_whether_the_laser_or_the_way_of_driving_is_turned(angle, around):
+    """The laser's lever arm swings otherwise: where the wheels drive another way, sensors are carried elsewhere on the base."""
+    rng, count = np.random.default_rng(5), 60
+    given, tag = np.array([0.2, 0.1, 0.3]), np.array([-0.1, 0.05, 0.6])
+    turn = np.array([0.0, 0.0, angle])
+    mount = se2.compose(turn, given) if around else given + turn
+    wheels = np.column_stack([np.full(count, 0.2), np.zeros(count), rng.uniform(-0.25, 0.25, count)])
+    laser = se2.compose(se2.compose(se2.inverse(mount), wheels), mount)
+    lidar = se2.compose(se2.compose(given, laser), se2.inverse(given))
+    log = SensorLog(Odometry(np.arange(3.0), np.zeros((3, 3))), mounting=SensorMounting(given, tag_position=tag))
+    done, (remark,) = laser_ahead(log, Pairs(np.arange(count) * 1.0, np.arange(count) + 0.3, lidar, wheels, np.ones(count)))
+    # The median direction over turns, at which the lever arm shows itself, is known to some hundredths.
+    np.testing.assert_allclose(done.mounting.T_base_laser[:2], mount[:2], atol=0.02)
+    assert abs(se2.wrap_angle(done.mounting.T_base_laser[2] - mount[2])) < 0.05
+    moved = np.append(se2.rotate(angle, tag[:2]), 0.6) if around else tag
+    np.testing.assert_allclose(done.mounting.tag_position, moved, atol=0.01)
+    assert f"looks {np.degrees(angle):+.0f}"[:8] in remark.text

@@ -9,9 +9,10 @@ from helpers.room_recording import recording, two_rounds
 from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.screening import clocks, stuck_sensors
+from uwblite.screening import screen as screening
 from uwblite.screening.screen import screen
 from uwblite.se2 import chain as chained
-from uwblite.sensor_log import LogNotes, Odometry, UwbRanges
+from uwblite.sensor_log import LaserScans, LogNotes, Odometry, SensorLog, UwbRanges
 
 
 @pytest.fixture(scope="module")
@@ -367,3 +368,72 @@ def test_readings_outside_the_time_of_the_odometry_are_counted_and_doubted_where
     assert outside == {0.0: 0, 30.0: 150 - 1, 1e6: len(log.scans.stamps)}[off]
     assert all(f"{outside} of {len(log.scans.stamps)} scans" in r.text for r in remarks)
     assert all("by about 1000000 s" in r.text for r in remarks if r.doubt)
+
+
+def test_a_gap_is_a_stand_a_way_or_a_robot_that_was_carried(monkeypatch):
+    """Silences of 5 s: in the first the robot stands, in the second it was put elsewhere, in the third it drives on."""
+    stamps = np.arange(0.0, 100.0, 0.1)
+    stamps = stamps[~np.any([(stamps > at) & (stamps < at + 5.0) for at in (20.05, 40.05, 60.05)], axis=0)]
+    x = 0.3 * stamps - 1.5 * (stamps > 22.0) - 1.5 * (stamps > 42.0)
+    odometry = Odometry(50.0 + stamps, np.column_stack([x, np.zeros((len(x), 2))]))
+    times = 50.0 + np.arange(0.0, 100.0, 0.5)
+    radio = UwbRanges(times, np.zeros(200, dtype=int), np.ones(200), np.ones(200), ("A",))
+    lidar = LaserScans(times, np.ones((200, 3), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 9.0)
+    log = SensorLog(odometry, radio, lidar)
+    monkeypatch.setattr(screening, "_elsewhere", lambda log, a, b: 85.0 < a < 95.0)
+    done, breaks, remarks = screening._gaps(log)
+    np.testing.assert_allclose(breaks.stamps, [70.0, 90.0, 110.0])
+    np.testing.assert_allclose(breaks.sigma, [[0.02] * 3, [20.0, 20.0, 3.0], [0.1] * 3])
+    assert [(r.kind, r.doubt) for r in remarks] == [("carried", True), ("odometry-gap", False)]
+    assert "silent for 5 s from t = 40 s" in remarks[0].text
+    # What others saw while the robot drove on is left out, but for what is next to the odometry.
+    kept = (times <= 110.2) | (times >= 114.9)
+    np.testing.assert_array_equal(done.ranges.stamps, times[kept])
+    np.testing.assert_array_equal(done.scans.stamps, times[kept])
+
+
+@pytest.mark.parametrize(
+    ("silence", "period", "gap"), [(1.95, 0.05, False), (2.05, 0.05, True), (3.9, 0.2, False), (4.1, 0.2, True)]
+)
+def test_a_silence_of_two_seconds_or_twenty_periods_is_a_gap(silence, period, gap):
+    stamps = period * np.arange(200)
+    stamps = np.where(np.arange(200) >= 100, stamps + silence - period, stamps)
+    log = SensorLog(Odometry(stamps, np.column_stack([0.3 * stamps, np.zeros((200, 2))])))
+    assert len(screening._gaps(log)[1].stamps) == gap
+
+
+def test_steps_of_lost_wheels_are_as_wide_as_the_robot_is_fast():
+    """Every two seconds of each stretch; a factor of four is between the usual speed and the greatest."""
+    stamps = np.arange(0.0, 60.0, 0.1)
+    odometry = Odometry(stamps, np.column_stack([0.4 * stamps, np.zeros((len(stamps), 2))]))
+    breaks = screening._unknown_steps(odometry, [(10.0, 15.5), (40.0, 41.0)])
+    np.testing.assert_allclose(breaks.stamps, np.array([10.9, 12.9, 14.9]), atol=0.11)
+    np.testing.assert_allclose(breaks.sigma, [[0.8, 0.8, 0.5]] * 3)
+    assert len(screening._unknown_steps(odometry, []).stamps) == 0
+
+
+@pytest.mark.parametrize(("path", "said"), [(1.99, True), (2.01, False)])
+def test_a_robot_that_drives_less_than_two_metres_is_a_doubt(path, said):
+    odometry = Odometry(
+        100.0 + np.arange(31.0), np.column_stack([np.linspace(0.0, path, 31), np.zeros(31), np.linspace(3.0, -4.0, 31)])
+    )
+    found = screening._hardly_moving(odometry)
+    assert [r.doubt for r in found] == [True] * said
+    assert all("1.99 m in 30 s (turning 7.0 rad)" in r.text for r in found)
+
+
+def test_cuts_near_other_breaks_are_those(monkeypatch):
+    """Three seconds before one or behind the next reading; of many four are said."""
+    stamps = np.arange(100.0, 400.0, 1.0)
+    log = SensorLog(Odometry(stamps, np.zeros((300, 3))))
+    times = np.array([110.5, 146.9, 147.1, 153.9, 154.1, 200.5, 250.5, 300.5])
+    monkeypatch.setattr(screening.cuts, "found", lambda log, jumps: times)
+    breaks, (remark,) = screening._cuts(log, np.zeros(0), np.array([150.0]))
+    np.testing.assert_array_equal(breaks.stamps, [110.0, 146.0, 154.0, 200.0, 250.0, 300.0])
+    np.testing.assert_array_equal(breaks.sigma, [[20.0, 20.0, 3.0]] * 6)
+    assert remark.doubt
+    assert "at t = 10 s, t = 47 s, t = 54 s, t = 100 s ... the robot" in remark.text
+    times = times[:1]
+    assert " ... " not in screening._cuts(log, np.zeros(0), np.zeros(0))[1][0].text
+    times = times[:0]
+    assert screening._cuts(log, np.zeros(0), np.zeros(0))[1] == []

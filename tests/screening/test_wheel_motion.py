@@ -213,3 +213,10 @@ def test_ratios_that_scatter_everywhere_show_no_stretch():
     few.wheels[:35, 0] = few.lidar[:35, 0] = 0.1
     few.lidar[:12, 0] = 0.13
     assert disagreeing(few, 0.0) == []
+
+
+def test_the_factor_of_turns_is_of_turns_alone():
+    """A base that drives sideways, whose ways are half of what it counts and whose turns are right."""
+    found = pairs()
+    found.wheels[:], found.lidar[:] = [0.0, 3.0, 1.0], [0.0, 1.5, 1.0]
+    assert disagreeing(found, 0.0) == []

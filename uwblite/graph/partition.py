@@ -43,7 +43,7 @@ def split(graph: Graph, part_of: Ints) -> tuple[Graph, tuple[Part, ...]]:
     for blocks, own in zip(touched, owners, strict=True):
         for name, index in blocks:
             is_shared[name][index[own < 0]] = True
-    number = {name: np.append(np.where(mask, np.cumsum(mask) - 1, -1), -1) for name, mask in is_shared.items()}
+    number = {name: np.where(mask, np.cumsum(mask) - 1, -1) for name, mask in is_shared.items()}
     shared = _taken(graph, {name: np.flatnonzero(mask) for name, mask in is_shared.items()}, owners, -1)
     parts = []
     for p in range(int(part_of.max()) + 1):

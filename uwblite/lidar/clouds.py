@@ -195,13 +195,11 @@ def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) ->
     A block of clouds shares one tree: a third coordinate keeps them apart.
     """
     parts = []
-    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=-1) + 1 + _BLOCK, _BLOCK))
+    blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + _BLOCK, _BLOCK))
     for first, last in pairwise(blocks):
         block = points[first:last]
         apart = np.column_stack([block, owner[first:last] * (4.0 * config.normal_radius)])
         parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
-    if not parts:
-        parts.append(estimate_normals(points, make_tree(points), config.normal_radius))
     lines = Lines(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lines)))
     facing = np.einsum("pi,pi->p", lines.normals, origins - points)
     return lines, lines.normals * np.where(facing < 0, -1.0, 1.0)[:, None]

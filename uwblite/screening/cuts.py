@@ -91,8 +91,8 @@ def _by_lidar(log: SensorLog) -> Floats:
     apart, share = _elsewhere(log, jumps, jumps + 1)
     apart &= share > 0.0
     # The scan itself may be at fault: those on either side of both must not match either.
-    low, high = np.maximum(jumps - 1, 0), np.minimum(jumps + 2, len(scans.stamps) - 1)
-    apart[apart] &= _elsewhere(log, low[apart], high[apart])[0]
+    # The first and the last change are none: about them, where scans are repeated, as large a one is usual.
+    apart[apart] &= _elsewhere(log, jumps[apart] - 1, jumps[apart] + 2)[0]
     middle = scans.middles
     return 0.5 * (middle[jumps[apart]] + middle[jumps[apart] + 1])
 
