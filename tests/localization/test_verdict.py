@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite.localization import hypotheses
-from uwblite.localization.verdict import ENOUGH_ENDS, RangeFit, confirming_way, doubt
+from uwblite.localization.verdict import ENOUGH_ENDS, RangeFit, confirming_way, doubt, nowhere
 
 CLEAR = RangeFit(8, 1.0, 4)
 TWO_ANCHORS, ONE_ANCHOR = RangeFit(3, 1.0, 2), RangeFit(3, 1.0, 1)
@@ -18,6 +18,14 @@ def test_what_is_known_by_one_kind_alone_takes_longest_and_people_half_of_it():
     alone = confirming_way(-0.1, 0.0, CLEAR, proven=False)
     assert alone == confirming_way(-0.1, ENOUGH_ENDS, ONE_ANCHOR, proven=False)
     assert confirming_way(-0.4, ENOUGH_ENDS, CLEAR, proven=False) == 0.5 * alone
+
+
+def test_ranges_of_which_one_in_four_disagrees_confirm_no_scans():
+    # Beside scans of another building three anchors of four, or half of the ranges, agree by chance.
+    odd = RangeFit(20, 0.75, 3)
+    assert confirming_way(-0.1, ENOUGH_ENDS, odd, proven=False) == confirming_way(-0.1, ENOUGH_ENDS, ONE_ANCHOR, proven=False)
+    assert nowhere(-0.1, ENOUGH_ENDS, odd) == ""
+    assert "ranges" in nowhere(-0.1, ENOUGH_ENDS, RangeFit(29, 0.52, 3))
 
 
 @pytest.mark.parametrize("fit", [-0.1, -0.4])

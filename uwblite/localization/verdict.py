@@ -21,14 +21,14 @@ SIGMA_FOUND = (0.25, 0.1)
 FIT_BESIDE_RANGES, FIT_ALONE = -0.5, -0.25
 """Mean log-likelihood of the rays from which a pose may count as found: in the right place it is -0.05 to -0.2, with people
 close by -0.5; rooms that are alike in part reach -0.3, other buildings beside ranges -0.35 to -0.7."""
-RANGES_FOUND, RANGES_ALONE = 0.5, 0.8
+RANGES_FOUND, RANGES_ALONE = 0.6, 0.8
 """Share of the ranges that must agree with a start, beside scans and alone: in the right place 0.9 to 1 alone, with anchors of
 another building 0.75 to 0.8."""
 FEW_ENDS, FEW_BESIDE = 12, 4
 """Rays' ends in known space from which a scan counts; the second beside ranges to three anchors."""
 ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
 """Rays' ends, or ranges to two anchors, that a start needs."""
-_FIT_CLEAR, _RANGES_CLEAR, _ANCHORS_CLEAR = -0.3, 0.75, 3
+_FIT_CLEAR, _RANGES_CLEAR, _ANCHORS_CLEAR = -0.3, 0.8, 3
 """Fit of the rays, share of the ranges and anchors from which they speak clearly for a place."""
 _CONFIRM, _CONFIRM_BUSY, _CONFIRM_ALONE = 0.5, 1.0, 2.0
 """m driven between two searches that agree; the second where people are about, the third where scans or ranges are alone."""
@@ -36,6 +36,9 @@ _UNIT_KNOWN = 0.04
 """Standard deviation of the map's unit from which another one would have been noticed."""
 _UNIT_CLEAR = 0.01
 """The same by scans, from which ranges say nothing against a pose that was found: of four anchors two may have been moved."""
+
+UNSURE = "place or heading is not sure yet; drive on"
+"""Why a place is not found that nothing speaks against."""
 
 
 def doubt(
@@ -62,7 +65,7 @@ def doubt(
         count = 1 + int((rivals > -certain).sum())
         return f"{count} places are as likely; drive on, around a corner or past another anchor"
     if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
-        return "place or heading is not sure yet; drive on"
+        return UNSURE
     return ""
 
 
@@ -135,6 +138,8 @@ def confirming_way(fit: float, ends: float, fitting: RangeFit, proven: bool) -> 
     clear = fitting.anchors >= _ANCHORS_CLEAR and fitting.share >= _RANGES_CLEAR
     if fit < _FIT_CLEAR:
         return _CONFIRM_BUSY if clear else _CONFIRM_ALONE
+    if fitting.share < _RANGES_CLEAR:
+        return _CONFIRM_ALONE
     return 0.0 if clear and share_of_needed(ends) + fitting.share_of_needed >= 2.0 else _CONFIRM
 
 
