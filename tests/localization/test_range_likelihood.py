@@ -37,3 +37,11 @@ def test_moments_are_wide_where_the_ranges_say_little_and_hold_the_truth():
     near = np.abs(ranges.anchor) == 0
     less = range_likelihood.range_moments(pose, range_likelihood.chosen(ranges, np.flatnonzero(near)))[1]
     assert np.trace(less) > 2.0 * np.trace(covariance)
+
+
+def test_the_errors_alone_are_those_of_the_factors():
+    pose, ranges = some_ranges(5)
+    poses = pose + np.random.default_rng(5).normal(0.0, 1.0, (20, 3))
+    np.testing.assert_allclose(
+        range_likelihood._misfits(poses, ranges), range_likelihood.range_errors(poses, ranges)[0], atol=1e-12
+    )

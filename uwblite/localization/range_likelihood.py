@@ -28,6 +28,15 @@ def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]
     return ranges.values - np.hypot(offset[..., 0], offset[..., 1]), offset, lever
 
 
+def _misfits(poses: Floats, ranges: Ranges) -> Floats:
+    """Return the errors (h, m) alone, m, for many poses in a third of the time."""
+    c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
+    x, y = ranges.tags.T
+    dx = c * x - s * y + (poses[:, :1] - ranges.places[:, 0])
+    dy = s * x + c * y + (poses[:, 1:2] - ranges.places[:, 1])
+    return np.asarray(ranges.values - np.sqrt(dx * dx + dy * dy))
+
+
 def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Floats:
     """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; detours and nonsense happen.
 
@@ -39,7 +48,7 @@ def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Float
     """
     if not len(ranges):
         return np.zeros(len(poses))
-    error, sigma = range_errors(poses, ranges)[0], ranges.sigma + wider
+    error, sigma = _misfits(poses, ranges), ranges.sigma + wider
     z = error / sigma
     late = 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z)
     return _INDEPENDENT * np.log(0.7 * np.exp(-0.5 * z**2) + late + 0.02).sum(axis=1)

@@ -91,7 +91,8 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
     top = 2**LEVELS
     rows, cols = _coarse_cells(field, top)
     centre = field.origin + (np.stack([cols, rows], axis=1) + 0.5 * top) * field.cell
-    rows, cols = (v[_allowed(centre, 0.75 * top * field.cell, ranges)] for v in (rows, cols))
+    allowed = yield from _allowed(centre, 0.75 * top * field.cell, ranges)
+    rows, cols = rows[allowed], cols[allowed]
     headings = np.arange(0.0, 2.0 * np.pi - 0.5 * _HEADING, _HEADING)
     if not len(rows):
         return Places(np.zeros((0, 3)), False)
@@ -105,16 +106,17 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
         kept = np.flatnonzero(scores >= least)
         if len(kept) > _MOST_NODES:
             complete = False
-            kept = kept[np.argsort(-scores[kept], kind="stable")[:_MOST_NODES]]
+            kept = kept[np.argpartition(-scores[kept], _MOST_NODES)[:_MOST_NODES]]
+            yield
         nodes = _children(nodes[kept], 2 ** (level - 1))
         scores = yield from _scored(field, level - 1, offsets, nodes)
     kept = np.flatnonzero(scores >= max(least, _RIVAL * scores.max(initial=0.0)))
     kept = kept[np.argsort(-scores[kept], kind="stable")]
     poses = np.column_stack([field.origin + (nodes[kept, :0:-1] + 0.5) * field.cell, se2.wrap_angle(headings[nodes[kept, 0]])])
     inside = field.free[nodes[kept, 1], nodes[kept, 2]]
-    yield from _pause(MOST_PLACES * len(kept))
+    yield from _pause(len(kept))
     if not len(ranges):
-        return _distinct(poses[inside], complete)
+        return (yield from _distinct(poses[inside], complete))
     return (yield from _likeliest(poses[inside], share * scores[kept[inside]], ranges, complete))
 
 
@@ -131,7 +133,7 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
         yield
     order = np.argsort(-weight, kind="stable")
     order = order[weight[order] >= weight[order[:1]] - _RANGE_RIVAL]
-    return _distinct(tried[order], complete and len(tried) == len(poses))
+    return (yield from _distinct(tried[order], complete and len(tried) == len(poses)))
 
 
 def _coarse_cells(field: Field, top: int) -> tuple[Ints, Ints]:
@@ -196,6 +198,8 @@ def _pause(count: int) -> Generator[None, None, None]:
         yield
 
 
+_CENTRES_AT_ONCE = 400_000
+"""Places times ranges that are compared at once, a unit of work of 2 ms."""
 _MANY = 50_000
 """Nodes or poses that take 1 ms or more to make, to compare or to sort."""
 
@@ -213,7 +217,7 @@ def _children(nodes: NDArray[np.int32], half: int) -> NDArray[np.int32]:
     return (nodes[:, None] + shift).reshape(-1, 3)
 
 
-def _allowed(centre: Floats, half: float, ranges: Ranges) -> Bools:
+def _allowed(centre: Floats, half: float, ranges: Ranges) -> Generator[None, None, Bools]:
     """Return where (n,) the robot may be by its ranges alone, whatever its heading, within a half width of a place, m.
 
     The tag was within |t| of where it is now: a range further off than that, the cell and four sigmas disagrees. Detours make
@@ -221,13 +225,16 @@ def _allowed(centre: Floats, half: float, ranges: Ranges) -> Bools:
     """
     if not len(ranges) or not len(centre):
         return np.ones(len(centre), bool)
-    cost = np.zeros(len(centre))
-    moved = np.hypot(*ranges.tags.T)
+    cost, moved = np.zeros(len(centre)), np.hypot(*ranges.tags.T)
+    at_once = max(1, _CENTRES_AT_ONCE // len(centre))
     for k in range(len(ranges)):
-        off = ranges.values[k] - np.hypot(*(centre - ranges.places[k]).T)
+        x, y = (centre - ranges.places[k]).T
+        off = ranges.values[k] - np.sqrt(x * x + y * y)
         beyond = np.abs(off) - moved[k] - 1.5 * half - 4.0 * ranges.sigma[k]
         # One that is a metre off is as wrong as one that is ten off.
         cost += np.clip(beyond, 0.0, 1.0) * np.where(off > 0.0, 0.5, 1.0)
+        if k % at_once == at_once - 1:
+            yield
     return np.asarray(cost <= cost.min() + 0.1 * len(ranges))
 
 
@@ -236,7 +243,7 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
     step = max(0.4, float(np.sqrt(np.prod(bounds[1] - bounds[0]) / 20_000)))
     axes = [np.arange(bounds[0][k], bounds[1][k] + step, step) for k in (0, 1)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    cells = cells[_allowed(cells, 0.75 * step, ranges)]
+    cells = cells[(yield from _allowed(cells, 0.75 * step, ranges))]
     headings = np.arange(0.0, 2.0 * np.pi - 0.05, 0.2)
     if len(cells) * len(headings) > _MOST_NODES:
         return Places(np.zeros((0, 3)), False)
@@ -248,9 +255,9 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
         yield
     order = np.argsort(cost, kind="stable")
     order = order[cost[order] <= cost[order[:1]] + _RANGE_RIVAL]
-    tried = _distinct(poses[order[:_MOST_RIVALS]], True).poses
+    tried = (yield from _distinct(poses[order[:_MOST_RIVALS]], True)).poses
     yield
-    return _distinct(refined_by_ranges(tried, ranges), 0 < len(order) <= _MOST_RIVALS)
+    return (yield from _distinct(refined_by_ranges(tried, ranges), 0 < len(order) <= _MOST_RIVALS))
 
 
 def _some(ranges: Ranges) -> Ranges:
@@ -266,14 +273,18 @@ _RANGE_RIVAL = 12.0
 """Log-likelihood by which a place may be worse than the best one before it is refined."""
 
 
-def _distinct(poses: Floats, complete: bool) -> Places:
+def _distinct(poses: Floats, complete: bool) -> Steps:
     """Return the first of poses (n, 3), best first, that are not near an earlier one."""
-    kept = np.zeros((0, 3))
+    kept, done = np.zeros((0, 3)), 0
     left = poses
     while len(left) and len(kept) < MOST_PLACES:
         kept = np.concatenate([kept, left[:1]])
+        done += len(left)
         x, y, turn = (left - left[0]).T
         left = left[(np.hypot(x, y) > _SAME[0]) | (np.abs(se2.wrap_angle(turn)) > _SAME[1])]
+        if done > _MANY:
+            done = 0
+            yield
     return Places(kept, complete and not len(left))
 
 
