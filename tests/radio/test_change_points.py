@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from uwblite.radio.change_points import _split, find_move, find_moves
+from uwblite.radio.change_points import _CARRIED, _split, find_move, find_moves
 from uwblite.radio.trilateration import TrilaterationConfig
 
 STAMPS = np.arange(0.0, 200.0, 1.0)
@@ -113,20 +113,29 @@ def test_two_places_must_explain_half_of_what_one_does_not(wild, found):
     assert (move is not None) == found
 
 
-def test_the_moment_is_the_one_at_which_both_places_explain_most():
-    """Every moment tried, the misfit of each range written out."""
+def test_the_moments_are_those_at_which_both_places_explain_most():
+    """Every pair of moments tried; what an anchor that is carried between them costs, whatever place it fits."""
     ranges = measured(3, np.array([-2.0, 1.0]), np.array([1.0, 4.0]), 90)
+    ranges[80:95] += 3.0
     width = 0.24
-    split = _split(PATH, ranges, 110, width, TrilaterationConfig())
+    split = _split(PATH, ranges, 70, 110, width, TrilaterationConfig())
 
     def misfit(place):
         off = np.abs(ranges - np.hypot(*(PATH - place.position).T) - place.bias)
         return np.minimum(off / width, 1.0) ** 2
 
     before, after = misfit(split.before), misfit(split.after)
-    costs = {k: before[:k].sum() + after[k:].sum() for k in range(20, 181)}
-    assert split.moment == min(costs, key=costs.get)
-    assert split.unexplained == pytest.approx(costs[split.moment])
+    costs = {
+        (start, end): before[:start].sum() + _CARRIED * (end - start) + after[end:].sum()
+        for start in range(20, 181) for end in range(start, 181)
+    }  # fmt: skip
+    left, moment = min(costs, key=costs.get)
+    assert (split.left, split.moment) == (left, moment)
+    assert 78 <= left < moment <= 97
+    assert split.cost == pytest.approx(costs[left, moment])
+    between = np.minimum(before, after)[left:moment].sum()
+    assert split.unexplained == pytest.approx(before[:left].sum() + between + after[moment:].sum())
+
 
 
 @pytest.mark.parametrize(("count", "found"), [(39, False), (40, True)])
