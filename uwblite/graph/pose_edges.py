@@ -192,14 +192,16 @@ class ScanEdges(EdgeTable):
 
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 
-    def _sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, Floats]:
-        """Return S (e, 3), and the heading (e,) of the base at the true time of the cloud."""
-        x = graph.poses[poses]
+    def _sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+        """Return S (e, 3), and cosine and sine (e,) of the base's heading at the true time of the cloud."""
+        base = graph.poses[poses]
         if not np.any(self.calibration >= 0):
-            return x, x[:, 2]
-        padded = np.append(graph.calibration.values, 0.0)
-        moved = se2.compose(x, se2.exp(twist * (padded[self.calibration[3]] - self.made_with)))
-        return se2.compose(moved, padded[self.calibration[:3]]), moved[:, 2]
+            return base, se2.cos_sin(base[:, 2])
+        x, y, turn, delay = np.append(graph.calibration.values, 0.0)[self.calibration]
+        base = se2.compose(base, se2.exp(twist * (delay - self.made_with)))
+        c, s = se2.cos_sin(base[:, 2])
+        sensor = np.stack([base[:, 0] + (c * x - s * y), base[:, 1] + (s * x + c * y), se2.wrap_angle(base[:, 2] + turn)])
+        return sensor.T, (c, s)
 
     def relative(self, graph: Graph) -> Floats:
         """Return the pose (e, 3) of cloud j in cloud i at the present estimates."""
@@ -222,7 +224,7 @@ class ScanEdges(EdgeTable):
         by_j = _by_pose(axes[0], axes[1], -_turned_about(axes, xj, sj))
         blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
         if np.any(self.calibration >= 0):
-            c, s = (to - at for at, to in zip(se2.cos_sin(heading_i), se2.cos_sin(heading_j), strict=True))
+            c, s = (to - at for at, to in zip(heading_i, heading_j, strict=True))
             by_turn = axes[2] + _turned_about(axes, si, sj)
             by_delay = self._along(axes, graph, heading_j, self.twist_j) - self._along(axes, graph, heading_i, self.twist_i)
             by_delay += by_turn * self.twist_i[:, 2]
@@ -232,9 +234,11 @@ class ScanEdges(EdgeTable):
                     blocks.append(("calibration", np.full(len(self), index), _by_pose(column)))
         return Linearization(residuals.T, tuple(blocks))
 
-    def _along(self, axes: tuple[Floats, Floats, Floats], graph: Graph, heading: Floats, twist: Floats) -> Floats:
-        """Return the derivative (3, e) by the time for which S moves with a base of these headings (e,)."""
-        c, s = se2.cos_sin(heading)
+    def _along(
+        self, axes: tuple[Floats, Floats, Floats], graph: Graph, heading: tuple[Floats, Floats], twist: Floats
+    ) -> Floats:
+        """Return the derivative (3, e) by the time for which S moves with a base of headings of this cosine and sine (e,)."""
+        c, s = heading
         x, y = np.append(graph.calibration.values, 0.0)[self.calibration[:2]]
         vx, vy = twist[:, 0] - twist[:, 2] * y, twist[:, 1] + twist[:, 2] * x
         return axes[0] * (c * vx - s * vy) + axes[1] * (s * vx + c * vy) + axes[2] * twist[:, 2]

@@ -192,13 +192,14 @@ def mean_by_key(key: Ints, values: Floats) -> tuple[Ints, Floats]:
 def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) -> tuple[Lines, Floats]:
     """Fit lines to all neighbourhoods; return them and normals (p, 2) turned towards the laser.
 
-    A block of clouds shares one tree: a third coordinate keeps them apart.
+    A block of clouds shares one tree, in which they lie side by side.
     """
     parts = []
     blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + _BLOCK, _BLOCK))
     for first, last in pairwise(blocks):
         block = points[first:last]
-        apart = np.column_stack([block, owner[first:last] * (4.0 * config.normal_radius)])
+        apart = block.copy()
+        apart[:, 0] += owner[first:last] * (np.ptp(points[:, 0]) + 2.0 * config.normal_radius)
         parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
     lines = Lines(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lines)))
     facing = np.einsum("pi,pi->p", lines.normals, origins - points)

@@ -95,13 +95,12 @@ class Canvas:
         size_x, size_y = size_x + -size_x % _FINE, size_y + -size_y % _FINE
         centre = np.zeros((size_y, size_x), dtype=np.bool_)
         centre[row - low_y, column - low_x] = True
-        rows, columns = np.nonzero(centre)
-        ink = np.zeros_like(centre)
+        places, ink = np.flatnonzero(centre), np.zeros(centre.size, dtype=np.bool_)
         dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1]
         brush = dx**2 + dy**2 <= (radius * _FINE) ** 2
-        for oy, ox in zip(dy[brush].tolist(), dx[brush].tolist(), strict=True):
-            ink[rows + oy, columns + ox] = True
-        self._lay(ink, int(low_x) // _FINE, int(low_y) // _FINE, colour, opacity)
+        for offset in (dy * size_x + dx)[brush].tolist():
+            ink[places + offset] = True
+        self._lay(ink.reshape(centre.shape), int(low_x) // _FINE, int(low_y) // _FINE, colour, opacity)
 
     def _lay(self, ink: Bools, x: int, y: int, colour: Colour, opacity: float) -> None:
         """Average fine ink to pixels and blend it in with its first pixel at (x, y)."""
