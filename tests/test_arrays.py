@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from uwblite.arrays import MAD_TO_SIGMA, renumbered, rms_length, runs_of, sigma_of_median, spread, spread_about_median
+from uwblite.arrays import (
+    MAD_TO_SIGMA,
+    renumbered,
+    rms_length,
+    row_medians,
+    runs_of,
+    sigma_of_median,
+    spread,
+    spread_about_median,
+)
 
 
 def test_the_factor_is_that_of_normal_errors():
@@ -46,3 +55,9 @@ def test_renumbered_values_are_those_of_either_array_once():
 def test_runs_are_those_of_set_flags():
     assert runs_of(np.array([True, False, True, True])) == [(0, 1), (2, 4)]
     assert runs_of(np.zeros(3, dtype=bool)) == runs_of(np.zeros(0, dtype=bool)) == []
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3, 8, 99, 100])
+def test_medians_of_rows_are_numpys_to_the_last_bit(columns):
+    values = np.random.default_rng(columns).normal(size=(40, columns))
+    assert np.array_equal(row_medians(values), np.median(values, axis=1))

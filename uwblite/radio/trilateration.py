@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import MAD_TO_SIGMA, Bools, Floats
+from ..arrays import MAD_TO_SIGMA, Bools, Floats, row_medians
 from ..config import setting
 
 
@@ -114,8 +114,10 @@ def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) ->
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     across, along = ((axis[:, None] - place) ** 2 for axis, place in zip(axes, path.T, strict=True))
     error = ranges - np.sqrt(across[:, None] + along).reshape(len(cells), -1)
-    bias = np.clip(np.median(error, axis=1), -config.bias_sigma - step, 3.0 * config.bias_sigma + step)
-    cost = np.minimum(((error - bias[:, None]) / (0.7 * step)) ** 2, 1.0).mean(axis=1)
+    bias = np.clip(row_medians(error), -config.bias_sigma - step, 3.0 * config.bias_sigma + step)
+    error -= bias[:, None]
+    error /= 0.7 * step
+    cost = np.minimum(np.square(error, out=error), 1.0, out=error).mean(axis=1)
     cost += 0.05 * (bias / (config.bias_sigma + step)) ** 2
     likely = np.argsort(cost, kind="stable")[:_CELLS_LOOKED_AT]
     best, apart = list[int](), np.ones(len(likely), dtype=bool)
@@ -162,7 +164,7 @@ def _refine(
         jacobian = np.stack([dx / distance, dy / distance, np.ones_like(dx)], axis=1)
         equations = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
         gradient = np.einsum("skm,sm->sk", jacobian, weight * error)
-        robust[on] = MAD_TO_SIGMA * np.median(np.abs(error), axis=1)
+        robust[on] = MAD_TO_SIGMA * row_medians(np.abs(error))
         prior = (np.clip(robust[on], drift, scale[on]) / config.bias_sigma) ** 2
         equations[:, 2, 2] += prior
         gradient[:, 2] -= prior * state[on, 2]
