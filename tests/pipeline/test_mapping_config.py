@@ -59,6 +59,9 @@ def test_the_paper_s_run_keeps_every_candidate_and_adds_the_accepted(result):
     assert all(c.reason for c in result.closures)
     added = [e for e in result.graph.edges if not isinstance(e, OdometryEdges | RangeEdges)]
     assert len(added[0]) == sum(c.accepted for c in result.closures)
+    (figures,) = [stage.figures for stage in result.stages if stage.name == "loop closure 1"]
+    assert (figures["candidates"], figures["accepted"]) == (len(result.closures), len(added[0]))
+    assert figures["submaps"] > 1
 
 
 def test_the_paper_s_run_is_a_map(result, room_log):

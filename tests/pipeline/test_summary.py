@@ -204,8 +204,9 @@ def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():
 @pytest.mark.parametrize(
     ("used", "sigma", "longest", "bias", "reason"),
     [
-        (0.6, 4.0, 5.0, -1.5, ""),
+        (0.5, 4.99, 5.0, -1.6, ""),
         (0.4, 0.1, 5.0, 0.0, "only 40% of its ranges agree"),
+        (1.0, 5.0, 5.0, 0.0, "its place is known to 5 m only"),
         (1.0, 1e17, 5.0, 0.0, "its place is known to 1e+17 m only, and its longest range is 5.0 m"),
         (1.0, np.nan, 5.0, 0.0, "its place is known to nan m only"),
         (1.0, 0.1, 5.0, -1.7, "a constant error of -1.7 m"),

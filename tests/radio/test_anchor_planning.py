@@ -106,15 +106,20 @@ def test_places_beside_walls_are_those_of_a_loop():
 @pytest.mark.parametrize("seed", range(4))
 def test_no_exchange_of_one_place_is_better(seed):
     rng = np.random.default_rng(seed)
-    at, offered, today = rng.uniform(0, 10, (30, 2)), rng.uniform(0, 10, (25, 2)), np.zeros((30, 3))
+    at, offered = rng.uniform(0, 10, (30, 2)), rng.uniform(0, 10, (25, 2))
+    today = _information(at, rng.uniform(0, 10, (seed, 2)), np.ones((seed, 30), dtype=bool), 8.0).sum(axis=0)
     gains = _information(at, offered, rng.random((25, 30)) < 0.6, 8.0)
     taken = offered[:, 0] < 1.0
     chosen = _choose(today, gains, offered, taken, 3)
-    least = position_errors(gains[chosen].sum(axis=0)).mean()
+    least = position_errors(today + gains[chosen].sum(axis=0)).mean()
+    # The most useful of those left comes first each time.
+    for k in range(3):
+        means = [position_errors(today + gains[[*chosen[:k], other]].sum(axis=0)).mean() for other in chosen[k:]]
+        assert np.argmin(means) == 0
     for k in range(3):
         others = np.delete(chosen, k)
         for other in np.flatnonzero(~taken & ~_near(offered, offered[others])):
-            assert position_errors(gains[[*others, other]].sum(axis=0)).mean() > least - 1e-12
+            assert position_errors(today + gains[[*others, other]].sum(axis=0)).mean() > least - 1e-12
 
 
 def test_what_cannot_be_planned_is_reported():

@@ -12,6 +12,7 @@ from uwblite.radio.range_noise import (
     RangeNoise,
     RangeNoiseConfig,
     _covariance_by_distance,
+    _fit,
     assumed,
     effective_sigma,
     learn,
@@ -271,3 +272,13 @@ def test_exact_covariances_give_the_length_and_the_slow_part_back(monkeypatch, i
     assert noise.length == pytest.approx(length)
     assert noise.slow == pytest.approx(0.06)
     assert noise.white == pytest.approx(0.08, rel=0.03)
+
+
+def test_what_is_left_of_the_variance_is_at_least_half_the_least_sigma():
+    """Covariances that explain all of it."""
+    config = replace(CONFIG, min_sigma=0.1)
+    distance = np.array([0.1, 0.4, 0.8])
+    noise = _fit(distance, 0.1**2 * np.exp(-distance), np.full(3, 100.0), 0.1**2, assumed(config), config)
+    assert noise.white == pytest.approx(0.05)
+    # The lengths that are tried are a quarter apart.
+    assert noise.slow == pytest.approx(0.1 * np.sqrt(0.95), rel=5e-3)

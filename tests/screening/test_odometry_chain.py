@@ -157,3 +157,11 @@ def test_only_what_repeats_stamp_and_pose_is_a_repeat():
     np.testing.assert_array_equal(done.poses, poses[[0, 2, 3, 4]])
     whole = Odometry(stamps[::2], poses[::2])
     assert without_repeats(whole) == (whole, 0)
+
+
+@pytest.mark.parametrize(("at", "other"), [(3, 0), (56, 59)])
+def test_the_first_and_the_last_step_predict_as_well(at, other):
+    steps = np.tile([0.04, 0.0, 0.0], (60, 1))
+    steps[other], steps[at] = [0.1, 0.0, 0.0], [20.0, 0.0, 0.0]
+    joined, _, _ = rejoined(Odometry(0.1 * np.arange(61), se2.chain(np.zeros(3), steps)))
+    assert se2.between(joined.poses[at], joined.poses[at + 1])[0] == pytest.approx((0.1 + 8 * 0.04) / 9)

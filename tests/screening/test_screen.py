@@ -437,3 +437,18 @@ def test_cuts_near_other_breaks_are_those(monkeypatch):
     assert " ... " not in screening._cuts(log, np.zeros(0), np.zeros(0))[1][0].text
     times = times[:0]
     assert screening._cuts(log, np.zeros(0), np.zeros(0))[1] == []
+
+
+def test_wheels_that_stand_are_asked_of_ranges_where_no_scan_sees_it(monkeypatch, sound):
+    """The times are said since the beginning; each stretch that ranges contradict is a doubt of its own."""
+    stands = [(110.0, 120.0), (130.0, 137.5), (150.0, 160.0)]
+    monkeypatch.setattr(screening.wheel_motion, "standing", lambda odometry, least: stands)
+    monkeypatch.setattr(screening.wheel_motion, "seen", lambda pairs, a, b: a == 110.0)
+    monkeypatch.setattr(screening.wheel_motion, "lost", lambda log, pairs: [])
+    monkeypatch.setattr(screening.range_motion, "excess", lambda log, a, b: 0.5 if a < 140.0 else 0.0)
+    for pairs, said in (("pairs", ["30 to 38"]), (None, ["10 to 20", "30 to 38"])):
+        log, same, breaks, remarks = screening._lost_wheels(sound, pairs)
+        assert (log, same) == (sound, pairs)
+        assert [r.text.split("t = ")[1].split(" s")[0] for r in remarks] == said
+        assert all(r.doubt and "rests on ranges alone" in r.text for r in remarks)
+        assert len(breaks.stamps) == (4 if pairs else 9)

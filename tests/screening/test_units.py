@@ -140,3 +140,10 @@ def test_degrees_are_refused_and_radians_are_not(wrapped):
     for heading in (path.poses[:, 2], -path.poses[:, 2], 0.01 * degrees):
         refuse_degrees(with_heading(path, heading))
     refuse_degrees(with_heading(arc(0.05), np.degrees(arc(0.05).poses[:, 2])))
+
+
+def test_readings_that_jitter_within_a_fifth_of_a_metre_agree_nevertheless():
+    path = arc(step=0.02)
+    jitter = 0.01 * np.random.default_rng(1).standard_normal((len(path.stamps), 2))
+    shaken = replace(path, poses=path.poses + np.column_stack([jitter, np.zeros(len(jitter))]))
+    assert heading_agreement(shaken)[0] > 0.97

@@ -194,7 +194,8 @@ def test_another_ratio_for_a_stretch_is_a_doubt(kind, ratio, said, first, last):
     """A tyre that loses air, a floor on which the wheels slip evenly; half of a recording may be the other's exception."""
     found = pairs(240, turn=0.2 if kind == "turn" else 0.0, way=0.1 if kind == "way" else 0.0)
     rng = np.random.default_rng(0)
-    found.lidar[:] *= 1.0 + 0.01 * rng.standard_normal((240, 1))
+    # Everywhere the wheels count too much: that is calibration.
+    found.lidar[:] *= 0.7 * (1.0 + 0.01 * rng.standard_normal((240, 1)))
     found.lidar[first:last] *= ratio
     remarks = disagreeing(found, 0.0)
     assert len(remarks) == said
