@@ -196,10 +196,11 @@ def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) ->
     """
     parts = []
     blocks = np.searchsorted(owner, np.arange(0, owner.max(initial=0) + 1 + _BLOCK, _BLOCK))
+    width = points[:, 0].max(initial=0.0) - points[:, 0].min(initial=0.0)
     for first, last in pairwise(blocks):
         block = points[first:last]
         apart = block.copy()
-        apart[:, 0] += owner[first:last] * (np.ptp(points[:, 0]) + 2.0 * config.normal_radius)
+        apart[:, 0] += owner[first:last] * (width + 2.0 * config.normal_radius)
         parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
     lines = Lines(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lines)))
     facing = np.einsum("pi,pi->p", lines.normals, origins - points)
