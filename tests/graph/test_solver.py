@@ -615,3 +615,18 @@ def test_a_damped_step_of_a_linear_problem_brings_what_it_promises(damping):
     normal = filled(graph)
     _, step, promised = _step(normal, damping * normal.diagonal, None)
     assert promised == pytest.approx(graph.chi2() - moved(graph, normal.unknowns, step).chi2(), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_a_search_under_a_lasting_brake_ends_where_its_steps_bring_nothing(seed):
+    # Across the way, a range to an anchor on it has next to no slope: linear steps leap too far, and only braked ones help.
+    rng = np.random.default_rng(seed)
+    x = np.linspace(0.0, 20.0, 81)
+    poses = np.stack([x, 0.05 * np.sin(x), np.zeros(81)], axis=1)
+    ranges = np.hypot(x - 10.0, poses[:, 1]) + 0.03 * rng.standard_normal(81) - 0.05 * (np.abs(x - 10.0) < 2.0)
+    edges = plain_ranges(np.arange(81), np.zeros(81, dtype=np.int64), ranges, 0.03)
+    graph = Graph(poses, np.array([[10.0, 0.3]]), (edges,), fixed_poses=np.ones(81, dtype=bool))
+    _, summary = optimize(graph)
+    best = least_squares(lambda a: (np.hypot(*(poses[:, :2] - a).T) - ranges) / 0.03, graph.anchors[0], xtol=1e-14)
+    assert summary.iterations <= 45
+    assert summary.chi2 <= 2.0 * best.cost + 1e-4

@@ -24,6 +24,9 @@ link along the trajectory, and the cheaper one counts: an error of the odometry 
 taken up in five steps instead of hundreds. (Relative poses as unknowns: after E. Olson, J. Leonard, S. Teller, Fast
 iterative alignment of pose graphs with poor initial estimates, ICRA 2006.)
 
+Where a step is dropped for the cost of the anchors' edges alone, anchors are solved for at its poses and it is tried with
+these (anchor_subproblem.py).
+
 Next to the minimum H hardly changes any more: a step that follows one of little effect takes the factor of that one.
 
 The search ends, and says why, when the decrease still to come is a negligible fraction of F, when every component of
@@ -42,6 +45,7 @@ import numpy as np
 from ..arrays import Bools, Floats
 from ..config import setting
 from ..errors import ConfigError, SolverError
+from .anchor_subproblem import with_anchors_settled
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost, kernel_weights, linearize
 from .normal_equations import NormalEquations
@@ -152,6 +156,7 @@ class _Descent:
         self.factor: Factor | None = None
         """To be used again; None = factorise."""
         self.damping, self.raised_by, self.last_decrease = config.initial_damping, 2.0, np.inf
+        self.decreases: list[float] = []
         self.scale = np.zeros(normal.unknowns.size)
         self.linked = linked_poses(len(graph.poses), linearized)
         robust = any(edges.kernel.name != "none" for edges in graph.edges)
@@ -178,6 +183,9 @@ class _Descent:
         trial = _trial(self.graph, self.normal.unknowns, step, self.linked)
         linearized = linearize(trial)
         chi2 = _cost(trial, linearized)
+        if promised > 0 and chi2 > self.chi2:
+            trial, linearized = with_anchors_settled(self.graph, trial, linearized, lambda g: optimize(g, _QUICK)[0])
+            chi2 = _cost(trial, linearized)
         self.history.append(chi2)
         negligible = self.config.relative_decrease * self.chi2 + _NOTHING
         self.moved = promised > 0 and chi2 <= self.chi2
@@ -197,6 +205,8 @@ class _Descent:
         """Go on from the trial, with less damping; return whether next to nothing is left to come."""
         decrease = self.chi2 - chi2
         over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= _FREE
+        self.decreases = [*self.decreases[1 - _PATIENCE :], decrease]
+        over = over or (len(self.decreases) == _PATIENCE and sum(self.decreases) <= negligible)
         near = not reused and decrease <= _NEAR * self.chi2 and self.damping <= _NEARLY_FREE
         self.factor = self.factor if near else None
         self.graph, self.linearized, self.chi2, self.last_decrease = trial, linearized, chi2, decrease
@@ -218,6 +228,8 @@ GRADIENT = "gradient negligible"
 STUCK = "no step decreases chi2"
 USED_UP = "iterations used up"
 
+_QUICK = SolverConfig(max_iterations=12, relative_decrease=1e-3)
+"""Search for anchors at given poses: the next step takes up what it leaves."""
 _LARGE_TURN = 0.05
 """rad; the square of a smaller turn of a pose is nothing beside its first order."""
 _NOTHING = 1e-12
@@ -226,6 +238,8 @@ _LITTLE = 1e-4
 """Share of chi2 beyond which a promise that failed is no sign of a minimum, however coarse the search."""
 _FREE = 1e-2
 """lambda up to which small steps mean a minimum and not just a strong brake."""
+_PATIENCE = 8
+"""Steps taken that together mean a minimum if they brought next to nothing, however strong the brake."""
 _NEAR = 1e-2
 """A step that decreased chi2 by less than this fraction of it changed H so little that the next one takes its factor."""
 _NEARLY_FREE = 1e-6

@@ -191,8 +191,8 @@ def refine(
     none = np.zeros((0, 3)), np.zeros((0, 3, 3))
     probe = ScanEdges(i, j, *none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
     normal: NormalEquations | None = None
-    # The next round looks all matches up again: one good step is enough.
-    brief = replace(solver, max_iterations=3, relative_decrease=0.5)
+    # The next round looks all matches up again: one good step is enough, but one it has to be.
+    brief = replace(solver, max_iterations=12, relative_decrease=0.5)
     T_i_j = probe.relative(graph)
     while True:
         factors = match(clouds, raster, i, T_i_j, points, gate, max(gate / 3.0, 2.5 * sigma))
