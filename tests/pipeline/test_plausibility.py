@@ -98,7 +98,7 @@ def test_three_given_anchors_decide_the_sign_and_two_do_not(given, doubted, lida
     assert len(handedness(graph, lidar)) == doubted
 
 
-def moved_together(places, lidar=False, agree_until=None):
+def moved_together(places, lidar=False, agree_until=None, recordings=1):
     """Return the doubts about a map in which the anchors A, B, ... have these places one after the other, from 0 and 100 s.
 
     Ranges to those that `agree_until` names agree with the map up to that time, s.
@@ -116,7 +116,8 @@ def moved_together(places, lidar=False, agree_until=None):
     table = {"stamp": np.concatenate(stamps), "anchor": np.concatenate(anchor).astype(np.float64)}
     until = np.array([(agree_until or {}).get(a.id, np.inf) for a in anchors])
     table["agrees"] = (table["stamp"] < until[np.concatenate(anchor)]).astype(np.float64)
-    task = SimpleNamespace(recordings=SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0])), stages=stages)
+    recorded = SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0]), each=[None] * recordings)
+    task = SimpleNamespace(recordings=recorded, stages=stages)
     check_moved_together(anchors, table, task)
     return [notice.kind for notice in stages.doubts]
 
@@ -142,7 +143,13 @@ def test_anchors_that_were_moved_together_are_rather_another_change():
     assert moved_together([[A, ELSEWHERE], [B, (4.0, 9.0)], [C]]) == ["anchors-moved-together"]
     assert moved_together([[A, ELSEWHERE]]) == ["anchors-moved-together"]
     assert not moved_together([[A, ELSEWHERE], [B], [C]])
-    assert not moved_together([[A, ELSEWHERE], [B, (4.0, 9.0)], [C]], lidar=True)
+
+
+def test_with_a_lidar_one_anchor_may_be_moved_and_all_of_them_between_recordings():
+    two_of_three = [[A, ELSEWHERE], [B, (4.0, 9.0)], [C]]
+    assert moved_together(two_of_three, lidar=True) == ["anchors-moved-together"]
+    assert not moved_together(two_of_three, lidar=True, recordings=2)
+    assert not moved_together([[A, ELSEWHERE]], lidar=True)
 
 
 @pytest.mark.parametrize(("until", "doubted"), [(105.0, True), (130.0, True), (170.0, False), (20.0, False)])

@@ -202,18 +202,19 @@ def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():
 
 
 @pytest.mark.parametrize(
-    ("used", "sigma", "longest", "bias", "reason"),
+    ("used", "sigma", "longest", "bias", "scatter", "reason"),
     [
-        (0.5, 4.99, 5.0, -1.6, ""),
-        (0.4, 0.1, 5.0, 0.0, "only 40% of its ranges agree"),
-        (1.0, 5.0, 5.0, 0.0, "its place is known to 5 m only"),
-        (1.0, 1e17, 5.0, 0.0, "its place is known to 1e+17 m only, and its longest range is 5.0 m"),
-        (1.0, np.nan, 5.0, 0.0, "its place is known to nan m only"),
-        (1.0, 0.1, 5.0, -1.7, "a constant error of -1.7 m"),
+        (0.5, 4.99, 5.0, -1.6, 1.5, ""),
+        (0.4, 0.1, 5.0, 0.0, 0.1, "only 40% of its ranges agree"),
+        (1.0, 5.0, 5.0, 0.0, 0.1, "its place is known to 5 m only"),
+        (1.0, 1e17, 5.0, 0.0, 0.1, "its place is known to 1e+17 m only, and its longest range is 5.0 m"),
+        (1.0, np.nan, 5.0, 0.0, 0.1, "its place is known to nan m only"),
+        (1.0, 0.1, 5.0, -1.7, 0.1, "a constant error of -1.7 m"),
+        (0.6, 0.1, 5.0, 0.0, 1.9, "its ranges scatter by 1.9 m about the map"),
     ],
 )
-def test_an_anchor_is_distrusted_for_a_reason(used, sigma, longest, bias, reason):
-    found = _reason_to_distrust(used, sigma, longest, bias)
+def test_an_anchor_is_distrusted_for_a_reason(used, sigma, longest, bias, scatter, reason):
+    found = _reason_to_distrust(used, sigma, longest, bias, scatter)
     assert bool(found) == bool(reason)
     assert reason in found
 

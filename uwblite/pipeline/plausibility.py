@@ -103,12 +103,14 @@ _LEAST_AGREEING = 0.3
 
 
 def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Floats], task: Task) -> None:
-    """Doubt a map without lidar in which half of the anchors changed at one time, unless they changed places only.
+    """Doubt a map in which half of the anchors changed at one time, unless they changed places only.
 
-    Wheels that were swapped, or a radio that changed, look the same, and nothing but the odometry ties before to after. An
-    anchor has changed where it was moved, and where its ranges agree with the map on one side of that time only.
+    Wheels that were swapped, a radio or its clock that changed, or a lidar that leads the trajectory astray look the same. An
+    anchor has changed where it was moved, and where its ranges agree with the map on one side of that time only. With a lidar,
+    one anchor alone may have been moved, and between recordings all of them.
     """
-    if task.recordings.have_scans or not table or not anchors:
+    lidar = task.recordings.have_scans
+    if not table or not anchors or (lidar and len(task.recordings.each) > 1):
         return
     names, stamps = [name_and_number(anchor.id) for anchor in anchors], table["stamp"]
     base = np.array([name for name, _ in names])[table["anchor"].astype(np.int64)]
@@ -120,12 +122,13 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
         one_sided = {n for n in both if _one_sided(table["agrees"], early & (base == n), late & (base == n))}
         changed = {names[k][0] for k in these} | one_sided
         renamed = _exchanged(these, anchors, names) and not one_sided
-        if len(changed) >= max(0.5 * len(both), min(2, len(both))) and not renamed:
+        if len(changed) >= max(0.5 * len(both), 2 if lidar else min(2, len(both))) and not renamed:
             when = float(start - task.recordings.stamps[0])
             task.stages.doubt(
                 "anchors-moved-together",
-                f"{len(changed)} of {len(both)} anchors were moved at about t = {when:.0f} s: rather the wheels, tag or radio "
-                "changed then, and nothing but the odometry ties the two parts of the map",
+                f"{len(changed)} of {len(both)} anchors were moved at about t = {when:.0f} s: rather "
+                + ("lidar, radio or clocks lead the map astray" if lidar else
+                   "the wheels, tag or radio changed then, and nothing but the odometry ties the two parts of the map"),
                 at=when, moved=len(changed), measured=len(both),
             )  # fmt: skip
             return

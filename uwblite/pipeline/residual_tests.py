@@ -19,7 +19,7 @@ from .estimate import Estimate, Task
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Typical scatter of ranges about the map, m, and in units of their scatter from one to the next, that multipath and blocked
 sight do not exceed."""
-_NO_DISTANCES = 1.5
+NO_DISTANCES = 1.5
 """Ranges that scatter by more are no distances, m."""
 _SUDDEN = 5.0
 """Standard deviations that a step of sound wheels hardly ever exceeds."""
@@ -59,7 +59,7 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, task: Task) -> No
         return
     short = short_term_sigma(ranges.stamps[alive], ranges.anchor[alive], ranges.ranges[alive], task.config.ranges)
     typical = float(np.median(_spread_by_anchor(residuals[alive], ranges.anchor[alive])))
-    if typical <= min(max(_SCATTER, _TIMES_NOISE * short), _NO_DISTANCES):
+    if typical <= min(max(_SCATTER, _TIMES_NOISE * short), NO_DISTANCES):
         return
     text = f"the ranges scatter by {typical:.1f} m: they are no distances to anchors that stand still"
     if typical > _TIMES_NOISE * short:

@@ -26,6 +26,7 @@ from .estimate import Estimate, Task
 from .final_stages import at_given_poses
 from .radio_stages import heights_given, tag_rises
 from .recordings import Recordings
+from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not speak against all anchors."""
@@ -156,21 +157,23 @@ def _anchor(
         status, alternative = "mirror-ambiguous", found.hypotheses[k][1].position
         reason = "the path past it is too straight: a mirrored place explains its ranges about as well"
     sigma, longest = float(np.sqrt(np.trace(covariance.anchors[k]))), float(ranges.ranges[ranges.anchor == k].max())
-    if doubtful := _reason_to_distrust(used, sigma, longest, bias):
+    scatter = spread_about_median(own)
+    if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter):
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
-        name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, spread_about_median(own), status, reason,
+        name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, scatter, status, reason,
         alternative,
     )
 
 
-def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float) -> str:
+def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, scatter: float) -> str:
     """Return why an anchor is distrusted, '' where it is not.
 
     Parameters
     ----------
     used : share of its ranges that agree with the map. sigma : standard deviation of its place, m. longest : its longest
         range, m: it stands nearer than that, and a place known worse than so is none. bias : constant error of its ranges, m.
+        scatter : robust standard deviation of its ranges about the map, m.
     """
     if used < _AGREE:
         return f"only {used:.0%} of its ranges agree with the map"
@@ -178,6 +181,8 @@ def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float) 
         return f"its place is known to {sigma:.3g} m only, and its longest range is {longest:.1f} m"
     if abs(bias) > _NO_BIAS:
         return f"its ranges fit only with a constant error of {bias:.1f} m, which no radio has"
+    if scatter > NO_DISTANCES:
+        return f"its ranges scatter by {scatter:.1f} m about the map: they are no distances to one place"
     return ""
 
 
