@@ -16,6 +16,8 @@ from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate
 
 _SPLITS = 7
 """Moments tried first, evenly spread over the ranges."""
+_PROMISING = 0.5
+"""Share of the gain that every other one of them must show before the rest is tried; moments are then not yet the best."""
 _LIKELY = 2
 """Of them those, the best first, from which the search goes on."""
 _ROUNDS = 6
@@ -124,7 +126,10 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     if alone < gain:
         return None
     starts = np.unique(np.linspace(_LEAST_RANGES, len(ranges) - _LEAST_RANGES, _SPLITS).astype(np.int64)).tolist()
-    tried = {(k, k): _split(path, ranges, k, k, width, config) for k in starts}
+    tried = {(k, k): _split(path, ranges, k, k, width, config) for k in starts[1::2] or starts}
+    if alone - min(found.unexplained for found in tried.values()) < _PROMISING * gain:
+        return None
+    tried |= {(k, k): _split(path, ranges, k, k, width, config) for k in starts[::2]}
     likely = sorted(tried, key=lambda at: tried[at].cost)[:_LIKELY]
     best = min((_converged(path, ranges, at, width, config, tried) for at in likely), key=lambda found: found.cost)
     move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
