@@ -75,10 +75,8 @@ def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift
     cells, biases, step = _raster_search(path, ranges, config)
     states, covariances, sigmas = _refine(path, ranges, _starts(cells, biases, step), step, drift, config)
     floor = max(float(sigmas.min()), 0.5 * drift, 0.02)
-    fits = zip(states, covariances, sigmas.tolist(), strict=True)
-    scored = sorted((_score(path, ranges, *fit, floor, config) for fit in fits), key=lambda h: h.cost)
     distinct: list[AnchorHypothesis] = []
-    for hypothesis in scored:
+    for hypothesis in _scored(path, ranges, states, covariances, sigmas, floor, config):
         apart = [np.hypot(*(hypothesis.position - other.position)) for other in distinct]
         if all(a > max(3.0 * floor, 0.5 * step) for a in apart):
             distinct.append(hypothesis)
@@ -181,11 +179,13 @@ def _refine(
     return state, np.asarray(np.linalg.inv(normal), dtype=np.float64), np.maximum(robust, 1e-3)
 
 
-def _score(
-    path: Floats, ranges: Floats, state: Floats, covariance: Floats, own: float, sigma: float, config: TrilaterationConfig
-) -> AnchorHypothesis:
-    position, bias = state[:2], float(state[2])
-    error = ranges - np.hypot(*(position - path).T) - bias
-    cost = float(np.minimum((error / sigma) ** 2, config.outlier**2).mean()) + (bias / config.bias_sigma) ** 2 / len(ranges)
-    spread = own * float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))
-    return AnchorHypothesis(position, bias, own, cost, spread)
+def _scored(
+    path: Floats, ranges: Floats, states: Floats, covariances: Floats, own: Floats, sigma: float, config: TrilaterationConfig
+) -> list[AnchorHypothesis]:
+    """Return the hypotheses of refined states, best first; for the parameters see _refine, whose robust sigmas are `own`."""
+    offset, bias = states[:, :2, None] - path.T, states[:, 2]
+    error = ranges - np.hypot(offset[:, 0], offset[:, 1]) - bias[:, None]
+    cost = np.minimum((error / sigma) ** 2, config.outlier**2).mean(axis=1) + (bias / config.bias_sigma) ** 2 / len(ranges)
+    spread = own * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1], 0.0))
+    order = np.argsort(cost, kind="stable").tolist()
+    return [AnchorHypothesis(states[k, :2], float(bias[k]), float(own[k]), float(cost[k]), float(spread[k])) for k in order]
