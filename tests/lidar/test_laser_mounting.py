@@ -9,7 +9,7 @@ from helpers.planted import box, drive, odometry, recording, scans, wander
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.lidar.laser_mounting import _LAGS, LEAST_PAIRS, _Agreement, _ratio, _turning_pairs, compare
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.sensor_log import LaserScans, SensorMounting
+from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting
 
 ROOM = np.concatenate([box(14, 11), box(3, 1) + np.array([2, 1, 2, 1]), box(1, 2) - np.array([4, 2, 4, 2])])
 TURNS = [(0.0, 0.0, 0.6), (0.4, 0.0, 0.0), (0.0, 0.0, -0.5), (0.3, 0.0, 0.0), (0.0, 0.0, 0.4)] * 2
@@ -173,3 +173,14 @@ def test_pairs_of_turns_on_the_spot_come_first_and_where_there_are_few_those_tha
             assert lidar.stamps[second].max() < 5.3
         else:
             assert len(first) <= 2 * LEAST_PAIRS
+
+
+@pytest.mark.parametrize(("period", "pairs"), [(1.9, True), (2.0, False)])
+def test_scans_two_seconds_apart_are_no_pair(period, pairs):
+    stamps = np.arange(0.0, 200.0, 0.1)
+    odometry = Odometry(stamps, np.column_stack([0.0 * stamps, 0.0 * stamps, 0.1 * stamps]))
+    at = period * np.arange(90)
+    scans = LaserScans(at, np.ones((90, 360), dtype=np.float32), -3.0, 0.0167, 0.0, 0.1, 9.0)
+    first, second = _turning_pairs(SensorLog(odometry, None, scans), scans, 1000)
+    assert first.tolist() == (list(range(89)) if pairs else [])
+    assert second.tolist() == [k + 1 for k in first.tolist()]

@@ -5,7 +5,7 @@ import pytest
 from helpers.planted import box, drive, scans
 
 from uwblite import se2
-from uwblite.lidar.scan_odometry import _FIRST_GATE, _points, misfits, scan_steps
+from uwblite.lidar.scan_odometry import _FIRST_GATE, _pairs, _points, _searched, misfits, scan_steps
 from uwblite.sensor_log import SensorMounting
 
 WALLS = np.concatenate([box(9, 7), box(1, 2) + np.array([2.5, 1.5] * 2)])
@@ -62,3 +62,11 @@ def test_rays_are_points_in_the_frame_of_the_base_that_come_from_the_laser(mount
     assert len(expected) > 50
     found = np.column_stack([points.keyframe, points.ray, points.points])
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_a_scan_that_sees_nothing_is_searched_in_vain():
+    lidar, _ = seen()
+    lidar.ranges[0] = np.inf
+    built, raster, *_ = _pairs(lidar, NOMINAL, FIRST[:1], SECOND[:1])
+    assert _searched(built, raster, 0, 1, np.zeros(3)) is None
+    assert _searched(built, raster, 1, 1, np.zeros(3))[1] > 0.9

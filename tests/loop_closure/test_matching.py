@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from helpers.laser_walks import HALL, scanned
 
 from uwblite import se2
@@ -56,3 +57,26 @@ def test_of_a_wide_search_the_net_overlap_is_enough():
     best = SimpleNamespace(share=np.array([0.3, 0.9]), rms=np.zeros(2))
     net = config.net_overlap + np.array([0.1, -0.1])
     assert matching._promising(best, net, config).tolist() == [True, False]
+
+
+def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
+    """In heading to three sigma, at least 0.1 rad and at most the limit; matching starts from guesses that are certain."""
+    config, asked = LoopClosureConfig(), []
+
+    def search(target, source, guess, half_widths, settings):
+        asked.append((target, source, *half_widths))
+        return SimpleNamespace(poses=np.tile(guess, (30, 1)))
+
+    monkeypatch.setattr(matching, "search", search)
+    monkeypatch.setattr(matching, "_prepare", lambda clouds, k, prepared: k)
+    spread = np.array([config.direct, 1.0, 2.0, config.search_limit + 1.0])
+    sigma = np.array([1.0, 0.01, 0.1, 9.0])
+    candidates = SimpleNamespace(
+        spread=spread, covariance=np.eye(3) * sigma[:, None, None] ** 2, guess=np.arange(12.0).reshape(4, 3),
+        target=np.array([0, 1, 2, 3]), source=np.array([4, 5, 6, 7]),
+    )  # fmt: skip
+    rows, guesses = matching._guesses(matching._Batch(candidates, None, 0.1, None, config, CorrelativeConfig()))
+    far = config.search_limit + 1.0
+    assert asked == [(1, 5, 1.0, 1.0, 0.1), (2, 6, 2.0, 2.0, pytest.approx(0.3)), (3, 7, far, far, config.search_angle)]
+    assert rows.tolist() == [0] + [1] * config.places + [2] * config.places + [3] * matching._MANY_PLACES
+    np.testing.assert_array_equal(guesses, candidates.guess[rows])

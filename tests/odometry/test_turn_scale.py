@@ -10,7 +10,7 @@ from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, odometry_indices, scan_indices, unknowns
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import ScanEdges
-from uwblite.odometry.turn_scale import _independent, _scale, turn_scales
+from uwblite.odometry.turn_scale import _independent, _neighbours, _scale, turn_scales
 
 STEPS, NOISE = 400, 0.01
 CALIBRATION = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
@@ -138,3 +138,15 @@ def test_drifts_by_way_and_time_are_no_scale():
     scale = turn_scales(wheels, seen, Graph(truth, calibration=replace(CALIBRATION, values=values)))[INDEX]
     assert scale.value == pytest.approx(0.1, abs=1e-9)
     np.testing.assert_allclose(scale.stretches, 0.1)
+
+
+def test_steps_that_scans_measure_as_well_are_found_up_to_the_last():
+    """Of edges either way round, between consecutive keyframes alone, in the order of the odometry; none beyond its end."""
+    wheels = chained(np.zeros((8, 3)), np.full(3, NOISE)).rows(np.array([0, 1, 3, 5, 6]))
+    i, j = np.array([6, 4, 0, 1, 5, 2, 3]), np.array([7, 3, 2, 2, 6, 3, 2])
+    turn = 0.1 * np.arange(1.0, 8.0)
+    none = np.zeros((7, 3))
+    steps = ScanEdges(i, j, np.column_stack([none[:, :2], turn]), none[:, None] + np.eye(3), none, none, np.full(4, -1))
+    row, turned = _neighbours(wheels, steps)
+    assert row.tolist() == [1, 2, 3, 4]
+    np.testing.assert_allclose(turned, [0.4, -0.2, 0.5, 0.1])

@@ -8,11 +8,11 @@ from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, unknowns
-from uwblite.graph.graph import Graph
+from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.keyframes import KeyframeConfig
-from uwblite.pipeline.final_stages import _sweeps
+from uwblite.pipeline.final_stages import _sweeps, at_given_poses
 from uwblite.pipeline.recordings import gather
 
 
@@ -47,3 +47,13 @@ def test_sweeps_begin_and_end_where_the_laser_was_by_its_corrected_mounting_and_
     for found, later in ((sweeps.first, 0.03), (sweeps.last, 0.03 + 0.001 * (scans.ranges.shape[1] - 1))):
         base = one.dense_trajectory(graph.poses, scans.stamps + later)
         np.testing.assert_allclose(found, se2.compose(base, mount), atol=1e-12)
+
+
+def test_at_given_poses_only_what_belongs_to_anchors_is_free_and_what_was_fixed_stays():
+    keys = tuple(UnknownKey(kind) for kind in ("bias", "height2", "range_scale", "odometry_scale", "laser_x", "bias"))
+    fixed = np.array([False, False, True, False, True, True])
+    graph = Graph(np.zeros((3, 3)), np.zeros((2, 2)), (), Calibration(keys, np.zeros(6)), fixed_calibration=fixed)
+    given = at_given_poses(graph)
+    assert given.fixed_poses.all()
+    assert given.fixed_anchors is None
+    np.testing.assert_array_equal(given.fixed_calibration, [False, False, True, True, True, True])

@@ -72,3 +72,23 @@ def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(mo
     task = Task(None, replace(config, solver=replace(config.solver, max_iterations=7)), Constraints(), None)
     select_range_priors(replace(estimate, ranges=graph.edges[2]), task)
     assert made == ["noise True", "solve 7"] * 2 + ["priors"]
+
+
+def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last(monkeypatch):
+    made, graph = [], loop()[0]
+    bootstrap = SimpleNamespace(placed=np.array([True, False, True]))
+    estimate = Estimate(graph, graph.edges[0], graph.edges[2], ("A", "B", "C"), bootstrap)
+    monkeypatch.setattr(radio_stages, "with_range_noise", lambda e, config: made.append("noise") or e)
+    monkeypatch.setattr(radio_stages, "optimize_with_heights", lambda *given: made.append("solve") or (graph, "result"))
+    monkeypatch.setattr(radio_stages.prior_selection, "select_priors", lambda graph, *given: made.append("priors") or graph)
+    monkeypatch.setattr(radio_stages, "with_free", lambda graph, *kinds: made.append("free") or graph)
+    monkeypatch.setattr(radio_stages, "solver_figures", lambda result: {"chi2": 1.0})
+    stages = SimpleNamespace(report=lambda *given: made.append(given), end=lambda *given, **more: made.append((given, more)))
+    radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages))
+    name = "first optimisation"
+    assert made == [
+        "noise", "solve", (name, 1, 3), "noise", "solve", (name, 2, 3), "noise", "priors", "free", "solve", (name, 3, 3),
+        ((name,), {"placed": 2, "chi2": 1.0}),
+    ]  # fmt: skip
+    without = replace(estimate, ranges=None)
+    assert radio_stages._optimised(without, None) is without

@@ -164,6 +164,7 @@ def test_the_moment_of_a_cut_is_in_all_the_spans_that_jump():
     spans = [np.array([[1.0, 4.0, 1.0]]), np.array([[2.0, 5.0, 3.0]]), np.array([[4.0, 6.0, -1.0]])]
     assert _together(spans, np.zeros(0), np.inf) == [3.0]
     assert _together([spans[0], spans[1][:, [0, 1, 2]] * [1, 1, -1]], np.zeros(0), np.inf) == []
+    assert _together([spans[0], spans[1] * [1, 1, 0]], np.zeros(0), np.inf) == []
     several = [np.array([[1.0, 2.0, 1.0], [2.0, 3.0, 1.0], [3.0, 4.0, 1.0]])]
     assert _together(several, np.zeros(0), 4.0) == []
     assert _together(several, np.zeros(0), 3.0) == [2.5]
