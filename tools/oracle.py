@@ -12,6 +12,7 @@ covariance is the Cramer-Rao bound.
                 range    scale |tag - anchor| + bias + patterns - range, white noise + Gaussian process
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,25 +84,23 @@ class _Rays:
 
 
 class _Layout:
-    """Where each unknown stands in the vector of all: poses after the first, anchors, surfaces, scalars."""
+    """Where each unknown stands in the vector of all: poses after the first, anchors, scalars, and four of each surface."""
 
     def __init__(self, poses: int, anchors: int, surfaces: int) -> None:
         self.poses = np.arange(poses)[:, None] * 3 + np.arange(3) - 3
         begin = 3 * poses - 3
         self.anchors = begin + np.arange(2 * anchors).reshape(-1, 2)
         begin += 2 * anchors
-        self.surfaces = begin + np.arange(2 * surfaces).reshape(-1, 2)
-        begin += 2 * surfaces
-        self.offset = begin + np.arange(surfaces)
-        begin += surfaces
-        self.radius = begin + np.arange(surfaces)
-        begin += surfaces
         self.wheels = begin + np.arange(_WHEELS)
         begin += _WHEELS
         self.bias = begin + np.arange(anchors)
         begin += anchors
         self.patterns = begin + np.arange(_PATTERN * (anchors + 1)).reshape(-1, _PATTERN)
-        self.size = begin + _PATTERN * (anchors + 1)
+        self.shared = begin + _PATTERN * (anchors + 1)
+        """Unknowns in front of those of surfaces."""
+        own = self.shared + np.arange(4 * surfaces).reshape(-1, 4)
+        self.surfaces, self.offset, self.radius = own[:, :2], own[:, 2], own[:, 3]
+        self.size = self.shared + own.size
 
 
 class Oracle:
@@ -125,6 +124,10 @@ class Oracle:
         self.anchors = len(recording.anchors) if self.has_ranges else 0
         self.layout = _Layout(len(self.frames), self.anchors, len(seen))
         self.x = self._start()
+        self._whitening = self._wheel_whitening()
+        self._range_factors: dict[int, tuple[Floats, bool]] = {}
+        """Of the covariance of each anchor's ranges, at the true places."""
+        self._excesses: tuple[Floats, Floats, Bools] | None = None
 
     def _at(self, stamps: Floats) -> Floats:
         r = self.recording
@@ -165,30 +168,49 @@ class Oracle:
     def solve(self) -> OracleFigures:
         """Descend from the truth and judge the optimum and its covariance."""
         for _ in range(_ROUNDS):
-            matrix, gradient = self._normal()
-            factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
-            step = -cho_solve(factor, gradient, check_finite=False)
+            factor, step = self._step()
             self.x += step
             if np.abs(step).max() < _CONVERGED:
                 break
         return self._figures(factor)
 
-    def _normal(self) -> tuple[Floats, Floats]:
-        """Return the normal equations at the present estimate."""
-        size = self.layout.size
-        parts = [self._wheel_rows(), self._priors()]
-        sparse_part = sparse.csr_matrix((size, size))
-        gradient = np.zeros(size)
-        for jacobian, residual in parts:
-            sparse_part = sparse_part + jacobian.T @ jacobian
+    def _step(self) -> tuple[tuple[Floats, bool], Floats]:
+        """Return the factor of the normal equations with surfaces eliminated, and the Gauss-Newton step (size,).
+
+        No two surfaces share a ray: their part of the matrix is made of blocks of four, and goes first.
+        """
+        layout = self.layout
+        shared = layout.shared
+        whole, matrix, gradient = self._normal()
+        own = _blocks_of_four(whole[shared:, shared:])
+        inverse = sparse.block_diag(np.linalg.inv(own), format="csr") if len(own) else sparse.csr_matrix((0, 0))
+        across = whole[shared:, :shared]
+        onto = inverse @ across
+        matrix += (whole[:shared, :shared] - across.T @ onto).toarray()
+        factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+        step = np.zeros(layout.size)
+        step[:shared] = -cho_solve(factor, gradient[:shared] - onto.T @ gradient[shared:], check_finite=False)
+        step[shared:] = -(inverse @ gradient[shared:]) - onto @ step[:shared]
+        return factor, step
+
+    def _normal(self) -> tuple[sparse.csr_matrix, Floats, Floats]:
+        """Return the normal equations at the present estimate: a sparse part, a dense one of what surfaces are not in, and
+        the gradient."""
+        layout = self.layout
+        gradient, matrix = np.zeros(layout.size), np.zeros((layout.shared, layout.shared))
+        prior = np.zeros(layout.size)
+        prior[layout.surfaces] = _ANY_PLACE**-2
+        whole = sparse.diags(prior, format="csr")
+        for jacobian, residual in (self._priors(), *self._ray_rows()):
+            whole = whole + jacobian.T @ jacobian
             gradient += jacobian.T @ residual
-        matrix = sparse_part.toarray()
-        matrix[self.layout.surfaces, self.layout.surfaces] += _ANY_PLACE**-2
-        if self.rays is not None:
-            self._add_rays(matrix, gradient)
+        jacobian, residual = self._wheel_rows()
+        near = jacobian[:, : layout.shared]
+        matrix += (near.T @ near).toarray()
+        gradient += jacobian.T @ residual
         if self.has_ranges:
             self._add_ranges(matrix, gradient)
-        return matrix, gradient
+        return whole, matrix, gradient
 
     def _rows(self, columns: Ints, values: Floats) -> sparse.csr_matrix:
         """Return rows (m,) that are non-zero in these columns (m, c); a column below 0 is fixed."""
@@ -218,7 +240,7 @@ class Oracle:
         for c, turned in ((7, frames.motion[:, 2]), (8, frames.length)):
             jacobian[:, :, c] = -np.concatenate([0.5 * turned[:, None] * ahead, turned[:, None]], axis=1)
         rows = self._rows(np.repeat(columns, 3, axis=0), jacobian.reshape(-1, 9))
-        whitening = self._wheel_whitening()
+        whitening = self._whitening
         return sparse.csr_matrix(whitening @ rows), whitening @ error.ravel()
 
     def _step_error(self, z: Floats, poses: Floats) -> Floats:
@@ -278,9 +300,11 @@ class Oracle:
         """Return the standard deviation of what the direction in which an antenna is hit adds to a range, m."""
         return self.recording.settings.radio.antenna_sd if self.rooms is None else self.rooms.antenna_sd
 
-    def _add_rays(self, matrix: Floats, gradient: Floats) -> None:
+    def _ray_rows(self) -> Iterator[tuple[sparse.csr_matrix, Floats]]:
+        """Yield whitened Jacobians and residuals of the rays, a bounded number at a time."""
         rays, layout = self.rays, self.layout
-        assert rays is not None
+        if rays is None:
+            return
         poses, place = self.poses(), np.searchsorted(self.seen, rays.surface)
         for first in range(0, len(rays.pose), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
@@ -309,10 +333,7 @@ class Oracle:
             rows[:, 5], rows[:, 6] = -incidence, np.where(wall, 0.0, -1.0)
             own = np.stack([layout.offset[place[part]], layout.radius[place[part]]], axis=1)
             columns = np.concatenate([layout.poses[rays.pose[part]], layout.surfaces[place[part]], own], axis=1)
-            jacobian = self._rows(columns, rows / sd[:, None])
-            product = (jacobian.T @ jacobian).tocoo()
-            matrix[product.row, product.col] += product.data
-            gradient += jacobian.T @ (residual / sd)
+            yield self._rows(columns, rows / sd[:, None]), residual / sd
 
     def _add_ranges(self, matrix: Floats, gradient: Floats) -> None:
         r, log, layout, model = self.recording, self.log, self.layout, self.recording.settings.radio
@@ -345,16 +366,20 @@ class Oracle:
                 np.broadcast_to(body, (len(unit), _PATTERN)), world,
             ], axis=1,
         )
-        mean, spread, sound = self._excess(number)
+        if self._excesses is None:
+            self._excesses = self._excess(number)
+        mean, spread, sound = self._excesses
         for anchor in range(self.anchors):
             rows = np.flatnonzero((number == anchor) & sound)
             if not len(rows):
                 continue
-            covariance = self._covariance(tag[rows]) + np.diag(model.noise_sd**2 + spread[rows] ** 2)
+            if anchor not in self._range_factors:
+                covariance = self._covariance(tag[rows]) + np.diag(model.noise_sd**2 + spread[rows] ** 2)
+                self._range_factors[anchor] = cho_factor(covariance, lower=True)
             jacobian = self._rows(columns[rows], values[rows])
             used = np.unique(jacobian.indices)
             dense = jacobian[:, used].toarray()
-            weighted = cho_solve(cho_factor(covariance, lower=True), np.column_stack([dense, residual[rows] + mean[rows]]))
+            weighted = cho_solve(self._range_factors[anchor], np.column_stack([dense, residual[rows] + mean[rows]]))
             matrix[np.ix_(used, used)] += dense.T @ weighted[:, :-1]
             gradient[used] += dense.T @ weighted[:, -1]
 
@@ -406,7 +431,7 @@ class Oracle:
             error = se2.transform(motion, self.x[layout.anchors]) - self.recording.anchors
             anchors = float(np.sqrt((error**2).sum(axis=1).mean()))
             columns, at = np.concatenate([columns, layout.anchors]), np.concatenate([at, self.recording.anchors])
-        unit = np.zeros((layout.size, columns.size))
+        unit = np.zeros((layout.shared, columns.size))
         unit[columns.ravel(), np.arange(columns.size)] = 1.0
         covariance = cho_solve(factor, unit, check_finite=False)[columns.ravel()]
         del unit
@@ -423,6 +448,13 @@ class Oracle:
         return OracleFigures(
             float(np.sqrt((off**2).sum(axis=1).mean())), anchors, float(np.sqrt(2.0 * variance[:path].mean())), bound
         )
+
+
+def _blocks_of_four(matrix: sparse.csr_matrix) -> Floats:
+    """Return the blocks (s, 4, 4) of a block-diagonal matrix (4s, 4s)."""
+    entries, blocks = matrix.tocoo(), np.zeros((matrix.shape[0] // 4, 4, 4))
+    blocks[entries.row // 4, entries.row % 4, entries.col % 4] = entries.data
+    return blocks
 
 
 def _between_error(z: Floats, first: Floats, second: Floats) -> Floats:
@@ -448,8 +480,8 @@ def _to_circle(points: Floats, direction: Floats, radius: Floats) -> tuple[Float
 
 def _in_pieces(rays: _Rays, poses: Floats, walls: Floats, columns: Floats) -> tuple[_Rays, Floats, Floats]:
     """Return rays, walls and columns with every wall cut into pieces of either side, and every column into sectors."""
-    own = poses[rays.pose]
-    at, wall = se2.transform(own, rays.points), rays.surface < len(walls)
+    own, wall = poses[rays.pose], rays.surface < len(walls)
+    at = _hits(rays, own, walls, columns)
     line = walls[np.where(wall, rays.surface, 0)]
     along = (line[:, 2:] - line[:, :2]) / np.hypot(*(line[:, 2:] - line[:, :2]).T)[:, None]
     piece = np.floor(np.maximum(((at - line[:, :2]) * along).sum(axis=1), 0.0) / _PIECE).astype(np.int64)
@@ -462,6 +494,20 @@ def _in_pieces(rays: _Rays, poses: Floats, walls: Floats, columns: Floats) -> tu
     parent = found // many
     of_wall = parent < len(walls)
     return replace(rays, surface=surface), walls[parent[of_wall]], columns[parent[~of_wall] - len(walls)]
+
+
+def _hits(rays: _Rays, own: Floats, walls: Floats, columns: Floats) -> Floats:
+    """Return where (p, 2) the rays from poses (p, 3) meet their surfaces: by noisy points, noise would choose the piece."""
+    at, direction = se2.transform(own, rays.points), se2.rotate(own[:, 2], rays.directions)
+    wall = rays.surface < len(walls)
+    line = walls[np.where(wall, rays.surface, 0)]
+    normal = np.stack([line[:, 1] - line[:, 3], line[:, 2] - line[:, 0]], axis=1)
+    incidence = (normal * direction).sum(axis=1)
+    shift = ((line[:, :2] - at) * normal).sum(axis=1) / np.where(incidence == 0.0, np.inf, incidence)
+    if len(columns):
+        circle = columns[np.where(wall, 0, rays.surface - len(walls))]
+        shift = np.where(wall, shift, _to_circle(at - circle[:, :2], direction, circle[:, 2])[0])
+    return at + shift[:, None] * direction
 
 
 _PIECE = 1.0
