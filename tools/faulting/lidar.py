@@ -163,6 +163,18 @@ def tilted(reach: float) -> Fault:
     return lambda case, rng: with_scans(case, lambda s: change(s, case, rng))
 
 
+def leaning(angle: float) -> Fault:
+    """The lidar leans to its right, rad: walls are farther, and to the right it sees the floor 0.3 m below it."""
+
+    def change(s: LaserScans) -> LaserScans:
+        rise = np.arcsin(np.sin(angle) * np.sin(s.angles))
+        floor = np.where(rise < 0.0, 0.3 / np.maximum(np.sin(-rise), 1e-6), np.inf)
+        walls = s.ranges / np.cos(rise)
+        return replace(s, ranges=np.where(floor < s.range_max, np.fmin(walls, floor), walls))
+
+    return lambda case, rng: with_scans(case, change)
+
+
 def reach_as_hits(reach: float) -> Fault:
     """What the lidar does not see it reports as walls at its reach, m."""
 

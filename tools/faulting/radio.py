@@ -188,6 +188,26 @@ def carried_anchor(case: Case, rng: Rng) -> Case:
     return replace(with_ranges(case, change), anchors={n: p for n, p in case.anchors.items() if n != name})
 
 
+def driven_away(metres: float) -> Fault:
+    """One anchor is driven away on a cart, between two and three fifths of the time."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        if case.log.ranges is None:
+            return case
+        name, way = case.log.ranges.anchor_ids[0], metres * np.array([0.8, 0.6])
+
+        def change(r: UwbRanges) -> UwbRanges:
+            age = (r.stamps - r.stamps[0]) / np.ptp(r.stamps)
+            driven = np.clip((age - 0.4) / 0.2, 0.0, 1.0)[:, None] * way
+            longer = _longer(case, r, case.anchors[name][0], driven)
+            return replace(r, ranges=np.where(r.anchor == 0, np.maximum(r.ranges + longer, 0.05), r.ranges))
+
+        place = case.anchors[name][0]
+        return replace(with_ranges(case, change), anchors={**case.anchors, name: [place, place + way]})
+
+    return fault
+
+
 def missed(share: float) -> Fault:
     """A share of the ranges is 0: the radio has missed its partner."""
     return lambda case, rng: with_ranges(
