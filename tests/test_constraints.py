@@ -22,7 +22,7 @@ from uwblite.pipeline.constraint_edges import _gauge, apply, apply_given, consen
 from uwblite.pipeline.estimate import Estimate, Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.radio.bootstrap import BootstrapResult
+from uwblite.radio.bootstrap_attempt import BootstrapResult
 
 IDS = ("A", "B", "C", "D")
 TRUE = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 6.0], [-1.0, 5.0]])

@@ -17,7 +17,7 @@ from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.joining import _FIRST_TOLERANCE, _laid_on, _one_bootstrap, _one_graph, _other_name, join, radio_name
-from uwblite.radio.bootstrap import BootstrapResult
+from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import SensorMounting

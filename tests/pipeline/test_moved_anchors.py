@@ -22,7 +22,7 @@ from uwblite.pipeline.moved_anchors import (
     separate_moved_anchors,
 )  # fmt: skip
 from uwblite.pipeline.progress import Stages
-from uwblite.radio.bootstrap import BootstrapResult
+from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.range_noise import RangeNoiseConfig
 
 

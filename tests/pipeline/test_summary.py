@@ -29,7 +29,7 @@ from uwblite.pipeline.summary import (
     _with_steady_errors,
     _with_times,
 )
-from uwblite.radio.bootstrap import BootstrapResult
+from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.sensor_log import SensorMounting
 

@@ -5,9 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from helpers.laser_walks import chained
 from helpers.planted import aligned_error, odometry, ranges, wander
-from helpers.planted_graphs import plain_ranges
 
 from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, prior_edges, unknowns
@@ -16,9 +14,10 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio import bootstrap
-from uwblite.radio.bootstrap import BootstrapConfig, BootstrapResult, _Bootstrap, bootstrap_graph
+from uwblite.radio.bootstrap import bootstrap_graph
+from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig, BootstrapResult
 from uwblite.radio.range_measurements import range_edges
-from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
+from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting, UwbRanges
 
 SIGMA = 0.05
@@ -214,132 +213,7 @@ def test_equal_inputs_give_equal_bytes():
     assert one.graph.anchors.tobytes() == other.graph.anchors.tobytes()
 
 
-class Scheduled(_Bootstrap):
-    """A bootstrap whose steps only write down that they were taken; each extension adds what `agrees` does not say."""
-
-    def __init__(self, poses, agrees, found):
-        self.path, self.config, self.hypotheses = np.arange(float(poses)), BootstrapConfig(), {}
-        self.placed, self.agrees, self.found = np.ones(1, dtype=bool), iter(agrees), iter(found)
-        self.taken, self.low, self.high = [], 0, 0
-
-    def _seed(self):
-        self.low, self.high = 0, 20
-        return 20.0
-
-    def _extend(self, piece):
-        self.taken.append(round(piece, 6))
-        self.high = min(self.high + 4, len(self.path))
-        return next(self.agrees)
-
-    def _solve(self, schedule):
-        self.taken.append((schedule[0], self.high))
-
-    def _search(self, low, high, drift):
-        assert (low, high, drift) == (self.low, self.high, 2.0 * self.config.range_sigma)
-        return {}
-
-    def _adopt(self, found):
-        return next(self.found)
-
-
-def test_pieces_grow_while_the_ranges_agree_and_all_is_solved_from_time_to_time():
-    """The first piece is 0.3 of the first stretch. It grows by half where the ranges agreed, shrinks by a fifth where they did
-    not, never below 0.3 of the first; all is solved at 1.35 times the poses and at the end, twice where an anchor came. What
-    is left at a distance goes on as if it had never been left."""
-    one = Scheduled(32, [True, False, True], [True, False])
-    one.run()
-    assert one.taken == [(10.0, 20), 6.0, 9.0, (6.0, 28), (6.0, 28), 7.2, (6.0, 32)]
-    slow = Scheduled(56, [False] * 9, [False] * 9)
-    slow.run(21.0)
-    assert slow.high == 24
-    slow.run()
-    pieces = [t for t in slow.taken if isinstance(t, float)]
-    assert pieces == [6.0, 4.8, 3.84, 3.072, 2.4576, 1.96608, 1.8, 1.8, 1.8]
-    assert [t[1] for t in slow.taken if isinstance(t, tuple)] == [20, 28, 40, 56]
-
-
-def along_a_line(poses=12, sigma=0.1):
-    """Return an attempt over poses one metre apart whose odometry is exact, with ranges to two placed anchors."""
-    truth = np.column_stack([np.arange(float(poses)), np.zeros((poses, 2))])
-    anchors = np.array([[4.0, 3.0], [6.0, -3.0]])
-    pose, anchor = np.repeat(np.arange(poses), 2), np.tile([0, 1], poses)
-    distance = np.hypot(*(truth[pose, :2] - anchors[anchor]).T)
-    graph = Graph(truth, anchors)
-    attempt = _Bootstrap(
-        graph, chained(truth, (0.05, 0.05, 0.05)), plain_ranges(pose, anchor, distance, sigma), np.arange(float(poses)),
-        BootstrapConfig(range_sigma=sigma), TrilaterationConfig(),
-    )  # fmt: skip
-    attempt.placed[:] = True
-    return attempt, truth
-
-
-@pytest.mark.parametrize(("piece", "low", "high"), [(2.0, 3, 9), (2.5, 3, 9), (0.1, 4, 8), (30.0, 0, 12)])
-def test_a_piece_is_laid_on_at_either_end_by_the_odometry(piece, low, high):
-    """As far as the piece reaches, one pose at least; where the ranges agree nothing else is moved."""
-    attempt, truth = along_a_line()
-    attempt.low, attempt.high = 5, 7
-    attempt.poses = np.where(np.arange(12)[:, None] // 5 == 1, truth, 99.0)
-    attempt.poses[7:] = 99.0
-    assert attempt._extend(piece)
-    assert (attempt.low, attempt.high) == (low, high)
-    np.testing.assert_allclose(attempt.poses[low:high], truth[low:high], atol=1e-12)
-    assert np.all(attempt.poses[:low] == 99.0)
-    assert np.all(attempt.poses[high:] == 99.0)
-
-
-def test_a_piece_that_the_ranges_contradict_is_optimised_from_its_first_pose():
-    attempt, truth = along_a_line()
-    attempt.poses[8:, 1] += 0.8
-    assert not attempt._optimise_piece(7, 12, 7)
-    np.testing.assert_array_equal(attempt.poses[:8], truth[:8])
-    assert np.abs(attempt.poses - truth)[:, :2].max() < 0.1
-    near, _ = along_a_line()
-    near.poses[8:, 1] += 0.1
-    before = near.poses.copy()
-    assert near._optimise_piece(7, 12, 7)
-    np.testing.assert_array_equal(near.poses, before)
-
-
-def test_the_misfit_is_a_median_in_standard_deviations_unless_the_path_is_torn():
-    attempt, truth = along_a_line()
-    assert attempt.misfit() == 0.0
-    attempt.ranges = replace(attempt.ranges, ranges=attempt.ranges.ranges + np.tile([0.3, -0.3], 12))
-    assert attempt.misfit() == pytest.approx(0.3 / (0.6745 * 0.1))
-    for tear, torn in ((0.99, False), (1.01, True)):
-        attempt, truth = along_a_line()
-        attempt.placed[:] = False
-        attempt.poses = truth + tear * (np.arange(12) >= 6)[:, None] * [0.0, 1.0, 0.0]
-        assert attempt.misfit() == (attempt.config.agreement if torn else 0.0)
-
-
-def test_the_first_stretch_is_the_one_whose_anchors_are_clearest():
-    """By 1 / (1 + sigma / range_sigma + position_sigma) of each clear anchor; lengths are tried until it is enough."""
-    tried = []
-
-    class Seeded(_Bootstrap):
-        def _search(self, low, high, drift):
-            tried.append((low, high, drift))
-            # The surer anchor scatters three times as much: 1 / (1 + 1 + 1) is less than 1 / (1 + 3 + 0.5) twice.
-            one = AnchorHypothesis(np.ones(2), 0.0, 0.1, 1.0, 1.0)
-            two = AnchorHypothesis(np.ones(2), 0.0, 0.3, 1.0, 0.5)
-            return {0: [one]} if low == 0 else ({0: [two], 1: [two]} if low == 15 else {0: []})
-
-    truth = np.column_stack([np.arange(41.0), np.zeros((41, 2))])
-    ranges_to = plain_ranges(np.arange(41), np.arange(41) % 2, np.ones(41), 0.1)
-    attempt = Seeded(
-        Graph(truth, np.zeros((2, 2))), chained(truth, (0.1, 0.1, 0.1)), ranges_to, np.arange(41.0),
-        BootstrapConfig(range_sigma=0.1), TrilaterationConfig(),
-    )  # fmt: skip
-    length = attempt._seed()
-    # 25 m at both ends and between, then 10 and 4 m, then all: none is worth 0.35 for each of two anchors.
-    assert [(low, high) for low, high, _ in tried[:2]] == [(0, 26), (15, 41)]
-    assert tried[-1][:2] == (0, 41)
-    assert all(abs(drift / 0.015 - (high - low)) <= 1.0 + 1e-9 for low, high, drift in tried)
-    assert (attempt.low, attempt.high, length) == (15, 41, 25.0)
-    assert attempt.placed.tolist() == [True, True]
-
-
-class Tried(_Bootstrap):
+class Tried(Attempt):
     """An attempt over 400 m whose misfit is given for 50, 100, 200 m and the end, by its heading error."""
 
     misfits: ClassVar[dict[float, tuple[float, ...]]] = {}
@@ -380,7 +254,7 @@ class Tried(_Bootstrap):
     ],
 )  # fmt: skip
 def test_a_heading_error_is_given_up_where_it_cannot_win(monkeypatch, misfits, wins, known):
-    monkeypatch.setattr(bootstrap, "_Bootstrap", Tried)
+    monkeypatch.setattr(bootstrap, "Attempt", Tried)
     monkeypatch.setattr(Tried, "misfits", misfits)
     monkeypatch.setattr(Tried, "known", {})
     turns = [u for u in unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)) if u.key.kind == "heading_scale"]

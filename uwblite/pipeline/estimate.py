@@ -14,7 +14,7 @@ from ..graph.range_edges import RangeEdges
 from ..lidar.cloud_rasters import CloudRasters
 from ..lidar.clouds import Clouds
 from ..loop_closure.closures import Closures, no_closures
-from ..radio.bootstrap import BootstrapResult
+from ..radio.bootstrap_attempt import BootstrapResult
 from .mapping_config import MappingConfig
 from .progress import Stages
 from .recordings import Recordings

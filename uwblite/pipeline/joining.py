@@ -21,7 +21,7 @@ from ..graph.graph import Calibration, Graph, PriorEdges
 from ..graph.marginals import marginals
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
-from ..radio.bootstrap import BootstrapResult
+from ..radio.bootstrap_attempt import BootstrapResult
 from ..radio.trilateration import AnchorHypothesis
 from .constraint_edges import consensus
 from .estimate import Estimate, Task

@@ -17,7 +17,7 @@ from ..lidar.submaps import SubmapConfig
 from ..loop_closure.closures import LoopClosureConfig
 from ..odometry.keyframes import KeyframeConfig
 from ..odometry.wheels import OdometryNoiseConfig
-from ..radio.bootstrap import BootstrapConfig
+from ..radio.bootstrap_attempt import BootstrapConfig
 from ..radio.range_noise import RangeNoiseConfig
 from ..radio.trilateration import TrilaterationConfig
 

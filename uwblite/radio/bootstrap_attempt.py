@@ -1,0 +1,261 @@
+"""An attempt at starting values: trajectory and anchors together, outwards from the best stretch.
+
+Raw odometry of a long recording is too bent to linearise about, and anchors of unknown position cannot straighten it
+before they are placed. So the stretch whose anchors are clearest comes first; from there the interval of known
+poses extends at both ends. Each piece is laid on by the calibrated odometry, pulled onto the anchors already placed
+(graduated kernel: wide first, then tight), and whenever the interval has become longer by a share, all of it is solved
+again and anchors not yet placed are searched from the poses so far.
+"""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, spread
+from ..config import setting
+from ..graph.gnc import tightened
+from ..graph.graph import Graph
+from ..graph.pose_edges import OdometryEdges
+from ..graph.range_edges import RangeEdges
+from ..graph.solver import SolverConfig
+from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate
+
+
+@dataclass(frozen=True, slots=True)
+class BootstrapConfig:
+    """Bootstrap of the first estimate."""
+
+    seed_distances: ClassVar[tuple[float, ...]] = (25.0, 10.0, 4.0, 60.0, 150.0)
+    """Travelled distances of the first stretch, m, tried in this order until the anchors in it are clear; then all of it."""
+    piece: ClassVar[float] = 0.3
+    """Distance laid on at once, as a share of the first stretch; more where the prediction holds."""
+    resolve_factor: ClassVar[float] = 1.35
+    """All poses so far are solved again when their number has increased by this factor."""
+    range_sigma: float = setting(0.15, advanced=True)
+    """Assumed standard deviation of ranges until it is learnt, m."""
+    least_sigma: ClassVar[float] = 0.05
+    """Least standard deviation of ranges meanwhile, m."""
+    drift: ClassVar[float] = 0.015
+    """Assumed drift of the odometry per travelled metre, m/m."""
+    heading_scales: ClassVar[tuple[float, ...]] = (0.0, -0.5, 1.0, -0.3, 0.4, -0.15, 0.15)
+    """Relative heading errors of the odometry tried in this order until the ranges agree: a wrong track width in the
+    base's settings is the commonest gross fault, and a factor of two the commonest value."""
+    agreement: ClassVar[float] = 2.0
+    """Ranges agree when their median error is below so many standard deviations."""
+    enough: ClassVar[float] = 50.0
+    """Travelled distance over which a heading error is tried before it is worth the whole path, m."""
+    tear: ClassVar[float] = 1.0
+    """No slip throws a step between keyframes off by more than this, m or rad: then a piece was laid on mirrored or in the
+    wrong place, however well its ranges agree."""
+    clear_enough: ClassVar[float] = 0.35
+    """A first stretch is good when its anchors (up to three) are worth this each; 1 = placed without error, 0 = unclear."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BootstrapResult:
+    """Starting values for the first optimisation."""
+
+    graph: Graph
+    """Odometry edges of the whole path; ranges of placed anchors."""
+    placed: Bools
+    """(a,) anchors that have a position."""
+    hypotheses: tuple[tuple[AnchorHypothesis, ...], ...]
+    """By anchor: what the last search found, best first."""
+    ambiguous: Bools
+    """(a,) two positions explain the ranges about equally well."""
+
+
+class Attempt:
+    """The poses in [low, high) are known, the anchors in `placed` have a position."""
+
+    def __init__(
+        self, graph: Graph, odometry: OdometryEdges, ranges: RangeEdges, path: Floats, config: BootstrapConfig,
+        search: TrilaterationConfig,
+    ) -> None:
+        self.graph, self.odometry, self.ranges, self.path = graph, odometry, ranges, path
+        self.config, self.search = config, search
+        self.live = ranges.alive
+        self.poses = se2.chain(graph.poses[0], odometry.corrected(graph))
+        self.anchors, self.calibration = graph.anchors.copy(), graph.calibration
+        self.placed = np.zeros(len(graph.anchors), dtype=bool)
+        self.sigma = np.full(len(graph.anchors), config.range_sigma)
+        self.hypotheses: dict[int, list[AnchorHypothesis]] = {}
+        self.low = self.high = self.solved = 0
+        self.piece = self.smallest = 0.0
+
+    @property
+    def complete(self) -> bool:
+        """Whether all poses are known."""
+        return self.low == 0 and self.high == len(self.path)
+
+    def run(self, enough: float = np.inf) -> None:
+        """Extend from the clearest stretch, or from where it was left, to a travelled distance, m, or to the whole path."""
+        if self.high == 0:
+            self._begin()
+        while self.placed.any() and not self.complete and self.path[self.high - 1] - self.path[self.low] < enough:
+            agreed = self._extend(self.piece)
+            self.piece = 1.5 * self.piece if agreed else max(0.8 * self.piece, self.smallest)
+            if self.high - self.low >= self.config.resolve_factor * self.solved or self.complete:
+                self._solve((6.0, 3.0))
+                self.solved = self.high - self.low
+                if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
+                    self._solve((6.0, 3.0))
+        if np.isinf(enough):
+            self._place_the_rest()
+
+    def agrees_to_the_end(self) -> bool:
+        """Extend as long as the ranges agree; return whether they do over the whole path."""
+        length = self.config.enough
+        while not self.complete and self.misfit() < self.config.agreement:
+            length *= 2.0
+            self.run(length)
+        if self.complete:
+            self._place_the_rest()
+        return self.complete and self.misfit() < self.config.agreement
+
+    def _begin(self) -> None:
+        """Solve the clearest stretch."""
+        self.piece = self.config.piece * self._seed()
+        self.smallest, self.solved = 0.3 * self.piece, self.high - self.low
+        if self.placed.any():
+            self._solve((10.0, 3.0))
+
+    def _place_the_rest(self) -> None:
+        """Put the anchors that stay unclear where they are likeliest."""
+        self.doubtful = np.array([self._unclear(self.hypotheses.get(k, [])) for k in range(len(self.placed))], dtype=bool)
+        for anchor, hypotheses in self.hypotheses.items():
+            if hypotheses and not self.placed[anchor]:
+                self._put(anchor, hypotheses[0])
+
+    def estimate(self) -> BootstrapResult:
+        """Return the estimate of this attempt."""
+        final = replace(self.graph, poses=self.poses, anchors=self.anchors, calibration=self.calibration)
+        found = tuple(tuple(self.hypotheses.get(k, ())) for k in range(len(self.placed)))
+        return BootstrapResult(final, self.placed, found, self.doubtful)
+
+    def misfit(self) -> float:
+        """Return the median error of ranges to placed anchors, in assumed standard deviations, as far as poses are known.
+
+        A trajectory that is torn somewhere never agrees; without any anchor the misfit is 0.
+        """
+        low, high = self.low, self.high or len(self.path)
+        part = self._part(low, high)
+        errors = [np.abs(e.residuals(part)[:, 0] * e.sigma) for e in part.edges if isinstance(e, RangeEdges)]
+        median = float(np.median(errors[0])) / (0.6745 * self.config.range_sigma) if errors else 0.0
+        steps = self.odometry.corrected(replace(self.graph, calibration=self.calibration))[low : high - 1]
+        off = se2.between(steps, se2.between(self.poses[low : high - 1], self.poses[low + 1 : high]))
+        return max(median, self.config.agreement) if np.any(np.abs(off) > self.config.tear) else median
+
+    def _unclear(self, hypotheses: list[AnchorHypothesis]) -> bool:
+        return len(hypotheses) > 0 and ambiguous(hypotheses, self.search)
+
+    def _seed(self) -> float:
+        """Choose the stretch whose anchors are clearest and place them; return its length, m."""
+        best, most = None, -1.0
+        total, count = float(self.path[-1]), min(len(np.unique(self.ranges.anchor[self.live])), 3)
+        for length in [d for d in self.config.seed_distances if d < total] + [total]:
+            places = 1 + max(0, min(5, int(2 * total / max(length, 1e-9)) - 2))
+            for start in np.linspace(0.0, total - length, places):
+                low = int(np.searchsorted(self.path, start))
+                high = int(np.searchsorted(self.path, start + length, "right"))
+                found = self._search(low, high, self.config.drift * length)
+                clear = [h[0] for h in found.values() if h and not self._unclear(h)]
+                worth = sum(1.0 / (1.0 + h.sigma / self.config.range_sigma + h.position_sigma) for h in clear)
+                if worth > most + 1e-9:
+                    best, most = (found, low, high), worth
+            if most > self.config.clear_enough * count:
+                break
+        assert best is not None
+        found, self.low, self.high = best
+        self._adopt(found)
+        return float(self.path[self.high - 1] - self.path[self.low])
+
+    def _search(self, low: int, high: int, drift: float) -> dict[int, list[AnchorHypothesis]]:
+        """Search the anchors not yet placed from the poses in [low, high)."""
+        ranges, inside = self.ranges, self.live & (self.ranges.pose >= low) & (self.ranges.pose < high)
+        found = {}
+        for anchor in np.unique(ranges.anchor[inside]):
+            if not self.placed[anchor]:
+                own = ranges.rows(inside & (ranges.anchor == anchor))
+                found[int(anchor)] = trilaterate(own.tag_positions(self.poses), own.planar_ranges(), self.search, drift)
+        return found
+
+    def _adopt(self, found: dict[int, list[AnchorHypothesis]]) -> bool:
+        """Place the anchors of which one hypothesis stands out; remember all; return whether any was placed."""
+        any_new = False
+        for anchor, hypotheses in found.items():
+            if hypotheses:
+                self.hypotheses[anchor] = hypotheses
+                if not self._unclear(hypotheses):
+                    self._put(anchor, hypotheses[0])
+                    any_new = True
+        return any_new
+
+    def _put(self, anchor: int, hypothesis: AnchorHypothesis) -> None:
+        self.anchors[anchor] = hypothesis.position
+        self.sigma[anchor] = max(hypothesis.sigma, self.sigma[anchor])
+        self.placed[anchor] = True
+
+    def _extend(self, piece: float) -> bool:
+        """Lay on one piece at each open end by calibrated odometry; return whether it agreed with the anchors as it was."""
+        motion = self.odometry.corrected(replace(self.graph, calibration=self.calibration))
+        agreed = True
+        if self.high < len(self.path):
+            old, new = self.high, int(np.searchsorted(self.path, self.path[self.high - 1] + piece, "right"))
+            self.high = max(min(new, len(self.path)), old + 1)
+            self.poses[old - 1 : self.high] = se2.chain(self.poses[old - 1], motion[old - 1 : self.high - 1])
+            agreed &= self._optimise_piece(old - 1, self.high, old - 1)
+        if self.low > 0:
+            old, new = self.low, int(np.searchsorted(self.path, self.path[self.low] - piece))
+            self.low = min(new, old - 1)
+            back = se2.inverse(motion[self.low : old])[::-1]
+            self.poses[self.low : old + 1] = se2.chain(self.poses[old], back)[::-1]
+            agreed &= self._optimise_piece(self.low, old + 1, old)
+        return agreed
+
+    def _optimise_piece(self, low: int, high: int, fixed_pose: int) -> bool:
+        """Optimise the poses of [low, high) with one of them, the anchors and the calibration fixed.
+
+        Returns True where the ranges agreed with the prediction; then nothing is moved.
+        """
+        part = self._part(low, high)
+        errors = [e.residuals(part) for e in part.edges if isinstance(e, RangeEdges)]
+        if not errors or float(np.median(np.abs(errors[0]))) < 2.0:
+            return True
+        fixed = np.zeros(high - low, dtype=bool)
+        fixed[fixed_pose - low] = True
+        everything = np.ones(len(self.anchors), dtype=bool)
+        unmoved = np.ones(len(self.calibration.values), dtype=bool)
+        part = replace(part, fixed_poses=fixed, fixed_anchors=everything, fixed_calibration=unmoved)
+        self.poses[low:high] = _anneal(part, (20.0, 6.0, 3.0)).poses
+        return False
+
+    def _solve(self, schedule: tuple[float, ...]) -> None:
+        """Optimise everything known so far and learn each anchor's spread."""
+        part = replace(self._part(self.low, self.high), fixed_anchors=~self.placed)
+        part = replace(part, fixed_calibration=self.graph.fixed_calibration).with_edges(*self.graph.edges)
+        solved = _anneal(part, schedule)
+        self.poses[self.low : self.high] = solved.poses
+        self.anchors, self.calibration = solved.anchors.copy(), solved.calibration
+        for edges in solved.edges:
+            if isinstance(edges, RangeEdges):
+                error = edges.residuals(solved)[:, 0] * edges.sigma
+                for anchor in np.unique(edges.anchor):
+                    self.sigma[anchor] = max(spread(error[edges.anchor == anchor]), self.config.range_sigma)
+
+    def _part(self, low: int, high: int) -> Graph:
+        """Return the graph of poses [low, high) with their odometry and their ranges to placed anchors."""
+        wheels = self.odometry.rows(np.arange(low, max(high - 1, low)))
+        wheels = replace(wheels, i=wheels.i - low, j=wheels.j - low)
+        which = self.live & (self.ranges.pose >= low) & (self.ranges.pose < high) & self.placed[self.ranges.anchor]
+        radio = self.ranges.rows(np.flatnonzero(which))
+        radio = replace(radio, pose=radio.pose - low, sigma=self.sigma[radio.anchor])
+        return Graph(self.poses[low:high], self.anchors, (), self.calibration).with_edges(wheels, radio)
+
+
+def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:
+    """Optimise with the ranges' kernel tightened step by step (graduated non-convexity)."""
+    ranges = [k for k, e in enumerate(graph.edges) if isinstance(e, RangeEdges)]
+    return tightened(graph, ranges, schedule, SolverConfig(max_iterations=15, relative_decrease=1e-4))
