@@ -9,7 +9,7 @@ Bools = NDArray[np.bool_]
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation / median absolute deviation of normal errors: the inverse of their 0.75 quantile."""
-_SIGMA_OF_MEDIAN = 1.2533
+MEDIAN_TO_MEAN = 1.2533
 """Standard deviation of a median of normal values / that of their mean: sqrt(pi / 2)."""
 
 
@@ -43,7 +43,15 @@ def spread_about_median(values: Floats) -> float:
 
 def sigma_of_median(values: Floats) -> float:
     """Return the standard deviation of the median of values (m,)."""
-    return _SIGMA_OF_MEDIAN * spread_about_median(values) / float(np.sqrt(len(values)))
+    return MEDIAN_TO_MEAN * spread_about_median(values) / float(np.sqrt(len(values)))
+
+
+def white_noise(values: Floats) -> float:
+    """Return the robust standard deviation of the noise of a smooth series (m,), m > 2, by its second differences.
+
+    With half of the neighbours taken off, those of white noise have 3/2 of its variance.
+    """
+    return spread(values[1:-1] - 0.5 * (values[:-2] + values[2:])) / float(np.sqrt(1.5))
 
 
 def row_medians(values: Floats) -> Floats:

@@ -50,5 +50,9 @@ class SolverError(UwbliteError):
     """The least-squares problem is ill-posed: no free variable, not finite, or not connected."""
 
 
+SINGULAR = "the normal equations are singular; add a prior or more measurements"
+"""Text of a SolverError."""
+
+
 class Cancelled(UwbliteError):
     """The caller's progress callback asked to stop."""

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, spread
+from ..arrays import Floats, white_noise
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..screening.units import LONGEST
 from ..sensor_log import SensorLog, UwbRanges
@@ -101,9 +101,7 @@ def _spikes(values: Floats, travelled: Floats) -> tuple[int, float]:
     """
     if len(values) < 5:
         return 0, 0.0
-    change = values[1:-1] - 0.5 * (values[:-2] + values[2:])
-    # Second differences of white noise have the variance 3/2 of it; a median ignores up to half of outliers.
-    noise = spread(change) / float(np.sqrt(1.5))
+    noise = white_noise(values)
     windows = np.lib.stride_tricks.sliding_window_view(values, 5)
     around = np.median(windows[:, [0, 1, 3, 4]], axis=1)
     driven = travelled[4:] - travelled[:-4]

@@ -42,11 +42,7 @@ def run(args: argparse.Namespace) -> int:
     log = apply_mounting(read_recording(args.log, bag=bag_choices(args)), args)
     diagnosis, seconds = (diagnose(log), model_seconds(log)) if args.quick else examined(log)
     cost = expected_cost(log, seconds)
-    if args.json:
-        console.say_json(summary_json(args.log, diagnosis, cost))
-    else:
-        for line in report_lines(args.log, diagnosis, cost):
-            console.say(line)
+    console.report(args.json, summary_json(args.log, diagnosis, cost), report_lines(args.log, diagnosis, cost))
     return 3 if diagnosis.serious else 0
 
 

@@ -9,6 +9,7 @@ import os
 import sys
 import time
 import traceback
+from collections.abc import Iterable
 from typing import Any, TextIO
 
 from ..report.printable import encodable, printable
@@ -48,6 +49,15 @@ def say_lines(text: str) -> None:
     """Write lines of our own making to stdout."""
     _clear_bar()
     write(sys.stdout, text + "\n")
+
+
+def report(as_json: bool, figures: Any, lines: Iterable[str]) -> None:
+    """Write a result to stdout, as one JSON object or as lines of text."""
+    if as_json:
+        say_json(figures)
+    else:
+        for line in lines:
+            say(line)
 
 
 def note(text: str) -> None:

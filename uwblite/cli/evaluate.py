@@ -57,10 +57,5 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--anchors, --landmarks and --walls need --truth, which lays the map over them")
     if args.recording and len(args.truth or ()) > 1:
         raise ConfigError("--recording is for a single --truth; several are of recording 1, 2, ...")
-    summary, lines = compare(args)
-    if args.json:
-        console.say_json(summary)
-    else:
-        for line in lines:
-            console.say(line)
+    console.report(args.json, *compare(args))
     return 0

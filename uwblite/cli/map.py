@@ -104,11 +104,7 @@ def _map(args: argparse.Namespace) -> int:
     made = _make_shown(args, logs, reading)
     if args.corrected_log:
         _write_corrected_log(args, made)
-    if args.json:
-        console.say_json(summary_json(args, made))
-    else:
-        for line in summary_lines(args, made):
-            console.say(line)
+    console.report(args.json, summary_json(args, made), summary_lines(args, made))
     return 3 if made.result.doubts else 0
 
 
@@ -181,11 +177,8 @@ def _dry_run(args: argparse.Namespace, log: "SensorLog") -> int:
 
     diagnosis = diagnose(log)
     cost = check.expected_cost(log, config=settings(args))
-    if args.json:
-        console.say_json(check.summary_json(log.notes.source, diagnosis, cost))
-    else:
-        for line in check.report_lines(log.notes.source, diagnosis, cost):
-            console.say(line)
+    about = log.notes.source, diagnosis, cost
+    console.report(args.json, check.summary_json(*about), check.report_lines(*about))
     return 3 if diagnosis.serious else 0
 
 

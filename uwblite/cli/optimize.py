@@ -100,11 +100,7 @@ def run(args: argparse.Namespace) -> int:
     figures["chi2_lower_bound"] = known.lower_bound
     if args.robust:
         figures["outliers"] = outliers
-    if args.json:
-        console.say_json(figures)
-    else:
-        for line in _lines(args, figures):
-            console.say(line)
+    console.report(args.json, figures, _lines(args, figures))
     return 0 if summary.converged else 3
 
 

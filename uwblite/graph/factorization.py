@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import depth_first_order, reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
 
 from ..arrays import Floats, Ints
-from ..errors import SolverError
+from ..errors import SINGULAR, SolverError
 
 _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""
@@ -125,10 +125,7 @@ def superlu(matrix: sparse.csc_matrix, order: str) -> SuperLU:
     try:
         return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=2, panel_size=1, options=options)
     except RuntimeError as problem:
-        raise SolverError(f"{_SINGULAR} ({problem})") from None
-
-
-_SINGULAR = "the normal equations are singular; add a prior or more measurements"
+        raise SolverError(f"{SINGULAR} ({problem})") from None
 
 
 class BandedFactor:
@@ -138,7 +135,7 @@ class BandedFactor:
         """Factorise a matrix given by its lower band (n, half): row j holds column j from the diagonal downwards."""
         self._factor, failed = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
         if failed:
-            raise SolverError(_SINGULAR)
+            raise SolverError(SINGULAR)
 
     def solve(self, right: Floats) -> Floats:
         """Solve for right-hand sides (n,) or (n, m)."""
@@ -155,7 +152,7 @@ class BorderedFactor:
         self._solved = inside.solve(self._rows.T)
         self._corner, failed = lapack.dpotrf(border[:, n:] - np.tril(self._rows @ self._solved), lower=1)
         if failed:
-            raise SolverError(_SINGULAR)
+            raise SolverError(SINGULAR)
 
     def solve(self, right: Floats) -> Floats:
         """Solve for right-hand sides (n + m,) or (n + m, k)."""

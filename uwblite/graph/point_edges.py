@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats, Ints
-from .graph import EdgeTable, Graph, Linearization
+from .graph import EdgeTable, Graph, Linearization, whiten
 from .robust import SQUARED, Kernel
 
 
@@ -33,7 +33,7 @@ class LandmarkEdges(EdgeTable):
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 2)."""
-        return np.einsum("eij,ej->ei", self.sqrt_information, self._seen(graph) - self.position)
+        return whiten(self.sqrt_information, self._seen(graph) - self.position)
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by pose and landmark."""
@@ -43,10 +43,6 @@ class LandmarkEdges(EdgeTable):
         by_anchor = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
         by_theta = np.stack([seen[:, 1], -seen[:, 0]], axis=1)
         by_pose = np.concatenate([-by_anchor, by_theta[:, :, None]], axis=2)
-        return Linearization(
-            np.einsum("eij,ej->ei", self.sqrt_information, seen - self.position),
-            (
-                ("poses", self.pose, self.sqrt_information @ by_pose),
-                ("anchors", self.anchor, self.sqrt_information @ by_anchor),
-            ),
-        )
+        root = self.sqrt_information
+        blocks = ("poses", self.pose, root @ by_pose), ("anchors", self.anchor, root @ by_anchor)
+        return Linearization(whiten(root, seen - self.position), blocks)

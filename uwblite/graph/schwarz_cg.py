@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 
 from ..arrays import Bools, Floats, Ints
-from ..errors import SolverError
+from ..errors import SINGULAR, SolverError
 
 _PIECE = 24
 """Poses of a piece."""
@@ -105,14 +105,14 @@ class TwoLevelFactor:
         try:
             self._local = np.linalg.inv(local.blocks(matrix.data))
         except np.linalg.LinAlgError as problem:
-            raise SolverError(f"{_SINGULAR} ({problem})") from None
+            raise SolverError(f"{SINGULAR} ({problem})") from None
         # Pairs of clouds that do not count left zeros. Symmetric: its columns serve as rows, which multiply faster.
         columns = matrix.copy()
         columns.eliminate_zeros()
         self._matrix = columns.T
         self._coarse, failed = lapack.dpotrf(_seen_by(columns, pieces.basis, self._onto), lower=1, overwrite_a=1)
         if failed:
-            raise SolverError(_SINGULAR)
+            raise SolverError(SINGULAR)
 
     def solve(self, right: Floats) -> Floats:
         """Solve for right-hand sides (n,) or (n, m).
@@ -132,7 +132,7 @@ class TwoLevelFactor:
             image = self._matrix @ direction
             curvature = float(direction @ image)
             if not curvature > 0.0:
-                raise SolverError(_SINGULAR)
+                raise SolverError(SINGULAR)
             solution += (energy / curvature) * direction
             residual -= (energy / curvature) * image
             near = self._nearly(residual)
@@ -161,4 +161,3 @@ def _seen_by(matrix: sparse.csc_matrix, basis: sparse.csr_matrix, onto: sparse.c
 
 _COLUMNS_AT_ONCE = 256
 """Columns of the coarse matrix made at once; a bound on the memory."""
-_SINGULAR = "the normal equations are singular; add a prior or more measurements"

@@ -295,8 +295,7 @@ def _trial(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Gra
     if np.abs(unknowns.spread("poses", step)[:, 2]).max(initial=0.0) < _LARGE_TURN or not linked.any():
         return straight
     along = moved_along(graph, unknowns, step, linked)
-    costs = [sum(edge_cost(e, e.residuals(g)) for e in g.edges) for g in (straight, along)]
-    return straight if not costs[1] < costs[0] else along
+    return along if along.chi2() < straight.chi2() else straight
 
 
 def _cost(graph: Graph, linearized: list[Linearization]) -> float:

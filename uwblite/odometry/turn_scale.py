@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, spread_about_median
+from ..arrays import MEDIAN_TO_MEAN, Floats, Ints, spread_about_median
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 
@@ -116,7 +116,7 @@ def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
     centres = np.array([_weighted_median(direction[p], weight[p]) for p in parts])
     steepness = 1.0 + np.tan(centre) ** 2
     count = _independent(direction - centre, weight, turn)
-    by_steps = steepness * _OF_MEDIAN * spread_about_median(direction) / np.sqrt(count)
+    by_steps = steepness * MEDIAN_TO_MEAN * spread_about_median(direction) / np.sqrt(count)
     by_stretches = steepness * float(np.std(centres, ddof=1)) / np.sqrt(_STRETCHES)
     scales = np.tan(centres) - 1.0
     return TurnScale(
@@ -134,10 +134,6 @@ def _independent(error: Floats, weight: Floats, turn: Ints) -> float:
     alike = float(np.sin(0.5 * np.pi * np.clip(same.mean(), 0.0, 1.0))) if len(same) else 0.0
     sums, squares = np.bincount(turn, weight), np.square(weight).sum()
     return float(weight.sum() ** 2 / (squares + alike * (np.square(sums).sum() - squares)))
-
-
-_OF_MEDIAN = 1.2533
-"""Standard deviation of a median of normal values / that of their mean: sqrt(pi / 2)."""
 
 
 def _weighted_median(values: Floats, weights: Floats) -> float:

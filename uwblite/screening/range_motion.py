@@ -6,7 +6,7 @@ count, apart from noise and a blocked line of sight. Where several anchors excee
 
 import numpy as np
 
-from ..arrays import Floats, spread
+from ..arrays import Floats, white_noise
 from ..sensor_log import SensorLog
 
 _WINDOW = 3
@@ -130,7 +130,7 @@ def _noise(ranges: Floats) -> float:
     """Return the standard deviation of one reading by second differences, m."""
     if len(ranges) < 5:
         return 0.1
-    return max(spread(ranges[1:-1] - 0.5 * (ranges[:-2] + ranges[2:])) / float(np.sqrt(1.5)), 0.03)
+    return max(white_noise(ranges), 0.03)
 
 
 def _travelled(log: SensorLog, stamps: Floats) -> Floats:

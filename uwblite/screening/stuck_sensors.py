@@ -24,14 +24,10 @@ def without_bursts(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     Each burst is spread evenly over the time since the one before; what then remains is a delay, which is calibrated.
     """
     remarks = []
-    odometry, scans = log.odometry, log.scans
-    spread = _spread(odometry.stamps)
-    if spread is not None:
-        log = replace(log, odometry=replace(odometry, stamps=spread[0]))
-        remarks.append(_burst_remark("odometry readings", *spread[1:]))
-    if scans is not None and (spread := _spread(scans.stamps)) is not None:
-        log = replace(log, scans=replace(scans, stamps=spread[0]))
-        remarks.append(_burst_remark("scans", *spread[1:]))
+    for name, what, sensor in (("odometry", "odometry readings", log.odometry), ("scans", "scans", log.scans)):
+        if sensor is not None and (spread := _spread(sensor.stamps)) is not None:
+            log = replace(log, **{name: replace(sensor, stamps=spread[0])})  # type: ignore[arg-type]
+            remarks.append(_burst_remark(what, *spread[1:]))
     return log, remarks
 
 

@@ -73,13 +73,15 @@ def _positions(odometry: Odometry) -> str:
     if moving.sum() < _ENOUGH:
         return ""
     speed = float(np.median(length[moving] / span[moving]))
-    if speed > _FAR_TOO_FAST:
-        unit = "millimetres" if speed > _CENTIMETRES else "centimetres"
-        return (
-            f"the odometry's positions look like {unit}: the usual speed would be {speed:.0f} m/s; write metres into the log "
-            f"(uwblite convert --odometry-unit {0.001 if unit == 'millimetres' else 0.01:g})"
-        )
-    return ""
+    if speed <= _FAR_TOO_FAST:
+        return ""
+    return _other_unit("the odometry's positions", f"usual speed would be {speed:.0f} m/s", speed > _CENTIMETRES, "odometry")
+
+
+def _other_unit(what: str, usual: str, millimetres: bool, option: str) -> str:
+    """Return the words on lengths in millimetres or centimetres."""
+    unit, factor = ("millimetres", 0.001) if millimetres else ("centimetres", 0.01)
+    return f"{what} look like {unit}: the {usual}; write metres into the log (uwblite convert --{option}-unit {factor:g})"
 
 
 def _heading(odometry: Odometry) -> str:
@@ -111,11 +113,7 @@ def _of_ranges(log: SensorLog) -> str:
     if len(positive) < _ENOUGH or np.median(positive) <= LONGEST:
         return ""
     usual = float(np.median(positive))
-    unit, factor = ("millimetres", 0.001) if usual > 1500.0 else ("centimetres", 0.01)
-    return (
-        f"the ranges look like {unit}: the usual one would be {usual:.0f} m; write metres into the log "
-        f"(uwblite convert --range-unit {factor:g})"
-    )
+    return _other_unit("the ranges", f"usual one would be {usual:.0f} m", usual > 1500.0, "range")
 
 
 def _of_scans(log: SensorLog) -> str:
@@ -131,8 +129,4 @@ def _of_scans(log: SensorLog) -> str:
     if len(seen) < _ENOUGH or np.median(seen) <= _LONGEST_READING:
         return ""
     usual = float(np.median(seen))
-    unit, factor = ("millimetres", 0.001) if usual > 500.0 else ("centimetres", 0.01)
-    return (
-        f"the laser's readings look like {unit}: the usual one would be {usual:.0f} m; write metres into the log "
-        f"(uwblite convert --laser-unit {factor:g})"
-    )
+    return _other_unit("the laser's readings", f"usual one would be {usual:.0f} m", usual > 500.0, "laser")
