@@ -261,34 +261,3 @@ def test_a_heading_error_is_given_up_where_it_cannot_win(monkeypatch, misfits, w
     graph = Graph(np.zeros((2, 3)), np.zeros((0, 2)), (), block(turns))
     assert bootstrap_graph(graph, None, None, None, BootstrapConfig(), None) == wins
     assert {heading: Tried.known[heading] for heading in known} == known
-
-
-@pytest.mark.parametrize("answers", [(True, True), (True, False), (False, True)])
-@pytest.mark.parametrize(("low", "high", "piece"), [(15, 25, 2.6), (15, 25, 0.1), (0, 25, 2.6), (15, 40, 2.6), (2, 38, 99.0)])
-def test_a_piece_is_laid_on_at_each_open_end_and_must_agree_at_both(answers, low, high, piece):
-    """One pose at least; those known stay, the others continue them as the wheels count."""
-    truth = se2.chain(np.array([3.0, -1.0, 0.4]), np.tile([0.5, 0.0, 0.1], (39, 1)))
-    attempt = object.__new__(_Bootstrap)
-    attempt.graph, attempt.path = Graph(np.zeros((40, 3))), 0.5 * np.arange(40.0)
-    attempt.odometry, attempt.calibration = chained(truth, np.full(3, 0.01)), attempt.graph.calibration
-    attempt.low, attempt.high, attempt.poses = low, high, np.zeros((40, 3))
-    attempt.poses[low:high] = truth[low:high]
-    calls = []
-
-    def optimise(first, last, fixed):
-        calls.append((first, last, fixed))
-        return answers[0 if fixed == high - 1 else 1]
-
-    attempt._optimise_piece = optimise
-    agreed = attempt._extend(piece)
-    further, asked = max(int(piece / 0.5), 1), []
-    if high < 40:
-        asked.append((high - 1, min(high + further, 40), high - 1))
-    if low > 0:
-        asked.append((max(low - further, 0), low + 1, low))
-    assert calls == asked
-    assert agreed == all(answers[0 if fixed == high - 1 else 1] for *_, fixed in asked)
-    first, last = min(c[0] for c in asked), max(c[1] for c in asked)
-    assert (attempt.low, attempt.high) == (min(low, first), max(high, last))
-    known = slice(attempt.low, attempt.high)
-    np.testing.assert_allclose(se2.between(truth[known], attempt.poses[known]), 0.0, atol=1e-9)

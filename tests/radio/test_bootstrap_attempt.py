@@ -7,6 +7,7 @@ import pytest
 from helpers.laser_walks import chained
 from helpers.planted_graphs import plain_ranges
 
+from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.radio.bootstrap_attempt import Attempt, BootstrapConfig
 from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
@@ -135,3 +136,34 @@ def test_the_first_stretch_is_the_one_whose_anchors_are_clearest():
     assert all(abs(drift / 0.015 - (high - low)) <= 1.0 + 1e-9 for low, high, drift in tried)
     assert (attempt.low, attempt.high, length) == (15, 41, 25.0)
     assert attempt.placed.tolist() == [True, True]
+
+
+@pytest.mark.parametrize("answers", [(True, True), (True, False), (False, True)])
+@pytest.mark.parametrize(("low", "high", "piece"), [(15, 25, 2.6), (15, 25, 0.1), (0, 25, 2.6), (15, 40, 2.6), (2, 38, 99.0)])
+def test_a_piece_is_laid_on_at_each_open_end_and_must_agree_at_both(answers, low, high, piece):
+    """One pose at least; those known stay, the others continue them as the wheels count."""
+    truth = se2.chain(np.array([3.0, -1.0, 0.4]), np.tile([0.5, 0.0, 0.1], (39, 1)))
+    attempt = object.__new__(Attempt)
+    attempt.graph, attempt.path = Graph(np.zeros((40, 3))), 0.5 * np.arange(40.0)
+    attempt.odometry, attempt.calibration = chained(truth, np.full(3, 0.01)), attempt.graph.calibration
+    attempt.low, attempt.high, attempt.poses = low, high, np.zeros((40, 3))
+    attempt.poses[low:high] = truth[low:high]
+    calls = []
+
+    def optimise(first, last, fixed):
+        calls.append((first, last, fixed))
+        return answers[0 if fixed == high - 1 else 1]
+
+    attempt._optimise_piece = optimise
+    agreed = attempt._extend(piece)
+    further, asked = max(int(piece / 0.5), 1), []
+    if high < 40:
+        asked.append((high - 1, min(high + further, 40), high - 1))
+    if low > 0:
+        asked.append((max(low - further, 0), low + 1, low))
+    assert calls == asked
+    assert agreed == all(answers[0 if fixed == high - 1 else 1] for *_, fixed in asked)
+    first, last = min(c[0] for c in asked), max(c[1] for c in asked)
+    assert (attempt.low, attempt.high) == (min(low, first), max(high, last))
+    known = slice(attempt.low, attempt.high)
+    np.testing.assert_allclose(se2.between(truth[known], attempt.poses[known]), 0.0, atol=1e-9)
