@@ -90,13 +90,13 @@ def test_clouds_without_any_point_say_nothing():
 
 
 def test_what_other_clouds_there_are_does_not_matter():
-    """One seen elsewhere in front of the pair and one behind it."""
+    """One seen elsewhere in front of the pair and one behind it, a pair of which with fewer points is asked about as well."""
     pair = scanned(POSES, HALL, 0.0, beams=360, reach=9.0)
     more = scanned(np.array([[3.0, 1.0, 0.0], *POSES, [-3.0, 0.0, 1.0]]), HALL, 0.0, beams=360, reach=9.0)
     for free in (False, True):
         alone = net(pair, se2.between(*POSES), spaces(pair) if free else None)
         among = net_overlap(
-            more, rasterize(more, 0.05, 0.5), spaces(more) if free else None, np.array([1]), np.array([2]),
-            se2.between(*POSES)[None], 10_000, GATE, SPACING,
+            more, rasterize(more, 0.05, 0.5), spaces(more) if free else None, np.array([1, 0, 3]), np.array([2, 3, 0]),
+            np.tile(se2.between(*POSES), (3, 1)), 10_000, GATE, SPACING,
         )  # fmt: skip
         assert among[0] == pytest.approx(alone, rel=1e-9)
