@@ -12,6 +12,8 @@ _INDEPENDENT = 0.5
 over 1.5 m in part."""
 _LATTICE, _LATTICE_STEPS = (1.5, 1.5, 0.6), (8, 8, 4)
 """m, m, rad about a pose, and steps to either side: several times what a start may be off by."""
+_AT_ONCE = 512
+"""Poses of the lattice whose ranges fit into a processor's cache."""
 _MOST_MOMENTS = 40
 """Ranges of which moments are made, for the time that it takes."""
 
@@ -75,7 +77,8 @@ def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     axes = [np.linspace(-reach, reach, 2 * count + 1) for reach, count in zip(_LATTICE, _LATTICE_STEPS, strict=True)]
     off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     few = np.unique(np.linspace(0, len(ranges) - 1, _MOST_MOMENTS).astype(np.int64))
-    weight = range_likelihood(pose + off, chosen(ranges, few)) * (len(ranges) / len(few))
+    some, parts = chosen(ranges, few), np.array_split(pose + off, len(off) // _AT_ONCE)
+    weight = np.concatenate([range_likelihood(part, some) for part in parts]) * (len(ranges) / len(few))
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     mean = weight @ off

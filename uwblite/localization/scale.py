@@ -58,10 +58,11 @@ def scan_scale(walls: Walls, pose: Floats, rays: Rays, looks: int) -> Scale:
     Notes
     -----
     Along a single wall every distance fits, with a pose that is moved by as much; the match then ends anywhere, and its
-    standard deviation does not show that. So it is compared with a match by the map's own metre.
+    standard deviation does not show that. So one that is off is compared with a match by the map's own metre.
     """
-    (error, sigma, whole), (_, _, own) = (_matched(walls, pose, rays, looks, scale) for scale in (_PRIOR[4], _NO_SCALE))
-    return Scale(error, sigma, whole - own)
+    error, sigma, whole = _matched(walls, pose, rays, looks, _PRIOR[4])
+    found = Scale(error, sigma)
+    return Scale(error, sigma, whole - _matched(walls, pose, rays, looks, _NO_SCALE)[2]) if found.off(SCAN_LIMIT) else found
 
 
 def _matched(walls: Walls, pose: Floats, rays: Rays, looks: int, prior: float) -> tuple[float, float, float]:
