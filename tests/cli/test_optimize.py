@@ -52,7 +52,7 @@ def test_headings_from_anywhere_end_in_the_certified_minimum(tmp_path, capsys):
     assert wrong["certificate"] == "none: the robust kernel huber has no relaxation"
 
 
-@pytest.mark.parametrize("seed", [1, 6, 12])
+@pytest.mark.parametrize("seed", [4, 6, 12])
 def test_anchors_that_start_far_away_end_in_the_minimum_from_the_truth(tmp_path, capsys, seed):
     graph, truth, where = loop(seed, anchors=4)
     best = optimize(replace(graph, poses=truth, anchors=where))[1].chi2
