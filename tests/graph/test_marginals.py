@@ -6,7 +6,14 @@ from helpers.planted_graphs import dense_system, loop, relative_edges
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights
-from uwblite.graph.marginals import CommonErrors, JointCovariance, calibration_covariance, marginals, with_common_errors
+from uwblite.graph.marginals import (
+    CommonErrors,
+    JointCovariance,
+    calibration_covariance,
+    marginals,
+    shape_error,
+    with_common_errors,
+)
 from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import optimize
 from uwblite.graph.unknowns import Unknowns, moved
@@ -212,7 +219,10 @@ def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(m
     information[np.arange(size, size + count), np.arange(size, size + count)] += 1.0 / scales[common.kind]
     covariance = np.zeros((size + 1, size + 1))
     covariance[:-1, :-1] = np.linalg.inv(information)[:size, :size]
-    found, number = marginals(graph, [common]), dense_system(graph)[2]
+    chosen = [0, 3, len(graph.poses) - 1]
+    found, number = marginals(graph, [common], among=chosen), dense_system(graph)[2]
+    rows = number["poses"][chosen].ravel()
+    np.testing.assert_allclose(found.among, covariance[np.ix_(rows, rows)], rtol=1e-4, atol=1e-10)
     for name, blocks in (("poses", found.poses), ("anchors", found.anchors)):
         own = number[name]
         np.testing.assert_allclose(blocks, covariance[own[:, :, None], own[:, None, :]], rtol=1e-4, atol=1e-10)
@@ -225,6 +235,31 @@ def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(m
         np.testing.assert_allclose(getattr(estimated, name), getattr(expected, name), atol=1e-7)
     np.testing.assert_allclose(estimated.calibration.values, expected.calibration.values, atol=1e-7)
     assert np.abs(estimated.poses - graph.poses).max() > 1e-4
+
+
+def test_the_error_of_a_shape_is_what_alignment_leaves_of_many_draws():
+    """Errors drawn from a covariance of no structure, small beside the path; a similarity is z -> a z + b."""
+    rng = np.random.default_rng(2)
+    poses = rng.normal(loc=[40.0, -20.0, 0.0], scale=10.0, size=(7, 3))
+    root = 1e-3 * rng.normal(size=(21, 21))
+    errors = (root @ rng.normal(size=(21, 4000))).reshape(7, 3, -1)
+    path, drawn = poses[:, 0] + 1j * poses[:, 1], errors[:, 0] + 1j * errors[:, 1]
+    fit = np.column_stack([path, np.ones(7)])
+    left = drawn - fit @ np.linalg.lstsq(fit, drawn, rcond=None)[0]
+    # Of a mean of 4,000 squares that scatter by about themselves.
+    expected = pytest.approx(np.mean(np.abs(left) ** 2), rel=4 / np.sqrt(4000))
+    assert shape_error(poses, root @ root.T) ** 2 == expected
+
+
+def test_moves_turns_and_growth_of_the_whole_are_no_error_of_its_shape():
+    poses = np.random.default_rng(3).normal(scale=5.0, size=(9, 3))
+    modes = np.zeros((4, 9, 3))
+    modes[0, :, 0] = modes[1, :, 1] = 1.0
+    modes[2, :, 0], modes[2, :, 1] = -poses[:, 1], poses[:, 0]
+    modes[3] = poses
+    modes = modes.reshape(4, -1).T
+    assert shape_error(poses, modes @ modes.T) == pytest.approx(0.0, abs=1e-6)
+    assert shape_error(poses, np.eye(27)) == pytest.approx(np.sqrt((18 - 4) / 9))
 
 
 def test_redundancy_is_the_diagonal_of_the_dense_projection():

@@ -163,11 +163,13 @@ def test_anchors_that_changed_places_were_only_renamed():
     assert not moved_together([[A, B], [B, C], [C, A]])
 
 
-@pytest.mark.parametrize(("sigma", "doubted"), [(0.2, False), (0.6, False), (0.8, True)])
-def test_places_known_to_a_good_part_of_the_area_only_are_doubted(sigma, doubted):
-    stages, poses = Stages(None, None), np.array([[0.0, 0.0, 0.0], [6.0, 8.0, 0.0]])
-    covariances = np.tile(np.diag([0.5 * sigma**2, 0.5 * sigma**2, 1.0]), (2, 1, 1))
-    check_certainty(SimpleNamespace(graph=SimpleNamespace(poses=poses)), covariances, SimpleNamespace(stages=stages))
+_ROUGH = [(50.0, 0.39, False), (50.0, 0.41, True), (4.0, 0.19, False), (4.0, 0.21, True)]
+
+
+@pytest.mark.parametrize(("across", "sigma", "doubted"), _ROUGH)
+def test_a_path_whose_shape_is_known_roughly_only_is_doubted(across, sigma, doubted):
+    stages, poses = Stages(None, None), across * np.array([[0.0, 0.0, 0.0], [0.6, 0.8, 0.0]])
+    check_certainty(SimpleNamespace(graph=SimpleNamespace(poses=poses)), sigma, SimpleNamespace(stages=stages))
     assert bool(stages.doubts) == doubted
 
 

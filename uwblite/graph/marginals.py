@@ -110,10 +110,15 @@ class Marginals(_Solved):
     leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
     """
 
-    def __init__(self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = ()) -> None:
+    def __init__(
+        self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = (), among: ArrayLike = ()
+    ) -> None:
         super().__init__(graph, normal)
         unseen = np.append(normal.diagonal <= 0, False)
         blocks = self._block_diagonal(unseen)
+        self._chosen = self.unknowns.number["poses"][np.asarray(among, dtype=np.int64)].ravel()
+        self.among = self.columns(self._chosen)[self._chosen]
+        """(3 k, 3 k) covariance of the k chosen poses with each other, x, y, theta of each in turn."""
         for errors in common:
             self._add_common(errors, blocks)
         self.poses = blocks["poses"]
@@ -133,6 +138,7 @@ class Marginals(_Solved):
             for name, number in self.unknowns.number.items():
                 own = moves[number]
                 blocks[name] += own @ own.transpose(0, 2, 1)
+            self.among += moves[self._chosen] @ moves[self._chosen].T
 
     def _block_diagonal(self, unseen: Bools) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
@@ -255,12 +261,28 @@ def _factor(normal: NormalEquations) -> SuperLU:
     return cast(SuperLU, normal.factor(np.where(seen, 1e-12 * diagonal, 1.0)))
 
 
-def marginals(graph: Graph, common: Sequence[CommonErrors] = ()) -> Marginals:
+def marginals(graph: Graph, common: Sequence[CommonErrors] = (), among: ArrayLike = ()) -> Marginals:
     """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand.
 
-    Those of single unknowns contain what common errors add.
+    Those of single unknowns, and of the poses `among`, contain what common errors add.
     """
-    return Marginals(graph, filled(graph, subtrees=True), common)
+    return Marginals(graph, filled(graph, subtrees=True), common, among)
+
+
+def shape_error(poses: Floats, covariance: Floats) -> float:
+    """Return the rms error of places (m) that is expected after alignment by a similarity.
+
+    sqrt(tr(P C P) / k) with P = 1 - Q Q^T, where Q (2 k, 4) spans the moves, the turn and the growth of the whole.
+
+    Parameters
+    ----------
+    poses : (k, 3), as far apart as to stand for all. covariance : (3 k, 3 k) of them with each other.
+    """
+    places = poses[:, :2] - poses[:, :2].mean(axis=0)
+    own = covariance.reshape(len(poses), 3, len(poses), 3)[:, :2, :, :2].reshape(places.size, places.size)
+    turn = places @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    q = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(poses), 1)), turn.ravel(), places.ravel()]))[0]
+    return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
 
 
 def with_common_errors(graph: Graph, common: Sequence[CommonErrors]) -> Graph:

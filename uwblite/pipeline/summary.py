@@ -9,7 +9,7 @@ from .. import se2
 from ..arrays import Bools, Floats, spread_about_median
 from ..graph.calibration import Unknown, unknowns
 from ..graph.graph import Graph
-from ..graph.marginals import Marginals, marginals
+from ..graph.marginals import Marginals, marginals, shape_error
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
@@ -30,6 +30,8 @@ from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not speak against all anchors."""
+_ALONG = 60
+"""Poses along the trajectory whose errors stand for those of all."""
 _AGREE = 0.5
 """Share of an anchor's ranges that must agree with the map."""
 _NO_BIAS = 1.6
@@ -42,7 +44,8 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
     """Gather the result; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
     stated = _with_steady_errors(with_noise_shown(with_fewer_pairs(graph)), len(estimate.anchor_ids), task.config.ranges)
-    covariance = marginals(stated, common_range_errors(stated))
+    along = np.unique(np.linspace(0, len(graph.poses) - 1, _ALONG).round().astype(np.int64))
+    covariance = marginals(stated, common_range_errors(stated), among=along)
     covariance.anchors += _by_alike_ranges(estimate, task.config.ranges)
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
@@ -63,7 +66,9 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
         _calibration(k, listed[key], graph, covariance, by_steps.get(key.label)) for k, key in enumerate(graph.calibration.keys)
     )
     table = {} if ranges is None else _range_table(ranges, graph, residuals, weights, np.abs(residuals) < limit, recordings)
-    plausibility.judge(estimate, anchors, calibrated, listed, table, grid, covariance.poses, task)
+    plausibility.judge(
+        estimate, anchors, calibrated, listed, table, grid, shape_error(graph.poses[along], covariance.among), task
+    )
     anchors = _distrusted(anchors, stages.doubts)
     stages.end("summary")
     stamps = [recording.trajectory_stamps for recording in recordings.each]
