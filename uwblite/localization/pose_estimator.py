@@ -224,11 +224,10 @@ class PoseEstimator:
     def _decide(self, pose: Floats, confirm: float) -> None:
         """Take the best hypothesis for the truth where two searches, so many metres apart, came to it without a doubt.
 
-        0 m: a second search of a standing robot will do; below 0 the first one will. One between the two may find the place
-        less sure, as after a turn that only the wheels have measured.
+        0 m: a second search of a standing robot will do; below 0 the first one will.
         """
         if self._reason:
-            self._confirmed = self._confirmed if self._reason == verdict.UNSURE else None
+            self._confirmed = None
             return
         self._reason = "found; a little more driving will confirm it"
         odom, confirmed = self._odometer.pose, self._confirmed

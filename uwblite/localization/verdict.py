@@ -37,9 +37,6 @@ _UNIT_KNOWN = 0.04
 _UNIT_CLEAR = 0.01
 """The same by scans, from which ranges say nothing against a pose that was found: of four anchors two may have been moved."""
 
-UNSURE = "place or heading is not sure yet; drive on"
-"""Why a place is not found that nothing speaks against."""
-
 
 def doubt(
     bank: Hypotheses, best: int, complete: bool, fit: float, ends: float, fitting: "RangeFit", proven: bool = False
@@ -65,7 +62,7 @@ def doubt(
         count = 1 + int((rivals > -certain).sum())
         return f"{count} places are as likely; drive on, around a corner or past another anchor"
     if max(sigma[0], sigma[1]) > SIGMA_FOUND[0] or sigma[2] > SIGMA_FOUND[1]:
-        return UNSURE
+        return "place or heading is not sure yet; drive on"
     return ""
 
 
