@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from uwblite.radio.change_points import _CARRIED, _split, find_move, find_moves
+from uwblite.radio.change_points import _CARRIED, _returned, _split, find_move, find_moves
 from uwblite.radio.trilateration import TrilaterationConfig
 
 STAMPS = np.arange(0.0, 200.0, 1.0)
@@ -62,15 +62,31 @@ def test_two_moves_are_found_in_the_order_of_time():
         np.testing.assert_allclose([move.before, move.after], [before, after], atol=0.5)
 
 
-def test_ranges_made_while_an_anchor_is_carried_belong_to_neither_place():
+def carried(seconds):
+    """Return ranges to an anchor that is on its way so long from t = 70 s on, and its two places."""
     before, after = np.array([1.0, -1.0]), np.array([9.0, 8.0])
-    place = before + np.clip((STAMPS[:, None] - 70.0) / 50.0, 0.0, 1.0) * (after - before)
-    ranges = np.hypot(*(place - PATH).T) + 0.2 + np.random.default_rng(2).normal(0.0, SIGMA, len(STAMPS))
+    place = before + np.clip((STAMPS[:, None] - 70.0) / seconds, 0.0, 1.0) * (after - before)
+    return np.hypot(*(place - PATH).T) + 0.2 + np.random.default_rng(2).normal(0.0, SIGMA, len(STAMPS)), before, after
+
+
+def test_ranges_made_while_an_anchor_is_carried_belong_to_neither_place():
+    ranges, before, after = carried(50.0)
     move = find_move(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig())
     assert move is not None
     # At the ends of the way it is still near both places.
     assert 70.0 <= move.left <= 80.0 < 110.0 <= move.stamp <= 120.0
     np.testing.assert_allclose([move.before, move.after], [before, after], atol=0.3)
+
+
+def test_two_places_that_leave_out_most_of_the_ranges_between_are_no_move():
+    """Any two places explain some ranges of an anchor that stands where neither is."""
+    assert find_move(PATH, carried(100.0)[0], STAMPS, SIGMA, TrilaterationConfig()) is None
+
+
+def test_a_move_that_another_follows_at_once_was_not_undone_in_between():
+    move = find_move(PATH, carried(50.0)[0], STAMPS, SIGMA, TrilaterationConfig())
+    none = np.zeros(0)
+    assert _returned(np.zeros((0, 2)), none, none, move, 0.24) is None
 
 
 @pytest.mark.parametrize(("back", "number"), [(188, 2), (196, 1)])
@@ -135,7 +151,6 @@ def test_the_moments_are_those_at_which_both_places_explain_most():
     assert split.cost == pytest.approx(costs[left, moment])
     between = np.minimum(before, after)[left:moment].sum()
     assert split.unexplained == pytest.approx(before[:left].sum() + between + after[moment:].sum())
-
 
 
 @pytest.mark.parametrize(("count", "found"), [(39, False), (40, True)])

@@ -29,6 +29,8 @@ _LEAST_MOVE = 0.8
 _GAIN, _FEWEST = 0.1, 6.0
 """Share and number of the ranges that two places must explain and one place does not; of anchors that stood still, it is up
 to 0.09 (with blocked lines of sight for minutes)."""
+_WAY = 0.3
+"""Share of its ranges, at most, that an anchor on a cart is measured at; two places that leave out more explain too little."""
 _STEP = 0.5
 """Change of a constant error that a line of sight blocked from some moment on explains, m."""
 _WIDTH = 4.0
@@ -88,8 +90,10 @@ def _returned(path: Floats, ranges: Floats, stamps: Floats, move: Move, width: f
 
     Parameters
     ----------
-    path, ranges, stamps : of the ranges since a move.
+    path, ranges, stamps : of the ranges since a move, up to the next; none where one follows another at once.
     """
+    if len(ranges) == 0:
+        return None
     gain = _misfit(path, ranges, move.second, width) - _misfit(path, ranges, move.first, width)
     until_end = np.cumsum(gain[::-1])[::-1]
     first = int(np.argmax(until_end))
@@ -133,7 +137,7 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     likely = sorted(tried, key=lambda at: tried[at].cost)[:_LIKELY]
     best = min((_converged(path, ranges, at, width, config, tried) for at in likely), key=lambda found: found.cost)
     move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
-    if alone - best.unexplained < gain or move.distance <= _LEAST_MOVE:
+    if alone - best.unexplained < gain or move.distance <= _LEAST_MOVE or best.moment - best.left > _WAY * len(ranges):
         return None
     return move if _with_step(path, ranges, best, width, config) - best.unexplained >= gain else None
 
