@@ -83,6 +83,12 @@ def test_two_places_that_leave_out_most_of_the_ranges_between_are_no_move():
     assert find_move(PATH, carried(100.0)[0], STAMPS, SIGMA, TrilaterationConfig()) is None
 
 
+@pytest.mark.parametrize(("bias", "found"), [(0.6, True), (1.4, False)])
+def test_a_place_whose_ranges_are_all_off_by_more_than_any_radio_is_none(bias, found):
+    ranges = measured(1, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), share=0.0) + bias * (STAMPS >= 100.0)
+    assert (find_move(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig()) is not None) == found
+
+
 def test_a_move_that_another_follows_at_once_was_not_undone_in_between():
     move = find_move(PATH, carried(50.0)[0], STAMPS, SIGMA, TrilaterationConfig())
     none = np.zeros(0)

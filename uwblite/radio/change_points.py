@@ -31,6 +31,8 @@ _GAIN, _FEWEST = 0.1, 6.0
 to 0.09 (with blocked lines of sight for minutes)."""
 _WAY = 0.3
 """Share of its ranges, at most, that an anchor on a cart is measured at; two places that leave out more explain too little."""
+_WORST_BIAS = 1.0
+"""Constant error of ranges to a place, m, beyond that of the worst radios: no anchor stood there."""
 _STEP = 0.5
 """Change of a constant error that a line of sight blocked from some moment on explains, m."""
 _WIDTH = 4.0
@@ -138,6 +140,8 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     best = min((_converged(path, ranges, at, width, config, tried) for at in likely), key=lambda found: found.cost)
     move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
     if alone - best.unexplained < gain or move.distance <= _LEAST_MOVE or best.moment - best.left > _WAY * len(ranges):
+        return None
+    if max(abs(move.first.bias), abs(move.second.bias)) > _WORST_BIAS:
         return None
     return move if _with_step(path, ranges, best, width, config) - best.unexplained >= gain else None
 
