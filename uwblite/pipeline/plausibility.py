@@ -130,7 +130,7 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
             when = float(start - task.recordings.stamps[0])
             task.stages.doubt(
                 "anchors-moved-together",
-                f"{len(changed)} of {len(both)} anchors were moved at about t = {when:.0f} s: rather "
+                f"{len(changed)} of {len(both | changed)} anchors were moved at about t = {when:.0f} s: rather "
                 + ("lidar, radio or clocks lead the map astray" if lidar else
                    "the wheels, tag or radio changed then, and nothing but the odometry ties the two parts of the map"),
                 at=when, moved=len(changed), measured=len(both),
