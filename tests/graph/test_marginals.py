@@ -2,19 +2,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import dense_system, loop, relative_edges
+from helpers.planted_graphs import calibrated_loop, dense_system, loop, relative_edges
 
 from uwblite import se2
-from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights
+from uwblite.graph.graph import Graph, edge_weights
 from uwblite.graph.marginals import (
     CommonErrors,
-    JointCovariance,
     calibration_covariance,
     marginals,
     shape_error,
     with_common_errors,
 )
-from uwblite.graph.robust import Kernel
 from uwblite.graph.solver import optimize
 from uwblite.graph.unknowns import Unknowns, moved
 from uwblite.graph.variance_components import variances_of_kinds
@@ -28,24 +26,9 @@ def dense_covariance(graph):
     return lambda a, i, b, j: padded[np.ix_(number[a][i], number[b][j])]
 
 
-def calibrated(seed=0, n=60):
-    """Return an optimised graph whose ranges have a common scale and bias, with a prior on both, and robust closures."""
-    graph, truth, _ = loop(seed, n=n)
-    odometry, closures, ranges = graph.edges
-    ranges = replace(ranges, calibration=np.tile([0, 1, -1, -1, -1, -1], (len(ranges), 1)))
-    prior = PriorEdges("calibration", np.arange(2), np.zeros((2, 1)), np.array([[[50.0]], [[5.0]]]))
-    closures = replace(closures, kernel=Kernel("cauchy", 2.0))
-    graph = replace(
-        graph,
-        calibration=Calibration((UnknownKey("scale"), UnknownKey("bias")), np.zeros(2)),
-        edges=(odometry, closures, ranges, prior),
-    )
-    return optimize(graph)[0], truth
-
-
 @pytest.mark.parametrize("n", [8, 60, 300])
 def test_marginals_are_blocks_of_the_dense_inverse(n):
-    graph, _ = calibrated(n=n)
+    graph, _ = calibrated_loop(n=n)
     covariance, found = dense_covariance(graph), marginals(graph)
     for i in range(n):
         np.testing.assert_allclose(found.poses[i], covariance("poses", i, "poses", i), rtol=1e-6, atol=1e-14)
@@ -57,14 +40,14 @@ def test_marginals_are_blocks_of_the_dense_inverse(n):
 
 @pytest.mark.parametrize("fixed", [None, [False, True], [True, False], [True, True]])
 def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(fixed):
-    graph = replace(calibrated()[0], fixed_calibration=None if fixed is None else np.array(fixed))
+    graph = replace(calibrated_loop()[0], fixed_calibration=None if fixed is None else np.array(fixed))
     covariance = dense_covariance(graph)
     expected = np.block([[covariance("calibration", a, "calibration", b) for b in (0, 1)] for a in (0, 1)])
     np.testing.assert_allclose(calibration_covariance(graph), expected, rtol=1e-6, atol=1e-15)
 
 
 def test_fixed_unknowns_have_no_covariance():
-    graph, _ = calibrated()
+    graph, _ = calibrated_loop()
     is_fixed = replace(graph, fixed_poses=np.arange(60) % 7 == 0, fixed_anchors=np.array([False, True, False]))
     covariance, found = dense_covariance(is_fixed), marginals(is_fixed)
     assert not found.poses[7].any()
@@ -75,7 +58,7 @@ def test_fixed_unknowns_have_no_covariance():
 
 @pytest.mark.parametrize("few", [True, False])
 def test_relative_covariances_follow_from_the_joint_one(few):
-    graph, _ = calibrated()
+    graph, _ = calibrated_loop()
     rng = np.random.default_rng(0)
     i, j = rng.integers(0, 3 if few else 60, 200), rng.integers(0, 60, 200)
     i[:2], j[:2] = [0, 5], [5, 0]  # from and to the fixed pose
@@ -85,23 +68,6 @@ def test_relative_covariances_follow_from_the_joint_one(few):
         joint = np.block([[covariance("poses", p, "poses", q) for q in (a, b)] for p in (a, b)])
         np.testing.assert_allclose(relative, J @ joint @ J.T, rtol=1e-5, atol=1e-12)
     np.testing.assert_allclose(found.relative(j, i)[2], found.relative(j[2], i[2])[0], rtol=1e-9)
-
-
-@pytest.mark.parametrize("chosen", [np.arange(0, 60, 7), np.array([40, 3, 17]), np.array([5]), np.array([0]), np.arange(60)])
-def test_joint_covariances_of_chosen_poses_are_those_of_all(chosen):
-    graph, _ = calibrated()
-    i, j = np.meshgrid(chosen, chosen)
-    i, j = i.ravel(), j.ravel()
-    joint = JointCovariance(graph, chosen)
-    np.testing.assert_allclose(joint.relative(i, j), marginals(graph).relative(i, j), rtol=1e-6, atol=1e-12)
-
-
-def test_joint_covariances_where_something_is_not_measured():
-    graph, _, _ = loop(2)
-    lonely = replace(graph, anchors=np.vstack([graph.anchors, [9.0, 9.0]]))
-    i, j = np.array([3, 5]), np.array([5, 9])
-    found, expected = (JointCovariance(g, np.array([9, 3, 5])).relative(i, j) for g in (lonely, graph))
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-12)
 
 
 def test_relative_covariance_of_neighbours_is_that_of_their_odometry():
@@ -199,7 +165,7 @@ def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(m
     """
     monkeypatch.setattr("uwblite.graph.marginals._COMMON_AT_ONCE", 7)
     monkeypatch.setattr("uwblite.graph.marginals._MET_AT_ONCE", 11)
-    graph, _ = calibrated(n=40)
+    graph, _ = calibrated_loop(n=40)
     graph = replace(graph, poses=graph.poses + 0.01 * np.random.default_rng(1).normal(size=graph.poses.shape))
     edges, rng = graph.edges[table], np.random.default_rng(0)
     edge, error = np.repeat(np.arange(len(edges)), 2), rng.permutation(2 * len(edges)) % count
@@ -263,7 +229,7 @@ def test_moves_turns_and_growth_of_the_whole_are_no_error_of_its_shape():
 
 
 def test_redundancy_is_the_diagonal_of_the_dense_projection():
-    graph, _ = calibrated(n=40)
+    graph, _ = calibrated_loop(n=40)
     jacobian, _, parts = dense_jacobian(graph)
     checked = 1.0 - np.einsum("mu,uv,mv->m", jacobian, np.linalg.inv(jacobian.T @ jacobian), jacobian)
     found = marginals(graph)

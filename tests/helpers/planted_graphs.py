@@ -1,5 +1,7 @@
 """Small graphs with a known truth and one edge of every kind, for the tests of the solver and its neighbours."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from uwblite import se2
@@ -8,6 +10,8 @@ from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
 from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from uwblite.graph.range_edges import RangeEdges
+from uwblite.graph.robust import Kernel
+from uwblite.graph.solver import optimize
 
 NAMES = ("scale", "turn", "per_metre", "per_second", "x", "y", "theta", "delay")
 RANGE_NAMES = ("range_scale", "bias", "height2", "tag_x", "tag_y", "range_delay")
@@ -149,3 +153,18 @@ def lawn(seed, n=1500, side=60.0, drift=0.02):
     for motion in odometry.T_i_j:
         guess.append(se2.compose(guess[-1], motion))
     return Graph(np.array(guess), np.zeros((16, 2)), (odometry, ranges)), truth, anchors
+
+
+def calibrated_loop(seed=0, n=60):
+    """Return an optimised graph whose ranges have a common scale and bias, with a prior on both, and robust closures."""
+    graph, truth, _ = loop(seed, n=n)
+    odometry, closures, ranges = graph.edges
+    ranges = replace(ranges, calibration=np.tile([0, 1, -1, -1, -1, -1], (len(ranges), 1)))
+    prior = PriorEdges("calibration", np.arange(2), np.zeros((2, 1)), np.array([[[50.0]], [[5.0]]]))
+    closures = replace(closures, kernel=Kernel("cauchy", 2.0))
+    graph = replace(
+        graph,
+        calibration=Calibration((UnknownKey("scale"), UnknownKey("bias")), np.zeros(2)),
+        edges=(odometry, closures, ranges, prior),
+    )
+    return optimize(graph)[0], truth

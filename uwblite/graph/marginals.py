@@ -7,7 +7,6 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
-from scipy.linalg import lapack
 from scipy.sparse.linalg import SuperLU
 
 from .. import se2
@@ -49,7 +48,7 @@ class _Solved:
 
     def __init__(self, graph: Graph, normal: NormalEquations) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
-        self._factor = _factor(normal)
+        self._factor = factor_of(normal)
 
     def estimated(self, common: CommonErrors) -> tuple[sparse.csc_matrix, Floats, Floats]:
         """Estimate errors that edges have in common: J^T W s of each as a column, their values (k,) and covariance (k, k).
@@ -173,7 +172,7 @@ class Marginals(_Solved):
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""
         i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
-        return _relative(self._graph, i, j, self.poses[i], self.poses[j], self._cross(i, j))
+        return relative_covariances(self._graph, i, j, self.poses[i], self.poses[j], self._cross(i, j))
 
     def _cross(self, i: Ints, j: Ints) -> Floats:
         """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the fewer of them."""
@@ -199,47 +198,7 @@ class Marginals(_Solved):
         return right
 
 
-class JointCovariance:
-    """Covariances among some poses of a graph given all its measurements: of all their pairs at once."""
-
-    def __init__(self, graph: Graph, poses: Ints) -> None:
-        """Eliminate everything else; the rest of the factor is that of the poses' own information matrix.
-
-        With the chosen poses last, H = L D L^T ends in a dense block L2 D2 L2^T, their information once all others are
-        marginalised out, and its inverse is W^T W with W = D2^-1/2 L2^-1.
-        """
-        number, size, lower, pivots, place = _last_block(graph, poses)
-        whitened = lapack.dtrtri(lower, lower=1, unitdiag=1, overwrite_c=1)[0]
-        whitened /= np.sqrt(pivots)[:, None]
-        self._graph = graph
-        self._covariance: Floats = whitened.T @ whitened
-        self._row = np.where(number >= size, place[np.maximum(number - size, 0)], -1)
-
-    def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
-        """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
-        i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
-
-        def among(a: Ints, b: Ints) -> Floats:
-            row, column = self._row[a][:, :, None], self._row[b][:, None, :]
-            return np.asarray(self._covariance[row, column] * ((row >= 0) & (column >= 0)))
-
-        return _relative(self._graph, i, j, among(i, i), among(j, j), among(i, j))
-
-
-def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
-    """Return the end of the factor with these poses last: their places among the unknowns (k, 3), -1 = fixed, and what it
-    takes to read it: where the block begins, L2 (n, n), the diagonal of D2 (n,), and each unknown's row in them (n,)."""
-    normal = filled(graph, last=poses)
-    factor, number = _factor(normal), normal.unknowns.number["poses"]
-    # Behind the chosen poses stand only anchors and calibration.
-    first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
-    place = factor.perm_c[np.arange(first, normal.unknowns.size)].astype(np.int64)
-    inside = np.sort(place)
-    lower = factor.L[inside][:, inside].toarray(order="F")
-    return number, first, lower, factor.U.diagonal()[inside], np.searchsorted(inside, place)
-
-
-def _relative(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross: Floats) -> Floats:
+def relative_covariances(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross: Floats) -> Floats:
     """Return the covariances (m, 3, 3) of between(X_i, X_j) by the poses' own and mutual ones."""
     by_i, by_j = se2.between_jacobians(graph.poses[i], graph.poses[j])
     mixed = by_i @ cross @ by_j.transpose(0, 2, 1)
@@ -247,7 +206,7 @@ def _relative(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Floats, cross:
     return own + mixed + mixed.transpose(0, 2, 1)
 
 
-def _factor(normal: NormalEquations) -> SuperLU:
+def factor_of(normal: NormalEquations) -> SuperLU:
     """Factorise H itself where it is regular, else with a trace of damping that leaves open directions open."""
     diagonal = normal.diagonal
     seen = diagonal > 0

@@ -11,7 +11,7 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
-from ..graph.marginals import JointCovariance
+from ..graph.joint_covariance import JointCovariance
 from ..lidar.joint_refinement import surface_cells
 from ..lidar.submaps import Submaps
 from .closures import Closures, LoopClosureConfig

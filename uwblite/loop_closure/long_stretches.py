@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
-from ..graph.marginals import JointCovariance
+from ..graph.joint_covariance import JointCovariance
 from ..lidar import submaps
 from ..lidar.submaps import Submaps
 from .candidates import Candidates, propose, uncertain

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..graph.graph import Graph
-from ..graph.marginals import JointCovariance
+from ..graph.joint_covariance import JointCovariance
 from ..graph.pose_edges import OdometryEdges
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
