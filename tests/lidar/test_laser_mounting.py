@@ -117,6 +117,21 @@ def test_a_delay_is_clear_by_its_gain_and_by_the_gain_s_own_scatter(monkeypatch,
     assert seen.delay_clear is clear
 
 
+@pytest.mark.parametrize(("upside_down", "over"), [(0.11, False), (0.09, True)])
+def test_the_other_way_up_must_agree_twice_as_well_at_its_best_delay_as_the_given_one_at_its_own(
+    monkeypatch, upside_down, over
+):
+    errors = np.full((len(_LAGS), 16), 0.29)
+    errors[30] = 0.2
+    given, other = _Agreement(np.full(16, 0.3), errors), _Agreement(np.full(16, 0.3), np.full_like(errors, 0.29))
+    other.errors[10] = upside_down
+    monkeypatch.setattr(_Agreement, "of", staticmethod(lambda *args: given if args[-1] > 0.0 else other))
+    monkeypatch.setattr("uwblite.lidar.laser_mounting._ratio", lambda laser, wheels: (1.0, 0.1))
+    seen = compare(turner()[0])
+    assert (seen.turned_over, seen.delay) == (over, _LAGS[10 if over else 30])
+    assert seen.misfit == pytest.approx(upside_down if over else 0.2)
+
+
 def test_the_ratio_of_turns_is_a_median_of_clear_ones():
     """Turns of more than 0.1 rad; the standard deviation of a median of Gaussian ratios is 1.2533 times that of a mean."""
     rng = np.random.default_rng(3)

@@ -8,7 +8,7 @@ from uwblite import se2
 from uwblite.graph.joint_covariance import JointCovariance
 from uwblite.lidar.correlative_matching import CorrelativeConfig
 from uwblite.lidar.submaps import SubmapConfig, of_pieces
-from uwblite.loop_closure.candidates import propose
+from uwblite.loop_closure.candidates import Candidates, propose
 from uwblite.loop_closure.closures import LoopClosureConfig
 from uwblite.loop_closure.long_stretches import any_uncertain, cut, first_of, likely, uncertain_pairs
 from uwblite.loop_closure.verification import find
@@ -91,12 +91,12 @@ def test_where_all_pillars_are_alike_none_is_accepted():
     assert any(c.outcome == "ambiguous" for c in found.candidates)
 
 
-def test_what_lies_beyond_one_sigma_is_not_likely(unlike):
-    pairs = unlike[2]
-    distance = np.hypot(pairs.guess[:, 0], pairs.guess[:, 1])
-    kept = likely(pairs)
-    assert 0 < len(kept.target) <= len(pairs.target)
-    assert len(kept.target) == np.sum(distance < 15.0 + pairs.spread / 3.0)
+def test_what_overlaps_within_one_sigma_is_likely():
+    """Stretches of 30 m overlap where their middles are 15 m apart; a spread of 6 m is three sigma."""
+    distance, spread = np.array([14.9, 15.1, 16.9, 17.1]), np.array([0.0, 0.0, 6.0, 6.0])
+    guess = np.column_stack([0.6 * distance, 0.8 * distance, np.ones(4)])
+    pairs = Candidates(np.arange(4), np.arange(4) + 9, guess, np.zeros((4, 3, 3)), spread, False)
+    assert likely(pairs).target.tolist() == [0, 2]
 
 
 def test_stretches_of_thirty_metres_begin_in_the_middle_of_the_one_before():

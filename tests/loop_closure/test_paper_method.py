@@ -9,10 +9,11 @@ from helpers.planted import box, drive
 
 from uwblite import se2
 from uwblite.graph.graph import Graph
+from uwblite.lidar.clouds import Clouds
 from uwblite.lidar.point_to_point import IcpConfig
-from uwblite.lidar.submaps import SubmapConfig, build
+from uwblite.lidar.submaps import SubmapConfig, Submaps, build
 from uwblite.loop_closure.closures import LoopClosureConfig
-from uwblite.loop_closure.paper_method import candidates, find
+from uwblite.loop_closure.paper_method import _shared, candidates, find
 
 ICP = IcpConfig(max_correspondence_distance=0.3, max_iterations=300, fitness_sigma=0.1)
 PLAIN = LoopClosureConfig(method="icp", partners=1000)
@@ -58,6 +59,23 @@ def test_sub_maps_far_apart_are_no_candidates(laps):
     target, source = candidates(far, pieces, recording, 1000)
     assert len(target)
     assert np.all((target < 4) == (source < 4))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_two_sub_maps_share_is_a_share_of_the_squares_of_the_smaller_one(seed):
+    """Against sets of squares; a sub-map of one point, and one of none, among them."""
+    rng = np.random.default_rng(seed)
+    counts = np.array([1, 40, 0, 15, 3])
+    owner, points = np.repeat(np.arange(5, dtype=np.int32), counts), rng.uniform(-1.0, 1.0, (counts.sum(), 2))
+    points[0] = points[1]
+    poses = np.column_stack([rng.uniform(-0.5, 0.5, (5, 2)), rng.uniform(-3.0, 3.0, 5)])
+    poses[0] = poses[1]
+    clouds = Clouds(np.append(0, np.cumsum(counts)), points, np.zeros_like(points), owner, np.zeros(len(points)))
+    squares = [{tuple(c) for c in np.floor(se2.transform(poses[k], points[owner == k]) / 0.5).tolist()} for k in range(5)]
+    expected = [[len(a & b) / max(min(len(a), len(b)), 1) for b in squares] for a in squares]
+    none = np.zeros(5, dtype=np.int64)
+    np.testing.assert_allclose(_shared(poses, Submaps(none, none, none, clouds, 0.1)), expected)
+    assert expected[0][1] == 1.0
 
 
 def test_partners_bound_the_candidates_best_first(laps):

@@ -285,3 +285,10 @@ def test_a_velocity_at_the_ends_is_that_of_the_half_which_is_there(rate, window)
         found = velocity_at(Odometry(stamps, truth), np.array([stamp]), window)
         np.testing.assert_allclose(found, [[0.4, 0.0, 0.5]], atol=0.02)
     np.testing.assert_array_equal(velocity_at(Odometry(stamps[:1], truth[:1]), np.array([stamps[0]]), window), 0.0)
+
+
+def test_a_break_between_the_only_two_samples_of_the_odometry_has_its_slack():
+    sigma = np.array([[0.3, 0.2, 0.1]])
+    two = np.array([1.0, 2.0])
+    np.testing.assert_allclose(_slack(two, two, OdometryBreaks(two[:1], sigma)), sigma)
+    np.testing.assert_array_equal(_slack(two, two[:1], OdometryBreaks(two[:1], sigma)), 0.0)

@@ -67,6 +67,20 @@ def test_moved_keyframes_keep_exact_measurements_exact(exact):
     assert moved.recordings is after
 
 
+def test_ranges_stay_where_the_tag_is_however_its_place_is_split(exact):
+    """A part of the tag's place may stand in the lever arms of the ranges, as where recordings have different mountings."""
+    recordings, estimate = exact
+    part, ranges = np.array([0.05, 0.12]), estimate.ranges
+    split = replace(ranges, tag=ranges.tag + part, lever_arm=ranges.lever_arm - se2.rotate(ranges.turn, part))
+    after = later(recordings, 0.06)
+    poses = after.each[0].frames.odometry
+    whole, parts = (
+        with_keyframes(replace(estimate, ranges=r), recordings, after).ranges.tag_positions(poses) for r in (ranges, split)
+    )
+    assert np.abs(ranges.turn).max() > 0.01
+    np.testing.assert_allclose(parts, whole, atol=1e-12)
+
+
 def test_added_keyframes_keep_poses_measurements_and_what_is_stated_of_them(exact):
     recordings, estimate = exact
     after = denser(recordings, CUT, 2)

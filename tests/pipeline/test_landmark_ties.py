@@ -197,6 +197,22 @@ def test_a_column_is_found_beside_its_given_place():
         observations(GivenLandmark("c", given, 0.6), one_cloud(ring), pose, np.zeros(1))
 
 
+def test_each_visit_observes_a_column_where_its_own_cloud_saw_it():
+    """A second visit whose pose is 0.1 m off in the map, and one after it that sees a single point less and counts no more."""
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    ring = 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
+    truth = np.array([[1.0, 2.0, 0.7], [3.0, -1.0, -0.4], [3.5, -1.0, -0.4]])
+    centres = se2.transform(se2.inverse(truth), np.array([4.0, 1.0]))
+    seen = [centres[0] + ring, centres[1] + ring, centres[2] + ring[1:]]
+    points, counts = np.concatenate(seen), [len(own) for own in seen]
+    owner = np.repeat(np.arange(3, dtype=np.int32), counts)
+    three = clouds.Clouds(np.append(0, np.cumsum(counts)), points, np.zeros_like(points), owner, np.zeros(len(points)))
+    poses = truth + np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    found = observations(GivenLandmark("c", (4.05, 1.0), 0.3), three, poses, np.array([0.0, 20.0, 20.5]))
+    assert found.keyframe.tolist() == [0, 1]
+    np.testing.assert_allclose(found.position, centres[:2], atol=0.01)
+
+
 def test_a_cloud_s_own_column_is_what_it_saw_near_the_place():
     """Another column a metre away does not count, on whichever side of the place it stands."""
     angle = np.linspace(0, 2 * np.pi, 40)

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.planted_graphs import loop
+from scipy.optimize import brentq
 
+from uwblite.radio import anchor_starts
 from uwblite.radio.anchor_starts import place_anchors, search_anchors
+from uwblite.radio.trilateration import AnchorHypothesis
 
 
 def test_anchors_far_away_are_put_where_their_ranges_cost_less():
@@ -16,6 +19,24 @@ def test_anchors_far_away_are_put_where_their_ranges_cost_less():
     # Ranges of 0.1 m from all around; the second stands where it was.
     np.testing.assert_allclose(found, where, atol=0.2)
     np.testing.assert_array_equal(found[1], where[1])
+
+
+@pytest.mark.parametrize(("less", "put"), [(0.015, False), (0.025, True)])
+def test_another_place_must_cost_a_fiftieth_less(monkeypatch, less, put):
+    """An anchor so far off that its ranges cost so much more there than where the search finds it."""
+    graph, truth, where = loop(0, anchors=1)
+    at = replace(graph, poses=truth, anchors=where, edges=graph.edges[-1:])
+    least = at.chi2()
+
+    def moved(x):
+        return replace(at, anchors=where + np.array([x, 0.0]))
+
+    aside = brentq(lambda x: (1.0 - less) * moved(x).chi2() - least, 0.0, 1.0)
+    hypothesis = AnchorHypothesis(where[0], 0.0, 0.1, 0.0, 0.0)
+    monkeypatch.setattr(anchor_starts, "trilaterate", lambda *_: [hypothesis])
+    found = search_anchors(moved(aside))
+    assert (found is not None) == put
+    assert not put or np.array_equal(found.anchors, where)
 
 
 def test_anchors_in_their_places_and_fixed_ones_stay():

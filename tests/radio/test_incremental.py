@@ -51,6 +51,17 @@ def test_a_part_that_does_not_fit_is_solved_with_ever_more_of_the_path(fits_from
     assert np.all(np.diff(900 - np.array([low for low in lows if low]), prepend=0) > 0)
 
 
+def test_a_part_moves_the_poses_from_its_first_on_and_no_earlier_one():
+    """Exact steps from a pose, the tenth of fourteen, that is held by a prior elsewhere than where it stands."""
+    truth = np.column_stack([np.arange(20.0), np.zeros((20, 2))])
+    each = np.arange(19)
+    steps = relative_edges(truth, each, each + 1, [0.05, 0.05, 0.05], None)
+    prior = PriorEdges("poses", np.array([10]), truth[[10]] + [0.0, 0.3, 0.0], np.eye(3)[None] / 0.001)
+    incremental_graph = _Incremental(Graph(truth, edges=(steps, prior)))
+    moved = np.abs(incremental_graph._solve(10, 14).graph.poses - truth[:14]).max(axis=1) > 1e-3
+    assert np.flatnonzero(moved).tolist() == [10, 11, 12, 13]
+
+
 def test_all_at_once_the_same_guess_is_lost():
     graph, _, anchors = lawn(0)
     assert optimize(replace(graph, anchors=anchors))[1].chi2_per_dof > 2.0

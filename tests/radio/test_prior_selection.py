@@ -14,7 +14,7 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.radio import prior_selection
-from uwblite.radio.prior_selection import _mean_under, log_marginal_likelihood, select_priors
+from uwblite.radio.prior_selection import _mean_under, _units, log_marginal_likelihood, select_priors
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
 from uwblite.sensor_log import Odometry, SensorMounting
@@ -176,6 +176,24 @@ def test_the_likeliest_unit_of_length_is_the_wrong_one(scale, unit, wide):
         assert found["range_scale"] < 0.01
     expected = CONFIG.odometry_unit if wide == "odometry_scale" else CONFIG.odometry_scale
     assert found["odometry_scale"] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(("wheels", "wrong"), [(0, []), (1, [[1]]), (2, [[1, 0], [0, 1], [1, 1]])])
+def test_units_that_are_tried_are_the_radio_s_then_those_of_one_recording_s_wheels_then_of_all(wheels, wrong):
+    """Four widths of the radio's scale, the sound one as likely as the three others together; a wrong unit one in ten."""
+    units, odds, hypothesis = _units(1, wheels, CONFIG)
+    right, scales = CONFIG.odometry_scale, np.geomspace(CONFIG.range_scale_sound, CONFIG.range_scale, 4)
+    expected = [[scale] + [right] * wheels for scale in scales]
+    expected += [[scales[0]] + [CONFIG.odometry_unit if one else right for one in these] for these in wrong]
+    np.testing.assert_allclose(units, expected)
+    np.testing.assert_allclose(np.exp(odds), [1.0] + [1.0 / 3.0] * 3 + [0.1] * len(wrong))
+    assert hypothesis.tolist() == [0] * 4 + list(range(1, len(wrong) + 1))
+
+
+def test_a_unit_of_the_wheels_that_is_no_less_sure_than_their_scale_is_not_tried():
+    sure = replace(CONFIG, odometry_unit=CONFIG.odometry_scale)
+    assert set(_units(1, 2, sure)[2].tolist()) == {0}
+    assert _units(0, 2, sure)[0].tolist() == [[CONFIG.odometry_scale] * 2]
 
 
 def test_a_scale_that_no_radio_has_is_no_scale():

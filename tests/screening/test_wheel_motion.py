@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from uwblite import se2
+from uwblite.screening import wheel_motion
 from uwblite.screening.wheel_motion import (
     Pairs,
     _chosen,
@@ -83,12 +84,43 @@ def test_pairs_are_spread_over_the_recording_and_over_stands():
     assert 8 <= inside.sum() <= 12
 
 
+@pytest.mark.parametrize(("silence", "bridged"), [(0.9, True), (1.1, False)])
+def test_no_pair_spans_three_times_its_usual_time(silence, bridged):
+    """All pairs, five scans of 0.1 s apart, of a short recording; five of them lie across a silence."""
+    stamps = np.concatenate([0.1 * np.arange(50), 4.9 + silence + 0.1 * np.arange(1, 50)])
+    odometry = driven(np.full(150, 0.2), np.zeros(150))
+    first, second = _chosen(scanned(odometry, stamps), stamps)
+    span = stamps[second] - stamps[first]
+    assert np.all(span < 1.5)
+    assert (len(first), np.sum(span > 0.6)) == ((94, 5) if bridged else (89, 0))
+
+
 @pytest.mark.parametrize(("count", "beams", "compared"), [(19, 40, False), (20, 29, False), (20, 30, True)])
 def test_a_few_scans_or_beams_are_not_compared(count, beams, compared):
     odometry = driven(np.full(100, 0.2), np.zeros(100))
     assert (compare(scanned(odometry, np.arange(count) * 0.4, beams)) is not None) == compared
     assert compare(scanned(odometry, 100.0 + np.arange(40.0))) is None
     assert compare(SensorLog(odometry)) is None
+
+
+def test_pairs_that_match_poorly_from_the_wheels_are_matched_from_rest_too(monkeypatch):
+    """Of three the first matches well; rest explains the second no better by 0.03, and the third clearly."""
+    at_rest, asked = np.array([0.82, 0.84]), []
+    odometry = driven(np.full(400, 0.2), np.zeros(400))
+
+    def steps(scans, mounting, first, second, guess):
+        asked.append(len(first))
+        by_wheels = len(asked) == 1
+        share = np.tile([0.9, 0.8, 0.8], len(first))[: len(first)] if by_wheels else np.resize(at_rest, len(first))
+        return guess + (1.0 if by_wheels else 7.0), share
+
+    monkeypatch.setattr(wheel_motion, "scan_steps", steps)
+    monkeypatch.setattr(wheel_motion, "_fit_better", lambda log, first, *_: np.ones(len(first), dtype=bool))
+    found = compare(scanned(odometry, 0.1 * np.arange(391.0)))
+    count = len(found.share)
+    assert asked == [count, sum(k % 3 > 0 for k in range(count))]
+    np.testing.assert_allclose(found.share[:6], [0.9, 0.8, 0.84, 0.9, 0.8, 0.84])
+    assert np.all((found.lidar[:, 1] == 7.0) == (np.arange(count) % 3 == 2))
 
 
 def pairs(count=100, way=0.1, turn=0.0, **more):
