@@ -37,7 +37,7 @@ def test_any_headings_end_in_the_same_minimum(seed):
 def test_a_chain_and_an_open_pose_have_none():
     graph = loop(0)[0]
     assert chordal_start(replace(graph, edges=graph.edges[:1])) is None
-    assert chordal_start(replace(graph, poses=np.append(graph.poses, np.zeros((1, 3)), axis=0))) is None
+    assert chordal_start(Graph(np.append(graph.poses, np.zeros((1, 3)), axis=0), graph.anchors, graph.edges)) is None
 
 
 def test_parallel_edges_are_averaged_by_their_information():

@@ -7,16 +7,16 @@ from helpers.planted_graphs import loop
 
 from uwblite.graph.certificate import certify
 from uwblite.graph.components import floating_components
-from uwblite.graph.graph import PriorEdges
+from uwblite.graph.graph import Graph, PriorEdges
 from uwblite.graph.solver import optimize
 
 
 def twice(seed=1):
     """Return two graphs in one, tied by nothing."""
-    graph = replace(loop(seed, anchors=0)[0])
+    graph = loop(seed, anchors=0)[0]
     relative = graph.edges[:2]
     apart = tuple(replace(e, i=e.i + 60, j=e.j + 60) for e in relative)
-    return replace(graph, poses=np.concatenate([graph.poses, graph.poses + 5.0]), edges=relative + apart)
+    return Graph(np.concatenate([graph.poses, graph.poses + 5.0]), edges=relative + apart)
 
 
 def test_the_second_part_floats_until_a_prior_holds_it():

@@ -266,7 +266,7 @@ def test_the_input_is_not_changed():
 
 def test_a_disconnected_anchor_and_pose_stay():
     graph, _, _ = loop(10)
-    lonely = replace(graph, poses=np.vstack([graph.poses, [7.0, 7.0, 1.0]]), anchors=np.vstack([graph.anchors, [9.0, 9.0]]))
+    lonely = Graph(np.vstack([graph.poses, [7.0, 7.0, 1.0]]), np.vstack([graph.anchors, [9.0, 9.0]]), graph.edges)
     found, summary = optimize(lonely)
     np.testing.assert_array_equal(found.poses[-1], [7.0, 7.0, 1.0])
     np.testing.assert_array_equal(found.anchors[-1], [9.0, 9.0])

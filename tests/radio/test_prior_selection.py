@@ -66,7 +66,7 @@ def solved(seed, bias=(0.0,) * 4, scale=1.0):
     edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
     constant = np.array([u.key.kind not in ("range_scale", "bias") for u in listed])
     fixed = np.ones(len(frames), dtype=bool)
-    graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, None, constant)
+    graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, fixed_calibration=constant)
     done = optimize(graph.with_edges(edges))[0]
     return graph.updated(done.poses, done.anchors, done.calibration.values), edges
 
@@ -153,7 +153,7 @@ def driven(seed, scale=1.0, unit=1.0):
     edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
     steps = wheel_edges(frames, 0, OdometryNoiseConfig(), block(listed))
     constant = np.array([u.key.kind not in ("range_scale", "bias", "odometry_scale") for u in listed])
-    graph = Graph(frames.odometry, PLACES / unit, (prior_edges(listed),), block(listed), None, None, constant)
+    graph = Graph(frames.odometry, PLACES / unit, (prior_edges(listed),), block(listed), fixed_calibration=constant)
     done = optimize(graph.with_edges(edges, steps))[0]
     return graph.updated(done.poses, done.anchors, done.calibration.values), (edges, steps)
 

@@ -167,7 +167,6 @@ def scan_indices(calibration: Calibration) -> Ints:
 
 def with_free(graph: Graph, *kinds: str) -> Graph:
     """Return the graph with the calibration unknowns of these kinds set free."""
-    assert graph.fixed_calibration is not None
     return replace(graph, fixed_calibration=graph.fixed_calibration & ~graph.calibration.of_kinds(*kinds))
 
 
@@ -189,5 +188,5 @@ def with_nonnegative_heights(graph: Graph) -> Graph:
     values = graph.calibration.values.copy()
     below = graph.calibration.of_kinds(HEIGHT) & (values < 0.0)
     values[below] = 0.0
-    fixed = np.asarray(graph.fixed_calibration) | below
-    return replace(graph.updated(graph.poses, graph.anchors, values), fixed_calibration=fixed)
+    graph = graph.updated(graph.poses, graph.anchors, values)
+    return replace(graph, fixed_calibration=graph.fixed_calibration | below)

@@ -148,12 +148,22 @@ class Graph:
     """(a, 2) m, map frame."""
     edges: tuple[Edges, ...] = ()
     calibration: Calibration = field(default_factory=Calibration)
-    fixed_poses: Bools | None = None
-    """(n,) True = fixed; None = the first pose is fixed (gauge)."""
-    fixed_anchors: Bools | None = None
-    """(a,) True = fixed; None = all free."""
-    fixed_calibration: Bools | None = None
-    """(c,) True = fixed; None = all free."""
+    fixed_poses: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    """(n,) True = fixed; made without any, the graph has its first pose fixed (gauge)."""
+    fixed_anchors: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    """(a,) True = fixed; made without any, all are free."""
+    fixed_calibration: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    """(c,) True = fixed; made without any, all are free."""
+
+    def __post_init__(self) -> None:
+        estimates = {"poses": self.poses, "anchors": self.anchors, "calibration": self.calibration.values}
+        for name, values in estimates.items():
+            fixed = getattr(self, f"fixed_{name}")
+            if not len(fixed):
+                gauge = (np.arange(len(values)) == 0) & (name == "poses")
+                object.__setattr__(self, f"fixed_{name}", gauge)
+            elif len(fixed) != len(values):
+                raise DataError(f"fixed_{name} has {len(fixed)} entries for {len(values)} {name}")
 
     @property
     def calibration_priors(self) -> "tuple[PriorEdges, ...]":

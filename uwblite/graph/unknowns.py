@@ -96,9 +96,4 @@ def _moved_to(graph: Graph, unknowns: Unknowns, step: Floats, poses: Floats) -> 
 
 def free_unknowns(graph: Graph) -> dict[str, Bools]:
     """Return by block which unknowns are free."""
-    fixed = {"poses": graph.fixed_poses, "anchors": graph.fixed_anchors, "calibration": graph.fixed_calibration}
-    counts = {"poses": len(graph.poses), "anchors": len(graph.anchors), "calibration": len(graph.calibration.values)}
-    free = {name: np.ones(counts[name], dtype=bool) if mask is None else ~mask for name, mask in fixed.items()}
-    if graph.fixed_poses is None:
-        free["poses"][:1] = False
-    return free
+    return {"poses": ~graph.fixed_poses, "anchors": ~graph.fixed_anchors, "calibration": ~graph.fixed_calibration}

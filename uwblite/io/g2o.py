@@ -158,9 +158,7 @@ def _lines(graph: Graph, ranges: bool, number: Ints) -> Iterator[str]:
             m = plain[kind]
             ends = [number[first[end] + index] for end, index in zip(ENDS[kind], m.ends, strict=True)]
             yield from _rows(tag, ends, m.value, upper_triangle(m.information))
-    fixed = np.zeros(1, dtype=np.int64) if graph.fixed_poses is None else np.flatnonzero(graph.fixed_poses)
-    if graph.fixed_anchors is not None:
-        fixed = np.concatenate([fixed, n + np.flatnonzero(graph.fixed_anchors & placed)])
+    fixed = np.flatnonzero(np.append(graph.fixed_poses, graph.fixed_anchors & placed))
     if fixed.tolist() != [0] or len(plain["pose_prior"].value):
         yield from _rows("FIX", [number[fixed]], np.zeros((len(fixed), 0)))
 

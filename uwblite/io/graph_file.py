@@ -185,13 +185,12 @@ def assembled(
         PriorEdges("poses", prior, value, L["pose_prior"] @ turned(-value[:, 2])),
         PriorEdges("anchors", known, place, L["landmark_prior"]),
     )
-    fixed_pose = np.isin(np.arange(len(poses)), fixed)
     given = len(fixed) or len(prior) or len(fixed_anchors) > 1
     return Graph(
         poses,
         anchors,
         tuple(e for e in edges if len(e)),
-        fixed_poses=fixed_pose if given else None,
+        fixed_poses=np.isin(np.arange(len(poses)), fixed if given else [0]),
         fixed_anchors=np.isin(np.arange(len(anchors)), fixed_anchors),
     )
 

@@ -148,7 +148,7 @@ def _names(letter: str, names: Sequence[str], count: int, letters: bytes) -> NDA
 
 def _lines(graph: Graph, stamps: Floats, poses: NDArray[np.str_], anchors: NDArray[np.str_]) -> Iterator[str]:
     plain = plain_edges(graph)
-    first = int(np.flatnonzero(graph.fixed_poses)[0]) if graph.fixed_poses is not None and graph.fixed_poses.any() else 0
+    first = int(np.argmax(graph.fixed_poses)) if len(graph.poses) else 0
     placed = np.isfinite(graph.anchors).all(axis=1)
     yield from _rows("VERTEX_SE2", stamps, [poses], graph.poses)
     yield from _rows("VERTEX_XY", None, [anchors[placed]], graph.anchors[placed])

@@ -72,13 +72,13 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     done = solved(replace(estimate, graph=given), task).graph
     # What the search itself has fixed are heights put back to 0.
-    fixed = np.asarray(graph.fixed_calibration) | (np.asarray(done.fixed_calibration) & ~np.asarray(given.fixed_calibration))
+    fixed = graph.fixed_calibration | (done.fixed_calibration & ~given.fixed_calibration)
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))
 
 
 def at_given_poses(graph: Graph) -> Graph:
     """Return the graph with anchors and the systematic errors of their ranges free, as far as they were, and nothing else."""
-    fixed = np.asarray(graph.fixed_calibration) | ~graph.calibration.of_kinds(BIAS, HEIGHT, RANGE_SCALE)
+    fixed = graph.fixed_calibration | ~graph.calibration.of_kinds(BIAS, HEIGHT, RANGE_SCALE)
     return replace(graph, fixed_poses=np.ones(len(graph.poses), dtype=bool), fixed_calibration=fixed)
 
 

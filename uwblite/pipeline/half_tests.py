@@ -76,8 +76,7 @@ def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Ta
     fixed = np.ones(len(graph.poses), dtype=bool)
     fixed[rows.start + 1 : rows.stop] = False
     priors = tuple(_loose(e, places[0]) for e in graph.calibration_priors)
-    fixed_values = np.zeros(len(graph.calibration.values), dtype=bool) | np.asarray(graph.fixed_calibration, dtype=bool)
-    fixed_values |= graph.calibration.of_kinds(RANGE_SCALE)
+    fixed_values = graph.fixed_calibration | graph.calibration.of_kinds(RANGE_SCALE)
     fixed_values[places] = False
     alone = Graph(graph.poses, graph.anchors, priors, graph.calibration, fixed, unseen, fixed_values)
     solved = optimize(alone.with_edges(wheels.rows(steps), ranges.rows(used)), task.config.solver)[0]

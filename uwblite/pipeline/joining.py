@@ -145,9 +145,8 @@ def _one_graph(
     for estimate, motion, own in zip(reversed(estimates), reversed(motions), reversed(place), strict=True):
         placed = estimate.placed
         anchors[own[placed]] = se2.transform(motion, estimate.graph.anchors[placed])
-    graph = Graph(
-        poses, anchors, (priors,), block, fixed_anchors=None if joined is None else ~joined.placed, fixed_calibration=fixed
-    )
+    unplaced = np.zeros(len(ids), dtype=bool) if joined is None else ~joined.placed
+    graph = Graph(poses, anchors, (priors,), block, fixed_anchors=unplaced, fixed_calibration=fixed)
     return replace(
         estimates[0], graph=graph, odometry=_one_odometry([e.odometry for e in estimates], at, recordings),
         ranges=_one_ranges([e.ranges for e in estimates], at, place, recordings), bootstrap=joined, anchor_ids=ids,
@@ -162,7 +161,6 @@ def _one_calibration(graphs: Sequence[Graph]) -> tuple[Calibration, PriorEdges, 
     at = [np.array([place[key] for key in own], dtype=np.int64) for own in keyed]
     values, roots, fixed = block.values, np.zeros((len(keys), 1, 1)), np.ones(len(keys), dtype=bool)
     for graph, own in zip(reversed(graphs), reversed(at), strict=True):
-        assert graph.fixed_calibration is not None
         fixed[own] &= graph.fixed_calibration
         values[own] = graph.calibration.values
         for priors in graph.calibration_priors:

@@ -40,9 +40,7 @@ def with_keyframes(estimate: Estimate, before: Recordings, after: Recordings) ->
     odometry = replace(odometry, motion=motion, length=length, duration=np.concatenate([drift_time(f) for f in frames]))
     edges = tuple(_renumbered(e, number) for e in estimate.graph.edges)
     ranges = None if estimate.ranges is None else _attached(estimate.ranges, before, after)
-    fixed = estimate.graph.fixed_poses
-    if fixed is not None:
-        fixed = np.isin(np.arange(len(poses)), number[fixed])
+    fixed = np.isin(np.arange(len(poses)), number[estimate.graph.fixed_poses])
     graph = replace(estimate.graph, poses=poses, edges=edges, fixed_poses=fixed)
     return replace(estimate, graph=graph, odometry=odometry, ranges=ranges, recordings=after)
 

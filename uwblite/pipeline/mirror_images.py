@@ -31,8 +31,7 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     if ranges is None or found is None:
         return estimate
     free = found.placed & (np.bincount(ranges.anchor[ranges.alive], minlength=len(found.placed)) > 0)
-    if estimate.graph.fixed_anchors is not None:
-        free &= ~np.asarray(estimate.graph.fixed_anchors)
+    free &= ~estimate.graph.fixed_anchors
     if not free.any():
         return estimate
     starts = (estimate.graph.anchors, _images(estimate, ranges))
@@ -66,10 +65,9 @@ def _images(estimate: Estimate, ranges: RangeEdges) -> Floats:
 def _minimum(estimate: Estimate, ranges: RangeEdges, free: Bools, anchors: Floats, task: Task) -> Graph:
     """Return the graph with the free anchors (a,), biases and heights at their best near a start (a, 2), the poses fixed."""
     graph = estimate.graph
-    own = graph.calibration.of_kinds(BIAS, HEIGHT)
-    fixed = np.zeros(len(own), dtype=bool) if graph.fixed_calibration is None else np.asarray(graph.fixed_calibration)
+    fixed = graph.fixed_calibration | ~graph.calibration.of_kinds(BIAS, HEIGHT)
     priors = tuple(e for e in graph.edges if isinstance(e, PriorEdges) and e.block != "poses")
-    alone = Graph(graph.poses, anchors, priors, graph.calibration, np.ones(len(graph.poses), dtype=bool), ~free, fixed | ~own)
+    alone = Graph(graph.poses, anchors, priors, graph.calibration, np.ones(len(graph.poses), dtype=bool), ~free, fixed)
     return optimize(alone.with_edges(ranges), task.config.solver)[0]
 
 

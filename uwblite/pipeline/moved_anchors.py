@@ -74,12 +74,13 @@ def _places_by_recording(
     """Return place (p, 2), covariance (p, 2, 2) and (anchor, recording) of each anchor in each recording."""
     ranges, graph = estimate.ranges, estimate.graph
     assert ranges is not None
-    assert graph.fixed_calibration is not None
     alive = np.flatnonzero(ranges.alive & estimate.placed[ranges.anchor])
     pairs, which = np.unique(np.stack([ranges.anchor[alive], recording_of[alive]], axis=1), axis=0, return_inverse=True)
-    own = graph.calibration.of_kinds(BIAS)
-    all_poses, fixed = np.ones(len(graph.poses), dtype=bool), graph.fixed_calibration | ~own
-    alone = Graph(graph.poses, graph.anchors[pairs[:, 0]], graph.calibration_priors, graph.calibration, all_poses, None, fixed)
+    alone = Graph(
+        graph.poses, graph.anchors[pairs[:, 0]], graph.calibration_priors, graph.calibration,
+        fixed_poses=np.ones(len(graph.poses), dtype=bool),
+        fixed_calibration=graph.fixed_calibration | ~graph.calibration.of_kinds(BIAS),
+    )  # fmt: skip
     # Outliers of the joint map may be of an anchor that was moved: first all ranges count alike.
     alike = np.ones(len(alive))
     edges = replace(ranges.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5), weights=alike)

@@ -172,7 +172,7 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     if estimate.ranges is None or steps is None:
         return estimate
     for solver in (_rough(config.solver), config.solver):
-        graph = relocate(estimate.ranges, estimate.graph, ~np.asarray(estimate.graph.fixed_anchors), config.trilateration)
+        graph = relocate(estimate.ranges, estimate.graph, ~estimate.graph.fixed_anchors, config.trilateration)
         estimate = with_range_noise(replace(estimate, graph=graph), config)
         problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
         estimate = estimate.with_estimates_of(optimize(problem, solver)[0])

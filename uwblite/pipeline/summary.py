@@ -211,10 +211,10 @@ def _count(name: str, recordings: Recordings) -> int:
 
 def _calibration(k: int, unknown: Unknown, graph: Graph, covariance: Marginals, by_steps: float | None) -> CalibrationEstimate:
     """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (turn_checks)."""
-    value, fixed = float(graph.calibration.values[k]), graph.fixed_calibration
+    value = float(graph.calibration.values[k])
     if by_steps is not None:
         return CalibrationEstimate(unknown.key, value, by_steps, unknown.unit, unknown.meaning, "estimated")
-    if fixed is not None and fixed[k]:
+    if graph.fixed_calibration[k]:
         why = "this recording has no measurement of it" if value == 0.0 else "fixed"
         return CalibrationEstimate(unknown.key, value, unknown.sigma, unknown.unit, unknown.meaning, "prior", why)
     sigma = float(covariance.calibration[k])

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
-
 from ..graph.pose_edges import ScanEdges
 from ..odometry.turn_scale import TurnScale, turn_scales
 from .estimate import Estimate, Task
@@ -18,7 +16,7 @@ def with_constant_turn_scales(estimate: Estimate, task: Task) -> Estimate:
     graph = estimate.graph
     if estimate.steps is None:
         return estimate
-    values, fixed = graph.calibration.values.copy(), np.asarray(graph.fixed_calibration).copy()
+    values, fixed = graph.calibration.values.copy(), graph.fixed_calibration.copy()
     for index, found in turn_scales(estimate.odometry, estimate.steps, graph).items():
         if fixed[index]:
             values[index] = found.value

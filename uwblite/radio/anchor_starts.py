@@ -26,8 +26,7 @@ def place_anchors(graph: Graph) -> tuple[Graph, tuple[int, ...]]:
         anchors[anchor] = found[0].position if found else 0.0
         if not found:
             lost.append(anchor)
-    fixed = np.zeros(len(anchors), dtype=bool) if graph.fixed_anchors is None else graph.fixed_anchors.copy()
-    fixed[lost] = True
+    fixed = graph.fixed_anchors | np.isin(np.arange(len(anchors)), lost)
     edges = tuple(_without(e, lost) if isinstance(e, RangeEdges) and lost else e for e in graph.edges)
     return replace(graph, anchors=anchors, fixed_anchors=fixed, edges=edges), tuple(lost)
 
@@ -38,10 +37,8 @@ def search_anchors(graph: Graph) -> Graph | None:
     An anchor that starts far away, or on the wrong side of a path, can end in a local minimum and bend the path there; the
     search of trilateration sees over the hills between.
     """
-    anchors, fixed = graph.anchors.copy(), graph.fixed_anchors
-    for anchor in range(len(anchors)):
-        if fixed is not None and fixed[anchor]:
-            continue
+    anchors = graph.anchors.copy()
+    for anchor in np.flatnonzero(~graph.fixed_anchors).tolist():
         own = replace(graph, edges=tuple(e.rows(e.anchor == anchor) for e in graph.edges if isinstance(e, RangeEdges)))
         found = trilaterate(*_distances_to(own, anchor), TrilaterationConfig())
         places = [graph.anchors[anchor], *(h.position for h in found)]

@@ -158,9 +158,7 @@ def _between(low: float, high: float) -> Sequence[float]:
 
 
 def _free(graph: Graph, name: str) -> Ints:
-    fixed = graph.fixed_calibration
-    named = graph.calibration.of_kinds(name)
-    return np.flatnonzero(named if fixed is None else named & ~fixed)
+    return np.flatnonzero(graph.calibration.of_kinds(name) & ~graph.fixed_calibration)
 
 
 def _prior_sigma(graph: Graph) -> Floats:
