@@ -8,7 +8,7 @@ from helpers.planted_graphs import every_kind
 from uwblite import se2
 from uwblite.errors import DataError
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_cost
-from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
+from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
 
@@ -168,6 +168,13 @@ def test_scan_poses_follow_the_base_for_the_delay_and_carry_the_mounting():
             for p, twist in ((edges.i[e], edges.twist_i[e]), (edges.j[e], edges.twist_j[e]))
         ]
         np.testing.assert_allclose(seen, se2.between(*sensor), atol=1e-12)
+
+
+def test_clouds_are_taken_as_made_without_a_delay_unless_it_is_given():
+    graph, kinds = every_kind(4, calibrated=False)
+    seen = kinds["scan"]
+    plain = ScanEdges(seen.i, seen.j, seen.T_i_j, seen.sqrt_information, seen.twist_i, seen.twist_j, seen.calibration)
+    np.testing.assert_allclose(plain.relative(graph), se2.between(graph.poses[seen.i], graph.poses[seen.j]), atol=1e-12)
 
 
 def test_ranges_are_slant_distances_of_the_moving_tag():

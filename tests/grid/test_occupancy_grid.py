@@ -424,9 +424,20 @@ def test_misuse_is_named():
         RayCounter(geometry_of(5)).insert_rays(*one, None, np.zeros((5, 5), bool))
     with pytest.raises(DataError, match="too long"):
         RayCounter(geometry_of(5)).insert_rays(np.zeros((1, 2)), np.full((1, 2), 1e6), np.ones(1, bool))
-    for wrong in ({"p_hit": 0.4}, {"p_miss": 0.5}, {"resolution": 0.0}, {"clear_weight": 2.0}, {"clamp": 0.0}):
-        with pytest.raises(ConfigError, match="grid"):
-            GridConfig(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [
+    {"p_hit": 0.5}, {"p_hit": 1.0}, {"p_miss": 0.5}, {"p_miss": 0.0}, {"resolution": 0.9e-4}, {"resolution": 1001.0},
+    {"clear_weight": 1.01}, {"clear_weight": -0.01}, {"clamp": 0.0}, {"max_cells": 0},
+])  # fmt: skip
+def test_settings_that_no_bayes_filter_or_no_grid_can_have_are_refused(wrong):
+    with pytest.raises(ConfigError, match="grid"):
+        GridConfig(**wrong)
+
+
+def test_the_limits_of_the_settings_are_allowed():
+    GridConfig(resolution=1e-4, clear_weight=0.0, max_cells=1)
+    GridConfig(resolution=1e3, clear_weight=1.0, p_hit=0.999, p_miss=0.001)
 
 
 @pytest.mark.parametrize("far", [3e3, 1e7])

@@ -33,7 +33,7 @@ def exact():
     estimate = dead_reckoning(recordings.each[0], config)
     n = len(estimate.graph.poses)
     closure = RelativePoseEdges(
-        np.array([2]), np.array([n - 2]), se2.between(estimate.graph.poses[[2]], estimate.graph.poses[[n - 2]]), np.eye(3)[None]
+        np.array([6]), np.array([n - 2]), se2.between(estimate.graph.poses[[6]], estimate.graph.poses[[n - 2]]), np.eye(3)[None]
     )
     prior = PriorEdges("poses", np.array([5]), estimate.graph.poses[[5]], np.eye(3)[None])
     fixed = np.arange(n) == 4
@@ -95,7 +95,7 @@ def test_added_keyframes_keep_poses_measurements_and_what_is_stated_of_them(exac
     np.testing.assert_array_equal(dense.odometry.j, np.arange(1, more))
     assert np.flatnonzero(dense.graph.fixed_poses).tolist() == [number[4]]
     closure, prior = dense.graph.edges[-2:]
-    assert (int(closure.i[0]), int(closure.j[0]), int(prior.index[0])) == (number[2], number[n - 2], number[5])
+    assert (int(closure.i[0]), int(closure.j[0]), int(prior.index[0])) == (number[6], number[n - 2], number[5])
     assert np.abs(closure.residuals(dense.graph)).max() < 1e-9
     assert np.abs(dense.ranges.residuals(dense.graph) * dense.ranges.sigma[:, None]).max() < 1e-3
 

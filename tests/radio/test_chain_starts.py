@@ -16,7 +16,8 @@ from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
 from uwblite.io.graph_chains import chained_poses
 from uwblite.io.pyfg import read_pyfg, write_pyfg
-from uwblite.radio.chain_starts import _BEND, _converged, place_chains
+from uwblite.radio import chain_starts
+from uwblite.radio.chain_starts import _BEND, _converged, _places, place_chains
 
 ROBOTS, STEPS = 3, 80
 
@@ -103,6 +104,17 @@ def test_four_robots_of_tiers_from_their_odometry(shared_data, tmp_path):
         return evaluate_trajectory(number, poses, number, whole.graph.poses, max_gap=1.5).ate.rmse
 
     assert ate(found) <= 1.05 * ate(local)
+
+
+def test_the_best_places_of_a_chain_are_four_a_tenth_apart_the_cheapest_first(monkeypatch):
+    """By distance or by heading; of places nearer to each other than that only the cheapest counts."""
+    found = [(3.0, 0.0, 0.11), (1.0, 0.0, 0.0), (2.0, 0.09, 0.09), (9.0, 0.5, 0.0), (4.0, 0.12, 0.0), (5.0, 0.3, 0.0)]
+    ends = iter([(cost, np.array([x, 0.0, theta])) for cost, x, theta in found])
+    monkeypatch.setattr(chain_starts, "_starts", lambda *_: found)
+    monkeypatch.setattr(chain_starts, "_converged", lambda *_: next(ends))
+    assert [cost for cost, _ in _places(np.zeros((4, 2)), np.zeros((4, 2)), np.ones(4))] == [1.0, 3.0, 4.0, 5.0]
+    ((cost, place),) = _places(np.zeros((3, 2)), np.zeros((3, 2)), np.ones(3))
+    assert (cost, place.tolist()) == (0.0, [0.0] * 3)
 
 
 def test_from_everywhere_the_search_goes_down():

@@ -125,6 +125,18 @@ def test_a_robot_that_stands_places_nothing_for_sure():
     assert ambiguous(found, CONFIG)
 
 
+@pytest.mark.parametrize("length", [0.0, 0.2, 1.0])
+def test_every_place_found_from_a_short_path_is_as_far_away_as_its_ranges_say(length):
+    """Whatever the direction that so short a path does not show: range less bias, give or take half the path."""
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        path = np.column_stack([np.linspace(0, length, 60), 0.002 * rng.standard_normal(60) * (length > 0.0)])
+        stated = measured(rng, path, rng.uniform(-9, 9, 2), 0.05)
+        for found in trilaterate(path, stated, CONFIG):
+            away = np.hypot(*(found.position - path.mean(axis=0))) + found.bias
+            assert abs(away - stated.mean()) < 0.5 * length + 0.05
+
+
 def test_hypotheses_are_distinct_and_in_order():
     rng = np.random.default_rng(6)
     path = loop_path(rng, metres=12.0)
