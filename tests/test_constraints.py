@@ -74,6 +74,22 @@ def test_the_users_frame_is_found_from_a_pose(T):
     np.testing.assert_allclose(se2.between(drive(), done.graph.poses), 0, atol=1e-9)
 
 
+def test_given_poses_hold_the_map_as_far_as_they_are_sure():
+    """Two that lie 0.1 m farther apart than odometry and ranges have it; the second says nothing of its heading."""
+    there, sigma = drive()[[7, 30]] + np.array([[0.0] * 3, [0.1, 0.0, 2.0]]), ((0.01, 0.02, 0.05), (1e-4, 1e-4, 100.0))
+    given = tuple(
+        GivenPose(float(STAMPS[k]), tuple(pose.tolist()), s) for k, pose, s in zip((7, 30), there, sigma, strict=True)
+    )
+    done = apply(Constraints(poses=given), first_estimate(), IDS, ALL, CLOCK)
+    (prior,) = (e for e in done.graph.edges if isinstance(e, PriorEdges))
+    assert (prior.block, prior.index.tolist()) == ("poses", [7, 30])
+    np.testing.assert_allclose(prior.value, there)
+    np.testing.assert_allclose(prior.sqrt_information, [np.diag(1.0 / np.array(s)) for s in sigma])
+    solved, _ = optimize(done.graph)
+    np.testing.assert_allclose(solved.poses[30, :2], there[1, :2], atol=1e-3)
+    assert abs(se2.wrap_angle(solved.poses[30, 2] - drive()[30, 2])) < 0.1
+
+
 def test_one_anchor_leaves_the_heading_as_it_was():
     done = apply(Constraints(anchors=surveyed("B")), first_estimate((2, -3, 0.0)), IDS, ALL, CLOCK)
     solved, summary = optimize(done.graph)

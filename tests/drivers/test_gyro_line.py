@@ -54,6 +54,12 @@ def test_what_happens_in_a_gap_is_not_guessed():
     assert stated[-1].heading - stated[0].heading == pytest.approx(0.2, abs=1e-9)
 
 
+@pytest.mark.parametrize(("step", "turned"), [(0.25, 0.25), (0.26, 0.0)])
+def test_a_rate_is_integrated_over_a_quarter_of_a_second_at_most(step, turned):
+    stated, _ = headings("line:x?columns=t,turn_rate", [f"{t},1.0" for t in (0.0, 0.125, 0.25, 0.25 + step)], period=0.125)
+    assert stated[-1].heading - stated[-2].heading == pytest.approx(turned, abs=1e-9)
+
+
 @pytest.mark.parametrize("columns", ["t", "x,y,theta", "turn_rate,turn_rate", "-"])
 def test_columns_without_a_turn_are_refused(columns):
     with pytest.raises(ConfigError, match="gyro line"):

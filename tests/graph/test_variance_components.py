@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from uwblite.graph.variance_components import _slope, variances_of_kinds
 
@@ -49,3 +50,26 @@ def test_slope_is_that_of_the_likelihood():
     np.testing.assert_allclose(slope, numeric, rtol=1e-6, atol=1e-8)
     # Scaling all parts together is one direction of curvature m / 2 whatever they are.
     assert curvature.sum() == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_variances_are_the_means_about_the_most_likely_logarithms(seed):
+    """Few errors, so that the priors count: against a minimiser of likelihood and priors that knows no derivatives."""
+    y, a, kind = seen(np.random.default_rng(seed), (0.2, 3.0), 0.5, measurements=20, unknowns=4, each=3)
+    values, vectors = np.linalg.eigh(a)
+    root, basis = np.sqrt(values), vectors.T
+    z, columns = basis @ y / root, root[:, None] * basis
+    parts = np.stack([np.eye(len(z)), *(columns[:, kind == g] @ columns[:, kind == g].T for g in range(2))])
+    width = np.log([10.0, 4.0, 4.0])
+    mean = np.array([0.0, *(-0.5 * width[1:] ** 2)])
+
+    def cost(logs):
+        covariance = np.tensordot(np.exp(logs), parts, axes=1)
+        fit = np.linalg.slogdet(covariance)[1] + z @ np.linalg.solve(covariance, z)
+        return 0.5 * (fit + np.sum(((logs - mean) / width) ** 2))
+
+    best = minimize(cost, mean, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-10, "maxiter": 5000}).x
+    curvature = _slope(z, parts * np.exp(best)[:, None, None])[1]
+    spread = np.diag(np.linalg.inv(curvature + np.diag(width**-2)))
+    # The rounds end where no logarithm changes by a thousandth.
+    np.testing.assert_allclose(variances_of_kinds(y, a, kind), np.exp(best + 0.5 * spread)[1:], rtol=5e-3)
