@@ -85,8 +85,11 @@ def test_lidar_sub_sampled(options):
     for scan, (true, values) in zip(scans, sent, strict=False):
         assert len(scan.ranges) == len(values)
         assert scan.stamp == pytest.approx(true, abs=0.002)
-        middle = (options.get("cluster", 1) - 1) / 2
-        assert scan.angle_min == pytest.approx((first + middle - 384) * 2 * math.pi / 1024)
+        cluster = options.get("cluster", 1)
+        assert scan.angle_min == pytest.approx((first + (cluster - 1) / 2 - 384) * 2 * math.pi / 1024)
+        assert scan.angle_increment == pytest.approx(cluster * 2 * math.pi / 1024)
+        # One turn of the mirror takes 0.1 s.
+        assert scan.time_increment == pytest.approx(cluster * 0.1 / 1024)
 
 
 @pytest.mark.parametrize("skew", [-2e-4, 0.0, 2e-4])

@@ -142,6 +142,18 @@ def test_degrees_are_refused_and_radians_are_not(wrapped):
     refuse_degrees(with_heading(arc(0.05), np.degrees(arc(0.05).poses[:, 2])))
 
 
+def test_a_heading_against_a_path_that_swings_about_one_direction_is_not_in_degrees():
+    """Against the path radians agree least; as degrees they are all but constant, which agrees with such a path in part."""
+    stamps = np.arange(0.0, 60.0, 0.05)
+    direction = 0.8 * (2.0 / np.pi) * np.arcsin(np.sin(2.35 * stamps))
+    steps = 0.025 * np.column_stack([np.cos(direction), np.sin(direction)])[:-1]
+    path = Odometry(stamps, np.column_stack([np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), -direction]))
+    assert np.median(np.abs(np.diff(direction)) / 0.05) > 1.0
+    plain, degrees, mirrored = (heading_agreement(path, factor)[0] for factor in (1.0, np.pi / 180.0, -1.0))
+    assert plain + 0.2 < degrees < mirrored
+    refuse_degrees(path)
+
+
 def test_readings_that_jitter_within_a_fifth_of_a_metre_agree_nevertheless():
     path = arc(step=0.02)
     jitter = 0.01 * np.random.default_rng(1).standard_normal((len(path.stamps), 2))
