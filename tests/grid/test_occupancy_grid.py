@@ -320,6 +320,28 @@ def test_the_extent_holds_all_rays(moving, flipped):
     assert (high - still.endpoints.max(axis=0) < 2e-4).all()
 
 
+@pytest.mark.parametrize("deskewed", [False, True])
+def test_the_map_of_a_laser_upside_down_is_that_of_its_beams_in_the_other_order(deskewed):
+    """Not square, so that a mirror image is another map; some beams see nothing."""
+    poses = drive(20) + np.array([0.7, 0.2, 0.3])
+    scans = room_scans(poses, range_max=2.4)
+    other = replace(scans, ranges=np.roll(scans.ranges[:, ::-1], 1, axis=1))
+    last, config = poses.copy() if deskewed else None, GridConfig(move_distance=0.0)
+    upright, flipped = (from_sweeps([Sweeps(s, poses, last, flip)], config) for s, flip in ((scans, False), (other, True)))
+    np.testing.assert_allclose(flipped.geometry.origin, upright.geometry.origin)
+    assert np.mean(flipped.states() != upright.states()) < 0.01
+    assert np.mean(upright.states()[::-1] != upright.states()) > 0.05
+
+
+def test_progress_over_several_recordings_counts_all_their_scans_twice():
+    """Once for the beams that saw something, once for those that saw nothing."""
+    steps = []
+    sweeps = [Sweeps(room_scans(poses), poses) for poses in (drive(70), drive(9)[:0], drive(5))]
+    grid = from_sweeps(sweeps, GridConfig(move_distance=0.0), progress=lambda done, total: steps.append((done, total)))
+    assert grid.scans_used == 75
+    assert steps == [(64, 150), (70, 150), (75, 150), (139, 150), (145, 150), (150, 150)]
+
+
 def test_the_grid_ends_where_knowledge_ends():
     poses = drive(30)
     grid = from_scans(poses, room_scans(poses), last=np.add(poses, [0.0, 0.0, 0.5]))

@@ -24,7 +24,7 @@ from uwblite.lidar.joint_refinement import (
     surface_cells,
     with_fewer_pairs,
 )
-from uwblite.lidar.scan_matching import PairFactors
+from uwblite.lidar.scan_matching import PairFactors, measured
 
 CONFIG = RefinementConfig()
 NOISE = np.array([0.01, 0.005, 0.006])
@@ -212,6 +212,19 @@ def test_rounds_are_reported_and_bounded():
     again = refine(graph, clouds, raster, np.zeros((len(truth), 3)), i, j, config, SolverConfig())
     assert again.graph.poses.tobytes() == result.graph.poses.tobytes()
 
+
+
+def test_a_cloud_in_many_pairs_informs_each_of_them_less():
+    """Its matches err alike in all of them: the variance of a match grows with half the mean number of pairs of both clouds."""
+    truth, path, clouds = room(6, 0.01, 8.0)
+    result = refined(Graph(truth).with_edges(chained(truth, NOISE)), clouds, path, replace(CONFIG, rounds=3), selections=1)
+    pairs = [(a, b) for a, b, used in zip(result.i.tolist(), result.j.tolist(), result.used, strict=True) if used]
+    number = [sum(k in pair for pair in pairs) for k in range(len(truth))]
+    alike = np.array([max(0.5 * (number[a] + number[b]) / 2.0, 1.0) for a, b in zip(result.i, result.j, strict=True)])
+    assert alike.max() > 1.5
+    _, root = measured(result.factors, np.zeros((len(alike), 3)), result.sigma**2 * CONFIG.correlation * alike)
+    sizes = [np.linalg.svd(r, compute_uv=False) for r in (root[result.used], result.edges.sqrt_information)]
+    np.testing.assert_allclose(sizes[1], sizes[0], rtol=1e-6, atol=1e-6 * sizes[0].max())
 
 
 @pytest.mark.parametrize(("convergence", "rounds"), [(1e9, 2), (0.0, 8)])

@@ -1,0 +1,84 @@
+"""A session: bytes resume the script, waits end in time, and what is no frame is always said."""
+
+import pytest
+
+from uwblite.drivers.events import Corrupt, Note, Send
+from uwblite.drivers.session import Driver, Session, Wait
+
+NOISE = Corrupt(b"?", "noise")
+
+
+def note(name, text=""):
+    return Note("info", name, str(text))
+
+
+class Letters:
+    """Each byte is an event, a question mark is none of the protocol."""
+
+    def feed(self, data, stamp):
+        return [NOISE if letter == "?" else letter for letter in data.decode()]
+
+    def reset(self):
+        pass
+
+
+class Listener(Driver):
+    """Takes what a device says unasked."""
+
+    def take(self, event):
+        return [note(event, self.now)]
+
+
+class Asker(Driver):
+    """Asks twice at most, half a second each, for an x; then ends."""
+
+    def script(self):
+        found = yield from self.ask(b"x?", lambda event: event == "x", 0.5, tries=2)
+        yield note("found", found)
+
+
+def test_what_is_no_frame_is_said_and_not_taken():
+    session = Session(Listener(Letters(), "letters"))
+    assert session.start(0.0) == []
+    assert session.feed(b"a?b", 2.0) == [note("a", 2.0), NOISE, note("b", 2.0)]
+    assert session.deadline() is None
+    assert session.tick(99.0) == []
+
+
+def test_a_script_that_waits_sees_noise_too_and_goes_on_waiting():
+    session = Session(Asker(Letters(), "letters"))
+    assert session.start(1.0) == [Send(b"x?")]
+    assert session.feed(b"?y", 1.2) == [NOISE]
+    assert session.feed(b"xz", 1.3) == [note("found", "x")]
+    assert session.feed(b"?x", 1.4) == [NOISE]
+    assert session.deadline() is None
+
+
+@pytest.mark.parametrize("start", [0.0, 7.0])
+def test_a_question_is_asked_again_when_its_time_is_over_and_given_up(start):
+    session = Session(Asker(Letters(), "letters"))
+    session.start(start)
+    assert session.deadline() == start + 0.5
+    assert session.tick(start + 0.49) == []
+    assert session.tick(start + 0.5) == [Send(b"x?")]
+    assert session.deadline() == start + 1.0
+    assert session.tick(start + 1.2) == [note("found", None)]
+    assert session.tick(start + 9.0) == []
+
+
+def test_a_note_is_said_once():
+    driver = Listener(Letters(), "letters")
+    assert driver.say_once(note("a", 1), note("b", 2)) == [note("a", 1), note("b", 2)]
+    assert driver.say_once(note("a", 3), note("c", 4)) == [note("c", 4)]
+
+
+def test_what_comes_while_a_script_sleeps_is_kept():
+    class Sleeper(Driver):
+        def script(self):
+            yield note("heard", "".join((yield from self.sleep(1.0))))
+            yield Wait(None)
+
+    session = Session(Sleeper(Letters(), "letters"))
+    session.start(0.0)
+    assert session.feed(b"ab", 0.5) == []
+    assert session.tick(1.0) == [note("heard", "ab")]
