@@ -106,6 +106,11 @@ def test_three_given_anchors_decide_the_sign_and_two_do_not(given, doubted, lida
 
 
 def moved_together(places, lidar=False, agree_until=None, recordings=1):
+    """Return the kinds of doubts that told_of_moves has."""
+    return [notice.kind for notice in told_of_moves(places, lidar, agree_until, recordings)]
+
+
+def told_of_moves(places, lidar=False, agree_until=None, recordings=1):
     """Return the doubts about a map in which the anchors A, B, ... have these places one after the other, from 0 and 100 s.
 
     Ranges to those that `agree_until` names agree with the map up to that time, s.
@@ -126,7 +131,7 @@ def moved_together(places, lidar=False, agree_until=None, recordings=1):
     recorded = SimpleNamespace(have_scans=lidar, stamps=np.array([0.0, 200.0]), each=[None] * recordings)
     task = SimpleNamespace(recordings=recorded, stages=stages)
     check_moved_together(anchors, table, task)
-    return [notice.kind for notice in stages.doubts]
+    return stages.doubts
 
 
 @pytest.mark.parametrize(
@@ -157,6 +162,15 @@ def test_with_a_lidar_one_anchor_may_be_moved_and_all_of_them_between_recordings
     assert moved_together(two_of_three, lidar=True) == ["anchors-moved-together"]
     assert not moved_together(two_of_three, lidar=True, recordings=2)
     assert not moved_together([[A, ELSEWHERE]], lidar=True)
+
+
+@pytest.mark.parametrize(("lidar", "cause"), [
+    (True, "rather lidar, radio or clocks lead the map astray"), (False, "rather the wheels, tag or radio changed then"),
+])  # fmt: skip
+def test_what_looks_like_anchors_moved_together_depends_on_what_holds_the_trajectory(lidar, cause):
+    (doubt,) = told_of_moves([[A, ELSEWHERE], [B, (4.0, 9.0)], [C]], lidar)
+    assert doubt.text.startswith(f"2 of 3 anchors were moved at about t = 100 s: {cause}")
+    assert doubt.figures == {"at": 100.0, "moved": 2, "measured": 3}
 
 
 @pytest.mark.parametrize(("until", "doubted"), [(105.0, True), (130.0, True), (170.0, False), (20.0, False)])

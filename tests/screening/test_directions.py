@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from uwblite import se2
-from uwblite.screening.directions import laser_ahead
+from uwblite.screening import directions
+from uwblite.screening.directions import heading_with_the_path, laser_ahead
 from uwblite.screening.wheel_motion import Pairs
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting
 
@@ -29,6 +30,27 @@ def test_pairs_along_bare_walls_do_not_hide_the_direction_of_the_laser(angle, st
     turned, remarks = laser_ahead(log, pairs_of_a_laser_turned_by(angle, stuck))
     assert [r.kind for r in remarks] == ["laser-turned-away"]
     assert abs(se2.wrap_angle(turned.mounting.T_base_laser[2] - angle)) < 0.1
+
+
+@pytest.mark.parametrize(("seen", "changed", "open_sign"), [
+    ({"heading": 1.0, "y": -1.0}, "the sign of its heading", False), ({"heading": -1.0, "y": 1.0}, "the sign of its y", False),
+    ({"heading": 0.0, "y": 0.0}, "the sign of its heading", True),
+])  # fmt: skip
+def test_a_heading_against_its_path_is_mended_as_the_laser_shows(monkeypatch, seen, changed, open_sign):
+    """The heading counts the wrong way, or y does; without a laser nothing shows which."""
+    stamps = 0.1 * np.arange(400)
+    odometry = Odometry(stamps, se2.chain(np.zeros(3), np.tile([0.05, 0.0, 0.02], (399, 1))) * [1.0, 1.0, -1.0])
+
+    def fits(log):
+        return seen["heading" if np.array_equal(log.odometry.poses[:, 1], odometry.poses[:, 1]) else "y"]
+
+    monkeypatch.setattr(directions, "_fits_laser", fits)
+    done, (remark,) = heading_with_the_path(SensorLog(odometry))
+    sign = [1.0, 1.0, -1.0] if "heading" in changed else [1.0, -1.0, 1.0]
+    np.testing.assert_array_equal(done.odometry.poses, odometry.poses * sign)
+    assert (remark.kind, f"path: {changed} was changed" in remark.text) == ("heading-against-path", True)
+    assert ("mirror image" in remark.text) == open_sign
+    assert heading_with_the_path(done) == (done, [])
 
 
 def test_directions_that_do_not_agree_leave_the_laser_as_given():
