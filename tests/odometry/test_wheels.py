@@ -28,10 +28,10 @@ def test_wheel_edges_hold_the_chain_and_name_the_calibration():
     stamps, truth = wander(rng, 20.0)
     frames = select(odometry(stamps, truth, rng, noise=0.02), KeyframeConfig())
     calibration = block(unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool)))
-    edges = wheel_edges(frames, 7, NOISE, calibration)
-    assert edges.i.tolist() == list(range(7, 7 + len(frames) - 1))
+    edges = wheel_edges(frames, NOISE, calibration)
+    assert edges.i.tolist() == list(range(len(frames) - 1))
     np.testing.assert_array_equal(edges.j, edges.i + 1)
-    graph = Graph(np.concatenate([np.zeros((7, 3)), frames.odometry]), calibration=calibration)
+    graph = Graph(frames.odometry, calibration=calibration)
     np.testing.assert_allclose(edges.residuals(graph), 0.0, atol=1e-8)
     assert edges.calibration.shape == (len(edges), 4)
 
@@ -43,7 +43,7 @@ def test_wheel_edges_hold_the_chain_and_name_the_calibration():
 def test_standard_deviations_are_those_stated(twist, sigma):
     """One edge of 2 s: over 0 or 1 m, 0 or 2 rad; 0.02 m and 0.01 rad after a metre, 0.05 rad times the root of 2 rad."""
     frames = select(Odometry(*drive([twist], [2.0])), KeyframeConfig(distance=10.0, angle=10.0))
-    (root,) = wheel_edges(frames, 0, NOISE, Calibration()).sqrt_information
+    (root,) = wheel_edges(frames, NOISE, Calibration()).sqrt_information
     np.testing.assert_allclose(root, np.diag(np.diag(root)))
     np.testing.assert_allclose(1.0 / np.diag(root), [sigma[0], sigma[0], sigma[1]], rtol=0.01)
 
@@ -57,7 +57,7 @@ def test_the_wheels_variance_adds_up_along_the_way(seed):
     wheels = Odometry(stamps, truth)
     totals = []
     for distance in (0.2, 0.5):
-        edges = wheel_edges(select(wheels, KeyframeConfig(distance=distance)), 0, NOISE, Calibration())
+        edges = wheel_edges(select(wheels, KeyframeConfig(distance=distance)), NOISE, Calibration())
         variance = 1.0 / np.einsum("eii->ei", edges.sqrt_information) ** 2
         totals.append((variance - NOISE.standing**2).sum(axis=0))
     np.testing.assert_allclose(totals[0], totals[1], rtol=1e-6)
@@ -70,7 +70,7 @@ def test_the_wheels_noise_is_what_measured_steps_show(position, heading):
     rng = np.random.default_rng(1)
     stamps, truth = wander(rng, 300.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig())
-    exact = wheel_edges(frames, 0, NOISE, Calibration())
+    exact = wheel_edges(frames, NOISE, Calibration())
     sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
     wrong = se2.compose(exact.motion, rng.standard_normal((len(exact), 3)) * sigma * [position, position, heading])
     wheels, graph = replace(exact, motion=wrong), Graph(frames.odometry)
@@ -91,7 +91,7 @@ def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
     rng = np.random.default_rng(2)
     stamps, truth = wander(rng, 300.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig())
-    exact = wheel_edges(frames, 0, NOISE, Calibration())
+    exact = wheel_edges(frames, NOISE, Calibration())
     sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
     off = rng.standard_normal((len(exact), 3)) * sigma * 4.0
     wheels = replace(exact, motion=se2.compose(exact.motion, off))
@@ -111,7 +111,7 @@ def test_noise_does_not_draw_the_wheels_scale(calibration):
     stamps, truth = wander(rng, 600.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig())
     names = unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool))
-    exact = wheel_edges(frames, 0, OdometryNoiseConfig(distance=0.3, heading_per_metre=0.5), block(names))
+    exact = wheel_edges(frames, OdometryNoiseConfig(distance=0.3, heading_per_metre=0.5), block(names))
     sigma = 1.0 / np.einsum("eii->ei", exact.sqrt_information)
     noise = rng.standard_normal((len(exact), 3)) * sigma
     wheels = replace(exact, motion=exact.motion / [1 + scale, 1 + scale, 1 + turn] + noise)
@@ -179,6 +179,6 @@ def test_the_slack_of_a_step_adds_to_its_variance():
     rng = np.random.default_rng(5)
     frames = select(Odometry(*wander(rng, 10.0)), KeyframeConfig())
     slack = rng.uniform(0.0, 0.3, (len(frames) - 1, 3))
-    edges = (wheel_edges(f, 0, NOISE, Calibration()) for f in (frames, replace(frames, slack=slack)))
+    edges = (wheel_edges(f, NOISE, Calibration()) for f in (frames, replace(frames, slack=slack)))
     plain, loose = (1.0 / np.einsum("eii->ei", e.sqrt_information) ** 2 for e in edges)
     np.testing.assert_allclose(loose, plain + slack**2)

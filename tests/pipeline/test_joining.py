@@ -109,9 +109,9 @@ def mapped(seed, tag, ids):
     graph = Graph(frames.odometry, rng.uniform(-6.0, 6.0, (len(ids), 2)), (priors,), replace(calibration, values=values))
     graph = replace(graph, fixed_calibration=rng.random(len(listed)) < 0.5)
     attached = attach_ranges(radio, wheels, frames, mounting)
-    edges = range_edges(attached, 0, ids, mounting, calibration, 0.1, TrilaterationConfig())
+    edges = range_edges(attached, ids, mounting, calibration, 0.1, TrilaterationConfig())
     bootstrap = BootstrapResult(graph, np.ones(len(ids), dtype=bool), ((),) * len(ids), np.zeros(len(ids), dtype=bool))
-    wheel = wheel_edges(frames, 0, OdometryNoiseConfig(), calibration)
+    wheel = wheel_edges(frames, OdometryNoiseConfig(), calibration)
     return Estimate(graph, wheel, edges, ids, bootstrap), len(frames)
 
 

@@ -37,11 +37,11 @@ def start(wheels: Odometry, radio: UwbRanges, calibrated: bool = True) -> tuple[
     graph = Graph(frames.odometry, np.zeros((len(ids), 2)), (prior_edges(listed),), calibration, fixed_calibration=fixed)
     mounting = SensorMounting()
     attached = attach_ranges(radio, wheels, frames, mounting)
-    edges = range_edges(attached, 0, ids, mounting, calibration, 0.1, TrilaterationConfig())
+    edges = range_edges(attached, ids, mounting, calibration, 0.1, TrilaterationConfig())
     path = np.concatenate([[0.0], np.cumsum(frames.path)])
     config = BootstrapConfig(range_sigma=1.5 * SIGMA)
     bootstrapped = bootstrap_graph(
-        graph, wheel_edges(frames, 0, OdometryNoiseConfig(), calibration), edges, path, config, TrilaterationConfig()
+        graph, wheel_edges(frames, OdometryNoiseConfig(), calibration), edges, path, config, TrilaterationConfig()
     )
     return bootstrapped, frames.stamps
 

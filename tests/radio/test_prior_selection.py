@@ -63,7 +63,7 @@ def solved(seed, bias=(0.0,) * 4, scale=1.0):
     frames, ids = select(wheels, KeyframeConfig()), radio.anchor_ids
     listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
     attached = attach_ranges(radio, wheels, frames, LEVEL)
-    edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
+    edges = range_edges(attached, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
     constant = np.array([u.key.kind not in ("range_scale", "bias") for u in listed])
     fixed = np.ones(len(frames), dtype=bool)
     graph = Graph(frames.odometry, PLACES.copy(), (prior_edges(listed),), block(listed), fixed, fixed_calibration=constant)
@@ -150,8 +150,8 @@ def driven(seed, scale=1.0, unit=1.0):
     frames, ids = select(wheels, KeyframeConfig(distance=0.05)), radio.anchor_ids
     listed = unknowns(CONFIG, ids, np.ones(4, dtype=bool))
     attached = attach_ranges(radio, wheels, frames, LEVEL)
-    edges = range_edges(attached, 0, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
-    steps = wheel_edges(frames, 0, OdometryNoiseConfig(), block(listed))
+    edges = range_edges(attached, ids, LEVEL, block(listed), 0.05, TrilaterationConfig())
+    steps = wheel_edges(frames, OdometryNoiseConfig(), block(listed))
     constant = np.array([u.key.kind not in ("range_scale", "bias", "odometry_scale") for u in listed])
     graph = Graph(frames.odometry, PLACES / unit, (prior_edges(listed),), block(listed), fixed_calibration=constant)
     done = optimize(graph.with_edges(edges, steps))[0]

@@ -33,8 +33,8 @@ class OdometryNoiseConfig:
     """Robust kernel: a step that slipped must not bend the rest; none = squared errors (the paper)."""
 
 
-def wheel_edges(keyframes: Keyframes, first: int, config: OdometryNoiseConfig, calibration: Calibration) -> OdometryEdges:
-    """Return the edges between consecutive keyframes of one recording; `first` is the graph's number of its first pose."""
+def wheel_edges(keyframes: Keyframes, config: OdometryNoiseConfig, calibration: Calibration) -> OdometryEdges:
+    """Return the edges between consecutive keyframes of one recording."""
     n = len(keyframes) - 1
     slack = keyframes.slack
     along, across = (np.sqrt(config.standing**2 + config.distance**2 * keyframes.path + slack[:, k] ** 2) for k in (0, 1))
@@ -43,8 +43,8 @@ def wheel_edges(keyframes: Keyframes, first: int, config: OdometryNoiseConfig, c
     sqrt_information = np.zeros((n, 3, 3))
     sqrt_information[:, 0, 0], sqrt_information[:, 1, 1], sqrt_information[:, 2, 2] = 1.0 / along, 1.0 / across, 1.0 / heading
     return OdometryEdges(
-        first + np.arange(n),
-        first + np.arange(1, n + 1),
+        np.arange(n),
+        np.arange(1, n + 1),
         keyframes.motion,
         keyframes.length,
         drift_time(keyframes),

@@ -51,11 +51,11 @@ def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
     graph = graph.with_edges(calibration.prior_edges(listed))
     graph = replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool))
     graph = with_free(graph, *ODOMETRY, BIAS, RANGE_SCALE)
-    odometry = wheel_edges(frames, 0, noise, block)
+    odometry = wheel_edges(frames, noise, block)
     if log.ranges is None:
         return Estimate(graph, odometry, None, ids)
     attached = attach_ranges(log.ranges, log.odometry, frames, log.mounting)
-    ranges = range_edges(attached, 0, ids, log.mounting, block, config.ranges.sigma, config.trilateration, config.ranges.kernel)
+    ranges = range_edges(attached, ids, log.mounting, block, config.ranges.sigma, config.trilateration, config.ranges.kernel)
     return Estimate(graph, odometry, ranges if np.any(ranges.weights) else None, ids)
 
 

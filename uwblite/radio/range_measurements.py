@@ -19,14 +19,13 @@ _RANGES = Kernel("cauchy", 2.5)
 
 
 def range_edges(
-    attached: AttachedRanges, first: int, anchor_ids: tuple[str, ...], mounting: SensorMounting,
+    attached: AttachedRanges, anchor_ids: tuple[str, ...], mounting: SensorMounting,
     calibration: Calibration, sigma: float, search: TrilaterationConfig, kernel: Kernel = _RANGES,
 ) -> RangeEdges:
     """Return one edge per range; readings that cannot be distances, or were made without odometry, get weight 0.
 
     Parameters
     ----------
-    first : the graph's number of the recording's first pose.
     anchor_ids : names of the graph's anchors; attached.anchor indexes them.
     sigma : m, for all ranges until noise is learnt.
     search : decides which readings can be distances. kernel : robust kernel of all ranges.
@@ -35,7 +34,7 @@ def range_edges(
     given = np.array([height or 0.0 for height in above])
     is_given = np.array([height is not None for height in above], dtype=bool)
     return RangeEdges(
-        attached.keyframe + first,
+        attached.keyframe,
         attached.anchor,
         attached.ranges,
         np.full(len(attached.ranges), sigma),
