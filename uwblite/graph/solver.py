@@ -42,7 +42,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Floats
 from ..config import setting
 from ..errors import ConfigError, SolverError
 from .anchor_subproblem import with_anchors_settled
@@ -50,7 +50,7 @@ from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost, kernel_weights, linearize
 from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
-from .unknowns import Unknowns, linked_poses, moved, moved_along
+from .unknowns import cheaper_move, linked_poses
 
 Progress = Callable[[int, int], None]
 """Called as progress(iterations done, most iterations)."""
@@ -180,7 +180,7 @@ class _Descent:
         """Try a step, and take it where the cost falls; return why the search ends with it, "" where it goes on."""
         reused = self.factor is not None
         self.factor, step, promised = _step(self.normal, self.damping * self.scale, self.factor)
-        trial = _trial(self.graph, self.normal.unknowns, step, self.linked)
+        trial = cheaper_move(self.graph, self.normal.unknowns, step, self.linked)
         linearized = linearize(trial)
         chi2 = _cost(trial, linearized)
         if promised > 0 and chi2 > self.chi2:
@@ -230,8 +230,6 @@ USED_UP = "iterations used up"
 
 _QUICK = SolverConfig(max_iterations=12, relative_decrease=1e-3)
 """Search for anchors at given poses: the next step takes up what it leaves."""
-_LARGE_TURN = 0.05
-"""rad; the square of a smaller turn of a pose is nothing beside its first order."""
 _NOTHING = 1e-12
 """chi2, in standard deviations squared, that never matters."""
 _LITTLE = 1e-4
@@ -287,15 +285,6 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
     except SolverError:
         return None, np.zeros(len(damping)), -1.0
     return factor, step, float(step @ (damping * step - normal.gradient))
-
-
-def _trial(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -> Graph:
-    """Return the graph moved by a step; where that turns poses by much, by whichever way of moving them costs less."""
-    straight = moved(graph, unknowns, step)
-    if np.abs(unknowns.spread("poses", step)[:, 2]).max(initial=0.0) < _LARGE_TURN or not linked.any():
-        return straight
-    along = moved_along(graph, unknowns, step, linked)
-    return along if along.chi2() < straight.chi2() else straight
 
 
 def _cost(graph: Graph, linearized: list[Linearization]) -> float:
