@@ -48,7 +48,7 @@ def test_long_stretches_are_tried_where_ends_are_uncertain_and_said_where_they_w
         recordings=recordings, config=MappingConfig(), stages=stages, executor=None,
         allowed=lambda i, j: np.ones(len(i), dtype=bool),
     )  # fmt: skip
-    estimate = SimpleNamespace(scans=SimpleNamespace(clouds=clouds), ranges=None)
+    estimate = SimpleNamespace(lidar=SimpleNamespace(clouds=clouds), ranges=None)
     base, found, pieces = closure_rounds._with_long_stretches_tied(graph, no_closures(), estimate, task)
     assert base is graph
     assert len(found.edges) == 0

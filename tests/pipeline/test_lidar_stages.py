@@ -21,7 +21,7 @@ def test_a_map_is_doubted_from_a_share_of_points_in_free_space_and_some_visits(m
     """More than 5 % of the points, on five visits at least."""
     monkeypatch.setattr(lidar_stages.visibility, "free_space_violation", lambda *args: (share, visits))
     stages = Stages(None, None)
-    estimate = SimpleNamespace(scans=SimpleNamespace(clouds=None), graph=SimpleNamespace(poses=None))
+    estimate = SimpleNamespace(lidar=SimpleNamespace(clouds=None), graph=SimpleNamespace(poses=None))
     task = SimpleNamespace(recordings=SimpleNamespace(path=None, of_keyframe=None), stages=stages)
     assert check_map_consistency(estimate, task) is estimate
     assert [n.kind for n in stages.doubts] == (["free-space-violation"] if doubted else [])

@@ -1,5 +1,6 @@
 """Rounds of loop closing: sub-maps, candidates, matches, second optimisation, until nothing new is found."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,18 +10,19 @@ from ..graph.joint_covariance import JointCovariance
 from ..graph.pose_edges import OdometryEdges
 from ..graph.solver import optimize
 from ..lidar import submaps, visibility
+from ..lidar.free_space import FreeSpace
 from ..lidar.submaps import Submaps
 from ..loop_closure import candidates as closure_candidates
 from ..loop_closure import closures, long_stretches, loose_links, paper_method, verification
-from ..loop_closure.closures import Closures
+from ..loop_closure.candidates import Candidates
+from ..loop_closure.closures import Closures, LoopClosureConfig
 from .estimate import Estimate, Task
 from .progress import Stage, solver_figures
 
 
 def close_loops(estimate: Estimate, task: Task) -> Estimate:
     """Build sub-maps, find closures among them and solve again, until nothing new is found (paper: second optimisation)."""
-    config, recordings, scans = task.config, task.recordings, estimate.scans
-    assert scans is not None
+    config, recordings, scans = task.config, task.recordings, estimate.lidar
     base = estimate.graph.with_edges(*estimate.odometry_and_ranges, *estimate.steps_and_closures)
     base, found, estimate = _with_loose_links_tied(base, estimate, task)
     base, found, stretches = _with_long_stretches_tied(base, found, estimate, task)
@@ -29,8 +31,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     with_ranges = estimate.ranges is not None
     for lap in range(config.loop_closure.rounds):
         pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
-        free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
-        pieces = visibility.static_points(pieces, free)
+        pieces, free = _static(pieces, base, estimate)
         covariance = JointCovariance(base.with_edges(found.edges), pieces.reference)
         candidates = closure_candidates.propose(
             base, covariance, pieces, recordings.of_keyframe, tried, missed, with_ranges, config.loop_closure
@@ -38,9 +39,7 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
         tried |= candidates.names(config.loop_closure)
         dynamic = visibility.dynamic_share(pieces, free, base.poses, recordings.of_keyframe)
         rules = replace(config.loop_closure, through=max(config.loop_closure.through, dynamic))
-        reporter = task.stages.reporter("loop closure")
-        new = verification.find(candidates, pieces, rules, config.correlative, reporter, free, task.executor)
-        new = _without_forbidden(new, task)
+        new = _verified(candidates, pieces, free, rules, task, task.stages.reporter("loop closure"))
         missed |= set() if with_ranges else closure_candidates.missed(candidates, new, config.loop_closure)
         found = closures.merged(found, new)
         if len(new.edges):
@@ -67,15 +66,13 @@ def _with_long_stretches_tied(
     -------
     The solved graph, the closures, and the stretches; None where nothing is as uncertain.
     """
-    recordings, scans, rules = task.recordings, estimate.scans, task.config.loop_closure
-    assert scans is not None
+    recordings, scans, rules = task.recordings, estimate.lidar, task.config.loop_closure
     first, last, reference = long_stretches.cut(recordings.path, recordings.of_keyframe)
     covariance = JointCovariance(base.with_edges(found.edges), reference)
     if not long_stretches.any_uncertain(base, covariance, reference, recordings.of_keyframe, rules):
         return base, found, None
     pieces = submaps.of_pieces(scans.clouds, base.poses, first, last, reference, task.config.submaps)
-    free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
-    pieces = visibility.static_points(pieces, free)
+    pieces, free = _static(pieces, base, estimate)
     tried: set[tuple[int, int, bool]] = set()
     accepted = 0
     for _ in range(_WIDE_ROUNDS):
@@ -86,8 +83,7 @@ def _with_long_stretches_tied(
             break
         pairs = long_stretches.first_of(pairs, pieces)
         tried |= pairs.names(rules)
-        new = verification.find(pairs, pieces, rules, task.config.correlative, None, free, task.executor)
-        new = _without_forbidden(new, task)
+        new = _verified(pairs, pieces, free, rules, task)
         found = closures.merged(found, new)
         if len(new.edges):
             base, found = verification.reconcile(base, found, rules, task.config.solver)
@@ -126,8 +122,7 @@ def _with_loose_links_tied(base: Graph, estimate: Estimate, task: Task) -> tuple
 
     Where these contradict the odometry it counts for little from then on: if it stood still, no match would win against it.
     """
-    recordings, scans, rules, wheels = task.recordings, estimate.scans, task.config.loop_closure, estimate.odometry
-    assert scans is not None
+    recordings, scans, rules, wheels = task.recordings, estimate.lidar, task.config.loop_closure, estimate.odometry
     links = loose_links.loose_links(wheels, base)
     if not len(links):
         return base, closures.no_closures(), estimate
@@ -135,8 +130,7 @@ def _with_loose_links_tied(base: Graph, estimate: Estimate, task: Task) -> tuple
         base, scans.clouds, wheels, links, recordings.of_keyframe, rules, task.config.submaps
     )
     free = visibility.observed_free_space(scans.clouds, pieces, base.poses)
-    found = verification.find(candidates, pieces, rules, task.config.correlative, None, free, task.executor)
-    found = _without_forbidden(found, task)
+    found = _verified(candidates, pieces, free, rules, task)
     spanned = loose_links.spanned(wheels, found.edges)
     solved, found = verification.reconcile(
         _with_odometry(base, wheels, loose_links.loosened(wheels, spanned, rules)), found, rules, task.config.solver
@@ -156,8 +150,7 @@ def _with_odometry(graph: Graph, wheels: OdometryEdges, others: OdometryEdges) -
 
 def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
     """Align sub-maps pair by pair by ICP and solve once more with those that fit (paper: second optimisation)."""
-    config, recordings, scans = task.config, task.recordings, estimate.scans
-    assert scans is not None
+    config, recordings, scans = task.config, task.recordings, estimate.lidar
     edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
     for lap in range(config.loop_closure.rounds):
         graph = estimate.graph
@@ -174,6 +167,21 @@ def close_loops_as_paper(estimate: Estimate, task: Task) -> Estimate:
         estimate = replace(estimate, closures=found).with_estimates_of(solved)
         task.stages.end(Stage("second optimisation", lap + 1), **solver_figures(result))
     return estimate
+
+
+def _static(pieces: Submaps, graph: Graph, estimate: Estimate) -> tuple[Submaps, list[FreeSpace]]:
+    """Return sub-maps without what moved in them, and what each saw to be free."""
+    free = visibility.observed_free_space(estimate.lidar.clouds, pieces, graph.poses)
+    return visibility.static_points(pieces, free), free
+
+
+def _verified(
+    candidates: Candidates, pieces: Submaps, free: Sequence[FreeSpace], rules: LoopClosureConfig, task: Task,
+    report: Callable[[int, int], None] | None = None,
+) -> Closures:  # fmt: skip
+    """Match candidates and return what became of them."""
+    found = verification.find(candidates, pieces, rules, task.config.correlative, report, free, task.executor)
+    return _without_forbidden(found, task)
 
 
 def _without_forbidden(found: Closures, task: Task) -> Closures:

@@ -82,6 +82,12 @@ class Estimate:
         return np.zeros(len(self.anchor_ids), dtype=bool) if self.bootstrap is None else self.bootstrap.placed
 
     @property
+    def lidar(self) -> ScanClouds:
+        """The clouds, for stages that run only where there are any."""
+        assert self.scans is not None
+        return self.scans
+
+    @property
     def odometry_and_ranges(self) -> tuple[Edges, ...]:
         """The edges of the first optimisation."""
         return (self.odometry,) if self.ranges is None else (self.odometry, self.ranges)

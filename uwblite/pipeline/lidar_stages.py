@@ -57,9 +57,8 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
 
 def _late(estimate: Estimate) -> float:
     """Return by how much the lidar's clock is later than that with which the clouds were made, s; 0 where noise explains it."""
-    assert estimate.scans is not None
     calibration = estimate.graph.calibration
-    late = calibration.get("laser_delay") - estimate.scans.delay
+    late = calibration.get("laser_delay") - estimate.lidar.delay
     if abs(late) < _CLOCK_TOLERANCE:
         return 0.0
     sigma = marginals(_with_inflated_ranges(estimate).problem).calibration[calibration.index("laser_delay")]
@@ -68,8 +67,7 @@ def _late(estimate: Estimate) -> float:
 
 def _at_delay(estimate: Estimate, late: float, task: Task) -> Estimate:
     """Return the estimate with keyframes and clouds made for a lidar whose clock is later by `late` s."""
-    assert estimate.scans is not None
-    before, delay = task.following(estimate).recordings, estimate.scans.delay + late
+    before, delay = task.following(estimate).recordings, estimate.lidar.delay + late
     estimate = with_keyframes(estimate, before, later(before, late))
     estimate = replace(estimate, scans=scan_clouds.make(task.following(estimate).recordings, task.config, delay))
     task.stages.end("clouds made again", laser_delay=round(delay, 4))
@@ -89,8 +87,7 @@ def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
 
 def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
     """Return some steps of the odometry (r,) as the clouds measure them from the estimate's poses."""
-    scans, poses, i = estimate.scans, estimate.graph.poses, estimate.odometry.i[rows]
-    assert scans is not None
+    scans, poses, i = estimate.lidar, estimate.graph.poses, estimate.odometry.i[rows]
     guess = se2.between(poses[i], poses[i + 1])
     return scan_to_scan.descend(
         scans.clouds, scans.raster, i, guess, task.config.refinement.first_gate, task.config.scan_to_scan
@@ -102,13 +99,12 @@ def _without_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple
 
     Where little happens between two scans, the second is found by any odometry.
     """
-    scans, before = estimate.scans, task.recordings
-    assert scans is not None
+    before = task.recordings
     doubtful = steps.contradicted(task.config.scan_to_scan)
     after = denser(before, doubtful, _CUTS)
     if len(after.stamps) == len(before.stamps):
         return estimate, steps
-    scans, former = scan_clouds.remake(scans, before, after, task.config)
+    scans, former = scan_clouds.remake(estimate.lidar, before, after, task.config)
     estimate = replace(with_keyframes(estimate, before, after), scans=scans)
     i = estimate.odometry.i
     kept = (former[i] >= 0) & (former[i + 1] == former[i] + 1)
@@ -132,8 +128,7 @@ _RETIMINGS = 4
 
 def _match_neighbours(estimate: Estimate, steps: Steps, task: Task) -> Estimate:
     """Match each cloud with those just before and after it, so that sub-maps are stiff."""
-    config, scans, graph = task.config, estimate.scans, estimate.graph
-    assert scans is not None
+    config, scans, graph = task.config, estimate.lidar, estimate.graph
     rules = config.refinement
     found = scan_to_scan.follow(
         scans.clouds, scans.raster, estimate.odometry, graph, steps, rules.first_gate, config.scan_to_scan
@@ -148,8 +143,7 @@ def _match_neighbours(estimate: Estimate, steps: Steps, task: Task) -> Estimate:
 
 def _refined_neighbours(estimate: Estimate, graph: Graph, gate: float, task: Task, **figures: object) -> Estimate:
     """Let neighbouring clouds constrain the poses of a graph, matches being sought up to the gate, m, at first."""
-    scans, rules = estimate.scans, task.config.refinement
-    assert scans is not None
+    scans, rules = estimate.lidar, task.config.refinement
     settings = replace(rules, partners=0, rounds=rules.track_rounds, first_gate=gate)
     i, j = _pairs(graph, scans, settings, task)
     edges = _with_inflated_ranges(estimate).odometry_and_ranges
@@ -203,8 +197,7 @@ def _refine(
 
 def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
     """Let all overlapping clouds constrain all poses; re-estimate the ranges' noise on the trajectory that results."""
-    scans, config = estimate.scans, task.config
-    assert scans is not None
+    scans, config = estimate.lidar, task.config
     if estimate.ranges is not None:
         estimate = replace(estimate, graph=with_free(estimate.graph, *RADIO))
     before, edges = estimate.graph.poses, estimate.odometry_and_ranges
@@ -260,9 +253,8 @@ def solved(estimate: Estimate, task: Task) -> Estimate:
 
 def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
     """Compare the free space of one visit to a place with the points of another; doubt a map that contradicts itself."""
-    assert estimate.scans is not None
     recordings, poses = task.recordings, estimate.graph.poses
-    share, visits = visibility.free_space_violation(estimate.scans.clouds, poses, recordings.path, recordings.of_keyframe)
+    share, visits = visibility.free_space_violation(estimate.lidar.clouds, poses, recordings.path, recordings.of_keyframe)
     task.stages.end("map consistency", visits=visits, free_space_violation=round(share, 4))
     if share > _VIOLATION and visits >= _ENOUGH_VISITS:
         task.stages.doubt(
