@@ -28,6 +28,13 @@ def matrix(pose):
     return np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
 
 
+@given(st.lists(angles, min_size=1))
+def test_a_rotation_is_a_pose_at_the_origin_as_a_matrix(turns):
+    expected = [matrix((0.0, 0.0, theta)) for theta in turns]
+    np.testing.assert_array_equal(se2.rotation(turns), expected)
+    np.testing.assert_array_equal(se2.rotation(turns[0]), expected[0])
+
+
 @given(poses, poses, poses)
 def test_compose_is_associative(a, b, c):
     assert_same(se2.compose(a, se2.compose(b, c)), se2.compose(se2.compose(a, b), c))

@@ -57,6 +57,16 @@ def rotate(theta: ArrayLike, vectors: ArrayLike) -> Floats:
     return turned
 
 
+def rotation(theta: ArrayLike) -> Floats:
+    """Return blockdiag(R(theta), 1), (..., 3, 3): it turns errors of poses; its first two rows and columns turn vectors."""
+    c, s = cos_sin(theta)
+    matrix = np.zeros((*c.shape, 3, 3))
+    matrix[..., 0, 0] = matrix[..., 1, 1] = c
+    matrix[..., 1, 0], matrix[..., 0, 1] = s, -s
+    matrix[..., 2, 2] = 1.0
+    return matrix
+
+
 def transform(pose: ArrayLike, points: ArrayLike) -> Floats:
     """Express points (..., 2), given in the frame of pose (..., 3), in the frame the pose is given in."""
     pose = np.asarray(pose, dtype=np.float64)

@@ -16,7 +16,7 @@ from ..graph.point_edges import LandmarkEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.range_edges import RangeEdges
 from .graph_chains import chained_poses
-from .plain_edges import ENDS, WIDTHS, Measured, root, turned
+from .plain_edges import ENDS, WIDTHS, Measured, root
 from .records import RecordFile, Records
 
 _NONE = np.zeros(0, dtype=np.int64)
@@ -182,7 +182,7 @@ def assembled(
         _ranges_from_poses(seer, seen, *ranges["range"]),
         PointDistanceEdges(one, other, nowhere, nowhere, *ranges["pose_range"]),
         AnchorDistanceEdges(first, second, *ranges["landmark_range"]),
-        PriorEdges("poses", prior, value, L["pose_prior"] @ turned(-value[:, 2])),
+        PriorEdges("poses", prior, value, L["pose_prior"] @ se2.rotation(-value[:, 2])),
         PriorEdges("anchors", known, place, L["landmark_prior"]),
     )
     given = len(fixed) or len(prior) or len(fixed_anchors) > 1

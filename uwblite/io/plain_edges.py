@@ -80,7 +80,7 @@ def _plain(edges: Edges, graph: Graph) -> tuple[str, tuple[Ints, ...], Floats, F
     if isinstance(edges, PriorEdges):
         if edges.block == "anchors":
             return "landmark_prior", (edges.index,), edges.value, edges.sqrt_information
-        return "pose_prior", (edges.index,), edges.value, edges.sqrt_information @ turned(edges.value[:, 2])
+        return "pose_prior", (edges.index,), edges.value, edges.sqrt_information @ se2.rotation(edges.value[:, 2])
     assert isinstance(edges, RelativePoseEdges | OdometryEdges | ScanEdges)
     return "relative", (edges.i, edges.j), *_between_bases(edges, graph)
 
@@ -101,19 +101,9 @@ def _between_bases(edges: RelativePoseEdges | OdometryEdges | ScanEdges, graph: 
     correction, delay = calibration[edges.calibration[:3]], calibration[edges.calibration[3]]
     A_i, A_j = (se2.compose(se2.exp(twist * (delay - edges.made_with)), correction) for twist in (edges.twist_i, edges.twist_j))
     T = se2.compose(se2.compose(A_i, edges.T_i_j), se2.inverse(A_j))
-    M = turned(A_j[:, 2])
+    M = se2.rotation(A_j[:, 2])
     M[:, 0, 2], M[:, 1, 2] = A_j[:, 1], -A_j[:, 0]
     return T, edges.sqrt_information @ np.linalg.inv(M)
-
-
-def turned(theta: Floats) -> Floats:
-    """Return blockdiag(R(theta), 1), (e, 3, 3)."""
-    turned = np.zeros((len(theta), 3, 3))
-    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(theta)
-    turned[:, 1, 0] = np.sin(theta)
-    turned[:, 0, 1] = -turned[:, 1, 0]
-    turned[:, 2, 2] = 1.0
-    return turned
 
 
 def upper_triangle(matrices: Floats) -> Floats:

@@ -29,8 +29,7 @@ def directional_overlap(
     """
     asked, matched = _sums(clouds, raster, i, j, T_i_j, limit, gate)
     back = _sums(clouds, raster, j, i, se2.inverse(T_i_j), limit, gate)
-    c, s = se2.cos_sin(T_i_j[:, 2])
-    turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    turn = se2.rotation(T_i_j[:, 2])[:, :2, :2]
     asked, matched = (a + turn @ b @ np.swapaxes(turn, 1, 2) for a, b in zip((asked, matched), back, strict=True))
     noise = _NOISE * np.trace(asked, axis1=1, axis2=2) + np.finfo(float).tiny
     root = np.linalg.inv(np.linalg.cholesky(asked + noise[:, None, None] * np.eye(2)))

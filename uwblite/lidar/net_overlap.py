@@ -39,8 +39,7 @@ def net_overlap(
     """
     forth = _net(clouds, raster, free, i, j, T_i_j, limit, gate)
     back = _net(clouds, raster, free, j, i, se2.inverse(T_i_j), limit, gate)
-    c, s = se2.cos_sin(T_i_j[:, 2])
-    turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    turn = se2.rotation(T_i_j[:, 2])[:, :2, :2]
     both = forth + turn @ back @ np.swapaxes(turn, 1, 2)
     return np.asarray(spacing * np.linalg.eigvalsh(both)[:, 0])
 

@@ -8,7 +8,6 @@ from .. import se2
 from ..arrays import Bools, Floats
 from ..errors import ConfigError, DataError
 from ..graph.graph import Graph, PriorEdges
-from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid
 from .estimate import Estimate, Task
 
@@ -114,13 +113,12 @@ def moved(graph: Graph, T_new_map: Floats) -> Graph:
 def _moved_prior(prior: PriorEdges, T_new_map: Floats) -> PriorEdges:
     if prior.block == "calibration":
         return prior
-    c, s = np.cos(T_new_map[2]), np.sin(T_new_map[2])
-    back = np.array([[c, s], [-s, c]])
+    back = se2.rotation(-T_new_map[2])
     if prior.block == "anchors":
-        return replace(prior, value=se2.transform(T_new_map, prior.value), sqrt_information=prior.sqrt_information @ back)
-    turn = np.eye(3)
-    turn[:2, :2] = back
-    return replace(prior, value=se2.compose(T_new_map, prior.value), sqrt_information=prior.sqrt_information @ turn)
+        value, back = se2.transform(T_new_map, prior.value), back[:2, :2]
+    else:
+        value = se2.compose(T_new_map, prior.value)
+    return replace(prior, value=value, sqrt_information=prior.sqrt_information @ back)
 
 
 def cropped(grid: OccupancyGrid, box: tuple[float, float, float, float]) -> OccupancyGrid:
@@ -142,6 +140,5 @@ def cropped(grid: OccupancyGrid, box: tuple[float, float, float, float]) -> Occu
             f"the map reaches from {west:.1f},{south:.1f} to {east:.1f},{north:.1f}"
         )
     cols, rows = slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
-    origin = geometry.origin + geometry.resolution * low
-    part = GridGeometry(geometry.resolution, origin, rows.stop - rows.start, cols.stop - cols.start)
+    part = geometry.window(rows.start, cols.start, rows.stop - rows.start, cols.stop - cols.start)
     return replace(grid, geometry=part, log_odds=grid.log_odds[rows, cols].copy())
