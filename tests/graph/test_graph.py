@@ -62,6 +62,21 @@ def test_rows_are_some_of_the_edges_of_the_same_kind(kind):
         np.testing.assert_array_equal(some.weights, whole.weights[which])
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("first", [0, 3, 8])
+@pytest.mark.parametrize("weighted", [(False, False), (True, False), (False, True), (True, True)])
+def test_rows_followed_by_the_others_are_all_edges(kind, first, weighted):
+    graph, kinds = every_kind(12)
+    whole = kinds[kind]
+    parts = [whole.rows(np.arange(first)), whole.rows(np.arange(first, 8))]
+    parts = [replace(p, weights=0.5 * np.ones(len(p)) if w else None) for p, w in zip(parts, weighted, strict=True)]
+    joined = parts[0].followed_by(parts[1])
+    assert (type(joined), joined.kernel, len(joined)) == (type(whole), whole.kernel, 8)
+    np.testing.assert_array_equal(joined.residuals(graph), whole.residuals(graph))
+    np.testing.assert_array_equal(joined.own_weights, np.concatenate([p.own_weights for p in parts]))
+    assert (joined.weights is None) == (not any(weighted))
+
+
 @pytest.mark.parametrize("free", list(itertools.product([False, True], repeat=4)))
 def test_scan_jacobians_equal_differences_whatever_of_mounting_and_delay_is_free(free):
     graph, kinds = every_kind(9)

@@ -12,7 +12,7 @@ residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with 
 """
 
 from dataclasses import dataclass, field, fields, replace
-from typing import ClassVar, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -61,9 +61,21 @@ class EdgeTable:
 
     def rows(self, which: Ints | Bools) -> Self:
         """Return some of the edges."""
+        arrays = {name: values[which] for name, values in self._by_edge().items() if len(values)}
+        return replace(self, **arrays)  # type: ignore[type-var]
+
+    def followed_by(self, *others: Self) -> Self:
+        """Return these edges and then others of their kind; what all edges share is as these have it."""
+        tables = (self, *others)
+        arrays = {name: np.concatenate([getattr(t, name) for t in tables]) for name in self._by_edge() if name != "weights"}
+        if any(t.weights is not None for t in tables):
+            arrays["weights"] = np.concatenate([t.own_weights for t in tables])
+        return replace(self, **arrays)  # type: ignore[type-var]
+
+    def _by_edge(self) -> dict[str, Any]:
+        """Return the arrays with a row per edge by their names; those that are left out are empty."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
-        arrays = {n: v for n, v in own.items() if isinstance(v, np.ndarray) and len(v) and n not in self.SHARED}
-        return replace(self, **{n: v[which] for n, v in arrays.items()})  # type: ignore[type-var]
+        return {name: v for name, v in own.items() if isinstance(v, np.ndarray) and name not in self.SHARED}
 
 
 class Edges(Protocol):

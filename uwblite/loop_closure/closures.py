@@ -98,12 +98,5 @@ def no_closures() -> Closures:
 
 def merged(one: Closures, other: Closures) -> Closures:
     """Return both collections as one."""
-    a, b = one.edges, other.edges
-    edges = RelativePoseEdges(
-        np.concatenate([a.i, b.i]),
-        np.concatenate([a.j, b.j]),
-        np.concatenate([a.T_i_j, b.T_i_j]),
-        np.concatenate([a.sqrt_information, b.sqrt_information]),
-        b.kernel,
-    )
+    edges = replace(one.edges.followed_by(other.edges), kernel=other.edges.kernel)
     return Closures(edges, one.candidates + other.candidates)

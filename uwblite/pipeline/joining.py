@@ -9,7 +9,6 @@ Systematic errors of odometry, tag and ranges stay each recording's own, see cal
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -195,16 +194,11 @@ def _renamed(indices: Ints, at: Ints) -> Ints:
 
 def _one_odometry(odometry: Sequence[OdometryEdges], at: Sequence[Ints], recordings: Recordings) -> OdometryEdges:
     """Return the odometry edges of all recordings."""
-    first = [recording.first for recording in recordings.each]
-    rows: dict[str, Any] = {name: np.concatenate([getattr(e, name) for e in odometry]) for name in _ODOMETRY_ROWS}
-    for end in ("i", "j"):
-        rows[end] = np.concatenate([getattr(e, end) + f for e, f in zip(odometry, first, strict=True)])
-    rows["calibration"] = np.concatenate([_renamed(e.calibration, a) for e, a in zip(odometry, at, strict=True)])
-    return replace(odometry[0], **rows)
-
-
-_ODOMETRY_ROWS = ("motion", "length", "duration", "sqrt_information")
-_RANGE_ROWS = ("pose", "anchor", "ranges", "sigma", "lever_arm", "turn", "velocity", "height", "calibration", "stamps")
+    moved = [
+        replace(own, i=own.i + recording.first, j=own.j + recording.first, calibration=_renamed(own.calibration, rename))
+        for own, recording, rename in zip(odometry, recordings.each, at, strict=True)
+    ]
+    return moved[0].followed_by(*moved[1:])
 
 
 def _one_ranges(
@@ -218,8 +212,4 @@ def _one_ranges(
             arm = own.lever_arm + se2.rotate(own.turn, own.tag - tag)
             own = replace(own, pose=own.pose + recording.first, anchor=anchors[own.anchor], lever_arm=arm, tag=tag)
             moved.append(replace(own, calibration=_renamed(own.calibration, rename)))
-    if not moved:
-        return None
-    rows: dict[str, Any] = {name: np.concatenate([getattr(r, name) for r in moved]) for name in _RANGE_ROWS}
-    rows["weights"] = np.concatenate([r.own_weights for r in moved])
-    return replace(moved[0], **rows)
+    return moved[0].followed_by(*moved[1:]) if moved else None
