@@ -12,17 +12,10 @@ from uwblite import se2
 from uwblite.errors import ConfigError, DataError
 from uwblite.grid.bresenham import mark_rays
 from uwblite.grid.geometry import GridGeometry
-from uwblite.grid.occupancy_grid import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    GridConfig,
-    Sweeps,
-    from_counts,
-    from_sweeps,
-)
+from uwblite.grid.occupancy_grid import FREE, OCCUPIED, UNKNOWN, GridConfig, from_counts
 from uwblite.grid.ray_counter import WEIGHT_UNIT, RayCounter
 from uwblite.grid.scan_rays import empty_reach, extent, in_runs, moved_scans, scan_rays, seen_reach
+from uwblite.grid.tracing import Sweeps, from_sweeps
 from uwblite.sensor_log import LaserScans
 
 DEFAULT = GridConfig()
@@ -489,6 +482,6 @@ def test_a_grid_too_large_is_made_coarser_before_it_is_allocated():
     assert grid.scans_used == 4
     reported = []
     sweeps = Sweeps(room_scans(drive(3)), drive(3))
-    grid = from_sweeps([sweeps], announce=reported.append)
+    grid = from_sweeps([sweeps], DEFAULT, announce=reported.append)
     assert reported[0].cells >= grid.geometry.cells
     assert reported[0].megabytes == pytest.approx(reported[0].cells * 12e-6)

@@ -8,31 +8,20 @@ scans Bayes' rule adds log-odds,
 
 so only two counts per cell need be kept, their order does not matter, and work can be split and added up exactly. A person
 who stood somewhere for a few scans is outvoted by the later scans that see the place free.
-
-A beam that saw nothing is a weak observation: the URG-04LX cannot distinguish "nothing there" from "too dark or too oblique".
-Such beams never draw anything; runs of adjacent ones clear space, with less weight, up to a stated distance and never beyond a
-wall that other beams have drawn. That takes a second walk over the scans, once the walls are known.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats
 from ..config import setting
-from ..errors import ConfigError, DataError
-from ..sensor_log import LaserScans
-from .geometry import GridGeometry, central_box
-from .ray_counter import WEIGHT_UNIT, Counts, RayCounter
-from .scan_rays import ScanRays, empty_reach, extent, moved_scans, scan_rays, seen_reach
-
-Progress = Callable[[int, int], None]
-"""Called as progress(scans done, scans in all)."""
+from ..errors import ConfigError
+from .geometry import GridGeometry
+from .ray_counter import WEIGHT_UNIT, RayCounter
 
 OCCUPIED_ABOVE = 0.65
 """Probability above which a cell counts as occupied."""
@@ -42,10 +31,6 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """States of a cell, numbered as in ROS nav_msgs/OccupancyGrid."""
 LEAST_CELL, LARGEST_CELL = 1e-4, 1e3
 """Edges of cells, m, beyond which no map is drawn or read."""
-
-_SCANS_AT_A_TIME = 64
-_TASKS = 8
-"""Parts the scans are split into for an executor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,172 +114,8 @@ def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
     return OccupancyGrid(counter.geometry, log_odds)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sweeps:
-    """Scans of one recording and where the laser was."""
-
-    scans: LaserScans
-    first: Floats
-    """(k, 3) T_map_laser at the first ray of every scan."""
-    last: Floats | None = None
-    """(k, 3) T_map_laser at the last ray; in between the laser moves evenly. None = no deskewing."""
-    flipped: bool = False
-    """The laser is mounted upside down."""
-
-    def __post_init__(self) -> None:
-        count, first, last = len(self.scans.stamps), self.first, self.last
-        if first.shape != (count, 3) or (last is not None and last.shape != first.shape):
-            raise DataError(f"{count} scans need as many poses, not {first.shape}")
-
-
-def from_sweeps(
-    recordings: Sequence[Sweeps],
-    config: GridConfig = GridConfig(),
-    *,
-    geometry: GridGeometry | None = None,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
-    announce: Callable[[GridGeometry], object] | None = None,
-) -> OccupancyGrid:
-    """Make one map of the scans of all recordings.
-
-    Parameters
-    ----------
-    geometry : the grid to fill; None = the smallest around all rays, coarser where config.max_cells asks for it.
-    executor : any concurrent.futures executor; the result does not depend on it.
-    announce : called with the geometry before the grid is allocated.
-
-    Raises
-    ------
-    ConfigError : poses or readings are not finite.
-    DataError : there are no scans.
-    """
-    if not any(len(sweeps.first) for sweeps in recordings):
-        raise DataError("there are no scans to make a map of")
-    tasks = [_task(sweeps, config) for sweeps in recordings if len(sweeps.first)]
-    chosen = sum(len(task.chosen) for task in tasks)
-    low, high = _around([task.extent() for task in tasks])
-    if geometry is None and np.prod((high - low) / config.resolution) > config.max_cells:
-        # Without the scans that lie far from all others.
-        box = central_box(np.concatenate([task.first[:, :2] for task in tasks]))
-        tasks = [task for task in (task.within(*box) for task in tasks) if len(task.chosen)]
-        low, high = _around([task.extent() for task in tasks])
-    count = sum(len(task.chosen) for task in tasks)
-    grid = geometry or GridGeometry.around(low, high, config.resolution, config.max_cells)
-    if announce is not None:
-        announce(grid)
-    counter = RayCounter(grid, config.clear_weight)
-    clears = config.max_clear_distance > 0 and config.clear_weight > 0
-
-    def trace(walls: Bools | None, before: int) -> None:
-        for task in tasks:
-            _trace(task, counter, walls, executor, reporter(before))
-            before += len(task.chosen)
-
-    def reporter(before: int) -> Callable[[int], None]:
-        return lambda done: None if progress is None else progress(before + done, count * (2 if clears else 1))
-
-    trace(None, 0)
-    if clears:
-        trace(walls_of(from_counts(counter, config)), count)
-    drawn = from_counts(counter if geometry else counter.cropped(), config)
-    return replace(drawn, scans_used=count, scans_astray=chosen - count)
-
-
-def _task(sweeps: Sweeps, config: GridConfig) -> "_Task":
-    chosen = moved_scans(sweeps.first, config.move_distance, config.move_angle)
-    return _Task(sweeps.scans, np.arange(len(sweeps.first)), sweeps.first, sweeps.last, sweeps.flipped, config).rows(chosen)
-
-
-def _around(boxes: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Return the box, given by two corners, around several."""
-    return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
-
-
 def walls_of(grid: OccupancyGrid) -> Bools:
     """Return which cells (rows, cols) are occupied or next to an occupied one: walls without holes of two cells."""
     occupied = np.pad(grid.log_odds > math.log(OCCUPIED_ABOVE / (1.0 - OCCUPIED_ABOVE)), 1)
     beside = occupied[:-2] | occupied[1:-1] | occupied[2:]
     return beside[:, :-2] | beside[:, 1:-1] | beside[:, 2:]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Task:
-    """Scans to trace and how."""
-
-    scans: LaserScans
-    chosen: Ints
-    first: Floats
-    last: Floats | None
-    flipped: bool
-    config: GridConfig
-
-    def _parts(self) -> Iterator[slice]:
-        """Yield a bounded number of scans at a time."""
-        for start in range(0, len(self.chosen), _SCANS_AT_A_TIME):
-            yield slice(start, min(start + _SCANS_AT_A_TIME, len(self.chosen)))
-
-    def _reach(self, part: slice, empty: bool) -> NDArray[np.float32]:
-        config, chosen = self.config, self.chosen[part]
-        if empty:
-            return empty_reach(self.scans, chosen, config.max_clear_distance, config.clear_run)
-        return seen_reach(self.scans, chosen, config.max_range or math.inf)
-
-    def _poses(self, part: slice) -> tuple[Floats, Floats | None]:
-        return self.first[part], None if self.last is None else self.last[part]
-
-    def batches(self, empty: bool) -> Iterator[tuple[int, ScanRays]]:
-        """Yield (scans done, rays): of beams that saw something, or of those that saw nothing."""
-        for part in self._parts():
-            yield part.stop, scan_rays(self.scans, self._reach(part, empty), *self._poses(part), flipped=self.flipped)
-
-    def extent(self) -> tuple[Floats, Floats]:
-        """Return the corners (2,) of a box around all rays, m."""
-        boxes = []
-        for part in self._parts():
-            reach = np.maximum(self._reach(part, False), self._reach(part, True))
-            boxes.append(extent(self.scans, reach, *self._poses(part), flipped=self.flipped))
-        return _around(boxes)
-
-    def within(self, low: Floats, high: Floats) -> "_Task":
-        """Return the task with the scans whose laser stood in a box."""
-        return self.rows(np.flatnonzero(np.all((self.first[:, :2] >= low) & (self.first[:, :2] <= high), axis=1)))
-
-    def rows(self, which: Ints) -> "_Task":
-        """Return the task with some of its scans."""
-        last = None if self.last is None else self.last[which]
-        return replace(self, chosen=self.chosen[which], first=self.first[which], last=last)
-
-    def split(self, parts: int) -> "list[_Task]":
-        """Return tasks that hold only their own share of the scans."""
-        tasks = [self.rows(part) for part in np.array_split(np.arange(len(self.chosen)), parts) if len(part)]
-        return [replace(task, scans=self.scans.rows(task.chosen), chosen=np.arange(len(task.chosen))) for task in tasks]
-
-
-def _trace(
-    task: _Task, counter: RayCounter, walls: Bools | None, executor: Executor | None, report: Callable[[int], None]
-) -> None:
-    """Trace the beams that saw something, or, where walls are given, those that saw nothing."""
-    if executor is None:
-        for done, rays in task.batches(empty=walls is not None):
-            _insert(counter, rays, walls)
-            report(done)
-        return
-    parts, done = task.split(_TASKS), 0
-    same: tuple[list[GridGeometry], list[Bools | None]] = [counter.geometry] * len(parts), [walls] * len(parts)
-    for part, counts in zip(parts, executor.map(_count, parts, *same), strict=True):
-        counter.add(*counts)
-        done += len(part.chosen)
-        report(done)
-
-
-def _count(task: _Task, geometry: GridGeometry, walls: Bools | None) -> tuple[Counts, Counts]:
-    """Trace one task; runs in a worker."""
-    counter = RayCounter(geometry, task.config.clear_weight)
-    for _, rays in task.batches(empty=walls is not None):
-        _insert(counter, rays, walls)
-    return counter.hits, counter.misses
-
-
-def _insert(counter: RayCounter, rays: ScanRays, walls: Bools | None) -> None:
-    counter.insert_rays(rays.origins, rays.endpoints, np.full(len(rays.scan), walls is None), rays.scan, walls)

@@ -9,9 +9,9 @@ from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_nonnegative_heig
 from ..graph.graph import Graph
 from ..graph.marginals import with_common_errors
 from ..graph.unknowns import free_unknowns
-from ..grid import occupancy_grid as grids
 from ..grid.geometry import GridGeometry
-from ..grid.occupancy_grid import OccupancyGrid, Sweeps
+from ..grid.occupancy_grid import OccupancyGrid
+from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors, with_range_errors
 from ..odometry.wheels import with_noise_shown
@@ -97,7 +97,7 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
             stages.report(Stage("occupancy grid", detail=detail), 0, 1)
 
     reporter = stages.reporter("occupancy grid")
-    grid = grids.from_sweeps(sweeps, config.grid, executor=task.executor, progress=reporter, announce=announce)
+    grid = from_sweeps(sweeps, config.grid, executor=task.executor, progress=reporter, announce=announce)
     if grid.scans_astray:
         stages.doubt(
             "scans-astray",
