@@ -1,4 +1,4 @@
-"""Anchors at given poses: what is free and counts there, and steps that anchors heard along a line would forbid."""
+"""Anchors at given poses: what is free and counts there, and steps that anchors with ranges along a line would forbid."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.planted_graphs import every_kind, plain_ranges, random_poses, relative_edges
 
-from uwblite.graph.anchor_subproblem import anchor_subproblem, with_anchors_settled
+from uwblite.graph.anchor_subproblem import anchor_subproblem, with_anchors_solved
 from uwblite.graph.graph import Graph, linearize
 from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.graph.unknowns import free_unknowns
@@ -49,7 +49,7 @@ def test_a_trial_that_its_other_edges_forbid_stays_as_it_is():
     graph, trial, linearized = mixed()
     elsewhere = [sum(e.residuals(g).ravel() @ e.residuals(g).ravel() for e in g.edges[:2]) for g in (graph, trial)]
     assert elsewhere[1] > elsewhere[0]
-    assert with_anchors_settled(graph, trial, linearized, pytest.fail) == (trial, linearized)
+    assert with_anchors_solved(graph, trial, linearized, pytest.fail) == (trial, linearized)
 
 
 def along_a_line(seed=0):
@@ -67,13 +67,13 @@ def along_a_line(seed=0):
     return Graph(stretched, np.array([[10.0, 0.03]]), edges)
 
 
-def test_a_settled_trial_keeps_its_poses_and_its_linearisation_is_its_own():
+def test_a_trial_with_anchors_solved_keeps_its_poses_and_its_linearisation_is_its_own():
     graph = along_a_line()
     trial = graph.updated(graph.poses, graph.anchors + np.array([0.0, -3.0]), graph.calibration.values)
-    settled, linearized = with_anchors_settled(graph, trial, linearize(trial), lambda g: optimize(g)[0])
-    np.testing.assert_array_equal(settled.poses, trial.poses)
-    assert settled.edges[1].residuals(settled).ravel() @ settled.edges[1].residuals(settled).ravel() < graph.chi2()
-    for found, expected in zip(linearized, linearize(settled), strict=True):
+    solved, linearized = with_anchors_solved(graph, trial, linearize(trial), lambda g: optimize(g)[0])
+    np.testing.assert_array_equal(solved.poses, trial.poses)
+    assert solved.edges[1].residuals(solved).ravel() @ solved.edges[1].residuals(solved).ravel() < graph.chi2()
+    for found, expected in zip(linearized, linearize(solved), strict=True):
         np.testing.assert_array_equal(found.residuals, expected.residuals)
         for (_, _, a), (_, _, b) in zip(found.blocks, expected.blocks, strict=True):
             np.testing.assert_array_equal(a, b)

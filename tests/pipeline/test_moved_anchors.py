@@ -150,4 +150,4 @@ def test_ranges_that_do_not_count_are_no_hearing():
     estimate.ranges = replace(estimate.ranges, weights=np.where(first & (estimate.ranges.anchor == 0), 0.0, 1.0))
     name_new_and_absent_anchors(estimate, task)
     assert sorted(w.figures["anchor"] for w in task.stages.warnings) == ["A", "B"]
-    assert "anchor B is heard only from recording 2 on: recording 1 drove within its reach" in task.stages.warnings[1].text
+    assert "anchor B has ranges only from recording 2 on: recording 1 drove within its reach" in task.stages.warnings[1].text

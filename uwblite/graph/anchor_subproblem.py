@@ -1,9 +1,9 @@
-"""Anchors at given poses: the small problem that settles where they are once a step has moved the poses.
+"""Anchors at given poses: the small problem that says where they are once a step has moved the poses.
 
-An anchor heard along a line may stand anywhere on a bow: across the line its distance and its height trade off. A linear step
-leaves the bow, the cost of its ranges rises, and damping that holds the anchor holds the poses as well. Solved for themselves
-at the new poses, anchors are back on it (embedded point iterations: Y. Jeong, D. Nister, D. Steedly, R. Szeliski, I. S. Kweon,
-Pushing the envelope of modern methods for bundle adjustment, CVPR 2010).
+An anchor with ranges along a line may stand anywhere on a bow: across the line its distance and its height trade off. A
+linear step leaves the bow, the cost of its ranges rises, and damping that holds the anchor holds the poses as well. Solved
+for themselves at the new poses, anchors are back on it (embedded point iterations: Y. Jeong, D. Nister, D. Steedly, R.
+Szeliski, I. S. Kweon, Pushing the envelope of modern methods for bundle adjustment, CVPR 2010).
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from .graph import Edges, Graph, Linearization, edge_cost
 from .unknowns import free_unknowns
 
 
-def with_anchors_settled(
+def with_anchors_solved(
     graph: Graph, trial: Graph, linearized: list[Linearization], solve: Callable[[Graph], Graph]
 ) -> tuple[Graph, list[Linearization]]:
     """Return a trial and its linearisation with the anchors solved for at its poses, where it costs too much by these alone.
@@ -33,10 +33,10 @@ def with_anchors_settled(
     problem = anchor_subproblem(graph, trial, linearized, kinds) if elsewhere <= 0.0 else None
     if problem is None:
         return trial, linearized
-    settled = solve(problem)
-    if not sum(_costs(problem.edges, settled)) < sum(now[k] for k in kinds):
+    solved = solve(problem)
+    if not sum(_costs(problem.edges, solved)) < sum(now[k] for k in kinds):
         return trial, linearized
-    trial = trial.with_estimates_of(settled)
+    trial = trial.with_estimates_of(solved)
     return trial, [e.linearize(trial) if k in kinds else linearized[k] for k, e in enumerate(trial.edges)]
 
 

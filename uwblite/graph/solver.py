@@ -45,7 +45,7 @@ import numpy as np
 from ..arrays import Floats
 from ..config import setting
 from ..errors import ConfigError, SolverError
-from .anchor_subproblem import with_anchors_settled
+from .anchor_subproblem import with_anchors_solved
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_cost, kernel_weights, linearize
 from .normal_equations import NormalEquations
@@ -184,7 +184,7 @@ class _Descent:
         linearized = linearize(trial)
         chi2 = _cost(trial, linearized)
         if promised > 0 and chi2 > self.chi2:
-            trial, linearized = with_anchors_settled(self.graph, trial, linearized, lambda g: optimize(g, _QUICK)[0])
+            trial, linearized = with_anchors_solved(self.graph, trial, linearized, lambda g: optimize(g, _QUICK)[0])
             chi2 = _cost(trial, linearized)
         self.history.append(chi2)
         negligible = self.config.relative_decrease * self.chi2 + _NOTHING

@@ -90,48 +90,48 @@ def _places_by_recording(
 
 
 def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:
-    """Warn of anchors that are heard in some recordings alone, though others drove where these heard them."""
+    """Warn of anchors with ranges in some recordings alone, though others drove where these have them."""
     ranges = estimate.ranges
     if len(task.recordings) == 1 or ranges is None:
         return estimate
     recording_of, number = task.recordings.of_keyframe, len(task.recordings)
-    # Where an anchor was moved, one place follows the other: that is reported, and the anchor is heard all the time.
+    # Where an anchor was moved, one place follows the other: that is reported, and the anchor has ranges all the time.
     names = np.array([radio_name(name) for name in estimate.anchor_ids])
     alive = np.flatnonzero(ranges.alive)
-    heard_by = np.zeros((len(names), number), dtype=np.int64)
-    np.add.at(heard_by, (ranges.anchor[alive], recording_of[ranges.pose[alive]]), 1)
+    counts = np.zeros((len(names), number), dtype=np.int64)
+    np.add.at(counts, (ranges.anchor[alive], recording_of[ranges.pose[alive]]), 1)
     for k in np.flatnonzero(estimate.placed).tolist():
-        heard = heard_by[names == names[k]].sum(axis=0) > 0
-        if heard.all():
+        present = counts[names == names[k]].sum(axis=0) > 0
+        if present.all():
             continue
         away = np.hypot(*(estimate.graph.poses[:, :2] - estimate.graph.anchors[k]).T)
         own = ranges.pose[alive[ranges.anchor[alive] == k]]
         within = away <= np.median(away[own])
         near = np.bincount(recording_of[within], minlength=number)
-        rate = within[own].sum() / max(int(near[heard].sum()), 1)
-        silent = np.flatnonzero(~heard & (rate * near >= _EXPECTED))
-        first, last = np.flatnonzero(heard)[[0, -1]].tolist()
-        _warn_of_absence(task, estimate.anchor_ids[k], first, last, silent)
+        rate = within[own].sum() / max(int(near[present].sum()), 1)
+        absent = np.flatnonzero(~present & (rate * near >= _EXPECTED))
+        first, last = np.flatnonzero(present)[[0, -1]].tolist()
+        _warn_of_absence(task, estimate.anchor_ids[k], first, last, absent)
     return estimate
 
 
 _EXPECTED = 10.0
-"""Ranges that a recording should have from the places where others heard an anchor, from which its silence says something."""
+"""Ranges to an anchor that a recording should have, by those of others from the same places, for their absence to count."""
 
 
-def _warn_of_absence(task: Task, anchor: str, first: int, last: int, silent: Ints) -> None:
-    """Warn of an anchor that recordings before the first or after the last that heard it (0, 1, ...) should have heard."""
-    before, after = ([int(n) + 1 for n in silent[side]] for side in (silent < first, silent > last))
+def _warn_of_absence(task: Task, anchor: str, first: int, last: int, absent: Ints) -> None:
+    """Warn of an anchor to which recordings before the first or after the last with ranges (0, 1, ...) should have ranges."""
+    before, after = ([int(n) + 1 for n in absent[side]] for side in (absent < first, absent > last))
     if before:
         task.stages.warn(
             "new-anchor",
-            f"anchor {anchor} is heard only from recording {first + 1} on: {_drove_there(before)}, so it is new or was off",
+            f"anchor {anchor} has ranges only from recording {first + 1} on: {_drove_there(before)}, so it is new or was off",
             anchor=anchor, recording=first + 1, silent=before,
         )  # fmt: skip
     if after:
         task.stages.warn(
             "absent-anchor",
-            f"anchor {anchor} is not heard any more after recording {last + 1}: {_drove_there(after)}, so it was taken away "
+            f"anchor {anchor} has no ranges after recording {last + 1}: {_drove_there(after)}, so it was taken away "
             "or is off",
             anchor=anchor, recording=last + 1, silent=after,
         )  # fmt: skip
