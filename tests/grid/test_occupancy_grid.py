@@ -307,8 +307,13 @@ def test_the_extent_holds_all_rays(moving, flipped):
     points = np.concatenate([rays.origins, rays.endpoints])
     assert (points >= low).all()
     assert (points <= high).all()
-    still = scan_rays(scans, reach, poses, flipped=flipped)
+    still, moved = scan_rays(scans, reach, poses, flipped=flipped), (low, high)
     low, high = extent(scans, reach, poses, flipped=flipped)
+    # A motion within the scans widens the box by what it can move the end of a ray at most.
+    motion = np.abs(last - poses)
+    widest = (np.hypot(motion[:, 0], motion[:, 1]) + motion[:, 2] * reach.max(axis=1)).max() + 1e-5
+    assert (low - moved[0] <= widest).all()
+    assert (moved[1] - high <= widest).all()
     assert (still.endpoints.min(axis=0) - low < 2e-4).all()
     assert (high - still.endpoints.max(axis=0) < 2e-4).all()
 

@@ -1,6 +1,7 @@
 """Joint refinement: pairs that see the same surfaces, noise-free rooms to a millimetre, noise stated as it is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.solver import SolverConfig
+from uwblite.lidar import joint_refinement
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
@@ -24,7 +26,7 @@ from uwblite.lidar.joint_refinement import (
     surface_cells,
     with_fewer_pairs,
 )
-from uwblite.lidar.scan_matching import PairFactors, measured
+from uwblite.lidar.scan_matching import PairFactors, match, measured
 
 CONFIG = RefinementConfig()
 NOISE = np.array([0.01, 0.005, 0.006])
@@ -234,6 +236,24 @@ def test_rounds_end_at_the_last_gate_where_nothing_moves(convergence, rounds):
     config = replace(CONFIG, rounds=8, convergence=convergence)
     result = refined(Graph(truth).with_edges(chained(truth, NOISE)), clouds, path, config, selections=1)
     assert result.rounds == rounds
+
+
+@pytest.mark.parametrize(("better", "gates"), [(True, [0.5, 0.12, 0.12, 0.12]), (False, [0.5, 0.35, 0.245, 0.1715])])
+def test_the_gate_shrinks_at_its_own_pace_where_a_step_failed(monkeypatch, better, gates):
+    """A step that moves nothing because it failed leaves as much as before; one that was right leaves little."""
+    truth, path, clouds = room(7, 0.0, 4.0)
+    asked = []
+
+    def recorded(clouds, raster, i, T_i_j, points, gate, *more):
+        asked.append(gate)
+        return match(clouds, raster, i, T_i_j, points, gate, *more)
+
+    summary = SimpleNamespace(chi2_initial=1.0, chi2_history=[0.5 if better else 1.0])
+    monkeypatch.setattr(joint_refinement, "match", recorded)
+    monkeypatch.setattr(joint_refinement, "minimise", lambda problem, *_: (problem, summary))
+    graph, config = Graph(truth).with_edges(chained(truth, NOISE)), replace(CONFIG, rounds=4, convergence=0.0)
+    assert refined(graph, clouds, path, config, selections=1).rounds == 4
+    np.testing.assert_allclose(asked, gates)
 
 
 def test_fewer_pairs_inform_nearly_as_much():

@@ -239,6 +239,14 @@ def test_stretches_in_which_most_readings_disagree_are_found():
     assert outlier_stretches(stamps[:99], np.zeros(99, dtype=bool)) == []
 
 
+@pytest.mark.parametrize(("agreeing", "found"), [(3, True), (4, False), (6, False)])
+def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, found):
+    """Twenty readings a bin: in each stretch of ten the first so many agree; elsewhere all."""
+    stamps = np.arange(400.0)
+    agrees = (np.arange(400) % 10 < agreeing) | (stamps < 100) | (stamps >= 200)
+    assert outlier_stretches(stamps, agrees) == ([(100.0, 199.0)] if found else [])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 12])
 def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed):

@@ -188,6 +188,14 @@ def test_agreement_is_the_share_of_ranges_that_fit_a_place_whatever_the_bias(fal
     assert agreement(path, stated, np.array([8.0, 2.0])) < 0.6
 
 
+@pytest.mark.parametrize(("apart", "share"), [(0.39, 1.0), (0.41, 0.6)])
+def test_errors_agree_within_four_tenths_of_a_metre(apart, share):
+    """Six of ten ranges have one error, four another; the anchor stands 2 m above the tag."""
+    path, place = loop_path(np.random.default_rng(9), count=10), np.array([4.0, -3.0])
+    error = 0.3 + apart * (np.arange(10) % 5 < 2)
+    assert agreement(path, np.hypot(np.hypot(*(place - path).T), 2.0) + error, place, 2.0) == pytest.approx(share)
+
+
 def test_the_score_of_a_place_is_its_truncated_cost_with_that_of_its_bias():
     """Errors of 0.1, -0.2 and 4 m at a sigma of 0.1 m: (1 + 4 + outlier^2) / 3, and the bias by its prior."""
     path, state = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]]), np.array([3.0, 4.0, 0.3])
