@@ -126,6 +126,18 @@ def test_scans_beside_a_time_show_one_place_or_another_or_nothing(before, after,
     assert cuts.same_place(log.without(lidar=True), start + 49.9, start + 50.1) is None
 
 
+@pytest.mark.parametrize(("share", "everywhere", "same"), [
+    (0.0, 1.0, None), (0.01, 1.0, False), (0.54, 1.0, False), (0.56, 0.49, None), (0.56, 0.5, True),
+])  # fmt: skip
+def test_two_scans_are_of_one_place_where_more_than_half_matches_in_every_direction(monkeypatch, share, everywhere, same):
+    """Too little that matches is another place; a smooth wall along which one may slide, and nothing at all, decide nothing."""
+    monkeypatch.setattr(cuts, "_matched", lambda *_: (np.zeros((1, 3)), np.array([share])))
+    monkeypatch.setattr(cuts, "directional_shares", lambda *_: np.array([everywhere]))
+    log = recording(two_rounds())
+    middle = log.odometry.stamps[0] + 50.0
+    assert cuts.same_place(log, middle - 1.0, middle + 1.0) is same
+
+
 @pytest.mark.parametrize(
     ("scans", "beams", "jump", "asked"),
     [
