@@ -1,10 +1,13 @@
 """Robust spreads: laws of the median absolute deviation, and normal errors with outliers."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from uwblite.arrays import (
     MAD_TO_SIGMA,
+    concatenated,
     renumbered,
     rms_length,
     row_medians,
@@ -61,3 +64,19 @@ def test_runs_are_those_of_set_flags():
 def test_medians_of_rows_are_numpys_to_the_last_bit(columns):
     values = np.random.default_rng(columns).normal(size=(40, columns))
     assert np.array_equal(row_medians(values), np.median(values, axis=1))
+
+
+def test_dataclasses_of_arrays_are_concatenated_field_by_field():
+    @dataclass(frozen=True)
+    class Inner:
+        rows: np.ndarray
+
+    @dataclass(frozen=True)
+    class Outer:
+        inner: Inner
+        flags: np.ndarray
+
+    parts = [Outer(Inner(np.full((n, 2), n)), np.full(n, n > 1)) for n in (1, 0, 2)]
+    whole = concatenated(parts)
+    assert whole.inner.rows.tolist() == [[1, 1], [2, 2], [2, 2]]
+    assert whole.flags.tolist() == [False, True, True]

@@ -1,7 +1,13 @@
-"""Names for arrays of one element type (shapes stand where an array is used), robust spreads of values, runs of flags."""
+"""Names for arrays of one element type (shapes stand where an array is used), tables joined, robust spreads, runs of flags."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+Table = TypeVar("Table")
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -18,6 +24,16 @@ def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
     used, number = np.unique(np.concatenate([one, other]), return_inverse=True)
     where = number.reshape(-1).astype(np.int64)
     return used, where[: len(one)], where[len(one) :]
+
+
+def concatenated(parts: Sequence[Table]) -> Table:
+    """Return dataclasses of arrays, all of one kind, as one: the rows of each part after those of the one before.
+
+    A field may be such a dataclass itself.
+    """
+    columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(parts[0])}  # type: ignore[arg-type]
+    whole = {n: np.concatenate(c) if isinstance(c[0], np.ndarray) else concatenated(c) for n, c in columns.items()}
+    return replace(parts[0], **whole)  # type: ignore[type-var]
 
 
 def rms_length(vectors: Floats) -> float:

@@ -5,7 +5,7 @@ a few micrometres at the reach of a lidar, and coordinates in one piece each: ho
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, concatenated
 from ..config import setting
 from ..odometry.attached import ScanPoints
 from . import beam_gaps
@@ -202,6 +202,6 @@ def _lines(owner: Ints, points: Floats, origins: Floats, config: CloudConfig) ->
         apart = block.copy()
         apart[:, 0] += owner[first:last] * (width + 2.0 * config.normal_radius)
         parts.append(estimate_normals(block, make_tree(apart), config.normal_radius, config.min_neighbours))
-    lines = Lines(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Lines)))
+    lines = concatenated(parts)
     facing = np.einsum("pi,pi->p", lines.normals, origins - points)
     return lines, lines.normals * np.where(facing < 0, -1.0, 1.0)[:, None]

@@ -5,13 +5,13 @@ pose (3 x 3), which is all that the graph needs to know of them.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, concatenated
 from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
 from .degeneracy import relative_eigen
@@ -84,7 +84,7 @@ def match(
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
     parts = [_condensed(clouds, found, scale) for found in correspondences(clouds, raster, i, T_i_j, points, gate)]
-    return _joined(parts)
+    return concatenated(parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,10 +180,6 @@ def _condensed(clouds: Clouds, found: Correspondences, scale: float) -> PairFact
     )
 
 
-def _joined(parts: list[PairFactors]) -> PairFactors:
-    return PairFactors(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PairFactors)))
-
-
 def shifts_by_range_error(
     clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float, turn: Floats
 ) -> Floats:
@@ -217,7 +213,7 @@ def shifts_by_range_error(
             own = weighted * (quarter == k)
             sums = [(own * nx).sum(1), (own * ny).sum(1), (own * (ny * rx - nx * ry)).sum(1)]
             slopes[found.pairs, k] = np.stack(sums, axis=1)
-    factors = _joined(parts)
+    factors = concatenated(parts)
     moved = np.stack([nondegenerate_step(replace(factors, gradient=slopes[:, k]))[0] for k in range(4)], axis=1)
     moved[..., :2] = se2.rotate(-T_i_j[:, None, 2], moved[..., :2])
     return -moved

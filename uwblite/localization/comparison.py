@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, concatenated
 from . import hypotheses, likelihood_field, range_likelihood, search, verdict
 from .hypotheses import Hypotheses
 from .known_map import KnownMap
@@ -148,7 +148,7 @@ class PlaceSearch:
         back, mean = se2.between(odom, self._odom), found.bank.mean.copy()
         mean[:, hypotheses.POSE] = se2.compose(found.bank.poses, se2.between(self._odom, odom))
         ranges = replace(found.ranges, tags=se2.transform(back, found.ranges.tags))
-        both = hypotheses.joined(bank, replace(found.bank, mean=mean))
+        both = concatenated([bank, replace(found.bank, mean=mean)])
         return replace(found, bank=both, rays=found.rays.moved(back), ranges=ranges)
 
     def _started(self, poses: Floats, ranges: Ranges, rays: Rays) -> Hypotheses:

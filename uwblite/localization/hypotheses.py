@@ -95,11 +95,6 @@ def started(poses: Floats, covariances: Floats, anchors: int, slow: float = SLOW
     return Hypotheses(mean, covariance, np.zeros(len(poses)))
 
 
-def joined(one: Hypotheses, other: Hypotheses) -> Hypotheses:
-    """Return both."""
-    return Hypotheses(*(np.concatenate([getattr(one, n), getattr(other, n)]) for n in ("mean", "covariance", "log_weight")))
-
-
 def placed(bank: Hypotheses, which: int, pose: Floats, covariance: Floats) -> Hypotheses:
     """Return the hypotheses with another pose (3,) and covariance (3, 3) of one of them, which then say nothing of the rest."""
     mean, whole = bank.mean.copy(), bank.covariance.copy()

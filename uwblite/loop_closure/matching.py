@@ -6,19 +6,19 @@ several, with the same outcome.
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, renumbered
+from ..arrays import Bools, Floats, Ints, concatenated, renumbered
 from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
 from ..lidar.free_space import FreeSpace
 from ..lidar.net_overlap import net_overlap
 from ..lidar.pair_alignment import Aligned, align_pairs
-from ..lidar.scan_matching import PairFactors, match, pair_points
+from ..lidar.scan_matching import match, pair_points
 from ..lidar.submaps import Submaps
 from ..lidar.visibility import violates_free_space
 from .candidates import Candidates
@@ -81,10 +81,7 @@ def fit(
         done += len(part.found)
         if progress is not None:
             progress(done, total)
-    factors = (np.concatenate([getattr(p.best.factors, f.name) for p in parts]) for f in fields(PairFactors))
-    best = Aligned(np.concatenate([p.best.pose for p in parts]), PairFactors(*factors))
-    names = ("found", "second", "through", "net")
-    return ClosureMatches(best, *(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    return concatenated(parts)
 
 
 def _batches(
