@@ -30,7 +30,7 @@ def bootstrap_graph(
     first, *others = (
         Attempt(replace(graph, calibration=calibration), odometry, ranges, path, config, search)
         for heading_scale in config.heading_scales
-        if (calibration := _with(graph.calibration, "heading_scale", heading_scale)) is not None
+        if (calibration := _with_heading_scale(graph.calibration, heading_scale)) is not None
     )
     first.run(config.enough)
     begun = first.misfit()
@@ -48,9 +48,9 @@ def bootstrap_graph(
     return (hopeful if hopeful.misfit() < 0.8 * first.misfit() else first).estimate()
 
 
-def _with(calibration: Calibration, name: str, value: float) -> Calibration | None:
-    """Return the calibration with one value set; None where that is not an unknown and the value is not nominal."""
-    index = calibration.index(name)
+def _with_heading_scale(calibration: Calibration, value: float) -> Calibration | None:
+    """Return the calibration with this heading scale; None where that is not an unknown and the value is not nominal."""
+    index = calibration.index("heading_scale")
     if index < 0:
         return calibration if value == 0.0 else None
     values = calibration.values.copy()
