@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 from helpers.planted_graphs import lawn, loop
 
+from uwblite import se2
 from uwblite.cli import main
 from uwblite.cli.formats import write_graph
+from uwblite.graph.graph import PriorEdges
+from uwblite.graph.point_edges import LandmarkEdges
 from uwblite.graph.solver import optimize
+from uwblite.io.g2o import read_g2o
 from uwblite.io.graph_file import GraphFile
 
 
@@ -60,6 +64,81 @@ def test_anchors_that_start_far_away_end_in_the_minimum_from_the_truth(tmp_path,
     far = replace(graph, anchors=where + rng.normal(scale=100.0, size=where.shape))
     assert optimize(far)[1].chi2 > 1.01 * best
     assert figures(capsys, written(tmp_path / "far.pyfg", far))["chi2"] == pytest.approx(best, rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_worthless_estimates_do_not_keep_the_search_from_the_minimum_from_the_truth(tmp_path, capsys, seed):
+    graph, truth, where = loop(seed, n=200, anchors=4)
+    graph = replace(graph, edges=(graph.edges[0], graph.edges[2]))
+    best = optimize(replace(graph, poses=truth, anchors=where))[1].chi2
+    rng = np.random.default_rng(seed)
+    poses = graph.poses + rng.normal(scale=3.0, size=graph.poses.shape) * (np.arange(200) > 0)[:, None]
+    worthless = replace(graph, poses=poses, anchors=np.zeros((4, 2)))
+    assert optimize(worthless)[1].chi2 > 1.5 * best
+    # Both searches end where a step gains less than a share of chi2.
+    assert figures(capsys, written(tmp_path / "zero.g2o", worthless))["chi2"] == pytest.approx(best, rel=1e-4)
+
+
+@pytest.mark.parametrize("options", [[], ["--from-odometry"]])
+@pytest.mark.parametrize("known", ["fixed", "priors"])
+@pytest.mark.parametrize("given", [True, False])
+def test_known_anchors_say_where_the_odometry_lies(tmp_path, capsys, given, known, options):
+    """The vertices, where there are any, are the odometry's: in another frame than the anchors, half a turn off."""
+    graph, truth, where = loop(7, n=150, anchors=4)
+    graph = replace(graph, edges=(graph.edges[0], graph.edges[2]), anchors=where, fixed_poses=np.zeros(150, dtype=bool))
+    if known == "fixed":
+        graph = replace(graph, fixed_anchors=np.ones(4, dtype=bool))
+    else:
+        graph = graph.with_edges(PriorEdges("anchors", np.arange(4), where, np.tile(100.0 * np.eye(2), (4, 1, 1))))
+    best, summary = optimize(replace(graph, poses=truth))
+    away = replace(graph, poses=se2.compose(np.array([30.0, -20.0, 2.8]), graph.poses))
+    path = written(tmp_path / "away.g2o", away)
+    if not given:
+        lines = (tmp_path / "away.g2o").read_text().splitlines(keepends=True)
+        (tmp_path / "away.g2o").write_text("".join(line for line in lines if not line.startswith("VERTEX_SE2")))
+    out = str(tmp_path / "out.g2o")
+    assert figures(capsys, path, *options, "--out", out)["chi2"] == pytest.approx(summary.chi2, rel=1e-5)
+    found = read_g2o(out).graph
+    np.testing.assert_allclose(found.poses, best.poses, atol=1e-3)
+    np.testing.assert_allclose(found.anchors, best.anchors, atol=1e-3)
+
+
+def test_robots_that_see_the_same_landmarks_are_tied_by_them(tmp_path, capsys):
+    graph, truth, _ = loop(8, n=80, anchors=0)
+    rng = np.random.default_rng(8)
+    where = rng.uniform(-5.0, 5.0, (4, 2))
+    pose, anchor = np.repeat(np.arange(80), 4)[::3], np.tile(np.arange(4), 80)[::3]
+    seen = se2.rotate(-truth[pose, 2], where[anchor] - truth[pose, :2]) + rng.normal(scale=0.05, size=(len(pose), 2))
+    landmarks = LandmarkEdges(pose, anchor, seen, np.tile(20.0 * np.eye(2), (len(pose), 1, 1)))
+    odometry = graph.edges[0].rows(np.flatnonzero(graph.edges[0].i != 39))
+    whole = replace(graph, edges=(odometry, landmarks), anchors=where)
+    best = optimize(replace(whole, poses=truth))[1].chi2
+    written(tmp_path / "two.g2o", whole)
+    lines = (tmp_path / "two.g2o").read_text().splitlines(keepends=True)
+    (tmp_path / "two.g2o").write_text("".join(line for line in lines if not line.startswith("VERTEX")))
+    found = figures(capsys, str(tmp_path / "two.g2o"))
+    assert found["chains"] == 2
+    assert found["chi2"] == pytest.approx(best, rel=1e-5)
+
+
+def test_an_anchor_that_cannot_be_placed_has_no_place_in_the_file(tmp_path, capsys):
+    graph = loop(3, n=80, anchors=3)[0]
+    ranges = graph.edges[2]
+    few = ranges.rows(np.flatnonzero((ranges.anchor != 1) | (np.cumsum(ranges.anchor == 1) <= 1)))
+    path = written(tmp_path / "few.pyfg", replace(graph, edges=(*graph.edges[:2], few)))
+    out = tmp_path / "out.pyfg"
+    assert figures(capsys, path, "--from-odometry", "--out", str(out))["unplaced_anchors"] == ["L1"]
+    assert " L1 " not in out.read_text()
+
+
+def test_robust_leaves_out_a_false_second_measurement_of_a_step(tmp_path, capsys):
+    graph = loop(3, n=100, anchors=0)[0]
+    steps, closures = graph.edges[:2]
+    again = replace(steps.rows(np.arange(40, 42)), T_i_j=steps.T_i_j[40:42] + np.array([[3.0, 0.0, 1.0], [0.0, 0.0, 0.0]]))
+    graph = replace(graph, edges=(steps, closures, again))
+    found = figures(capsys, written(tmp_path / "false.g2o", graph), "--robust")
+    assert found["outliers"] == {"RelativePoseEdges": 1}
+    assert found["chi2_per_dof"] == pytest.approx(1.0, abs=0.3)
 
 
 def test_robust_names_the_false_ranges_and_leaves_them_out(tmp_path, capsys):

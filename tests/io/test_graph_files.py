@@ -373,3 +373,34 @@ def test_an_edge_that_leaves_a_direction_open_is_written_so_that_readers_can_fac
         factor = np.linalg.cholesky(information)
         np.testing.assert_allclose(factor @ factor.T, L.T @ L, atol=1e-3)
         assert back.chi2() == pytest.approx(graph.chi2(), rel=1e-5)
+
+
+def test_ids_of_gtsam_and_several_fixed_vertices_on_a_line(tmp_path):
+    """gtsam puts a letter into the highest byte of an id; g2o reads FIX to the end of the line."""
+    x = ord("x") << 56
+    edges = [f"EDGE_SE2 {x + k} {x + k + 1} 1 0 0 1 0 0 1 0 1\n" for k in range(3)]
+    (tmp_path / "a.g2o").write_text(f"FIX {x} {x + 2} {x + 9}\n" + "".join(edges))
+    file = read_g2o(tmp_path / "a.g2o")
+    assert file.pose_ids == tuple(str(x + k) for k in range(4))
+    assert file.graph.fixed_poses.tolist() == [True, False, True, False]
+    (tmp_path / "b.g2o").write_text("FIX\n" + edges[0])
+    with pytest.raises(FormatError, match="FIX has 0 fields, expected 1"):
+        read_g2o(tmp_path / "b.g2o")
+    (tmp_path / "c.g2o").write_text(edges[0].replace(str(x), str(2**63)))
+    with pytest.raises(FormatError, match="is not a vertex id"):
+        read_g2o(tmp_path / "c.g2o")
+
+
+def test_one_known_landmark_does_not_also_hold_the_first_pose(tmp_path):
+    lines = "VERTEX_XY 9 5 5\nFIX 9\n" + "".join(f"EDGE_SE2 {k} {k + 1} 1 0 0.5 1 0 0 1 0 1\n" for k in range(3))
+    (tmp_path / "a.g2o").write_text(lines + "".join(f"EDGE_RANGE_SE2_XY {k} 9 {1 + k} 100\n" for k in range(4)))
+    graph = read_g2o(tmp_path / "a.g2o").graph
+    assert not graph.fixed_poses.any()
+    assert graph.fixed_anchors.tolist() == [True]
+
+
+def test_a_prior_says_where_poses_start_that_nothing_else_places(tmp_path):
+    lines = "".join(f"EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1\n" for k in range(3))
+    (tmp_path / "a.g2o").write_text(lines + f"EDGE_PRIOR_SE2 1 7 8 {np.pi / 2!r} 1 0 0 1 0 1\n")
+    poses = read_g2o(tmp_path / "a.g2o").graph.poses
+    np.testing.assert_allclose(poses[:, :2], [[7, 7], [7, 8], [7, 9], [7, 10]], atol=1e-12)

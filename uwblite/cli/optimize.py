@@ -1,11 +1,14 @@
 """`uwblite optimize`: the solver on a pose graph of any origin, no robot needed."""
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .options import number, place
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ..arrays import Bools
     from ..graph.certificate import Certificate
     from ..graph.graph import Graph
     from ..graph.solver import Progress, SolverConfig, SolverSummary
@@ -52,10 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..config import override
     from ..errors import ConfigError
-    from ..graph.chordal_start import chordal_start
     from ..graph.solver import SolverConfig
-    from ..radio.anchor_starts import place_anchors, search_anchors
-    from ..radio.chain_starts import place_chains
     from . import console
     from .formats import graph_format, read_graph, refuse_existing, write_graph
 
@@ -64,44 +64,98 @@ def run(args: argparse.Namespace) -> int:
     refuse_existing(args.force, args.out, args.trajectory)
     config = override(SolverConfig(), args.set)
     file = read_graph(args.graph, from_odometry=args.from_odometry or args.incremental)
-    if args.incremental and file.chains.any():
-        count = int(file.chains.max()) + 1
+    if args.incremental and (count := len(set(file.chains.tolist()))) > 1:
         raise ConfigError(f"--incremental adds the poses of one robot; {args.graph} has {count} chains of odometry")
     for warning in file.warnings:
         console.note(f"uwblite: {args.graph}: {warning}")
-    starts = place_chains(_with_kernel(file.graph, args.kernel, args.kernel_scale), file.chains)
+    file = dataclasses.replace(file, graph=_with_kernel(file.graph, args.kernel, args.kernel_scale))
     progress = console.Progress()
     try:
         solve = partial(_solve, args, config=config, progress=lambda done, most: progress("optimising", done, most))
-        solutions = []
-        for start in starts:
-            graph, lost = place_anchors(start)
-            solutions.append((*solve(graph), lost, graph))
-        best = min(solutions, key=lambda solution: (sum(solution[2].values()), solution[1].chi2))
-        solved, summary, outliers, lost, start = best
-        known = _certificate(solved, summary, args.robust)
-        others = () if known.is_global or args.robust or args.incremental else (chordal_start(solved), search_anchors(start))
-        for other in others:
-            found = None if other is None else solve(other)
-            if found is not None and found[1].chi2 < (1.0 - config.relative_decrease) * summary.chi2:
-                solved, summary, _ = found
-                known = _certificate(solved, summary, args.robust)
+        solutions = [_Solution(*solve(start), start, lost) for start, lost in _starts(file)]
+        best = min(solutions, key=lambda solution: (sum(solution.outliers.values()), solution.summary.chi2))
+        known = _certificate(best, args.robust)
+        if not (known.is_global or args.robust or args.incremental):
+            for start, lost in _further_starts(file, best, args.from_odometry):
+                found = _Solution(*solve(start), start, lost)
+                if len(lost) <= len(best.lost) and found.summary.chi2 < (1.0 - config.relative_decrease) * best.summary.chi2:
+                    best, known = found, _certificate(found, args.robust)
     finally:
         progress.close()
-    solved_file = dataclasses.replace(file, graph=solved)
+    solved_file = dataclasses.replace(file, graph=_without(best.graph, best.lost))
     if args.out:
         write_graph(args.out, solved_file)
     if args.trajectory:
         from ..io.tum import write_tum
 
-        write_tum(args.trajectory, file.stamps, solved.poses)
-    figures = _figures(solved_file, summary, [file.anchor_ids[k] for k in lost])
+        write_tum(args.trajectory, file.stamps, best.graph.poses)
+    figures = _figures(solved_file, best.summary, [file.anchor_ids[k] for k in best.lost])
     figures["certificate"] = "global minimum" if known.is_global else f"none: {known.reason}"
     figures["chi2_lower_bound"] = known.lower_bound
     if args.robust:
-        figures["outliers"] = outliers
+        figures["outliers"] = best.outliers
     console.report(args.json, figures, _lines(args, figures))
-    return 0 if summary.converged else 3
+    return 0 if best.summary.converged else 3
+
+
+class _Solution(NamedTuple):
+    """An optimised graph."""
+
+    graph: "Graph"
+    summary: "SolverSummary"
+    outliers: dict[str, int]
+    """By kind of edge."""
+    start: "Graph"
+    lost: tuple[int, ...]
+    """Anchors that could not be placed."""
+
+
+def _further_starts(file: "GraphFile", best: _Solution, forgotten: bool) -> "Iterator[tuple[Graph, tuple[int, ...]]]":
+    """Yield further starts, and the anchors that have no place there: without the file's estimates, where they were used."""
+    from ..graph.chordal_start import chordal_start
+    from ..radio.anchor_starts import search_anchors
+
+    for start in (chordal_start(best.graph), search_anchors(best.start)):
+        if start is not None:
+            yield start, best.lost
+    if not forgotten:
+        yield from _starts(file.from_odometry(), best)
+
+
+def _starts(file: "GraphFile", known: _Solution | None = None) -> "Iterator[tuple[Graph, tuple[int, ...]]]":
+    """Yield graphs with every chain and anchor placed, and the anchors that could not be.
+
+    Parameters
+    ----------
+    known : places of anchors that these starts cannot place.
+    """
+    import dataclasses
+
+    import numpy as np
+
+    from ..io.graph_chains import tied_chains
+    from ..radio.anchor_starts import place_anchors
+    from ..radio.chain_starts import place_chains
+
+    if not tied_chains(file.graph, file.chains).all():
+        return
+    for start in place_chains(file.graph, file.chains):
+        graph, lost = place_anchors(start)
+        if known is not None and (missed := [k for k in lost if k not in known.lost]):
+            again = np.isin(np.arange(len(start.anchors)), missed)[:, None]
+            placed = np.where(again, known.graph.anchors, start.anchors)
+            graph, lost = place_anchors(dataclasses.replace(start, anchors=placed))
+        yield graph, lost
+
+
+def _without(graph: "Graph", lost: tuple[int, ...]) -> "Graph":
+    """Return the graph with the places of these anchors unknown."""
+    import dataclasses
+
+    import numpy as np
+
+    gone = np.isin(np.arange(len(graph.anchors)), lost)
+    return dataclasses.replace(graph, anchors=np.where(gone[:, None], np.nan, graph.anchors))
 
 
 def _solve(
@@ -135,15 +189,11 @@ _THRESHOLDS = {1: 3.3, 2: 3.7, 3: 4.0}
 
 def _thresholds(graph: "Graph") -> dict[int, float]:
     """Return by position the threshold of each kind of edges that may hold outliers: all but priors and successive poses."""
-    import numpy as np
-
     from ..graph.graph import PriorEdges
-    from ..graph.pose_edges import RelativePoseEdges
 
-    chosen = {}
+    chosen, closing = {}, _closing(graph)
     for k, e in enumerate(graph.edges):
-        chain = isinstance(e, RelativePoseEdges) and bool(np.all(np.abs(e.j - e.i) == 1))
-        if len(e) and not chain and not isinstance(e, PriorEdges):
+        if len(e) and (k not in closing or closing[k].any()) and not isinstance(e, PriorEdges):
             chosen[k] = _THRESHOLDS[e.residuals(graph).shape[1]]
     return chosen
 
@@ -152,24 +202,40 @@ def _with_kernel(graph: "Graph", name: str, scale: float) -> "Graph":
     """Return the graph with a robust kernel on every edge but those between successive poses."""
     import dataclasses
 
-    import numpy as np
-
     from ..graph.pose_edges import RelativePoseEdges
     from ..graph.robust import Kernel
 
-    kernel = Kernel(name, scale)
+    kernel, closing = Kernel(name, scale), _closing(graph)
     edges: list[Any] = []
-    for e in graph.edges:
+    for k, e in enumerate(graph.edges):
         if not isinstance(e, RelativePoseEdges):
             edges.append(dataclasses.replace(e, kernel=kernel))  # type: ignore[type-var]
             continue
-        loop = np.abs(e.j - e.i) != 1
+        loop = closing[k]
         for chosen, used in ((~loop, e.kernel), (loop, kernel)):
             if chosen.any():
                 parts = {n: getattr(e, n)[chosen] for n in ("i", "j", "T_i_j", "sqrt_information")}
                 weights = None if e.weights is None else e.weights[chosen]
                 edges.append(dataclasses.replace(e, **parts, weights=weights, kernel=used))
     return dataclasses.replace(graph, edges=tuple(edges))
+
+
+def _closing(graph: "Graph") -> "dict[int, Bools]":
+    """Return by position of each kind of relative poses which of them (e,) are not the first between successive poses."""
+    import numpy as np
+
+    from ..graph.pose_edges import RelativePoseEdges
+
+    kinds = {k: e for k, e in enumerate(graph.edges) if isinstance(e, RelativePoseEdges)}
+    seen = np.zeros(len(graph.poses), dtype=bool)
+    closing = {}
+    for k, e in kinds.items():
+        lower, step = np.minimum(e.i, e.j), np.abs(e.j - e.i) == 1
+        first = np.zeros(len(e), dtype=bool)
+        first[np.unique(np.where(step, lower, -1), return_index=True)[1]] = True
+        closing[k] = ~(first & step & ~seen[lower])
+        seen[lower[step]] = True
+    return closing
 
 
 def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> dict[str, Any]:
@@ -188,19 +254,19 @@ def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> di
         "iterations": summary.iterations,
         "converged": summary.converged,
         "reason": summary.reason,
-        "chains": int(file.chains.max(initial=0)) + 1,
+        "chains": len(set(file.chains.tolist())),
         "unplaced_anchors": lost,
         "exit_code": 0 if summary.converged else 3,
     }
 
 
-def _certificate(graph: "Graph", summary: "SolverSummary", robust: bool) -> "Certificate":
+def _certificate(solution: _Solution, robust: bool) -> "Certificate":
     """Return what is known of the global minimum."""
     from ..graph.certificate import Certificate, certify
 
     if robust:
         return Certificate(False, 0.0, "a search decided which edges are outliers")
-    return certify(graph) if summary.converged else Certificate(False, 0.0, "the search did not converge")
+    return certify(solution.graph) if solution.summary.converged else Certificate(False, 0.0, "the search did not converge")
 
 
 def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:

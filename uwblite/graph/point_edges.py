@@ -46,3 +46,14 @@ class LandmarkEdges(EdgeTable):
         root = self.sqrt_information
         blocks = ("poses", self.pose, root @ by_pose), ("anchors", self.anchor, root @ by_anchor)
         return Linearization(whiten(root, seen - self.position), blocks)
+
+
+def seen_anchors(graph: Graph) -> Floats:
+    """Return the anchors (a, 2); those without a place (nan) stand where the first pose with one sees them."""
+    places = np.full_like(graph.anchors, np.nan)
+    for e in graph.edges:
+        if isinstance(e, LandmarkEdges):
+            seen = se2.transform(graph.poses[e.pose], e.position)
+            first = np.flatnonzero(np.isfinite(seen).all(axis=1) & np.isnan(places[e.anchor, 0]))[::-1]
+            places[e.anchor[first]] = seen[first]
+    return np.where(np.isnan(graph.anchors), places, graph.anchors)

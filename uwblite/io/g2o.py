@@ -8,7 +8,7 @@
 | EDGE_SE2_XY | id_pose id_landmark dx dy I11 I12 I22 |
 | EDGE_PRIOR_SE2 | id x y theta I11 I12 I13 I22 I23 I33 |
 | EDGE_PRIOR_XY | id x y I11 I12 I22 |
-| FIX | id |
+| FIX | id ... |
 | EDGE_RANGE_SE2_XY | id_pose id_landmark range I11 (not part of g2o; seen in other projects) |
 | EDGE_RANGE_SE2 | id_pose id_pose range I11 (not part of g2o: our own, for robots that range to each other) |
 | VERTEX2 | id x y theta (TORO) |
@@ -38,7 +38,7 @@ _LAYOUTS = {
     "EDGE_SE2_XY": Layout(2, 5, places=2),
     "EDGE_PRIOR_SE2": Layout(1, 9, places=3),
     "EDGE_PRIOR_XY": Layout(1, 5, places=2),
-    "FIX": Layout(1, 0),
+    "FIX": Layout(1, 0, listed=True),
     "EDGE_RANGE_SE2_XY": Layout(2, 2, places=1),
     "EDGE_RANGE_SE2": Layout(2, 2, places=1),
     "VERTEX2": Layout(1, 3, places=3),
@@ -91,8 +91,8 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     lines = {kind: records[tag] for kind, tag in _TAGS.items()} | {"relative": steps}
     plain = {kind: measurements(of, kind, index, content, "information") for kind, of in lines.items()}
     plain["landmark_range"] = measured("landmark_range")
-    poses = given_places(vertices, pose_of, len(pose_ids), content, from_odometry)
-    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
+    poses = given_places(vertices, pose_of, len(pose_ids), content)
+    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content)
     fixed = records["FIX"].names[:, 0]
     graph = assembled(plain, poses, anchors, *(index[fixed][index[fixed] >= 0] for index in (pose_of, landmark_of)))
     return GraphFile.checked(
@@ -101,6 +101,7 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
         tuple(map(str, landmark_ids.tolist())),
         np.arange(len(pose_ids), dtype=np.float64),
         content,
+        from_odometry,
     )
 
 
@@ -180,13 +181,14 @@ def _together(a: Records, b: Records) -> Records:
 
 def _ids(content: RecordFile) -> Ints:
     """Return the vertex id that each name of the file stands for."""
-    wrong = next((name for name in content.names if not _ID.fullmatch(name)), None)
+    wrong = next((name for name in content.names if not _ID.fullmatch(name) or abs(int(name)) >= 2**63), None)
     if wrong is not None:
         raise content.error(f"{wrong[:30].decode(errors='replace')!r} is not a vertex id, a whole number")
     return np.array([int(name) for name in content.names], dtype=np.int64)
 
 
-_ID = re.compile(rb"-?\d{1,18}")
+_ID = re.compile(rb"-?\d{1,19}")
+"""As many digits as 64 bits hold: gtsam puts a letter into the highest byte."""
 
 
 def _numbered(ids: Ints, names: Sequence[Ints]) -> tuple[Ints, Ints]:

@@ -1,13 +1,80 @@
-"""Initial poses of a graph file that has none: along its relative poses."""
+"""Initial poses of a graph file that has none: along its relative poses, from what is given or held."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
+from ..graph.distance_edges import PointDistanceEdges
+from ..graph.graph import Graph, PriorEdges
+from ..graph.point_edges import LandmarkEdges, seen_anchors
+from ..graph.pose_edges import RelativePoseEdges
+from ..graph.range_edges import RangeEdges
+from ..graph.unknowns import free_unknowns
+
+
+def along_edges(graph: Graph) -> tuple[Graph, Ints]:
+    """Return a graph with a start for its poses, and for the landmarks that edges see or priors place; and chains (n,).
+
+    Chain 0 stands in the map's frame: what is given, what has a prior, and what edges tie to these; in a graph that holds
+    nothing anywhere, the part of the first pose, which is the origin. Every other chain, which only ranges and landmarks
+    may tie to it, begins at the origin and wants a place.
+
+    Parameters
+    ----------
+    graph : poses and anchors that are given, nan where none is.
+    """
+    poses, anchors = graph.poses, graph.anchors.copy()
+    relative = [e for e in graph.edges if isinstance(e, RelativePoseEdges)]
+    steps = [np.concatenate([getattr(e, name) for e in relative]) for name in ("i", "j", "T_i_j")] if relative else None
+    priors: dict[str, dict[int, Floats]] = {"poses": {}, "anchors": {}}
+    for e in graph.edges:
+        if isinstance(e, PriorEdges):
+            priors[e.block] |= dict(zip(e.index.tolist(), e.value, strict=True))
+    for anchor, place in priors["anchors"].items():
+        anchors[anchor] = place if np.isnan(anchors[anchor, 0]) else anchors[anchor]
+    chains = np.zeros(len(poses), dtype=np.int64)
+    held = bool(np.isfinite(poses[:, 0]).any() or held_anchors(graph).any())
+    poses = chained_poses(poses, *steps) if steps and np.isfinite(poses[:, 0]).any() else poses
+    while len(lost := np.flatnonzero(np.isnan(poses[:, 0]))):
+        pinned = [k for k in lost.tolist() if k in priors["poses"]]
+        start = poses.copy()
+        start[pinned[0] if pinned else lost[0]] = priors["poses"][pinned[0]] if pinned else 0.0
+        reached = chained_poses(start, *steps) if steps else start
+        if not pinned and held:
+            chains[np.isnan(poses[:, 0]) & ~np.isnan(reached[:, 0])] = chains.max() + 1
+        poses, held = reached, True
+    framed = replace(graph, anchors=anchors, poses=np.where((chains == 0)[:, None], poses, np.nan))
+    return replace(graph, anchors=seen_anchors(framed), poses=poses), chains
+
+
+def held_anchors(graph: Graph) -> Bools:
+    """Return which anchors (a,) are fixed or have a prior."""
+    held = ~free_unknowns(graph)["anchors"]
+    for e in graph.edges:
+        if isinstance(e, PriorEdges) and e.block == "anchors":
+            held[e.index] = True
+    return held
+
+
+def tied_chains(graph: Graph, chains: Ints) -> Bools:
+    """Return for each pose (n,) whether ranges or landmarks tie its chain to chain 0 or to landmarks that are held."""
+    count = int(chains.max(initial=0)) + 1
+    held = np.flatnonzero(held_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.int64)
+    ends = [(np.zeros(len(held), dtype=np.int64), count + held)]
+    for e in graph.edges:
+        if isinstance(e, PointDistanceEdges):
+            ends.append((chains[e.i], chains[e.j]))
+        elif isinstance(e, RangeEdges | LandmarkEdges):
+            ends.append((chains[e.pose], count + e.anchor))
+    one, other = (np.concatenate(column) for column in zip(*ends, strict=True))
+    links = csr_matrix((np.ones(len(one)), (one, other)), shape=(count + len(graph.anchors),) * 2)
+    label = connected_components(links, directed=False)[1]
+    return np.asarray(label[chains] == label[0], dtype=np.bool_)
 
 
 def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:

@@ -3,11 +3,9 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Floats, Ints
 from ..errors import FormatError
 from ..graph.components import floating_components
 from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
@@ -15,7 +13,8 @@ from ..graph.graph import Graph, PriorEdges
 from ..graph.point_edges import LandmarkEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.range_edges import RangeEdges
-from .graph_chains import chained_poses
+from ..graph.unknowns import free_unknowns
+from .graph_chains import along_edges, tied_chains
 from .plain_edges import ENDS, WIDTHS, Measured, root
 from .records import RecordFile, Records
 
@@ -34,8 +33,7 @@ class GraphFile:
     stamps: Floats
     """(n,) s, time of each pose; its number where the file gives no time."""
     chains: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """(n,) chain of each pose: 0 stands where the file puts it or at the first pose; the others, which no edges but ranges
-    tie to it, begin at the origin and want a place."""
+    """(n,) chain of each pose: 0 stands in the map's frame; others begin at the origin and want a place (see `along_edges`)."""
     skipped: dict[str, int] = field(default_factory=dict)
     """Lines of kinds that are not used, by tag."""
     warnings: tuple[str, ...] = ()
@@ -43,56 +41,46 @@ class GraphFile:
 
     @staticmethod
     def checked(
-        graph: Graph, pose_ids: tuple[str, ...], anchor_ids: tuple[str, ...], stamps: Floats, content: RecordFile
+        graph: Graph,
+        pose_ids: tuple[str, ...],
+        anchor_ids: tuple[str, ...],
+        stamps: Floats,
+        content: RecordFile,
+        from_odometry: bool = False,
     ) -> "GraphFile":
-        """Return the graph of a file that was read.
+        """Return the graph of a file that was read, with a start for whatever the file gives no position of.
+
+        Parameters
+        ----------
+        from_odometry : forget the positions that it gives.
 
         Raises
         ------
         FormatError : a pose hangs on nothing.
         """
-        poses, chains = with_origins(graph)
-        lost = np.flatnonzero(~_tied(graph, chains)[chains])
+        started, chains = along_edges(graph)
+        file = GraphFile(started, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())))
+        file = file.from_odometry() if from_odometry else file
+        lost = np.flatnonzero(~tied_chains(file.graph, file.chains))
         if len(lost):
             raise content.error(f"pose {pose_ids[lost[0]]} is not connected to the first one ({len(lost)} such poses)")
-        graph = replace(graph, poses=poses)
-        nowhere = [name for name, xy in zip(anchor_ids, graph.anchors, strict=True) if np.isnan(xy[0])]
+        nowhere = [name for name, xy in zip(anchor_ids, file.graph.anchors, strict=True) if np.isnan(xy[0])]
         warnings: tuple[str, ...] = (
             (f"no position is given of {len(nowhere)} landmarks: {', '.join(nowhere[:10])}",) if nowhere else ()
         )
-        floating = np.flatnonzero(floating_components(graph) > 0)
+        floating = np.flatnonzero(floating_components(file.graph) > 0)
         if len(floating):
             named = f"pose {pose_ids[floating[0]]} is not connected to the first one ({len(floating)} such poses)"
             warnings += (f"{named}: they keep to their own edges, and where they stand says nothing",)
-        return GraphFile(graph, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())), warnings)
+        return replace(file, warnings=warnings)
 
-
-def with_origins(graph: Graph) -> tuple[Floats, Ints]:
-    """Return poses (n, 3), each chain that nothing but ranges ties to the first begun at the origin, and their chains (n,)."""
-    poses, chains = graph.poses, np.zeros(len(graph.poses), dtype=np.int64)
-    relative = [e for e in graph.edges if isinstance(e, RelativePoseEdges)]
-    while len(lost := np.flatnonzero(np.isnan(poses[:, 0]))):
-        start = poses.copy()
-        start[lost[0]] = 0.0
-        ends = [np.concatenate([getattr(e, name) for e in relative]) for name in ("i", "j", "T_i_j")] if relative else None
-        poses = start if ends is None else chained_poses(start, *ends)
-        chains[np.isnan(graph.poses[:, 0]) & ~np.isnan(poses[:, 0]) & (chains == 0)] = chains.max() + 1
-    return poses, chains
-
-
-def _tied(graph: Graph, chains: Ints) -> Bools:
-    """Return for each chain whether ranges tie it to the first one, directly, over others or over landmarks."""
-    count, landmarks = int(chains.max()) + 1, len(graph.anchors)
-    ends = [(np.zeros(0, dtype=np.int64),) * 2]
-    for e in graph.edges:
-        if isinstance(e, PointDistanceEdges):
-            ends.append((chains[e.i], chains[e.j]))
-        elif isinstance(e, RangeEdges):
-            ends.append((chains[e.pose], count + e.anchor))
-    one, other = (np.concatenate(column) for column in zip(*ends, strict=True))
-    links = csr_matrix((np.ones(len(one)), (one, other)), shape=(count + landmarks,) * 2)
-    label = connected_components(links, directed=False)[1]
-    return np.asarray(label[:count] == label[0], dtype=np.bool_)
+    def from_odometry(self) -> "GraphFile":
+        """Return the graph as it starts where estimates are forgotten: what is fixed stays, all else follows the edges."""
+        free = free_unknowns(self.graph)
+        poses = np.where(free["poses"][:, None], np.nan, self.graph.poses)
+        anchors = np.where(free["anchors"][:, None], np.nan, self.graph.anchors)
+        graph, chains = along_edges(replace(self.graph, poses=poses, anchors=anchors))
+        return replace(self, graph=graph, chains=chains)
 
 
 def symmetric(upper: Floats, size: int) -> Floats:
@@ -103,8 +91,8 @@ def symmetric(upper: Floats, size: int) -> Floats:
     return matrices
 
 
-def given_places(vertices: Records, index_of: Ints, count: int, content: RecordFile, forget: bool) -> Floats:
-    """Return the places (count, numbers) that vertices give, nan where none does or all are to be forgotten.
+def given_places(vertices: Records, index_of: Ints, count: int, content: RecordFile) -> Floats:
+    """Return the places (count, numbers) that vertices give, nan where none does.
 
     Raises
     ------
@@ -116,8 +104,7 @@ def given_places(vertices: Records, index_of: Ints, count: int, content: RecordF
     if len(first) < len(index):
         again = int(np.setdiff1d(np.arange(len(index)), first)[0])
         raise content.error("this vertex was given before", int(vertices.lines[again]))
-    if not forget:
-        places[index] = vertices.numbers
+    places[index] = vertices.numbers
     return places
 
 
@@ -152,24 +139,16 @@ def measurements(of: Records, kind: str, index: dict[str, Ints], content: Record
 def assembled(
     plain: dict[str, Measured], poses: Floats, anchors: Floats, fixed: Ints = _NONE, fixed_anchors: Ints = _NONE
 ) -> Graph:
-    """Return the graph of measurements, with a start for whatever the file gives no position of.
+    """Return the graph of measurements.
 
     Parameters
     ----------
-    poses : (n, 3) given poses, nan where the file gives none; these are reached from the others along edges.
-    anchors : (a, 2) given landmarks; nan where none is given; these are placed by the first edge that sees them.
-    fixed, fixed_anchors : indices of what is fixed. Nothing named and no prior on a pose: the first pose is fixed.
-
-    Returns
-    -------
-    Graph; poses and anchors that nothing leads to stay nan.
+    poses : (n, 3) given poses, nan where the file gives none.
+    anchors : (a, 2) given landmarks, nan where the file gives none.
+    fixed, fixed_anchors : indices of what is fixed. Nothing named and no prior: the first pose is fixed.
     """
     (i, j), T_i_j, _ = plain["relative"]
-    poses = chained_poses(poses, i, j, T_i_j)
     (pose, anchor), position, _ = plain["observation"]
-    placed = np.full_like(anchors, np.nan)
-    placed[anchor[::-1]] = se2.transform(poses[pose], position)[::-1]
-    anchors = np.where(np.isnan(anchors), placed, anchors)
     (seer, seen), (one, other), (first, second) = (plain[kind].ends for kind in _DISTANCES)
     L = {kind: root(m.information) for kind, m in plain.items()}
     ranges = {kind: (plain[kind].value[:, 0], 1.0 / L[kind][:, 0, 0]) for kind in _DISTANCES}
@@ -185,7 +164,7 @@ def assembled(
         PriorEdges("poses", prior, value, L["pose_prior"] @ se2.rotation(-value[:, 2])),
         PriorEdges("anchors", known, place, L["landmark_prior"]),
     )
-    given = len(fixed) or len(prior) or len(fixed_anchors) > 1
+    given = len(fixed) or len(prior) or len(fixed_anchors) or len(known)
     return Graph(
         poses,
         anchors,

@@ -95,12 +95,12 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     for kind, of in lines.items():
         found = measurements(of, kind, index, content, "covariance")
         plain[kind] = found._replace(information=_inverse(found.information, of, content))
-    poses = given_places(records["VERTEX_SE2"], pose_of, len(pose_ids), content, from_odometry)
-    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content, from_odometry)
+    poses = given_places(records["VERTEX_SE2"], pose_of, len(pose_ids), content)
+    anchors = given_places(records["VERTEX_XY"], landmark_of, len(landmark_ids), content)
     stamps = np.arange(len(pose_ids), dtype=np.float64)
     stamps[ends[:, 1]] = steps.stamps
     stamps[pose_of[records["VERTEX_SE2"].names[:, 0]]] = records["VERTEX_SE2"].stamps
-    return GraphFile.checked(assembled(plain, poses, anchors), pose_ids, landmark_ids, stamps, content)
+    return GraphFile.checked(assembled(plain, poses, anchors), pose_ids, landmark_ids, stamps, content, from_odometry)
 
 
 def write_pyfg(

@@ -28,6 +28,8 @@ class Layout:
     """Whether a time stands before the names."""
     places: int = 0
     """How many of the numbers, from the first on, are places, angles or distances; the others are uncertainties."""
+    listed: bool = False
+    """Whether a line may hold several names, each a record of its own; it holds nothing else."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,6 +112,8 @@ def _count(result: RecordFile, tag: bytes, line: int) -> None:
 
 def _table(rows: list[tuple[int, list[bytes]]], layout: Layout, names: dict[bytes, int], result: RecordFile) -> Records:
     """Turn the tokens of lines of one tag into arrays."""
+    if layout.listed:
+        rows = [(line, [tokens[0], *name]) for line, tokens in rows for name in ([[n] for n in tokens[1:]] or [[]])]
     first = 1 + layout.stamped
     width = first + layout.names + layout.numbers
     for line, tokens in rows:

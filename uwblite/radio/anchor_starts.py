@@ -6,6 +6,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..graph.graph import Graph
+from ..graph.point_edges import seen_anchors
 from ..graph.range_edges import RangeEdges
 from .trilateration import TrilaterationConfig, trilaterate
 
@@ -13,9 +14,10 @@ from .trilateration import TrilaterationConfig, trilaterate
 def place_anchors(graph: Graph) -> tuple[Graph, tuple[int, ...]]:
     """Return the graph with a position for each anchor that has none, and the anchors that could not be placed.
 
-    The poses are taken as they are; anchors without a position are found from their ranges alone (trilateration.trilaterate).
-    Those that cannot be found are fixed at the origin with their ranges switched off.
+    The poses are taken as they are; anchors without a position stand where a pose sees them, or are found from their ranges
+    alone (trilateration.trilaterate). Those that cannot be found are fixed at the origin with their ranges switched off.
     """
+    graph = replace(graph, anchors=seen_anchors(graph))
     missing = np.flatnonzero(~np.isfinite(graph.anchors).all(axis=1))
     if not len(missing):
         return graph, ()

@@ -1,10 +1,10 @@
-"""Starting places for the chains of several robots that nothing but ranges ties together.
+"""Starting places for the chains of several robots that nothing but ranges and landmarks ties together.
 
 Each chain is taken as rigid, as its odometry has it. Chains are placed one after another, the best tied first: for every
-heading R on a circle of starts, a range d from its point b to a placed point a means |a - R b - t| = d, which is
-trilateration of t; squared, |p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t and |t|^2. Gauss-Newton steps in
-heading and place follow, with Cauchy weights, for odometry drifts and some ranges are wrong. Several hypotheses are kept
-from chain to chain; which is right is for the optimisation of the whole graph to say.
+heading R on a circle of starts, a range d from its point b to a placed point a (0 where the chain sees the landmark a at
+b) means |a - R b - t| = d, which is trilateration of t; squared, |p|^2 - 2 p.t + |t|^2 = d^2 with p = a - R b is linear in t
+and |t|^2. Gauss-Newton steps in heading and place follow, with Cauchy weights, for odometry drifts and some ranges are
+wrong. Several hypotheses are kept from chain to chain; which is right is for the optimisation of the whole graph to say.
 """
 
 from dataclasses import replace
@@ -15,6 +15,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.distance_edges import PointDistanceEdges
 from ..graph.graph import Graph
+from ..graph.point_edges import LandmarkEdges
 from ..graph.range_edges import RangeEdges
 from .anchor_starts import place_anchors
 
@@ -37,11 +38,11 @@ def place_chains(graph: Graph, chains: Ints) -> list[Graph]:
 
     Parameters
     ----------
-    graph : poses of each chain in a frame of its own; those of chain 0 are where they are.
+    graph : poses of each chain in a frame of its own; those of chain 0, and anchors that have a place, are where they are.
     chains : (n,) chain of each pose.
     """
     hypotheses = [(0.0, graph)]
-    waiting = set(range(1, int(chains.max(initial=0)) + 1))
+    waiting = set(chains.tolist()) - {0}
     placed = {0}
     while waiting:
         chain = max(sorted(waiting), key=lambda c: len(_ties(hypotheses[0][1], chains, c, placed)[2]))
@@ -77,14 +78,19 @@ def _ties(graph: Graph, chains: Ints, chain: int, placed: set[int]) -> tuple[Flo
             own.append(graph.poses[e.pose[tied], :2])
             there.append(anchors[e.anchor[tied]])
             ranges.append(e.ranges[tied])
+        elif isinstance(e, LandmarkEdges):
+            tied = (chains[e.pose] == chain) & np.isfinite(anchors[e.anchor]).all(axis=1)
+            own.append(se2.transform(graph.poses[e.pose[tied]], e.position[tied]))
+            there.append(anchors[e.anchor[tied]])
+            ranges.append(np.zeros(int(tied.sum())))
     every = max(-(-sum(map(len, ranges)) // _MOST_RANGES), 1)
     return tuple(np.concatenate(part)[::every] for part in (there, own, ranges))  # type: ignore[return-value]
 
 
 def _measured_from(graph: Graph, here: Bools) -> Graph:
-    """Return the graph with those landmarks placed that ranges from some of the poses place."""
-    ranges = tuple(e.rows(np.flatnonzero(here[e.pose])) for e in graph.edges if isinstance(e, RangeEdges))
-    found, lost = place_anchors(replace(graph, edges=ranges))
+    """Return the graph with those landmarks placed that edges from some of the poses place."""
+    kinds = (e for e in graph.edges if isinstance(e, RangeEdges | LandmarkEdges))
+    found, lost = place_anchors(replace(graph, edges=tuple(e.rows(np.flatnonzero(here[e.pose])) for e in kinds)))
     anchors = found.anchors.copy()
     anchors[list(lost)] = np.nan
     return replace(graph, anchors=anchors)
