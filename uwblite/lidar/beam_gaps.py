@@ -72,7 +72,6 @@ def _beside(scan: Ints, ray: Ints) -> Bools:
 def _continues(step: Floats, other: Floats) -> Bools:
     """Return which steps (p, 2) from hit to hit go on along others (p, 2) beside them, whose lengths change little."""
     length = np.hypot(step[:, 0], step[:, 1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        along = np.sum(step * other, axis=1) / length
-        across = np.abs(step[:, 0] * other[:, 1] - step[:, 1] * other[:, 0]) / length
-        return np.asarray((along > _LEAST_BESIDE * length) & (across < _NOISE + _BEND * along))
+    along = np.sum(step * other, axis=1) / length
+    across = np.abs(step[:, 0] * other[:, 1] - step[:, 1] * other[:, 0]) / length
+    return np.asarray((along > _LEAST_BESIDE * length) & (across < _NOISE + _BEND * along))

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..radio.change_points import Move, find_moves
 from ..radio.range_noise import short_term_sigma
+from ..radio.trilateration import usable
 from ..sensor_log import OdometryBreaks, Remark, Screening, SensorLog, UwbRanges
 from .estimate import Estimate, Task
 from .radio_stages import first_optimisation
@@ -91,11 +92,11 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task)
     measured[of_recording] = ranges.ranges
     edges = replace(edges, ranges=measured)
     positions = edges.tag_positions(estimate.graph.poses)
-    usable = np.isfinite(edges.ranges) & (edges.ranges > _SHORTEST) & (edges.ranges < task.config.trilateration.max_range)
-    sigma = short_term_sigma(edges.stamps[usable], edges.anchor[usable], edges.ranges[usable], task.config.ranges)
+    sound = usable(edges.ranges, task.config.trilateration)
+    sigma = short_term_sigma(edges.stamps[sound], edges.anchor[sound], edges.ranges[sound], task.config.ranges)
     moves = {}
     for k, name in enumerate(ranges.anchor_ids):
-        own = of_recording[(ranges.anchor == k) & usable[of_recording]]
+        own = of_recording[(ranges.anchor == k) & sound[of_recording]]
         found = find_moves(positions[own], edges.rows(own).planar_ranges(), edges.stamps[own], sigma, task.config.trilateration)
         if found:
             moves[name] = found
@@ -137,10 +138,6 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
         mounting=replace(log.mounting, anchor_heights=heights),
         screening=replace(before, remarks=(*before.remarks, *remarks)),
     )
-
-
-_SHORTEST = 0.02
-"""Shorter readings are no distances, m."""
 
 
 def name_and_number(name: str) -> tuple[str, int]:
