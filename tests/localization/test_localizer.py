@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.localization_room import ANCHORS, EVEN, ODD, ROUND, SCANNER, errors, grid_of, known, path, robot
+from helpers.localization_room import ANCHORS, EVEN, ODD, ROUND, SCANNER, cast, errors, grid_of, known, path, robot
 
 from uwblite import se2
 from uwblite.errors import DataError
@@ -271,6 +271,60 @@ def test_sensors_that_go_on_show_that_the_odometry_was_silent_for_long():
         after = drive.localizer.add_ranges(drive.stamp + 60.0 + 0.2 * k, ["A"], [50.0])
     assert after.stamp > before.stamp + 59.0
     assert np.trace(after.covariance) > 10 * np.trace(before.covariance)
+
+
+@pytest.mark.parametrize("back", [2.0, 3600.0])
+def test_a_clock_that_is_set_back_stops_nothing(back):
+    poses = path(ROUND)
+    drive = robot(known())
+    drive.along(poses[:30])
+    drive.stamp -= back
+    states = drive.along(poses[30:60])
+    assert not any(s.lost for s in states)
+    assert errors(states[5:], poses[35:60]).max() < 0.1
+    assert states[-1].stamp == pytest.approx(drive.stamp - 0.2)
+
+
+def test_one_odometry_of_the_past_sets_no_clock_back(drive):
+    poses, states = drive
+    odd = robot(known())
+    odd.along(poses[:20])
+    for k in range(10):
+        odd.localizer.add_odometry(odd.stamp - 50.0 + 0.02 * (k % 3), 0.0, 0.0, 0.0)
+    again = odd.along(poses[20:30])
+    np.testing.assert_array_equal(again[-1].pose, states[29].pose)
+
+
+def test_an_odometry_that_was_set_back_alone_keeps_the_other_clocks():
+    poses = path(ROUND)
+    odd = robot(known())
+    odd.along(poses[:30])
+    for pose in poses[30:60]:
+        odd.odom = se2.compose(odd.odom, se2.between(odd.last, pose) * [1.01, 1.0, 1.0])
+        odd.last = pose
+        state = odd.localizer.add_odometry(odd.stamp - 1000.0, *odd.odom)
+        state = odd.localizer.add_scan(odd.stamp, cast(pose), SCANNER)
+        odd.stamp += 0.2
+    assert not state.lost
+    assert np.hypot(*(state.pose - poses[59])[:2]) < 0.3
+    assert odd.localizer.refused == 0
+
+
+def test_an_odometry_that_is_always_a_second_late_is_waited_for():
+    poses, drive = path(ROUND), robot(known())
+    steps = se2.between(poses[:-1], poses[1:])
+    odom = [np.zeros(3)]
+    for step in steps:
+        odom.append(se2.compose(odom[-1], step))
+    for k, pose in enumerate(poses[:100]):
+        if k >= 5:
+            state = drive.localizer.add_odometry(100.0 + 0.2 * (k - 5), *odom[k - 5])
+        drive.localizer.add_scan(100.0 + 0.2 * k, cast(pose), SCANNER)
+        if k % 5 == 0:
+            metres = [np.hypot(*(np.array(p) - pose[:2])) for p in ANCHORS.values()]
+            drive.localizer.add_ranges(100.0 + 0.2 * k, list(ANCHORS), metres)
+    assert not state.lost
+    assert np.hypot(*(state.pose - poses[94])[:2]) < 0.1
 
 
 def test_a_map_of_nothing_is_refused(tmp_path):

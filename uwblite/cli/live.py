@@ -89,7 +89,7 @@ class Tracker:
         self._early: list[Measured] = []
         self._seen: dict[str, float] = {}
         self._silent: set[str] = set()
-        self._due = -float("inf")
+        self._said = -float("inf")
         self._sees = False
         self._was_lost = True
 
@@ -145,9 +145,9 @@ class Tracker:
         if state is None or not state.stamp > -float("inf"):
             return
         self.on_state(state)
-        if state.stamp < self._due and state.lost == self._was_lost:
+        if self._said <= state.stamp < self._said + 0.999 / self.args.rate and state.lost == self._was_lost:
             return
-        self._due, self._was_lost = state.stamp + 0.999 / self.args.rate, state.lost
+        self._said, self._was_lost = state.stamp, state.lost
         console.say_lines(line_of(state))
         console.flush()
 
@@ -155,16 +155,16 @@ class Tracker:
         """Say once when a sensor that was there, or should be, falls silent."""
         from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange
 
-        kinds = {LiveOdometry: "odometry", LiveRange: "uwb", LiveGyro: "gyro"}
-        kind = kinds.get(type(measured), "lidar")
+        kind = {LiveOdometry: "odometry", LiveRange: "uwb", LiveGyro: "gyro"}.get(type(measured), "lidar")
+        now = measured.order if self.localizer is None else self.localizer.on_time(measured.order)
         if not self._seen:
-            self._seen = {name: measured.order for name in _SENSORS if name != "gyro"}
-        self._seen[kind] = max(self._seen.get(kind, measured.order), measured.order)
+            self._seen = {name: now for name in _SENSORS if name != "gyro"}
+        self._seen[kind] = max(self._seen.get(kind, now), now)
         if kind in self._silent:
             self._silent.discard(kind)
             console.note(f"uwblite: {kind} is back")
         for other, last in self._seen.items():
-            if measured.order - last > _SILENCE and other not in self._silent:
+            if now - last > _SILENCE and other not in self._silent:
                 self._silent.add(other)
                 console.note(f"uwblite: warning: nothing from {other} for {_SILENCE:.0f} s; {_SENSORS[other]}")
 

@@ -23,9 +23,11 @@ from .records import LocalizerState, Scanner
 from .sensing import LEAD, Range, Scan, Waiting, scan_rays
 
 _PATIENCE = 0.5
-"""s by which a measurement may be ahead of the odometry before the odometry counts as silent."""
+"""s by which a measurement may be ahead of the odometry before the odometry counts as silent, until it was seen to be late."""
 _UNSEEN_SPEED = 0.3
 """m/s and rad/s; how fast a robot may move while its odometry is silent."""
+_SET_BACK, _IN_A_ROW = 0.5, 4
+"""s by which the odometry must be behind itself, and how often in a row with rising stamps, for its clock to be set back."""
 
 
 class Localizer:
@@ -45,9 +47,13 @@ class Localizer:
         self.known, self.mounting, self.scanner = known, mounting or SensorMounting(), scanner
         self._laser = replace(self.mounting, T_base_laser=se2.compose(known.laser_correction, self.mounting.T_base_laser))
         self._odometer, self._turns, self._waiting = Odometer(), GyroTurns(), Waiting()
-        self._wheels = np.full(3, np.nan)
+        self._wheels, self._measured = np.full(3, np.nan), -np.inf
+        self._patience = _PATIENCE
         self._leap: tuple[float, Floats] | None = None
         self._leaps = 0
+        self._behind: list[tuple[float, Floats]] = []
+        self._clock_shift = 0.0
+        """s, added to the odometry's stamps so that time goes on where its clock was set back."""
         self._estimator = PoseEstimator(known, self._odometer)
         self._names = {name: k for k, name in enumerate(known.anchors.ids)}
         heights = [self.mounting.height_difference(name) or 0.0 for name in known.anchors.ids]
@@ -68,6 +74,15 @@ class Localizer:
     def add_odometry(self, stamp: float, x: float, y: float, theta: float) -> LocalizerState:
         """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
         wheels = np.array([x, y, theta], dtype=np.float64)
+        stamp += self._clock_shift
+        if stamp < self._measured - _SET_BACK:
+            self._set_back(stamp, wheels)
+            return self.state()
+        self._behind = []
+        if self._measured < stamp <= self._odometer.stamp:
+            # It was not silent but late: what was bridged is measured now, and next time it is waited for.
+            self._patience = min(2.0 * self._patience, LEAD)
+            self._odometer.forget_from(stamp)
         leap, self._leap = self._leap, None
         if leap is not None and stamp > leap[0]:
             self._move(*leap)
@@ -84,7 +99,7 @@ class Localizer:
 
     def add_gyro(self, stamp: float, heading: float) -> LocalizerState:
         """Take the heading of a gyro, s and rad from any zero; once its bias is known, the wheels turn as it does."""
-        self._turns.add(stamp, heading)
+        self._turns.add(self.on_time(stamp), heading)
         return self.state()
 
     def add_ranges(self, stamp: float, anchor_ids: Sequence[str], metres: ArrayLike, tag: int = 0) -> LocalizerState:
@@ -96,9 +111,10 @@ class Localizer:
         """
         values = np.asarray(metres, dtype=np.float64).reshape(-1)
         good = usable(values, TrilaterationConfig())
+        until = self.on_time(stamp)
         for name, value in zip(np.asarray(anchor_ids)[good].tolist(), values[good].tolist(), strict=True):
             if name in self._names:
-                self._waiting.add(stamp, Range(self._names[name], value, tag))
+                self._waiting.add(until, Range(self._names[name], value, tag))
             else:
                 self.strangers[name] = self.strangers.get(name, 0) + 1
         self._work_off()
@@ -115,20 +131,41 @@ class Localizer:
         self.scanner = scanner or self.scanner
         if self.scanner is not None and self.known.walls is not None:
             readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
-            scan = Scan(stamp + self.known.laser_delay, readings, self.scanner)
+            scan = Scan(self.on_time(stamp) + self.known.laser_delay, readings, self.scanner)
             self._waiting.add(scan.end, scan)
         self._work_off()
         return self.state()
 
     def state(self) -> LocalizerState:
         """Return the pose at the time of the last odometry."""
-        return self._estimator.state(self._wheels)
+        state = self._estimator.state(self._wheels)
+        return replace(state, stamp=state.stamp - self._clock_shift) if self._clock_shift else state
+
+    def on_time(self, stamp: float) -> float:
+        """Return a sensor's stamp on a clock that was never set back, s: the sensor's was, if that brings it nearer."""
+        return min(stamp + self._clock_shift, stamp, key=lambda t: abs(t - self._odometer.stamp))
+
+    def _set_back(self, stamp: float, wheels: Floats) -> None:
+        """Take a pose (3,) of the wheels that is behind the last one; the clock was set back when several come in order."""
+        if self._behind and stamp <= self._behind[-1][0]:
+            self._behind = []
+        self._behind.append((stamp, wheels))
+        if len(self._behind) < _IN_A_ROW:
+            return
+        behind, self._behind = self._behind, []
+        # The first of them was one period after the last one by the old clock.
+        shift = self._measured + (behind[1][0] - behind[0][0]) - behind[0][0]
+        self._clock_shift += shift
+        self._odometer.forget_from(behind[0][0] + shift)
+        for earlier, pose in behind:
+            self._move(earlier + shift, pose)
+        self._work_off()
 
     def _move(self, stamp: float, wheels: Floats) -> None:
         """Move the pose to a later one (3,) of the wheels."""
         step = self._odometer.add(stamp, self._turns.turned(stamp, wheels))
         if self._odometer.stamp == stamp:
-            self._wheels = wheels
+            self._wheels, self._measured = wheels, stamp
         if step is not None:
             self._estimator.move(step)
 
@@ -148,7 +185,7 @@ class Localizer:
         """Where the odometry has fallen silent, let the robot stand, and the pose become unsure."""
         latest = self._waiting.latest(self._odometer.stamp)
         gap = latest - self._odometer.stamp
-        if gap > _PATIENCE:
+        if gap > self._patience:
             self._odometer.add(latest - 0.1, self._odometer.pose.copy())
             self._estimator.wander(_UNSEEN_SPEED * min(gap, 3.0))
 

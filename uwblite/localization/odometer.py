@@ -61,6 +61,11 @@ class Odometer:
         self._append(stamp, pose)
         return step
 
+    def forget_from(self, stamp: float) -> None:
+        """Forget the poses from a time on, s, but for the first of all."""
+        kept = int(np.searchsorted(self._stamps[self._begin : self._end], stamp))
+        self._end = self._begin + max(kept, 1)
+
     def at(self, stamps: Floats) -> Floats:
         """Return the poses (n, 3) at times (n,); beyond either end the nearest one."""
         kept = slice(self._begin, self._end)

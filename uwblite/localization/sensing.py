@@ -17,7 +17,8 @@ _CLEAR = 3.0
 TRACK_RAYS = 180
 """Rays of a scan that are matched."""
 LEAD = 5.0
-"""s; a stamp that is farther ahead of the odometry is not believed before others confirm it: one alone is a clock's fault."""
+"""s; a stamp that is farther ahead of the odometry is not believed before others confirm it: one alone is a clock's fault.
+One that is as far behind is none that a sensor was late with."""
 _CONFIRMED = 4
 """Different stamps, all so far ahead, after which the odometry was silent for so long."""
 
@@ -55,7 +56,7 @@ class Waiting:
     def __init__(self) -> None:
         self._entries: list[tuple[float, Range | Scan]] = []
         self.refused = 0
-        """Measurements that were left out: so far ahead of an odometry that was not silent."""
+        """Measurements that were left out: so far ahead of an odometry that was not silent, or as far behind it."""
 
     def add(self, until: float, entry: Range | Scan) -> None:
         """Keep a measurement until the odometry has reached a time, s."""
@@ -78,7 +79,9 @@ class Waiting:
         """Return those that the odometry has reached, in the order of their times, and keep the others."""
         due = sorted((w for w in self._entries if w[0] <= now), key=lambda w: w[0])
         self._entries = [w for w in self._entries if w[0] > now]
-        return due
+        recent = [w for w in due if w[0] >= now - LEAD]
+        self.refused += len(due) - len(recent)
+        return recent
 
 
 def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
