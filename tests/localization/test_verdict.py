@@ -28,6 +28,13 @@ def test_ranges_of_which_one_in_four_disagrees_confirm_no_scans():
     assert "ranges" in nowhere(-0.1, ENOUGH_ENDS, RangeFit(29, 0.52, 3))
 
 
+def test_people_beside_a_few_ranges_contradict_no_place_in_a_map_that_is_the_right_one():
+    assert "scans" in nowhere(-0.4, ENOUGH_ENDS, TWO_ANCHORS)
+    assert nowhere(-0.4, ENOUGH_ENDS, TWO_ANCHORS, proven=True) == ""
+    assert "scans" in nowhere(-0.4, ENOUGH_ENDS, ONE_ANCHOR, proven=True)
+    assert "scans" in nowhere(-0.6, ENOUGH_ENDS, TWO_ANCHORS, proven=True)
+
+
 @pytest.mark.parametrize("fit", [-0.1, -0.4])
 @pytest.mark.parametrize("ends", [0.0, ENOUGH_ENDS])
 def test_in_a_map_in_which_the_robot_was_tracked_ranges_to_two_anchors_need_no_second_search(fit, ends):

@@ -15,10 +15,24 @@ def test_the_newest_part_of_a_window_is_of_its_time(parts, kept):
     assert not Window().newest(parts).looks
 
 
-def test_a_robot_that_stands_keeps_a_scan_of_its_own_where_the_last_one_is_too_old():
+def look(way, stamp):
     rays = Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool))
-    window = Window(looks=[WindowLook(rays, np.zeros(3), 4.0, 5.0)])
-    assert not window.wants_look(4.0)
-    assert not window.wants_look(4.0, 4.9)
-    assert window.wants_look(4.0, 5.0)
-    assert window.wants_look(4.5)
+    return WindowLook(rays, np.zeros(3), way, stamp)
+
+
+def test_a_robot_that_stands_keeps_a_scan_of_its_own_where_the_last_one_is_too_old():
+    window = Window(looks=[look(4.0, 5.0)])
+    assert not window.wants_look(4.0, 5.1)
+    assert not window.wants_look(4.0, 5.1, 4.9)
+    assert window.wants_look(4.0, 5.1, 5.0)
+    assert window.wants_look(4.5, 5.1)
+
+
+def test_a_robot_that_stands_keeps_one_scan_the_newest_and_one_that_creeps_keeps_its_place():
+    window = Window(looks=[look(4.0, 5.0)])
+    assert window.wants_look(4.02, 6.0)
+    window.add_look(look(4.02, 6.0))
+    assert [kept.stamp for kept in window.looks] == [6.0]
+    assert not window.wants_look(4.2, 9.0)
+    window.add_look(look(4.5, 10.0))
+    assert [kept.stamp for kept in window.looks] == [6.0, 10.0]

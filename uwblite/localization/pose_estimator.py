@@ -96,7 +96,7 @@ class PoseEstimator:
     def use_scan(self, rays: Rays) -> None:
         """Take a scan's rays, in the present frame of the base."""
         doubted_since = self._running.matched if self._certain and self._running.in_doubt() else -np.inf
-        if self._window.wants_look(self._way, doubted_since) and len(rays.hit):
+        if self._window.wants_look(self._way, self._odometer.stamp, doubted_since) and len(rays.hit):
             self._window.add_look(WindowLook(rays.spread(RAYS), self._odometer.pose.copy(), self._way, self._odometer.stamp))
         walls = self.known.walls
         if not len(self._bank) or walls is None or not len(rays.hit):
@@ -207,7 +207,7 @@ class PoseEstimator:
         self._reason = verdict.doubt(self._bank, best, found.complete, fit, known, fitting, proven) or verdict.other_unit(
             self.known.walls, pose, found.rays, found.looks, ranges, not proven
         )
-        self._trim(bool(verdict.nowhere(fit, known, fitting)))
+        self._trim(bool(verdict.nowhere(fit, known, fitting, proven)))
         self._bank = hypotheses.pruned(self._bank, _MOST, _FORGET)
         self._decide(pose, verdict.confirming_way(fit, known, fitting, proven))
 

@@ -56,7 +56,7 @@ def doubt(
     # Rays and ranges err independently: half of what either needs is enough where there is half of the other as well.
     if share_of_needed(ends) + fitting.share_of_needed < 1.0:
         return "too little was measured yet; drive on"
-    if why := nowhere(fit, ends, fitting):
+    if why := nowhere(fit, ends, fitting, proven):
         return why
     if len(rivals) and rivals.max() > -certain:
         count = 1 + int((rivals > -certain).sum())
@@ -66,10 +66,14 @@ def doubt(
     return ""
 
 
-def nowhere(fit: float, ends: float, fitting: "RangeFit") -> str:
-    """Return what contradicts even the best place; "" = nothing does."""
+def nowhere(fit: float, ends: float, fitting: "RangeFit", proven: bool = False) -> str:
+    """Return what contradicts even the best place; "" = nothing does.
+
+    In a map that is the right one, ranges to two anchors leave no other building for scans to exclude.
+    """
     seen = share_of_needed(ends)
-    if seen and fit < (FIT_BESIDE_RANGES if fitting.enough else FIT_ALONE):
+    beside = fitting.enough or (proven and fitting.anchors >= 2)
+    if seen and fit < (FIT_BESIDE_RANGES if beside else FIT_ALONE):
         return "the scans fit the walls nowhere well; is this the right map?"
     if fitting.count >= ENOUGH_RANGES and fitting.share < RANGES_ALONE + seen * (RANGES_FOUND - RANGES_ALONE):
         return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"

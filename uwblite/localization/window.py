@@ -21,6 +21,8 @@ _LOOK_EVERY, _RANGE_EVERY = 0.4, 0.25
 """m driven between the scans, and between the ranges to one anchor, that are kept."""
 _ALIKE = 3
 """Ranges to one anchor that a standing robot keeps."""
+_STANDING, _LOOK_AGAIN = 0.05, 1.0
+"""m driven, below which a scan takes the last one's place, and s after which it does: people who hid the walls move on."""
 RAYS = 48
 """Rays kept of a scan."""
 
@@ -99,12 +101,21 @@ class Window:
         if len(own) < _ALIKE or entry.way - own[-_ALIKE].way >= _RANGE_EVERY:
             self.ranges.append(entry)
 
-    def wants_look(self, way: float, after: float = -np.inf) -> bool:
-        """Return whether the robot has moved enough for another scan, or there is none after a time, s."""
-        return not self.looks or way - self.looks[-1].way >= _LOOK_EVERY or self.looks[-1].stamp <= after
+    def wants_look(self, way: float, stamp: float, after: float = -np.inf) -> bool:
+        """Return whether a scan is wanted.
+
+        Parameters
+        ----------
+        way : the odometer at the scan, m. stamp : its time, s. after : s; one that is newer than that is wanted.
+        """
+        if not self.looks or way - self.looks[-1].way >= _LOOK_EVERY or self.looks[-1].stamp <= after:
+            return True
+        return way - self.looks[-1].way < _STANDING and stamp - self.looks[-1].stamp >= _LOOK_AGAIN
 
     def add_look(self, look: WindowLook) -> None:
-        """Keep a scan."""
+        """Keep a scan; that of a robot that stands takes the last one's place."""
+        if self.looks and look.way - self.looks[-1].way < _STANDING:
+            self.looks.pop()
         self.looks.append(look)
 
     def seen(self, odom: Floats, way: float, length: float) -> tuple[Rays, Floats]:
