@@ -116,7 +116,7 @@ def learn(positions: Floats, residuals: Floats, weights: Floats, config: RangeNo
 
 def _covariance_by_distance(p: Floats, e: Floats, edges: Floats) -> tuple[Floats, Floats]:
     """Return mean products of residuals (b,) and pair counts (b,) by distance between the places."""
-    stride = max(1, len(e) // 1500)
+    stride = -(-len(e) // _MOST_PAIRED)
     p, e = p[::stride], e[::stride]
     tree = cKDTree(p)
     # Both trees at once count pairs by the thousand; each pair comes twice and each place with itself once, at distance 0.
@@ -125,6 +125,10 @@ def _covariance_by_distance(p: Floats, e: Floats, edges: Floats) -> tuple[Floats
     product = tree.count_neighbors(tree, upto, weights=(e, e), cumulative=False)
     pairs[0], product[0] = pairs[0] - len(e), product[0] - e @ e
     return product / np.maximum(pairs, 1.0), 0.5 * pairs
+
+
+_MOST_PAIRED = 1500
+"""Ranges of an anchor whose pairs are counted, at most; more of them show no other correlation, at the square of the cost."""
 
 
 def _fit(
