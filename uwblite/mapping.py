@@ -86,10 +86,10 @@ def build_map(
         if (renamed := anchor_moves.with_moves_apart(estimate, task, logs)) is None:
             break
     # Last of all: moves of anchors are sought on the trajectory before, on which their limits were set.
-    estimate = final_stages.without_range_errors(estimate)
+    estimate, covariance = final_stages.without_range_errors(estimate, task)
     stages.note([recording.log for recording in task.recordings.each])
     grid = final_stages.occupancy_grid(estimate, task)
-    return summary.summarise(estimate, grid, task)
+    return summary.summarise(estimate, covariance, grid, task)
 
 
 _MOST_MOVES = 3

@@ -11,7 +11,6 @@ from uwblite.graph.marginals import (
     calibration_covariance,
     marginals,
     shape_error,
-    with_common_errors,
 )
 from uwblite.graph.solver import optimize
 from uwblite.graph.unknowns import Unknowns, moved
@@ -197,7 +196,7 @@ def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(m
 
     without = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residuals)
     step = without - np.linalg.solve(information, both.T @ residuals)[:size]
-    expected, estimated = moved(graph, Unknowns(number, size), step), with_common_errors(graph, [common])
+    expected, estimated = moved(graph, Unknowns(number, size), step), found.corrected()
     for name in ("poses", "anchors"):
         np.testing.assert_allclose(getattr(estimated, name), getattr(expected, name), atol=1e-7)
     np.testing.assert_allclose(estimated.calibration.values, expected.calibration.values, atol=1e-7)

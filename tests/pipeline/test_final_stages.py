@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.planted_graphs import loop
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
 from uwblite.graph.calibration import CalibrationConfig, block, unknowns
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
+from uwblite.graph.pose_edges import ScanEdges
 from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.keyframes import KeyframeConfig
-from uwblite.pipeline.final_stages import _sweeps, at_given_poses
+from uwblite.pipeline.final_stages import _sweeps, _with_steady_errors, at_given_poses
 from uwblite.pipeline.recordings import gather
 
 
@@ -57,3 +59,21 @@ def test_at_given_poses_only_what_belongs_to_anchors_is_free_and_what_was_fixed_
     assert given.fixed_poses.all()
     assert not given.fixed_anchors.any()
     np.testing.assert_array_equal(given.fixed_calibration, [False, False, True, True, True, True])
+
+
+@pytest.mark.parametrize(("steady", "lidar", "counted"), [(0.1, False, True), (0.0, False, False), (0.1, True, False)])
+def test_what_ranges_err_alike_counts_in_covariances_where_no_lidar_holds_the_poses(monkeypatch, steady, lidar, counted):
+    asked = []
+
+    def learnt(edges, graph, anchors, config, *, steady):
+        asked.append((edges, anchors, steady))
+        return edges, ()
+
+    monkeypatch.setattr("uwblite.pipeline.final_stages.learn_noise", learnt)
+    graph = loop()[0]
+    i, none = np.zeros(1, dtype=int), np.zeros((1, 3))
+    scans = ScanEdges(i, i + 1, none, np.eye(3)[None], none, none, np.full(4, -1))
+    graph = graph.with_edges(scans) if lidar else graph
+    found = _with_steady_errors(graph, 3, replace(MappingConfig().ranges, steady=steady))
+    assert found.edges == graph.edges
+    assert asked == ([(graph.edges[2], 3, True)] if counted else [])

@@ -26,7 +26,6 @@ from uwblite.pipeline.summary import (
     _distrusted,
     _range_table,
     _reason_to_distrust,
-    _with_steady_errors,
     _with_times,
 )
 from uwblite.radio.bootstrap_attempt import BootstrapResult
@@ -218,24 +217,6 @@ def test_an_anchor_is_distrusted_for_a_reason(used, sigma, longest, bias, scatte
     found = _reason_to_distrust(used, sigma, longest, bias, scatter)
     assert bool(found) == bool(reason)
     assert reason in found
-
-
-@pytest.mark.parametrize(("steady", "lidar", "counted"), [(0.1, False, True), (0.0, False, False), (0.1, True, False)])
-def test_what_ranges_err_alike_counts_in_covariances_where_no_lidar_holds_the_poses(monkeypatch, steady, lidar, counted):
-    asked = []
-
-    def learnt(edges, graph, anchors, config, *, steady):
-        asked.append((edges, anchors, steady))
-        return edges, ()
-
-    monkeypatch.setattr("uwblite.pipeline.summary.learn_noise", learnt)
-    graph = loop()[0]
-    i, none = np.zeros(1, dtype=int), np.zeros((1, 3))
-    scans = ScanEdges(i, i + 1, none, np.eye(3)[None], none, none, np.full(4, -1))
-    graph = graph.with_edges(scans) if lidar else graph
-    found = _with_steady_errors(graph, 3, replace(MappingConfig().ranges, steady=steady))
-    assert found.edges == graph.edges
-    assert asked == ([(graph.edges[2], 3, True)] if counted else [])
 
 
 def anchor_of(found=None, ranges=None, recordings=None, k=1, limit=0.2):

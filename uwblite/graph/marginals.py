@@ -43,14 +43,57 @@ class CommonErrors:
     """(k,) kind of each error: those of one have one variance, of which 1 is a guess."""
 
 
-class _Solved:
-    """A graph's measurements, linearised and factorised."""
+class Marginals:
+    """Covariances of the unknowns of a graph given all its measurements.
 
-    def __init__(self, graph: Graph, normal: NormalEquations) -> None:
+    Zero where an unknown is fixed, infinite on the diagonal where no edge touches it. A direction that edges
+    leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
+    """
+
+    def __init__(
+        self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = (), among: ArrayLike = ()
+    ) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
         self._factor = factor_of(normal)
+        unseen = np.append(normal.diagonal <= 0, False)
+        blocks = self._block_diagonal(unseen)
+        self.chosen = np.asarray(among, dtype=np.int64)
+        """(k,) poses of which `among` is."""
+        self._chosen = self.unknowns.number["poses"][self.chosen].ravel()
+        self.among = self.columns(self._chosen)[self._chosen]
+        """(3 k, 3 k) covariance of the k chosen poses with each other, x, y, theta of each in turn."""
+        self._correction = np.zeros(self.unknowns.size)
+        for errors in common:
+            self._add_common(errors, blocks)
+        self.poses = blocks["poses"]
+        """(n, 3, 3) of x, y, theta, map frame, m and rad."""
+        self.anchors = blocks["anchors"]
+        """(a, 2, 2) m^2, map frame."""
+        self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
+        """(c,) standard deviations, unit by name."""
 
-    def estimated(self, common: CommonErrors) -> tuple[sparse.csc_matrix, Floats, Floats]:
+    def corrected(self) -> Graph:
+        """Return the graph, an optimised one, at the optimum that it has when its common errors are estimated with all else.
+
+        To first order, as errors of a centimetre are; what edges have in common changes no other weight. (Best linear
+        unbiased prediction: C. R. Henderson, Biometrics 31, 1975.)
+        """
+        return moved(self._graph, self.unknowns, self._correction)
+
+    def _add_common(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
+        """Add what estimated common errors u make: H^-1 J^T W S times u to the estimates, times their covariance to these."""
+        slopes, errors, covariance = self._estimated(common)
+        self._correction -= self._factor.solve(slopes @ errors)
+        root = np.linalg.cholesky(covariance + _DEPENDENT * np.eye(len(covariance)))
+        for first in range(0, len(root), _COMMON_AT_ONCE):
+            moves = self._factor.solve(slopes @ root[:, first : first + _COMMON_AT_ONCE])
+            moves = np.concatenate([moves, np.zeros((1, moves.shape[1]))])
+            for name, number in self.unknowns.number.items():
+                own = moves[number]
+                blocks[name] += own @ own.transpose(0, 2, 1)
+            self.among += moves[self._chosen] @ moves[self._chosen].T
+
+    def _estimated(self, common: CommonErrors) -> tuple[sparse.csc_matrix, Floats, Floats]:
         """Estimate errors that edges have in common: J^T W s of each as a column, their values (k,) and covariance (k, k).
 
         The errors u are unknowns with the prior N(0, G); how large those of each kind are, the residuals say, see
@@ -68,11 +111,6 @@ class _Solved:
         inside = np.linalg.inv(root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root)))
         covariance = root[:, None] * inside * root
         return slopes, -covariance @ seen, covariance
-
-    def shift(self, common: CommonErrors) -> Floats:
-        """Return by how much (size,) the unknowns at the optimum change when common errors are estimated with them."""
-        slopes, errors, _ = self.estimated(common)
-        return -np.asarray(self._factor.solve(slopes @ errors))
 
     def _seen(self, common: CommonErrors) -> tuple[Floats, Floats]:
         """Return S^T W r (k,) and S^T W S (k, k)."""
@@ -100,44 +138,6 @@ class _Solved:
             free = row >= 0
             right = right + sparse.csc_matrix((slope[free], (row[free], error[free])), shape=right.shape)
         return right
-
-
-class Marginals(_Solved):
-    """Covariances of the unknowns of a graph given all its measurements.
-
-    Zero where an unknown is fixed, infinite on the diagonal where no edge touches it. A direction that edges
-    leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
-    """
-
-    def __init__(
-        self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = (), among: ArrayLike = ()
-    ) -> None:
-        super().__init__(graph, normal)
-        unseen = np.append(normal.diagonal <= 0, False)
-        blocks = self._block_diagonal(unseen)
-        self._chosen = self.unknowns.number["poses"][np.asarray(among, dtype=np.int64)].ravel()
-        self.among = self.columns(self._chosen)[self._chosen]
-        """(3 k, 3 k) covariance of the k chosen poses with each other, x, y, theta of each in turn."""
-        for errors in common:
-            self._add_common(errors, blocks)
-        self.poses = blocks["poses"]
-        """(n, 3, 3) of x, y, theta, map frame, m and rad."""
-        self.anchors = blocks["anchors"]
-        """(a, 2, 2) m^2, map frame."""
-        self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
-        """(c,) standard deviations, unit by name."""
-
-    def _add_common(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
-        """Add to the covariances what the uncertainty of estimated common errors makes: that of u times H^-1 J^T W S."""
-        slopes, _, covariance = self.estimated(common)
-        root = np.linalg.cholesky(covariance + _DEPENDENT * np.eye(len(covariance)))
-        for first in range(0, len(root), _COMMON_AT_ONCE):
-            moves = self._factor.solve(slopes @ root[:, first : first + _COMMON_AT_ONCE])
-            moves = np.concatenate([moves, np.zeros((1, moves.shape[1]))])
-            for name, number in self.unknowns.number.items():
-                own = moves[number]
-                blocks[name] += own @ own.transpose(0, 2, 1)
-            self.among += moves[self._chosen] @ moves[self._chosen].T
 
     def _block_diagonal(self, unseen: Bools) -> dict[str, Floats]:
         """Return by block of unknowns the covariance of each with itself."""
@@ -242,16 +242,6 @@ def shape_error(poses: Floats, covariance: Floats) -> float:
     turn = places @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     q = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(poses), 1)), turn.ravel(), places.ravel()]))[0]
     return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
-
-
-def with_common_errors(graph: Graph, common: Sequence[CommonErrors]) -> Graph:
-    """Return an optimised graph at the optimum that it has when common errors are estimated with everything else.
-
-    To first order, as errors of a centimetre are; what edges have in common changes no other weight. (Best linear unbiased
-    prediction: C. R. Henderson, Biometrics 31, 1975.)
-    """
-    solved = _Solved(graph, filled(graph, subtrees=True))
-    return moved(graph, solved.unknowns, sum((solved.shift(errors) for errors in common), np.zeros(solved.unknowns.size)))
 
 
 def calibration_covariance(graph: Graph) -> Floats:

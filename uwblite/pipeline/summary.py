@@ -9,16 +9,12 @@ from .. import se2
 from ..arrays import Bools, Floats, spread_about_median
 from ..graph.calibration import Unknown, unknowns
 from ..graph.graph import Graph
-from ..graph.marginals import Marginals, marginals, shape_error
+from ..graph.marginals import Marginals, shape_error
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
-from ..lidar.joint_refinement import with_fewer_pairs
-from ..lidar.surface_errors import common_range_errors
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
-from ..odometry.wheels import with_noise_shown
 from ..radio.anchor_covariance import by_alike_errors
-from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
 from . import plausibility
 from .anchor_moves import name_and_number
@@ -30,8 +26,6 @@ from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not speak against all anchors."""
-_ALONG = 60
-"""Poses along the trajectory whose errors stand for those of all."""
 _AGREE = 0.5
 """Share of an anchor's ranges that must agree with the map."""
 _NO_BIAS = 1.6
@@ -40,12 +34,9 @@ _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
 
 
-def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> MapResult:
+def summarise(estimate: Estimate, covariance: Marginals, grid: OccupancyGrid | None, task: Task) -> MapResult:
     """Gather the result; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
-    stated = _with_steady_errors(with_noise_shown(with_fewer_pairs(graph)), len(estimate.anchor_ids), task.config.ranges)
-    along = np.unique(np.linspace(0, len(graph.poses) - 1, _ALONG).round().astype(np.int64))
-    covariance = marginals(stated, common_range_errors(stated), among=along)
     covariance.anchors += _by_alike_ranges(estimate, task.config.ranges)
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
@@ -66,9 +57,8 @@ def summarise(estimate: Estimate, grid: OccupancyGrid | None, task: Task) -> Map
         _calibration(k, listed[key], graph, covariance, by_steps.get(key.label)) for k, key in enumerate(graph.calibration.keys)
     )
     table = {} if ranges is None else _range_table(ranges, graph, residuals, weights, np.abs(residuals) < limit, recordings)
-    plausibility.judge(
-        estimate, anchors, calibrated, listed, table, grid, shape_error(graph.poses[along], covariance.among), task
-    )
+    shape = shape_error(graph.poses[covariance.chosen], covariance.among)
+    plausibility.judge(estimate, anchors, calibrated, listed, table, grid, shape, task)
     anchors = _distrusted(anchors, stages.doubts)
     stages.end("summary")
     stamps = [recording.trajectory_stamps for recording in recordings.each]
@@ -96,19 +86,6 @@ def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Notice]) -
     if all(doubt.kind in _ABOUT_PARTS for doubt in doubts):
         return anchors
     return tuple(replace(a, status="distrusted", reason="the map is doubted") if a.status == "ok" else a for a in anchors)
-
-
-def _with_steady_errors(graph: Graph, anchors: int, config: RangeNoiseConfig) -> Graph:
-    """Return the graph with ranges that count once what they err alike by direction and distance; poses stay where they are.
-
-    Where a lidar holds the poses, the final optimisation has done so. Where ranges alone do, the poses follow such errors as
-    the anchors do, and no residual shows it.
-    """
-    if config.steady == 0.0 or any(isinstance(e, ScanEdges) for e in graph.edges):
-        return graph
-    return replace(graph, edges=tuple(
-        learn_noise(e, graph, anchors, config, steady=True)[0] if isinstance(e, RangeEdges) else e for e in graph.edges
-    ))  # fmt: skip
 
 
 def _by_alike_ranges(estimate: Estimate, config: RangeNoiseConfig) -> Floats:
