@@ -133,8 +133,38 @@ def test_a_range_that_stands_while_the_robot_moves(count, speed, value, left_out
     wrong = (anchor == 0) & (stamps >= 10) & (stamps < 10 + count) & left_out
     np.testing.assert_array_equal(done.ranges.stamps, stamps[~wrong])
     np.testing.assert_array_equal(done.ranges.anchor, anchor[~wrong])
-    said = f"anchor A repeats one range to the last digit while the robot moves (t = 10 to {9 + count} s)"
+    said = f"anchor A repeats one range while the robot moves (t = 10 to {9 + count} s)"
     assert [r.text.split(";")[0] for r in remarks] == [said] * left_out
+
+
+@pytest.mark.parametrize(
+    ("noise", "rounded", "jitter", "found"),
+    [(0.03, 0.001, 0.0, True), (0.03, 0.001, 0.01, True), (0.03, 0.01, 0.01, True), (0.03, 0.001, 0.03, False),
+     (0.1, 0.001, 0.03, True), (0.005, 0.001, 0.01, False), (0.03, 0.1, 0.0, False), (0.03, 1.0, 0.0, False)],
+)  # fmt: skip
+def test_a_range_stands_when_it_scatters_far_less_than_the_radio(noise, rounded, jitter, found):
+    """Two anchors that the robot drives about; the second one's ranges stand at 4 m from 40 to 80 s, but for a jitter."""
+    rng = np.random.default_rng(3)
+    stamps, anchor = np.repeat(np.arange(0.0, 100.0, 0.5), 2), np.tile([0, 1], 200)
+    values = 6.0 + 4.0 * np.sin(0.1 * stamps + anchor) + rng.normal(0.0, noise, 400)
+    stands = (anchor == 1) & (stamps >= 40.0) & (stamps < 80.0)
+    values[stands] = 4.0 + rng.uniform(-jitter, jitter, stands.sum())
+    log = SensorLog(driving(0.5), ranges(stamps, np.round(values / rounded) * rounded, anchor))
+    done, remarks = without_repeated_ranges(log)
+    assert len(remarks) == found
+    assert abs(len(done.ranges.stamps) - (400 - found * stands.sum())) <= 2
+
+
+@pytest.mark.parametrize("rounded", [0.001, 0.01, 0.1, 1.0])
+def test_a_robot_on_a_circle_about_an_anchor_measures_rightly(rounded):
+    """The range to the middle changes by its noise alone; of a robot that stands, those to both."""
+    stamps, anchor = np.repeat(np.arange(0.0, 100.0, 0.2), 2), np.tile([0, 1], 500)
+    noise = np.random.default_rng(4).normal(0.0, 0.03, 1000)
+    values = np.where(anchor == 0, 3.0, np.hypot(3.0 * np.cos(0.2 * stamps) - 5.0, 3.0 * np.sin(0.2 * stamps))) + noise
+    for speed in (0.6, 0.0):
+        driven = values if speed else np.where(anchor == 0, 3.0, 5.0) + noise
+        log = SensorLog(driving(speed), ranges(stamps, np.round(driven / rounded) * rounded, anchor))
+        assert without_repeated_ranges(log) == (log, [])
 
 
 def test_ranges_written_twice_count_once_and_where_all_are_stuck_none_is_left():

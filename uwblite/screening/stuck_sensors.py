@@ -5,13 +5,27 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats, runs_of
+from ..arrays import Bools, Floats, runs_of, white_noise
 from ..sensor_log import Remark, SensorLog
 
 _SAME_RANGES = 12
-"""Equal ranges in a row that no radio gives while the robot moves: their noise is centimetres, their resolution millimetres."""
+"""Ranges in a row that stand still at least."""
 _MOVED = 0.5
-"""Travelled distance, m, over which a range of noise alone would not stay the same to the last digit."""
+"""Travelled distance, m, from which on a robot is elsewhere."""
+_NEW_PLACE = 0.01
+"""Travelled distance, m, after which a range is a new measurement, for a robot that hardly moves."""
+_UNLIKELY = 25.0
+"""Negative logarithm of a probability that no recording's number of stretches makes likely."""
+_MIDDLE = (0.05, 0.95)
+"""Quantiles between which ranges count as standing; about the ends of a stretch some do not."""
+_FINEST, _FINEST_STEP = 0.02, 0.001
+"""Quantile of the steps between values that occur, and the finest resolution that counts, m."""
+_CHANGES, _STEPS = 0.2, 4.0
+"""Change of a range, m and in steps of its resolution, with which it is measured and not repeated."""
+_QUIET, _ENOUGH = 0.25, 8
+"""Quantile of the noise of stretches that stands for sight, and stretches without which the noise is not known."""
+_USUAL_NOISE, _LEAST_NOISE = 0.03, 0.005
+"""Noise of such radios, m, where the recording does not show it, and the least that is assumed."""
 _SAME_SCANS = 3
 """Equal scans in a row that no lidar gives: some beam of hundreds always changes."""
 _LEAST_SEEN = 10
@@ -92,29 +106,75 @@ _FEW_BEAMS = 32
 
 
 def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Leave out ranges that repeat themselves to the last digit while the robot moves, and ranges written twice."""
+    """Leave out ranges that stand still while the robot moves, and ranges written twice.
+
+    Noise lets n ranges in a row lie within a width w with a probability of at most (w / (sigma sqrt(2 pi)))^n, wherever the
+    robot drives: on a circle about the anchor, too. w is at least a step of the radio's resolution, so that ranges rounded to
+    more than their noise repeat themselves rightly.
+    """
     ranges = log.ranges
     if ranges is None or len(ranges.stamps) < 2:
         return log, []
     travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
     wrong, remarks, start = np.zeros(len(ranges.stamps), dtype=bool), [], float(log.odometry.stamps[0])
-    for anchor, name in enumerate(ranges.anchor_ids):
+    for anchor in range(len(ranges.anchor_ids)):
         own = np.flatnonzero(ranges.anchor == anchor)
-        same = np.concatenate([[False], np.diff(ranges.ranges[own]) == 0.0])
-        twice = same & np.concatenate([[False], np.diff(ranges.stamps[own]) == 0.0])
-        stuck = np.zeros(len(own), dtype=bool)
-        for first, last in runs_of(same & ~twice):
-            far = travelled[own[last - 1]] - travelled[own[first - 1]] > _MOVED
-            if last - first >= _SAME_RANGES and far and ranges.ranges[own[first]] > 0.0:
-                stuck[first - 1 : last] = True
+        wrong[own[1:]] = (np.diff(ranges.ranges[own]) == 0.0) & (np.diff(ranges.stamps[own]) == 0.0)
+    usable = ~wrong & (ranges.ranges > 0.0)
+    each = [np.flatnonzero(usable & (ranges.anchor == anchor)) for anchor in range(len(ranges.anchor_ids))]
+    resolution = _resolution(ranges.ranges[usable])
+    sigma = _noise([ranges.ranges[own] for own in each], resolution)
+    for name, own in zip(ranges.anchor_ids, each, strict=True):
+        stuck = _standing(ranges.ranges[own], travelled[own], resolution, sigma)
         if stuck.any():
             when = _when(ranges.stamps[own], stuck, start)
-            text = f"anchor {name} repeats one range to the last digit while the robot moves ({when}); these were left out"
+            text = f"anchor {name} repeats one range while the robot moves ({when}); these were left out"
             remarks.append(Remark("repeated-ranges", text))
-        wrong[own[twice | stuck]] = True
+        wrong[own[stuck]] = True
     if not wrong.any():
         return log, []
     return replace(log, ranges=None if wrong.all() else ranges.rows(~wrong)), remarks
+
+
+def _standing(values: Floats, travelled: Floats, resolution: float, sigma: float) -> Bools:
+    """Return which of one anchor's ranges (m,) stand still while the robot travels; resolution and sigma of all, m."""
+    stuck = np.zeros(len(values), dtype=bool)
+    if len(values) < _SAME_RANGES:
+        return stuck
+    ends = np.ptp(np.lib.stride_tricks.sliding_window_view(values, _SAME_RANGES), axis=1)
+    for most in (0.0, sigma):
+        for first, last in runs_of(ends <= most):
+            last += _SAME_RANGES - 1
+            low, high = np.quantile(values[first:last], _MIDDLE)
+            density = (high - low + resolution) / (sigma * np.sqrt(2.0 * np.pi))
+            way = travelled[last - 1] - travelled[first]
+            count = min(last - first, way / _NEW_PLACE)
+            unlikely = density < 1.0 and -count * np.log(density) > _UNLIKELY
+            # Where some repeat themselves to the last digit, those about them may be measured.
+            stuck[first:last] |= way > _MOVED and unlikely and not stuck[first:last].any()
+    return stuck
+
+
+def _resolution(values: Floats) -> float:
+    """Return the step in which ranges (m,) come, m; far less than their noise where they are not rounded."""
+    steps = np.diff(np.unique(np.round(values, 4)))
+    return max(float(np.quantile(steps, _FINEST)), _FINEST_STEP) if len(steps) else _FINEST_STEP
+
+
+def _noise(each: list[Floats], resolution: float) -> float:
+    """Return the noise of the quieter ranges, m: by stretches in which the range to an anchor clearly changes.
+
+    Parameters
+    ----------
+    each : ranges of each anchor (m,), m. resolution : m; rounding looks like noise of up to 0.6 times as much.
+    """
+    found = []
+    for values in each:
+        parts = [values[k : k + _SAME_RANGES] for k in range(0, len(values) - _SAME_RANGES + 1, _SAME_RANGES)]
+        found += [white_noise(part) for part in parts if np.ptp(part) > max(_CHANGES, _STEPS * resolution)]
+    if len(found) < _ENOUGH:
+        return _USUAL_NOISE
+    return float(np.sqrt(max(np.quantile(found, _QUIET) ** 2 - (0.5 * resolution) ** 2, _LEAST_NOISE**2)))
 
 
 def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
