@@ -284,16 +284,19 @@ def test_every_check_is_made_once(monkeypatch, ranges_used):
 
 @pytest.mark.parametrize(("statuses", "warnings", "doubts"), [
     (("ok", "mirror-ambiguous"), ["anchor-mirror-ambiguous"], []),
-    (("mirror-ambiguous", "distrusted"), ["anchor-distrusted"], ["anchor-mirror-ambiguous"]),
+    (("mirror-ambiguous", "distrusted"), ["anchor-distrusted"], ["anchor-mirror-ambiguous", "ranges-disagree"]),
     (("unplaced", "unplaced"), ["anchor-unplaced"] * 2, ["no-anchor"]), (("ok", "ok"), [], []),
+    (("ok", "ok", "distrusted", "unplaced"), ["anchor-distrusted", "anchor-unplaced"], []),
+    (("ok", "distrusted", "unplaced"), ["anchor-distrusted", "anchor-unplaced"], ["ranges-disagree"]),
 ])  # fmt: skip
-def test_anchors_that_are_not_ok_are_named(statuses, warnings, doubts):
-    """Mirror images are a doubt where no anchor has one place alone."""
+@pytest.mark.parametrize("lidar", [False, True])
+def test_anchors_that_are_not_ok_are_named(statuses, warnings, doubts, lidar):
+    """Mirror images are a doubt where no anchor has one place alone, and half of the anchors distrusted where no lidar is."""
     anchors = [AnchorEstimate(f"A{k}", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, s, "why") for k, s in enumerate(statuses)]
     stages = Stages(None, None)
-    check_anchors(anchors, SimpleNamespace(stages=stages))
+    check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=lidar)))
     assert [n.kind for n in stages.warnings] == warnings
-    assert [n.kind for n in stages.doubts] == doubts
+    assert [n.kind for n in stages.doubts] == [kind for kind in doubts if not (lidar and kind == "ranges-disagree")]
 
 
 @pytest.mark.parametrize(("accepted", "contradicted", "other", "placed", "grid", "kind"), [

@@ -79,7 +79,7 @@ half a metre; rooms mapped by odometry and ranges have 0.08 to 0.15 m."""
 
 
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
-    """Name anchors that are not ok, and doubt a map with which most ranges disagree.
+    """Name anchors that are not ok, and doubt a map with which most ranges, or without a lidar half of the anchors, disagree.
 
     Where no anchor in reach has one place alone, their mirror ambiguity is a doubt, too.
     """
@@ -100,8 +100,17 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
             "or the trajectory is wrong"
         )
         task.stages.doubt("ranges-disagree", text, share=agreeing / count)
+    placed, distrusted = (sum(a.status in kinds for a in anchors) for kinds in (_PLACED, _PLACED[-1:]))
+    if distrusted and 2 * distrusted >= placed and not task.recordings.have_scans:
+        text = (
+            f"{distrusted} of {placed} anchors are distrusted, and nothing but ranges and odometry holds the trajectory: "
+            "it is what is wrong, rather than each of them"
+        )
+        task.stages.doubt("ranges-disagree", text, distrusted=distrusted, placed=placed)
 
 
+_PLACED = ("ok", "mirror-ambiguous", "distrusted")
+"""What anchors with a place are called."""
 _LEAST_AGREEING = 0.3
 """Least share of ranges that agree with a map that is right: where a radio reports every other range as 0, it is 0.4."""
 
