@@ -108,7 +108,7 @@ def test_captured_node_info(shared_data):
     "line",
     [
         b"DIST,4,AN0,0090,0.00,0.00,0.00,3.25,AN1,D91E,0.00,0.00,0.00,3.33,AN3,15BA,0.00,0,AN3,15BA,0.00,0.00,0.00,0.00",
-        b"1HDIST,1,AN0,5004,1.00,1.00,1.00,", b"DIST,0", b"DIST,1,AN0,5004,1.00,1.00,1.00,nan",
+        b"1HDIST,1,AN0,5004,1.00,1.00,1.00,", b"DIST,0,AN0", b"DIST,1,AN0,5004,1.00,1.00,1.00,nan",
         b"DIST,5,AN0,5004,1.00,1.00,1.00,1.00",
         b"DIST,1,AN1,5004,1.00,1.00,1.00,1.00", b"DIST,2,AN0,5004,1.00,1.00,1.00,1.00,AN1,5004,1.00,1.00,1.00,1.00",
         b"DIST,1,AN0,5004,1.00,1.00,1.00,900.00", b"DIST,1,AN0,5004,1.00,1.00,1.00,1.00,POS,1.00,1.00,1.00,101",
@@ -118,6 +118,22 @@ def test_captured_node_info(shared_data):
 )  # fmt: skip
 def test_garbled_lines_are_rejected(line):
     assert [type(e) for e in feed_whole(ShellProtocol, line + b"\r\n")] == [Corrupt]
+
+
+@pytest.mark.parametrize("nan", ["nan", "-nan"])
+def test_ranges_beside_an_estimate_that_is_no_number_are_kept(nan):
+    """The location engine does not converge where anchors are not surveyed; what was measured does not depend on it."""
+    for line, source in ((LEC, "lec"), (LES, "les")):
+        bad = line.decode().replace("1.90,-1.96,0.15,91", f"{nan},{nan},{nan},0").encode()
+        (event,) = feed_whole(ShellProtocol, bad)
+        (whole,) = feed_whole(ShellProtocol, line)
+        assert (event.readings, event.anchors, event.position, event.source) == (whole.readings, whole.anchors, None, source)
+
+
+@pytest.mark.parametrize("line", [b"DIST,0\r\n", b"DIST,0,\r\n"])
+def test_a_line_without_anchors_is_a_line(line):
+    """A tag out of reach reports it; nothing was lost and nothing damaged."""
+    assert feed_whole(ShellProtocol, line) == [RangeLine(1.0, (), (), None, "lec")]
 
 
 def test_a_line_that_broke_off_does_not_take_the_next_one_with_it():

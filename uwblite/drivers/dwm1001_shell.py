@@ -29,7 +29,7 @@ class Prompt:
 
 @dataclass(frozen=True, slots=True)
 class RangeLine:
-    """One line of ``les`` or ``lec``."""
+    """One line of ``les`` or ``lec``; of ``lec`` also without an anchor."""
 
     stamp: float
     """s, arrival of its first byte."""
@@ -37,7 +37,7 @@ class RangeLine:
     anchors: tuple[tuple[float, float, float], ...]
     """Configured positions of the anchors, m."""
     position: tuple[float, float, float, int] | None = None
-    """The module's estimate x, y, z, m, and quality 0..100; missing with fewer than three anchors."""
+    """The module's estimate x, y, z, m, and quality 0..100; None with fewer than three anchors, or where it found none."""
     source: str = "lec"
     """"lec" or "les"."""
 
@@ -71,13 +71,16 @@ COMMANDS = (
 _NUMBER = r"(-?\d{1,6}\.\d\d)"
 _DISTANCE = r"(\d{1,4}\.\d\d)"
 _QUALITY = r"(\d{1,3})"
+_COORDINATE = r"(-?\d{1,6}\.\d\d|-?nan)"
+_ESTIMATE = rf"{_COORDINATE},{_COORDINATE},{_COORDINATE},{_QUALITY}"
+"""Of the module's location engine, which may not converge; the ranges beside it are good."""
 _BLOCK = re.compile(rf"([0-9A-F]{{4}})\[{_NUMBER},{_NUMBER},{_NUMBER}\]={_DISTANCE}")
 _LES = re.compile(
     rf"((?:{_BLOCK.pattern.replace('(', '(?:')} )*{_BLOCK.pattern.replace('(', '(?:')})"
-    rf"(?: le_us=\d{{1,9}})?(?: est\[{_NUMBER},{_NUMBER},{_NUMBER},{_QUALITY}\])?$"
+    rf"(?: le_us=\d{{1,9}})?(?: est\[{_ESTIMATE}\])?$"
 )
 _LEC_ROW = re.compile(rf"AN(\d),([0-9A-F]{{4}}),{_NUMBER},{_NUMBER},{_NUMBER},{_DISTANCE}(?:,|$)")
-_POS = re.compile(rf"POS,{_NUMBER},{_NUMBER},{_NUMBER},{_QUALITY}$")
+_POS = re.compile(rf"POS,{_ESTIMATE}$")
 _LISTENER = re.compile(rf"POS,\d{{1,3}},([0-9A-F]{{4}}),{_NUMBER},{_NUMBER},{_NUMBER},{_QUALITY},x[0-9a-fA-F]{{2}}$")
 _LOG_ROW = re.compile(r"\[\d{6,}\.\d{3} [A-Z]{3}\] ")
 _ANSWER = re.compile(
@@ -129,11 +132,11 @@ def _find_lec(text: str, stamp_at: StampAt) -> Found:
     if start < 0:
         return 0, None
     bad = corrupt(text.encode("latin-1"), "lec line cut or garbled")
-    head = re.match(r"DIST,(\d),", text[start:])
-    if not head or not 1 <= int(head[1]) <= 4:
+    head = re.match(r"DIST,(?:([1-4]),|(0),?$)", text[start:])
+    if not head:
         return start, bad
     at, readings, anchors = start + head.end(), [], []
-    for index in range(int(head[1])):
+    for index in range(int(head[1] or 0)):
         row = _LEC_ROW.match(text, at)
         if not row or int(row[1]) != index:
             return start, bad
@@ -141,7 +144,7 @@ def _find_lec(text: str, stamp_at: StampAt) -> Found:
         anchors.append((float(row[3]), float(row[4]), float(row[5])))
         at = row.end()
     position = None
-    if at < len(text) or text.endswith(","):
+    if head[1] and (at < len(text) or text.endswith(",")):
         estimate = _POS.match(text, at)
         if not estimate:
             return start, bad
@@ -197,7 +200,9 @@ def _find_text(text: str, stamp_at: StampAt) -> Found:
     return 0, TextLine(stamp_at(0), stripped) if known and stripped.isprintable() else None
 
 
-def _position(groups: Sequence[str]) -> tuple[float, float, float, int]:
+def _position(groups: Sequence[str]) -> tuple[float, float, float, int] | None:
+    if any("nan" in text for text in groups):
+        return None
     x, y, z, quality = groups
     return float(x), float(y), float(z), int(quality)
 
