@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from uwblite.errors import DataError
-from uwblite.screening.units import heading_agreement, refuse_degrees, refuse_wrong_lengths
-from uwblite.sensor_log import LaserScans, Odometry, SensorLog, UwbRanges
+from uwblite.screening.units import heading_agreement, refuse_degrees, refuse_wrong_lengths, refuse_wrong_times
+from uwblite.sensor_log import Gyro, LaserScans, Odometry, SensorLog, UwbRanges
 
 
 def straight(speed=0.3, seconds=20.0, period=0.1):
@@ -159,3 +159,42 @@ def test_readings_that_jitter_within_a_fifth_of_a_metre_agree_nevertheless():
     jitter = 0.01 * np.random.default_rng(1).standard_normal((len(path.stamps), 2))
     shaken = replace(path, poses=path.poses + np.column_stack([jitter, np.zeros(len(jitter))]))
     assert heading_agreement(shaken)[0] > 0.97
+
+
+def times_said(log):
+    try:
+        refuse_wrong_times(log)
+    except DataError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(("unit", "name"), [(1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")])
+@pytest.mark.parametrize("speed", [0.05, 0.3, 2.0])
+@pytest.mark.parametrize("period", [0.01, 0.05, 0.5])
+def test_stamps_of_a_recording(unit, name, speed, period):
+    log = SensorLog(straight(speed, period=period), ranges([3.0] * 40), scans(3.0, 20))
+    assert times_said(log) == ""
+    text = times_said(log.with_time_unit(1.0 / unit))
+    assert name in text
+    assert float(factor(text)) == unit
+
+
+def test_slow_robots_and_seldom_readings_are_in_seconds():
+    """A reading for every keyframe, a stamp for every message, a crawl at a usual rate, and a robot that stands."""
+    for speed, period in ((0.1, 10.0), (0.03, 2.0), (0.001, 0.1), (0.0, 100.0)):
+        assert times_said(SensorLog(straight(speed, 100.0 * period, period))) == ""
+
+
+def test_one_sensor_s_stamps():
+    log = SensorLog(straight(), ranges([3.0] * 40), scans(3.0, 20))
+    log = replace(log, gyro=Gyro(log.odometry.stamps, np.zeros(len(log.odometry.stamps))))
+    for name, what in (("ranges", "radio"), ("scans", "lidar"), ("gyro", "gyro")):
+        sensor = getattr(log, name)
+        for unit, word in ((1e3, "milliseconds"), (1e9, "nanoseconds")):
+            moved = replace(sensor, stamps=1.7e9 * unit + sensor.stamps * unit)
+            assert f"stamps of the {what} look like {word}" in times_said(replace(log, **{name: moved}))
+    ms = replace(log.odometry, stamps=1e3 * log.odometry.stamps)
+    assert "stamps of the odometry look like milliseconds" in times_said(replace(log, odometry=replace(ms, poses=0 * ms.poses)))
+    # A sensor that was started late, or died, is of the same clock.
+    assert times_said(replace(log, ranges=replace(log.ranges, stamps=0.001 * log.ranges.stamps))) == ""

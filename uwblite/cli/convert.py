@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     unit = number(above=0)
     part.add_argument("--start", metavar="S", type=number(), help="leave out what is earlier, s after the first odometry")
     part.add_argument("--end", metavar="S", type=number(), help="leave out what is later, s after the first odometry")
+    part.add_argument("--time-unit", metavar="S", type=unit, default=1.0, help="seconds per unit of the stamps (1)")
     part.add_argument("--odometry-unit", metavar="M", type=unit, default=1.0, help="metres per unit of the odometry (1)")
     part.add_argument("--angle-unit", metavar="RAD", type=unit, default=1.0, help="radians per unit of its heading (1)")
     part.add_argument("--range-unit", metavar="M", type=unit, default=1.0, help="metres per unit of the ranges (1)")
@@ -242,9 +243,11 @@ def _write(args: argparse.Namespace, to: str, log: "SensorLog") -> None:
 
 
 def _scaled(log: "SensorLog", args: argparse.Namespace) -> "SensorLog":
-    """Return the recording in metres and radians."""
+    """Return the recording in metres, radians and seconds."""
     import dataclasses
 
+    if args.time_unit != 1.0:
+        log = log.with_time_unit(args.time_unit)
     odometry = dataclasses.replace(
         log.odometry, poses=log.odometry.poses * (args.odometry_unit, args.odometry_unit, args.angle_unit)
     )

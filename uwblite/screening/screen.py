@@ -43,6 +43,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     if log.screening is not None:
         return log
     clocks.refuse_without_stamps(log)
+    units.refuse_wrong_times(log)
     remarks = [*clocks.set_back(log), *clocks.made_up(log)]
     log, set_right = clocks.without_jumps(log)
     log, outside = clocks.within_odometry(log)

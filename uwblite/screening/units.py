@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..arrays import Floats
 from ..errors import DataError
 from ..sensor_log import Odometry, SensorLog
 
@@ -21,6 +22,13 @@ _CHORD = 1.0
 """Time over which speed is taken, s: readings of two robots by turns, or in bursts, jump from one to the next."""
 _ENOUGH = 10
 """Readings from which a unit is judged."""
+_TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+_SELDOM = 1.0
+"""Time between readings of the odometry, s, up to which stamps are taken for seconds."""
+_PERIODS, _SPEEDS = (5e-4, 2.0), (0.01, _FAR_TOO_FAST)
+"""Times between readings, s, and highest usual speeds, m/s, of a robot: what the right unit of time gives."""
+_SAME_LENGTH = 2.0
+"""Sensors of one recording last equally long to this factor."""
 _AGREEMENT = 0.7
 """Agreement of heading and direction of motion below which the heading is not the path's."""
 _CLEARLY = 0.2
@@ -32,6 +40,13 @@ def refuse_wrong_lengths(log: SensorLog) -> None:
     found = [text for text in (_positions(log.odometry), _of_ranges(log), _of_scans(log)) if text]
     if found:
         raise DataError("; ".join(found))
+
+
+def refuse_wrong_times(log: SensorLog) -> None:
+    """Raise DataError where stamps have plainly another unit than seconds."""
+    text = _odometry_stamps(log.odometry) or _other_stamps(log)
+    if text:
+        raise DataError(text)
 
 
 def refuse_degrees(odometry: Odometry) -> None:
@@ -64,15 +79,67 @@ def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, b
     return float(np.abs(np.sum(weight * np.exp(2j * (direction - factor * half)))) / np.sum(weight)), bool(varied)
 
 
-def _positions(odometry: Odometry) -> str:
+def _odometry_stamps(odometry: Odometry) -> str:
+    """Return the words on stamps with which neither the time between readings nor the speed is a robot's."""
+    period, speeds = _period(odometry.stamps), _speeds(odometry)
+    if period <= _SELDOM or len(speeds) < _ENOUGH:
+        return ""
+    fast = float(np.quantile(speeds, 0.9))
+    for name, unit in _TIMES.items():
+        if _PERIODS[0] <= period * unit <= _PERIODS[1] and _SPEEDS[0] <= fast / unit <= _SPEEDS[1]:
+            return (
+                f"the stamps look like {name}: the odometry would come every {period:.3g} s, at {fast:.1g} m/s; "
+                f"write seconds into the log (uwblite convert --time-unit {unit:g})"
+            )
+    return ""
+
+
+def _other_stamps(log: SensorLog) -> str:
+    """Return the words on a sensor whose stamps have another unit than the odometry's."""
+    wheels = log.odometry.stamps
+    for what, sensor in (("gyro", log.gyro), ("radio", log.ranges), ("lidar", log.scans)):
+        if sensor is None or len(sensor.stamps) < _ENOUGH:
+            continue
+        name = _finer(sensor.stamps, wheels)
+        odd, name = (what, name) if name else ("odometry", _finer(wheels, sensor.stamps))
+        if name:
+            return (
+                f"the stamps of the {odd} look like {name}: odometry and {what} would last {np.ptp(wheels):.4g} s and "
+                f"{np.ptp(sensor.stamps):.4g} s; write every stamp in seconds"
+            )
+    return ""
+
+
+def _finer(stamps: Floats, others: Floats) -> str:
+    """Return the unit of stamps (n,) that makes them last as long as others (m,), s, at a sensor's rate; '' without one."""
+    for name, unit in _TIMES.items():
+        alike = np.ptp(others) / _SAME_LENGTH < np.ptp(stamps) * unit < np.ptp(others) * _SAME_LENGTH
+        if alike and _PERIODS[0] <= _period(stamps) * unit <= _PERIODS[1]:
+            return name
+    return ""
+
+
+def _period(stamps: Floats) -> float:
+    """Return the usual time between readings (n,), s."""
+    steps = np.diff(stamps)
+    return float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 0.0
+
+
+def _speeds(odometry: Odometry) -> Floats:
+    """Return the speeds (k,), m/s, of the readings that move, each taken over a second or to the next reading."""
     first = np.arange(len(odometry.stamps) - 1)
     second = np.minimum(np.searchsorted(odometry.stamps, odometry.stamps[first] + _CHORD), len(first))
     span = odometry.stamps[second] - odometry.stamps[first]
     length = np.hypot(*(odometry.poses[second] - odometry.poses[first])[:, :2].T)
     moving = (length > 1e-6) & (span > 0.5 * _CHORD)
-    if moving.sum() < _ENOUGH:
+    return np.asarray(length[moving] / span[moving])
+
+
+def _positions(odometry: Odometry) -> str:
+    speeds = _speeds(odometry)
+    if len(speeds) < _ENOUGH:
         return ""
-    speed = float(np.median(length[moving] / span[moving]))
+    speed = float(np.median(speeds))
     if speed <= _FAR_TOO_FAST:
         return ""
     return _other_unit("the odometry's positions", f"usual speed would be {speed:.0f} m/s", speed > _CENTIMETRES, "odometry")

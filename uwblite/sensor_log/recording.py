@@ -1,8 +1,9 @@
 """One recording as arrays, checked once when it enters, and the checks."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -98,6 +99,10 @@ class SensorLog:
             screening = replace(screening, breaks=breaks, lidar_by_wheels=screening.lidar_by_wheels / factor)
         return replace(self, odometry=odometry, screening=screening)
 
+    def with_time_unit(self, unit: float) -> "SensorLog":
+        """Return the same recording with its stamps multiplied by the seconds of their unit."""
+        return self._of_each(lambda sensor: replace(sensor, stamps=sensor.stamps * unit))
+
     def with_later_scans(self, delay: float) -> "SensorLog":
         """Return the same recording with every scan later by delay, s."""
         if self.scans is None or delay == 0.0:
@@ -111,13 +116,12 @@ class SensorLog:
             first, last = np.searchsorted(sensor.stamps, start, "left"), np.searchsorted(sensor.stamps, end, "right")
             return sensor.rows(slice(int(first), int(last)))
 
-        return replace(
-            self,
-            odometry=cut(self.odometry),
-            ranges=None if self.ranges is None else cut(self.ranges),
-            scans=None if self.scans is None else cut(self.scans),
-            gyro=None if self.gyro is None else cut(self.gyro),
-        )
+        return self._of_each(cut)
+
+    def _of_each(self, change: Callable[[Any], Any]) -> "SensorLog":
+        """Return the recording with every sensor changed."""
+        sensors = {name: getattr(self, name) for name in ("odometry", "ranges", "scans", "gyro")}
+        return replace(self, **{name: change(sensor) for name, sensor in sensors.items() if sensor is not None})
 
 
 def _check(values: Floats, name: str, shape: tuple[int | None, ...], ordered: bool = False, most: float = MOST_SECONDS) -> None:
