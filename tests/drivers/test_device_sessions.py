@@ -122,6 +122,33 @@ def test_lidar_pause_and_hardware_fault_are_named_and_survived():
     assert of_kind(actions, LaserScan)[-1].stamp > START + 14.5
 
 
+def test_status_that_ends_a_stream_is_named():
+    device, _ = lidar()
+    advance, done = device.advance, []
+
+    def scripted(now):
+        if now > START + 3 and not done:
+            done.append(device._stream.echo)
+            device._stream = None
+            return device._block(done[0], "0M")
+        return advance(now)
+
+    device.advance = scripted
+    actions, _ = simulate(ScipDriver(), device, 10.0)
+    (restart,) = [note for note in of_kind(actions, Note) if note.name == "lidar-restart"]
+    assert "status 0M: unstable" in restart.text
+    assert of_kind(actions, LaserScan)[-1].stamp > START + 9.5
+
+
+def test_lidar_on_a_slow_line_begins_in_a_few_seconds():
+    """Over a round trip of 0.2 s more readings of the clock show nothing more."""
+    device, _ = lidar()
+    actions, _ = simulate(ScipDriver(), device, 10.0, latency=0.2)
+    scans = of_kind(actions, LaserScan)
+    assert scans[0].stamp < START + 6.0
+    assert len(scans) > 40
+
+
 def test_lidar_that_is_silent_asks_for_the_port_to_be_opened_again():
     device, _ = lidar()
     device.receive = lambda data, now: b""

@@ -173,6 +173,18 @@ def test_another_device_at_the_port_gives_no_data_and_that_is_reported(tmp_path,
     assert any("no data at all" in doubt for doubt in recorder.doubts())
 
 
+def test_a_tag_that_answers_and_ranges_to_nobody_is_not_called_another_device(tmp_path):
+    """Its line and its bit rate are right: it is out of the anchors' reach."""
+
+    class OutOfReach(TalkingPort):
+        def read(self):
+            return b"DIST,0\r\n" if super().read() else b""
+
+    _, notes = record(tmp_path, {"uwb": ("uwb", "shell:/dev/x")}, 8.0, lambda url, clock: OutOfReach(clock))
+    (text,) = [note.text for _, note in notes if note.name == "uwb-no-data"]
+    assert text.endswith("it answers, but measures nothing")
+
+
 @pytest.mark.parametrize("name", ["line", "gyro-line", "shell", "makerfabs", "scip", "kobuki"])
 def test_a_line_that_never_ends_is_kept_in_part_and_counted(name):
     columns = {"line": "?columns=t,x,y,theta", "gyro-line": "?columns=t,turn_rate"}.get(name, "")

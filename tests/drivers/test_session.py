@@ -82,3 +82,12 @@ def test_what_comes_while_a_script_sleeps_is_kept():
     session.start(0.0)
     assert session.feed(b"ab", 0.5) == []
     assert session.tick(1.0) == [note("heard", "ab")]
+
+
+def test_the_last_thing_that_was_understood_has_a_time():
+    session = Session(Listener(Letters(), "letters"))
+    session.start(1.0)
+    assert session.last_event < 0.0
+    session.feed(b"a", 2.0)
+    session.feed(b"?", 3.0)
+    assert session.last_event == 2.0

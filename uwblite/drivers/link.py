@@ -208,7 +208,9 @@ class Link:
         silent, note = now - max(self.last_message, self.opened), None
         if silent > SILENCE and not self.quiet:
             self._fall_silent()
-            if now - self.last_data < SILENCE:
+            if now - self.session.last_event < SILENCE:
+                why = "it answers, but measures nothing"
+            elif now - self.last_data < SILENCE:
                 why = "bytes come, but no good frame: wrong bit rate, wrong device or a bad cable"
             else:
                 why = "check power and cable; unplug it and plug it in again"

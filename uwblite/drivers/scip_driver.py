@@ -101,7 +101,7 @@ class ScipDriver(ScipUnit):
         refusal = yield from self._begin_stream()
         if refusal:
             return refusal
-        good = self.now
+        good, why = self.now, ""
         until = self.now + max(FIRST_PATIENCE, 20 * self.period)
         durations: list[float] = []  # s that each scan took on the line
         while (event := (yield Wait(until))) is not None:
@@ -109,7 +109,7 @@ class ScipDriver(ScipUnit):
                 # Scans come, but damaged: starting the laser again would only lose more of them.
                 until = max(until, min(self.now + SCAN_PATIENCE, good + NOISE_PATIENCE))
             elif isinstance(event, Distances) and event.command[0] == "M":
-                good, self._rounds = self.now, 0
+                good, why, self._rounds = self.now, "", 0
                 durations.append(self.now - event.stamp)
                 until = self.now + max(SCAN_PATIENCE, 10 * self.period, 3 * durations[-1])
                 yield from self._scan(event)
@@ -123,9 +123,11 @@ class ScipDriver(ScipUnit):
                     yield from self.sleep(FAULT_PAUSE)
                     self._rounds = -1
                     return ""
+                if kind == "refused":
+                    why = f"it broke the stream off, {text}"
                 if kind in ("paused", "resumed"):
                     yield Note("warning" if kind == "paused" else "info", f"lidar-{kind}", f"lidar: {text}")
-        return "no scan for too long"
+        return why or "no scan for too long"
 
     def _begin_stream(self) -> Script[str]:
         self._clock.period = self.period

@@ -24,6 +24,8 @@ SETTLE = 0.1
 PARAMETER_READS = 4
 TIME_READS = 8, 40
 """Readings of the clock, at least and at most; a busy computer needs more of them."""
+TIME_SPENT = 2.0
+"""s after which no more than the least readings are taken: over a slow line more of them show no more."""
 GOOD_TIE = 0.002
 """s to which the clocks should be tied to each other."""
 NOMINAL_SPREAD = 0.035
@@ -144,10 +146,10 @@ class ScipUnit(Driver):
 
     def _tie_clock(self) -> Script[None]:
         """Read the clock a few times in the time-adjust mode; without it, what was measured before stays in force."""
-        entered = yield from self._request("TM0")
+        entered, began = (yield from self._request("TM0")), self.now
         for k in range(TIME_READS[1] if entered and status_meaning("TM0", entered.status)[0] == "ok" else 0):
             sent = self.now
-            if k >= TIME_READS[0] and self._clock.tied < GOOD_TIE:
+            if k >= TIME_READS[0] and (self._clock.tied < GOOD_TIE or sent - began > TIME_SPENT):
                 break
             reply = yield from self._request("TM1", 1)
             if reply is None or not reply.lines:

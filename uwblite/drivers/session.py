@@ -12,6 +12,7 @@ A device that only talks needs no script of its own, only `take`. Nothing here o
 brings `now`, seconds of a monotonic clock.
 """
 
+import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
@@ -142,6 +143,8 @@ class Session:
         self.driver = driver
         self._script: Script[None] | None = None
         self._due: float | None = None
+        self.last_event = -math.inf
+        """s, when the device last sent something that was understood."""
 
     @property
     def baud(self) -> int:
@@ -162,6 +165,8 @@ class Session:
         for event in self.driver.parse(data, now):
             if isinstance(event, Corrupt):
                 actions.append(event)
+            else:
+                self.last_event = now
             actions += self._resume(event)
         return actions
 
