@@ -9,6 +9,7 @@ from ..arrays import Bools, Floats
 from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
+from .shared_names import without_shared_names
 from .wheel_motion import Pairs
 
 _GAP = 2.0
@@ -58,8 +59,9 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     log, turned = heading_from_gyro(replace(log, odometry=odometry))
     remarks += [*_repeats(repeats), *bursts, *glitches, *broken, *turned]
     repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_lidar_marks]
-    repairs += [stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges, directions.heading_with_the_path]
-    for repair in repairs + [directions.laser_upright] * turn_laser:
+    repairs += [stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges, without_shared_names]
+    repairs += [directions.heading_with_the_path] + [directions.laser_upright] * turn_laser
+    for repair in repairs:
         log, more = repair(log)
         remarks += more
     log, gaps, more = _gaps(log)

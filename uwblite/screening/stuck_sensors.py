@@ -122,8 +122,8 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         wrong[own[1:]] = (np.diff(ranges.ranges[own]) == 0.0) & (np.diff(ranges.stamps[own]) == 0.0)
     usable = ~wrong & (ranges.ranges > 0.0)
     each = [np.flatnonzero(usable & (ranges.anchor == anchor)) for anchor in range(len(ranges.anchor_ids))]
-    resolution = _resolution(ranges.ranges[usable])
-    sigma = _noise([ranges.ranges[own] for own in each], resolution)
+    resolution = resolution_of(ranges.ranges[usable])
+    sigma = quiet_noise([ranges.ranges[own] for own in each], resolution)
     for name, own in zip(ranges.anchor_ids, each, strict=True):
         stuck = _standing(ranges.ranges[own], travelled[own], resolution, sigma)
         if stuck.any():
@@ -155,13 +155,13 @@ def _standing(values: Floats, travelled: Floats, resolution: float, sigma: float
     return stuck
 
 
-def _resolution(values: Floats) -> float:
+def resolution_of(values: Floats) -> float:
     """Return the step in which ranges (m,) come, m; far less than their noise where they are not rounded."""
     steps = np.diff(np.unique(np.round(values, 4)))
     return max(float(np.quantile(steps, _FINEST)), _FINEST_STEP) if len(steps) else _FINEST_STEP
 
 
-def _noise(each: list[Floats], resolution: float) -> float:
+def quiet_noise(each: list[Floats], resolution: float) -> float:
     """Return the noise of the quieter ranges, m: by stretches in which the range to an anchor clearly changes.
 
     Parameters
