@@ -187,7 +187,7 @@ def refine(
     i, j = np.where(turned, j, i), np.where(turned, i, j)
     points = pair_points(clouds, j, config.points)
     names = scan_indices(graph.calibration)
-    gate, sigma, rounds, moved = config.first_gate, config.sigma, 0, np.inf
+    gate, sigma, rounds = config.first_gate, config.sigma, 0
     none = np.zeros((0, 3)), np.zeros((0, 3, 3))
     probe = ScanEdges(i, j, *none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
     normal: NormalEquations | None = None
@@ -213,14 +213,12 @@ def refine(
         solved, summary = minimise(problem, linearized, normal, brief)
         graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
         before, T_i_j = T_i_j, probe.relative(graph)
-        earlier, moved = moved, _surfaces_moved(factors, used, T_i_j - before)
+        moved = _surfaces_moved(factors, used, T_i_j - before)
         rounds += 1
         if on_round is not None:
             on_round(rounds, config.rounds)
         last = gate <= config.last_gate * 1.001
-        # Where points lie as near to one line as to another, matches change for ever and go nowhere.
-        wavering = _WAVERING * earlier < moved < _LITTLE * config.convergence
-        if rounds >= config.rounds or (last and (moved < config.convergence or wavering)):
+        if rounds >= config.rounds or (last and moved < config.convergence):
             return RefinementResult(graph, replace(edges.rows(used), weights=None), i, j, factors, used, sigma, rounds, summary)
         # After a step that failed or was braked, as much may be left as before.
         whole = used.any() and summary.chi2_history[0] < summary.chi2_initial
@@ -228,9 +226,6 @@ def refine(
         gate = max(min(gate * config.shrink, _GATE_PER_SHIFT * farthest), config.last_gate)
 
 
-_WAVERING, _LITTLE = 0.8, 2.0
-"""A round that moves surfaces by more than this share of what the one before did, and by less than so many times what is
-asked for, settles nothing; where clouds still settle, it is about half."""
 _GATE_PER_SHIFT = 3.0
 """Gate of a round by the farthest that the one before moved a cloud in the frame of its partner: less than that is left."""
 
