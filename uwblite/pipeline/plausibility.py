@@ -104,7 +104,7 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     if distrusted and 2 * distrusted >= placed and not task.recordings.have_scans:
         text = (
             f"{distrusted} of {placed} anchors are distrusted, and nothing but ranges and odometry holds the trajectory: "
-            "it is what is wrong, rather than each of them"
+            "a wrong trajectory is likelier than so many bad anchors"
         )
         task.stages.doubt("ranges-disagree", text, distrusted=distrusted, placed=placed)
 
