@@ -41,10 +41,12 @@ def test_a_log_goes_to_a_bag_and_back(room_log, tmp_path, capsys, storage):
 
 
 def test_units_and_parts(room_log, tmp_path, capsys):
-    words = ["--odometry-unit", "2", "--range-unit", "10", "--laser-unit", "0.5", "--start", "10", "--end", "20"]
+    units = ["--odometry-unit", "2", "--range-unit", "10", "--laser-unit", "0.5", "--time-unit", "2"]
+    words = [*units, "--start", "20", "--end", "40"]
     assert main(["convert", str(room_log), str(tmp_path / "x.log"), *words, "--laser-flipped"]) == 0
     one, two = read_log(room_log), read_log(tmp_path / "x.log")
     assert len(two.odometry.stamps) == 201
+    np.testing.assert_allclose(two.odometry.stamps, 2 * one.odometry.stamps[200:401])
     np.testing.assert_allclose(two.odometry.poses[:, :2], 2 * one.odometry.poses[200:401, :2], atol=2e-6)
     assert two.scans.range_max == pytest.approx(0.5 * one.scans.range_max)
     assert two.mounting.laser_flipped
@@ -59,10 +61,12 @@ def test_units_and_parts(room_log, tmp_path, capsys):
         (["{log}", "--list"], "not a bag"),
         (["{log}", "x.g2o"], "not a format for a recording"),
         (["missing.bag", "x.log"], "no such file"),
+        (["nothing", "x.log"], "holds no odometry.csv and no ROS 2 bag"),
     ],
 )
 def test_what_cannot_be_converted_is_reported(room_log, tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "nothing").mkdir()
     assert main(["convert", *(w.format(log=room_log) for w in words)]) == 1
     assert message in capsys.readouterr().err
 

@@ -60,6 +60,9 @@ def test_odometry_alone_is_enough_and_order_does_not_matter(tmp_path):
     ("name", "text", "message"),
     [
         ("odometry.csv", "stamp,x,y,theta\n1,2,3\n", r"odometry\.csv:2: 3 columns, expected 4"),
+        ("odometry.csv", "stamp,theta,x\n1,2,3\n", r"odometry\.csv:1: 3 columns, expected stamp,x,y,theta"),
+        ("odometry.csv", "stamp,yaw,x,y\n1,2,3,4\n", r"odometry\.csv:1: 4 columns, expected stamp,x,y,theta"),
+        ("odometry.csv", "stamp;x;y;theta\n1;2;3;4\n", r"odometry\.csv:1: 1 columns, expected stamp,x,y,theta"),
         ("odometry.csv", "stamp,x,y,theta\n1,2,3,nan\n", "'nan' is not a finite number"),
         ("odometry.csv", "stamp,x,y,theta\n", "there are no rows"),
         ("odometry.csv", "", "empty"),
@@ -76,6 +79,39 @@ def test_wrong_files_are_named(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(UwbliteError, match=message):
         read_csv_folder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "stamp,x,y,theta\n1,2,3,4\n5,6,7,8\n", "theta,stamp,y,x\n4,1,3,2\n8,5,7,6\n", "1,2,3,4\n5,6,7,8\n",
+        "\ufeff1,2,3,4\n5,6,7,8\n", "Stamp, X, Y, speed, Theta\r\n1, 2, 3, 99, 4\r\n5, 6, 7, 99, 8\r\n",
+        "t,x,y,yaw\n1,2,3,4\n5,6,7,8\n",
+    ],
+)  # fmt: skip
+def test_columns_are_found_by_their_names_or_their_order(tmp_path, text):
+    """Sorted by another program, with more columns, with a byte order mark, without a header: no row is lost or misread."""
+    (tmp_path / "odometry.csv").write_text(text)
+    odometry = read_csv_folder(tmp_path).odometry
+    assert np.column_stack([odometry.stamps, odometry.poses]).tolist() == [[1, 2, 3, 4], [5, 6, 7, 8]]
+
+
+@pytest.mark.parametrize("text", ["stamp,anchor,range\n1,A,2\n2,7,3\n", "1,A,2\n2,7,3\n", "range,anchor,stamp\n2,A,1\n3,7,2\n"])
+def test_the_quality_of_ranges_may_be_missing(tmp_path, text):
+    (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n1,0,0,0\n")
+    (tmp_path / "ranges.csv").write_text(text)
+    ranges = read_csv_folder(tmp_path).ranges
+    assert [ranges.anchor_ids[k] for k in ranges.anchor] == ["A", "7"]
+    assert (ranges.stamps.tolist(), ranges.ranges.tolist(), ranges.quality.tolist()) == ([1, 2], [2, 3], [100, 100])
+
+
+def test_scans_without_a_header_lose_none(tmp_path):
+    (tmp_path / "odometry.csv").write_text("stamp,x,y,theta\n1,0,0,0\n")
+    (tmp_path / "sensors.toml").write_text("\ufeff[scans]\nangle_min = -0.1\nangle_increment = 0.1\n", encoding="utf-8")
+    (tmp_path / "scans.csv").write_text("1,2,,nan\n2,2,3,4\n")
+    scans = read_csv_folder(tmp_path).scans
+    assert scans.stamps.tolist() == [1, 2]
+    assert scans.ranges[0, :2].tolist() == [2, np.inf]
 
 
 def test_a_folder_without_odometry_is_no_recording(tmp_path):

@@ -3,7 +3,7 @@
 import os
 from typing import TYPE_CHECKING
 
-from ..errors import ConfigError
+from ..errors import ConfigError, FormatError
 
 if TYPE_CHECKING:
     from ..io.bag_topics import BagTopics
@@ -43,6 +43,7 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
     Raises
     ------
     ConfigError : topics or mappings are named for what is no bag.
+    FormatError : a folder is neither tables nor a bag, or a file is not what it should be.
     """
     kind = format_of(path)
     scan_message = bag[0].scan if bag is not None and kind not in ("bag", "csv") else ""
@@ -56,6 +57,9 @@ def read_recording(path: str, every_nth_scan: int = 1, bag: "BagChoices | None" 
         from ..io.rosbag import read_bag
 
         return _with_every_nth(read_bag(path, *(bag or ())), every_nth_scan)
+    if os.path.isdir(path):
+        what = "holds a map, and a recording is wanted" if kind == "map" else "holds no odometry.csv and no ROS 2 bag"
+        raise FormatError(f"this folder {what}", path)
     from ..io.carmen import read_log
 
     return read_log(path, every_nth_scan=every_nth_scan, scan_message=scan_message)

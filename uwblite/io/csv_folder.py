@@ -8,7 +8,9 @@
 | scans.csv | stamp, then one column a beam; empty = nothing seen, nan = invalid |
 | sensors.toml | geometry of the scans, mounting of the sensors |
 
-Stamps in seconds, lengths in metres, angles in radians. Files of sensors that were not there are not there either.
+Stamps in seconds, lengths in metres, angles in radians. Columns are found by the names of the header, others are skipped;
+where the header has names of its own, or is missing, they stand in this order. The quality may be missing. Files of sensors
+that were not there are not there either.
 """
 
 import csv
@@ -148,7 +150,7 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
     sensors = Sensors()
     if (path / "sensors.toml").exists():
         sensors = from_dict(Sensors, parse_toml("".join(_lines(path / "sensors.toml", digest)), str(path / "sensors.toml")))
-    table = _in_order(_table(path / "odometry.csv", 4, digest))
+    table = _in_order(_table(path / "odometry.csv", ("stamp", "x", "y", "theta"), digest))
     ranges = _read_ranges(path / "ranges.csv", digest) if (path / "ranges.csv").exists() else None
     scans = _read_scans(path / "scans.csv", sensors.scans, digest) if (path / "scans.csv").exists() else None
     gyro = _read_gyro(path / "gyro.csv", digest) if (path / "gyro.csv").exists() else None
@@ -161,39 +163,75 @@ def read_csv_folder(folder: str | os.PathLike[str]) -> SensorLog:
 def _lines(path: Path, digest: "hashlib._Hash") -> Iterator[str]:
     """Yield the lines of a file, a block in memory at a time."""
     with open_source(path) as source:
-        for block in source.blocks():
+        for k, block in enumerate(source.blocks()):
             digest.update(block)
             try:
-                yield from io.StringIO(block.decode())
+                yield from io.StringIO(block.decode("utf-8" if k else "utf-8-sig"))
             except UnicodeDecodeError:
                 raise FormatError("not UTF-8 text", str(path)) from None
 
 
-def _rows(path: Path, columns: int, digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
-    """Yield (line number, fields) behind the header; columns < 0 asks for at least that many."""
+def _rows(path: Path, digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
+    """Yield (line number, fields) of the rows that are not empty."""
     reader = csv.reader(_lines(path, digest))
     try:
-        next(reader, None)
         for row in reader:
-            if row and (len(row) != columns if columns > 0 else len(row) < -columns):
-                raise FormatError(f"{len(row)} columns, expected {abs(columns)}", str(path), reader.line_num)
             if row:
                 yield reader.line_num, row
     except csv.Error as error:
         raise FormatError(f"not CSV: {error}", str(path), reader.line_num) from None
 
 
+def _columns(path: Path, names: tuple[str, ...], digest: "hashlib._Hash") -> Iterator[tuple[int, list[str]]]:
+    """Yield (line number, fields) behind the header, fields in the order of `names`; quality is 100 where it is missing."""
+    places, width = list[int](), 0
+    for line, row in _rows(path, digest):
+        if not places:
+            places, width = _places(row, names, path, line), len(row)
+            if _is_header(row):
+                continue
+        if len(row) != width:
+            raise FormatError(f"{len(row)} columns, expected {width}", str(path), line)
+        yield line, [row[k] if k >= 0 else _BEST for k in places]
+
+
+_BEST = "100"
+"""Quality of a range of which none is reported."""
+
+
+def _is_header(row: list[str]) -> bool:
+    """Return whether the first row of a table names its columns: a stamp is a number."""
+    try:
+        float(row[0])
+    except ValueError:
+        return True
+    return False
+
+
+def _places(row: list[str], names: tuple[str, ...], path: Path, line: int) -> list[int]:
+    """Return where the named columns stand by a table's first row, -1 = not there."""
+    header = [cell.strip().lower() for cell in row] if _is_header(row) else []
+    found = [header.index(name) if name in header else -1 for name in names]
+    needed = [k for k, name in enumerate(names) if name != "quality"]
+    if all(found[k] >= 0 for k in needed):
+        return found
+    elsewhere = any(place not in (-1, k) for k, place in enumerate(found))
+    if elsewhere or not len(needed) <= len(row) <= len(names):
+        raise FormatError(f"{len(row)} columns, expected {','.join(names)}", str(path), line)
+    return [k if k < len(row) else -1 for k in range(len(names))]
+
+
 def _number(text: str, path: Path, line: int) -> float:
     return finite(text, f"{text[:30]!r} is not a finite number", str(path), line)
 
 
-def _table(path: Path, columns: int, digest: "hashlib._Hash") -> Floats:
+def _table(path: Path, names: tuple[str, ...], digest: "hashlib._Hash") -> Floats:
     cells = array("d")
-    for line, row in _rows(path, columns, digest):
+    for line, row in _columns(path, names, digest):
         cells.extend([_number(cell, path, line) for cell in row])
     if not cells:
         raise FormatError("there are no rows", str(path))
-    return np.array(cells).reshape(-1, columns)
+    return np.array(cells).reshape(-1, len(names))
 
 
 def _in_order(table: Floats) -> Floats:
@@ -201,13 +239,13 @@ def _in_order(table: Floats) -> Floats:
 
 
 def _read_gyro(path: Path, digest: "hashlib._Hash") -> Gyro:
-    table = _in_order(_table(path, 2, digest))
+    table = _in_order(_table(path, ("stamp", "heading"), digest))
     return Gyro(table[:, 0].copy(), np.unwrap(table[:, 1]))
 
 
 def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:
     cells, anchors, names = array("d"), array("q"), dict[str, int]()
-    for line, row in _rows(path, 4, digest):
+    for line, row in _columns(path, ("stamp", "anchor", "range", "quality"), digest):
         cells.extend([_number(row[k], path, line) for k in (0, 2, 3)])
         place = names.get(row[1])
         if place is None:
@@ -226,7 +264,9 @@ def _read_ranges(path: Path, digest: "hashlib._Hash") -> UwbRanges | None:
 
 def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash") -> LaserScans | None:
     stamps, readings, beams = array("d"), array("f"), 0
-    for line, row in _rows(path, -2, digest):
+    for k, (line, row) in enumerate(_rows(path, digest)):
+        if k == 0 and _is_header(row):
+            continue
         beams = beams or len(row) - 1
         if len(row) != beams + 1:
             raise FormatError(f"{len(row) - 1} beams, the first scan has {beams}", str(path), line)
