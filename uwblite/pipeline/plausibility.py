@@ -13,6 +13,7 @@ from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from .anchor_moves import name_and_number
+from .drift_tests import check_drifts
 from .estimate import Estimate, Task
 from .half_tests import check_halves
 from .residual_tests import check_residuals
@@ -51,6 +52,7 @@ def judge(
     else:
         check_residuals(estimate, np.zeros(0), task)
     check_halves(estimate, task)
+    check_drifts(estimate, task)
     check_untied_parts(estimate, task)
     check_handedness(estimate, task)
     check_turn_scales(estimate, task)

@@ -1,0 +1,52 @@
+"""What drifts where nothing but ranges holds the path is a doubt; each pattern by its own name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.room_recording import recording, two_rounds
+
+from uwblite import se2
+from uwblite.mapping import build_map
+from uwblite.sensor_log import Odometry
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return recording(two_rounds()).without(lidar=True)
+
+
+def drifts(log):
+    return [n for n in build_map(log).doubts if n.kind == "drift"]
+
+
+def age(stamps):
+    return (stamps - stamps[0]) / np.ptp(stamps)
+
+
+def test_a_sound_recording_drifts_in_nothing(sound):
+    assert drifts(sound) == []
+
+
+def test_ranges_that_grow(sound):
+    ranges = sound.ranges
+    (found,) = drifts(replace(sound, ranges=replace(ranges, ranges=ranges.ranges + 1.5 * age(ranges.stamps))))
+    assert "all ranges seem to grow by 1." in found.text
+    assert found.figures["value"] == pytest.approx(1.5, abs=0.3)
+
+
+def test_ranges_that_are_late(sound):
+    """To first order: ways are bent where the robot turns within the delay, so less than all of it is found."""
+    ranges = sound.ranges
+    (found,) = drifts(replace(sound, ranges=replace(ranges, stamps=ranges.stamps + 2.0)))
+    assert "s late, or more" in found.text
+    assert -2.1 < found.figures["value"] < -1.0
+
+
+def test_wheels_that_lose_air(sound):
+    odometry = sound.odometry
+    steps = se2.between(odometry.poses[:-1], odometry.poses[1:])
+    steps[:, :2] *= (1.0 - 0.2 * age(odometry.stamps[1:]))[:, None]
+    (found,) = drifts(replace(sound, odometry=Odometry(odometry.stamps, se2.chain(odometry.poses[0], steps))))
+    assert "the wheels' ways seem to change by" in found.text
+    assert found.figures["value"] == pytest.approx(0.2, abs=0.05)
