@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from .options import number, place
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from ..arrays import Bools
     from ..graph.certificate import Certificate
     from ..graph.graph import Graph
     from ..graph.solver import Progress, SolverConfig, SolverSummary
     from ..io.graph_file import GraphFile
+    from ..radio.graph_starts import Start
 
 HELP = "optimise a pose graph: g2o, TORO or PyFG in, optimised graph and trajectory out"
 EPILOG = """\
@@ -52,10 +51,12 @@ def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     import dataclasses
     from functools import partial
+    from itertools import chain
 
     from ..config import override
     from ..errors import ConfigError
     from ..graph.solver import SolverConfig
+    from ..radio.graph_starts import starts, starts_nearby
     from . import console
     from .formats import graph_format, read_graph, refuse_existing, write_graph
 
@@ -71,25 +72,29 @@ def run(args: argparse.Namespace) -> int:
     file = dataclasses.replace(file, graph=_with_kernel(file.graph, args.kernel, args.kernel_scale))
     progress = console.Progress()
     try:
-        solve = partial(_solve, args, config=config, progress=lambda done, most: progress("optimising", done, most))
-        solutions = [_Solution(*solve(start), start, lost) for start, lost in _starts(file)]
+        solve = partial(_solve, args, config, lambda done, most: progress("optimising", done, most))
+        solutions = map(solve, starts(file.graph, file.chains))
         best = min(solutions, key=lambda solution: (sum(solution.outliers.values()), solution.summary.chi2))
         known = _certificate(best, args.robust)
         if not (known.is_global or args.robust or args.incremental):
-            for start, lost in _further_starts(file, best, args.from_odometry):
-                found = _Solution(*solve(start), start, lost)
-                if len(lost) <= len(best.lost) and found.summary.chi2 < (1.0 - config.relative_decrease) * best.summary.chi2:
+            further = starts_nearby(best.start, best.graph)
+            if not args.from_odometry:
+                forgotten = file.from_odometry()
+                further = chain(further, starts(forgotten.graph, forgotten.chains, best.start.placed(best.graph).anchors))
+            for found in map(solve, further):
+                as_many = len(found.start.unplaced) <= len(best.start.unplaced)
+                if as_many and found.summary.chi2 < (1.0 - config.relative_decrease) * best.summary.chi2:
                     best, known = found, _certificate(found, args.robust)
     finally:
         progress.close()
-    solved_file = dataclasses.replace(file, graph=_without(best.graph, best.lost))
+    solved_file = dataclasses.replace(file, graph=best.start.placed(best.graph))
     if args.out:
         write_graph(args.out, solved_file)
     if args.trajectory:
         from ..io.tum import write_tum
 
         write_tum(args.trajectory, file.stamps, best.graph.poses)
-    figures = _figures(solved_file, best.summary, [file.anchor_ids[k] for k in best.lost])
+    figures = _figures(solved_file, best.summary, [file.anchor_ids[k] for k in best.start.unplaced])
     figures["certificate"] = "global minimum" if known.is_global else f"none: {known.reason}"
     figures["chi2_lower_bound"] = known.lower_bound
     if args.robust:
@@ -105,82 +110,31 @@ class _Solution(NamedTuple):
     summary: "SolverSummary"
     outliers: dict[str, int]
     """By kind of edge."""
-    start: "Graph"
-    lost: tuple[int, ...]
-    """Anchors that could not be placed."""
+    start: "Start"
 
 
-def _further_starts(file: "GraphFile", best: _Solution, forgotten: bool) -> "Iterator[tuple[Graph, tuple[int, ...]]]":
-    """Yield further starts, and the anchors that have no place there: without the file's estimates, where they were used."""
-    from ..graph.chordal_start import chordal_start
-    from ..radio.anchor_starts import search_anchors
-
-    for start in (chordal_start(best.graph), search_anchors(best.start)):
-        if start is not None:
-            yield start, best.lost
-    if not forgotten:
-        yield from _starts(file.from_odometry(), best)
-
-
-def _starts(file: "GraphFile", known: _Solution | None = None) -> "Iterator[tuple[Graph, tuple[int, ...]]]":
-    """Yield graphs with every chain and anchor placed, and the anchors that could not be.
-
-    Parameters
-    ----------
-    known : places of anchors that these starts cannot place.
-    """
-    import dataclasses
-
-    import numpy as np
-
-    from ..io.graph_chains import tied_chains
-    from ..radio.anchor_starts import place_anchors
-    from ..radio.chain_starts import place_chains
-
-    if not tied_chains(file.graph, file.chains).all():
-        return
-    for start in place_chains(file.graph, file.chains):
-        graph, lost = place_anchors(start)
-        if known is not None and (missed := [k for k in lost if k not in known.lost]):
-            again = np.isin(np.arange(len(start.anchors)), missed)[:, None]
-            placed = np.where(again, known.graph.anchors, start.anchors)
-            graph, lost = place_anchors(dataclasses.replace(start, anchors=placed))
-        yield graph, lost
-
-
-def _without(graph: "Graph", lost: tuple[int, ...]) -> "Graph":
-    """Return the graph with the places of these anchors unknown."""
-    import dataclasses
-
-    import numpy as np
-
-    gone = np.isin(np.arange(len(graph.anchors)), lost)
-    return dataclasses.replace(graph, anchors=np.where(gone[:, None], np.nan, graph.anchors))
-
-
-def _solve(
-    args: argparse.Namespace, graph: "Graph", config: "SolverConfig", progress: "Progress"
-) -> tuple["Graph", "SolverSummary", dict[str, int]]:
+def _solve(args: argparse.Namespace, config: "SolverConfig", progress: "Progress", start: "Start") -> _Solution:
     """Optimise in the way the options ask for; with --robust also count the outliers by kind of edge."""
     import dataclasses
 
     if args.incremental:
         from ..radio.incremental import optimize_incrementally
 
-        return *optimize_incrementally(graph, config, progress), {}
+        return _Solution(*optimize_incrementally(start.graph, config, progress), {}, start)
     if not args.robust:
         from ..graph.solver import optimize
 
-        return *optimize(graph, config, progress), {}
+        return _Solution(*optimize(start.graph, config, progress), {}, start)
     from ..graph.gnc import optimize_gnc
 
+    graph = start.graph
     solved, summary, weights = optimize_gnc(graph, _thresholds(graph), config, progress)
     outliers: dict[str, int] = {}
     for k, weight in weights.items():
         name = type(graph.edges[k]).__name__
         outliers[name] = outliers.get(name, 0) + int((weight == 0.0).sum())
     # The file keeps every edge; which ones were left out is not a property of the measurements.
-    return dataclasses.replace(solved, edges=graph.edges), summary, outliers
+    return _Solution(dataclasses.replace(solved, edges=graph.edges), summary, outliers, start)
 
 
 _THRESHOLDS = {1: 3.3, 2: 3.7, 3: 4.0}

@@ -1,11 +1,14 @@
-"""Parts of a graph that no edge ties to anything fixed: each may stand anywhere as a whole."""
+"""Which parts of a graph edges tie together; one that they tie to nothing fixed may stand anywhere as a whole."""
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ..arrays import Ints
+from ..arrays import Bools, Ints
+from .distance_edges import PointDistanceEdges
 from .graph import Graph, PriorEdges
+from .point_edges import LandmarkEdges
+from .range_edges import RangeEdges
 from .unknowns import free_unknowns
 
 
@@ -21,9 +24,39 @@ def floating_components(graph: Graph) -> Ints:
     free = free_unknowns(graph)
     tied += [first[name] + np.flatnonzero(~free[name]) for name in first]
     one, other = np.concatenate(links, axis=1)
-    label = connected_components(csr_matrix((np.ones(len(one)), (one, other)), shape=(nodes, nodes)), directed=False)[1]
+    label = _labels(one, other, nodes)
     begins = np.unique(label[:n], return_index=True)
     start = np.full(nodes, -1)
     start[begins[0]] = begins[1]
     start[label[np.concatenate(tied)]] = -1
     return np.asarray(start[label[:n]])
+
+
+def held_anchors(graph: Graph) -> Bools:
+    """Return which anchors (a,) are fixed or have a prior."""
+    held = ~free_unknowns(graph)["anchors"]
+    for e in graph.edges:
+        if isinstance(e, PriorEdges) and e.block == "anchors":
+            held[e.index] = True
+    return held
+
+
+def tied_chains(graph: Graph, chains: Ints) -> Bools:
+    """Return for each pose (n,) whether ranges or landmarks tie its chain to chain 0 or to landmarks that are held."""
+    count = int(chains.max(initial=0)) + 1
+    held = np.flatnonzero(held_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.int64)
+    ends = [(np.zeros(len(held), dtype=np.int64), count + held)]
+    for e in graph.edges:
+        if isinstance(e, PointDistanceEdges):
+            ends.append((chains[e.i], chains[e.j]))
+        elif isinstance(e, RangeEdges | LandmarkEdges):
+            ends.append((chains[e.pose], count + e.anchor))
+    one, other = (np.concatenate(column) for column in zip(*ends, strict=True))
+    label = _labels(one, other, count + len(graph.anchors))
+    return np.asarray(label[chains] == label[0], dtype=np.bool_)
+
+
+def _labels(one: Ints, other: Ints, nodes: int) -> Ints:
+    """Return the number (nodes,) of the part that each node belongs to, from links between nodes `one` and `other`."""
+    links = csr_matrix((np.ones(len(one)), (one, other)), shape=(nodes, nodes))
+    return np.asarray(connected_components(links, directed=False)[1])

@@ -5,16 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
-from ..graph.distance_edges import PointDistanceEdges
+from ..arrays import Floats, Ints
+from ..graph.components import held_anchors
 from ..graph.graph import Graph, PriorEdges
-from ..graph.point_edges import LandmarkEdges, seen_anchors
+from ..graph.point_edges import seen_anchors
 from ..graph.pose_edges import RelativePoseEdges
-from ..graph.range_edges import RangeEdges
-from ..graph.unknowns import free_unknowns
 
 
 def along_edges(graph: Graph) -> tuple[Graph, Ints]:
@@ -50,31 +48,6 @@ def along_edges(graph: Graph) -> tuple[Graph, Ints]:
         poses, held = reached, True
     framed = replace(graph, anchors=anchors, poses=np.where((chains == 0)[:, None], poses, np.nan))
     return replace(graph, anchors=seen_anchors(framed), poses=poses), chains
-
-
-def held_anchors(graph: Graph) -> Bools:
-    """Return which anchors (a,) are fixed or have a prior."""
-    held = ~free_unknowns(graph)["anchors"]
-    for e in graph.edges:
-        if isinstance(e, PriorEdges) and e.block == "anchors":
-            held[e.index] = True
-    return held
-
-
-def tied_chains(graph: Graph, chains: Ints) -> Bools:
-    """Return for each pose (n,) whether ranges or landmarks tie its chain to chain 0 or to landmarks that are held."""
-    count = int(chains.max(initial=0)) + 1
-    held = np.flatnonzero(held_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.int64)
-    ends = [(np.zeros(len(held), dtype=np.int64), count + held)]
-    for e in graph.edges:
-        if isinstance(e, PointDistanceEdges):
-            ends.append((chains[e.i], chains[e.j]))
-        elif isinstance(e, RangeEdges | LandmarkEdges):
-            ends.append((chains[e.pose], count + e.anchor))
-    one, other = (np.concatenate(column) for column in zip(*ends, strict=True))
-    links = csr_matrix((np.ones(len(one)), (one, other)), shape=(count + len(graph.anchors),) * 2)
-    label = connected_components(links, directed=False)[1]
-    return np.asarray(label[chains] == label[0], dtype=np.bool_)
 
 
 def chained_poses(poses: Floats, i: Ints, j: Ints, T_i_j: Floats) -> Floats:

@@ -7,14 +7,14 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints
 from ..errors import FormatError
-from ..graph.components import floating_components
+from ..graph.components import floating_components, tied_chains
 from ..graph.distance_edges import AnchorDistanceEdges, PointDistanceEdges
 from ..graph.graph import Graph, PriorEdges
 from ..graph.point_edges import LandmarkEdges
 from ..graph.pose_edges import RelativePoseEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.unknowns import free_unknowns
-from .graph_chains import along_edges, tied_chains
+from .graph_chains import along_edges
 from .plain_edges import ENDS, WIDTHS, Measured, root
 from .records import RecordFile, Records
 

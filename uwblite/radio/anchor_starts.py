@@ -11,11 +11,12 @@ from ..graph.range_edges import RangeEdges
 from .trilateration import TrilaterationConfig, trilaterate
 
 
-def place_anchors(graph: Graph) -> tuple[Graph, tuple[int, ...]]:
+def place_anchors(graph: Graph, elsewhere: Floats | None = None) -> tuple[Graph, tuple[int, ...]]:
     """Return the graph with a position for each anchor that has none, and the anchors that could not be placed.
 
     The poses are taken as they are; anchors without a position stand where a pose sees them, or are found from their ranges
-    alone (trilateration.trilaterate). Those that cannot be found are fixed at the origin with their ranges switched off.
+    alone (trilateration.trilaterate), or have the place `elsewhere` (a, 2) where that is finite. Those that cannot be found
+    are fixed at the origin with their ranges switched off.
     """
     graph = replace(graph, anchors=seen_anchors(graph))
     missing = np.flatnonzero(~np.isfinite(graph.anchors).all(axis=1))
@@ -25,8 +26,12 @@ def place_anchors(graph: Graph) -> tuple[Graph, tuple[int, ...]]:
     for anchor in missing.tolist():
         positions, ranges = _distances_to(graph, anchor)
         found = trilaterate(positions, ranges, TrilaterationConfig())
-        anchors[anchor] = found[0].position if found else 0.0
-        if not found:
+        if found:
+            anchors[anchor] = found[0].position
+        elif elsewhere is not None and np.isfinite(elsewhere[anchor]).all():
+            anchors[anchor] = elsewhere[anchor]
+        else:
+            anchors[anchor] = 0.0
             lost.append(anchor)
     fixed = graph.fixed_anchors | np.isin(np.arange(len(anchors)), lost)
     edges = tuple(_without(e, lost) if isinstance(e, RangeEdges) and lost else e for e in graph.edges)
