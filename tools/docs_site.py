@@ -1,4 +1,4 @@
-"""A hook of mkdocs: pages that lie outside docs/ join the site, and links between the two are those of the site."""
+"""A hook of mkdocs: pages from outside docs/ join the site, links lead within it, and blocks of code are recognised."""
 
 import re
 from pathlib import Path
@@ -26,7 +26,7 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def as_in_site(name, text):
-    """Return a page with its links as they lead within the site.
+    """Return a page with its links as they lead within the site, and its blocks of code as mkdocs finds them.
 
     Parameters
     ----------
@@ -51,6 +51,8 @@ def as_in_site(name, text):
         up = "../" * len(here.parts)
         return f"]({up}{site.as_posix()}{hash_}{part})"
 
+    # Words behind a fence's language say how the tests run the block; mkdocs takes no fence with several for one.
+    text = re.sub(r"^(```\w+) .*$", r"\1", text, flags=re.MULTILINE)
     return re.sub(r"\]\(([^)\s]+)\)", link, text)
 
 

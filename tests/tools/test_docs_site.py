@@ -29,6 +29,10 @@ def test_links_lead_within_the_site(page, link, expected):
     assert as_in_site(page, f"see [this]({link}).") == f"see [this]({expected})."
 
 
+def test_what_a_block_of_code_is_run_with_is_left_out():
+    assert as_in_site("docs/driving.md", "a\n```sh norun\nuwblite record\n```\nb") == "a\n```sh\nuwblite record\n```\nb"
+
+
 @pytest.mark.slow
 def test_mkdocs_has_no_complaint(tmp_path):
     if importlib.util.find_spec("mkdocs") is None:
