@@ -144,7 +144,7 @@ def test_a_map_that_most_ranges_contradict_is_doubted(shares, doubted):
         for k, share in enumerate(shares)
     ]
     stages = Stages(None, None)
-    check_anchors(anchors, SimpleNamespace(stages=stages))
+    check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=False)))
     assert [d.kind for d in stages.doubts] == ["ranges-disagree"] * doubted
 
 
@@ -297,6 +297,19 @@ def test_anchors_that_are_not_ok_are_named(statuses, warnings, doubts, lidar):
     check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=lidar)))
     assert [n.kind for n in stages.warnings] == warnings
     assert [n.kind for n in stages.doubts] == [kind for kind in doubts if not (lidar and kind == "ranges-disagree")]
+
+
+@pytest.mark.parametrize(("used", "left_out", "lidar", "doubted"), [
+    (1, 1, False, True), (1, 1, True, False), (2, 1, False, False), (2, 2, False, True), (1, 0, False, False),
+])  # fmt: skip
+def test_names_left_out_count_as_distrusted_anchors(used, left_out, lidar, doubted):
+    anchors = [AnchorEstimate(f"A{k}", np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for k in range(used)]
+    stages = Stages(None, None)
+    for _ in range(left_out):
+        stages.warn("shared-name", "two anchors answer to a name")
+    check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=lidar)))
+    assert [n.kind for n in stages.doubts] == ["ranges-disagree"] * doubted
+    assert all(f"{left_out} of {used + left_out} anchors" in n.text and "too few" in n.text for n in stages.doubts)
 
 
 @pytest.mark.parametrize(("accepted", "contradicted", "other", "placed", "grid", "kind"), [

@@ -83,7 +83,7 @@ half a metre; rooms mapped by odometry and ranges have 0.08 to 0.15 m."""
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     """Name anchors that are not ok, and doubt a map with which most ranges, or without a lidar half of the anchors, disagree.
 
-    Where no anchor in reach has one place alone, their mirror ambiguity is a doubt, too.
+    A name that two anchors answer to counts as one. Mirror ambiguity is a doubt where no anchor in reach has one place alone.
     """
     unclear = not any(anchor.status == "ok" for anchor in anchors)
     for anchor in anchors:
@@ -102,13 +102,16 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
             "or the trajectory is wrong"
         )
         task.stages.doubt("ranges-disagree", text, share=agreeing / count)
-    placed, distrusted = (sum(a.status in kinds for a in anchors) for kinds in (_PLACED, _PLACED[-1:]))
-    if distrusted and 2 * distrusted >= placed and not task.recordings.have_scans:
+    if task.recordings.have_scans:
+        return
+    left_out = sum(notice.kind == "shared-name" for notice in task.stages.warnings)
+    placed, wrong = (left_out + sum(a.status in kinds for a in anchors) for kinds in (_PLACED, _PLACED[-1:]))
+    if wrong and 2 * wrong >= placed:
         text = (
-            f"{distrusted} of {placed} anchors are distrusted, and nothing but ranges and odometry holds the trajectory: "
-            "a wrong trajectory is likelier than so many bad anchors"
+            f"{wrong} of {placed} anchors are distrusted or left out, and only ranges and odometry hold the trajectory: "
+            + ("the others may be too few" if wrong == left_out else "a wrong trajectory is likelier than so many bad anchors")
         )
-        task.stages.doubt("ranges-disagree", text, distrusted=distrusted, placed=placed)
+        task.stages.doubt("ranges-disagree", text, distrusted=wrong, placed=placed)
 
 
 _PLACED = ("ok", "mirror-ambiguous", "distrusted")
