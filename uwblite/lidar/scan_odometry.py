@@ -14,7 +14,7 @@ from . import cloud_rasters, clouds, scan_matching
 from .cloud_rasters import CloudRasters
 from .clouds import CloudConfig, Clouds, make_cloud
 from .correlative_matching import CorrelativeConfig, search
-from .directional_overlap import directional_overlap
+from .overlap import directional_overlap
 from .pair_alignment import align_pairs
 from .scan_matching import PairPoints
 from .visibility import nearest_by_bearing, pair_violations

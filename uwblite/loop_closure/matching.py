@@ -16,7 +16,7 @@ from ..lidar.cloud_rasters import rasterize
 from ..lidar.clouds import Clouds, make_cloud
 from ..lidar.correlative_matching import CorrelativeConfig, search
 from ..lidar.free_space import FreeSpace
-from ..lidar.net_overlap import net_overlap
+from ..lidar.overlap import net_overlap
 from ..lidar.pair_alignment import Aligned, align_pairs
 from ..lidar.scan_matching import match, pair_points
 from ..lidar.submaps import Submaps

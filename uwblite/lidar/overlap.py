@@ -1,0 +1,105 @@
+"""How much surface two clouds show in common, in the direction in which they show least.
+
+In corridors walls match wherever one is laid along the other: of two places that look alike most points match, but not the few
+surfaces that face along the corridor. So only the direction counts in which least speaks for a place: with the normals n of
+points and weights w, a direction u has the sum u^T (sum w n n^T) u, and eigenvalues give the least of all directions.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints
+from .cloud_rasters import CloudRasters
+from .clouds import Clouds
+from .free_space import FreeSpace, seen_beyond
+from .scan_matching import Correspondences, correspondences, pair_points
+
+_NOISE = 0.005
+"""Share of the points added in every direction: where fewer face, as along a bare wall, the noise of normals does."""
+_AGAINST = 2.0
+"""Matches that one miss in view outweighs, by the ratio of likelihoods: in the true place five of six points match, in a wrong
+one that looks alike half of them; log((1/2) / (1/6)) / log((5/6) / (1/2)) = 2.2."""
+_MARGIN = 0.3
+"""How far behind the farthest seen free space a point counts as in view, m."""
+
+
+def directional_overlap(
+    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, limit: int, gate: float
+) -> Floats:
+    """Return the least share (e,) over all directions of clouds i and j (e,) that matches when laid at poses (e, 3).
+
+    With A = sum n n^T over the points looked up and M the same sum over those that match, the share that matches in a
+    direction u is u^T M u / u^T A u; the least of all is the smaller eigenvalue of M u = l A u.
+
+    Parameters
+    ----------
+    limit : most points looked up per cloud. gate : farthest match, m.
+    """
+    asked, matched = _both_ways(
+        clouds, raster, i, j, T_i_j, limit, gate, lambda found, *_: (found.row >= 0).astype(np.float64),
+        lambda found, *_: found.good.astype(np.float64),
+    )  # fmt: skip
+    noise = _NOISE * np.trace(asked, axis1=1, axis2=2) + np.finfo(float).tiny
+    root = np.linalg.inv(np.linalg.cholesky(asked + noise[:, None, None] * np.eye(2)))
+    return np.asarray(np.linalg.eigvalsh(root @ matched @ np.swapaxes(root, 1, 2))[:, 0])
+
+
+def net_overlap(
+    clouds: Clouds, raster: CloudRasters, free: Sequence[FreeSpace] | None, i: Ints, j: Ints, T_i_j: Floats, limit: int,
+    gate: float, spacing: float,
+) -> Floats:
+    """Return the net surface (e,), m, that speaks for clouds i and j (e,) lying at poses (e, 3), counted both ways.
+
+    Two stretches of a recording that meet share only a part of their surfaces: what share of all points matches says how long
+    they run together, not whether the place is right. Points that the other cloud cannot have seen say nothing; each that
+    matches speaks for the place, each in view without a match against it.
+
+    Parameters
+    ----------
+    free : what each cloud saw to be free; None = not asked, all points count as in view.
+    limit : most points looked up per cloud. gate : farthest match, m.
+    spacing : distance between neighbouring points of a cloud, m.
+    """
+
+    def weight(found: Correspondences, i: Ints, j: Ints, T_i_j: Floats) -> Floats:
+        missed = (found.row >= 0) & ~found.good
+        if free is not None:
+            missed &= _in_view(clouds, free, i, T_i_j, found)
+        # Points left out count by those looked up.
+        asked = np.maximum((found.row >= 0).sum(axis=1), 1)
+        return np.asarray((found.good - _AGAINST * missed) * (clouds.counts[j] / asked)[:, None])
+
+    (both,) = _both_ways(clouds, raster, i, j, T_i_j, limit, gate, weight)
+    return np.asarray(spacing * np.linalg.eigvalsh(both)[:, 0])
+
+
+def _both_ways(
+    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, T_i_j: Floats, limit: int, gate: float,
+    *weights: Callable[[Correspondences, Ints, Ints, Floats], Floats],
+) -> Floats:
+    """Return for each kind of weights the sums w n n^T (k, e, 2, 2), in the frames of i, over the points of both clouds.
+
+    Parameters
+    ----------
+    weights : give the weights (e, n) of points of clouds j (e,) that were looked up in clouds i (e,) at poses (e, 3).
+    """
+
+    def one_way(i: Ints, j: Ints, T_i_j: Floats) -> Floats:
+        sums = np.zeros((len(weights), len(i), 2, 2))
+        for found in correspondences(clouds, raster, i, T_i_j, pair_points(clouds, j, limit), gate):
+            some = found.pairs
+            normals = se2.rotate(T_i_j[some, 2, None], clouds.normals[found.row])
+            for own, weight in zip(sums, weights, strict=True):
+                own[some] = np.einsum("en,enk,enl->ekl", weight(found, i[some], j[some], T_i_j[some]), normals, normals)
+        return sums
+
+    turn = se2.rotation(T_i_j[:, 2])[:, :2, :2]
+    return np.asarray(one_way(i, j, T_i_j) + turn @ one_way(j, i, se2.inverse(T_i_j)) @ np.swapaxes(turn, 1, 2))
+
+
+def _in_view(clouds: Clouds, free: Sequence[FreeSpace], i: Ints, T_i_j: Floats, found: Correspondences) -> Bools:
+    """Return which points (e, n) were in view from the places at which clouds i (e,) were seen."""
+    points = se2.transform(T_i_j[:, None, :], clouds.points[found.row])
+    return np.array([seen_beyond(free[k], p, _MARGIN)[1] > 0 for k, p in zip(i.tolist(), points, strict=True)], dtype=bool)
