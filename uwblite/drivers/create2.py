@@ -81,7 +81,7 @@ class Create2Driver(BaseDriver):
     Parameters
     ----------
     start : pose of the base at the first frame; m, m, rad.
-    baud : bit/s; a robot that was told so while it was switched on talks at 19200.
+    baud : bit/s; a robot that was switched on with its clean button held for 10 s talks at 19200.
     """
 
     def __init__(self, start: Pose = (0.0, 0.0, 0.0), baud: int = BAUD) -> None:

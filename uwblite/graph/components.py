@@ -32,20 +32,20 @@ def floating_components(graph: Graph) -> Ints:
     return np.asarray(start[label[:n]])
 
 
-def held_anchors(graph: Graph) -> Bools:
-    """Return which anchors (a,) are fixed or have a prior."""
-    held = ~free_unknowns(graph)["anchors"]
+def given_anchors(graph: Graph) -> Bools:
+    """Return which anchors (a,) are given: fixed, or with a prior."""
+    given = ~free_unknowns(graph)["anchors"]
     for e in graph.edges:
         if isinstance(e, PriorEdges) and e.block == "anchors":
-            held[e.index] = True
-    return held
+            given[e.index] = True
+    return given
 
 
 def tied_chains(graph: Graph, chains: Ints) -> Bools:
-    """Return for each pose (n,) whether ranges or landmarks tie its chain to chain 0 or to landmarks that are held."""
+    """Return for each pose (n,) whether ranges or landmarks tie its chain to chain 0 or to landmarks that are given."""
     count = int(chains.max(initial=0)) + 1
-    held = np.flatnonzero(held_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.int64)
-    ends = [(np.zeros(len(held), dtype=np.int64), count + held)]
+    given = np.flatnonzero(given_anchors(graph)) if not (chains == 0).any() else np.zeros(0, dtype=np.int64)
+    ends = [(np.zeros(len(given), dtype=np.int64), count + given)]
     for e in graph.edges:
         if isinstance(e, PointDistanceEdges):
             ends.append((chains[e.i], chains[e.j]))

@@ -1,4 +1,4 @@
-"""Initial poses of a graph file that has none: along its relative poses, from what is given or held."""
+"""Initial poses of a graph file that has none: along its relative poses, from what is given or fixed."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from .. import se2
 from ..arrays import Floats, Ints
-from ..graph.components import held_anchors
+from ..graph.components import given_anchors
 from ..graph.graph import Graph, PriorEdges
 from ..graph.point_edges import seen_anchors
 from ..graph.pose_edges import RelativePoseEdges
@@ -36,16 +36,16 @@ def along_edges(graph: Graph) -> tuple[Graph, Ints]:
     for anchor, place in priors["anchors"].items():
         anchors[anchor] = place if np.isnan(anchors[anchor, 0]) else anchors[anchor]
     chains = np.zeros(len(poses), dtype=np.int64)
-    held = bool(np.isfinite(poses[:, 0]).any() or held_anchors(graph).any())
+    given = bool(np.isfinite(poses[:, 0]).any() or given_anchors(graph).any())
     poses = chained_poses(poses, *steps) if steps and np.isfinite(poses[:, 0]).any() else poses
     while len(lost := np.flatnonzero(np.isnan(poses[:, 0]))):
         pinned = [k for k in lost.tolist() if k in priors["poses"]]
         start = poses.copy()
         start[pinned[0] if pinned else lost[0]] = priors["poses"][pinned[0]] if pinned else 0.0
         reached = chained_poses(start, *steps) if steps else start
-        if not pinned and held:
+        if not pinned and given:
             chains[np.isnan(poses[:, 0]) & ~np.isnan(reached[:, 0])] = chains.max() + 1
-        poses, held = reached, True
+        poses, given = reached, True
     framed = replace(graph, anchors=anchors, poses=np.where((chains == 0)[:, None], poses, np.nan))
     return replace(graph, anchors=seen_anchors(framed), poses=poses), chains
 
