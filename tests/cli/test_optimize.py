@@ -154,7 +154,9 @@ def test_robust_names_the_false_ranges_and_leaves_them_out(tmp_path, capsys):
     assert found["chi2_per_dof"] == pytest.approx(1.0, abs=0.2)
     assert figures(capsys, path)["chi2_per_dof"] > 2.0
     assert main(["optimize", path, "--robust"]) == 0
-    assert "outliers left out: " in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "outliers left out: " in out
+    assert "certificate: none: a search decided which edges are outliers\n" in out
 
 
 def test_the_two_ways_exclude_one_another(tmp_path, capsys):

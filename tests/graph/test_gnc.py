@@ -6,7 +6,7 @@ import pytest
 from helpers.planted_graphs import loop, relative_edges
 
 from uwblite import se2
-from uwblite.errors import ConfigError
+from uwblite.errors import ConfigError, SolverError
 from uwblite.graph.gnc import optimize_gnc, tightened, truncated_weight
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.robust import Kernel
@@ -119,6 +119,17 @@ def test_thresholds_are_checked():
     for wrong in ({3: 4.0}, {-1: 4.0}, {0: 0.0}):
         with pytest.raises(ConfigError, match="threshold"):
             optimize_gnc(graph, wrong)
+
+
+@pytest.mark.parametrize("optimise", [
+    lambda graph: optimize_gnc(graph, THRESHOLDS), lambda graph: tightened(graph, [CLOSURES], (4.0,), SolverConfig()),
+])  # fmt: skip
+def test_problems_that_are_none_are_refused_before_any_step(optimise):
+    graph, _, _ = loop(0)
+    with pytest.raises(SolverError, match="nothing to optimise"):
+        optimise(replace(graph, fixed_poses=np.ones(60, dtype=bool), fixed_anchors=np.ones(3, dtype=bool)))
+    with pytest.raises(SolverError, match=r"starting values are not finite: anchors\[1\]"):
+        optimise(replace(graph, anchors=graph.anchors * [[1.0], [np.nan], [1.0]]))
 
 
 def test_kernels_that_tighten_are_not_drawn_by_false_closures():

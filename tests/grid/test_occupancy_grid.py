@@ -175,8 +175,8 @@ def test_the_smallest_grid_is_a_cell_with_two_around_it_on_every_side():
 def test_a_map_without_a_size_is_refused():
     with pytest.raises(ConfigError, match="no map of nan"):
         GridGeometry.around(np.zeros(2), np.array([np.nan, 1.0]), 0.05, 10**6)
-    with pytest.raises(ConfigError, match=r"grid\.max_cells"):
-        GridGeometry.around(np.zeros(2), np.ones(2), 0.05, 10)
+    with pytest.raises(ConfigError, match=r"no map of 3 x 1 m fits into 10 cells; raise grid\.max_cells"):
+        GridGeometry.around(np.array([1.0, 2.0]), np.array([4.0, 3.0]), 0.05, 10)
 
 
 def room_scans(poses, half=2.0, beams=360, noise=0.0, range_max=10.0, seed=0):

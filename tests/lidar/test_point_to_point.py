@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from uwblite import se2
+from uwblite.config import override
+from uwblite.errors import ConfigError
 from uwblite.lidar.point_cloud import make_tree
 from uwblite.lidar.point_to_point import IcpConfig, Registration, align, fitness_score
 
@@ -111,6 +113,13 @@ def test_every_failure_has_a_name():
     for found, words in cases:
         assert not found.converged
         assert words in found.reason
+
+
+def test_settings_need_an_iteration_and_a_distance():
+    assert override(IcpConfig(), ["max_iterations=1"]).max_iterations == 1
+    for wrong in ("max_iterations=0", "max_correspondence_distance=0", "min_matches=0"):
+        with pytest.raises(ConfigError, match="out of range"):
+            override(IcpConfig(), [wrong])
 
 
 def test_fitness_is_the_mean_squared_distance_of_all_points():

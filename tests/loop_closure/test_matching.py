@@ -61,10 +61,11 @@ def test_of_a_wide_search_the_net_overlap_is_enough():
 
 def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
     """In heading to three sigma, at least 0.1 rad and at most the limit; matching starts from guesses that are certain."""
-    config, asked = LoopClosureConfig(), []
+    config, asked, steps = LoopClosureConfig(), [], []
 
     def search(target, source, guess, half_widths, settings):
         asked.append((target, source, *half_widths))
+        steps.append((settings.resolution, settings.spread, settings.angle_step))
         return SimpleNamespace(poses=np.tile(guess, (30, 1)))
 
     monkeypatch.setattr(matching, "search", search)
@@ -78,5 +79,7 @@ def test_places_are_searched_as_far_as_they_are_uncertain(monkeypatch):
     rows, guesses = matching._guesses(matching._Batch(candidates, None, 0.1, None, config, CorrelativeConfig()))
     far = config.search_limit + 1.0
     assert asked == [(1, 5, 1.0, 1.0, 0.1), (2, 6, 2.0, 2.0, pytest.approx(0.3)), (3, 7, far, far, config.search_angle)]
+    fine, coarse = (0.15, 0.12, 0.03), pytest.approx((0.3, 0.24, 0.02))  # twice the cells, finer headings for long clouds
+    assert steps == [fine, fine, coarse]
     assert rows.tolist() == [0] + [1] * config.places + [2] * config.places + [3] * matching._MANY_PLACES
     np.testing.assert_array_equal(guesses, candidates.guess[rows])

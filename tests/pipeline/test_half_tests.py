@@ -134,7 +134,7 @@ def test_anchors_of_both_halves_that_are_mirror_images_are_a_doubt(monkeypatch, 
 def test_a_half_says_where_anchors_are_that_it_shows_well(monkeypatch, wide, ranged, found):
     """From a path a tenth as wide as it is long, with eight ranges that count to an anchor that was placed."""
     angle = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
-    poses = np.column_stack([np.cos(angle), wide * np.sin(angle), angle])
+    poses = np.column_stack([7.0 + np.cos(angle), wide * np.sin(angle) - 4.0, angle])
     anchor = np.repeat([0, 1, 2], [8, 7, 9])
     ranges = SimpleNamespace(anchor=anchor, alive=np.ones(24, dtype=bool)) if ranged else None
     graph = SimpleNamespace(poses=poses, anchors=np.arange(6.0).reshape(3, 2))

@@ -28,6 +28,21 @@ def test_a_map_is_doubted_from_a_share_of_points_in_free_space_and_some_visits(m
     assert stages.done[0].figures == {"visits": visits, "free_space_violation": share}
 
 
+def test_clouds_are_made_and_their_points_counted(monkeypatch):
+    """The laser's mounting and clock are free from then on."""
+    scans = ScanClouds(SimpleNamespace(points=np.zeros((7, 2))), None, 0.0)
+    monkeypatch.setattr(lidar_stages.scan_clouds, "make", lambda *_: scans)
+    calibration = Calibration((UnknownKey("laser_x"), UnknownKey("odometry_scale")), np.zeros(2))
+    graph = replace(loop()[0], calibration=calibration, fixed_calibration=np.ones(2, dtype=bool))
+    stages = Stages(None, None)
+    made = lidar_stages.make_clouds(
+        Estimate(graph, graph.edges[0], None, ()), SimpleNamespace(recordings=None, config=None, stages=stages)
+    )
+    assert [(s.name, s.figures) for s in stages.done] == [("clouds", {"points": 7})]
+    assert made.scans is scans
+    assert made.graph.fixed_calibration.tolist() == [False, True]
+
+
 @pytest.mark.parametrize(("clock", "made", "sigma", "late"), [
     (0.0139, 0.01, 0.0001, 0.0), (0.0141, 0.01, 0.001, 0.0041), (-0.02, 0.0, 0.006, -0.02), (-0.02, 0.0, 0.007, 0.0),
 ])  # fmt: skip

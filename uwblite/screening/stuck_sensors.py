@@ -23,7 +23,7 @@ _FINEST, _FINEST_STEP = 0.02, 0.001
 _CHANGES, _STEPS = 0.2, 4.0
 """Change of a range, m and in steps of its resolution, with which it is measured and not repeated."""
 _QUIET, _ENOUGH = 0.25, 8
-"""Quantile of the noise of stretches that stands for a free line of sight, and stretches without which the noise is not known."""
+"""Quantile of the noise of stretches that stands for a free line of sight, and stretches without which it is not known."""
 _USUAL_NOISE, _LEAST_NOISE = 0.03, 0.005
 """Noise of such radios, m, where the recording does not show it, and the least that is assumed."""
 _SAME_SCANS = 3
