@@ -1,6 +1,7 @@
 """The documents: every command runs, every example works, every link leads somewhere, the generated page is current."""
 
 import argparse
+import fnmatch
 import importlib
 import importlib.util
 import os
@@ -14,9 +15,11 @@ import pytest
 from conftest import ROOT
 
 from uwblite.cli import VERBS, main, module_of
+from uwblite.config import leaves
 from uwblite.io.constraints_file import parse_constraints
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.map_result import OUTCOMES
+from uwblite.pipeline.mapping_config import MappingConfig
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -58,6 +61,17 @@ def test_every_command_is_understood(document):
             name = words[0].rsplit("/", 1)[-1]
             if name == "uwblite":
                 assert parses(words[1:]), words
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
+def test_every_setting_that_is_named_exists(document):
+    """By its group, or an earlier name of it, in backticks or behind --set; a star stands for the rest of a name."""
+    known = {name for name, _ in leaves(MappingConfig)}
+    groups = {name.partition(".")[0] for name in known if "." in name} | set(MappingConfig.RENAMED)
+    marked = " ".join(re.findall(r"`[^`\n]+`|--set \S+", document.read_text()))
+    named = re.findall(r"(?<![/\w.])([a-z_]+)\.([a-z_]+\*?|\*)(?![\w(/.])", marked)
+    named = {f"{group}.{rest}" for group, rest in named if group in groups and rest not in ("py", "md", "csv", "yaml")}
+    assert {name for name in named if not any(fnmatch.fnmatch(k, name) for k in known)} == set()
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -33,7 +33,7 @@ uwblite map run.log --out tuned --set grid.resolution=0.02 --set keyframes.dista
 | walls are thick or speckled | `grid.resolution`; a cell of about three times the lidar's noise |
 | the middle of halls stays unknown | `grid.max_clear_distance` |
 | the odometry is much worse than usual (slip, carpet) | `odometry.*` upwards |
-| the ranges are much worse than usual | `ranges.sigma`, `anchors.bias_sigma` upwards |
+| the ranges are much worse than usual | `ranges.sigma`, `trilateration.bias_sigma` upwards |
 | mapping takes too long | `keyframes.distance` upwards, `keyframes.scans` downwards |
 | a calibration value must not be estimated | its sigma in `calibration.*` to 0 |
 

@@ -25,24 +25,25 @@ class CalibrationConfig:
     """Prior standard deviation of each unknown; 0 switches it off (fixed at its nominal value)."""
 
     odometry_scale: float = 0.02
-    """Relative error of travelled distance (wheel radius), 1."""
+    """Relative error of travelled distance (wheel radius)."""
     odometry_unit: float = 1.0
-    """The same where the wheels' unit is wrong: a setting, off by any factor. The data choose, see prior_selection."""
+    """The same where the unit of the wheels is set wrong, by any factor; used only where the recording shows it."""
     heading_scale: float = 0.3
-    """Relative error of turned angle (track width), 1."""
+    """Relative error of turned angle (track width)."""
     heading_per_metre: float = 0.05
     """Heading drift per travelled metre (unequal wheels), rad/m."""
     heading_rate: float = 0.0005
     """Heading drift per second while the robot moves (gyro bias), rad/s."""
     range_scale: float = 0.15
-    """Relative error of all ranges where the radios' idea of distance is off, 1; 0.07 is on record. The data choose."""
+    """Relative error of all ranges where the unit of the radios is wrong (0.07 has been seen); used as far as the recording
+    shows it."""
     range_scale_sound: float = 0.001
-    """The same for radios that are sound, as most are: they measure times of flight by crystals right to 2e-5, in air that is
-    3e-4 slower than vacuum, and what their correction for received power leaves is a few centimetres in tens of metres."""
+    """The same for radios whose unit is right, as it is for most: their clocks err by 2e-5, air slows the signal by 3e-4, and
+    the correction for received power leaves a few centimetres in tens of metres."""
     range_bias: float = 0.8
     """Constant error of one anchor's ranges where the radios' antenna delays are not calibrated, m."""
     range_bias_sound: float = 0.1
-    """The same where they are, m. The marginal likelihood chooses between the two."""
+    """The same where they are calibrated, m; the recording decides between the two (by the marginal likelihood)."""
     anchor_height: float = 1.5
     """Height of anchors above the tag where none is given, m."""
     tag_offset: float = 0.03

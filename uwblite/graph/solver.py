@@ -58,16 +58,16 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class SolverConfig:
-    """When to stop, and how carefully to start."""
+    """When the optimisation ends, and how small its first steps are."""
 
     max_iterations: int = 100
-    """Most linear systems solved."""
+    """Most iterations, each of which solves one linear system."""
     relative_decrease: float = setting(1e-7, advanced=True)
     """Stop when chi2 is about to decrease by no more than this fraction of it."""
     gradient_tolerance: float = setting(1e-9, advanced=True)
     """Stop when no gradient component exceeds this, in standard deviations: max |g_i| / sqrt(H_ii)."""
     initial_damping: ClassVar[float] = 1e-10
-    """First lambda; 1e-10 starts with a Gauss-Newton step, 1e-3 distrusts the starting values."""
+    """First lambda; 1e-10 starts with a Gauss-Newton step, 1e-3 with a smaller one, for poor starting values."""
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:

@@ -16,9 +16,9 @@ class IcpConfig:
     """How two clouds are aligned."""
 
     max_correspondence_distance: float = setting(0.15, above=0.0)
-    """m; points farther apart are no pair (the paper's d)."""
+    """m; points farther apart are not matched (the paper's d)."""
     max_iterations: int = setting(50, minimum=1)
-    """Of one pair of clouds."""
+    """Most iterations for one pair of clouds."""
     tolerance_translation: float = setting(5e-4, advanced=True)
     """m; a smaller step in both senses ends the iteration."""
     tolerance_rotation: ClassVar[float] = 2.5e-4
@@ -28,7 +28,7 @@ class IcpConfig:
     min_matches: int = setting(10, minimum=1, advanced=True)
     """Fewer pairs of points are no registration."""
     fitness_sigma: float = float("inf")
-    """m^2; a fitness score above it is no registration (the paper's sigma)."""
+    """m^2; a match with a greater mean squared distance between nearest points is rejected (the paper's sigma)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,7 @@ from .step_search import StepSearch
 
 @dataclass(frozen=True, slots=True)
 class TrackingConfig:
-    """When and where neighbouring clouds are searched for."""
+    """Matching of each cloud with its neighbours in time."""
 
     on: bool = True
     """Match each cloud with those before and after it; off = only wheels and radio shape the sub-maps (the paper)."""

@@ -17,8 +17,8 @@ class LoopClosureConfig:
     """Search and acceptance of loop closures."""
 
     method: Literal["search", "icp"] = "search"
-    """search: candidates by the graph's own uncertainty, judged by all that follows here. icp: the paper's plain way, by
-    the settings of [icp]; of those here only rounds, partners and correlation count (see paper_method)."""
+    """search: candidates by the uncertainty of the graph, verified by all settings of this group. icp: the paper's method
+    with the settings of [icp]; of this group it uses rounds, partners and correlation only."""
     partners: int = 4
     """Candidates per sub-map and round, best expected overlap first."""
     rounds: int = 4

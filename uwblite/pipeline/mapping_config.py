@@ -39,7 +39,8 @@ class MappingConfig:
     use_loops: bool = True
     """Search loop closures and match clouds of different times."""
     detect_laser_flip: bool = True
-    """Take the laser as mounted the other way up than given where its turns agree with the odometry's only so."""
+    """Take the laser as mounted upside down, or upright where it is given as upside down, if its turns agree with the
+    odometry's only then."""
     align: Literal["odometry", "first-pose", "walls", "anchors"] = "odometry"
     """Where the map's axes lie: where the odometry began; at the first pose; there, turned so that most walls run along x
     and y; or at the first placed anchor, x towards the last."""

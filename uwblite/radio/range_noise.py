@@ -33,10 +33,10 @@ class RangeNoiseConfig:
     min_sigma: float = setting(0.03, advanced=True)
     """Largest standard deviation of such radios, m."""
     steady: float = 0.06
-    """Standard deviation of what an anchor's errors have in common in one direction and at one distance from it, m: radiation
-    patterns and received power alone make so much, and no residual shows what a wrong place of the anchor explains as well."""
+    """Standard deviation of the error that all ranges to an anchor from one direction and distance have in common, m.
+    Radiation pattern and received power alone cause as much. Residuals do not show it: a shifted anchor explains it as well."""
     learn: bool = True
-    """Estimate white and slow part from the residuals."""
+    """Estimate from the residuals how much of the error is new in every range, and how much changes slowly with the place."""
     kernel: Kernel = setting(_ROBUST, advanced=True)
     """Robust kernel: ranges through walls are long; none = squared errors (the paper)."""
 
