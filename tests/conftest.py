@@ -1,6 +1,7 @@
 """What all tests share: the slow marker, one BLAS thread, hypothesis without clocks, recordings kept elsewhere."""
 
 import os
+import signal
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -12,6 +13,8 @@ ROOT = Path(__file__).resolve().parent.parent
 SHARED = Path(os.environ.get("UWBLITE_SHARED_DATA", ROOT.parent / "shared" / "data"))
 """Real recordings under other licences; they are no part of this repository."""
 
+# A shell's background jobs ignore SIGINT, and so would the programs that the tests start and end with it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("uwblite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("uwblite")
 

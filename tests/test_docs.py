@@ -86,17 +86,28 @@ def test_the_examples_of_every_verb_are_understood(verb):
             assert parses(words[1:]), line
 
 
-@pytest.fixture
-def workspace(tmp_path, monkeypatch):
-    """A folder with what the README has made of the sample recording: run.log, second.log and the truth."""
-    (tmp_path / "tests").symlink_to(ROOT / "tests")
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    """A folder with what the README has made of the sample recording: run.log, second.log and the truth; and their map."""
+    folder = tmp_path_factory.mktemp("prepared")
+    (folder / "tests").symlink_to(ROOT / "tests")
     [text] = [text for info, text in blocks(ROOT / "README.md", "sh") if "sample" in info]
-    for words in commands(text):
-        if words[0] == "uwblite":
-            assert main(words[1:]) == 0
-        else:
-            subprocess.run(words, check=True)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(folder)
+        for words in commands(text):
+            if words[0] == "uwblite":
+                assert main(words[1:]) == 0
+            else:
+                subprocess.run(words, check=True)
+        assert main(["map", "run.log", "--out", "map", "-q"]) == 0
+    return folder
+
+
+@pytest.fixture
+def workspace(prepared, tmp_path, monkeypatch):
+    """A folder as a reader of the README has it before the first map."""
+    shutil.copytree(prepared, tmp_path, symlinks=True, ignore=shutil.ignore_patterns("map"), dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
@@ -108,7 +119,7 @@ def needed(words):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
-def test_every_command_runs(document, workspace):
+def test_every_command_runs(document, prepared, workspace):
     skipped = []
     for info, text in blocks(document, "sh"):
         if "norun" in info or "sample" in info:
@@ -117,7 +128,7 @@ def test_every_command_runs(document, workspace):
             skipped.append(package)
             continue
         if "map" in info:
-            map_run_log()
+            provide_map(prepared)
         for words in commands(text):
             if words[0] == "tools/quickstart":
                 assert " ".join(words) in (ROOT / ".ci" / "run").read_text()
@@ -136,9 +147,10 @@ def test_every_command_runs(document, workspace):
         pytest.skip(f"absent: {', '.join(skipped)}; the other commands ran")
 
 
-def map_run_log():
+def provide_map(prepared):
     """Make the folder map that a block begins with."""
-    assert main(["map", "run.log", "--out", "map", "--force", "-q"]) == 0
+    shutil.rmtree("map", ignore_errors=True)
+    shutil.copytree(prepared / "map", "map")
 
 
 def tool_beside(name):
@@ -148,10 +160,10 @@ def tool_beside(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
-def test_every_python_example_works(document, workspace, capsys):
+def test_every_python_example_works(document, prepared, workspace, capsys):
     for info, text in blocks(document, "python"):
         if "map" in info:
-            map_run_log()
+            provide_map(prepared)
         exec(compile(text, document.name, "exec"), {})
 
 

@@ -198,9 +198,9 @@ def test_hardly_any_recording_at_all():
 
 
 def test_the_caller_can_stop_at_any_call(minute):
-    calls, minute = [], minute.crop(end=8.0)
+    calls, minute = [], minute.crop(end=6.0)
     build_map(minute, progress=lambda *a: calls.append(a))
-    for stop in (1, len(calls) // 3, 2 * len(calls) // 3, len(calls)):
+    for stop in (1, len(calls) // 2, len(calls)):
         count = iter(range(1, len(calls) + 2))
         with pytest.raises(Cancelled, match="stopped by the caller"):
             build_map(minute, progress=lambda *_, count=count, stop=stop: next(count) < stop)
@@ -233,21 +233,21 @@ FALSE_RANGES = (FalseRanges(anchor=2, start=60.0, seconds=120.0, metres=3.0),)
 @pytest.mark.parametrize(
     ("limit", "settings"),
     [
-        (0.06, {"world": "hall", "minutes": 8.0, "seed": 11}),
-        (0.06, {"world": "lab", "minutes": 6.0, "seed": 12}),
-        (0.10, {"world": "corridor", "minutes": 8.0, "seed": 13}),
-        (0.06, {"world": "hall", "minutes": 8.0, "seed": 14, "nlos": "heavy", "nlos_anchors": (3, 4)}),
-        (0.08, {"world": "hall", "minutes": 8.0, "seed": 15, "odometry_scale": 2.0, "slips": 3}),
-        (0.06, {"world": "hall", "minutes": 8.0, "seed": 16, "outliers": 0.1, "zeros": 0.05, "false_ranges": FALSE_RANGES}),
-        (0.06, {"world": "hall", "minutes": 8.0, "seed": 17, "anchor_height": 2.0, "tag_height": 0.3}),
-        (0.15, {"world": "hall", "minutes": 8.0, "seed": 18, "without": ("uwb",)}),
-        (0.06, {"world": "hall", "minutes": 8.0, "seed": 19, "people": 4}),
-        (0.06, {"world": "lab", "minutes": 6.0, "seed": 20, "laser_error": (0.03, -0.02, 0.03), "laser_delay": 0.03}),
+        (0.06, {"world": "hall", "minutes": 5.0, "seed": 11}),
+        (0.06, {"world": "lab", "minutes": 4.0, "seed": 12}),
+        (0.10, {"world": "corridor", "minutes": 5.0, "seed": 13}),
+        (0.06, {"world": "hall", "minutes": 5.0, "seed": 14, "nlos": "heavy", "nlos_anchors": (3, 4)}),
+        (0.08, {"world": "hall", "minutes": 5.0, "seed": 15, "odometry_scale": 2.0, "slips": 3}),
+        (0.06, {"world": "hall", "minutes": 5.0, "seed": 16, "outliers": 0.1, "zeros": 0.05, "false_ranges": FALSE_RANGES}),
+        (0.06, {"world": "hall", "minutes": 5.0, "seed": 17, "anchor_height": 2.0, "tag_height": 0.3}),
+        (0.15, {"world": "hall", "minutes": 5.0, "seed": 18, "without": ("uwb",)}),
+        (0.06, {"world": "hall", "minutes": 5.0, "seed": 19, "people": 4}),
+        (0.06, {"world": "lab", "minutes": 4.0, "seed": 20, "laser_error": (0.03, -0.02, 0.03), "laser_delay": 0.03}),
     ],
     ids=["hall", "lab", "corridor", "nlos", "slips", "false ranges", "heights", "no uwb", "people", "mounting"],
 )
 def test_simulated_worlds(tmp_path, limit, settings):
-    """Odometry alone drifts by decimetres to metres within these minutes; the bars are for recordings four times as long."""
+    """Odometry alone drifts by decimetres to metres within these minutes; the bars are for recordings six times as long."""
     log, truth = simulated(tmp_path, scan_rate=5.0, **settings)
     result = build_map(log)
     assert ate(result, truth) < limit
@@ -265,8 +265,8 @@ def test_wheels_and_radio_alone(tmp_path, world, limit):
     assert all(a.status == "ok" for a in result.anchors)
 
 
-REAL = {"plaza1": 0.45, "carmen/freiburg-101": 0.25, "carmen/belgioioso": 0.25}
-"""m. Odometry alone: 1.5, 8.6 and 1.7 m."""
+REAL = {"carmen/freiburg-101": 0.25, "carmen/belgioioso": 0.25}
+"""m. Odometry alone: 8.6 and 1.7 m."""
 
 
 @pytest.mark.slow
@@ -287,10 +287,13 @@ def test_the_labyrinth_is_right_up_to_its_mirror_image(shared_data):
 
 
 @pytest.mark.slow
-def test_plaza_s_anchors_and_range_scale(shared_data):
+def test_plaza_s_trajectory_anchors_and_range_scale(shared_data):
+    """Odometry alone is 1.5 m off."""
     folder = shared_data / "plaza1"
     result = build_map(read_log(folder / "run.log.gz"))
-    laid = evaluate_trajectory(result.stamps, result.trajectory, *read_tum(folder / "truth.tum")).T_truth_map
+    errors = evaluate_trajectory(result.stamps, result.trajectory, *read_tum(folder / "truth.tum"), max_gap=30.0)
+    assert errors.ate.rmse < 0.45
+    laid = errors.T_truth_map
     rows = [row.split(",") for row in (folder / "truth_anchors.csv").read_text().split()[1:]]
     places = {row[0]: np.array(row[1:3], dtype=float) for row in rows}
     for anchor in result.anchors:
@@ -395,7 +398,7 @@ def test_a_lidar_that_sees_little_does_no_harm_to_the_radio(tmp_path):
     """A nearly empty hall: with lidar no worse than without, up to a twentieth, on average over three recordings."""
     fused, alone = [], []
     for seed in (1, 2, 3):
-        log, truth = simulated(tmp_path / str(seed), world="arena", seed=seed, minutes=12.0, speed=0.4)
+        log, truth = simulated(tmp_path / str(seed), world="arena", seed=seed, minutes=8.0, speed=0.4)
         alone.append(ate(build_map(log, replace(MappingConfig(), use_lidar=False)), truth))
         fused.append(ate(build_map(log), truth))
     assert np.mean(fused) < 1.05 * np.mean(alone)
@@ -403,7 +406,7 @@ def test_a_lidar_that_sees_little_does_no_harm_to_the_radio(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_ranges_through_walls_move_no_anchor(tmp_path, seed):
     """Through the block of a corridor ranges are 0.3 m late, always in the same directions; the map shows which they are."""
     log, truth = simulated(tmp_path, world="corridor", minutes=10.0, seed=seed)

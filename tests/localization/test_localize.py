@@ -128,7 +128,7 @@ def test_another_recording_through_the_same_room(tmp_path):
     simulate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(simulate)
     for seed in (5, 6):
-        simulate.main(["lab", "--out", str(tmp_path / str(seed)), "--seed", str(seed), "--minutes", "6", "--scan-rate", "5"])
+        simulate.main(["lab", "--out", str(tmp_path / str(seed)), "--seed", str(seed), "--minutes", "4", "--scan-rate", "5"])
     from uwblite.io.tum import read_tum
 
     first = read_log(tmp_path / "5" / "run.log")

@@ -248,10 +248,9 @@ def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, foun
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [11, 12])
-def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_laser(seed):
+def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_laser():
     """Two of four anchors measure 2 m too little for 40 % of the time each: wheels alone are weak enough to follow them."""
-    stamps, truth, log = run(seed, walls=np.concatenate([box(13, 13), box(3, 2) + 0.5]), metres=100.0)
+    stamps, truth, log = run(11, walls=np.concatenate([box(13, 13), box(3, 2) + 0.5]), metres=100.0)
     radio, part = log.ranges, (log.ranges.stamps - stamps[0]) / np.ptp(stamps)
     outlying = (radio.anchor == 0) & (part > 0.1) & (part < 0.5) | (radio.anchor == 1) & (part > 0.5) & (part < 0.9)
     consistent, lied = (
