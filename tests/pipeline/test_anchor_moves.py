@@ -19,21 +19,15 @@ from uwblite.pipeline.anchor_moves import (
     _of_all,
     _renamed,
     first_with_moves_apart,
-    name_and_number,
     with_moves_apart,
 )
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
+from uwblite.pipeline.recordings import Recording
 from uwblite.radio.change_points import Move
 from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting, UwbRanges
-
-
-def test_names_of_places():
-    assert name_and_number("5C0B") == ("5C0B", 1)
-    assert name_and_number("5C0B@3") == ("5C0B", 3)
-    assert name_and_number("user@home") == ("user@home", 1)
 
 
 @pytest.mark.slow
@@ -173,7 +167,7 @@ def test_moves_are_sought_in_the_level_part_of_usable_ranges(monkeypatch):
     # As recorded: what the graph leaves out, because the anchor was carried then, is looked at again.
     as_recorded, edges = np.nan_to_num(edges.ranges[1:]), replace(edges, ranges=np.where(np.arange(5) == 2, 0.0, edges.ranges))
     ranges = UwbRanges(np.arange(1.0, 5.0), np.array([0, 1, 0, 1]), as_recorded, np.ones(4), ("A", "B"))
-    second = SimpleNamespace(rows=slice(1, 3))
+    second = Recording(1, None, range(2), 1)
     task = SimpleNamespace(config=MappingConfig())
     assert _moves(second, SensorLog(four_ranges().odometry, ranges), estimate, task) == {}
     assert sorted(asked) == [1.0, 2.0]

@@ -1,6 +1,7 @@
 """The occupancy grid: a map larger than memory allows is drawn coarser, and that is said."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from uwblite.graph.pose_edges import ScanEdges
 from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.keyframes import KeyframeConfig
+from uwblite.pipeline import final_stages
+from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.final_stages import _sweeps, _with_steady_errors, at_given_poses
 from uwblite.pipeline.recordings import gather
 
@@ -59,6 +62,27 @@ def test_at_given_poses_only_what_belongs_to_anchors_is_free_and_what_was_fixed_
     assert given.fixed_poses.all()
     assert not given.fixed_anchors.any()
     np.testing.assert_array_equal(given.fixed_calibration, [False, False, True, True, True, True])
+
+
+def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monkeypatch):
+    """What is free of poses, wheels and laser is free again afterwards."""
+    keys = tuple(UnknownKey(kind) for kind in ("bias", "height2", "height2", "odometry_scale"))
+    graph = Graph(np.ones((3, 3)), np.zeros((2, 2)), (), Calibration(keys, np.ones(4)), np.arange(3) == 0)
+    monkeypatch.setattr(final_stages, "with_range_noise", lambda estimate, *_, steady: estimate)
+
+    def solved(estimate, task):
+        given = estimate.graph
+        height = np.array([False, True, False, False])
+        values = np.where(height, 0.0, given.calibration.values)
+        moved = given.updated(given.poses, given.anchors + 2.0, values)
+        return replace(estimate, graph=replace(moved, fixed_calibration=given.fixed_calibration | height))
+
+    monkeypatch.setattr(final_stages, "solved", solved)
+    found = final_stages._anchors_alone(Estimate(graph, None, None, ()), SimpleNamespace(config=MappingConfig())).graph
+    assert found.fixed_calibration.tolist() == [False, True, False, False]
+    assert found.fixed_poses.tolist() == [True, False, False]
+    assert found.calibration.values.tolist() == [1.0, 0.0, 1.0, 1.0]
+    assert (found.anchors == 2.0).all()
 
 
 @pytest.mark.parametrize(("steady", "lidar", "counted"), [(0.1, False, True), (0.0, False, False), (0.1, True, False)])

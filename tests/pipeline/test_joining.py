@@ -16,7 +16,7 @@ from uwblite.odometry.attached import attach_ranges
 from uwblite.odometry.keyframes import KeyframeConfig, select
 from uwblite.odometry.wheels import OdometryNoiseConfig, wheel_edges
 from uwblite.pipeline.estimate import Estimate
-from uwblite.pipeline.joining import _FIRST_TOLERANCE, _laid_on, _one_bootstrap, _one_graph, _other_name, join, radio_name
+from uwblite.pipeline.joining import _FIRST_TOLERANCE, _laid_on, _one_bootstrap, _one_graph, _other_name, join
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.range_measurements import range_edges
 from uwblite.radio.trilateration import TrilaterationConfig
@@ -85,12 +85,6 @@ def test_an_anchor_that_was_moved_while_recorded_is_called_so_in_later_recording
     assert _other_name("A", np.array([0.3, 0.3]), 0.0, 1, placed) == "A@2"
     assert _other_name("A@2", np.array([9.2, 0.3]), 0.0, 1, placed) == "A"
     assert _other_name("A", np.array([0.4, 0.4]), 0.0, 1, placed) == "A#2"
-
-
-@pytest.mark.parametrize("anchor", ["5C0B", "5C0B#2", "5C0B@2", "5C0B@12#3"])
-def test_all_places_of_an_anchor_have_one_radio_name(anchor):
-    assert radio_name(anchor) == "5C0B"
-    assert radio_name("a@b#c") == "a@b#c"
 
 
 def mapped(seed, tag, ids):

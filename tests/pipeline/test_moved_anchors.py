@@ -57,9 +57,8 @@ def test_an_anchor_that_stands_elsewhere_in_a_recording_is_another_one_there(mon
     assert estimate.ranges.anchor.tolist() == [0, 1, 0, 2, 0, 2]
     np.testing.assert_array_equal(estimate.graph.anchors, [[0.0, 0.0], [5.0, 0.0], [9.0, 0.0]])
     assert (estimate.bootstrap.hypotheses, estimate.placed.tolist()) == ((("a",), ("b",), ()), [True] * 3)
-    assert [(w.figures["anchor"], w.figures["recording"], w.figures["new_id"]) for w in stages.warnings] == [
-        ("B", 2, "B#2"), ("B", 3, "B#2"),
-    ]  # fmt: skip
+    names = ("anchor", "recording", "new_id", "distance")
+    assert [[w.figures[name] for name in names] for w in stages.warnings] == [["B", 2, "B#2", 4.0], ["B", 3, "B#2", 4.1]]
 
 
 @pytest.mark.parametrize("wild", [0.0, 0.1])

@@ -39,7 +39,10 @@ def untied(ranges=None, scans_at=None, edges=(), poses=POSES):
     readings = None if scans_at is None else np.ones((len(scans_at), 3), np.float32)
     scans = None if scans_at is None else LaserScans(scans_at, readings, -1.0, 1.0, 0.0, 0.0, 5.0)
     log = SensorLog(Odometry(STAMPS, poses), None, scans)
-    recording = SimpleNamespace(log=log, frames=SimpleNamespace(stamps=STAMPS), rows=slice(0, 100), has_scans=scans is not None)
+    recording = SimpleNamespace(
+        log=log, frames=SimpleNamespace(stamps=STAMPS), rows=slice(0, 100), has=lambda keyframe: keyframe < 100,
+        has_scans=scans is not None,
+    )  # fmt: skip
     stages = Stages(None, None)
     graph = Graph(poses, np.zeros((4, 2)), edges=edges)
     task = SimpleNamespace(recordings=SimpleNamespace(each=[recording]), stages=stages)

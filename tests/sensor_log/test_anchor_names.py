@@ -1,6 +1,21 @@
 """Names of anchors at several places."""
 
-from uwblite.sensor_log.anchor_names import last_places
+import pytest
+
+from uwblite.sensor_log.anchor_names import last_places, name_and_number, numbered, radio_name
+
+
+def test_names_of_places():
+    assert name_and_number("5C0B") == ("5C0B", 1)
+    assert name_and_number("5C0B@3") == ("5C0B", 3)
+    assert name_and_number("user@home") == ("user@home", 1)
+    assert numbered("5C0B@3", 1) == "5C0B@3#2"
+
+
+@pytest.mark.parametrize("anchor", ["5C0B", "5C0B#2", "5C0B@2", "5C0B@12#3"])
+def test_all_places_of_an_anchor_have_one_radio_name(anchor):
+    assert radio_name(anchor) == "5C0B"
+    assert radio_name("a@b#c") == "a@b#c"
 
 
 def test_the_last_place_counts_whether_moved_within_or_between_recordings():

@@ -15,6 +15,7 @@ from ..radio.change_points import Move, find_moves
 from ..radio.range_noise import short_term_sigma
 from ..radio.trilateration import usable
 from ..sensor_log import OdometryBreaks, Remark, Screening, SensorLog, UwbRanges
+from ..sensor_log.anchor_names import name_and_number
 from .estimate import Estimate, Task
 from .radio_stages import first_optimisation
 from .recordings import Recording, gather
@@ -87,7 +88,7 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task)
     if ranges is None or edges is None or estimate.bootstrap is None:
         return {}
     # The recording's ranges stand in the edges in their own order; some may have been left out there.
-    of_recording = np.flatnonzero((edges.pose >= recording.rows.start) & (edges.pose < recording.rows.stop))
+    of_recording = np.flatnonzero(recording.has(edges.pose))
     measured = edges.ranges.copy()
     measured[of_recording] = ranges.ranges
     edges = replace(edges, ranges=measured)
@@ -138,9 +139,3 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
         mounting=replace(log.mounting, anchor_heights=heights),
         screening=replace(before, remarks=(*before.remarks, *remarks)),
     )
-
-
-def name_and_number(name: str) -> tuple[str, int]:
-    """Return the radio's name of an anchor and which of its places is meant: ``ID`` is the first, ``ID@2`` the second ..."""
-    base, mark, number = name.rpartition("@")
-    return (base, int(number)) if mark and number.isdigit() else (name, 1)

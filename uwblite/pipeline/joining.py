@@ -6,7 +6,6 @@ the other; one that was moved in between does not join in, gets a place of its o
 Systematic errors of odometry, tag and ranges stay each recording's own, see calibration.unknowns.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -22,6 +21,7 @@ from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..radio.bootstrap_attempt import BootstrapResult
 from ..radio.trilateration import AnchorHypothesis
+from ..sensor_log.anchor_names import numbered, radio_name
 from .constraint_edges import consensus
 from .estimate import Estimate, Task
 from .recordings import Recording, Recordings
@@ -75,16 +75,6 @@ def warn_of_moved_anchor(task: Task, anchor: str, distance: float, recording: in
         f"anchor {anchor} was moved: in recording {recording + 1} it stands {distance:.2f} m away, and is called {new_id}",
         anchor=anchor, distance=round(distance, 4), recording=recording + 1, new_id=new_id,
     )  # fmt: skip
-
-
-def numbered(anchor: str, recording: int) -> str:
-    """Return the id of an anchor that stands elsewhere in a recording than before."""
-    return f"{anchor}#{recording + 1}"
-
-
-def radio_name(anchor: str) -> str:
-    """Return what the radio calls an anchor, given the id of one of its places, as ``5C0B@2#3``."""
-    return re.sub(r"(@\d+)?(#\d+)?$", "", anchor)
 
 
 def _other_name(name: str, here: Floats, spread: float, number: int, placed: dict[str, tuple[Floats, float]]) -> str:

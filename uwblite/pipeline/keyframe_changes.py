@@ -73,7 +73,7 @@ def _attached(ranges: RangeEdges, before: Recordings, after: Recordings) -> Rang
     pose, arm, turn, velocity = ranges.pose.copy(), ranges.lever_arm.copy(), ranges.turn.copy(), ranges.velocity.copy()
     for old, recording in zip(before.each, after.each, strict=True):
         log = recording.log
-        own = np.flatnonzero((ranges.pose >= old.rows.start) & (ranges.pose < old.rows.stop))
+        own = np.flatnonzero(old.has(ranges.pose))
         if log.ranges is None or not len(own):
             continue
         again = attach_ranges(log.ranges, log.odometry, recording.frames, log.mounting)

@@ -12,8 +12,9 @@ from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig, optimize
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
+from ..sensor_log.anchor_names import numbered, radio_name
 from .estimate import Estimate, Task
-from .joining import numbered, radio_name, warn_of_moved_anchor
+from .joining import warn_of_moved_anchor
 from .lidar_stages import refine_jointly
 
 _LEAST_MOVE = 0.25

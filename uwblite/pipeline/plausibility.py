@@ -12,7 +12,7 @@ from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
-from .anchor_moves import name_and_number
+from ..sensor_log.anchor_names import name_and_number
 from .drift_tests import check_drifts
 from .estimate import Estimate, Task
 from .half_tests import check_halves

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..constraints import Clock
 from ..errors import DataError
 from ..odometry import keyframes
@@ -35,6 +35,10 @@ class Recording:
     def rows(self) -> slice:
         """Its keyframes among all."""
         return slice(self.first, self.first + len(self.frames))
+
+    def has(self, keyframe: Ints) -> Bools:
+        """Return which keyframes (m,) are its own."""
+        return (keyframe >= self.rows.start) & (keyframe < self.rows.stop)
 
     @property
     def has_scans(self) -> bool:

@@ -16,8 +16,8 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
 from ..radio.anchor_covariance import by_alike_errors
 from ..radio.range_noise import RangeNoiseConfig
+from ..sensor_log.anchor_names import name_and_number
 from . import plausibility
-from .anchor_moves import name_and_number
 from .estimate import Estimate, Task
 from .final_stages import at_given_poses
 from .radio_stages import heights_given, tag_rises

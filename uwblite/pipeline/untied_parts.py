@@ -61,7 +61,7 @@ def _exchanged(recording: Recording, ranges: RangeEdges | None) -> list[tuple[fl
     """Return when, from and to, s, several anchors fall silent for good and several others appear."""
     if ranges is None or not len(ranges):
         return []
-    own = ranges.rows(np.flatnonzero((ranges.pose >= recording.rows.start) & (ranges.pose < recording.rows.stop)))
+    own = ranges.rows(np.flatnonzero(recording.has(ranges.pose)))
     order = np.argsort(own.stamps, kind="stable")
     stamps, anchor = own.stamps[order], own.anchor[order]
     _, appears = np.unique(anchor, return_index=True)

@@ -18,6 +18,22 @@ def _parts(name: str, names: Collection[str]) -> tuple[str, int, int]:
     return found[1], int(found[3] or 1), int(found[2] or 1)
 
 
+def name_and_number(name: str) -> tuple[str, int]:
+    """Return the name of an anchor in its recording and which of its places there is meant: ``ID`` is 1, ``ID@2`` is 2 ..."""
+    base, mark, number = name.rpartition("@")
+    return (base, int(number)) if mark and number.isdigit() else (name, 1)
+
+
+def numbered(anchor: str, recording: int) -> str:
+    """Return the name of an anchor that stands elsewhere in a recording (0, 1, ...) than before."""
+    return f"{anchor}#{recording + 1}"
+
+
+def radio_name(anchor: str) -> str:
+    """Return what the radio calls an anchor, given the name of one of its places, as ``5C0B@2#3``."""
+    return re.sub(r"(@\d+)?(#\d+)?$", "", anchor)
+
+
 def last_places(names: Collection[str]) -> dict[str, str]:
     """Return of each anchor of a map, by its radio's name, the name of its last place."""
     return {_parts(name, names)[0]: name for name in sorted(names, key=lambda n: _parts(n, names)[1:])}
