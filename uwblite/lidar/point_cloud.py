@@ -17,20 +17,10 @@ def make_tree(points: Floats) -> cKDTree:
 
 
 def statistical_outlier_filter(points: Floats, neighbours: int, std_ratio: float) -> Bools:
-    """Return which points are not unusually far from their nearest neighbours.
+    """Return which points (n, 2), m, are not unusually far from their nearest neighbours; a smaller cloud uses all it has.
 
     A point stays if its mean distance to its nearest neighbours is at most mean + std_ratio * standard deviation of
     that distance over the whole cloud.
-
-    Parameters
-    ----------
-    points : (n, 2), m.
-    neighbours : how many nearest neighbours; a smaller cloud uses all it has.
-    std_ratio : in standard deviations.
-
-    Returns
-    -------
-    (n,) True where the point stays.
     """
     k = min(neighbours, len(points) - 1)
     if k < 1:

@@ -26,11 +26,8 @@ def remap_command(report: dict[str, Any], folder: Path, recordings: dict[str, Pa
 
     Parameters
     ----------
-    report : report.json of the result.
-    folder : its folder; config.toml there holds the settings.
+    folder : of the result; config.toml there holds the settings.
     recordings : files at hand by the SHA-256 of their bytes.
-    constraints : file for --constraints.
-    out : folder to make.
 
     Raises
     ------
