@@ -21,6 +21,7 @@ from .pose_estimator import PoseEstimator
 from .range_update import RangeFacts
 from .records import LocalizerState, Scanner
 from .sensing import LEAD, Range, Scan, Waiting, scan_rays
+from .sensor_clock import JUMP, SensorClock
 
 _PATIENCE = 0.5
 """s by which a measurement may be ahead of the odometry before the odometry counts as silent, until it was seen to be late."""
@@ -52,6 +53,10 @@ class Localizer:
         self._leap: tuple[float, Floats] | None = None
         self._leaps = 0
         self._behind: list[tuple[float, Floats]] = []
+        self._range_clock: SensorClock[tuple[int, float, int]] = SensorClock(self.on_time)
+        self._scan_clock: SensorClock[tuple[Floats, Scanner]] = SensorClock(self.on_time)
+        self._step, self._silences = 0.0, 0
+        """Last step of the odometry's stamps, s, and how many were far longer than the one before."""
         self._clock_shift = 0.0
         """s, added to the odometry's stamps so that time goes on where its clock was set back."""
         self._estimator = PoseEstimator(known, self._odometer)
@@ -111,12 +116,12 @@ class Localizer:
         """
         values = np.asarray(metres, dtype=np.float64).reshape(-1)
         good = usable(values, TrilaterationConfig())
-        until = self.on_time(stamp)
         for name, value in zip(np.asarray(anchor_ids)[good].tolist(), values[good].tolist(), strict=True):
-            if name in self._names:
-                self._waiting.add(until, Range(self._names[name], value, tag))
-            else:
+            if name not in self._names:
                 self.strangers[name] = self.strangers.get(name, 0) + 1
+                continue
+            for at, entry in self._range_clock.take(stamp, self._measured, self._silences, (self._names[name], value, tag)):
+                self._waiting.add(at, Range(*entry))
         self._work_off()
         return self.state()
 
@@ -131,8 +136,9 @@ class Localizer:
         self.scanner = scanner or self.scanner
         if self.scanner is not None and self.known.walls is not None:
             readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
-            scan = Scan(self.on_time(stamp) + self.known.laser_delay, readings, self.scanner)
-            self._waiting.add(scan.end, scan)
+            for at, entry in self._scan_clock.take(stamp, self._measured, self._silences, (readings, self.scanner)):
+                scan = Scan(at + self.known.laser_delay, *entry)
+                self._waiting.add(scan.end, scan)
         self._work_off()
         return self.state()
 
@@ -165,7 +171,8 @@ class Localizer:
         """Move the pose to a later one (3,) of the wheels."""
         step = self._odometer.add(stamp, self._turns.turned(stamp, wheels))
         if self._odometer.stamp == stamp:
-            self._wheels, self._measured = wheels, stamp
+            self._silences += stamp - self._measured > self._step + JUMP
+            self._step, self._wheels, self._measured = stamp - self._measured, wheels, stamp
         if step is not None:
             self._estimator.move(step)
 
