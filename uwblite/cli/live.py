@@ -11,9 +11,8 @@ from .options import mounted, number
 from .serving import LOCAL, page_address, serving
 
 if TYPE_CHECKING:
-    from ..io.carmen_live import Measured
     from ..io.stored_result import StoredResult
-    from ..localization import Localizer, LocalizerState
+    from ..localization import LocalizerState
     from ..localization.known_map import KnownMap
 
 DEVICES = ("odometry", "lidar", "uwb", "gyro")
@@ -79,125 +78,39 @@ class Tracker:
     """From pieces of a log to lines on stdout."""
 
     def __init__(self, known: "KnownMap", args: argparse.Namespace) -> None:
-        from ..io.carmen_live import LiveReader
+        from ..localization.live_feed import LiveFeed
 
-        self.known, self.args = known, args
-        self.reader = LiveReader()
-        self.localizer: Localizer | None = None
         self.state: LocalizerState | None = None
         self.on_state: Callable[[LocalizerState], None] = lambda _: None
-        self._early: list[Measured] = []
-        self._seen: dict[str, float] = {}
-        self._silent: set[str] = set()
-        self._said = -float("inf")
-        self._sees = False
-        self._was_lost = True
+        self._feed = LiveFeed(known, lambda own: mounted(own, args), lambda line: console.note(f"uwblite: {line}"))
+        self._period = 0.999 / args.rate
+        self._said, self._was_lost = -float("inf"), True
 
     def take(self, data: bytes) -> None:
         """Use a piece of the log."""
-        for measured in self.reader.feed(data):
-            self._watch(measured)
-            if self.localizer is None:
-                self._early.append(measured)
-                if self._ready(measured):
-                    self._begin()
-            else:
-                self._use(measured)
+        for state in self._feed.take(data):
+            self._say(state)
 
-    def _ready(self, measured: "Measured") -> bool:
-        """Return whether the log has said how the sensors are mounted: with the first scan, or when none comes for 2 s."""
-        from ..io.carmen_live import LiveScan
-
-        return isinstance(measured, LiveScan) or measured.order - self._early[0].order > _NO_LIDAR
-
-    def _begin(self) -> None:
-        from ..localization import Localizer
-
-        self.localizer = Localizer(self.known, mounted(self.reader.mounting, self.args))
-        early, self._early = self._early, []
-        for measured in early:
-            self._use(measured)
-
-    def _use(self, measured: "Measured") -> None:
-        from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange
-        from ..localization import Localizer, Scanner
-
-        assert self.localizer is not None
-        if isinstance(measured, LiveOdometry):
-            self.state = self.localizer.add_odometry(measured.stamp, *measured.pose.tolist())
-        elif isinstance(measured, LiveGyro):
-            self.localizer.add_gyro(measured.stamp, measured.heading)
-            return
-        elif isinstance(measured, LiveRange):
-            self.state = self.localizer.add_ranges(measured.stamp, [measured.anchor_id], [measured.range], measured.tag)
-        else:
-            if not self._sees and self.localizer.scanner is None and "lidar" in self._silent:
-                # It comes late: only now the log has said where the laser sits.
-                self.localizer = Localizer(self.known, mounted(self.reader.mounting, self.args))
-            self._sees = True
-            s = measured.scans
-            scanner = Scanner(s.angle_min, s.angle_increment, s.time_increment, s.range_min, s.range_max)
-            self.state = self.localizer.add_scan(measured.stamp, s.ranges[0], scanner)
-        self._say()
-
-    def _say(self) -> None:
-        state = self.state
-        if state is None or not state.stamp > -float("inf"):
+    def _say(self, state: "LocalizerState") -> None:
+        self.state = state
+        if not state.stamp > -float("inf"):
             return
         self.on_state(state)
-        if self._said <= state.stamp < self._said + 0.999 / self.args.rate and state.lost == self._was_lost:
+        if self._said <= state.stamp < self._said + self._period and state.lost == self._was_lost:
             return
         self._said, self._was_lost = state.stamp, state.lost
         console.say_lines(line_of(state))
         console.flush()
 
-    def _watch(self, measured: "Measured") -> None:
-        """Say once when a sensor that was there, or should be, falls silent."""
-        from ..io.carmen_live import LiveGyro, LiveOdometry, LiveRange
-
-        kind = {LiveOdometry: "odometry", LiveRange: "uwb", LiveGyro: "gyro"}.get(type(measured), "lidar")
-        now = measured.order if self.localizer is None else self.localizer.on_time(measured.order)
-        if not self._seen:
-            self._seen = {name: now for name in _SENSORS if name != "gyro"}
-        self._seen[kind] = max(self._seen.get(kind, now), now)
-        if kind in self._silent:
-            self._silent.discard(kind)
-            console.note(f"uwblite: {kind} is back")
-        for other, last in self._seen.items():
-            if now - last > _SILENCE and other not in self._silent:
-                self._silent.add(other)
-                console.note(f"uwblite: warning: nothing from {other} for {_SILENCE:.0f} s; {_SENSORS[other]}")
-
     def ended(self, interrupted: bool) -> int:
-        """Say what was lost and return the exit code."""
-        if self.localizer is None and self._early:
-            self._begin()
-        if self.reader.broken:
-            console.note(f"uwblite: {self.reader.broken} broken lines were left out")
-        strangers = {} if self.localizer is None else self.localizer.strangers
-        if strangers:
-            console.note(f"uwblite: ranges to anchors that are not in the map: {_counted(strangers)}")
-        ahead = 0 if self.localizer is None else self.localizer.refused
-        if ahead:
-            console.note(f"uwblite: {ahead} measurements were left out, stamped seconds ahead of all others")
+        """Say what was left out and return the exit code."""
+        for state in self._feed.end():
+            self._say(state)
         if interrupted:
             return 130
         if self.state is None:
             console.note("uwblite: warning: the log holds no measurement")
         return 0 if self.state is not None and not self.state.lost else 3
-
-
-_NO_LIDAR = 2.0
-"""s after which a robot counts as one without lidar."""
-_SILENCE = 5.0
-"""s."""
-_SENSORS = {
-    "odometry": "the pose is held and becomes unsure",
-    "lidar": "the pose rests on ranges and odometry",
-    "uwb": "the pose rests on scans and odometry",
-    "gyro": "directions are the wheels' own",
-}
-"""And what it means that one is silent; a gyro is missed only where one sent before."""
 
 
 @contextmanager
@@ -252,11 +165,6 @@ def _tell_map(known: "KnownMap") -> None:
         console.note("uwblite: warning: the map has no anchor with a place: the robot is localised by the walls alone")
     if known.walls is None:
         console.note("uwblite: warning: the map has no grid: the robot is localised by the anchors alone")
-
-
-def _counted(names: dict[str, int]) -> str:
-    some = ", ".join(f"{name} ({count})" for name, count in sorted(names.items())[:10])
-    return some + (f" and {len(names) - 10} more" if len(names) > 10 else "")
 
 
 def _stdin() -> Iterator[bytes]:
