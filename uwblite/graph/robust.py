@@ -18,7 +18,7 @@ class Kernel:
     """A robust kernel and its scale."""
 
     name: str = "none"
-    """One of KERNELS."""
+    """none, huber, cauchy, geman-mcclure or tukey."""
     scale: float = 1.0
     """Whitened norm (in standard deviations) at which the kernel departs from the square."""
 

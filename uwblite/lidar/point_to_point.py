@@ -26,7 +26,7 @@ class IcpConfig:
     min_sigma: float = setting(0.01, advanced=True)
     """m; residuals smaller than that do not make the result more certain."""
     min_matches: int = setting(10, minimum=1, advanced=True)
-    """Fewer pairs of points are no registration."""
+    """A match of fewer pairs of points is rejected."""
     fitness_sigma: float = float("inf")
     """m^2; a match with a greater mean squared distance between nearest points is rejected (the paper's sigma)."""
 

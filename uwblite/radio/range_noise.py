@@ -31,7 +31,7 @@ class RangeNoiseConfig:
     correlation_length: float = setting(1.5, advanced=True)
     """Distance over which the slow part stays alike, m, before it is learnt."""
     min_sigma: float = setting(0.03, advanced=True)
-    """Largest standard deviation of such radios, m."""
+    """Smallest standard deviation that is learnt, m."""
     steady: float = 0.06
     """Standard deviation of the error that all ranges to an anchor from one direction and distance have in common, m.
     Radiation pattern and received power alone cause as much. Residuals do not show it: a shifted anchor explains it as well."""
