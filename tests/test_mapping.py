@@ -24,6 +24,7 @@ from uwblite.lidar.joint_refinement import with_fewer_pairs
 from uwblite.lidar.surface_errors import common_range_errors
 from uwblite.mapping import MappingConfig, _stages, build_map
 from uwblite.odometry.wheels import with_noise_shown
+from uwblite.pipeline import anchor_moves
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.final_stages import at_given_poses
 from uwblite.radio.anchor_covariance import by_alike_errors
@@ -117,6 +118,20 @@ def test_equal_input_gives_equal_bytes_whoever_computes(minute):
     same_bytes(one, build_map(minute))
     with ThreadPoolExecutor(2) as executor:
         same_bytes(one, build_map(minute, executor=executor))
+
+
+def test_names_that_turn_out_right_as_recorded_are_not_estimated_anew(minute, monkeypatch):
+    """Moves are taken back once the trajectory has been estimated with them: it goes on from the first optimisation."""
+    log = minute.without(lidar=True)
+    plain = build_map(log)
+    proposed = iter([lambda logs: logs, lambda logs: None])
+    monkeypatch.setattr(anchor_moves, "first_with_moves_apart", lambda estimate, task, logs: [replace(log) for log in logs])
+    monkeypatch.setattr(anchor_moves, "with_moves_apart", lambda estimate, task, logs: next(proposed)(logs))
+    result = build_map(log)
+    assert [stage.name for stage in result.stages].count("first optimisation") == 2
+    assert [stage.name for stage in plain.stages].count("first optimisation") == 1
+    assert result.trajectory.tobytes() == plain.trajectory.tobytes()
+    assert (result.warnings, result.doubts) == (plain.warnings, plain.doubts)
 
 
 def test_the_recording_is_not_changed_and_progress_is_reported_in_order(minute):

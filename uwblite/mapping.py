@@ -73,13 +73,16 @@ def build_map(
         free = replace(config.calibration, odometry_scale=config.calibration.odometry_unit)
         task = replace(task, recordings=gather(logs, config.keyframes), config=replace(config, calibration=free))
         estimate = radio_stages.first_optimisation(task)
-    before = stages.mark()
+    before, as_recorded = stages.mark(), (estimate, task)
     renamed = anchor_moves.first_with_moves_apart(estimate, task, logs)
     for _ in range(_MOST_MOVES):
         if renamed is not None:
             stages.back_to(before)
-            task = replace(task, recordings=gather(renamed, config.keyframes))
-            estimate = radio_stages.first_optimisation(task)
+            estimate, task = as_recorded
+            # Moves that were taken back leave the recordings as they were.
+            if any(log is not other for log, other in zip(renamed, logs, strict=True)):
+                task = replace(task, recordings=gather(renamed, config.keyframes))
+                estimate = radio_stages.first_optimisation(task)
         for stage in _stages(task):
             estimate = stage(estimate, task)
             task = task.following(estimate)

@@ -223,7 +223,7 @@ class Tried(Attempt):
         self.path, self.config, self.low, self.high = np.arange(401.0), config, 0, 0
         self.heading = float(graph.calibration.values[0])
 
-    def run(self, enough=np.inf):
+    def run(self, enough=np.inf, torn=True):
         self.high = int(min(enough, 400.0)) + 1
         self.known[self.heading] = self.high - 1
 

@@ -19,7 +19,7 @@ class Scheduled(Attempt):
     def __init__(self, poses, agrees, found):
         self.path, self.config, self.hypotheses = np.arange(float(poses)), BootstrapConfig(), {}
         self.placed, self.agrees, self.found = np.ones(1, dtype=bool), iter(agrees), iter(found)
-        self.taken, self.low, self.high = [], 0, 0
+        self.taken, self.low, self.high, self.tears_at = [], 0, 0, np.inf
 
     def _seed(self):
         self.low, self.high = 0, 20
@@ -40,6 +40,9 @@ class Scheduled(Attempt):
     def _adopt(self, found):
         return next(self.found)
 
+    def _is_torn(self):
+        return self.high >= self.tears_at
+
 
 def test_pieces_grow_while_the_ranges_agree_and_all_is_solved_from_time_to_time():
     """The first piece is 0.3 of the first stretch. It grows by half where the ranges agreed, shrinks by a fifth where they did
@@ -55,6 +58,17 @@ def test_pieces_grow_while_the_ranges_agree_and_all_is_solved_from_time_to_time(
     pieces = [t for t in slow.taken if isinstance(t, float)]
     assert pieces == [6.0, 4.8, 3.84, 3.072, 2.4576, 1.96608, 1.8, 1.8, 1.8]
     assert [t[1] for t in slow.taken if isinstance(t, tuple)] == [20, 28, 40, 56]
+
+
+def test_an_attempt_that_is_torn_once_all_was_solved_goes_on_only_where_asked_to():
+    """A tear in the pieces just laid on may be mended when all is solved; before that nothing ends."""
+    for tears_at, high in ((24, 28), (29, 40), (np.inf, 56)):
+        tried = Scheduled(56, [True] * 9, [False] * 3)
+        tried.tears_at = tears_at
+        tried.run(100.0, torn=False)
+        assert tried.high == high
+        tried.run(100.0)
+        assert tried.high == 56
 
 
 def along_a_line(poses=12, sigma=0.1):

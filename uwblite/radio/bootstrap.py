@@ -38,7 +38,7 @@ def bootstrap_graph(
     if first.misfit() < config.agreement or not others:
         return first.estimate()
     for attempt in others:
-        attempt.run(config.enough)
+        attempt.run(config.enough, torn=False)
     others.sort(key=Attempt.misfit)
     hopeful = others[0] if others[0].misfit() < 0.8 * begun else first
     for attempt in others:

@@ -90,8 +90,13 @@ class Attempt:
         """Whether all poses are known."""
         return self.low == 0 and self.high == len(self.path)
 
-    def run(self, enough: float = np.inf) -> None:
-        """Extend from the clearest stretch, or from where it was left, to a travelled distance, m, or to the whole path."""
+    def run(self, enough: float = np.inf, *, torn: bool = True) -> None:
+        """Extend from the clearest stretch, or from where it was left, to a travelled distance, m, or to the whole path.
+
+        Parameters
+        ----------
+        torn : go on where the trajectory is torn; no attempt that is torn agrees with the ranges later.
+        """
         if self.high == 0:
             self._begin()
         while self.placed.any() and not self.complete and self.path[self.high - 1] - self.path[self.low] < enough:
@@ -102,6 +107,8 @@ class Attempt:
                 self.solved = self.high - self.low
                 if self._adopt(self._search(self.low, self.high, 2.0 * self.config.range_sigma)):
                     self._solve((6.0, 3.0))
+                if not torn and self._is_torn():
+                    break
         if np.isinf(enough):
             self._place_the_rest()
 
@@ -144,9 +151,14 @@ class Attempt:
         part = self._part(low, high)
         errors = [np.abs(e.residuals(part)[:, 0] * e.sigma) for e in part.edges if isinstance(e, RangeEdges)]
         median = float(np.median(errors[0])) / (0.6745 * self.config.range_sigma) if errors else 0.0
+        return max(median, self.config.agreement) if self._is_torn() else median
+
+    def _is_torn(self) -> bool:
+        """Return whether a step of the known poses is not the odometry's."""
+        low, high = self.low, self.high or len(self.path)
         steps = self.odometry.corrected(replace(self.graph, calibration=self.calibration))[low : high - 1]
         off = se2.between(steps, se2.between(self.poses[low : high - 1], self.poses[low + 1 : high]))
-        return max(median, self.config.agreement) if np.any(np.abs(off) > self.config.tear) else median
+        return bool(np.any(np.abs(off) > self.config.tear))
 
     def _unclear(self, hypotheses: list[AnchorHypothesis]) -> bool:
         return len(hypotheses) > 0 and ambiguous(hypotheses, self.search)
