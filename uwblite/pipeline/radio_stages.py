@@ -10,8 +10,18 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
+from ..errors import SolverError
 from ..graph import calibration
-from ..graph.calibration import BIAS, ODOMETRY, RADIO, RANGE_SCALE, optimize_with_heights, with_free, with_nonnegative_heights
+from ..graph.calibration import (
+    BIAS,
+    HEIGHT,
+    ODOMETRY,
+    RADIO,
+    RANGE_SCALE,
+    optimize_with_heights,
+    with_free,
+    with_nonnegative_heights,
+)
 from ..graph.graph import Graph
 from ..graph.solver import SolverConfig, optimize
 from ..odometry import gyro
@@ -122,6 +132,8 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     places = [calibration.index("odometry_scale", recording=n) for n in range(len(recordings))]
     factors = np.array([1.0 if place < 0 else 1.0 + float(calibration.values[place]) for place in places])
     factors = np.where(np.abs(factors - 1.0) > _OTHER_UNIT, factors, 1.0)
+    # High anchors make ranges too long, never too short.
+    height = _height_instead(estimate, task.config) if np.any(factors > 1.0) else None
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:
             double = abs(abs(np.log2(factor)) - 1.0) < _DOUBLE
@@ -132,11 +144,32 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
                 f"{whose}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its "
                 f"odometry has: {reason}"
             )
-            add = task.stages.doubt if unclear else task.stages.warn
+            high = height is not None and factor > 1.0
+            if high:
+                text += f"; or the wheels are right and the anchors hang {height:.1f} m above the tag: give their heights"
+            add = task.stages.doubt if unclear or high else task.stages.warn
             add("odometry-unit", text, recording=recording.number + 1, factor=round(factor, 4))
     return factors
 
 
+def _height_instead(estimate: Estimate, config: MappingConfig) -> float | None:
+    """Return how high the anchors hang if the wheels' unit is right, m; None where that explains the ranges clearly worse."""
+    edges = estimate.odometry_and_ranges
+    graph = estimate.graph.with_edges(*edges)
+    heights = graph.calibration.of_kinds(HEIGHT)
+    if not heights.any():
+        return None
+    high = with_free(prior_selection.with_high_anchors(estimate.graph, config.calibration), *RADIO).with_edges(*edges)
+    try:
+        other, _ = optimize_with_heights(high, config.solver)
+        gain = prior_selection.log_evidence(other) - prior_selection.log_evidence(graph)
+    except SolverError:
+        return None
+    return float(np.sqrt(np.median(other.calibration.values[heights]))) if gain > -_CLEARLY_WORSE else None
+
+
+_CLEARLY_WORSE = 20.0
+"""Difference of logarithmic evidence from which on one hypothesis is refuted."""
 _OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
 _DOUBLE = 0.1

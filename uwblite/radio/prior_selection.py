@@ -12,6 +12,8 @@ where nothing contradicts it, that all are right. The scale of the radios and th
 widths from sound to unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the
 marginal likelihood. A scale that is clearly off floats with the widest. So a scale stays where it is as long as the
 recording does not show it, moves a part of the way where it leans to one side, and floats where the posterior odds are clear.
+Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too. Where that seems wrong, the evidence
+(Laplace) at its optimum is compared with that of another hypothesis: all units are right, and the anchors hang high.
 
 With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 
@@ -25,7 +27,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
-from ..graph.calibration import CalibrationConfig
+from ..graph.calibration import HEIGHT, CalibrationConfig
 from ..graph.graph import Edges, Graph, PriorEdges
 from ..graph.marginals import calibration_covariance
 
@@ -42,6 +44,40 @@ _FARTHEST = 0.08
 _SHORT, _TOO_SHORT = -0.01, 0.01
 """Relative error from which on ranges are shorter than light allows, and the factor on the odds of a radio that says so: too
 long may come from late first paths, too short only from a wrong constant."""
+_HIGH = 6.0
+"""Height above the tag at which anchors of a large hall hang, m."""
+
+
+def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
+    """Return the graph with priors under which all units are right and the anchors hang as high as in a large hall.
+
+    Lengths that a wrong unit stretched are put back, for a start.
+    """
+    scales = graph.calibration.of_kinds("odometry_scale")
+    stretched = 1.0 + float(np.mean(graph.calibration.values[scales])) if scales.any() else 1.0
+    poses = np.column_stack([graph.poses[:, :2] / stretched, graph.poses[:, 2]])
+    graph = graph.updated(poses, graph.anchors / stretched, np.where(scales, 0.0, graph.calibration.values))
+    sigma = _prior_sigma(graph)
+    widths = (("range_scale", config.range_scale_sound), ("odometry_scale", config.odometry_scale), (HEIGHT, _HIGH**2))
+    for name, width in widths:
+        sigma[graph.calibration.of_kinds(name)] = width
+    return _with_prior_sigma(graph, sigma)
+
+
+def log_evidence(graph: Graph) -> float:
+    """Return the logarithm of the probability of all measurements (Laplace), but for terms that hypotheses share.
+
+    Parameters
+    ----------
+    graph : solved, with all its edges; calibration values have priors.
+
+    Raises
+    ------
+    SolverError : the measurements do not determine the graph.
+    """
+    which = np.flatnonzero(~graph.fixed_calibration)
+    determinant = np.linalg.slogdet(calibration_covariance(graph)[np.ix_(which, which)])[1]
+    return float(0.5 * (determinant - graph.chi2()) - np.sum(np.log(_prior_sigma(graph)[which])))
 
 
 def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
