@@ -154,6 +154,27 @@ def test_rooms_that_the_map_does_not_hold_take_no_pose_away_while_ranges_agree()
     assert errors(states[found:], poses[found:]).max() < 0.15
 
 
+def test_a_few_ends_near_walls_pull_at_no_pose_where_the_others_lie_in_unknown_space():
+    """The map ends before the robot; what it sees beside itself is 0.1 m off the walls that the map has there."""
+    grid = grid_of(ODD)
+    right = grid.geometry.centre_of(*np.indices(grid.log_odds.shape))[..., 0] > 4.0
+    cut = dataclasses.replace(grid, log_odds=np.where(right, 0.0, grid.log_odds).astype(np.float32))
+    drive = robot(dataclasses.replace(known(), walls=walls_of(cut)))
+    poses = path(((1.0, 2.5), (3.5, 2.5), (3.5, 5.0), (1.5, 5.0), (1.5, 3.0), (3.8, 3.0)))
+    odd = (poses[:, 0] > 2.5) & (np.arange(len(poses)) > len(poses) - 20)
+    assert not drive.along(poses[~odd])[-1].lost
+    bearing = np.degrees(SCANNER.angle_min + SCANNER.angle_increment * np.arange(181))
+    for pose in poses[odd]:
+        drive.along(pose[None], scans=False, ranges=False)
+        beside = cast(pose + np.array([0.0, 0.1, 0.0]))
+        beyond = cast(pose)
+        beyond[pose[0] + beyond * np.cos(np.radians(bearing)) < 4.2] = np.nan
+        readings = np.where(np.abs(bearing) > 80.0, beside, beyond)
+        state = drive.localizer.add_scan(drive.stamp - 0.2, readings, SCANNER)
+    assert not state.lost
+    assert abs(state.pose[1] - 3.0) < 0.04
+
+
 def test_legs_and_moved_things_do_not_pull():
     """Two people walk beside the robot, a quarter of its view each side."""
     poses = path(ROUND)

@@ -34,6 +34,8 @@ _UNIT_WAY = 1.0
 """m driven between two comparisons of the map's unit with the sensors'."""
 _PROVEN = 3
 """Comparisons of the unit that a tracked pose must have passed, two metres of driving, for the map to count as right."""
+_KNOWN = 0.5
+"""Share of a scan's ends that must lie in known space for it to move a pose that was found."""
 _MOST, _FORGET = 40, -14.0
 """Hypotheses, and log-weight below which one goes."""
 _MOST_PARTS = 4
@@ -105,8 +107,9 @@ class PoseEstimator:
         least = _LEAST_FRESH if driven > 1e-3 else _STANDING_FRESH
         before = self._bank
         self._bank = hypotheses.matched(before, walls, rays, float(np.clip(driven / _FRESH_WAY, least, 1.0)))
-        found = walls.agreement(self._bank.poses, rays.spread(RAYS))
-        if self._certain and found.fit[0] < FIT_LOST:
+        some = rays.spread(RAYS)
+        found = walls.agreement(self._bank.poses, some)
+        if self._certain and (found.fit[0] < FIT_LOST or found.known[0] < _KNOWN * int(some.hit.sum())):
             # What does not agree as a whole must not move the pose: walls that the map does not hold lie near others.
             self._bank = before
         if len(self._bank) > 1:
