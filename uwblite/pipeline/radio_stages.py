@@ -165,11 +165,14 @@ def _height_instead(estimate: Estimate, config: MappingConfig) -> float | None:
         gain = prior_selection.log_evidence(other) - prior_selection.log_evidence(graph)
     except SolverError:
         return None
-    return float(np.sqrt(np.median(other.calibration.values[heights]))) if gain > -_CLEARLY_WORSE else None
+    height = float(np.sqrt(np.median(other.calibration.values[heights])))
+    return height if gain > -_CLEARLY_WORSE and height > _NOTICEABLE else None
 
 
 _CLEARLY_WORSE = 20.0
 """Difference of logarithmic evidence from which on one hypothesis is refuted."""
+_NOTICEABLE = 1.0
+"""Height above the tag, m, below which an anchor's ranges are longer than on the floor only where it is passed."""
 _OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
 _DOUBLE = 0.1
