@@ -53,7 +53,7 @@ class LiveFeed:
                 yield from self._begin()
 
     def end(self) -> Iterator[LocalizerState]:
-        """Use what was held back, yield the states, and say what was left out."""
+        """Use what still waits, yield the states, and say what was left out."""
         yield from self._begin()
         if self._reader.broken:
             self._note(f"{self._reader.broken} broken lines were left out")

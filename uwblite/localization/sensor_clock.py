@@ -22,7 +22,7 @@ class SensorClock(Generic[T]):
 
     Measurements are ahead of the odometry, when they arrive, by about the same time always. That changes bit by bit where a
     device is silent or its messages become late; where a stamp leaps, the sensor's or the odometry's, and from then on the
-    lead is another one, a clock has jumped. Until that is clear, measurements are held back.
+    lead is another one, a clock has jumped. Until that is clear, measurements wait.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class SensorClock(Generic[T]):
         self._shift, self._lead = 0.0, np.nan
         self._last = self._now = -np.inf
         self._longest, self._silences = 0.0, 0
-        self._held: list[tuple[float, float, float, T]] = []
+        self._pending: list[tuple[float, float, float, T]] = []
         """Stamp, lead, last odometry and measurement."""
 
     def take(self, stamp: float, now: float, silences: int, what: T) -> list[tuple[float, T]]:
@@ -49,9 +49,9 @@ class SensorClock(Generic[T]):
         if not np.isfinite(lead):
             return [(at, what)]
         leapt = silences != self._silences or not -JUMP <= at - self._last <= self._longest + JUMP
-        self._held.append((stamp, lead, now, what))
-        if abs(lead - self._lead) > JUMP and (leapt or len(self._held) > 1):
-            leads, nows = np.array([(h[1], h[2]) for h in self._held]).T
+        self._pending.append((stamp, lead, now, what))
+        if abs(lead - self._lead) > JUMP and (leapt or len(self._pending) > 1):
+            leads, nows = np.array([(h[1], h[2]) for h in self._pending]).T
             if np.ptp(leads) <= JUMP:
                 if len(np.unique(nows)) < _CONFIRMED:
                     return []
@@ -60,7 +60,7 @@ class SensorClock(Generic[T]):
             self._lead = lead
         elif now > self._now:
             self._lead += _LEARNT * (lead - self._lead)
-        free, self._held = [(self._time(h[0]), h[3]) for h in self._held], []
+        free, self._pending = [(self._time(h[0]), h[3]) for h in self._pending], []
         self._longest = max(0.9 * self._longest, min(free[-1][0] - self._last, _LONGEST) if np.isfinite(self._last) else 0.0)
         self._last, self._now, self._silences = free[-1][0], now, silences
         return free

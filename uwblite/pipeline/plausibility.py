@@ -83,7 +83,7 @@ half a metre; rooms mapped by odometry and ranges have 0.08 to 0.15 m."""
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     """Name anchors that are not ok, and doubt a map with which most ranges, or without a lidar half of the anchors, disagree.
 
-    A name that two anchors answer to counts as one. Mirror ambiguity is a doubt where no anchor in reach has one place alone.
+    A name of two anchors counts as a distrusted one. Mirror ambiguity is a doubt where no anchor in reach has one place alone.
     """
     unclear = not any(anchor.status == "ok" for anchor in anchors)
     for anchor in anchors:

@@ -162,7 +162,7 @@ def _height_instead(estimate: Estimate, config: MappingConfig) -> float | None:
     high = with_free(prior_selection.with_high_anchors(estimate.graph, config.calibration), *RADIO).with_edges(*edges)
     try:
         other, _ = optimize_with_heights(high, config.solver)
-        gain = prior_selection.log_evidence(other) - prior_selection.log_evidence(graph)
+        gain = prior_selection.laplace_marginal_likelihood(other) - prior_selection.laplace_marginal_likelihood(graph)
     except SolverError:
         return None
     height = float(np.sqrt(np.median(other.calibration.values[heights])))
@@ -170,9 +170,9 @@ def _height_instead(estimate: Estimate, config: MappingConfig) -> float | None:
 
 
 _CLEARLY_WORSE = 20.0
-"""Difference of logarithmic evidence from which on one hypothesis is refuted."""
+"""Difference of the logarithms of marginal likelihoods from which on one hypothesis is refuted."""
 _NOTICEABLE = 1.0
-"""Height above the tag, m, below which an anchor's ranges are longer than on the floor only where it is passed."""
+"""Height above the tag, m, from which on anchors can look like another unit; lower ones lengthen short ranges only."""
 _OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
 _DOUBLE = 0.1

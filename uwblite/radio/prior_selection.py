@@ -12,8 +12,8 @@ where nothing contradicts it, that all are right. The scale of the radios and th
 widths from sound to unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the
 marginal likelihood. A scale that is clearly off floats with the widest. So a scale stays where it is as long as the
 recording does not show it, moves a part of the way where it leans to one side, and floats where the posterior odds are clear.
-Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too. Where that seems wrong, the evidence
-(Laplace) at its optimum is compared with that of another hypothesis: all units are right, and the anchors hang high.
+Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too. Where that seems wrong, the marginal
+likelihood (Laplace) at its optimum is compared with that of another hypothesis: all units are right, and the anchors hang high.
 
 With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 
@@ -64,8 +64,8 @@ def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
     return _with_prior_sigma(graph, sigma)
 
 
-def log_evidence(graph: Graph) -> float:
-    """Return the logarithm of the probability of all measurements (Laplace), but for terms that hypotheses share.
+def laplace_marginal_likelihood(graph: Graph) -> float:
+    """Return the logarithm of the marginal likelihood of a graph at its optimum (Laplace), but for terms that hypotheses share.
 
     Parameters
     ----------
