@@ -110,18 +110,18 @@ def moved_together(places, lidar=False, agree_until=None, recordings=1):
     return [notice.kind for notice in told_of_moves(places, lidar, agree_until, recordings)]
 
 
-def told_of_moves(places, lidar=False, agree_until=None, recordings=1):
+def told_of_moves(places, lidar=False, agree_until=None, recordings=1, moment=100.0):
     """Return the doubts about a map in which the anchors A, B, ... have these places one after the other, from 0 and 100 s.
 
-    Ranges to those that `agree_until` names agree with the map up to that time, s.
+    Ranges to those that `agree_until` names agree with the map up to that time, s; `moment` stands for those 100 s.
     """
     anchors, stamps, anchor = [], [], []
     for name, own in zip("ABCD", places, strict=False):
         for number, place in enumerate(own):
-            since = 100.0 * number if len(own) > 1 else np.nan
+            since = moment * number if len(own) > 1 else np.nan
             label = name if number == 0 else f"{name}@{number + 1}"
             anchors.append(AnchorEstimate(label, np.array(place), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok", "", None, since))
-            measured = np.arange(100.0 * number, 200.0 if number == len(own) - 1 else 100.0, 5.0)
+            measured = np.arange(moment * number, 200.0 if number == len(own) - 1 else moment, 5.0)
             stamps.append(measured)
             anchor.append(np.full(len(measured), len(anchors) - 1))
     stages = Stages(None, None)
@@ -155,6 +155,11 @@ def test_anchors_that_were_moved_together_are_rather_another_change():
     assert moved_together([[A, ELSEWHERE], [B, (4.0, 9.0)], [C]]) == ["anchors-moved-together"]
     assert moved_together([[A, ELSEWHERE]]) == ["anchors-moved-together"]
     assert not moved_together([[A, ELSEWHERE], [B], [C]])
+
+
+def test_a_move_shortly_before_the_end_is_one_of_the_anchors_that_are_measured_after_it():
+    assert not told_of_moves([[A, ELSEWHERE], [B], [C]], moment=185.0)
+    assert told_of_moves([[A, ELSEWHERE], [B, (4.0, 9.0)], [C]], moment=185.0)
 
 
 def test_with_a_lidar_one_anchor_may_be_moved_and_all_of_them_between_recordings():

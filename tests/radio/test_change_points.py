@@ -89,6 +89,14 @@ def test_a_place_whose_ranges_are_all_off_by_more_than_any_radio_is_none(bias, f
     assert (find_move(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig()) is not None) == found
 
 
+@pytest.mark.parametrize(("bias", "found"), [(0.0, True), (-0.8, False)])
+def test_a_short_move_that_a_constant_error_takes_back_is_none(bias, found):
+    """A radio's constant error does not change as it is moved; that of ranges past furniture does, and place with it."""
+    before, after = np.array([-2.0, 1.0]), np.array([-2.9, 1.9])
+    ranges = measured(1, before, after, share=0.0) + bias * (STAMPS >= 100.0)
+    assert (find_move(PATH, ranges, STAMPS, SIGMA, TrilaterationConfig()) is not None) == found
+
+
 def test_a_move_that_another_follows_at_once_was_not_undone_in_between():
     move = find_move(PATH, carried(50.0)[0], STAMPS, SIGMA, TrilaterationConfig())
     none = np.zeros(0)

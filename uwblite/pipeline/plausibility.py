@@ -135,7 +135,7 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
     moves = sorted((a.since, k) for k, a in enumerate(anchors) if np.isfinite(a.since) and names[k][1] > 1)
     for start, _ in moves:
         these = [k for since, k in moves if start <= since < start + _ONE_TIME]
-        early, late = stamps < start, stamps > start + _ONE_TIME
+        early, late = stamps < start, stamps > max(anchors[k].since for k in these)
         both = set(base[early].tolist()) & set(base[late].tolist())
         one_sided = {n for n in both if _one_sided(table["agrees"], early & (base == n), late & (base == n))}
         changed = {names[k][0] for k in these} | one_sided

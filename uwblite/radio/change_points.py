@@ -25,7 +25,8 @@ _ROUNDS = 6
 _LEAST_RANGES = 20
 """Ranges on either side of a moment."""
 _LEAST_MOVE = 0.8
-"""Shorter moves cannot be distinguished from a blocked line of sight, m."""
+"""Shorter moves cannot be distinguished from a blocked line of sight, m; what the constant errors of both places differ by
+counts off."""
 _GAIN, _FEWEST = 0.1, 6.0
 """Share and number of the ranges that two places must explain and one place does not; of anchors that stood still, it is up
 to 0.09 (with blocked lines of sight for minutes)."""
@@ -139,7 +140,9 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     likely = sorted(tried, key=lambda at: tried[at].cost)[:_LIKELY]
     best = min((_converged(path, ranges, at, width, config, tried) for at in likely), key=lambda found: found.cost)
     move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
-    if alone - best.unexplained < gain or move.distance <= _LEAST_MOVE or best.moment - best.left > _WAY * len(ranges):
+    # A place is traded against a constant error; that of a radio does not change because the radio is moved.
+    beyond = move.distance - abs(move.second.bias - move.first.bias)
+    if alone - best.unexplained < gain or beyond <= _LEAST_MOVE or best.moment - best.left > _WAY * len(ranges):
         return None
     if max(abs(move.first.bias), abs(move.second.bias)) > _WORST_BIAS:
         return None
