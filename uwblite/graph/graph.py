@@ -11,6 +11,7 @@ Unknowns live in three blocks: ``poses`` (n, 3) T_map_base, ``anchors`` (a, 2) i
 residuals use the chart of g2o, e = Z^-1 (Xi^-1 Xj), so that chi2 compares with g2o's.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
@@ -203,6 +204,11 @@ def edge_cost(edges: Edges, residuals: Floats) -> float:
     """Return the robust, weighted cost of whitened residuals (e, d) of these edges."""
     rho = edges.kernel.rho(np.einsum("ed,ed->e", residuals, residuals))
     return float(np.sum(rho * edges.own_weights))
+
+
+def edge_costs(graph: Graph, linearized: Sequence[Linearization]) -> list[float]:
+    """Return the same of each kind of a graph's edges, linearised at its estimates."""
+    return [edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True)]
 
 
 def kernel_weights(edges: Edges, residuals: Floats) -> Floats:

@@ -47,7 +47,7 @@ from ..config import setting
 from ..errors import ConfigError, SolverError
 from .anchor_subproblem import with_anchors_solved
 from .factorization import Factor
-from .graph import Edges, Graph, Linearization, edge_cost, kernel_weights, linearize
+from .graph import Edges, Graph, Linearization, edge_costs, kernel_weights, linearize
 from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
 from .unknowns import cheaper_move, linked_poses
@@ -91,15 +91,22 @@ class SolverSummary:
     """Robust, weighted cost at the start."""
     chi2: float
     """Robust, weighted cost at the end."""
-    dof: int
-    """Independent residuals of the edges in use minus free unknowns."""
+    unknowns: int
+    """Free scalars."""
+    solved: Graph = field(repr=False)
+    """The graph at the end."""
     chi2_history: Floats = field(default_factory=lambda: np.zeros(0))
     """(iterations,) cost tried by each step."""
 
     @property
+    def dof(self) -> int:
+        """Independent residuals of the edges in use minus free unknowns; counting them takes as long as a step."""
+        return independent_residuals(self.solved, linearize(self.solved)) - self.unknowns
+
+    @property
     def chi2_per_dof(self) -> float:
         """About 1 where the noise model holds; nan without redundancy."""
-        return self.chi2 / self.dof if self.dof > 0 else float("nan")
+        return self.chi2 / dof if (dof := self.dof) > 0 else float("nan")
 
 
 def _or_none(edges: Edges, residuals: Floats) -> Floats | None:
@@ -138,8 +145,8 @@ def minimise(
             progress(len(descent.history), config.max_iterations)
         reason = reason or descent.prepare()
     graph, history, converged = descent.graph, np.array(descent.history), reason in (NO_DECREASE, GRADIENT)
-    dof = independent_residuals(graph, descent.linearized or linearize(graph)) - normal.unknowns.size
-    return graph, SolverSummary(converged, reason, len(history), chi2_initial, descent.chi2, dof, history)
+    chi2, size = descent.chi2, normal.unknowns.size
+    return graph, SolverSummary(converged, reason, len(history), chi2_initial, chi2, size, graph, history)
 
 
 class _Descent:
@@ -147,7 +154,8 @@ class _Descent:
 
     def __init__(self, graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig) -> None:
         self.graph, self.linearized, self.normal, self.config = graph, linearized, normal, config
-        self.chi2 = _cost(graph, linearized)
+        self.costs = edge_costs(graph, linearized)
+        self.chi2 = sum(self.costs)
         if not np.isfinite(self.chi2):
             raise SolverError(what_is_not_finite(graph, linearized))
         self.history: list[float] = []
@@ -182,15 +190,16 @@ class _Descent:
         self.factor, step, promised = _step(self.normal, self.damping * self.scale, self.factor)
         trial = cheaper_move(self.graph, self.normal.unknowns, step, self.linked)
         linearized = linearize(trial)
-        chi2 = _cost(trial, linearized)
-        if promised > 0 and chi2 > self.chi2:
-            trial, linearized = with_anchors_solved(self.graph, trial, linearized, lambda g: optimize(g, _QUICK)[0])
-            chi2 = _cost(trial, linearized)
+        costs = edge_costs(trial, linearized)
+        if promised > 0 and sum(costs) > self.chi2:
+            trial, linearized = with_anchors_solved(self.graph, self.costs, trial, linearized, lambda g: optimize(g, _QUICK))
+            costs = edge_costs(trial, linearized)
+        chi2 = sum(costs)
         self.history.append(chi2)
         negligible = self.config.relative_decrease * self.chi2 + _NOTHING
         self.moved = promised > 0 and chi2 <= self.chi2
         if self.moved:
-            over = self._take(trial, linearized, chi2, promised, negligible, reused)
+            over = self._take(trial, linearized, costs, promised, negligible, reused)
         else:
             over = self._refuse(promised, negligible, reused)
         if not over and self.damping > _MOST_DAMPING:
@@ -200,16 +209,17 @@ class _Descent:
         return NO_DECREASE if over else ""
 
     def _take(
-        self, trial: Graph, linearized: list[Linearization], chi2: float, promised: float, negligible: float, reused: bool
-    ) -> bool:
+        self, trial: Graph, linearized: list[Linearization], costs: list[float], promised: float, negligible: float,
+        reused: bool,
+    ) -> bool:  # fmt: skip
         """Go on from the trial, with less damping; return whether next to nothing is left to come."""
-        decrease = self.chi2 - chi2
+        decrease = self.chi2 - sum(costs)
         over = self.to_come(decrease, self.last_decrease, promised) <= negligible and self.damping <= _FREE
         self.decreases = [*self.decreases[1 - _PATIENCE :], decrease]
         over = over or (len(self.decreases) == _PATIENCE and sum(self.decreases) <= negligible)
         near = not reused and decrease <= _NEAR * self.chi2 and self.damping <= _NEARLY_FREE
         self.factor = self.factor if near else None
-        self.graph, self.linearized, self.chi2, self.last_decrease = trial, linearized, chi2, decrease
+        self.graph, self.linearized, self.last_decrease, self.costs, self.chi2 = trial, linearized, decrease, costs, sum(costs)
         self.damping, self.raised_by = max(self.damping * _relaxed(decrease / promised), _LEAST_DAMPING), 2.0
         return over
 
@@ -285,7 +295,3 @@ def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tu
     except SolverError:
         return None, np.zeros(len(damping)), -1.0
     return factor, step, float(step @ (damping * step - normal.gradient))
-
-
-def _cost(graph: Graph, linearized: list[Linearization]) -> float:
-    return sum(edge_cost(edges, lin.residuals) for edges, lin in zip(graph.edges, linearized, strict=True))
