@@ -110,8 +110,9 @@ def _raster_search(path: Floats, ranges: Floats, config: TrilaterationConfig) ->
     step = float(np.max(high - low)) / config.raster
     axes = [np.arange(low[k] + step / 2, high[k] + step / 2, step) for k in (0, 1)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    across, along = ((axis[:, None] - place) ** 2 for axis, place in zip(axes, path.T, strict=True))
-    error = ranges - np.sqrt(across[:, None] + along).reshape(len(cells), -1)
+    # Single precision is enough to choose cells by, and takes half the time.
+    across, along = (((axis[:, None] - place) ** 2).astype(np.float32) for axis, place in zip(axes, path.T, strict=True))
+    error = ranges.astype(np.float32) - np.sqrt(across[:, None] + along).reshape(len(cells), -1)
     bias = np.clip(row_medians(error), -config.bias_sigma - step, 3.0 * config.bias_sigma + step)
     error -= bias[:, None]
     error /= 0.7 * step
@@ -150,23 +151,23 @@ def _refine(
     -------
     Position and bias (s, 3), their covariances (s, 3, 3) for unit sigma, and robust sigmas (s,).
     """
-    count = len(starts)
+    count, eye = len(starts), np.eye(3)
     state = starts.copy()
-    scale, normal = np.full(count, 1.5 * step), np.tile(np.eye(3), (count, 1, 1))
+    scale, normal = np.full(count, 1.5 * step), np.tile(eye, (count, 1, 1))
     robust, on = np.zeros(count), np.arange(count)
     for _ in range(25):
         dx, dy = (state[on, k, None] - path[:, k] for k in (0, 1))
-        distance = np.maximum(np.hypot(dx, dy), 1e-6)
+        distance = np.maximum(np.sqrt(dx * dx + dy * dy), 1e-6)
         error = ranges - distance - state[on, 2:]
         weight = 1.0 / (1.0 + (error / scale[on, None]) ** 2) ** 2
         jacobian = np.stack([dx / distance, dy / distance, np.ones_like(dx)], axis=1)
-        equations = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
-        gradient = np.einsum("skm,sm->sk", jacobian, weight * error)
+        weighted = jacobian * weight[:, None]
+        equations, gradient = weighted @ jacobian.transpose(0, 2, 1), (weighted @ error[:, :, None])[:, :, 0]
         robust[on] = MAD_TO_SIGMA * row_medians(np.abs(error))
         prior = (np.clip(robust[on], drift, scale[on]) / config.bias_sigma) ** 2
         equations[:, 2, 2] += prior
         gradient[:, 2] -= prior * state[on, 2]
-        equations += 1e-3 * equations * np.eye(3) + 1e-9 * np.eye(3)
+        equations += 1e-3 * equations * eye + 1e-9 * eye
         delta = np.linalg.solve(equations, gradient[:, :, None])[:, :, 0]
         state[on] += delta * np.minimum(1.0, 2.0 * step / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), 1e-12))[:, None]
         normal[on] = equations
