@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-Table = TypeVar("Table")
+_Joined = TypeVar("_Joined")
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -19,6 +19,17 @@ MEDIAN_TO_MEAN = 1.2533
 """Standard deviation of a median of normal values / that of their mean: sqrt(pi / 2)."""
 
 
+class Table:
+    """A dataclass of arrays, each with a row per entry."""
+
+    __slots__ = ()
+
+    def rows(self, which: slice | Ints | Bools) -> Self:
+        """Return some of the entries; what is no array stays."""
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        return replace(self, **{n: c[which] for n, c in columns.items() if isinstance(c, np.ndarray)})  # type: ignore[type-var]
+
+
 def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
     """Return the values that stand in either of two arrays (e,), (e,), ascending, and where among them those of both stand."""
     used, number = np.unique(np.concatenate([one, other]), return_inverse=True)
@@ -26,7 +37,7 @@ def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
     return used, where[: len(one)], where[len(one) :]
 
 
-def concatenated(parts: Sequence[Table]) -> Table:
+def concatenated(parts: Sequence[_Joined]) -> _Joined:
     """Return dataclasses of arrays, all of one kind, as one: the rows of each part after those of the one before.
 
     A field may be such a dataclass itself.

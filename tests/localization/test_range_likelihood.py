@@ -35,7 +35,7 @@ def test_moments_are_wide_where_the_ranges_say_little_and_hold_the_truth():
     off = mean - pose
     assert off @ np.linalg.solve(covariance, off) < 16.0
     near = np.abs(ranges.anchor) == 0
-    less = range_likelihood.range_moments(pose, range_likelihood.chosen(ranges, np.flatnonzero(near)))[1]
+    less = range_likelihood.range_moments(pose, ranges.rows(np.flatnonzero(near)))[1]
     assert np.trace(less) > 2.0 * np.trace(covariance)
 
 

@@ -23,7 +23,7 @@ def check_ranges(log: SensorLog, found: Findings) -> dict[str, Any]:
     positive = ranges.ranges[ranges.ranges > 0]
     if len(positive) > FEW and np.quantile(positive, 0.95) < 0.1:
         found.warning("radio", f"95 % of the ranges are below {np.quantile(positive, 0.95):.3f} m", "check the unit: metres")
-    travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
+    travelled = log.odometry.travelled_at(ranges.stamps)
     where = log.odometry.at(ranges.stamps)[:, :2]
     figures["anchors"] = {}
     for index, anchor_id in enumerate(ranges.anchor_ids):

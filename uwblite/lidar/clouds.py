@@ -148,15 +148,12 @@ def make_cloud(points: Floats, viewpoints: Floats | None = None, normal_radius: 
     if viewpoints is not None:
         away = np.einsum("ni,ni->n", viewpoints - points, normals) < 0.0
         normals = np.where(away[:, None], -normals, normals)
-    return _one(lines.centers, normals, np.where(straight, lines.normal_variance, 0.0))
+    variance = np.where(straight, lines.normal_variance, 0.0)
+    return Clouds(np.array([0, len(points)]), lines.centers, normals, np.zeros(len(points), dtype=np.int32), variance)
 
 
 _STRAIGHT = 0.6
 """Least linearity of a line through single points."""
-
-
-def _one(points: Floats, normals: Floats, variance: Floats) -> Clouds:
-    return Clouds(np.array([0, len(points)]), points, normals, np.zeros(len(points), dtype=np.int32), variance)
 
 
 def _average_cells(rays: ScanPoints, size: float) -> tuple[Ints, Floats, Floats]:

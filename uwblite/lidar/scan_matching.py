@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated
+from ..arrays import Bools, Floats, Ints, Table, concatenated
 from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
 from .degeneracy import relative_eigen
@@ -23,7 +23,7 @@ _SAME_FACING = float(np.sqrt(0.5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PairFactors:
+class PairFactors(Table):
     """Matches of pairs (e) of clouds, condensed about their relative poses."""
 
     hessian: Floats

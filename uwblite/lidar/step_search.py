@@ -7,7 +7,7 @@ the other saw free space. A step for which two distinct places score alike is am
 a bare wall are one place: the match leaves that direction free, and fixes the others.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from .cloud_rasters import rasterize
 from .clouds import Clouds
 from .pair_alignment import Aligned, align_pairs
 from .raster_search import Window, best_poses
-from .scan_matching import PairFactors, measured, pair_points
+from .scan_matching import measured, pair_points
 from .visibility import nearest_by_bearing, pair_violations
 
 _VIEWS = 6
@@ -129,8 +129,8 @@ def _apart(pose: Floats, others: Floats) -> Bools:
 
 def _measurably(best: int, tried: Aligned) -> Bools:
     """Return which places (c,) differ from the best one in a direction that its match measures."""
-    factors = PairFactors(*(getattr(tried.factors, f.name)[best : best + 1] for f in fields(PairFactors)))
-    z, sqrt_information = measured(factors, tried.pose[best : best + 1], np.full(1, _MATCH_VARIANCE))
+    one = slice(best, best + 1)
+    z, sqrt_information = measured(tried.factors.rows(one), tried.pose[one], np.full(1, _MATCH_VARIANCE))
     off = se2.between(z[0], tried.pose) @ sqrt_information[0].T
     differs = np.sqrt(np.sum(off**2, axis=1)) > _SAME
     differs[best] = False  # though an alignment that has not converged would still go far from where it stands

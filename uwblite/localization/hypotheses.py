@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Table
 from .range_errors import HARMONICS, PATTERN_SIGMA
 from .walls import Rays, Walls
 
@@ -44,7 +44,7 @@ _GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hypotheses:
+class Hypotheses(Table):
     """Places where the robot may be."""
 
     mean: Floats
@@ -66,10 +66,6 @@ class Hypotheses:
     def pose_covariances(self) -> Floats:
         """(h, 3, 3) m, m, rad; map frame."""
         return self.covariance[:, POSE, POSE]
-
-    def rows(self, which: Ints | Bools) -> "Hypotheses":
-        """Return some of them."""
-        return Hypotheses(self.mean[which], self.covariance[which], self.log_weight[which])
 
 
 def none(anchors: int) -> Hypotheses:

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats
 from .window import Ranges
 
 _INDEPENDENT = 0.5
@@ -16,11 +16,6 @@ _AT_ONCE = 512
 """Poses of the lattice whose ranges fit into a processor's cache."""
 _MOST_MOMENTS = 40
 """Ranges of which moments are made, for the time that it takes."""
-
-
-def chosen(ranges: Ranges, which: Ints) -> Ranges:
-    """Return some of the ranges."""
-    return Ranges(*(getattr(ranges, n)[which] for n in ("anchor", "places", "tags", "values", "sigma")))
 
 
 def range_errors(poses: Floats, ranges: Ranges) -> tuple[Floats, Floats, Floats]:
@@ -77,7 +72,7 @@ def range_moments(pose: Floats, ranges: Ranges) -> tuple[Floats, Floats]:
     axes = [np.linspace(-reach, reach, 2 * count + 1) for reach, count in zip(_LATTICE, _LATTICE_STEPS, strict=True)]
     off = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     few = np.unique(np.linspace(0, len(ranges) - 1, _MOST_MOMENTS).astype(np.int64))
-    some, parts = chosen(ranges, few), np.array_split(pose + off, len(off) // _AT_ONCE)
+    some, parts = ranges.rows(few), np.array_split(pose + off, len(off) // _AT_ONCE)
     weight = np.concatenate([range_likelihood(part, some) for part in parts]) * (len(ranges) / len(few))
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()

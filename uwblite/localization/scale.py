@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats
-from .range_likelihood import chosen, range_errors
+from .range_likelihood import range_errors
 from .walls import Rays, Walls
 from .window import Ranges
 
@@ -91,7 +91,7 @@ def range_scale(pose: Floats, ranges: Ranges) -> Scale:
     """
     whole, own = _fitted(pose, ranges)
     odd = ranges.anchor == np.unique(ranges.anchor)[int(np.argmax(np.abs(own)))]
-    less = _fitted(pose, chosen(ranges, np.flatnonzero(~odd)))[0] if len(own) > 2 else whole
+    less = _fitted(pose, ranges.rows(np.flatnonzero(~odd)))[0] if len(own) > 2 else whole
     return min(whole, less, key=lambda s: abs(s.error) / s.sigma)
 
 

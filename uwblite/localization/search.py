@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from .likelihood_field import CELL, FARTHEST, LEVELS, Field
-from .range_likelihood import chosen, range_likelihood, refined_by_ranges
+from .range_likelihood import range_likelihood, refined_by_ranges
 from .walls import Rays
 from .window import Ranges
 
@@ -262,7 +262,7 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
 
 def _some(ranges: Ranges) -> Ranges:
     """Return forty of the ranges, for the time that all would take."""
-    return chosen(ranges, np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.int64)))
+    return ranges.rows(np.unique(np.linspace(0, len(ranges) - 1, 40).astype(np.int64)))
 
 
 _PER_SCORE = 30.0

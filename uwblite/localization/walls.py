@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, Table
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from ..lidar.cloud_rasters import rasterize
@@ -31,7 +31,7 @@ _MOST_CELLS = 4_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rays:
+class Rays(Table):
     """Thinned rays of a scan in the frame of the base."""
 
     ends: Floats
@@ -44,10 +44,6 @@ class Rays:
     def moved(self, pose: Floats) -> "Rays":
         """Return the rays in the frame in which the base has this pose (3,)."""
         return Rays(se2.transform(pose, self.ends), se2.transform(pose, self.origins), self.hit)
-
-    def rows(self, which: Ints | Bools) -> "Rays":
-        """Return some of the rays."""
-        return Rays(self.ends[which], self.origins[which], self.hit[which])
 
     def spread(self, count: int) -> "Rays":
         """Return at most so many rays, evenly spread."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, Table
 from .range_update import RangeFacts
 from .walls import Rays
 
@@ -56,7 +56,7 @@ class WindowLook:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ranges:
+class Ranges(Table):
     """The window's ranges as arrays."""
 
     anchor: Ints

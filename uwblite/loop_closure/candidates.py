@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, Table
 from ..graph.graph import Graph
 from ..graph.joint_covariance import JointCovariance
 from ..lidar.joint_refinement import surface_cells
@@ -18,7 +18,7 @@ from .closures import Closures, LoopClosureConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidates:
+class Candidates(Table):
     """Pairs of sub-maps to try."""
 
     target: Ints
@@ -33,13 +33,6 @@ class Candidates:
     """(c,) 3 sigma of its position, m."""
     constrained: bool = True
     """Ranges or given anchors constrain the trajectory, so that its covariance is reliable."""
-
-    def rows(self, chosen: slice | Ints) -> "Candidates":
-        """Return some of them."""
-        return replace(
-            self, target=self.target[chosen], source=self.source[chosen], guess=self.guess[chosen],
-            covariance=self.covariance[chosen], spread=self.spread[chosen],
-        )
 
     def renumbered(self, target: Ints, source: Ints) -> "Candidates":
         """Return them with other numbers of sub-maps."""

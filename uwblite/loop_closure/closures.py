@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ..arrays import Bools
+from ..arrays import Bools, Floats
 from ..config import setting
 from ..graph.pose_edges import RelativePoseEdges
 from ..map_result import LoopClosure
@@ -90,10 +90,18 @@ class Closures:
         return Closures(self.edges.rows(np.flatnonzero(keep)), tuple(records))
 
 
+def collected(records: Sequence[LoopClosure], sqrt_information: Floats) -> Closures:
+    """Return candidates, those accepted as edges, too, with the square roots (c, 3, 3) of their information."""
+    good = np.array([closure.accepted for closure in records], dtype=bool)
+    kept = [closure for closure in records if closure.accepted]
+    i, j = (np.array([getattr(closure, end) for closure in kept], dtype=np.int64) for end in ("i", "j"))
+    T_i_j = np.array([closure.T_i_j for closure in kept]).reshape(-1, 3)
+    return Closures(RelativePoseEdges(i, j, T_i_j, sqrt_information[good]), tuple(records))
+
+
 def no_closures() -> Closures:
     """Return the empty collection."""
-    none = np.zeros(0, dtype=np.int64)
-    return Closures(RelativePoseEdges(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3))), ())
+    return collected((), np.zeros((0, 3, 3)))
 
 
 def merged(one: Closures, other: Closures) -> Closures:

@@ -14,13 +14,12 @@ import numpy as np
 from .. import se2
 from ..arrays import Floats, Ints, renumbered
 from ..graph.graph import Graph
-from ..graph.pose_edges import RelativePoseEdges
 from ..lidar.clouds import Clouds
 from ..lidar.point_cloud import make_tree
 from ..lidar.point_to_point import IcpConfig, Registration, align
 from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
-from .closures import Closures, LoopClosureConfig
+from .closures import Closures, LoopClosureConfig, collected
 from .parallel import in_order
 
 _CELL = 0.5
@@ -52,19 +51,9 @@ def find(
         results += part
         if progress is not None:
             progress(len(results), len(target))
-    information = [found.information / config.correlation for found in results]
-    records = [_record(int(i[k]), int(j[k]), found, information[k]) for k, found in enumerate(results)]
-    good = np.flatnonzero([c.accepted for c in records])
-    kept = [records[k] for k in good]
-    return Closures(
-        RelativePoseEdges(
-            np.array([c.i for c in kept], dtype=np.int64),
-            np.array([c.j for c in kept], dtype=np.int64),
-            np.array([c.T_i_j for c in kept]).reshape(-1, 3),
-            _root(np.array([information[k] for k in good]).reshape(-1, 3, 3)),
-        ),
-        tuple(records),
-    )
+    information = np.array([found.information / config.correlation for found in results]).reshape(-1, 3, 3)
+    pairs = zip(i.tolist(), j.tolist(), results, information, strict=True)
+    return collected([_record(*pair) for pair in pairs], _root(information))
 
 
 def candidates(poses: Floats, submaps: Submaps, recording: Ints, limit: int) -> tuple[Ints, Ints]:

@@ -17,7 +17,6 @@ from .. import se2
 from ..arrays import Floats
 from ..graph.gnc import tightened
 from ..graph.graph import Graph
-from ..graph.pose_edges import RelativePoseEdges
 from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..lidar.correlative_matching import CorrelativeConfig
@@ -28,7 +27,7 @@ from ..lidar.submaps import Submaps
 from ..map_result import LoopClosure
 from . import slid_stretches
 from .candidates import Candidates
-from .closures import Closures, LoopClosureConfig, no_closures
+from .closures import Closures, LoopClosureConfig, collected, no_closures
 from .matching import ClosureMatches, fit
 
 
@@ -104,12 +103,11 @@ def _collect(
     """Return every candidate with its outcome, and the accepted ones as edges between the sub-maps' keyframes."""
     i, j = submaps.reference[candidates.target], submaps.reference[candidates.source]
     information = np.swapaxes(sqrt_information, 1, 2) @ sqrt_information
-    records = tuple(
+    records = [
         LoopClosure(int(i[k]), int(j[k]), z[k], information[k], float(result.rms[k]), float(result.share[k]), outcome, reason)
         for k, (outcome, reason) in enumerate(verdicts)
-    )
-    good = np.array([closure.accepted for closure in records], dtype=bool)
-    return Closures(RelativePoseEdges(i[good], j[good], z[good], sqrt_information[good]), records)
+    ]
+    return collected(records, sqrt_information)
 
 
 def reconcile(graph: Graph, closures: Closures, config: LoopClosureConfig, solver: SolverConfig) -> tuple[Graph, Closures]:

@@ -70,8 +70,7 @@ def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframe
     base = odometry.at(log_ranges.stamps)
     arm = se2.between(keyframes.odometry[keyframe], base)
     twist = velocity_at(odometry, log_ranges.stamps)
-    which = np.zeros(len(arm), dtype=np.int64) if log_ranges.tag is None else log_ranges.tag
-    tag = mounting.tags[which]
+    tag = mounting.tags[log_ranges.tags]
     in_base = np.stack([twist[:, 0] - twist[:, 2] * tag[:, 1], twist[:, 1] + twist[:, 2] * tag[:, 0]], axis=1)
     beside = tag - mounting.tag_position
     return AttachedRanges(
@@ -84,7 +83,7 @@ def attach_ranges(log_ranges: UwbRanges, odometry: Odometry, keyframes: Keyframe
         se2.rotate(arm[:, 2], in_base),
         (log_ranges.stamps >= odometry.stamps[0] - OUTSIDE) & (log_ranges.stamps <= odometry.stamps[-1] + OUTSIDE),
         beside[:, 2],
-        which,
+        log_ranges.tags,
     )
 
 

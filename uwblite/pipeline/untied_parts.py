@@ -52,7 +52,7 @@ def _without_scans(recording: Recording) -> list[tuple[float, float]]:
     scans, odometry = recording.log.scans, recording.log.odometry
     if scans is None or len(scans.stamps) < 2:
         return []
-    way = np.diff(np.interp(scans.stamps, odometry.stamps, odometry.travelled))
+    way = np.diff(odometry.travelled_at(scans.stamps))
     at = np.flatnonzero((np.diff(scans.stamps) > _SILENT) & (way > _DRIVEN))
     return [(float(scans.stamps[k]), float(scans.stamps[k + 1])) for k in at.tolist()]
 

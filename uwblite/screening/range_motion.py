@@ -60,7 +60,7 @@ def cuts(log: SensorLog, jumps: Floats) -> list[float]:
     for stamps, ranges in by_anchor:
         if len(ranges) < 4 * _LONG:
             continue
-        way, margin = _travelled(log, stamps), _MARGIN + _TIMES_NOISE * _noise(ranges)
+        way, margin = log.odometry.travelled_at(stamps), _MARGIN + _TIMES_NOISE * _noise(ranges)
         over = np.minimum(*(_jumps(ranges, way, window)[:-1] for window in (_WINDOW, _LONG))) - margin
         close = np.isfinite(over) & (np.diff(stamps) <= _SILENCE * np.median(np.diff(stamps)))
         spans.append(np.column_stack([stamps[:-1], stamps[1:], over])[close])
@@ -116,10 +116,7 @@ def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:
         return []
     usable = (ranges.ranges > _USABLE[0]) & (ranges.ranges < _USABLE[1])
     usable &= (ranges.stamps >= log.odometry.stamps[0]) & (ranges.stamps <= log.odometry.stamps[-1])
-    tag = np.zeros_like(ranges.anchor) if ranges.tag is None else ranges.tag
-    pairs = np.unique(np.stack([ranges.anchor, tag]), axis=1).T.tolist()
-    own = [usable & (ranges.anchor == anchor) & (tag == which) for anchor, which in pairs]
-    return [(ranges.stamps[o], ranges.ranges[o]) for o in own if o.sum() >= _WINDOW]
+    return [(ranges.stamps[own], ranges.ranges[own]) for _, own in ranges.by_pair(usable) if len(own) >= _WINDOW]
 
 
 def _chunks(values: Floats) -> list[Floats]:
@@ -133,11 +130,6 @@ def _noise(ranges: Floats) -> float:
     return max(white_noise(ranges), 0.03)
 
 
-def _travelled(log: SensorLog, stamps: Floats) -> Floats:
-    """Return the way driven until each stamp, m."""
-    return np.interp(stamps, log.odometry.stamps, log.odometry.travelled)
-
-
 def _way(log: SensorLog, stamps: Floats) -> float:
     """Return the way driven between the first and the last stamp, m."""
-    return float(np.ptp(_travelled(log, stamps))) if len(stamps) else 0.0
+    return float(np.ptp(log.odometry.travelled_at(stamps))) if len(stamps) else 0.0

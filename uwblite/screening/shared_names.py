@@ -33,15 +33,13 @@ def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     if ranges is None or len(log.odometry.stamps) < 2:
         return log, []
     usable = ranges.ranges > 0.0
-    tag = np.zeros_like(ranges.anchor) if ranges.tag is None else ranges.tag
-    pairs = np.unique(np.column_stack([ranges.anchor, tag])[usable], axis=0)
-    each = [np.flatnonzero(usable & (ranges.anchor == anchor) & (tag == which)) for anchor, which in pairs.tolist()]
+    each = ranges.by_pair(usable)
     if not each:
         return log, []
-    noise = quiet_noise([ranges.ranges[own] for own in each], resolution_of(ranges.ranges[usable]))
+    noise = quiet_noise([ranges.ranges[own] for _, own in each], resolution_of(ranges.ranges[usable]))
     driven = np.interp(ranges.stamps, log.odometry.stamps, _driven(log))
     wrong, remarks = np.zeros(len(ranges.stamps), dtype=bool), []
-    for anchor, own in zip(pairs[:, 0].tolist(), each, strict=True):
+    for anchor, own in each:
         leaps = np.abs(np.diff(ranges.ranges[own])) > _most(np.diff(driven[own]), noise)
         if _two_distances(ranges.ranges[own], driven[own], leaps, noise) and not wrong[own].any():
             text = (

@@ -115,7 +115,7 @@ def without_repeated_ranges(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     ranges = log.ranges
     if ranges is None or len(ranges.stamps) < 2:
         return log, []
-    travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
+    travelled = log.odometry.travelled_at(ranges.stamps)
     wrong, remarks, start = np.zeros(len(ranges.stamps), dtype=bool), [], float(log.odometry.stamps[0])
     for anchor in range(len(ranges.anchor_ids)):
         own = np.flatnonzero(ranges.anchor == anchor)
@@ -182,7 +182,7 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     ranges = log.ranges
     if ranges is None or len(ranges.stamps) < _MARKS:
         return log, []
-    travelled = np.interp(ranges.stamps, log.odometry.stamps, log.odometry.travelled)
+    travelled = log.odometry.travelled_at(ranges.stamps)
     # A robot that stands repeats itself rightly.
     apart = np.column_stack([ranges.ranges, ranges.anchor, np.floor(travelled / _MOVED)])[ranges.ranges > 0.0]
     mark = _mark(np.unique(apart, axis=0)[:, 0])
@@ -203,7 +203,7 @@ def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     scans = log.scans
     if scans is None or not len(scans.stamps):
         return log, []
-    travelled = np.interp(scans.stamps, log.odometry.stamps, log.odometry.travelled)
+    travelled = log.odometry.travelled_at(scans.stamps)
     apart = scans.ranges[np.unique(np.floor(travelled / _MOVED), return_index=True)[1]]
     holds = (apart >= scans.range_min) & (apart <= scans.range_max)
     mark = _mark(apart[holds])

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, runs_of, sigma_of_median, spread_about_median
+from ..arrays import Bools, Floats, Ints, Table, runs_of, sigma_of_median, spread_about_median
 from ..lidar.scan_odometry import directional_shares, misfits, scan_steps
 from ..sensor_log import Odometry, Remark, SensorLog
 
@@ -47,7 +47,7 @@ _LEAST_PAIRS, _LEAST_SECONDS = 6, 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
+class Pairs(Table):
     """Motion between scans a moment apart by lidar and by wheels."""
 
     start: Floats
@@ -65,10 +65,6 @@ class Pairs:
     def measured(self) -> Bools:
         """Which pairs measure a motion."""
         return self.share >= _SHARE
-
-    def rows(self, which: Bools) -> "Pairs":
-        """Return some of them."""
-        return Pairs(self.start[which], self.end[which], self.lidar[which], self.wheels[which], self.share[which])
 
 
 def standing(odometry: Odometry, least: float = _LEAST_STANDING) -> list[tuple[float, float]]:

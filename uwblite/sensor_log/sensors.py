@@ -1,17 +1,17 @@
 """What each sensor measured, and where it sits on the base."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, Table
 from ..errors import DataError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Odometry:
+class Odometry(Table):
     """Wheel odometry: poses of the base in the drifting odom frame."""
 
     stamps: Floats
@@ -19,14 +19,14 @@ class Odometry:
     poses: Floats
     """(n, 3) x, y, theta of T_odom_base; m, m, rad."""
 
-    def rows(self, which: slice | Ints | Bools) -> "Odometry":
-        """Return some of the readings."""
-        return Odometry(self.stamps[which], self.poses[which])
-
     @property
     def travelled(self) -> Floats:
         """(n,) m, distance since the first stamp."""
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T))])
+
+    def travelled_at(self, stamps: Floats) -> Floats:
+        """Return the distance (m,), m, driven until stamps (m,), s."""
+        return np.interp(stamps, self.stamps, self.travelled)
 
     @property
     def steps(self) -> Floats:
@@ -64,6 +64,16 @@ class UwbRanges:
         if self.tag is not None:
             raise DataError(f"{place} does not keep the ranges of several tags apart; convert to a .log, which does")
 
+    @property
+    def tags(self) -> Ints:
+        """(m,) which of the robot's tags measured."""
+        return np.zeros(len(self.stamps), dtype=np.int64) if self.tag is None else self.tag
+
+    def by_pair(self, among: Bools) -> list[tuple[int, Ints]]:
+        """Return for each pair of an anchor and a tag the anchor and the rows of its ranges among some (m,)."""
+        pairs = np.unique(np.column_stack([self.anchor, self.tags])[among], axis=0).tolist()
+        return [(anchor, np.flatnonzero(among & (self.anchor == anchor) & (self.tags == tag))) for anchor, tag in pairs]
+
     def rows(self, which: slice | Ints | Bools) -> "UwbRanges":
         """Return some of the ranges, with the anchors that they are to."""
         used, anchor = np.unique(self.anchor[which], return_inverse=True)
@@ -73,7 +83,7 @@ class UwbRanges:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gyro:
+class Gyro(Table):
     """The heading of a gyro, from an arbitrary zero, with its bias."""
 
     stamps: Floats
@@ -81,13 +91,9 @@ class Gyro:
     heading: Floats
     """(g,) rad, counter-clockwise, unwrapped."""
 
-    def rows(self, which: slice | Ints | Bools) -> "Gyro":
-        """Return some of the readings."""
-        return Gyro(self.stamps[which], self.heading[which])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LaserScans:
+class LaserScans(Table):
     """2D scans with the field names of sensor_msgs/LaserScan; all scans share one geometry."""
 
     stamps: Floats
@@ -113,10 +119,6 @@ class LaserScans:
     def middles(self) -> Floats:
         """(k,) s, time of the ray in the middle of each scan."""
         return self.stamps + 0.5 * self.time_increment * self.ranges.shape[1]
-
-    def rows(self, which: slice | Ints | Bools) -> "LaserScans":
-        """Return some of the scans."""
-        return replace(self, stamps=self.stamps[which], ranges=self.ranges[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
