@@ -6,8 +6,9 @@
     python tools/faults.py --worlds hall,kasdorf --minutes 5 --sensors all,no-lidar --print
 
 A case is silently wrong when the map is trusted (exit code 0) and yet the trajectory is off by more than 0.5 m (rms), or
-an anchor that is called ok by more than 1 m and three standard deviations (of what is true of a real recording as well:
-that is what its map says without a fault). Without lidar and without given anchors
+an anchor that is called ok by more than 1 m and three standard deviations. "Said" is what is doubted, or refused with exit
+code 1, which counts as wrong. The truth of a real recording is its map without a fault, whose own standard deviations
+count as well. Without lidar and without given anchors
 nothing but the odometry distinguishes a map from its mirror image: there the result is judged up to reflection.
 """
 
