@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from .options import number, place
 
 if TYPE_CHECKING:
-    from ..arrays import Bools
     from ..graph.certificate import Certificate
     from ..graph.graph import Graph
     from ..graph.solver import Progress, SolverConfig, SolverSummary
@@ -55,6 +54,8 @@ def run(args: argparse.Namespace) -> int:
 
     from ..config import override
     from ..errors import ConfigError
+    from ..graph.loop_edges import with_kernel
+    from ..graph.robust import Kernel
     from ..graph.solver import SolverConfig
     from ..radio.graph_starts import starts, starts_nearby
     from . import console
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--incremental adds the poses of one robot; {args.graph} has {count} chains of odometry")
     for warning in file.warnings:
         console.note(f"uwblite: {args.graph}: {warning}")
-    file = dataclasses.replace(file, graph=_with_kernel(file.graph, args.kernel, args.kernel_scale))
+    file = dataclasses.replace(file, graph=with_kernel(file.graph, Kernel(args.kernel, args.kernel_scale)))
     progress = console.Progress()
     try:
         solve = partial(_solve, args, config, lambda done, most: progress("optimising", done, most))
@@ -125,71 +126,16 @@ def _solve(args: argparse.Namespace, config: "SolverConfig", progress: "Progress
         from ..graph.solver import optimize
 
         return _Solution(*optimize(start.graph, config, progress), {}, start)
-    from ..graph.gnc import optimize_gnc
+    from ..graph.gnc import optimize_gnc, outlier_thresholds
 
     graph = start.graph
-    solved, summary, weights = optimize_gnc(graph, _thresholds(graph), config, progress)
+    solved, summary, weights = optimize_gnc(graph, outlier_thresholds(graph), config, progress)
     outliers: dict[str, int] = {}
     for k, weight in weights.items():
         name = type(graph.edges[k]).__name__
         outliers[name] = outliers.get(name, 0) + int((weight == 0.0).sum())
     # The file keeps every edge; which ones were left out is not a property of the measurements.
     return _Solution(dataclasses.replace(solved, edges=graph.edges), summary, outliers, start)
-
-
-_THRESHOLDS = {1: 3.3, 2: 3.7, 3: 4.0}
-"""Whitened norm beyond which an edge of so many dimensions is an outlier: one good edge in a thousand lies there."""
-
-
-def _thresholds(graph: "Graph") -> dict[int, float]:
-    """Return by position the threshold of each kind of edges that may hold outliers: all but priors and successive poses."""
-    from ..graph.graph import PriorEdges
-
-    chosen, closing = {}, _closing(graph)
-    for k, e in enumerate(graph.edges):
-        if len(e) and (k not in closing or closing[k].any()) and not isinstance(e, PriorEdges):
-            chosen[k] = _THRESHOLDS[e.residuals(graph).shape[1]]
-    return chosen
-
-
-def _with_kernel(graph: "Graph", name: str, scale: float) -> "Graph":
-    """Return the graph with a robust kernel on every edge but those between successive poses."""
-    import dataclasses
-
-    from ..graph.pose_edges import RelativePoseEdges
-    from ..graph.robust import Kernel
-
-    kernel, closing = Kernel(name, scale), _closing(graph)
-    edges: list[Any] = []
-    for k, e in enumerate(graph.edges):
-        if not isinstance(e, RelativePoseEdges):
-            edges.append(dataclasses.replace(e, kernel=kernel))  # type: ignore[type-var]
-            continue
-        loop = closing[k]
-        for chosen, used in ((~loop, e.kernel), (loop, kernel)):
-            if chosen.any():
-                parts = {n: getattr(e, n)[chosen] for n in ("i", "j", "T_i_j", "sqrt_information")}
-                weights = None if e.weights is None else e.weights[chosen]
-                edges.append(dataclasses.replace(e, **parts, weights=weights, kernel=used))
-    return dataclasses.replace(graph, edges=tuple(edges))
-
-
-def _closing(graph: "Graph") -> "dict[int, Bools]":
-    """Return by position of each kind of relative poses which of them (e,) are not the first between successive poses."""
-    import numpy as np
-
-    from ..graph.pose_edges import RelativePoseEdges
-
-    kinds = {k: e for k, e in enumerate(graph.edges) if isinstance(e, RelativePoseEdges)}
-    seen = np.zeros(len(graph.poses), dtype=bool)
-    closing = {}
-    for k, e in kinds.items():
-        lower, step = np.minimum(e.i, e.j), np.abs(e.j - e.i) == 1
-        first = np.zeros(len(e), dtype=bool)
-        first[np.unique(np.where(step, lower, -1), return_index=True)[1]] = True
-        closing[k] = ~(first & step & ~seen[lower])
-        seen[lower[step]] = True
-    return closing
 
 
 def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> dict[str, Any]:

@@ -18,8 +18,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import ConfigError
-from .graph import Graph, Linearization, linearize
+from .graph import Graph, Linearization, PriorEdges, linearize
+from .loop_edges import closing
 from .normal_equations import NormalEquations
 from .problem_checks import check
 from .robust import SQUARED, Kernel
@@ -76,7 +76,6 @@ def optimize_gnc(
     weights (e,) themselves, 0 = outlier, 1 = inlier.
     """
     check(graph)
-    _check_thresholds(graph, thresholds)
     edges = tuple(replace(e, kernel=SQUARED) if k in thresholds else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
     plain = replace(graph, edges=edges)
     linearized = linearize(plain)
@@ -101,16 +100,19 @@ def optimize_gnc(
     return current, summary, weights
 
 
+_THRESHOLDS = {1: 3.3, 2: 3.7, 3: 4.0}
+"""Whitened norm beyond which an edge of so many dimensions is an outlier: one good edge in a thousand lies there."""
+
+
+def outlier_thresholds(graph: Graph) -> dict[int, float]:
+    """Return by position the threshold of each kind of edges that may hold outliers: priors and successive poses do not."""
+    kinds = enumerate(zip(graph.edges, closing(graph), strict=True))
+    suspects = [(k, e) for k, (e, loop) in kinds if len(e) and (loop is None or loop.any()) and not isinstance(e, PriorEdges)]
+    return {k: _THRESHOLDS[e.residuals(graph).shape[1]] for k, e in suspects}
+
+
 _STRICT = 100.0
 """mu at which the surrogate is the truncated square to within a per cent of the threshold."""
-
-
-def _check_thresholds(graph: Graph, thresholds: Mapping[int, float]) -> None:
-    for position, threshold in thresholds.items():
-        if not 0 <= position < len(graph.edges):
-            raise ConfigError(f"threshold for edges {position}: the graph has {len(graph.edges)} kinds of edges")
-        if not threshold > 0:
-            raise ConfigError(f"threshold for edges {position} must be positive, not {threshold}")
 
 
 def _squared(graph: Graph, thresholds: Mapping[int, float]) -> dict[int, Floats]:
