@@ -23,8 +23,7 @@ def check_scans(log: SensorLog, found: Findings) -> dict[str, Any]:
         "range max m": round(scans.range_max, 3),
     }
     sample = scans.ranges[:: max(1, len(scans.ranges) // 400)].astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        hit = (sample >= scans.range_min) & (sample <= scans.range_max)
+    hit = scans.hits(sample)
     figures["share of beams that hit"] = round(float(hit.mean()), 3)
     figures["share that saw nothing"] = round(float(np.isposinf(sample).mean()), 3)
     figures["share that is invalid"] = round(float(np.isnan(sample).mean()), 3)

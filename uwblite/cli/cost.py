@@ -82,8 +82,7 @@ def seen_size(log: "SensorLog") -> "Floats":
         scans = log.scans.rows(slice(None, None, -(-len(log.scans.stamps) // _SCANS_LOOKED_AT) or 1))
         bases = log.odometry.at(scans.stamps)
         lasers = se2.compose(bases, log.mounting.T_base_laser)
-        hit = (scans.ranges >= scans.range_min) & (scans.ranges <= scans.range_max)
-        rows, beams = np.nonzero(hit)
+        rows, beams = np.nonzero(scans.hits(scans.ranges))
         bearing = lasers[rows, 2] + scans.angles[beams]
         rays = scans.ranges[rows, beams][:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
         points.append(lasers[rows, :2] + rays)

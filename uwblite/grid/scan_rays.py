@@ -50,7 +50,7 @@ def moved_scans(poses: Floats, distance: float, angle: float) -> Ints:
 def seen_reach(scans: LaserScans, chosen: Ints, max_range: float = math.inf) -> NDArray[np.float32]:
     """Return the length (s, b) of the rays of chosen scans (s,) that ended at something up to max_range, m; 0 = none."""
     readings = scans.ranges[chosen]
-    return np.where((readings >= scans.range_min) & (readings <= min(max_range, scans.range_max)), readings, np.float32(0.0))
+    return np.where(scans.hits(readings, max_range), readings, np.float32(0.0))
 
 
 def empty_reach(scans: LaserScans, chosen: Ints, distance: float, run: int) -> NDArray[np.float32]:

@@ -132,8 +132,7 @@ def _searched(built: Clouds, raster: CloudRasters, i: int, j: int, guess: Floats
 def _points(scans: LaserScans, mounting: SensorMounting, chosen: Ints, range_max: float) -> ScanPoints:
     """Return the rays of the chosen scans as points in the frame of the base, each scan as a snapshot."""
     readings = scans.ranges[chosen]
-    with np.errstate(invalid="ignore"):
-        scan, ray = np.nonzero((readings >= scans.range_min) & (readings <= min(range_max, scans.range_max)))
+    scan, ray = np.nonzero(scans.hits(readings, range_max))
     sign = -1.0 if mounting.laser_flipped else 1.0
     reach = readings[scan, ray].astype(np.float64)
     bearing = sign * scans.angles[ray]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, Table
+from ..arrays import Floats, Ints, Table, concatenated
 from .range_update import RangeFacts
 from .walls import Rays
 
@@ -125,8 +125,7 @@ class Window:
             return Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)), np.zeros(0)
         laid = [k.rays.moved(se2.between(odom, k.odom)) for k in looks]
         ago = np.concatenate([np.full(len(k.rays.hit), way - k.way) for k in looks])
-        parts = ([getattr(r, name) for r in laid] for name in ("ends", "origins", "hit"))
-        return Rays(*(np.concatenate(p) for p in parts)), ago
+        return concatenated(laid), ago
 
     def ranges_since(self, odom: Floats, way: float) -> Ranges:
         """Return the ranges, with the tag's places in the present frame of the base."""

@@ -119,8 +119,7 @@ def scan_points(log: SensorLog, keyframes: Keyframes, owner: Ints, chosen: Ints,
     first = se2.between(anchor, log.odometry.at(start))
     sweep = se2.between(first, se2.between(anchor, log.odometry.at(end)))
     readings = scans.ranges[chosen]
-    upper = min(range_max, scans.range_max)
-    scan, ray = np.nonzero((readings >= scans.range_min) & (readings <= upper))
+    scan, ray = np.nonzero(scans.hits(readings, range_max))
     fraction = ray / max(beams - 1, 1)
     laser = beam_origins(first, sweep, scan, fraction, mounting)
     sign = -1.0 if mounting.laser_flipped else 1.0

@@ -205,7 +205,7 @@ def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         return log, []
     travelled = log.odometry.travelled_at(scans.stamps)
     apart = scans.ranges[np.unique(np.floor(travelled / _MOVED), return_index=True)[1]]
-    holds = (apart >= scans.range_min) & (apart <= scans.range_max)
+    holds = scans.hits(apart)
     mark = _mark(apart[holds])
     if mark is None or np.any(apart == np.float32(mark), axis=1).sum() < _MARKS:
         return log, []

@@ -191,8 +191,7 @@ def _of_scans(log: SensorLog) -> str:
     if view > 2.0 * np.pi + 0.1:
         return f"the laser's field of view is {np.degrees(view):.0f} degrees; angles must be radians, at most one turn in all"
     sample = scans.ranges[:: max(1, len(scans.ranges) // 200)]
-    with np.errstate(invalid="ignore"):
-        seen = sample[(sample >= scans.range_min) & (sample <= scans.range_max)]
+    seen = sample[scans.hits(sample)]
     if len(seen) < _ENOUGH or np.median(seen) <= _LONGEST_READING:
         return ""
     usual = float(np.median(seen))

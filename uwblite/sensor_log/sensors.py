@@ -115,6 +115,11 @@ class LaserScans(Table):
         """(b,) angle of each ray in the laser frame, rad."""
         return np.asarray(self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1]), dtype=np.float64)
 
+    def hits(self, readings: NDArray[np.floating], farthest: float = np.inf) -> Bools:
+        """Return which readings (...), m, ended at something up to a distance, m."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray((readings >= self.range_min) & (readings <= min(farthest, self.range_max)))
+
     @property
     def middles(self) -> Floats:
         """(k,) s, time of the ray in the middle of each scan."""
