@@ -22,9 +22,9 @@ EVEN = ODD[:4]
 ANCHORS = {"A": (0.3, 0.4), "B": (7.6, 0.5), "C": (7.2, 5.6), "D": (0.5, 5.3)}
 
 
-def grid_of(walls, origin=(-1.025, -1.025), size=(10.05, 8.05)):
+def grid_of(walls, origin=(-1.025, -1.025), size=(10.05, 8.05), cell=CELL):
     """Return the grid in which the walls are drawn one cell thick and all within the rectangle is free."""
-    geometry = GridGeometry(CELL, np.asarray(origin, dtype=float), round(size[1] / CELL), round(size[0] / CELL))
+    geometry = GridGeometry(cell, np.asarray(origin, dtype=float), round(size[1] / cell), round(size[0] / cell))
     x, y = geometry.centre_of(*np.indices((geometry.rows, geometry.cols))).transpose(2, 0, 1)
     odds = np.where((x > 0) & (x < 8) & (y > 0) & (y < 6), -4.0, 0.0)
     for x1, y1, x2, y2 in walls:
@@ -92,14 +92,21 @@ class Drive:
         self.last = None
         self.states = []
 
-    def along(self, poses, scans=True, ranges=True):
-        """Drive along poses (n, 3), a fifth of a second each; return the states after each."""
+    def along(self, poses, scans=True, ranges=True, every=1):
+        """Drive along poses (n, 3), a fifth of a second each; return the states after each.
+
+        Parameters
+        ----------
+        every : which of the poses the odometry reports; the last one is always among them.
+        """
         states = []
         for k, pose in enumerate(poses):
             if self.last is not None:
                 self.odom = se2.compose(self.odom, se2.between(self.last, pose) * [1.01, 1.0, 1.0])
             self.last = pose
-            state = self.localizer.add_odometry(self.stamp, *self.odom)
+            state = self.localizer.state()
+            if (len(poses) - 1 - k) % every == 0:
+                state = self.localizer.add_odometry(self.stamp, *self.odom)
             if scans and self.walls:
                 readings = cast(pose, self.walls) + self.rng.normal(0, self.noise, 181)
                 state = self.localizer.add_scan(self.stamp, readings, SCANNER)

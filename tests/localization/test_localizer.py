@@ -246,6 +246,17 @@ def test_anchors_that_the_map_does_not_know_are_counted():
     assert drive.localizer.strangers == {"X": 3}
 
 
+def test_a_map_of_large_cells_serves():
+    """0.2 m: walls lie anywhere within half a cell, which the covariance holds."""
+    coarse = grid_of(ODD, cell=0.2)
+    room = dataclasses.replace(known(), walls=walls_of(coarse))
+    poses = path(ROUND)[:80]
+    state = robot(room).along(poses)[-1]
+    assert not state.lost
+    off = np.append(state.pose[:2] - poses[-1, :2], se2.wrap_angle(state.pose[2] - poses[-1, 2]))
+    assert off @ np.linalg.solve(state.covariance, off) < 14.2  # three degrees of freedom, 1 in 400
+
+
 def test_a_silent_odometry_makes_the_pose_unsure():
     poses = path(ROUND)
     drive = robot(known())

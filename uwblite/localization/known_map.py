@@ -51,7 +51,15 @@ class KnownMap:
     laser_delay: float = 0.0
     """s; a scan stamped t was taken at t + laser_delay by the odometry's clock."""
 
+    @property
+    def covariance(self) -> Floats:
+        """(3, 3) m^2, rad^2; what the map itself is off by: alike in neighbouring scans, no filter averages it."""
+        cells = 0.0 if self.walls is None else self.walls.rounding / np.sqrt(12.0)
+        return np.diag(np.square(_OFF) + np.square((cells, cells, 0.0)))
 
+
+_OFF = (0.02, 0.02, 0.005)
+"""m, m, rad; standard deviation of a map in cells of 0.05 m. In larger ones a wall lies anywhere within half a cell."""
 _SIGMA = 0.1
 """m; spread of ranges to an anchor of which the map does not say it."""
 _LEAST_SIGMA = 0.05

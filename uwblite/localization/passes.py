@@ -16,7 +16,6 @@ from ..arrays import Bools, Floats, Ints
 from ..sensor_log import SensorLog
 from .known_map import KnownMap
 from .localizer import Localizer
-from .pose_estimator import MAP_COVARIANCE
 from .records import Scanner
 
 _SPACING = (0.1, 0.1, 1.0)
@@ -79,7 +78,7 @@ def run_pass(log: SensorLog, known: KnownMap, rows: Ints, backwards: bool, repor
         if kind == _ODOMETRY:
             state = localizer.add_odometry(at, *log.odometry.poses[k].tolist())
             if (slot := wanted[k]) >= 0 and not state.lost:
-                poses[slot], covariances[slot] = state.pose, state.covariance - MAP_COVARIANCE
+                poses[slot], covariances[slot] = state.pose, state.covariance - known.covariance
             reason = state.reason
         elif kind == _RANGE and log.ranges is not None:
             r = log.ranges
@@ -126,11 +125,15 @@ class Smoothed:
     """(k,) where both know the pose and it is not the same."""
 
 
-def smoothed(one: Pass, other: Pass) -> Smoothed:
+def smoothed(one: Pass, other: Pass, of_map: Floats) -> Smoothed:
     """Average two passes by their covariances.
 
     ``x = a + A (A + B)^-1 (b - a)``, ``P = A - A (A + B)^-1 A``. Where they contradict one another the surer one stays, with a
     covariance that reaches to the other.
+
+    Parameters
+    ----------
+    of_map : (3, 3) covariance of the map's own errors, which both passes share.
     """
     a, b = one.poses, other.poses
     off = b - a
@@ -140,7 +143,7 @@ def smoothed(one: Pass, other: Pass) -> Smoothed:
     covariances = np.where(np.isfinite(one.covariances), one.covariances, other.covariances)
     A, B, d = one.covariances[both], other.covariances[both], off[both]
     gain = A @ np.linalg.inv(A + B)
-    far = np.einsum("ni,nij,nj->n", d, np.linalg.inv(A + B + MAP_COVARIANCE), d) > _APART
+    far = np.einsum("ni,nij,nj->n", d, np.linalg.inv(A + B + of_map), d) > _APART
     mean, joint = a[both] + np.einsum("nij,nj->ni", gain, d), A - gain @ A
     first = np.trace(A, axis1=1, axis2=2) <= np.trace(B, axis1=1, axis2=2)
     surer = np.where(first[:, None], a[both], b[both])
@@ -150,4 +153,4 @@ def smoothed(one: Pass, other: Pass) -> Smoothed:
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     contradicting = np.zeros(len(a), dtype=bool)
     contradicting[both] = far
-    return Smoothed(poses, covariances + MAP_COVARIANCE, contradicting)
+    return Smoothed(poses, covariances + of_map, contradicting)

@@ -22,8 +22,6 @@ from .running_fit import FIT_LOST, FIT_SOUND, full_agreement
 from .walls import Rays
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
-MAP_COVARIANCE = np.diag(np.square((0.02, 0.02, 0.005)))
-"""m^2, rad^2; what the map itself is off by: its errors are alike in neighbouring scans, and no filter averages them."""
 _FRESH_WAY = 0.1
 """m; a scan taken so far from the last one errs independently of it; a nearer one in proportion."""
 _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
@@ -151,7 +149,7 @@ class PoseEstimator:
         fit = np.exp(running.fit - FIT_SOUND) if self._sees() else running.ranges / verdict.RANGES_FOUND
         quality = float(share[best]) * float(np.clip(fit, 0.0, 1.0)) * (1.0 if self._certain else 0.5)
         reason = "" if self._certain else self._reason
-        pose, covariance = bank.poses[best].copy(), covariance + MAP_COVARIANCE
+        pose, covariance = bank.poses[best].copy(), covariance + self.known.covariance
         return LocalizerState(stamp, pose, covariance, quality, odometry, not self._certain, reason, bank.poses[order[1:]], far)
 
     def _sees(self) -> bool:

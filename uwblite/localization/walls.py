@@ -86,6 +86,15 @@ class Walls:
     nearest: NDArray[np.signedinteger]
     """(x, y) nearest wall point of each of its cells, -1 = none within reach."""
 
+    @property
+    def rounding(self) -> float:
+        """m; by how much farther from the surface the cells of a coarse map lie than those of a fine one."""
+        return float(np.sqrt(max(self.geometry.resolution**2 - _FINE**2, 0.0)))
+
+    @property
+    def _on_wall(self) -> float:
+        return float(np.hypot(_ON_WALL, self.rounding))
+
     def state_at(self, x: Floats, y: Floats) -> NDArray[np.int8]:
         """Return the states (...) of the cells at places (...), m; UNKNOWN outside."""
         g = self.geometry
@@ -159,7 +168,7 @@ class Walls:
             return c * px - s * py + poses[:, :1], s * px + c * py + poses[:, 1:2]
 
         x, y = laid(rays.ends)
-        on_wall = np.exp(-0.5 * np.square(np.minimum(self.distances(x, y), 10.0) / _ON_WALL))
+        on_wall = np.exp(-0.5 * np.square(np.minimum(self.distances(x, y), 10.0) / self._on_wall))
         value = np.log(_STRANGE + (1.0 - _STRANGE) * on_wall)
         unknown = (self.state_at(x, y) < 0) & (on_wall < 0.5)
         value = np.where(unknown, 0.5 * np.log(_STRANGE), value)
@@ -182,8 +191,8 @@ class Walls:
         return Agreement(value.mean(axis=1), fit, share, known, (ends | passed).sum(axis=1).astype(np.float64))
 
 
-_ON_WALL = 0.1
-"""m; standard deviation of an end about the wall: cells, lidar noise and a pose that is not refined."""
+_ON_WALL, _FINE = 0.1, 0.05
+"""m; standard deviation of an end about the wall in cells of the second: cells, lidar noise and a pose that is not refined."""
 _STRANGE = 0.1
 """Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
 _LOOKS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
