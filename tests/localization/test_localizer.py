@@ -8,6 +8,7 @@ from helpers.localization_room import ANCHORS, EVEN, ODD, ROUND, SCANNER, cast, 
 
 from uwblite import se2
 from uwblite.errors import DataError
+from uwblite.localization import Scanner
 from uwblite.localization.known_map import from_result
 from uwblite.localization.walls import walls_of
 
@@ -244,6 +245,61 @@ def test_anchors_that_the_map_does_not_know_are_counted():
     drive = robot(known(), anchors={"X": (1.0, 1.0)})
     drive.along(path(ROUND)[:15], scans=False)
     assert drive.localizer.strangers == {"X": 3}
+
+
+def test_as_many_ids_as_ranges_are_wanted():
+    with pytest.raises(DataError, match="2 anchor ids for 3 ranges"):
+        robot(known()).localizer.add_ranges(100.0, ["A", "B"], [1.0, 2.0, 3.0])
+
+
+def test_values_that_no_device_measures_change_nothing(drive):
+    """Poses and headings whose steps have no digits left, readings beyond any lidar, a header that is broken."""
+    poses, states = drive
+    odd = robot(known())
+    odd.along(poses[:20])
+    before = odd.localizer.add_scan(odd.stamp - 0.1, np.full(181, 1e200), Scanner(-1.5, 0.01, 0.0, 0.02, np.inf))
+    odd.localizer.add_odometry(odd.stamp - 0.05, 1e300, -1e300, np.inf)
+    odd.localizer.add_gyro(odd.stamp - 0.05, -1e300)
+    for scanner in (Scanner(np.nan, 0.01), Scanner(-1.5, np.inf), Scanner(-1.5, 0.01, np.nan)):
+        odd.localizer.add_scan(odd.stamp - 0.15, np.full(181, 2.0), scanner)
+    assert not before.lost
+    again = odd.along(poses[20:30])
+    np.testing.assert_allclose(again[-1].pose, states[29].pose, atol=0.02)
+
+
+def test_a_lidar_that_states_no_reach_has_one():
+    """Infinity, read where nothing was seen, is then no wall either."""
+    poses, drive = path(ROUND)[:40], robot(known())
+    scanner = dataclasses.replace(SCANNER, range_max=np.inf)
+    for k, pose in enumerate(poses):
+        drive.localizer.add_odometry(100.0 + 0.2 * k, *pose)
+        drive.localizer.add_ranges(100.0 + 0.2 * k, list(ANCHORS), [np.hypot(*(pose[:2] - p)) for p in ANCHORS.values()])
+        readings = np.where(np.arange(181) < 40, np.inf, cast(pose))
+        state = drive.localizer.add_scan(100.0 + 0.2 * k, readings, scanner)
+    assert not state.lost
+    np.testing.assert_allclose(state.pose, poses[-1], atol=0.03)
+
+
+@pytest.mark.parametrize("every", [5, 10])
+def test_an_odometry_that_comes_rarely_is_waited_for(every):
+    """Every one or two seconds: scans between two of them are laid where it says that the robot was."""
+    poses = path(ROUND)
+    drive = robot(known())
+    drive.along(poses[:60], every=every)
+    state = drive.along(poses[60 : 60 + every], every=every)[-1]
+    assert not state.lost
+    assert errors([state], poses[59 + every : 60 + every])[0] < 0.1
+
+
+def test_where_nothing_measures_how_a_robot_moves_it_is_not_found():
+    """Scans and ranges of different places, taken for those of one place, fit some third one."""
+    poses = path(ROUND)
+    drive = robot(known())
+    drive.along(poses[:1])
+    for k, pose in enumerate(poses[1:50]):
+        drive.localizer.add_scan(100.2 + 0.2 * k, cast(pose), SCANNER)
+        state = drive.localizer.add_ranges(100.2 + 0.2 * k, ["A", "C"], [np.hypot(*(pose[:2] - ANCHORS[n])) for n in "AC"])
+        assert state.lost
 
 
 def test_a_map_of_large_cells_serves():

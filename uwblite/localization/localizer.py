@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from .. import se2
 from ..arrays import Floats
+from ..errors import DataError
 from ..radio.trilateration import TrilaterationConfig, usable
 from ..sensor_log import SensorMounting
 from .gyro_turns import GyroTurns
@@ -29,6 +30,10 @@ _UNSEEN_SPEED = 0.3
 """m/s and rad/s; how fast a robot may move while its odometry is silent."""
 _SET_BACK, _IN_A_ROW = 0.5, 4
 """s by which the odometry must be behind itself, and how often in a row with rising stamps, for its clock to be set back."""
+
+
+_BEYOND = 1e8
+"""m and rad; a pose or a heading that is farther from its zero is none: steps from there have no digits left."""
 
 
 class Localizer:
@@ -79,15 +84,16 @@ class Localizer:
     def add_odometry(self, stamp: float, x: float, y: float, theta: float) -> LocalizerState:
         """Take a pose of the base in the drifting odometry frame; s, m, m, rad."""
         wheels = np.array([x, y, theta], dtype=np.float64)
+        wheels[~(np.abs(wheels) < _BEYOND)] = np.nan
         stamp += self._clock_shift
         if stamp < self._measured - _SET_BACK:
             self._set_back(stamp, wheels)
             return self.state()
         self._behind = []
-        if self._measured < stamp <= self._odometer.stamp:
-            # It was not silent but late: what was bridged is measured now, and next time it is waited for.
+        if self._measured < min(stamp, self._odometer.stamp) and stamp <= self._measured + LEAD:
+            # It was not silent but late, or comes rarely: what was bridged is measured now, and next time it is waited for.
             self._patience = min(2.0 * self._patience, LEAD)
-            self._odometer.forget_from(stamp)
+            self._odometer.forget_from(np.nextafter(self._measured, np.inf))
         leap, self._leap = self._leap, None
         if leap is not None and stamp > leap[0]:
             self._move(*leap)
@@ -104,7 +110,8 @@ class Localizer:
 
     def add_gyro(self, stamp: float, heading: float) -> LocalizerState:
         """Take the heading of a gyro, s and rad from any zero; once its bias is known, the wheels turn as it does."""
-        self._turns.add(self.on_time(stamp), heading)
+        if abs(heading) < _BEYOND:
+            self._turns.add(self.on_time(stamp), heading)
         return self.state()
 
     def add_ranges(self, stamp: float, anchor_ids: Sequence[str], metres: ArrayLike, tag: int = 0) -> LocalizerState:
@@ -113,10 +120,16 @@ class Localizer:
         Parameters
         ----------
         stamp : s, on the odometry's clock. anchor_ids, metres : (m,) of each range. tag : which of the robot's tags measured.
+
+        Raises
+        ------
+        DataError : there are more ids than ranges, or fewer.
         """
         values = np.asarray(metres, dtype=np.float64).reshape(-1)
+        if len(anchor_ids) != len(values):
+            raise DataError(f"{len(anchor_ids)} anchor ids for {len(values)} ranges; one id belongs to each range")
         good = usable(values, TrilaterationConfig())
-        for name, value in zip(np.asarray(anchor_ids)[good].tolist(), values[good].tolist(), strict=True):
+        for name, value in zip(np.asarray(list(anchor_ids))[good].tolist(), values[good].tolist(), strict=True):
             if name not in self._names:
                 self.strangers[name] = self.strangers.get(name, 0) + 1
                 continue
@@ -134,7 +147,7 @@ class Localizer:
         scanner : geometry, where it is not the one of before.
         """
         self.scanner = scanner or self.scanner
-        if self.scanner is not None and self.known.walls is not None:
+        if self.scanner is not None and self.scanner.usable and self.known.walls is not None:
             readings = np.asarray(ranges, dtype=np.float64).reshape(-1)
             for at, entry in self._scan_clock.take(stamp, self._measured, self._silences, (readings, self.scanner)):
                 scan = Scan(at + self.known.laser_delay, *entry)

@@ -77,8 +77,13 @@ class PoseEstimator:
         self._way += way_of(step)
 
     def wander(self, sigma: float) -> None:
-        """Let the pose become unsure by a standard deviation, m and rad, of motion that nothing has measured."""
+        """Let the pose become unsure by a standard deviation, m and rad, of motion that nothing has measured.
+
+        What came before it cannot be laid together with what comes after.
+        """
         self._bank = hypotheses.moved(self._bank, np.zeros(3), sigma, self.known.anchors.slow_sigma)
+        self._window, self._confirmed = Window(), None
+        self._places.drop()
 
     def use_range(self, fact: RangeFacts, tag: Floats, stamp: float) -> None:
         """Take a range of the tag at a place (2,) of the base, m, at a time, s."""

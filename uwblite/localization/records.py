@@ -21,6 +21,11 @@ class Scanner:
     range_max: float = 30.0
     """m."""
 
+    @property
+    def usable(self) -> bool:
+        """Whether it says where each ray goes; a header that is broken does not."""
+        return bool(np.isfinite((self.angle_min, self.angle_increment, self.time_increment)).all())
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalizerState:

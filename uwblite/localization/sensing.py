@@ -12,6 +12,8 @@ from .odometer import Odometer
 from .records import Scanner
 from .walls import Rays
 
+_FARTHEST = 1000.0
+"""m; a reading that is farther is none, whatever the device calls its reach."""
 _CLEAR = 3.0
 """m; up to here a ray that saw nothing would have seen a wall, as grid.max_clear_distance."""
 TRACK_RAYS = 180
@@ -93,7 +95,7 @@ def scan_rays(odometer: Odometer, mounting: SensorMounting, scan: Scan) -> Rays:
     """
     stamp, readings, scanner = scan.stamp, scan.readings, scan.scanner
     count = len(readings)
-    hit = (readings >= scanner.range_min) & (readings <= scanner.range_max)
+    hit = (readings >= scanner.range_min) & (readings <= min(scanner.range_max, _FARTHEST))
     empty = (np.isposinf(readings) | (readings > scanner.range_max)) & ~hit
     ray = np.flatnonzero(hit | empty)
     ray = ray[:: max(1, -(-len(ray) // TRACK_RAYS))]
