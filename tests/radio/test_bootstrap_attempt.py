@@ -20,9 +20,10 @@ class Scheduled(Attempt):
         self.path, self.config, self.hypotheses = np.arange(float(poses)), BootstrapConfig(), {}
         self.placed, self.agrees, self.found = np.ones(1, dtype=bool), iter(agrees), iter(found)
         self.taken, self.low, self.high, self.tears_at = [], 0, 0, np.inf
+        self.poses, self.anchors, self.length = np.zeros((poses, 3)), np.zeros((1, 2)), 20
 
     def _seed(self):
-        self.low, self.high = 0, 20
+        self.low, self.high = 0, self.length
         return 20.0
 
     def _extend(self, piece):
@@ -58,6 +59,24 @@ def test_pieces_grow_while_the_ranges_agree_and_all_is_solved_from_time_to_time(
     pieces = [t for t in slow.taken if isinstance(t, float)]
     assert pieces == [6.0, 4.8, 3.84, 3.072, 2.4576, 1.96608, 1.8, 1.8, 1.8]
     assert [t[1] for t in slow.taken if isinstance(t, tuple)] == [20, 28, 40, 56]
+
+
+@pytest.mark.parametrize(
+    ("off", "stretch", "placed", "same"),
+    [(0.0, 20, True, True), (0.14, 20, True, True), (0.16, 20, True, False), (0.0, 21, True, False), (0.0, 20, False, False)],
+)
+def test_attempts_begin_alike_where_the_clearest_stretch_has_one_shape_and_one_set_of_anchors(off, stretch, placed, same):
+    """Wherever it lies; the bound is the assumed standard deviation of a range, 0.15 m."""
+    attempts = []
+    for at, length, known, shift in (([0.0, 0.0, 0.0], 20, True, 0.0), ([5.0, -3.0, 2.0], stretch, placed, off)):
+        attempt = Scheduled(32, [], [])
+        shape = np.column_stack([np.arange(32.0), np.zeros(32), np.zeros(32)])
+        attempt.poses = se2.compose(np.array(at), shape)
+        attempt.anchors = se2.transform(np.array(at), np.array([[4.0, 2.0], [7.0 + shift, -3.0]]))
+        attempt.placed, attempt.length = np.array([known, True]), length
+        attempt.run(0.0)
+        attempts.append(attempt)
+    assert attempts[0].began_like(attempts[1]) == attempts[1].began_like(attempts[0]) == same
 
 
 def test_an_attempt_that_is_torn_once_all_was_solved_goes_on_only_where_asked_to():

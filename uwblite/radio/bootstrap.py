@@ -16,9 +16,10 @@ def bootstrap_graph(
 ) -> BootstrapResult:  # fmt: skip
     """Estimate poses and anchor positions without any guess of the anchors.
 
-    Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path.
-    In the order of their misfit there, each goes on as long as the ranges agree; the first that comes to the end wins. Where
-    none does, the best of them is carried on if it began clearly better than the heading as it is, and wins if it ends so.
+    Where the ranges do not agree in the end, other hypotheses of a gross heading error are tried over a part of the path;
+    one that begins like an attempt before would go on like it, and ends there. In the order of their misfit, each goes on as
+    long as the ranges agree; the first that comes to the end wins. Where none does, the best of them is carried on if it began
+    clearly better than the heading as it is, and wins if it ends so.
 
     Parameters
     ----------
@@ -37,10 +38,14 @@ def bootstrap_graph(
     first.run()
     if first.misfit() < config.agreement or not others:
         return first.estimate()
+    tried = [first]
     for attempt in others:
-        attempt.run(config.enough, torn=False)
-    others.sort(key=Attempt.misfit)
-    hopeful = others[0] if others[0].misfit() < 0.8 * begun else first
+        attempt.run(0.0)
+        if not any(attempt.began_like(other) for other in tried):
+            attempt.run(config.enough, torn=False)
+            tried.append(attempt)
+    others = sorted(tried[1:], key=Attempt.misfit)
+    hopeful = others[0] if others and others[0].misfit() < 0.8 * begun else first
     for attempt in others:
         if attempt.agrees_to_the_end():
             return attempt.estimate()

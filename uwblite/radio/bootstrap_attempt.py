@@ -8,7 +8,7 @@ again and anchors not yet placed are searched from the poses so far.
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -84,6 +84,7 @@ class Attempt:
         self.hypotheses: dict[int, list[AnchorHypothesis]] = {}
         self.low = self.high = self.solved = 0
         self.piece = self.smallest = 0.0
+        self.begun = np.zeros((0, 2))
 
     @property
     def complete(self) -> bool:
@@ -128,6 +129,17 @@ class Attempt:
         self.smallest, self.solved = 0.3 * self.piece, self.high - self.low
         if self.placed.any():
             self._solve((10.0, 3.0))
+        known = np.zeros(len(self.path), dtype=bool)
+        known[self.low : self.high] = True
+        places = np.concatenate([self.poses[:, :2], self.anchors])
+        places[~np.concatenate([known, self.placed])] = np.nan
+        self.begun = se2.transform(se2.inverse(self.poses[self.low]), places)
+
+    def began_like(self, other: Self) -> bool:
+        """Return whether poses and anchors of the clearest stretch are another attempt's, up to the noise of a range."""
+        apart = np.hypot(*(self.begun - other.begun).T)
+        same = np.array_equal(np.isnan(self.begun), np.isnan(other.begun))
+        return same and float(np.nanmax(apart)) < self.config.range_sigma
 
     def _place_the_rest(self) -> None:
         """Put the anchors that stay unclear where they are likeliest."""
@@ -270,4 +282,4 @@ class Attempt:
 def _anneal(graph: Graph, schedule: tuple[float, ...]) -> Graph:
     """Optimise with the ranges' kernel tightened step by step (graduated non-convexity)."""
     ranges = [k for k, e in enumerate(graph.edges) if isinstance(e, RangeEdges)]
-    return tightened(graph, ranges, schedule, SolverConfig(max_iterations=15, relative_decrease=1e-4))
+    return tightened(graph, ranges, schedule, SolverConfig(max_iterations=15, relative_decrease=1e-3))
