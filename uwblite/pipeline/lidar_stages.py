@@ -22,7 +22,7 @@ from . import scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
 from .progress import solver_figures
-from .radio_stages import with_range_noise
+from .radio_stages import rough, with_range_noise
 from .recordings import denser, later
 
 
@@ -81,7 +81,7 @@ def _descended(estimate: Estimate, task: Task) -> tuple[Estimate, Steps]:
     """
     weak, config = _with_inflated_ranges(estimate), task.config
     whole = replace(weak, odometry=replace(weak.odometry, kernel=SQUARED)).odometry_and_ranges
-    estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*whole), config.solver)[0])
+    estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*whole), rough(config.solver))[0])
     return estimate, _steps(estimate, np.arange(len(estimate.odometry)), task)
 
 
@@ -136,7 +136,7 @@ def _match_neighbours(estimate: Estimate, steps: Steps, task: Task) -> Estimate:
     estimate = replace(estimate, odometry=found.wheels)
     weak = _with_inflated_ranges(estimate)
     problem = graph.with_edges(*weak.odometry_and_ranges, found.steps)
-    graph = graph.with_estimates_of(optimize(problem, config.solver)[0])
+    graph = graph.with_estimates_of(optimize(problem, rough(config.solver))[0])
     gate = float(np.clip(found.miss, rules.later_gate, rules.first_gate))
     return _refined_neighbours(estimate, graph, gate, task, searched=found.searched)
 

@@ -111,7 +111,8 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
         if lap == _NOISE_ROUNDS - 1:
             graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
             estimate = replace(estimate, graph=with_free(graph, *RADIO))
-        solved, result = optimize_with_heights(estimate.graph.with_edges(*estimate.odometry_and_ranges), config.solver)
+        solver = config.solver if lap else rough(config.solver)
+        solved, result = optimize_with_heights(estimate.graph.with_edges(*estimate.odometry_and_ranges), solver)
         graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
         estimate = replace(estimate, graph=graph.with_estimates_of(solved))
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
@@ -207,7 +208,7 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     config, steps = task.config, estimate.steps
     if estimate.ranges is None or steps is None:
         return estimate
-    for solver in (_rough(config.solver), config.solver):
+    for solver in (rough(config.solver), config.solver):
         graph = relocate(estimate.ranges, estimate.graph, ~estimate.graph.fixed_anchors, config.trilateration)
         estimate = with_range_noise(replace(estimate, graph=graph), config)
         problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
@@ -216,21 +217,23 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, graph=with_nonnegative_heights(estimate.graph))
 
 
-def _rough(solver: SolverConfig) -> SolverConfig:
-    return replace(solver, max_iterations=min(solver.max_iterations, _ROUGH_ITERATIONS))
+def rough(solver: SolverConfig) -> SolverConfig:
+    """Return the rules of an optimisation whose weights are re-estimated afterwards, and which is followed by another one."""
+    iterations, decrease = min(solver.max_iterations, _ROUGH_ITERATIONS), max(solver.relative_decrease, _ROUGH_DECREASE)
+    return replace(solver, max_iterations=iterations, relative_decrease=decrease)
 
 
-_ROUGH_ITERATIONS = 12
-"""Iterations of an optimisation that another one follows."""
+_ROUGH_ITERATIONS, _ROUGH_DECREASE = 12, 1e-4
+"""Most iterations of such an optimisation, and the share of chi2 that no longer matters in it."""
 
 
 def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors."""
     if estimate.ranges is None:
         return estimate
-    for _ in range(_NOISE_ROUNDS - 1):
+    for solver in (rough(task.config.solver), task.config.solver):
         # The marginal likelihood is one about the optimum of the very weights that it is computed with.
         estimate = with_range_noise(estimate, task.config, steady=True)
         edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
-        estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*edges), _rough(task.config.solver))[0])
+        estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*edges), solver)[0])
     return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))
