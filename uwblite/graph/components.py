@@ -24,7 +24,7 @@ def floating_components(graph: Graph) -> Ints:
     free = free_unknowns(graph)
     tied += [first[name] + np.flatnonzero(~free[name]) for name in first]
     one, other = np.concatenate(links, axis=1)
-    label = _labels(one, other, nodes)
+    label = part_of_each(one, other, nodes)
     begins = np.unique(label[:n], return_index=True)
     start = np.full(nodes, -1)
     start[begins[0]] = begins[1]
@@ -52,11 +52,11 @@ def tied_chains(graph: Graph, chains: Ints) -> Bools:
         elif isinstance(e, RangeEdges | LandmarkEdges):
             ends.append((chains[e.pose], count + e.anchor))
     one, other = (np.concatenate(column) for column in zip(*ends, strict=True))
-    label = _labels(one, other, count + len(graph.anchors))
+    label = part_of_each(one, other, count + len(graph.anchors))
     return np.asarray(label[chains] == label[0], dtype=np.bool_)
 
 
-def _labels(one: Ints, other: Ints, nodes: int) -> Ints:
-    """Return the number (nodes,) of the part that each node belongs to, from links between nodes `one` and `other`."""
+def part_of_each(one: Ints, other: Ints, nodes: int) -> Ints:
+    """Return the number (nodes,) of the part that each node belongs to, by links (l,) between nodes `one` and `other`."""
     links = csr_matrix((np.ones(len(one)), (one, other)), shape=(nodes, nodes))
     return np.asarray(connected_components(links, directed=False)[1])

@@ -5,11 +5,10 @@ two ends of the stretch that they move. A wheel slips once; it does not make goo
 """
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
+from ..graph.components import part_of_each
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 
@@ -79,9 +78,7 @@ def tied_parts(wheels: OdometryEdges, graph: Graph, least: int, sound: Bools) ->
             good = (_fixed(edges) >= least) & _agrees(edges, graph)
             i.append(edges.i[good])
             j.append(edges.j[good])
-    ends, size = (np.concatenate(i), np.concatenate(j)), len(graph.poses)
-    ties = sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(size, size))
-    return np.asarray(connected_components(ties, directed=False)[1], dtype=np.int64)
+    return part_of_each(np.concatenate(i), np.concatenate(j), len(graph.poses))
 
 
 def _agrees(edges: ScanEdges, graph: Graph) -> Bools:

@@ -21,7 +21,8 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Ints
-from ..graph.graph import Edges, Graph, PriorEdges
+from ..graph.components import given_anchors
+from ..graph.graph import Edges, Graph
 from ..graph.problem_checks import check
 from ..graph.range_edges import RangeEdges
 from ..graph.robust import Kernel
@@ -118,10 +119,7 @@ class _Incremental:
         self.ranged = np.zeros(count, dtype=bool)
         for edges, _ in self.ranges:
             self.ranged[edges.anchor] = True
-        given = ~self.free["anchors"]
-        for prior in graph.edges:
-            if isinstance(prior, PriorEdges) and prior.block == "anchors":
-                given[prior.index] = True
+        given = given_anchors(graph)
         self.ranged &= ~given
         self.joined = ~self.ranged
         self.joined_at = np.where(self.joined, -1, len(graph.poses))
