@@ -7,7 +7,7 @@ import pytest
 from helpers.planted import box, drive, odometry, recording, scans, wander
 
 from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.lidar.laser_mounting import _LAGS, LEAST_PAIRS, _Agreement, _ratio, _turning_pairs, compare
+from uwblite.lidar.laser_mounting import _LAGS, LEAST_PAIRS, _ratio, _turning_pairs, compare
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting
 
@@ -97,6 +97,12 @@ def test_a_laser_upside_down_is_mapped_and_reported():
     assert not [d for d in counted.doubts if d.kind == "laser-turned-over"]
 
 
+def differences(monkeypatch, given, other):
+    """Let laser and wheels differ by these (lags, pairs), the laser mounted as given and the other way up."""
+    turns = np.full(given.shape[1], 0.3)
+    monkeypatch.setattr("uwblite.lidar.laser_mounting._differences", lambda *args: (turns, given if args[-1] > 0.0 else other))
+
+
 @pytest.mark.parametrize(("centre", "best", "scatter", "clear"), [
     (0.10, 0.069, 0.0, True), (0.10, 0.071, 0.0, False), (0.10, 0.06, 0.081, False), (0.10, 0.06, 0.079, True),
 ])  # fmt: skip
@@ -107,9 +113,7 @@ def test_a_delay_is_clear_by_its_gain_and_by_the_gain_s_own_scatter(monkeypatch,
     errors = np.full((len(_LAGS), pairs), 0.29)
     errors[len(_LAGS) // 2] = centre
     errors[30] = best + scatter * np.where(np.arange(pairs) % 2 == 0, 1.0, -1.0)
-    given = _Agreement(np.full(pairs, 0.3), errors)
-    other = _Agreement(np.full(pairs, 0.3), np.full_like(errors, 0.3))
-    monkeypatch.setattr(_Agreement, "of", staticmethod(lambda *args: given if args[-1] > 0.0 else other))
+    differences(monkeypatch, errors, np.full_like(errors, 0.3))
     monkeypatch.setattr("uwblite.lidar.laser_mounting._ratio", lambda laser, wheels: (1.0, 0.1))
     seen = compare(log)
     assert seen.delay == _LAGS[30]
@@ -123,9 +127,9 @@ def test_the_other_way_up_must_agree_twice_as_well_at_its_best_delay_as_the_give
 ):
     errors = np.full((len(_LAGS), 16), 0.29)
     errors[30] = 0.2
-    given, other = _Agreement(np.full(16, 0.3), errors), _Agreement(np.full(16, 0.3), np.full_like(errors, 0.29))
-    other.errors[10] = upside_down
-    monkeypatch.setattr(_Agreement, "of", staticmethod(lambda *args: given if args[-1] > 0.0 else other))
+    other = np.full_like(errors, 0.29)
+    other[10] = upside_down
+    differences(monkeypatch, errors, other)
     monkeypatch.setattr("uwblite.lidar.laser_mounting._ratio", lambda laser, wheels: (1.0, 0.1))
     seen = compare(turner()[0])
     assert (seen.turned_over, seen.delay) == (over, _LAGS[10 if over else 30])

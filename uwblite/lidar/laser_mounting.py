@@ -71,15 +71,16 @@ def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
     middle = 0.5 * scans.time_increment * scans.ranges.shape[1]
     wheels = _wheel_turns(log, scans, first, second, middle + _LAGS)
     sign = -1.0 if log.mounting.laser_flipped else 1.0
-    as_given, other = (_Agreement.of(log, scans, first, second, wheels, s * sign) for s in (1.0, -1.0))
-    right = other if other.misfit.min() < 0.5 * as_given.misfit.min() else as_given
-    best, centre = int(np.argmin(right.misfit)), len(_LAGS) // 2
-    gain = right.errors[centre] - right.errors[best]
-    clear = right.misfit[best] < 0.7 * right.misfit[centre] and gain.mean() > 2.0 * gain.std() / np.sqrt(gain.size)
+    both = [_differences(log, scans, first, second, wheels, s * sign) for s in (1.0, -1.0)]
+    as_given, other = misfits = [errors.mean(axis=1) for _, errors in both]
+    right = int(other.min() < 0.5 * as_given.min())
+    (turn, errors), misfit = both[right], misfits[right]
+    best, centre = int(np.argmin(misfit)), len(_LAGS) // 2
+    gain = errors[centre] - errors[best]
+    clear = misfit[best] < 0.7 * misfit[centre] and gain.mean() > 2.0 * gain.std() / np.sqrt(gain.size)
     return Turning(
-        len(first), float(np.median(np.abs(wheels[centre]))), float(as_given.misfit.min()), float(other.misfit.min()),
-        float(right.misfit[best]), float(_LAGS[best]), bool(clear),
-        *_ratio(right.turn, wheels[best]),
+        len(first), float(np.median(np.abs(wheels[centre]))), float(as_given.min()), float(other.min()),
+        float(misfit[best]), float(_LAGS[best]), bool(clear), *_ratio(turn, wheels[best]),
     )
 
 
@@ -92,30 +93,23 @@ def _ratio(laser: Floats, wheels: Floats) -> tuple[float, float]:
     return float(np.median(ratio)), sigma_of_median(ratio)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Agreement:
-    """Turns by the laser under one assumption of its mounting, and how well the wheels agree."""
+def _differences(
+    log: SensorLog, scans: LaserScans, first: Ints, second: Ints, wheels: Floats, sign: float
+) -> tuple[Floats, Floats]:
+    """Return turns (p,) by the laser, rad, under one assumption of its mounting, and how far the wheels' are off.
 
-    turn: Floats
-    """(p,) rad, counter-clockwise."""
-    errors: Floats
-    """(lags, pairs) differences to the wheels without their sign, of the clearer half of the pairs, rad; at most 0.3."""
-
-    @property
-    def misfit(self) -> Floats:
-        """(lags,) mean difference, rad."""
-        return np.asarray(self.errors.mean(axis=1), dtype=np.float64)
-
-    @staticmethod
-    def of(log: SensorLog, scans: LaserScans, first: Ints, second: Ints, wheels: Floats, sign: float) -> "_Agreement":
-        turn, sharp = _matched_turn(scans, first, second, _laser_shift(log, scans, first, second) * (1.0, sign))
-        some = sharp > 0.0
-        clear = some & (sharp >= np.quantile(sharp[some], 0.5)) if some.any() else ~some
-        # A wrong track width makes all turns wrong by one factor; that is no disagreement on which way they go.
-        by_wheels, seen = wheels[len(wheels) // 2], sign * turn
-        large = clear & (np.abs(by_wheels) > 0.05)
-        factor = float(np.clip(np.median(seen[large] / by_wheels[large]), 1.0 / _WIDEST, _WIDEST)) if large.any() else 1.0
-        return _Agreement(seen, np.minimum(np.abs(factor * wheels[:, clear] - seen[clear]), 0.3))
+    Returns
+    -------
+    Turns, counter-clockwise, and differences without sign (lags, pairs) of the clearer half of the pairs, rad; at most 0.3.
+    """
+    turn, sharp = _matched_turn(scans, first, second, _laser_shift(log, scans, first, second) * (1.0, sign))
+    some = sharp > 0.0
+    clear = some & (sharp >= np.quantile(sharp[some], 0.5)) if some.any() else ~some
+    # A wrong track width makes all turns wrong by one factor; they go the same way all the same.
+    by_wheels, seen = wheels[len(wheels) // 2], sign * turn
+    large = clear & (np.abs(by_wheels) > 0.05)
+    factor = float(np.clip(np.median(seen[large] / by_wheels[large]), 1.0 / _WIDEST, _WIDEST)) if large.any() else 1.0
+    return seen, np.minimum(np.abs(factor * wheels[:, clear] - seen[clear]), 0.3)
 
 
 _NOISE = 0.02

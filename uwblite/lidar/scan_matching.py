@@ -4,7 +4,7 @@ Nearest neighbours come from one raster per cloud. A pair's matches are condense
 pose (3 x 3), which is all that the graph needs to know of them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,8 +83,7 @@ def match(
     -------
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
-    parts = [_condensed(clouds, found, scale) for found in correspondences(clouds, raster, i, T_i_j, points, gate)]
-    return concatenated(parts)
+    return concatenated([_condensed(clouds, m, scale) for m in correspondences(clouds, raster, i, T_i_j, points, gate)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,43 +110,29 @@ def correspondences(
     clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float
 ) -> Iterator[Correspondences]:
     """Yield the matches of all pairs, a bounded number of pairs at a time; for the parameters see match."""
-    surface = _Surface.of(clouds)
+    # Each coordinate of points and normals in one piece.
+    surface = [np.ascontiguousarray(column) for column in (*clouds.points.T, *clouds.normals.T)]
     at_once = max(_AT_ONCE // max(points.row.shape[1], 1), 1)
     for first in range(0, max(len(i), 1), at_once):
         part = slice(first, first + at_once)
         yield _looked_up(clouds, surface, raster, part, i[part], T_i_j[part], points.row[part], gate)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Surface:
-    """Points and normals of all clouds, each coordinate in one piece."""
-
-    x: Floats
-    y: Floats
-    nx: Floats
-    ny: Floats
-
-    @classmethod
-    def of(cls, clouds: Clouds) -> "_Surface":
-        return cls(*(np.ascontiguousarray(column) for column in (*clouds.points.T, *clouds.normals.T)))
-
-
 def _looked_up(
-    clouds: Clouds, surface: _Surface, raster: CloudRasters, pairs: slice, i: Ints, T_i_j: Floats, row: NDArray[np.int32],
-    gate: float,
+    clouds: Clouds, surface: Sequence[Floats], raster: CloudRasters, pairs: slice, i: Ints, T_i_j: Floats,
+    row: NDArray[np.int32], gate: float,
 ) -> Correspondences:
     """Look up the points of some pairs (e,): per-pair values are columns (e, 1)."""
     c, s = (v[:, None] for v in se2.cos_sin(T_i_j[:, 2]))
-    px, py = surface.x.take(row), surface.y.take(row)
+    px, py, sx, sy = (column.take(row) for column in surface)
     rx, ry = c * px - s * py, s * px + c * py
     x, y = rx + T_i_j[:, :1], ry + T_i_j[:, 1:2]
     found = look_up(raster, i, x, y)
     near = found >= 0
     target = found + clouds.offsets[i, None]
     target *= near
-    nx, ny = surface.nx.take(target), surface.ny.take(target)
-    dx, dy = x - surface.x.take(target), y - surface.y.take(target)
-    sx, sy = surface.nx.take(row), surface.ny.take(row)
+    qx, qy, nx, ny = (column.take(target) for column in surface)
+    dx, dy = x - qx, y - qy
     facing = nx * (c * sx - s * sy) + ny * (s * sx + c * sy)
     good = near & (dx * dx + dy * dy <= gate * gate) & (facing > _SAME_FACING) & (row >= 0)
     return Correspondences(pairs, row, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))

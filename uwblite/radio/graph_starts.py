@@ -46,7 +46,7 @@ def starts(graph: Graph, chains: Ints, elsewhere: Floats | None = None) -> Itera
 
 
 def starts_nearby(start: Start, optimised: Graph) -> Iterator[Start]:
-    """Yield starts that may lead out of the minimum that was found: all poses anew by chordal_start, or anchors elsewhere."""
+    """Yield starts that may lead out of the minimum that was found: all poses by chordal_start, or anchors elsewhere."""
     for graph in (chordal_start(optimised), search_anchors(start.graph)):
         if graph is not None:
             yield Start(graph, start.unplaced)

@@ -64,18 +64,14 @@ def _section(title: str, content: str) -> str:
 
 
 def _banner(result: MapResult) -> str:
-    parts = []
-    if result.doubts:
-        items = "".join(f"<li>{escape(doubt.text)}</li>" for doubt in result.doubts)
-        parts.append(
-            f'<div class="box bad" role=alert><b>Do not trust this map before these are resolved:</b><ul>{items}</ul></div>'
-        )
-    if result.warnings:
-        items = "".join(f"<li>{escape(warning.text)}</li>" for warning in result.warnings)
-        parts.append(f'<div class="box warn"><b>Worth knowing:</b><ul>{items}</ul></div>')
-    if not parts:
-        parts.append('<div class="box good">No warnings.</div>')
-    return f'<section id="warnings">{"".join(parts)}</section>'
+    boxes = (
+        ('"box bad" role=alert', "Do not trust this map before these are resolved:", result.doubts),
+        ('"box warn"', "Worth knowing:", result.warnings),
+    )
+    items = ((kind, head, "".join(f"<li>{escape(notice.text)}</li>" for notice in found)) for kind, head, found in boxes)
+    text = "".join(f"<div class={kind}><b>{head}</b><ul>{listed}</ul></div>" for kind, head, listed in items if listed)
+    text = text or '<div class="box good">No warnings.</div>'
+    return f'<section id="warnings">{text}</section>'
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], empty: str) -> str:
@@ -92,19 +88,8 @@ def _cell(text: str) -> str:
 
 
 def _anchor_table(anchors: tuple[AnchorEstimate, ...]) -> str:
-    head = (
-        "anchor",
-        "x, m",
-        "\u00b1",
-        "y, m",
-        "\u00b1",
-        "bias, m",
-        "\u00b1",
-        "ranges",
-        "down-weighted",
-        "residual rms, m",
-        "status",
-    )
+    spread, rest = "\u00b1", ("ranges", "down-weighted", "residual rms, m", "status")
+    head = ("anchor", "x, m", spread, "y, m", spread, "bias, m", spread, *rest)
     rows = [
         (
             a.id,
