@@ -19,9 +19,19 @@ _TINY = 1e-30
 def relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Return (..., 3, 3) B, its inverse, eigenvalues and eigenvectors of B^-1 H B^-T where N = B B^T, N kept from vanishing."""
     basis = np.asarray(np.linalg.cholesky(spurious + _floor(information)[..., None] * np.eye(3)), dtype=np.float64)
-    inverse = np.asarray(np.linalg.inv(basis), dtype=np.float64)
+    inverse = _inverse(basis)
     values, vectors = np.linalg.eigh(inverse @ information @ np.swapaxes(inverse, -1, -2))
     return basis, inverse, values, vectors
+
+
+def _inverse(lower: Floats) -> Floats:
+    """Return the inverse of lower triangular matrices (..., 3, 3), in a tenth of the time of a general one."""
+    x, y, z = (1.0 / lower[..., k, k] for k in range(3))
+    inverse = np.zeros_like(lower)
+    inverse[..., 0, 0], inverse[..., 1, 1], inverse[..., 2, 2] = x, y, z
+    inverse[..., 1, 0], inverse[..., 2, 1] = -lower[..., 1, 0] * x * y, -lower[..., 2, 1] * y * z
+    inverse[..., 2, 0] = (lower[..., 1, 0] * lower[..., 2, 1] * y - lower[..., 2, 0]) * x * z
+    return inverse
 
 
 def _floor(information: Floats) -> Floats:
