@@ -13,7 +13,7 @@ from .serving import LOCAL, page_address
 if TYPE_CHECKING:
     from ..drivers.recorder import Recorder
 
-HELP = "record a run: UWB tag, lidar and odometry into a log that `uwblite map` reads"
+HELP = "record UWB tag, lidar, base and gyro into a log that `uwblite map` reads"
 EPILOG = """
 examples:
   uwblite devices                                     what is plugged in, and is it set up?

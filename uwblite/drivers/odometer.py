@@ -94,6 +94,6 @@ class BaseDriver(Driver):
         if self._wheel_drop:
             findings.append(Note("warning", "wheel-drop", "a wheel hangs in the air: travel will be wrong"))
         if 0 < self._voltage < self._low:
-            text = f"the battery is low ({self._voltage:.1f} V): charge it before a run"
+            text = f"the battery is low ({self._voltage:.1f} V): charge it before a recording"
             findings.append(Note("warning", "low-battery", text))
         return Identity(self.title, (("battery", f"{self._voltage:.1f} V"),), tuple(findings))

@@ -107,7 +107,7 @@ def from_counts(counter: RayCounter, config: GridConfig) -> OccupancyGrid:
     per_hit = np.float32(math.log(config.p_hit / (1.0 - config.p_hit)))
     per_miss = np.float32(math.log(config.p_miss / (1.0 - config.p_miss)) / WEIGHT_UNIT)
     log_odds = np.zeros(counter.hits.shape, dtype=np.float32)
-    # In strips: the products in double precision would be the largest arrays of the run.
+    # In strips: the products in double precision would be the largest arrays of all.
     for rows in counter.geometry.strips():
         part = counter.hits[rows] * per_hit + counter.misses[rows] * per_miss
         log_odds[rows] = np.clip(part, -config.clamp, config.clamp)

@@ -211,7 +211,7 @@ def refine(
         linearized = linearize(problem)
         normal = normal or NormalEquations(problem, linearized)
         solved, summary = minimise(problem, linearized, normal, brief)
-        graph = graph.updated(solved.poses, solved.anchors, solved.calibration.values)
+        graph = graph.with_estimates_of(solved)
         before, T_i_j = T_i_j, probe.relative(graph)
         moved = _surfaces_moved(factors, used, T_i_j - before)
         rounds += 1

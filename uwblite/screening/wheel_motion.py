@@ -2,8 +2,8 @@
 
 Pairs of scans a moment apart, spread over the recording, are matched and compared with the odometry of the same moment.
 One factor for all ways and one for all turns is calibration, and taken out before. What then remains over a stretch is a
-fault: wheels that count nothing while the scans move are replaced there (replaced_wheels.py); any other sustained
-disagreement is a doubt.
+fault: wheels that count nothing while the scans move are replaced there (replaced_wheels.py); any other lasting
+difference is a doubt.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ _SEEN_MOVING = (0.03, 0.03)
 _MOST = 0.6
 """Share of a stretch's pairs from which it is reported."""
 _LEAST_PAIRS, _LEAST_SECONDS = 6, 6.0
-"""Pairs and seconds of a sustained disagreement."""
+"""Pairs and seconds of a lasting difference."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
