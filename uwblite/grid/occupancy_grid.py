@@ -67,7 +67,7 @@ class GridConfig:
             raise ConfigError(f"grid needs 0 < p_miss < 0.5 < p_hit < 1, not {self.p_miss} and {self.p_hit}")
         if not 0.0 <= self.clear_weight <= 1.0:
             raise ConfigError(f"grid.clear_weight must lie in 0..1, not {self.clear_weight}")
-        for name in ("clamp", "max_cells", "clear_run"):
+        for name in ("clamp", "max_cells"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"grid.{name} must be positive, not {getattr(self, name)}")
 
