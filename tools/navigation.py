@@ -44,6 +44,8 @@ MARGIN = 0.1
 """m that plans keep beyond it: what map, pose and pursuit are off by."""
 NEAR = 0.10
 """m of the truth within which a goal is reached."""
+CLOSE = 0.03
+"""m from a goal, by its own pose, from which the robot stops as soon as it comes no nearer."""
 STEP, SCAN_EVERY, RANGE_EVERY = 0.05, 4, 40
 """s of a step; steps between scans and between rounds of ranges."""
 SPEED, TURN, LOOK = 0.25, 0.8, 0.35
@@ -192,7 +194,7 @@ class Driver:
         """Drive to a goal (2,) in the map."""
         tally.goals += 1
         pose, lost = self.step(0.0, 0.0)
-        path = np.zeros((0, 2))
+        path, rest = np.zeros((0, 2)), np.inf
         for _ in range(int(MOST_SECONDS / STEP)):
             if lost:
                 tally.lost += 1
@@ -207,8 +209,8 @@ class Driver:
                 except UwbliteError as why:
                     print(f"goal {tally.goals} is given up: {why}", file=sys.stderr, flush=True)
                     return
-            rest = float(np.hypot(*(goal - pose[:2])))
-            if rest < 0.03:
+            before, rest = rest, float(np.hypot(*(goal - pose[:2])))
+            if rest < CLOSE and rest >= before:
                 break
             speed, turn = pursued(path, pose, rest)
             pose, lost = self.step(speed, turn)
