@@ -2,6 +2,7 @@
 
 The bootstrap asks this of ranges along odometry that drifts. Here it is asked once more along the final trajectory and with
 the ranges' final noise, which counts how alike neighbouring errors are: a curve, other anchors or the lidar decide then.
+Without a lidar, the ranges have bent a straight trajectory to suit the place that was found; there the poses are free too.
 """
 
 from dataclasses import replace
@@ -39,12 +40,39 @@ def find_mirror_images(estimate: Estimate, task: Task) -> Estimate:
     apart = np.hypot(*(there.anchors - here.anchors).T)
     each, together = (_costs(there, ranges, w) - _costs(here, ranges, w) for w in (ranges.alive, ranges.own_weights))
     as_well = (apart > _APART) & ((each < _CLEAR) | (together < _LIKELIER))
+    others = there.anchors
+    for k in np.flatnonzero(free & ~as_well).tolist() if not task.recordings.have_scans else ():
+        other = _along_another_path(estimate, ranges, k, starts[1][k], task)
+        if other is not None:
+            as_well[k], others[k] = True, other
     ambiguous = np.where(free, as_well, found.ambiguous)
     hypotheses = list(found.hypotheses)
     for k in np.flatnonzero(free & ambiguous).tolist():
         if hypotheses[k]:
-            hypotheses[k] = (hypotheses[k][0], replace(hypotheses[k][0], position=there.anchors[k]))
+            hypotheses[k] = (hypotheses[k][0], replace(hypotheses[k][0], position=others[k]))
     return replace(estimate, bootstrap=replace(found, ambiguous=ambiguous, hypotheses=tuple(hypotheses)))
+
+
+def _along_another_path(estimate: Estimate, ranges: RangeEdges, k: int, image: Floats, task: Task) -> Floats | None:
+    """Return the other place (2,) that an anchor has where the path bends with it, None where there is none or it is excluded.
+
+    Parameters
+    ----------
+    image : (2,) where it is looked for, m.
+    """
+    graph = estimate.graph
+    tags = ranges.tag_positions(graph.poses)[ranges.alive & (ranges.anchor == k)]
+    if np.linalg.eigvalsh(np.cov(tags.T))[0] > _STRAIGHT**2 or np.hypot(*(image - graph.anchors[k])) < _APART:
+        return None
+    anchors = graph.anchors.copy()
+    anchors[k] = image
+    found = optimize(replace(graph, anchors=anchors), task.config.solver)[0]
+    excluded = found.chi2() - graph.chi2() >= _CLEAR
+    return None if excluded or np.hypot(*(found.anchors[k] - graph.anchors[k])) < _APART else found.anchors[k]
+
+
+_STRAIGHT = 1.0
+"""m across a path, rms, beyond which no odometry lets it bend into its mirror image."""
 
 
 def _images(estimate: Estimate, ranges: RangeEdges) -> Floats:
