@@ -163,3 +163,10 @@ def test_the_two_ways_exclude_one_another(tmp_path, capsys):
     path = written(tmp_path / "g.pyfg", loop(3, n=50)[0])
     assert main(["optimize", path, "--robust", "--incremental"]) == 2
     assert "not allowed with" in capsys.readouterr().err
+
+
+def test_lines_of_kinds_that_are_not_used_are_said(tmp_path, capsys):
+    path = tmp_path / "a.g2o"
+    path.write_text("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_BEARING_SE2_XY 0 5 0.5 100\n")
+    assert main(["optimize", str(path)]) == 0
+    assert "warning: lines of other kinds were not used: 1 EDGE_BEARING_SE2_XY" in capsys.readouterr().out

@@ -234,6 +234,9 @@ G2O_ERRORS = [
     ("VERTEX_SE2 q 0 0 0\n", "'q' is not a vertex id"),
     ("VERTEX_SE2 99999999999999999999999 0 0 0\n", "not a vertex id"),
     ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", "three-dimensional"),
+    ("VERTEX_SE2 0 0 0 0\nEDGE_RANGE_SE3 0 1 3 1\n", "EDGE_RANGE_SE3: the graph is three-dimensional"),
+    ("VERTEX_SE2 0 0 0 0\nVERTEX_XYZ 5 1 1 1\n", "VERTEX_XYZ: the graph is three-dimensional"),
+    ("VERTEX_SIM3:EXPMAP 0 0 0 0 0 0 0 1\n", "three-dimensional"),
     ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 5 0 0 0\nEDGE_SE2 1 2 0 0 0 1 0 0 1 0 1\n", "pose 1 is not connected"),
     ("EDGE_SE2 1 1 0 0 0 1 0 0 1 0 1\n", "a:1: an edge leads from a pose to itself"),
     ("EDGE_SE2 1 2 0 0 0 1 0 0 -1 0 1\n", "a:1: the information matrix is not positive"),
@@ -262,6 +265,7 @@ def test_wrong_g2o_files_are_named(tmp_path, text, outputs):
         ("EDGE_SE2 0 A0 A1 0 0 0 -1 0 0 1 0 1\n", "a:1: the covariance matrix is not positive"),
         ("VERTEX_SE2 0 A1 0 0 0\nEDGE_RANGE 0 A1 L1 5 0\n", "a:2: the variance of a range must be positive"),
         ("VERTEX_SE3:QUAT 0 A0 0 0 0 0 0 0 1\n", "three-dimensional"),
+        ("VERTEX_SE2 0 A1 0 0 0\nEDGE_SE3_XYZ 0 A1 L0 1 1 1\n", "EDGE_SE3_XYZ: the graph is three-dimensional"),
     ],
 )
 def test_wrong_pyfg_files_are_named(tmp_path, text, outputs):

@@ -186,6 +186,9 @@ def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
     if "outliers" in figures:
         counted = ", ".join(f"{count} {name}" for name, count in figures["outliers"].items())
         lines.append(f"outliers left out: {counted or 'there is no edge that may be one'}")
+    if figures["skipped"]:
+        unused = ", ".join(f"{count} {tag}" for tag, count in figures["skipped"].items())
+        lines.append(f"warning: lines of other kinds were not used: {unused}")
     if figures["unplaced_anchors"]:
         lines.append(f"warning: no position for anchors {', '.join(figures['unplaced_anchors'])}: too few ranges")
     written = [name for name in (args.out, args.trajectory) if name]

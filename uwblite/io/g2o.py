@@ -26,7 +26,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, given_places, measurements
+from .graph_file import GraphFile, assembled, check_planar, given_places, measurements
 from .plain_edges import ENDS, measured, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
@@ -50,7 +50,6 @@ _TAGS = {
 }  # fmt: skip
 _FROM_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 """Where dx dy dtheta I11 I12 I13 I22 I23 I33 stand among the numbers of an EDGE2."""
-_SPATIAL = ("VERTEX_SE3", "EDGE_SE3", "VERTEX_TRACKXYZ", "VERTEX3", "EDGE3")
 
 
 def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> GraphFile:
@@ -70,9 +69,7 @@ def read_g2o(path: str | os.PathLike[str], *, from_odometry: bool = False) -> Gr
     with open_source(path) as source:
         content = read_records(source, _LAYOUTS)
     records = content.records
-    for tag in content.skipped:
-        if tag.startswith(_SPATIAL):
-            raise content.error(f"holds {tag}: the graph is three-dimensional; only planar graphs are read")
+    check_planar(content)
     toro = records["EDGE2"]
     toro = Records(toro.lines, toro.stamps, toro.names, toro.numbers[:, _FROM_TORO])
     steps = _together(records["EDGE_SE2"], toro)

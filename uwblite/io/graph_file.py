@@ -1,5 +1,6 @@
 """Pose graphs between files and the Graph type: what g2o, TORO and PyFG have in common."""
 
+import re
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -81,6 +82,16 @@ class GraphFile:
         anchors = np.where(free["anchors"][:, None], np.nan, self.graph.anchors)
         graph, chains = along_edges(replace(self.graph, poses=poses, anchors=anchors))
         return replace(self, graph=graph, chains=chains)
+
+
+def check_planar(content: RecordFile) -> None:
+    """Raise FormatError where a file holds lines of a three-dimensional graph."""
+    for tag in content.skipped:
+        if _SPATIAL.search(tag):
+            raise content.error(f"holds {tag}: the graph is three-dimensional; only planar graphs are read")
+
+
+_SPATIAL = re.compile(r"S(E|IM)3|XYZ|(VERTEX|EDGE)3")
 
 
 def symmetric(upper: Floats, size: int) -> Floats:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from .files import replacing
-from .graph_file import GraphFile, assembled, given_places, measurements
+from .graph_file import GraphFile, assembled, check_planar, given_places, measurements
 from .plain_edges import ENDS, plain_edges, upper_triangle
 from .records import Layout, RecordFile, Records, read_records
 from .source import open_source
@@ -43,7 +43,6 @@ _TAGS = {
     "range": "EDGE_RANGE", "pose_range": "EDGE_RANGE", "landmark_range": "EDGE_RANGE",
 }  # fmt: skip
 """In the order of the file."""
-_SPATIAL = ("VERTEX_SE3", "VERTEX_XYZ", "EDGE_SE3")
 _NAME = re.compile(rb"([A-Za-z])(\d{1,15})")
 
 
@@ -63,9 +62,7 @@ def read_pyfg(path: str | os.PathLike[str], *, from_odometry: bool = False) -> G
     """
     with open_source(path) as source:
         content = read_records(source, _LAYOUTS)
-    for tag in content.skipped:
-        if tag.startswith(_SPATIAL):
-            raise content.error(f"holds {tag}: the graph is three-dimensional; only planar graphs are read")
+    check_planar(content)
     pose_ids, pose_of, landmark_ids, landmark_of = _numbered(content)
     if not pose_ids:
         raise content.error("holds no poses; is this a PyFG file?")
