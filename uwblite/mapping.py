@@ -15,6 +15,7 @@ import numpy as np
 from .constraints import Constraints
 from .map_result import MapResult
 from .pipeline import (
+    anchor_heights,
     anchor_moves,
     closure_rounds,
     constraint_edges,
@@ -73,6 +74,7 @@ def build_map(
         free = replace(config.calibration, odometry_scale=config.calibration.odometry_unit)
         task = replace(task, recordings=gather(logs, config.keyframes), config=replace(config, calibration=free))
         estimate = radio_stages.first_optimisation(task)
+    anchor_heights.check_heights(estimate, task)
     before, as_recorded = stages.mark(), (estimate, task)
     renamed = anchor_moves.first_with_moves_apart(estimate, task, logs)
     for _ in range(_MOST_MOVES):

@@ -53,6 +53,18 @@ class ScanClouds:
     """Offset of the lidar's clock with which the clouds were made, s."""
 
 
+@dataclass(frozen=True, slots=True)
+class OtherHeights:
+    """A hypothesis about heights of anchors that the ranges do not refute."""
+
+    high: float
+    """How far the anchors hang above the tag where they hang high, m."""
+    taken: bool
+    """Whether they are taken as high; otherwise as low."""
+    apart: float
+    """How far the trajectory under the hypothesis that is not taken is from the estimate, rms after alignment, m."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """What is known of one recording, or of several joined, after a stage."""
@@ -71,6 +83,7 @@ class Estimate:
     steps: ScanEdges | None = None
     """Between neighbouring clouds; None before scan-to-scan matching."""
     closures: Closures = field(default_factory=no_closures)
+    other_heights: OtherHeights | None = None
     recordings: Recordings | None = None
     """With the keyframes of the graph's poses; None while these are the task's."""
     joint: ScanEdges | None = None

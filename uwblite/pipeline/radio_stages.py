@@ -10,11 +10,9 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats
-from ..errors import SolverError
 from ..graph import calibration
 from ..graph.calibration import (
     BIAS,
-    HEIGHT,
     ODOMETRY,
     RADIO,
     RANGE_SCALE,
@@ -31,7 +29,7 @@ from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
-from . import joining, map_frame
+from . import anchor_heights, joining, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 from .progress import solver_figures
@@ -47,8 +45,8 @@ def first_optimisation(task: Task) -> Estimate:
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
     estimates = [_optimised(bootstrapped(estimate, n, task), task) for n, estimate in enumerate(estimates)]
     if len(estimates) == 1:
-        return estimates[0]
-    return _optimised(joining.join(estimates, task), task)
+        return anchor_heights.with_likelier_heights(estimates[0], task.config)
+    return anchor_heights.with_likelier_heights(_optimised(joining.join(estimates, task), task), task.config)
 
 
 def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
@@ -133,8 +131,7 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     places = [calibration.index("odometry_scale", recording=n) for n in range(len(recordings))]
     factors = np.array([1.0 if place < 0 else 1.0 + float(calibration.values[place]) for place in places])
     factors = np.where(np.abs(factors - 1.0) > _OTHER_UNIT, factors, 1.0)
-    # High anchors make ranges too long, never too short.
-    height = _height_instead(estimate, task.config) if np.any(factors > 1.0) else None
+    other = estimate.other_heights
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:
             double = abs(abs(np.log2(factor)) - 1.0) < _DOUBLE
@@ -145,35 +142,14 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
                 f"{whose}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its "
                 f"odometry has: {reason}"
             )
-            high = height is not None and factor > 1.0
-            if high:
-                text += f"; or the wheels are right and the anchors hang {height:.1f} m above the tag: give their heights"
+            high = other is not None and not other.taken
+            if other is not None and high:
+                text += f"; or the wheels are right and the anchors hang {other.high:.1f} m above the tag: give their heights"
             add = task.stages.doubt if unclear or high else task.stages.warn
             add("odometry-unit", text, recording=recording.number + 1, factor=round(factor, 4))
     return factors
 
 
-def _height_instead(estimate: Estimate, config: MappingConfig) -> float | None:
-    """Return how high the anchors hang if the wheels' unit is right, m; None where that explains the ranges clearly worse."""
-    edges = estimate.odometry_and_ranges
-    graph = estimate.graph.with_edges(*edges)
-    heights = graph.calibration.of_kinds(HEIGHT)
-    if not heights.any():
-        return None
-    high = with_free(prior_selection.with_high_anchors(estimate.graph, config.calibration), *RADIO).with_edges(*edges)
-    try:
-        other, _ = optimize_with_heights(high, config.solver)
-        gain = prior_selection.laplace_marginal_likelihood(other) - prior_selection.laplace_marginal_likelihood(graph)
-    except SolverError:
-        return None
-    height = float(np.sqrt(np.median(other.calibration.values[heights])))
-    return height if gain > -_CLEARLY_WORSE and height > _NOTICEABLE else None
-
-
-_CLEARLY_WORSE = 20.0
-"""Difference of the logarithms of marginal likelihoods from which on one hypothesis is refuted."""
-_NOTICEABLE = 1.0
-"""Height above the tag, m, from which on anchors can look like another unit; lower ones lengthen short ranges only."""
 _OTHER_UNIT = 0.12
 """Relative error of travelled distance from which on it is not a wheel radius to be calibrated but another unit."""
 _DOUBLE = 0.1

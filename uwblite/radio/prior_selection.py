@@ -12,8 +12,8 @@ where nothing contradicts it, that all are right. The scale of the radios and th
 widths from sound to unsound are tried, and what is taken is their mean on the scale of logarithms, weighted by the
 marginal likelihood. A scale that is clearly off floats with the widest. So a scale stays where it is as long as the
 recording does not show it, moves a part of the way where it leans to one side, and floats where the posterior odds are clear.
-Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too. Where that seems wrong, the marginal
-likelihood (Laplace) at its optimum is compared with that of another hypothesis: all units are right, and the anchors hang high.
+Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too. The marginal likelihood (Laplace) at the
+optimum is compared with that of another hypothesis: the wheels' unit is right, and the anchors hang high.
 
 With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 
@@ -49,18 +49,17 @@ _HIGH = 6.0
 
 
 def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
-    """Return the graph with priors under which all units are right and the anchors hang as high as in a large hall.
+    """Return the graph with priors under which the wheels' unit is right and the anchors hang as high as in a large hall.
 
-    Lengths that a wrong unit stretched are put back, for a start.
+    Lengths that a wrong unit stretched are put back, for a start; heights that were put back to 0 are free again.
     """
-    scales = graph.calibration.of_kinds("odometry_scale")
+    scales, heights = graph.calibration.of_kinds("odometry_scale"), graph.calibration.of_kinds(HEIGHT)
     stretched = 1.0 + float(np.mean(graph.calibration.values[scales])) if scales.any() else 1.0
     poses = np.column_stack([graph.poses[:, :2] / stretched, graph.poses[:, 2]])
     graph = graph.updated(poses, graph.anchors / stretched, np.where(scales, 0.0, graph.calibration.values))
+    graph = replace(graph, fixed_calibration=graph.fixed_calibration & ~heights)
     sigma = _prior_sigma(graph)
-    widths = (("range_scale", config.range_scale_sound), ("odometry_scale", config.odometry_scale), (HEIGHT, _HIGH**2))
-    for name, width in widths:
-        sigma[graph.calibration.of_kinds(name)] = width
+    sigma[scales], sigma[heights] = config.odometry_scale, _HIGH**2
     return _with_prior_sigma(graph, sigma)
 
 

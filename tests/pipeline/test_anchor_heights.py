@@ -1,0 +1,75 @@
+"""Which hypothesis about the heights of anchors is taken, and when the other one is a doubt."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.planted import NOMINAL, drive, odometry, ranges
+from helpers.planted_graphs import loop
+
+from uwblite import se2
+from uwblite.arrays import rms_length
+from uwblite.constraints import Constraints
+from uwblite.graph.calibration import HEIGHT
+from uwblite.pipeline import anchor_heights, radio_stages
+from uwblite.pipeline.anchor_heights import check_heights
+from uwblite.pipeline.estimate import Estimate, OtherHeights, Task
+from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.pipeline.progress import Stages
+from uwblite.pipeline.recordings import gather
+from uwblite.sensor_log import SensorLog
+
+
+@pytest.mark.parametrize(
+    ("apart", "lidar", "doubts"), [(None, False, 0), (0.39, False, 0), (0.41, False, 1), (0.41, True, 0)]
+)
+@pytest.mark.parametrize("taken", [False, True])
+def test_heights_that_make_another_trajectory_are_a_doubt_without_a_lidar(apart, lidar, taken, doubts):
+    stages = Stages(None, None)
+    other = None if apart is None else OtherHeights(4.7, taken, apart)
+    check_heights(
+        SimpleNamespace(other_heights=other), SimpleNamespace(recordings=SimpleNamespace(have_scans=lidar), stages=stages)
+    )
+    assert [d.kind for d in stages.doubts] == ["anchor-heights"] * doubts
+    assert not stages.warnings
+    for doubt in stages.doubts:
+        assert "4.7 m above the tag" in doubt.text
+        assert ("taken as high" in doubt.text) == taken
+
+
+def round_trip(height: float, unit: float) -> tuple[SensorLog, np.ndarray]:
+    """Return a drive on a circle of 8 m radius past three anchors, wheels in units of so many metres, and the truth."""
+    rng = np.random.default_rng(3)
+    stamps, truth = drive([[0.7, 0.0, 0.7 / 8.0]], [72.0])
+    places = np.array([[9.0, 14.0], [-8.0, 2.0], [3.0, -4.0]])
+    radio = ranges(rng, stamps, truth, places, rate=1.0, sigma=0.05)
+    radio = replace(radio, ranges=np.hypot(radio.ranges, height))
+    return SensorLog(odometry(stamps, truth, rng, scale=1.0 / unit, noise=0.01, turn_noise=0.01), radio, None, NOMINAL), truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("height", "unit"), [(4.5, 1.0), (6.0, 1.0), (0.0, 1.0), (1.0, 1.3), (0.0, 1.5)])
+def test_anchors_that_hang_high_are_told_from_wheels_in_another_unit(height, unit):
+    """On a round the ranges' curvature alone tells them apart: the path has the right size, and low anchors stay low."""
+    config = MappingConfig()
+    log, truth = round_trip(height, unit)
+    task = Task(gather([log], config.keyframes), config, Constraints(), Stages(None, None))
+    estimate = radio_stages.first_optimisation(task)
+    cal, found = estimate.graph.calibration, estimate.graph.poses[:, :2]
+    true = np.column_stack([np.interp(task.recordings.stamps, log.odometry.stamps, column) for column in truth[:, :2].T])
+    assert rms_length(se2.transform(se2.align(found, true), found) - true) < 0.15
+    assert cal.get("odometry_scale") == pytest.approx(unit - 1.0, abs=0.02)
+    heights = np.sqrt(cal.values[cal.of_kinds(HEIGHT)])
+    if height > 1.0:
+        assert heights == pytest.approx(np.full(3, height), abs=0.5)
+        assert estimate.other_heights is None or estimate.other_heights.taken
+    else:
+        assert np.all(heights < 1.5)
+        assert estimate.other_heights is None
+
+
+def test_without_heights_to_find_nothing_is_compared():
+    graph = loop()[0]
+    estimate = Estimate(graph, graph.edges[0], None, ())
+    assert anchor_heights.with_likelier_heights(estimate, MappingConfig()) is estimate

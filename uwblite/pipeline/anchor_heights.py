@@ -1,0 +1,69 @@
+"""How high do anchors hang of which no height is given? Slant ranges to high ones look like another unit of the wheels.
+
+Two hypotheses, low or as high as in a large hall, are solved and compared by marginal likelihood at their optima.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import rms_length
+from ..errors import SolverError
+from ..graph.calibration import HEIGHT, RADIO, optimize_with_heights, with_free
+from ..graph.graph import Graph
+from ..radio import prior_selection
+from .estimate import Estimate, OtherHeights, Task
+from .mapping_config import MappingConfig
+
+_LIKELIER = float(np.log(3.0))
+"""Difference of the logarithms of marginal likelihoods from which on the other hypothesis is taken (positive evidence)."""
+_REFUTED = 20.0
+"""The same from which on a hypothesis is refuted: noise that is not quite as assumed makes up the half of it."""
+_NOTICEABLE = 1.0
+"""Height above the tag, m, from which on anchors can look like another unit; lower ones lengthen short ranges only."""
+_ELSEWHERE = 0.4
+"""rms distance of two trajectories, m, from which on it matters which of them is true."""
+
+
+def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate:
+    """Return the estimate under the likelier of the two hypotheses, and what the other one says where it is not refuted."""
+    edges = estimate.odometry_and_ranges
+    low = estimate.graph.with_edges(*edges)
+    heights = low.calibration.of_kinds(HEIGHT)
+    if estimate.ranges is None or not heights.any():
+        return estimate
+    start = with_free(prior_selection.with_high_anchors(estimate.graph, config.calibration), *RADIO)
+    try:
+        high, _ = optimize_with_heights(start.with_edges(*edges), config.solver)
+        # Heights that were put back to 0 count as known no better than the others.
+        likely = [prior_selection.laplace_marginal_likelihood(with_free(graph, HEIGHT)) for graph in (low, high)]
+    except SolverError:
+        return estimate
+    gain, height = likely[1] - likely[0], float(np.sqrt(np.median(high.calibration.values[heights])))
+    taken = gain > _LIKELIER
+    if taken:
+        graph = replace(start, fixed_calibration=high.fixed_calibration)
+        estimate = replace(estimate, graph=graph.with_estimates_of(high))
+    if abs(gain) > _REFUTED or height < _NOTICEABLE:
+        return estimate
+    return replace(estimate, other_heights=OtherHeights(height, taken, _apart(low, high)))
+
+
+def _apart(one: Graph, other: Graph) -> float:
+    """Return the rms distance of the poses of two graphs after alignment, m."""
+    here, there = one.poses[:, :2], other.poses[:, :2]
+    return rms_length(se2.transform(se2.align(there, here), there) - here)
+
+
+def check_heights(estimate: Estimate, task: Task) -> None:
+    """Doubt a map without lidar where the ranges do not decide how high the anchors hang, and it would be another map."""
+    other = estimate.other_heights
+    if other is None or task.recordings.have_scans or other.apart < _ELSEWHERE:
+        return
+    taken, instead = ("high", "low") if other.taken else ("low", "high")
+    text = (
+        f"the ranges fit anchors that hang {other.high:.1f} m above the tag and low ones nearly alike: taken as {taken}; "
+        f"if they are {instead}, the trajectory is another one by {other.apart:.1f} m (rms); give the anchors' heights"
+    )
+    task.stages.doubt("anchor-heights", text, height=other.high, taken=taken, apart=other.apart)
