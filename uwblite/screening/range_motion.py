@@ -34,19 +34,28 @@ def excess(log: SensorLog, start: float, end: float) -> float:
     ----------
     start, end : s; the readings before start and those after end are compared, and those between with each other.
     """
+    by_anchor = _by_anchor(log)
+    count = max((int(np.sum((stamps > start) & (stamps < end))) for stamps, _ in by_anchor), default=0)
+    edges = np.linspace(start, end, max(1, min(2, count // _WINDOW), count // (2 * _WINDOW)) + 1)
     found = []
-    for stamps, ranges in _by_anchor(log):
-        noise = _noise(ranges)
-        before, after = ranges[stamps <= start][-_WINDOW:], ranges[stamps >= end][:_WINDOW]
-        inside = ranges[(stamps > start) & (stamps < end)]
-        within = [np.median(part) for part in _chunks(inside) if len(part) >= _WINDOW]
-        ends = [np.median(part) for part in (before, after) if len(part) >= _WINDOW]
+    for stamps, ranges in by_anchor:
+        inside = np.searchsorted(edges, stamps) - 1
+        parts = [ranges[(inside == k) & (stamps > start) & (stamps < end)] for k in range(len(edges) - 1)]
+        parts = [ranges[stamps <= start][-_WINDOW:], *parts, ranges[stamps >= end][:_WINDOW]]
+        level = np.array([np.median(part) if len(part) >= _WINDOW else np.nan for part in parts])
         # Where the readings before and after stand, the robot may have driven a little.
-        extra = _way(log, stamps[stamps <= start][-_WINDOW:]) + _way(log, stamps[stamps >= end][:_WINDOW])
-        changes = [np.ptp(chunks) - more for chunks, more in ((within, 0.0), (within + ends, extra)) if len(chunks) >= 2]
-        if changes:
-            found.append(float(max(changes)) - _way(log, np.array([start, end])) - _MARGIN - _TIMES_NOISE * noise)
-    return _agreed(found)
+        extra = np.zeros(len(level))
+        extra[[0, -1]] = _way(log, stamps[stamps <= start][-_WINDOW:]), _way(log, stamps[stamps >= end][:_WINDOW])
+        change = np.abs(level[:, None] - level) - extra[:, None] - extra - _MARGIN - _TIMES_NOISE * _noise(ranges)
+        if np.isfinite(level).sum() >= 2:
+            found.append(np.where(np.isfinite(change), change, -np.inf))
+    if not found:
+        return 0.0
+    # Bursts of late readings, now of one anchor and then of another, agree only when compared with each other; most moments
+    # have none.
+    agreed = _agreed(np.stack(found)).max(axis=1)
+    agreed = np.sort(agreed[np.isfinite(agreed)])
+    return max(0.0, float(agreed[(len(agreed) - 1) // 2]) - _way(log, np.array([start, end]))) if len(agreed) else 0.0
 
 
 def cuts(log: SensorLog, jumps: Floats) -> list[float]:
@@ -64,9 +73,7 @@ def cuts(log: SensorLog, jumps: Floats) -> list[float]:
         over = np.minimum(*(_jumps(ranges, way, window)[:-1] for window in (_WINDOW, _LONG))) - margin
         close = np.isfinite(over) & (np.diff(stamps) <= _SILENCE * np.median(np.diff(stamps)))
         spans.append(np.column_stack([stamps[:-1], stamps[1:], over])[close])
-    # Where nothing else would show a cut, neighbouring readings of one anchor count as well.
-    seen = log.scans is not None and len(log.scans.stamps) > 0
-    return _together(spans, jumps, np.inf if seen else max(_LEAST_VOTES, len(by_anchor) // 2))
+    return _together(spans, jumps)
 
 
 def _jumps(ranges: Floats, way: Floats, window: int) -> Floats:
@@ -79,13 +86,12 @@ def _jumps(ranges: Floats, way: Floats, window: int) -> Floats:
     return found
 
 
-def _together(spans: list[Floats], jumps: Floats, readings: float) -> list[float]:
+def _together(spans: list[Floats], jumps: Floats) -> list[float]:
     """Return the middles of the times, s, in which enough of the anchors in reach jump.
 
     Parameters
     ----------
     spans : of each anchor (n, 3) two neighbouring readings' stamps, s, and by how much they differ beyond what is plausible, m.
-    readings : so many that jump are enough, whatever anchors they are of.
     """
     found: list[float] = []
     votes = np.concatenate(spans)
@@ -95,18 +101,15 @@ def _together(spans: list[Floats], jumps: Floats, readings: float) -> list[float
         agreeing = [own[own[:, 2] > 0.0] for own in during]
         same, (anchors, reached) = np.concatenate(agreeing), (sum(len(own) > 0 for own in k) for k in (agreeing, during))
         least = 1 if np.any((jumps >= start) & (jumps <= end)) else _LEAST_VOTES
-        enough = anchors >= max(least, reached // 2) or len(same) >= readings
-        if enough and all(abs(0.5 * (start + end) - t) > 10.0 for t in found):
+        if anchors >= max(least, reached // 2) and all(abs(0.5 * (start + end) - t) > 10.0 for t in found):
             found.append(0.5 * float(same[:, 0].max() + same[:, 1].min()))
     return sorted(found)
 
 
-def _agreed(over: list[float]) -> float:
-    """Return the excess that enough anchors exceed."""
-    if not over:
-        return 0.0
+def _agreed(over: Floats) -> Floats:
+    """Return what enough of the anchors exceed, of what each exceeds (a, ...)."""
     needed = min(max(_LEAST_VOTES, len(over) // 2), len(over))
-    return max(0.0, sorted(over, reverse=True)[needed - 1])
+    return np.asarray(np.sort(over, axis=0)[-needed])
 
 
 def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:
@@ -117,10 +120,6 @@ def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:
     usable = (ranges.ranges > _USABLE[0]) & (ranges.ranges < _USABLE[1])
     usable &= (ranges.stamps >= log.odometry.stamps[0]) & (ranges.stamps <= log.odometry.stamps[-1])
     return [(ranges.stamps[own], ranges.ranges[own]) for _, own in ranges.by_pair(usable) if len(own) >= _WINDOW]
-
-
-def _chunks(values: Floats) -> list[Floats]:
-    return np.array_split(values, max(1, min(2, len(values) // _WINDOW), len(values) // (2 * _WINDOW)))
 
 
 def _noise(ranges: Floats) -> float:
