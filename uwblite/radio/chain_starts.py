@@ -43,17 +43,18 @@ def place_chains(graph: Graph, chains: Ints) -> list[Graph]:
     """
     hypotheses = [(0.0, graph)]
     waiting = set(chains.tolist()) - {0}
-    placed = {0}
+    here = chains == 0
     while waiting:
-        chain = max(sorted(waiting), key=lambda c: len(_ties(hypotheses[0][1], chains, c, placed)[2]))
+        anchors = [_measured_from(g, here) for _, g in hypotheses]
+        chain = max(sorted(waiting), key=lambda c: len(_ties(hypotheses[0][1], anchors[0], chains == c, here)[2]))
         found = [
             (cost + more, replace(g, poses=_moved(g.poses, chains == chain, T)))
-            for cost, g in hypotheses
-            for more, T in _places(*_ties(g, chains, chain, placed))
+            for (cost, g), there in zip(hypotheses, anchors, strict=True)
+            for more, T in _places(*_ties(g, there, chains == chain, here))
         ]
         hypotheses = sorted(found, key=lambda h: h[0])[:_KEPT]
         waiting.remove(chain)
-        placed.add(chain)
+        here = here | (chains == chain)
     return [g for _, g in hypotheses]
 
 
@@ -61,39 +62,42 @@ def _moved(poses: Floats, mine: Bools, T: Floats) -> Floats:
     return np.where(mine[:, None], se2.compose(T, poses), poses)
 
 
-def _ties(graph: Graph, chains: Ints, chain: int, placed: set[int]) -> tuple[Floats, Floats, Floats]:
-    """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them."""
-    here = np.isin(chains, sorted(placed))
+def _ties(graph: Graph, anchors: Floats, mine: Bools, here: Bools) -> tuple[Floats, Floats, Floats]:
+    """Return placed points (r, 2), points (r, 2) of a chain in its own frame, and the ranges (r,) between them.
+
+    Parameters
+    ----------
+    anchors : (a, 2) m, places measured from the placed poses; nan: none.
+    mine, here : (n,) poses of the chain, and those that are placed.
+    """
     there, own, ranges = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0)]
-    anchors = _measured_from(graph, here).anchors
     for e in graph.edges:
         if isinstance(e, PointDistanceEdges):
             for one, other in ((e.i, e.j), (e.j, e.i)):
-                tied = (chains[one] == chain) & here[other]
+                tied = mine[one] & here[other]
                 own.append(graph.poses[one[tied], :2])
                 there.append(graph.poses[other[tied], :2])
                 ranges.append(e.distance[tied])
-        elif isinstance(e, RangeEdges):
-            tied = (chains[e.pose] == chain) & np.isfinite(anchors[e.anchor]).all(axis=1)
-            own.append(graph.poses[e.pose[tied], :2])
+        elif isinstance(e, RangeEdges | LandmarkEdges):
+            tied = mine[e.pose] & np.isfinite(anchors[e.anchor]).all(axis=1)
             there.append(anchors[e.anchor[tied]])
-            ranges.append(e.ranges[tied])
-        elif isinstance(e, LandmarkEdges):
-            tied = (chains[e.pose] == chain) & np.isfinite(anchors[e.anchor]).all(axis=1)
-            own.append(se2.transform(graph.poses[e.pose[tied]], e.position[tied]))
-            there.append(anchors[e.anchor[tied]])
-            ranges.append(np.zeros(int(tied.sum())))
+            if isinstance(e, RangeEdges):
+                own.append(graph.poses[e.pose[tied], :2])
+                ranges.append(e.ranges[tied])
+            else:
+                own.append(se2.transform(graph.poses[e.pose[tied]], e.position[tied]))
+                ranges.append(np.zeros(int(tied.sum())))
     every = max(-(-sum(map(len, ranges)) // _MOST_RANGES), 1)
     return tuple(np.concatenate(part)[::every] for part in (there, own, ranges))  # type: ignore[return-value]
 
 
-def _measured_from(graph: Graph, here: Bools) -> Graph:
-    """Return the graph with those landmarks placed that edges from some of the poses place."""
+def _measured_from(graph: Graph, here: Bools) -> Floats:
+    """Return the anchors (a, 2), m, as edges from some of the poses place them; nan where they place none."""
     kinds = (e for e in graph.edges if isinstance(e, RangeEdges | LandmarkEdges))
     found, lost = place_anchors(replace(graph, edges=tuple(e.rows(np.flatnonzero(here[e.pose])) for e in kinds)))
     anchors = found.anchors.copy()
     anchors[list(lost)] = np.nan
-    return replace(graph, anchors=anchors)
+    return anchors
 
 
 def _places(there: Floats, own: Floats, ranges: Floats) -> list[tuple[float, Floats]]:
