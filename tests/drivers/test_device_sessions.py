@@ -306,6 +306,34 @@ def test_tag_that_falls_silent_asks_for_the_port_to_be_opened_again():
     assert "uwb-silent" in names(actions)
 
 
+def test_bytes_that_no_tag_sends_are_told_from_silence():
+    session = Session(Dwm1001Driver())
+    actions, now = session.start(START), START
+    while now < START + 10:
+        now = round(now + 0.1, 1)
+        actions += [*session.feed(b"\xf8\x00\x86\xfe\x1e", now), *session.tick(now)]
+    assert [action.name for action in actions if isinstance(action, Note)] == ["uwb-unreadable"]
+
+
+def test_tag_that_leaves_its_shell_in_mid_run_is_started_again_soon():
+    device, _ = tag()
+    session = Session(Dwm1001Driver(shell=True))
+    feed, done = session.feed, []
+
+    def scripted(data, now):
+        if now > START + 8 and not done:
+            done.append(now)
+            device._reboot_at = now
+        return feed(data, now)
+
+    session.feed = scripted
+    actions, _ = simulate(session, device, 20.0)
+    stamps = [epoch.stamp for epoch in of_kind(actions, RangeEpoch) if epoch.stamp > START + 6]
+    assert stamps[-1] > START + 19
+    # 3 s without a line, 1 s without an echo, and the start.
+    assert max(after - before for before, after in itertools.pairwise(stamps)) < 6.5
+
+
 def test_tag_that_restarts_in_mid_run_comes_back():
     device, _ = tag()
     session = Session(Dwm1001Driver())

@@ -27,6 +27,14 @@ ANSWERS = {"ver_get": "hardware", "nodeid_get": "node_id", "panid_get": "pan_id"
 """The value that completes the answer to a query."""
 SHORTEST_PERIOD = 0.1
 """s between fixes at the highest rate."""
+SILENT = Note(
+    "error", "uwb-silent", "uwb: no answer. The USB bridge of the DEV board can hang: unplug it and plug it in again;"
+    " check that the port is the DWM1001's and that no other program has it",
+)  # fmt: skip
+UNREADABLE = Note(
+    "error", "uwb-unreadable", "uwb: bytes come, but none that a DWM1001 sends: check that the port is its own, and that it"
+    f" talks at {BAUD} bit/s",
+)  # fmt: skip
 
 
 class Dwm1001Driver(Driver):
@@ -60,7 +68,7 @@ class Dwm1001Driver(Driver):
         """Forget what was half received; the mode is not known."""
         self._tlv, self._lines = TlvProtocol(), ShellProtocol()
         self._text = self._binary = True
-        self._streaming = False
+        self._streaming = self._heard = False
 
     @property
     def period(self) -> float:
@@ -69,6 +77,7 @@ class Dwm1001Driver(Driver):
 
     def parse(self, data: bytes, now: float) -> list[Any]:
         """Return the events of the mode that the module is in, of both while that is not known."""
+        self._heard = self._heard or bool(data)
         events: list[Any] = self._lines.feed(data, now) if self._text else []
         events += self._tlv.feed(data, now) if self._binary else []
         for event in events:
@@ -100,11 +109,7 @@ class Dwm1001Driver(Driver):
                 self._poller = self._poller or FixPoller(self, self.period)
                 yield from self._poller.script()
             yield Note("warning", "uwb-restart", "uwb: no fix and no answer; starting the module again")
-        text = (
-            "uwb: no answer. The USB bridge of the DEV board can hang: unplug it and plug it in again;"
-            " check that the port is the DWM1001's and that no other program has it"
-        )
-        yield from self.say_once(Note("error", "uwb-silent", text))
+        yield from self.say_once(UNREADABLE if self._heard else SILENT)
         yield Reopen("no answer")
 
     # ---- finding out the mode, and changing it
@@ -179,19 +184,22 @@ class Dwm1001Driver(Driver):
         ))  # fmt: skip
 
     def _read_lines(self) -> Script[None]:
-        """Read the stream until no more lines come; the command toggles it, so it is sent until they do."""
+        """Read the stream until no more lines come; the command toggles it, so it is sent until they do, while it is echoed."""
         self._streaming, tries, self._missed = True, 4, True
         while tries:
             tries -= 1
             yield Send(b"lec\r")
-            until = self.now + max(1.0, 3 * self.period)
+            until, answered = self.now + max(1.0, 3 * self.period), False
             while (event := (yield Wait(until))) is not None:
+                answered = True
                 if isinstance(event, Corrupt):
                     self._missed = True
                     self._health.damage(self.now)
                 elif isinstance(event, RangeLine):
                     until, tries = self.now + max(3.0, 3 * self.period), 4
                     yield from self._take_line(event)
+            if not answered:  # not even an echo: it is no longer in its shell
+                break
         self._streaming = False
 
     def _take_line(self, line: RangeLine) -> Script[None]:
