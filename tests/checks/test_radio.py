@@ -8,8 +8,7 @@ from uwblite.checks.odometry import STRAIGHT
 from uwblite.checks.radio import FEW, _check_anchor, _check_coverage, _repeats, _spikes, check_calibration, check_ranges
 from uwblite.graph.graph import UnknownKey
 from uwblite.map_result import AnchorEstimate, CalibrationEstimate
-from uwblite.screening.units import LONGEST
-from uwblite.sensor_log import Odometry, SensorLog, UwbRanges
+from uwblite.sensor_log import LONGEST_RANGE, Odometry, SensorLog, UwbRanges
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -45,7 +44,7 @@ def anchor_figures(values, travelled=None, where=None):
 
 def test_the_figures_of_an_anchor_are_those_of_its_usable_ranges():
     values = np.tile([2.0, 3.0, 4.0, 3.0], 50)
-    values[[7, 9]], values[[50, 120, 180]] = [0.0, 0.02], [-0.03, LONGEST, np.inf]
+    values[[7, 9]], values[[50, 120, 180]] = [0.0, 0.02], [-0.03, LONGEST_RANGE, np.inf]
     figures, _ = anchor_figures(values, travelled=10.0 * np.arange(200))
     assert (figures["count"], figures["zeros"], figures["absurd"], figures["spikes"]) == (200, 2, 3, 0)
     assert (figures["nearest m"], figures["farthest m"]) == (2.0, 4.0)
@@ -54,7 +53,7 @@ def test_the_figures_of_an_anchor_are_those_of_its_usable_ranges():
 
 
 @pytest.mark.parametrize(("broken", "rank"), [(1, None), (2, "note"), (10, "note"), (11, "warning")])
-@pytest.mark.parametrize("value", [0.0, -1.0, LONGEST])
+@pytest.mark.parametrize("value", [0.0, -1.0, LONGEST_RANGE])
 def test_readings_that_measure_nothing_are_worth_a_note_from_a_hundredth_on(broken, rank, value):
     """More than 1 of 100 is a note, more than 10 a warning."""
     _, found = anchor_figures(np.where(np.arange(100) < broken, value, 3.0))
@@ -91,12 +90,12 @@ def test_the_coverage_is_that_of_a_loop_over_windows(seed):
     """Windows of 2 s of the odometry's 31 s, the last one shorter; ranges outside it or of no length do not count."""
     rng = np.random.default_rng(seed)
     stamps, anchor = np.sort(rng.uniform(95.0, 135.0, 60)), rng.integers(0, 4, 60)
-    values = rng.choice([0.0, 3.0, 5.0, LONGEST], 60, p=[0.1, 0.4, 0.4, 0.1])
+    values = rng.choice([0.0, 3.0, 5.0, LONGEST_RANGE], 60, p=[0.1, 0.4, 0.4, 0.1])
     odometry = Odometry(np.array([100.0, 131.0]), np.zeros((2, 3)))
     log = SensorLog(odometry, UwbRanges(stamps, anchor, values, np.full(60, 100.0), ("A", "B", "C", "D")))
     counts = []
     for begin in np.arange(100.0, 131.0, 2.0):
-        now = (stamps >= begin) & (stamps < begin + 2.0) & (stamps <= 131.0) & (values > 0.0) & (values < LONGEST)
+        now = (stamps >= begin) & (stamps < begin + 2.0) & (stamps <= 131.0) & (values > 0.0) & (values < LONGEST_RANGE)
         counts.append(len(set(anchor[now].tolist())))
     found = Findings()
     shares = _check_coverage(log, found)

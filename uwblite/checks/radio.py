@@ -6,8 +6,7 @@ import numpy as np
 
 from ..arrays import Floats, white_noise
 from ..map_result import AnchorEstimate, CalibrationEstimate
-from ..screening.units import LONGEST
-from ..sensor_log import SensorLog, UwbRanges
+from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE, SensorLog, UwbRanges, plausible
 from .findings import Findings, timing
 from .odometry import STRAIGHT, straightness
 
@@ -49,15 +48,15 @@ def _repeats(ranges: UwbRanges) -> float:
 def _check_anchor(
     anchor_id: str, stamps: Floats, values: Floats, travelled: Floats, where: Floats, found: Findings
 ) -> dict[str, Any]:
-    usable = np.isfinite(values) & (values > 0.02) & (values < LONGEST)
-    zeros, absurd = int(np.sum(np.abs(values) <= 0.02)), int(np.sum((values < -0.02) | (values >= LONGEST)))
+    usable, zeros = plausible(values), int(np.sum(np.abs(values) <= SHORTEST_RANGE))
+    absurd = int(np.sum(~usable)) - zeros
     spikes, noise = _spikes(values[usable], travelled[usable])
     count = len(values)
     if zeros + absurd > 0.01 * count:
         found.add(
             "warning" if zeros + absurd > 0.1 * count else "note",
             "radio",
-            f"anchor {anchor_id}: {zeros} of {count} readings are zero and {absurd} are negative or beyond {LONGEST:.0f} m",
+            f"anchor {anchor_id}: {zeros} of {count} readings are zero and {absurd} negative or beyond {LONGEST_RANGE:.0f} m",
             "they are left out; a radio that reports zero has missed its partner",
         )
     if int(usable.sum()) < FEW:
@@ -117,7 +116,7 @@ def _check_coverage(log: SensorLog, found: Findings) -> dict[str, float]:
     ranges = log.ranges
     assert ranges is not None
     start, end = float(log.odometry.stamps[0]), float(log.odometry.stamps[-1])
-    usable = (ranges.ranges > 0.02) & (ranges.ranges < LONGEST) & (ranges.stamps >= start) & (ranges.stamps <= end)
+    usable = plausible(ranges.ranges) & (ranges.stamps >= start) & (ranges.stamps <= end)
     # Windows without ranges are only counted, however long the recording claims to be.
     windows = max(1.0, np.ceil((end - start) / _WINDOW))
     slot = np.floor((ranges.stamps[usable] - start) / _WINDOW)

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from .. import se2
 from ..arrays import Floats
 from ..errors import DataError
-from ..radio.trilateration import TrilaterationConfig, usable
-from ..sensor_log import SensorMounting
+from ..sensor_log import SensorMounting, plausible
 from .gyro_turns import GyroTurns
 from .known_map import KnownMap
 from .odometer import Odometer
@@ -128,7 +127,7 @@ class Localizer:
         values = np.asarray(metres, dtype=np.float64).reshape(-1)
         if len(anchor_ids) != len(values):
             raise DataError(f"{len(anchor_ids)} anchor ids for {len(values)} ranges; one id belongs to each range")
-        good = usable(values, TrilaterationConfig())
+        good = plausible(values)
         for name, value in zip(np.asarray(list(anchor_ids))[good].tolist(), values[good].tolist(), strict=True):
             if name not in self._names:
                 self.strangers[name] = self.strangers.get(name, 0) + 1

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..arrays import MAD_TO_SIGMA, Bools, Floats, row_medians
 from ..config import setting
+from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +25,7 @@ class TrilaterationConfig:
     """Ranges used for the search, spread evenly over the path."""
     min_ranges: int = 8
     """An anchor with fewer usable ranges is not placed."""
-    max_range: float = 200.0
+    max_range: float = LONGEST_RANGE
     """Longer readings are no ranges of such a radio, m."""
     bias_sigma: float = 0.6
     """Plausible size of one anchor's constant error, m."""
@@ -51,8 +52,8 @@ class AnchorHypothesis:
 
 
 def usable(ranges: Floats, config: TrilaterationConfig) -> Bools:
-    """Return which readings (m,) can be distances at all: positive, finite, below max_range."""
-    return np.isfinite(ranges) & (ranges > 0.02) & (ranges < config.max_range)
+    """Return which readings (m,) can be distances at all: positive and below max_range."""
+    return (ranges > SHORTEST_RANGE) & (ranges < config.max_range)
 
 
 def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift: float = 0.0) -> list[AnchorHypothesis]:

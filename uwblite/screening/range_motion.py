@@ -7,7 +7,7 @@ count, apart from noise and a blocked line of sight. Where several anchors excee
 import numpy as np
 
 from ..arrays import Floats, white_noise
-from ..sensor_log import SensorLog
+from ..sensor_log import SensorLog, plausible
 
 _WINDOW = 3
 """Readings whose median is taken."""
@@ -23,8 +23,6 @@ _TIMES_NOISE = 5.0
 """Standard deviations of one reading that a median never is off."""
 _LEAST_VOTES = 2
 """Anchors that must agree, where so many are in reach."""
-_USABLE = (0.02, 200.0)
-"""Readings outside are no distances, m."""
 
 
 def excess(log: SensorLog, start: float, end: float) -> float:
@@ -117,8 +115,7 @@ def _by_anchor(log: SensorLog) -> list[tuple[Floats, Floats]]:
     ranges = log.ranges
     if ranges is None:
         return []
-    usable = (ranges.ranges > _USABLE[0]) & (ranges.ranges < _USABLE[1])
-    usable &= (ranges.stamps >= log.odometry.stamps[0]) & (ranges.stamps <= log.odometry.stamps[-1])
+    usable = plausible(ranges.ranges) & (ranges.stamps >= log.odometry.stamps[0]) & (ranges.stamps <= log.odometry.stamps[-1])
     return [(ranges.stamps[own], ranges.ranges[own]) for _, own in ranges.by_pair(usable) if len(own) >= _WINDOW]
 
 

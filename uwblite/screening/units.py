@@ -4,7 +4,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import DataError
-from ..sensor_log import Odometry, SensorLog
+from ..sensor_log import LONGEST_RANGE, Odometry, SensorLog
 
 FASTEST = 3.0
 """A ground robot that maps a building is not faster, m/s."""
@@ -14,10 +14,8 @@ _CENTIMETRES = 90.0
 """Usual speed, m/s, from which positions are rather millimetres than centimetres."""
 _FAST_TURN, _MORE_THAN_A_TURN = 1.0, 7.0
 """Usual turn rate, rad/s, and range of headings, rad, without which they cannot be degrees."""
-LONGEST = 200.0
-"""No radio of this kind reaches farther, m."""
 _LONGEST_READING = 150.0
-"""Nor does a lidar of this kind see farther as a rule, m."""
+"""No lidar of this kind sees farther as a rule, m."""
 _CHORD = 1.0
 """Time over which speed is taken, s: readings of two robots by turns, or in bursts, jump from one to the next."""
 _ENOUGH = 10
@@ -177,7 +175,7 @@ def _of_ranges(log: SensorLog) -> str:
     if log.ranges is None:
         return ""
     positive = log.ranges.ranges[log.ranges.ranges > 0]
-    if len(positive) < _ENOUGH or np.median(positive) <= LONGEST:
+    if len(positive) < _ENOUGH or np.median(positive) <= LONGEST_RANGE:
         return ""
     usual = float(np.median(positive))
     return _other_unit("the ranges", f"usual one would be {usual:.0f} m", usual > 1500.0, "range")

@@ -42,6 +42,15 @@ class Odometry(Table):
         return se2.between(self.at(start), self.at(end))
 
 
+SHORTEST_RANGE, LONGEST_RANGE = 0.02, 200.0
+"""m; no radio of this kind reaches farther, and one that reports zero has missed its partner."""
+
+
+def plausible(ranges: Floats) -> Bools:
+    """Return which readings (m,) of a radio, m, can be distances."""
+    return (ranges > SHORTEST_RANGE) & (ranges < LONGEST_RANGE)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class UwbRanges:
     """Distances between the tag on the robot and fixed anchors."""
