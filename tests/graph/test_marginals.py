@@ -156,14 +156,16 @@ def dense_jacobian(graph):
     return np.concatenate(rows), np.concatenate(residuals), parts
 
 
+@pytest.mark.parametrize("kept", [0, 1 << 20])
 @pytest.mark.parametrize(("table", "count"), [(0, 40), (1, 8)], ids=["odometry", "robust closures"])
-def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(monkeypatch, table, count):
+def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(monkeypatch, table, count, kept):
     """Against the dense normal equations with the errors among the unknowns: covariances, and where the estimates move to.
 
     A few of them at once, so that there are several blocks, the last of which is not full. The last edge has none.
     """
     monkeypatch.setattr("uwblite.graph.marginals._COMMON_AT_ONCE", 7)
     monkeypatch.setattr("uwblite.graph.marginals._MET_AT_ONCE", 11)
+    monkeypatch.setattr("uwblite.graph.marginals._MOST_KEPT", kept)
     graph, _ = calibrated_loop(n=40)
     graph = replace(graph, poses=graph.poses + 0.01 * np.random.default_rng(1).normal(size=graph.poses.shape))
     edges, rng = graph.edges[table], np.random.default_rng(0)

@@ -1,6 +1,6 @@
 """Marginal covariances of an optimised graph, from the sparse factor of its normal equations."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -20,6 +20,8 @@ from .variance_components import variances_of_kinds
 
 _COMMON_AT_ONCE = 32
 """Common errors solved for together: bounds the memory."""
+_MOST_KEPT = 1 << 23
+"""Numbers of their solution that are kept; more are solved for once more."""
 _MET_AT_ONCE = 1 << 14
 """Rows of a table of common errors in memory at once."""
 _AT_ONCE = 300
@@ -82,35 +84,44 @@ class Marginals:
 
     def _add_common(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
         """Add what estimated common errors u make: H^-1 J^T W S times u to the estimates, times their covariance to these."""
-        slopes, errors, covariance = self._estimated(common)
-        self._correction -= self._factor.solve(slopes @ errors)
-        root = np.linalg.cholesky(covariance + _DEPENDENT * np.eye(len(covariance)))
+        times, errors, covariance = self._estimated(common)
+        self._correction -= times(errors)
+        root = np.asarray(np.linalg.cholesky(covariance + _DEPENDENT * np.eye(len(covariance))), dtype=np.float64)
         for first in range(0, len(root), _COMMON_AT_ONCE):
-            moves = self._factor.solve(slopes @ root[:, first : first + _COMMON_AT_ONCE])
+            moves = times(root[:, first : first + _COMMON_AT_ONCE])
             moves = np.concatenate([moves, np.zeros((1, moves.shape[1]))])
             for name, number in self.unknowns.number.items():
                 own = moves[number]
                 blocks[name] += own @ own.transpose(0, 2, 1)
             self.among += moves[self._chosen] @ moves[self._chosen].T
 
-    def _estimated(self, common: CommonErrors) -> tuple[sparse.csc_matrix, Floats, Floats]:
-        """Estimate errors that edges have in common: J^T W s of each as a column, their values (k,) and covariance (k, k).
+    def _estimated(self, common: CommonErrors) -> tuple[Callable[[Floats], Floats], Floats, Floats]:
+        """Estimate errors that edges have in common: return H^-1 J^T W S as what multiplies by it, values (k,) and covariance
+        (k, k).
 
         The errors u are unknowns with the prior N(0, G); how large those of each kind are, the residuals say, see
         variance_components. With S^T P r and A = S^T P S as there, u = -(A + G^-1)^-1 S^T P r.
         """
         slopes, (seen, products), kind = self.slopes(common), self._seen(common), common.kind
+        few = slopes.shape[0] * slopes.shape[1] <= _MOST_KEPT
+        kept = np.zeros(slopes.shape if few else (0, 0))
         for first in range(0, slopes.shape[1], _COMMON_AT_ONCE):
             some = slice(first, first + _COMMON_AT_ONCE)
             moves = self._factor.solve(slopes[:, some].toarray())
             seen[some] -= moves.T @ self._gradient
             products[:, some] -= slopes.T @ moves
+            if few:
+                kept[:, some] = moves
         variances = variances_of_kinds(seen, products, kind)[kind]
         # As products of roots of G: a kind that is hardly there has no inverse.
         root = np.sqrt(variances)
         inside = np.linalg.inv(root[:, None] * (0.5 * (products + products.T)) * root + np.eye(len(root)))
         covariance = root[:, None] * inside * root
-        return slopes, -covariance @ seen, covariance
+
+        def times(values: Floats) -> Floats:
+            return kept @ values if few else np.asarray(self._factor.solve(slopes @ values))
+
+        return times, -covariance @ seen, covariance
 
     def _seen(self, common: CommonErrors) -> tuple[Floats, Floats]:
         """Return S^T W r (k,) and S^T W S (k, k)."""
