@@ -1,6 +1,7 @@
 """``python -m uwblite`` and the command ``uwblite``.
 
 This file and the package's ``__init__`` import as little as they can: until `start` runs, Ctrl-C ends in a traceback.
+Numerical libraries are told how many threads they have before they are imported.
 """
 
 import os
@@ -9,7 +10,13 @@ import sys
 
 
 def start() -> int:
-    """Run the command line; Ctrl-C while nothing has begun, or once all is done, ends it without a traceback."""
+    """Run the command line; Ctrl-C while nothing has begun, or once all is done, ends it without a traceback.
+
+    Numerical libraries have one thread, unless the environment says otherwise: the matrices here are small, so that threads
+    wait for each other, and how a sum is divided among them changes its last digits.
+    """
+    for library in ("OPENBLAS", "OMP", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
     from .cli import main

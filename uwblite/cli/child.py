@@ -17,21 +17,20 @@ class Child:
 
     Parameters
     ----------
-    niceness : 0..19; 19 = it runs when nobody else wants to. Other than 0, numerical libraries take one core alone.
+    niceness : 0..19; 19 = it runs when nobody else wants to.
     """
 
     def __init__(self, words: Sequence[str], niceness: int = 0) -> None:
         package = (__package__ or "uwblite.cli").rpartition(".")[0]
         root = Path(__file__).resolve().parents[package.count(".") + 2]
         path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
-        alone = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")} if niceness else {}
         self._output = tempfile.TemporaryFile("w+b")  # noqa: SIM115
         self._process = subprocess.Popen(
             [sys.executable, "-m", package, *words],
             stdin=subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.STDOUT,
-            env={**os.environ, **alone, "PYTHONPATH": path},
+            env={**os.environ, "PYTHONPATH": path},
         )
         if niceness and hasattr(os, "setpriority"):
             with suppress(OSError):
