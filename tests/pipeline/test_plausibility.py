@@ -22,6 +22,7 @@ from uwblite.pipeline.plausibility import (
     check_handedness,
     check_moved_together,
     check_sustained_outliers,
+    check_unit,
     outlier_stretches,
 )
 from uwblite.pipeline.progress import Stages
@@ -341,6 +342,24 @@ def test_residuals_twice_as_large_as_noise_allows_after_the_last_optimisation_ar
     stages.end("summary")
     check_fit(SimpleNamespace(stages=stages))
     assert [n.figures["chi2_per_dof"] for n in stages.doubts] == ([fits[-1]] if doubted else [])
+
+
+@pytest.mark.parametrize(
+    ("have_scans", "kinds", "names", "doubted"),
+    [
+        (False, ["odometry-unit"], ["A", "B"], False),
+        (False, ["odometry-unit", "sustained-outliers"], ["A", "B"], True),
+        (False, ["odometry-unit"], ["A", "A@2"], True),
+        (True, ["odometry-unit", "sustained-outliers"], ["A", "A@2"], False),
+        (False, ["sustained-outliers"], ["A", "A@2"], False),
+    ],
+)
+def test_another_unit_is_doubted_where_it_rests_on_ranges_that_contradict_each_other(have_scans, kinds, names, doubted):
+    stages = Stages(None, None)
+    for kind in kinds:
+        stages.warn(kind, "warned of before")
+    check_unit(names, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
+    assert [notice.kind for notice in stages.doubts] == ["odometry-unit"] * doubted
 
 
 def test_an_anchor_that_disagrees_for_long_is_named_with_the_times_since_the_beginning():

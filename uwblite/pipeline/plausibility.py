@@ -51,6 +51,7 @@ def judge(
         check_residuals(estimate, table["residual"], task)
     else:
         check_residuals(estimate, np.zeros(0), task)
+    check_unit(estimate.anchor_ids, task)
     check_halves(estimate, task)
     check_drifts(estimate, task)
     check_untied_parts(estimate, task)
@@ -254,6 +255,19 @@ def check_handedness(estimate: Estimate, task: Task) -> None:
             )
         if wrong and abs(error) > _WRONG_TURNS:
             task.stages.doubt("mirrored", text, factor=factor)
+
+
+def check_unit(anchor_ids: Sequence[str], task: Task) -> None:
+    """Doubt another unit of the wheels where it rests on ranges alone, and these contradict each other."""
+    kinds = {notice.kind for notice in task.stages.warnings}
+    if task.recordings.have_scans or "odometry-unit" not in kinds:
+        return
+    if "sustained-outliers" in kinds or any(name_and_number(name)[1] > 1 for name in anchor_ids):
+        text = (
+            "the unit that the wheels were given rests on the ranges alone, and an anchor was moved or disagrees for long; "
+            "give the anchors' places, or the distance between two"
+        )
+        task.stages.doubt("odometry-unit", text)
 
 
 def check_fit(task: Task) -> None:
