@@ -169,7 +169,7 @@ def test_another_device_at_the_port_gives_no_data_and_that_is_reported(tmp_path,
         tmp_path, {sensor: (sensor, f"{name}:/dev/x{columns}")}, 6.0, lambda url, clock: Other(clock)
     )  # fmt: skip
     assert recorder.links[0].counts.messages == 0
-    assert {f"{sensor}-no-data", f"{sensor}-silent"} & {note.name for _, note in notes}
+    assert {f"{sensor}-{what}" for what in ("no-data", "silent", "unreadable")} & {note.name for _, note in notes}
     assert any("no data at all" in doubt for doubt in recorder.doubts())
 
 
