@@ -8,7 +8,6 @@ Szeliski, I. S. Kweon, Pushing the envelope of modern methods for bundle adjustm
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -17,24 +16,16 @@ from .graph import Graph, Linearization, edge_costs
 from .unknowns import free_unknowns
 
 
-class Solved(Protocol):
-    """What is said of a search."""
-
-    @property
-    def chi2(self) -> float:
-        """Cost at its end."""
-
-
 def with_anchors_solved(
     graph: Graph, before: Sequence[float], trial: Graph, linearized: list[Linearization],
-    solve: Callable[[Graph], tuple[Graph, Solved]],
+    solve: Callable[[Graph], Graph],
 ) -> tuple[Graph, list[Linearization]]:  # fmt: skip
     """Return a trial and its linearisation with the anchors solved for at its poses, where it costs too much by these alone.
 
     Parameters
     ----------
     graph : before the step. before : cost of each kind of its edges.
-    solve : returns a graph at its optimum, or near it, and what it costs there.
+    solve : returns a graph at its optimum, or near it.
     """
     touched = [{name for name, *_ in lin.blocks} for lin in linearized]
     kinds = [k for k, names in enumerate(touched) if "anchors" in names or "poses" not in names]
@@ -43,8 +34,8 @@ def with_anchors_solved(
     problem = anchor_subproblem(graph, trial, linearized, kinds) if elsewhere <= 0.0 else None
     if problem is None:
         return trial, linearized
-    solved, summary = solve(problem)
-    if not summary.chi2 < sum(now[k] for k in kinds):
+    solved = solve(problem)
+    if not solved.chi2() < sum(now[k] for k in kinds):
         return trial, linearized
     trial = trial.with_estimates_of(solved)
     return trial, [e.linearize(trial) if k in kinds else linearized[k] for k, e in enumerate(trial.edges)]

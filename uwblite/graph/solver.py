@@ -192,7 +192,7 @@ class _Descent:
         linearized = linearize(trial)
         costs = edge_costs(trial, linearized)
         if promised > 0 and sum(costs) > self.chi2:
-            trial, linearized = with_anchors_solved(self.graph, self.costs, trial, linearized, lambda g: optimize(g, _QUICK))
+            trial, linearized = with_anchors_solved(self.graph, self.costs, trial, linearized, lambda g: optimize(g, _QUICK)[0])
             costs = edge_costs(trial, linearized)
         chi2 = sum(costs)
         self.history.append(chi2)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..arrays import Bools, Floats, runs_of
+from ..arrays import Bools, Floats
 from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
@@ -16,6 +16,7 @@ from ..sensor_log.anchor_names import name_and_number
 from .drift_tests import check_drifts
 from .estimate import Estimate, Task
 from .half_tests import check_halves
+from .range_agreement import check_sustained_outliers, check_unit
 from .residual_tests import check_residuals
 from .turn_checks import check_turn_scales
 from .untied_parts import check_untied_parts
@@ -257,19 +258,6 @@ def check_handedness(estimate: Estimate, task: Task) -> None:
             task.stages.doubt("mirrored", text, factor=factor)
 
 
-def check_unit(anchor_ids: Sequence[str], task: Task) -> None:
-    """Doubt another unit of the wheels where it rests on ranges alone, and these contradict each other."""
-    kinds = {notice.kind for notice in task.stages.warnings}
-    if task.recordings.have_scans or "odometry-unit" not in kinds:
-        return
-    if "sustained-outliers" in kinds or any(name_and_number(name)[1] > 1 for name in anchor_ids):
-        text = (
-            "the unit that the wheels were given rests on the ranges alone, and an anchor was moved or disagrees for long; "
-            "give the anchors' places, or the distance between two"
-        )
-        task.stages.doubt("odometry-unit", text)
-
-
 def check_fit(task: Task) -> None:
     """Doubt a map whose residuals are far larger than the noise allows."""
     fits = [float(stage.figures["chi2_per_dof"]) for stage in task.stages.done if "chi2_per_dof" in stage.figures]
@@ -277,37 +265,3 @@ def check_fit(task: Task) -> None:
         times = float(np.sqrt(fits[-1]))
         text = f"measurements lie {times:.1f} times as far off as their noise allows (chi2/dof {fits[-1]:.1f})"
         task.stages.doubt("poor-fit", text, chi2_per_dof=fits[-1])
-
-
-def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
-    """Return the stretches (first and last stamp, s) in which most of one anchor's readings (m,) disagree with the map.
-
-    Bins of equal counts; fewer than 100 readings show no stretches.
-    """
-    if len(stamps) < 100:
-        return []
-    order = np.argsort(stamps, kind="stable")
-    bins = np.array_split(order, min(40, len(order) // 20))
-    bad = np.array([agrees[b].mean() < 0.4 for b in bins], dtype=bool)
-    return [(float(stamps[bins[a][0]]), float(stamps[bins[b - 1][-1]])) for a, b in runs_of(bad) if b - a >= 2]
-
-
-def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], task: Task) -> None:
-    """Warn of each anchor whose ranges disagree with the map for long: its line of sight was blocked, or it was moved.
-
-    Parameters
-    ----------
-    table : MapResult.range_table. anchor_ids : names.
-    """
-    start = float(task.recordings.stamps[0])
-    for k, name in enumerate(anchor_ids):
-        own = (table["anchor"] == k) & (table["weight"] > 0)
-        stretches = outlier_stretches(table["stamp"][own], table["agrees"][own] > 0.5) if own.any() else []
-        if stretches:
-            when = ", ".join(f"{a - start:.0f} to {b - start:.0f} s" for a, b in stretches[:4])
-            task.stages.warn(
-                "sustained-outliers",
-                f"anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
-                "its line of sight was blocked, or it was moved; these ranges count for little",
-                anchor=name, stretches=stretches,
-            )  # fmt: skip

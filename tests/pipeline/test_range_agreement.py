@@ -1,0 +1,70 @@
+"""Stretches in which an anchor's ranges disagree with the map, and a unit of the wheels that rests on them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from uwblite.pipeline.progress import Stages
+from uwblite.pipeline.range_agreement import check_sustained_outliers, check_unit, outlier_stretches
+
+
+def test_stretches_in_which_most_readings_disagree_are_found():
+    stamps = np.arange(400.0)
+    agrees = np.random.default_rng(0).random(400) < 0.95
+    assert outlier_stretches(stamps, agrees) == []
+    agrees[100:200] = False
+    agrees[360:] = False
+    found = outlier_stretches(stamps, agrees)
+    assert len(found) == 2
+    np.testing.assert_allclose(found, [(100, 199), (360, 399)], atol=20)
+    assert outlier_stretches(stamps[:99], np.zeros(99, dtype=bool)) == []
+
+
+@pytest.mark.parametrize(("agreeing", "found"), [(3, True), (4, False), (6, False)])
+def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, found):
+    """Twenty readings a bin: in each stretch of ten the first so many agree; elsewhere all."""
+    stamps = np.arange(400.0)
+    agrees = (np.arange(400) % 10 < agreeing) | (stamps < 100) | (stamps >= 200)
+    assert outlier_stretches(stamps, agrees) == ([(100.0, 199.0)] if found else [])
+
+
+@pytest.mark.parametrize(
+    ("have_scans", "kinds", "names", "doubted"),
+    [
+        (False, ["odometry-unit"], ["A", "B"], False),
+        (False, ["odometry-unit", "sustained-outliers"], ["A", "B"], True),
+        (False, ["odometry-unit"], ["A", "A@2"], True),
+        (True, ["odometry-unit", "sustained-outliers"], ["A", "A@2"], False),
+        (False, ["sustained-outliers"], ["A", "A@2"], False),
+    ],
+)
+def test_another_unit_is_doubted_where_it_rests_on_ranges_that_contradict_each_other(have_scans, kinds, names, doubted):
+    stages = Stages(None, None)
+    for kind in kinds:
+        stages.warn(kind, "warned of before")
+    check_unit(names, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
+    assert [notice.kind for notice in stages.doubts] == ["odometry-unit"] * doubted
+
+
+def test_an_anchor_that_disagrees_for_long_is_named_with_the_times_since_the_beginning():
+    """Of three anchors the second disagrees from 200 s on and in four more stretches; ranges without weight do not count."""
+    stamps = np.tile(1000.0 + np.arange(1000.0), 3)
+    anchor = np.repeat([0.0, 1.0, 2.0], 1000)
+    wrong = np.zeros(3000, dtype=bool)
+    for first in (200, 400, 500, 600, 700):
+        wrong |= (anchor == 1) & (stamps >= 1000 + first) & (stamps < 1050 + first)
+    table = {
+        "stamp": stamps, "anchor": anchor, "agrees": np.where(wrong | (anchor == 2), 0.0, 1.0),
+        "weight": np.where(anchor == 2, 0.0, 1.0),
+    }  # fmt: skip
+    stages = Stages(None, None)
+    check_sustained_outliers(
+        table, "ABC", SimpleNamespace(recordings=SimpleNamespace(stamps=np.array([1000.0, 9e3])), stages=stages)
+    )
+    (notice,) = stages.warnings
+    assert (notice.kind, notice.figures["anchor"], len(notice.figures["stretches"])) == ("sustained-outliers", "B", 5)
+    assert (
+        "anchor B disagrees with the map for long (t = 200 to 249 s, 400 to 449 s, 500 to 549 s, 600 to 649 s ...)"
+        in notice.text
+    )
