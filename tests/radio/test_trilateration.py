@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from uwblite import se2
 from uwblite.radio.trilateration import (
+    AnchorHypothesis,
     TrilaterationConfig,
     _raster_search,
     _refine,
@@ -110,6 +111,14 @@ def test_a_path_that_drifts_counts_as_far_as_it_drifts():
     found = trilaterate(bent, stated, CONFIG, drift=0.4)
     assert np.hypot(*(found[0].position - anchor)) < 0.4
     assert not ambiguous(found, CONFIG)
+
+
+@pytest.mark.parametrize(("ratio", "open_"), [(8.0, True), (12.0, False)])
+def test_a_second_place_is_dismissed_at_a_likelihood_ratio_of_about_e_to_the_10(ratio, open_):
+    """Costs are means over the samples of squared residuals, twice the negative logarithm of the likelihood."""
+    costs = 1.0 + np.array([0.0, 2.0 * ratio / CONFIG.samples])
+    places = [AnchorHypothesis(np.array([0.0, 1.0 - 2 * k]), 0.0, 0.05, float(cost), 0.1) for k, cost in enumerate(costs)]
+    assert ambiguous(places, CONFIG) == open_
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])

@@ -32,7 +32,7 @@ class TrilaterationConfig:
     outlier: ClassVar[float] = 3.0
     """Standard deviations beyond which a range counts as an outlier when hypotheses are compared."""
     ambiguity: float = setting(0.2, advanced=True)
-    """A second hypothesis within this share of the ranges' total cost makes the anchor ambiguous."""
+    """An anchor is ambiguous where a second hypothesis costs less than this more: of 100 ranges, a likelihood ratio of e^10."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
