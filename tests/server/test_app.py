@@ -51,12 +51,12 @@ def test_the_page_and_its_state_are_served(app):
     assert page.status == 200
     assert app.token.encode() in page.body
     assert app.handle("GET", "/", {"host": "localhost:8000"}).status == 200
-    run = json.loads(app.handle("GET", "/state", {"host": HOST}).body)["runs"][0]
-    assert run["name"] == "map"
-    assert (run["accepted"], run["candidates"]) == (1, 3)
-    assert [a["id"] for a in run["anchors"]][1] == "91A3"
-    assert run["closures"][0]["wish"] == "leave"
-    assert run["image"]["width"] == pytest.approx(10.0)
+    shown = json.loads(app.handle("GET", "/state", {"host": HOST}).body)["results"][0]
+    assert shown["name"] == "map"
+    assert (shown["accepted"], shown["candidates"]) == (1, 3)
+    assert [a["id"] for a in shown["anchors"]][1] == "91A3"
+    assert shown["closures"][0]["wish"] == "leave"
+    assert shown["image"]["width"] == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_the_page_and_its_state_are_served(app):
     ],
 )  # fmt: skip
 def test_strangers_get_nothing(app, foreign):
-    for method, path in (("GET", "/"), ("GET", "/state"), ("GET", "/run/0/report.json"), ("POST", "/closure")):
+    for method, path in (("GET", "/"), ("GET", "/state"), ("GET", "/result/0/report.json"), ("POST", "/closure")):
         answer = app.handle(method, path, headers(app, **foreign), b"{}")
         assert answer.status == 403
         assert app.token.encode() not in answer.body
@@ -77,7 +77,7 @@ def test_strangers_get_nothing(app, foreign):
 
 @pytest.mark.parametrize("token", ["", "x", "\u00e9"])
 def test_posts_need_the_token_and_json(app, token):
-    wish = {"run": 0, "number": 0, "wish": "reject"}
+    wish = {"result": 0, "number": 0, "wish": "reject"}
     assert post(app, "/closure", wish, **{"x-token": token}).status == 403
     assert post(app, "/closure", wish, **{"content-type": "text/plain"}).status == 415
     assert app.handle("PUT", "/closure", headers(app), b"{}").status == 405
@@ -88,55 +88,57 @@ def test_posts_need_the_token_and_json(app, token):
 @pytest.mark.parametrize(
     "path",
     [
-        "/run/0/../map/report.json", "/run/0/..%2f..%2fc.toml", "/run/0/%2fetc%2fpasswd", "/run/0/c.toml", "/run/1/map.png",
-        "/run/-1/map.png", "/run/0/", "/run/0", "/etc/passwd", "/run/0/map.png/x", "/run/0/secret.png", "//",
-        "/run/0/report.html%00.png", "/run/\u00b2/map.png",
+        "/result/0/../map/report.json", "/result/0/..%2f..%2fc.toml", "/result/0/%2fetc%2fpasswd", "/result/0/c.toml",
+        "/result/1/map.png", "/result/-1/map.png", "/result/0/", "/result/0", "/etc/passwd", "/result/0/map.png/x",
+        "/result/0/secret.png", "//", "/result/0/report.html%00.png", "/result/\u00b2/map.png",
     ],
 )  # fmt: skip
 def test_nothing_but_a_result_s_own_files_is_served(app, path):
-    folder = app.runs[0].result.folder
+    folder = app.results[0].result.folder
     (folder / "secret.png").write_bytes(b"secret")
     (folder.parent / "c.toml").write_text("secret = 1")
     assert app.handle("GET", path, {"host": HOST}).status == 404
 
 
 def test_a_link_out_of_the_folder_is_not_followed(app):
-    folder = app.runs[0].result.folder
+    folder = app.results[0].result.folder
     (folder / "config.toml").unlink()
     (folder.parent / "elsewhere").write_text("secret")
     (folder / "config.toml").symlink_to(folder.parent / "elsewhere")
-    assert app.handle("GET", "/run/0/config.toml", {"host": HOST}).status == 404
-    report = app.handle("GET", "/run/0/report.html", {"host": HOST})
+    assert app.handle("GET", "/result/0/config.toml", {"host": HOST}).status == 404
+    report = app.handle("GET", "/result/0/report.html", {"host": HOST})
     assert report.status == 200
     assert report.framed
 
 
 def test_wishes_go_into_the_constraints_file(app):
-    assert post(app, "/closure", {"run": 0, "number": 0, "wish": "reject"}).status == 200
-    assert post(app, "/closure", {"run": 0, "number": 1, "wish": "force"}).status == 200
-    state = json.loads(post(app, "/anchor", {"run": 0, "id": "91A3", "place": [1.5, -2.0]}).body)
+    assert post(app, "/closure", {"result": 0, "number": 0, "wish": "reject"}).status == 200
+    assert post(app, "/closure", {"result": 0, "number": 1, "wish": "force"}).status == 200
+    state = json.loads(post(app, "/anchor", {"result": 0, "id": "91A3", "place": [1.5, -2.0]}).body)
     assert state["edits"] == 3
-    assert [c["wish"] for c in sorted(state["runs"][0]["closures"], key=lambda c: c["number"])] == ["reject", "force", "leave"]
+    closures = sorted(state["results"][0]["closures"], key=lambda c: c["number"])
+    assert [c["wish"] for c in closures] == ["reject", "force", "leave"]
     written = parse_constraints(app.constraints.read_text())
     assert written.forbidden[0].stamps == (1000.0, 1006.0)
     assert written.closures[0].pose == (1.0, 1.0, 1.0)
     assert written.anchors[0].position == (1.5, -2.0)
-    assert json.loads(post(app, "/anchor", {"run": 0, "id": "91A3", "place": None}).body)["edits"] == 2
+    assert json.loads(post(app, "/anchor", {"result": 0, "id": "91A3", "place": None}).body)["edits"] == 2
     # Who starts again finds it as it was.
-    again = app_of([app.runs[0].result], {}, app.constraints, Work)
+    again = app_of([app.results[0].result], {}, app.constraints, Work)
     assert again.edits == app.edits
 
 
 @pytest.mark.parametrize(
     ("path", "wish"),
     [
-        ("/closure", {"run": 0, "number": 9, "wish": "reject"}), ("/closure", {"run": 0, "number": True, "wish": "reject"}),
-        ("/closure", {"run": 3, "number": 0, "wish": "reject"}), ("/closure", {"run": 0, "number": 0, "wish": "burn"}),
-        ("/closure", {}), ("/closure", []), ("/anchor", {"run": 0, "id": "?", "place": [0, 0]}),
-        ("/anchor", {"run": 0, "id": "91A3", "place": [0]}), ("/anchor", {"run": 0, "id": "91A3", "place": ["1", 2]}),
-        ("/anchor", {"run": 0, "id": "91A3", "place": [1e99, 2]}),
-        ("/anchor", {"run": 0, "id": "91A3", "place": [0, 0], "sigma": 0}),
-        ("/anchor", {"run": 0, "id": "91A3", "place": [float("nan"), 0]}),
+        ("/closure", {"result": 0, "number": 9, "wish": "reject"}),
+        ("/closure", {"result": 0, "number": True, "wish": "reject"}),
+        ("/closure", {"result": 3, "number": 0, "wish": "reject"}), ("/closure", {"result": 0, "number": 0, "wish": "burn"}),
+        ("/closure", {}), ("/closure", []), ("/anchor", {"result": 0, "id": "?", "place": [0, 0]}),
+        ("/anchor", {"result": 0, "id": "91A3", "place": [0]}), ("/anchor", {"result": 0, "id": "91A3", "place": ["1", 2]}),
+        ("/anchor", {"result": 0, "id": "91A3", "place": [1e99, 2]}),
+        ("/anchor", {"result": 0, "id": "91A3", "place": [0, 0], "sigma": 0}),
+        ("/anchor", {"result": 0, "id": "91A3", "place": [float("nan"), 0]}),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_changes_nothing(app, path, wish):
@@ -148,29 +150,29 @@ def test_what_makes_no_sense_changes_nothing(app, path, wish):
 
 
 def test_mapping_again_puts_the_new_result_beside_the_old(app):
-    answer = json.loads(post(app, "/map", {"run": 0}).body)
+    answer = json.loads(post(app, "/map", {"result": 0}).body)
     assert answer["job"] == {"code": None, "output": "occupancy grid"}
-    folder = app.runs[0].result.folder
+    folder = app.results[0].result.folder
     assert app.job.words[0] == "map"
     assert app.job.words[-4:] == ["--constraints", str(app.constraints), "--out", str(folder.with_name("map_2"))]
     assert "--laser-flipped" in app.job.words
-    assert post(app, "/map", {"run": 0}).status == 400
+    assert post(app, "/map", {"result": 0}).status == 400
     shutil.copytree(folder, folder.with_name("map_2"))
     app.job.ended = 3
     state = json.loads(app.handle("GET", "/state", {"host": HOST}).body)
-    assert [r["name"] for r in state["runs"]] == ["map", "map_2"]
-    assert post(app, "/map", {"run": 1}).status == 200
+    assert [r["name"] for r in state["results"]] == ["map", "map_2"]
+    assert post(app, "/map", {"result": 1}).status == 200
     assert app.job.words[-1].endswith("map_2_2")
 
 
 def test_a_map_that_failed_is_not_shown(app):
-    post(app, "/map", {"run": 0})
+    post(app, "/map", {"result": 0})
     app.job.ended = 1
-    assert len(json.loads(app.handle("GET", "/state", {"host": HOST}).body)["runs"]) == 1
+    assert len(json.loads(app.handle("GET", "/state", {"host": HOST}).body)["results"]) == 1
 
 
 def test_without_the_recording_it_reports_what_to_do(app):
     app.recordings.clear()
-    answer = post(app, "/map", {"run": 0})
+    answer = post(app, "/map", {"result": 0})
     assert answer.status == 400
     assert "uwblite view DIR RECORDING" in json.loads(answer.body)["error"]

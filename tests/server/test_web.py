@@ -49,14 +49,14 @@ def test_answers_carry_what_keeps_others_out(served):
     assert "Access-Control-Allow-Origin" not in headers
     assert headers["Cache-Control"] == "no-store"
     assert headers["X-Content-Type-Options"] == "nosniff"
-    _, headers, _ = ask(server, "GET", "/run/0/report.html")
+    _, headers, _ = ask(server, "GET", "/result/0/report.html")
     assert headers["Content-Security-Policy"].startswith("sandbox allow-scripts;")
 
 
 def test_a_post_comes_through_and_a_long_one_does_not(served):
     app, server = served
     headers = {"X-Token": app.token, "Content-Type": "application/json"}
-    status, _, body = ask(server, "POST", "/closure", json.dumps({"run": 0, "number": 0, "wish": "reject"}), headers)
+    status, _, body = ask(server, "POST", "/closure", json.dumps({"result": 0, "number": 0, "wish": "reject"}), headers)
     assert status == 200
     assert json.loads(body)["edits"] == 1
     assert ask(server, "POST", "/closure", b"x" * 70_000, headers)[0] == 413
@@ -168,7 +168,7 @@ def test_the_limit_of_a_head_holds_for_each_request_of_a_connection(live):
         assert (answer.status, answer.read()) == (200, b"")
 
 
-@pytest.mark.parametrize("target", ["http://[", "//[", "/%00", "/..%2f..%2fetc/passwd", "*", "/run/0/../../c.toml"])
+@pytest.mark.parametrize("target", ["http://[", "//[", "/%00", "/..%2f..%2fetc/passwd", "*", "/result/0/../../c.toml"])
 def test_a_target_that_names_no_page_is_not_found(served, live, target):
     for _, server in (served, live):
         with socket.create_connection(server.server_address, timeout=10) as line:

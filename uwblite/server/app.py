@@ -17,7 +17,7 @@ from .edits import edits_text, parse_edits, with_anchor, with_closure
 from .page import page
 from .remap import remap_command
 from .requests import HTML, PNG, Response, json_response, path_of, refusal, text_response
-from .runs import Run, described, run_of
+from .shown_results import ShownResult, described, shown_result
 
 _TYPES = {
     ".html": HTML, ".png": PNG, ".json": "application/json", ".csv": "text/plain; charset=utf-8",
@@ -41,7 +41,7 @@ class Job(Protocol):
 class App:
     """The state behind the page."""
 
-    runs: list[Run]
+    results: list[ShownResult]
     recordings: dict[str, Path]
     """Recordings at hand, by the SHA-256 of their bytes."""
     constraints: Path
@@ -84,16 +84,16 @@ class App:
         if path == "/state":
             return json_response(self._state())
         parts = path.strip("/").split("/")
-        runs = {str(k): run for k, run in enumerate(self.runs)}
-        if len(parts) == 3 and parts[0] == "run" and parts[1] in runs:
-            return self._file(runs[parts[1]], parts[2])
+        results = {str(k): shown for k, shown in enumerate(self.results)}
+        if len(parts) == 3 and parts[0] == "result" and parts[1] in results:
+            return self._file(results[parts[1]], parts[2])
         return text_response("there is no such page", 404)
 
-    def _file(self, run: Run, name: str) -> Response:
+    def _file(self, shown: ShownResult, name: str) -> Response:
         """Return a file of a result; nothing but the names that a result may hold is looked for."""
-        if name == "grid.png" and run.grid_png is not None:
-            return Response(200, PNG, run.grid_png)
-        file = run.result.folder / name
+        if name == "grid.png" and shown.grid_png is not None:
+            return Response(200, PNG, shown.grid_png)
+        file = shown.result.folder / name
         kind = _TYPES.get(file.suffix)
         if not is_of_result(name) or kind is None or not file.is_file() or file.is_symlink():
             return text_response("there is no such file in this result", 404)
@@ -103,7 +103,7 @@ class App:
         self._collect()
         edited = len(self.edits.closures) + len(self.edits.forbidden) + len(self.edits.anchors)
         return {
-            "runs": [described(run, self.edits) for run in self.runs],
+            "results": [described(shown, self.edits) for shown in self.results],
             "edits": edited,
             "constraints": self.constraints.name,
             "job": None if self.job is None else {"code": self.job.code(), "output": self.job.output()},
@@ -112,23 +112,23 @@ class App:
     def _post(self, path: str, body: bytes) -> Response:
         wish = _parsed(body)
         if path == "/closure":
-            closures = self._run(wish).result.closures
+            closures = self._chosen(wish).result.closures
             number = _whole(wish, "number", len(closures))
             self._keep(with_closure(self.edits, closures[number], str(wish.get("wish", ""))))
         elif path == "/anchor":
             self._keep(self._with_anchor(wish))
         elif path == "/map":
-            self._start(self._run(wish))
+            self._start(self._chosen(wish))
         else:
             return text_response("there is no such page", 404)
         return json_response(self._state())
 
-    def _run(self, wish: dict[str, Any]) -> Run:
-        return self.runs[_whole(wish, "run", len(self.runs))]
+    def _chosen(self, wish: dict[str, Any]) -> ShownResult:
+        return self.results[_whole(wish, "result", len(self.results))]
 
     def _with_anchor(self, wish: dict[str, Any]) -> Constraints:
-        run, name, place = self._run(wish), wish.get("id"), wish.get("place")
-        if name not in {a.id for a in run.result.anchors}:
+        shown, name, place = self._chosen(wish), wish.get("id"), wish.get("place")
+        if name not in {a.id for a in shown.result.anchors}:
             raise ConfigError("there is no such anchor in this result")
         if place is None:
             return with_anchor(self.edits, str(name), None)
@@ -144,15 +144,15 @@ class App:
         write_text(self.constraints, edits_text(self.own, edits))
         self.edits = edits
 
-    def _start(self, run: Run) -> None:
+    def _start(self, shown: ShownResult) -> None:
         self._collect()
         if self.job is not None and self.job.code() is None:
             raise ConfigError("a map is being made already")
-        folder = run.result.folder.resolve()
+        folder = shown.result.folder.resolve()
         out = next(p for k in range(2, 10_000) if not (p := folder.with_name(f"{folder.name}_{k}")).exists())
         if not self.constraints.exists():
             self._keep(self.edits)
-        self.job = self.launch(remap_command(run.result.report, folder, self.recordings, self.constraints, out))
+        self.job = self.launch(remap_command(shown.result.report, folder, self.recordings, self.constraints, out))
         self.making = out
 
     def _collect(self) -> None:
@@ -161,7 +161,7 @@ class App:
             return
         made, self.making = self.making, None
         if self.job.code() in (0, 3):
-            self.runs.append(run_of(read_result(made)))
+            self.results.append(shown_result(read_result(made)))
 
 
 def app_of(
@@ -173,7 +173,7 @@ def app_of(
     ------
     ConfigError : the constraints file is there and is none.
     """
-    app = App([run_of(r) for r in results], recordings, constraints, launch, secrets.token_urlsafe(24))
+    app = App([shown_result(r) for r in results], recordings, constraints, launch, secrets.token_urlsafe(24))
     app.load()
     return app
 

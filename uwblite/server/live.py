@@ -16,7 +16,7 @@ from .advice import SensorState, advice, silent_after
 from .feed import Feed
 from .live_page import live_page
 from .requests import HTML, PNG, Response, path_of, refusal, text_response
-from .runs import described, run_of
+from .shown_results import described, shown_result
 
 _TRAIL = 300
 """Points of the way since the latest map."""
@@ -41,18 +41,18 @@ class LivePage:
             empty: dict[str, Any] = {name: [] for name in ("paths", "anchors", "doubts", "warnings")}
             self.feed.publish("map", empty | {"image": None, "accepted": 0, "candidates": 0})
             return
-        run = run_of(result)
-        self._picture = run.grid_png
+        shown = shown_result(result)
+        self._picture = shown.grid_png
         self._maps += 1
-        shown = described(run, Constraints())
+        page = described(shown, Constraints())
         kept = ("name", "doubts", "warnings", "image", "paths", "accepted", "candidates")
         anchors = [
             entry | {"covariance": a.covariance.tolist() if np.isfinite(a.covariance).all() else None}
-            for entry, a in zip(shown["anchors"], result.anchors, strict=True)
+            for entry, a in zip(page["anchors"], result.anchors, strict=True)
         ]
         hidden: dict[str, Any] = {} if paths else {"paths": []}
         version = f"{self._token[:8]}-{self._maps}"
-        self.feed.publish("map", {name: shown[name] for name in kept} | {"anchors": anchors, "version": version} | hidden)
+        self.feed.publish("map", {name: page[name] for name in kept} | {"anchors": anchors, "version": version} | hidden)
 
     def show_status(self, status: Mapping[str, Any]) -> None:
         """Show what is true now: summary, advice, sensors, pose, trail; see `watch_status`."""

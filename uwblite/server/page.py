@@ -39,7 +39,7 @@ async function ask(path, wish) {
     state = content; show();
   } catch { say.textContent = "uwblite view has ended; start it again and reload this page"; }
 }
-const clock = (run, k) => run.closures.find(c => c.number === k);
+const clock = (result, k) => result.closures.find(c => c.number === k);
 function status() {
   const job = state.job;
   if (job && job.code === null) return "mapping again ... " + job.output;
@@ -49,51 +49,51 @@ function status() {
 }
 function show() {
   say.textContent = status();
-  main.replaceChildren(...state.runs.map(card));
+  main.replaceChildren(...state.results.map(card));
   highlight();
   clearTimeout(timer);
   if (state.job && state.job.code === null) timer = setTimeout(() => ask("/state"), 1000);
 }
-function card(run, number) {
+function card(result, number) {
   const detail = el("div", {class: "detail"}), busy = state.job && state.job.code === null;
-  const facts = [run.recordings.join(", "), run.settings, run.accepted + " of " + run.candidates + " closures accepted",
-    run.anchors.length + " anchors"].filter(Boolean).join(" · ");
-  const svg = picture(run, number, detail);
+  const facts = [result.recordings.join(", "), result.settings, result.accepted + " of " + result.candidates +
+    " closures accepted", result.anchors.length + " anchors"].filter(Boolean).join(" · ");
+  const svg = picture(result, number, detail);
   const rejected = el("input", {type: "checkbox", style: "width:auto", onchange: e => svg.classList.toggle("hideno",
     !e.target.checked)});
-  const paths = run.paths.length < 2 ? [key("path", "path")] : run.paths.slice(0, 4).map((_, k) => el("span", {}, el("i",
+  const paths = result.paths.length < 2 ? [key("path", "path")] : result.paths.slice(0, 4).map((_, k) => el("span", {}, el("i",
     {class: "key p" + k, ...(k ? {} : {style: "color:var(--path)"})}), " recording " + (k + 1)));
-  const node = el("section", {}, el("h2", {}, run.name), el("div", {class: "faint"}, facts));
-  for (const text of run.doubts) node.append(el("div", {class: "doubt"}, "Doubt: " + text));
+  const node = el("section", {}, el("h2", {}, result.name), el("div", {class: "faint"}, facts));
+  for (const text of result.doubts) node.append(el("div", {class: "doubt"}, "Doubt: " + text));
   node.append(svg, el("div", {class: "row faint"}, ...paths, key("start", "start", "disc"), key("path", "end", "ring"),
-    ...(run.anchors.length ? [key("anchor", "anchor", "anchors")] : []), key("accepted", "closure accepted"),
+    ...(result.anchors.length ? [key("anchor", "anchor", "anchors")] : []), key("accepted", "closure accepted"),
     el("label", {}, rejected, " ", key("rejected", "rejected")), key("start", "forced, pinned"), key("anchor",
       "rejected by you")));
   node.append(detail, el("div", {class: "row"},
-    el("button", {class: "main map", onclick: () => ask("/map", {run: number}), ...(busy ? {disabled: ""} : {})},
+    el("button", {class: "main map", onclick: () => ask("/map", {result: number}), ...(busy ? {disabled: ""} : {})},
       "Map again"),
-    el("a", {href: "/run/" + number + "/report.html", target: "_blank", rel: "noopener"}, "report"),
-    el("a", {href: "/run/" + number + "/map.png", target: "_blank", rel: "noopener"}, "picture")));
-  node.append(table(run, number, detail));
-  if (chosen && chosen.run === number) chosen.tell(detail); else hint(detail);
+    el("a", {href: "/result/" + number + "/report.html", target: "_blank", rel: "noopener"}, "report"),
+    el("a", {href: "/result/" + number + "/map.png", target: "_blank", rel: "noopener"}, "picture")));
+  node.append(table(result, number, detail));
+  if (chosen && chosen.result === number) chosen.tell(detail); else hint(detail);
   return node;
 }
 function hint(detail) { detail.replaceChildren(el("span", {class: "faint"}, "Nothing chosen.")); }
-function picture(run, number, detail) {
-  const svg = shape("svg", {class: "hideno", role: "img", "aria-label": "map of " + run.name});
-  const placed = run.anchors.filter(a => a.place);
-  const {size, bar} = drawMap(svg, run.paths.flat(), placed, run.image, "/run/" + number + "/grid.png", .5);
-  svg.append(...drawn(run.paths));
-  for (const c of run.closures.slice().reverse()) {
+function picture(result, number, detail) {
+  const svg = shape("svg", {class: "hideno", role: "img", "aria-label": "map of " + result.name});
+  const placed = result.anchors.filter(a => a.place);
+  const {size, bar} = drawMap(svg, result.paths.flat(), placed, result.image, "/result/" + number + "/grid.png", .5);
+  svg.append(...drawn(result.paths));
+  for (const c of result.closures.slice().reverse()) {
     const [a, b] = c.places, ends = {x1: a[0], y1: -a[1], x2: b[0], y2: -b[1]};
     const mark = " " + (c.accepted || c.wish !== "leave" ? "" : "no") + " " + c.wish;
     const stroke = shape("line", {...ends, class: "closure" + mark, "data-closure": c.number});
     const hit = shape("line", {...ends, class: "hit" + mark});
-    const open = () => choose(number, detail, d => tellClosure(d, run, number, c.number), `[data-closure="${c.number}"]`);
+    const open = () => choose(number, detail, d => tellClosure(d, result, number, c.number), `[data-closure="${c.number}"]`);
     for (const node of [stroke, hit]) node.addEventListener("click", open);
     svg.append(stroke, hit);
   }
-  run.paths.forEach((path, k) => {
+  result.paths.forEach((path, k) => {
     const mark = (at, name) => shape("circle", {cx: at[0], cy: -at[1], r: size / 110, class: name});
     if (path.length) svg.append(mark(path[0], "start"), mark(path[path.length - 1], "end p" + k % 4));
   });
@@ -101,53 +101,53 @@ function picture(run, number, detail) {
     const node = anchorMark(a.id, a.place, size);
     node.classList.toggle("pinned", Boolean(a.pinned));
     node.dataset.anchor = a.id;
-    node.addEventListener("click", () => choose(number, detail, d => tellAnchor(d, run, number, a.id), null));
+    node.addEventListener("click", () => choose(number, detail, d => tellAnchor(d, result, number, a.id), null));
     svg.append(node);
   }
   svg.append(bar);
   return svg;
 }
 function choose(number, detail, tell, mark) {
-  chosen = {run: number, tell, mark};
+  chosen = {result: number, tell, mark};
   tell(detail);
   highlight();
 }
 function highlight() {
   document.querySelectorAll(".chosen").forEach(node => node.classList.remove("chosen"));
-  if (chosen && chosen.mark) document.querySelectorAll("section")[chosen.run].querySelectorAll(chosen.mark)
+  if (chosen && chosen.mark) document.querySelectorAll("section")[chosen.result].querySelectorAll(chosen.mark)
     .forEach(node => node.classList.add("chosen"));
 }
-function tellClosure(detail, run, number, k) {
-  const c = clock(state.runs[number], k);
+function tellClosure(detail, result, number, k) {
+  const c = clock(state.results[number], k);
   if (!c) return hint(detail);
   const button = (wish, text) => el("button", {"data-wish": wish, ...(c.wish === wish ? {disabled: ""} : {}),
-    onclick: () => ask("/closure", {run: number, number: k, wish})}, text);
+    onclick: () => ask("/closure", {result: number, number: k, wish})}, text);
   detail.replaceChildren(el("div", {}, "Closure at " + c.stamps.map((t,
     i) => t.toFixed(2) + " s" + (c.recordings[i] > 1 ? " of recording "
     + c.recordings[i] : "")).join(" and ") + ": " + (c.accepted ? "accepted" : "rejected") + ", " + c.reason),
     el("div", {class: "row"}, button("reject", "Reject"), button("force", "Force"), button("leave",
       "Leave it to the mapper")));
 }
-function tellAnchor(detail, run, number, id) {
-  const a = state.runs[number].anchors.find(a => a.id === id);
+function tellAnchor(detail, result, number, id) {
+  const a = state.results[number].anchors.find(a => a.id === id);
   if (!a) return hint(detail);
   const place = a.pinned || a.place, x = el("input", {value: place[0].toFixed(3), "aria-label": "x"});
   const y = el("input", {value: place[1].toFixed(3), "aria-label": "y"});
   const sigma = a.sigma ? " ± " + a.sigma.map(v => v.toFixed(2)).join(", ") : "";
   const [px, py] = a.place.map(v => v.toFixed(2) + " m"), pinned = a.pinned ? ", pinned" : "";
-  const pin = () => ask("/anchor", {run: number, id, place: [Number(x.value), Number(y.value)]});
-  const free = () => ask("/anchor", {run: number, id, place: null});
+  const pin = () => ask("/anchor", {result: number, id, place: [Number(x.value), Number(y.value)]});
+  const free = () => ask("/anchor", {result: number, id, place: null});
   detail.replaceChildren(
     el("div", {}, "Anchor " + a.id + " (" + a.status + ") at x " + px + ", y " + py + sigma + pinned),
     el("div", {class: "row"}, "x", x, "y", y, "m", el("button", {"data-wish": "pin", onclick: pin}, "Pin here"),
       el("button", {"data-wish": "free", ...(a.pinned ? {} : {disabled: ""}), onclick: free}, "Free")));
 }
-function table(run, number, detail) {
-  const rows = run.closures.slice(0, 400).map(c => el("tr", {}, el("td", {},
+function table(result, number, detail) {
+  const rows = result.closures.slice(0, 400).map(c => el("tr", {}, el("td", {},
     c.stamps.map(t => t.toFixed(1)).join(" – ") + " s"),
     el("td", {}, c.wish === "leave" ? (c.accepted ? "accepted" : "rejected") : c.wish === "force"
       ? "forced" : "rejected by you"),
-    el("td", {}, el("button", {onclick: () => choose(number, detail, d => tellClosure(d, run, number, c.number),
+    el("td", {}, el("button", {onclick: () => choose(number, detail, d => tellClosure(d, result, number, c.number),
       `[data-closure="${c.number}"]`)},
       "choose"))));
   return el("details", {}, el("summary", {}, "All closures"), el("div", {class: "list"}, el("table", {}, ...rows)));

@@ -21,7 +21,7 @@ _MOST_CLOSURES = 3000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class ShownResult:
     """A result on the page."""
 
     name: str
@@ -30,19 +30,19 @@ class Run:
     """The map as a grey picture, largest y on top."""
 
 
-def run_of(result: StoredResult) -> Run:
+def shown_result(result: StoredResult) -> ShownResult:
     """Return a result as the page needs it."""
     grid = None if result.grid is None else encode_png(trinary_image(result.grid))
-    return Run(os.path.basename(os.path.abspath(result.folder)), result, grid)
+    return ShownResult(os.path.basename(os.path.abspath(result.folder)), result, grid)
 
 
-def described(run: Run, edits: Constraints) -> dict[str, Any]:
-    """Return everything that the page shows of a run; lengths in metres, map frame."""
-    result, report = run.result, run.result.report
+def described(shown: ShownResult, edits: Constraints) -> dict[str, Any]:
+    """Return everything that the page shows of a result; lengths in metres, map frame."""
+    result, report = shown.result, shown.result.report
     pinned = {a.id: a for a in edits.anchors}
     order = sorted(range(len(result.closures)), key=lambda k: not result.closures[k].accepted)[:_MOST_CLOSURES]
     return {
-        "name": run.name,
+        "name": shown.name,
         "doubts": [text_of(d) for d in report.get("doubts") or ()],
         "warnings": [text_of(w) for w in report.get("warnings") or ()],
         "recordings": [os.path.basename(str(i.get("source", ""))) for i in report.get("inputs") or ()],
