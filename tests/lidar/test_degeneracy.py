@@ -7,7 +7,7 @@ from helpers.registration_worlds import CORRIDOR, ROOM, pair
 
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.clouds import joined
-from uwblite.lidar.degeneracy import relative_eigen
+from uwblite.lidar.degeneracy import MEASURED, measured_part, relative_eigen
 from uwblite.lidar.scan_matching import match, nondegenerate_step, pair_points
 
 CENTRE = (3.0, 1.5)
@@ -60,3 +60,15 @@ def test_lines_without_scatter_are_fully_measured():
 
 def test_nothing_matched_has_no_measured_direction():
     assert (relative_eigen(np.zeros((3, 3)), np.zeros((3, 3)))[2] == 0.0).all()
+
+
+def test_the_measured_part_is_that_of_the_nondegenerate_step():
+    rng = np.random.default_rng(8)
+    for walls, centre in ((ROOM, CENTRE), (CORRIDOR, (0.0, 0.0))):
+        factors = matched(*pair(walls, np.zeros(3), rng, centre, noise=0.015), np.zeros(3))
+        information, gradient = measured_part(factors.hessian, factors.spurious, factors.gradient)
+        step, root = nondegenerate_step(factors)
+        np.testing.assert_allclose(information, np.swapaxes(root, 1, 2) @ root, atol=1e-6 * information.max())
+        np.testing.assert_allclose(information @ step[:, :, None], -gradient[:, :, None], atol=1e-6 * np.abs(gradient).max())
+    nothing = measured_part(MEASURED * factors.spurious, factors.spurious, factors.gradient)[0]
+    np.testing.assert_allclose(nothing, 0.0, atol=1e-6 * factors.spurious.max())

@@ -2,9 +2,12 @@
 
 import numpy as np
 from helpers.hypotheses import a_bank, numeric
+from helpers.localization_room import cast, grid_of
 
+from uwblite import se2
 from uwblite.localization import hypotheses
 from uwblite.localization.hypotheses import SLOW_LENGTH
+from uwblite.localization.walls import Rays, walls_of
 
 
 def test_a_step_moves_the_covariance_by_the_numeric_jacobian_of_the_mean():
@@ -20,3 +23,28 @@ def test_a_step_moves_the_covariance_by_the_numeric_jacobian_of_the_mean():
         noise = hypotheses.moved(still, step).covariance[0]
         np.testing.assert_allclose(hypotheses.moved(bank, step).covariance[0] - noise, F @ bank.covariance[0] @ F.T, atol=1e-9)
         assert np.isclose(F[-1, -1], np.exp(-np.hypot(*step[:2]) / SLOW_LENGTH))
+
+
+def test_scans_between_two_oblique_walls_say_nothing_along_them_and_a_third_wall_does():
+    turn = 0.2  # rad; cells of an oblique wall are a staircase, whose normals scatter
+    sides, end = ((-1.8, -1, 5.8, -1), (-1.8, 1, 5.8, 1)), ((4, -1, 4, 1),)
+    sigma = np.array([0.2, 0.2, 0.05])
+
+    def spread(drawn):
+        """Return the standard deviations along and across the walls after forty fresh scans."""
+        turned = [tuple(se2.rotate(turn, np.array(w, dtype=float).reshape(2, 2)).ravel() + [2.0, 2.0] * 2) for w in drawn]
+        walls = walls_of(grid_of(turned))
+        pose = np.array([*se2.rotate(turn, np.array([1.0, 0.1])) + 2.0, turn])
+        readings, angles = cast(pose, turned), np.linspace(-np.pi / 2, np.pi / 2, 181)
+        seen = np.isfinite(readings)
+        ends = readings[seen, None] * np.stack([np.cos(angles[seen]), np.sin(angles[seen])], axis=1)
+        bank = hypotheses.started(pose[None], np.diag(sigma**2)[None], 1)
+        for _ in range(40):
+            bank = hypotheses.matched(bank, walls, Rays(ends, np.zeros_like(ends), np.ones(len(ends), bool)), 1.0)
+        along = se2.rotate(turn, np.eye(2))
+        return np.sqrt(np.diag(along @ bank.pose_covariances[0, :2, :2] @ along.T))
+
+    along, across = spread(sides)
+    assert along > 0.9 * sigma[0]
+    assert across < 0.01
+    assert max(spread(sides + end)) < 0.01

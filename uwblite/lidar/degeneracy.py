@@ -14,6 +14,8 @@ _FLOOR = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) * 1e-9
 """N is at least this share of H's diagonal: without any scatter a direction is measured up to the inverse of it. Sums x
 and y, whatever the frame."""
 _TINY = 1e-30
+MEASURED = 2.0
+"""Multiple of the spurious information that a direction must exceed to have been measured."""
 
 
 def relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Floats, Floats, Floats]:
@@ -22,6 +24,17 @@ def relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Float
     inverse = _inverse(basis)
     values, vectors = np.linalg.eigh(inverse @ information @ np.swapaxes(inverse, -1, -2))
     return basis, inverse, values, vectors
+
+
+def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+    """Return information (..., 3, 3) and gradient (..., 3) less what the scatter of the normals may have added.
+
+    A direction keeps its Gauss-Newton step with the share 1 - MEASURED / l of its information, none where l is below MEASURED.
+    """
+    basis, inverse, values, vectors = relative_eigen(information, spurious)
+    kept = np.maximum(1.0 - MEASURED / np.maximum(values, _TINY), 0.0)
+    share = (basis @ vectors * kept[..., None, :]) @ (np.swapaxes(vectors, -1, -2) @ inverse)
+    return share @ information, (share @ gradient[..., None])[..., 0]
 
 
 def _inverse(lower: Floats) -> Floats:

@@ -14,7 +14,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
 from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
-from .degeneracy import relative_eigen
+from .degeneracy import MEASURED, relative_eigen
 
 _AT_ONCE = 16384
 """Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
@@ -206,8 +206,6 @@ def shifts_by_range_error(
 
 _NEAREST = 0.05
 """Least distance of a point whose ray has a direction, m."""
-_MEASURED = 2.0
-"""Multiple of the spurious information that a direction must exceed to have been measured."""
 
 
 def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
@@ -218,7 +216,7 @@ def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
     of 1, see degeneracy.
     """
     basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.spurious)
-    kept = np.maximum(values - _MEASURED, 0.0)
+    kept = np.maximum(values - MEASURED, 0.0)
     divisor = np.where(kept > 0.0, values, np.inf)
     within = np.swapaxes(vectors, 1, 2) @ inverse
     step = -np.einsum("eji,ej->ei", within, np.einsum("eij,ej->ei", within, factors.gradient) / divisor)

@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Bools, Floats, Table
+from ..lidar.degeneracy import measured_part
 from .range_errors import HARMONICS, PATTERN_SIGMA
 from .walls import Rays, Walls
 
@@ -151,7 +152,8 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypothe
     Notes
     -----
     The scan measures the pose alone, so that the update is made for it, with prior information I and the scan's H and
-    gradient, and carried over to the rest of the state by its covariance with the pose.
+    gradient, and carried over to the rest of the state by its covariance with the pose. Along an aisle H is that of the
+    walls' normals, which scatter: it is left out (lidar.degeneracy), or a hundred scans would be sure of what none has seen.
     """
     if not len(bank):
         return bank
@@ -160,7 +162,8 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypothe
     pose = bank.poses.copy()
     hessian = np.zeros_like(prior)
     for gate, scale in _GATES:
-        hessian, gradient, weight = walls.factors(pose, rays, gate, scale)
+        hessian, spurious, gradient, weight = walls.factors(pose, rays, gate, scale)
+        hessian, gradient = measured_part(hessian, spurious, gradient)
         share = fresh * np.minimum(_INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / _FLIMSY**2
         hessian, gradient = hessian * share[:, None, None], gradient * share[:, None]
         away = pose - bank.poses

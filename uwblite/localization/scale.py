@@ -71,7 +71,7 @@ def _matched(walls: Walls, pose: Floats, rays: Rays, looks: int, prior: float) -
     start, beam = np.append(pose, (0.0, 0.0)), rays.ends - rays.origins
     hessian, scaled = information, rays
     for gate, width in _GATES:
-        h, g, weight = walls.factors((start + x)[None, :3], scaled, gate, width, (rays.origins, beam))
+        h, _, g, weight = walls.factors((start + x)[None, :3], scaled, gate, width, (rays.origins, beam))
         share = min(_PER_LOOK * looks / max(float(weight[0]), 1e-9), 1.0) / _WALL_SIGMA**2
         hessian = information + share * h[0]
         x = x - np.linalg.solve(hessian, share * g[0] + information @ x)

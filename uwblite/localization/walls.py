@@ -5,7 +5,7 @@ that ends in free space met something that is not in the map, and one that passe
 count against a pose, and pull at none. Points in unknown space count for nothing.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,8 @@ class Walls:
     """(n, 2) unit, towards the free side; 0 where there is no line."""
     one_sided: Bools
     """(n,) the wall was seen from the side of its normal alone."""
+    normal_variance: Floats
+    """(n,) rad^2, of the normal's angle, by the scatter of the cells about the line."""
     cell: float
     """m; of the table of nearest walls."""
     origin: Floats
@@ -121,7 +123,7 @@ class Walls:
 
     def factors(
         self, poses: Floats, rays: Rays, gate: float, scale: float, rates: tuple[Floats, ...] = ()
-    ) -> tuple[Floats, Floats, Floats]:
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the quadratic form of the point-to-line distances about poses (h, 3).
 
         Parameters
@@ -132,6 +134,7 @@ class Walls:
         Returns
         -------
         hessian (h, 3 + k, 3 + k) : sum of w J^T J, J = (n, n . d(R p)/dtheta, n . R rate), as lidar.scan_matching.
+        spurious (h, 3, 3) : the part of the pose's by the scatter of the normals alone, see lidar.degeneracy.
         gradient (h, 3 + k) : sum of w J^T r. weight (h,) : sum of w.
         """
         c, s = (v[:, None] for v in se2.cos_sin(poses[:, 2]))
@@ -140,8 +143,8 @@ class Walls:
         x, y = rx + poses[:, :1], ry + poses[:, 1:2]
         near = self.nearest_at(x, y)
         if not len(self.points):
-            n = 3 + len(rates)
-            return np.zeros((len(poses), n, n)), np.zeros((len(poses), n)), np.zeros(len(poses))
+            n, h = 3 + len(rates), len(poses)
+            return np.zeros((h, n, n)), np.zeros((h, 3, 3)), np.zeros((h, n)), np.zeros(h)
         nx, ny = (self.normals[:, k].take(near) for k in (0, 1))
         dx, dy = x - self.points[:, 0].take(near), y - self.points[:, 1].take(near)
         ox, oy = rays.origins[rays.hit].T - rays.ends[rays.hit].T
@@ -153,7 +156,10 @@ class Walls:
         more = [nx * (c * u - s * v) + ny * (s * u + c * v) for u, v in (rate[rays.hit].T for rate in rates)]
         jacobian = np.stack([nx, ny, ny * rx - nx * ry, *more], axis=1)
         weighted = jacobian * w[:, None]
-        return weighted @ jacobian.transpose(0, 2, 1), np.einsum("hkp,hp->hk", weighted, r), w.sum(axis=1)
+        # The tangent (-ny, nx) stands where the normal stood.
+        tangent = np.stack([-ny, nx, nx * rx + ny * ry], axis=1)
+        spurious = (tangent * (w * self.normal_variance.take(near))[:, None]) @ tangent.transpose(0, 2, 1)
+        return weighted @ jacobian.transpose(0, 2, 1), spurious, np.einsum("hkp,hp->hk", weighted, r), w.sum(axis=1)
 
     def agreement(self, poses: Floats, rays: Rays) -> Agreement:
         """Return how rays agree with the map at poses (h, 3).
@@ -204,16 +210,16 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     states = grid.states()
     occupied = _surface(grid.geometry, states)
     if not len(occupied):
-        empty = np.zeros((0, 2))
-        return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), 1.0, np.zeros(2), np.zeros((0, 0), np.int32))
+        empty, none = np.zeros((0, 2)), np.zeros((0, 0), np.int32)
+        return Walls(grid.geometry, states, empty, empty, np.zeros(0, bool), np.zeros(0), 1.0, np.zeros(2), none)
     cloud = make_cloud(occupied, normal_radius=max(_NORMAL_RADIUS, 3.0 * grid.geometry.resolution))
     extent = np.ptp(occupied, axis=0) + 2.0 * REACH
     cell = max(grid.geometry.resolution, float(np.sqrt(extent[0] * extent[1] / _MOST_CELLS)))
     raster = rasterize(cloud, cell, REACH)
     shape = (int(raster.shape[0, 0]), int(raster.shape[0, 1]))
     bare = Walls(
-        grid.geometry, states, *cloud.cloud(0), np.zeros(len(cloud.points), bool), cell, raster.origin[0],
-        raster.nearest.reshape(shape) if raster.nearest.size else np.zeros((0, 0), np.int32),
+        grid.geometry, states, *cloud.cloud(0), np.zeros(len(cloud.points), bool), cloud.normal_variance.astype(np.float64),
+        cell, raster.origin[0], raster.nearest.reshape(shape) if raster.nearest.size else np.zeros((0, 0), np.int32),
     )  # fmt: skip
     return _facing_free_space(bare)
 
@@ -242,7 +248,7 @@ def _facing_free_space(walls: Walls) -> Walls:
     turned = np.where((free[1] > free[0])[:, None], -walls.normals, walls.normals)
     one_sided = np.minimum(free[0], free[1]) == 0
     points = walls.points - _BEHIND * turned * one_sided[:, None]
-    return Walls(walls.geometry, walls.states, points, turned, one_sided, walls.cell, walls.origin, walls.nearest)
+    return replace(walls, points=points, normals=turned, one_sided=one_sided)
 
 
 def _cells(values: Floats, origin: float, size: float) -> Ints:
