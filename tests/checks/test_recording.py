@@ -178,6 +178,8 @@ def test_what_a_trial_map_doubts_or_refuses_is_serious_and_said_once(without_sca
     (found,) = [f for f in diagnose(still).findings if "hardly moves" in f.what]
     again = diagnose(still, doubts=(Notice("hardly-moving", found.what, {}),)).findings
     assert sum(f.what == found.what for f in again) == 1
+    settled = [f.rank for f in diagnose(still, doubts=()).findings if f.what == found.what]
+    assert settled == ["warning"]
 
 
 def test_findings_are_ranked_and_json_ready(sound):

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.range_agreement import check_sustained_outliers, check_unit, outlier_stretches
+from uwblite.pipeline.range_agreement import (
+    check_sustained_outliers,
+    check_unit,
+    check_wheels_against_lidar,
+    outlier_stretches,
+)
 
 
 def test_stretches_in_which_most_readings_disagree_are_found():
@@ -68,3 +73,39 @@ def test_an_anchor_that_disagrees_for_long_is_named_with_the_times_since_the_beg
         "anchor B disagrees with the map for long (t = 200 to 249 s, 400 to 449 s, 500 to 549 s, 600 to 649 s ...)"
         in notice.text
     )
+
+
+def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretches=((0.0, 40.0), (60.0, 90.0))):
+    """Return the stages of a map whose wheels and lidar contradict each other; residual(s) of three anchors' ranges."""
+    stamps = np.arange(150.0)
+    table = {"stamp": stamps, "anchor": stamps % 3, "residual": residual(stamps)}
+    anchors = [SimpleNamespace(id=name, status=status) for name, status in zip(names, statuses, strict=True)]
+    stages = Stages(None, None)
+    stages.doubt("wheels-against-lidar", "they differ", stretches=stretches)
+    check_wheels_against_lidar(table, anchors, SimpleNamespace(stages=stages))
+    return stages
+
+
+def test_ranges_that_agree_with_the_map_decide_between_wheels_and_lidar():
+    """Every tenth range is late, in half of one stretch every third as well."""
+    stages = against(lambda s: np.where((s % 10 == 0) | ((s > 60) & (s < 75) & (s % 3 == 1)), 1.0, 0.1))
+    assert stages.doubts == []
+    (notice,) = stages.warnings
+    assert (notice.kind, notice.text.startswith("they differ; "), len(notice.figures["stretches"])) == (
+        "wheels-against-lidar", True, 2)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("residual", "options"),
+    [
+        (lambda s: np.where(s % 5 == 0, 0.4, 0.1), {}),
+        (lambda s: np.where((s >= 60) & (s < 80), 0.4, 0.0), {}),
+        (np.zeros_like, {"names": ("A", "B", "B@2")}),
+        (np.zeros_like, {"statuses": ("ok", "ok", "distrusted")}),
+        (np.zeros_like, {"stretches": ((0.0, 40.0), (200.0, 210.0))}),
+    ],
+    ids=["a fifth of all is off", "those of one stretch are off", "an anchor was moved", "two anchors", "none in a stretch"],
+)
+def test_too_few_ranges_that_agree_decide_nothing(residual, options):
+    stages = against(residual, **options)
+    assert ([n.kind for n in stages.doubts], stages.warnings) == (["wheels-against-lidar"], [])

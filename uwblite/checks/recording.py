@@ -40,7 +40,7 @@ def diagnose(
     *,
     anchors: tuple[AnchorEstimate, ...] = (),
     calibration: tuple[CalibrationEstimate, ...] = (),
-    doubts: tuple[Notice, ...] = (),
+    doubts: tuple[Notice, ...] | None = None,
     refused: str = "",
 ) -> Diagnosis:
     """Examine a recording.
@@ -48,12 +48,12 @@ def diagnose(
     Parameters
     ----------
     anchors, calibration, doubts : of a map made for the check, where there is one: it shows the wheels' scale, the delay of
-        the radio and the bias of each anchor, and whether the sensors agree.
+        the radio and the bias of each anchor, and whether the sensors agree. doubts: None where no map was made.
     refused : why no map could be made; empty where it was, or was not tried.
     """
     found = Findings()
     _check_notes(log, found)
-    _check_screening(log, found)
+    _check_screening(log, doubts, found)
     odometry = check_odometry(log.odometry, found)
     figures: dict[str, Any] = {"odometry": odometry}
     if log.ranges is None or len(log.ranges.stamps) == 0:
@@ -65,7 +65,7 @@ def diagnose(
         found.note("lidar", "there are no laser scans", "there will be a trajectory and anchors, but no map")
     else:
         figures["lidar"] = check_scans(log, found)
-    _check_map(doubts, refused, found)
+    _check_map(doubts or (), refused, found)
     return Diagnosis(found.ranked(), figures)
 
 
@@ -75,8 +75,8 @@ def _advice_without_ranges(log: SensorLog) -> str:
     return "the map rests on wheels and lidar; check the tag if that is not meant"
 
 
-def _check_screening(log: SensorLog, found: Findings) -> None:
-    """What a map would repair is a warning, what it would doubt or refuse is serious."""
+def _check_screening(log: SensorLog, doubts: tuple[Notice, ...] | None, found: Findings) -> None:
+    """What a map would repair is a warning, what it would doubt or refuse is serious, but for what the map settled."""
     try:
         repaired = screen(log)
     except DataError as error:
@@ -87,7 +87,7 @@ def _check_screening(log: SensorLog, found: Findings) -> None:
     if not sensors:
         found.serious("log", "neither ranges nor scans are left to hold the trajectory", "odometry alone drifts")
     for remark in screening.remarks if screening is not None else ():
-        if remark.doubt:
+        if remark.doubt and (doubts is None or any(remark.text == doubt.text for doubt in doubts)):
             found.serious("log", remark.text, "the map will be doubted: repair the recording, or cut it there")
         else:
             found.warning("log", remark.text, "a map repairs it so; the files stay as they are")

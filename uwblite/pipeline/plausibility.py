@@ -16,7 +16,7 @@ from ..sensor_log.anchor_names import name_and_number
 from .drift_tests import check_drifts
 from .estimate import Estimate, Task
 from .half_tests import check_halves
-from .range_agreement import check_sustained_outliers, check_unit
+from .range_agreement import check_sustained_outliers, check_unit, check_wheels_against_lidar
 from .residual_tests import check_residuals
 from .turn_checks import check_turn_scales
 from .untied_parts import check_untied_parts
@@ -59,6 +59,7 @@ def judge(
     check_handedness(estimate, task)
     check_turn_scales(estimate, task)
     check_fit(task)
+    check_wheels_against_lidar(table, anchors, task)
 
 
 def check_certainty(estimate: Estimate, sigma: float, task: Task) -> None:

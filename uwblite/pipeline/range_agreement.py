@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..arrays import Bools, Floats, runs_of
+from ..map_result import AnchorEstimate
 from ..sensor_log.anchor_names import name_and_number
 from .estimate import Task
 
@@ -54,3 +55,37 @@ def check_unit(anchor_ids: Sequence[str], task: Task) -> None:
             "give the anchors' places, or the distance between two"
         )
         task.stages.doubt("odometry-unit", text)
+
+
+def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[AnchorEstimate], task: Task) -> None:
+    """Turn the doubt that wheels and lidar contradict each other into a warning where ranges decide for the lidar.
+
+    The map follows the lidar. Ranges to three anchors or more that agree with it, over the recording and in each stretch in
+    question, would not agree with a path that the lidar has bent: then the wheels are at fault alone. Anchors that seem to have
+    been moved could have been taken along by such a path.
+
+    Parameters
+    ----------
+    table : MapResult.range_table; empty without ranges. anchors : in the order of its numbers.
+    """
+    stages, kind = task.stages, "wheels-against-lidar"
+    against = [notice for notice in stages.doubts if notice.kind == kind]
+    if not against or not len(table.get("stamp", ())) or any(name_and_number(a.id)[1] > 1 for a in anchors):
+        return
+    sound = np.array([a.status == "ok" for a in anchors])[table["anchor"].astype(np.int64)]
+    stamps, anchor, near = table["stamp"], table["anchor"], np.abs(table["residual"]) < _NEAR
+    if near.mean() < _MOST_NEAR:
+        return
+    for notice in against:
+        inside = [sound & (stamps >= a) & (stamps <= b) for a, b in notice.figures["stretches"]]
+        if all(len(set(anchor[own].tolist())) >= _ENOUGH and near[own].mean() >= _MANY_NEAR for own in inside):
+            stages.doubts.remove(notice)
+            stages.warn(kind, f"{notice.text}; the ranges agree with the lidar there: check the wheels", **notice.figures)
+
+
+_ENOUGH, _NEAR = 3, 0.3
+"""Anchors whose ranges fix the robot's place by themselves, and how near to the map their ranges are then, m: a path that is
+half a metre off is not so near to three distances."""
+_MOST_NEAR, _MANY_NEAR = 0.85, 0.6
+"""Share of all their ranges, and of those in each stretch, few as they may be, that must be as near. Right maps have 0.9 to
+0.96, one of a lidar that saw the floor now and then 0.78, with an error of 0.43 m."""

@@ -194,7 +194,7 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
         f"wheels and lidar measure different motions ({when}{more}): one of the two stands still, slips or is wrong by another "
         "factor there than elsewhere"
     )
-    return [Remark("wheels-against-lidar", text, doubt=True)]
+    return [Remark("wheels-against-lidar", text, doubt=True, stretches=tuple((float(a), float(b)) for a, b in runs))]
 
 
 def unmatched(pairs: Pairs) -> list[Remark]:

@@ -42,6 +42,8 @@ class Remark:
     """What, where and how to fix it, for people."""
     doubt: bool = False
     """Whether a map of the recording should not be trusted; otherwise it was repaired, or costs accuracy only."""
+    stretches: tuple[tuple[float, float], ...] = ()
+    """First and last time, s, of each stretch in which it was so; empty where it is no matter of stretches."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
