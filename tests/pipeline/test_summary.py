@@ -27,6 +27,7 @@ from uwblite.pipeline.summary import (
     _range_table,
     _reason_to_distrust,
     _with_times,
+    _without_strange_biases,
 )
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.trilateration import AnchorHypothesis
@@ -199,6 +200,24 @@ def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():
     assert _distrusted(anchors, [part]) is anchors
     found = _distrusted(anchors, [part, whole])
     assert [(a.status, a.reason) for a in found] == [("distrusted", "the map is doubted"), ("unplaced", "few")]
+
+
+@pytest.mark.parametrize(
+    ("biases", "sigma", "strange"),
+    [
+        ((1.2, 1.1, 2.4, 1.3), 0.3, [2]),
+        ((1.2, 1.1, 2.1, 1.3), 0.3, []),
+        ((-1.2, 0.0, 0.1), 0.3, [0]),
+        ((-1.2, 0.0, 0.1), 0.45, []),
+        ((0.0, 1.5, np.nan), 0.1, []),
+        ((0.0, 1.5), 0.1, []),
+    ],
+)
+def test_an_anchor_whose_constant_error_is_far_from_that_of_the_others_is_distrusted(biases, sigma, strange):
+    anchors = tuple(AnchorEstimate("A", np.zeros(2), np.eye(2), 9, 1.0, b, sigma, 0.1, "ok") for b in biases)
+    found = _without_strange_biases(anchors)
+    assert [k for k, a in enumerate(found) if a.status == "distrusted"] == strange
+    assert all("from that of the others" in found[k].reason for k in strange)
 
 
 @pytest.mark.parametrize(

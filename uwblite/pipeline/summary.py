@@ -30,6 +30,8 @@ _AGREE = 0.5
 """Share of an anchor's ranges that must agree with the map."""
 _NO_BIAS = 1.6
 """Constant error of an anchor's ranges, m, twice that of the worst radios: rather its place is what is wrong."""
+_OTHER_BIAS = 1.0
+"""m, and three standard deviations, by which constant errors of anchors do not differ: rather a place is wrong."""
 _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
 
@@ -46,7 +48,7 @@ def summarise(estimate: Estimate, covariance: Marginals, grid: OccupancyGrid | N
     # By the scatter of ranges to a typical anchor; by its own scatter, no anchor would ever disagree.
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
-    anchors = _with_times(anchors, ranges)
+    anchors = _with_times(_without_strange_biases(anchors), ranges)
     listed = {
         u.key: u
         for r in recordings.each
@@ -146,6 +148,19 @@ def _anchor(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, scatter, status, reason,
         alternative,
     )
+
+
+def _without_strange_biases(anchors: tuple[AnchorEstimate, ...]) -> tuple[AnchorEstimate, ...]:
+    """Return the anchors, distrusted where their constant error is far from that of the others; of two neither is."""
+    biases = np.array([a.bias for a in anchors])
+    if np.isfinite(biases).sum() < 3:
+        return anchors
+    off = biases - np.nanmedian(biases)
+    return tuple(
+        replace(a, status="distrusted", reason=f"its ranges fit only with a constant error {by:+.1f} m from that of the others")
+        if a.status == "ok" and abs(by) > max(_OTHER_BIAS, 3.0 * a.bias_sigma) else a
+        for a, by in zip(anchors, off.tolist(), strict=True)
+    )  # fmt: skip
 
 
 def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, scatter: float) -> str:
