@@ -100,7 +100,9 @@ class LaserMessages:
         self._queue(layout, Pending(number, 0, readings, stamp))
 
     def _queue(self, layout: Layout, pending: Pending) -> None:
-        scans = self._scans.setdefault(layout, _Scans())
+        scans = self._scans.get(layout)
+        if scans is None:
+            scans = self._scans[layout] = _Scans()
         if scans.seen % self._every_nth == 0:
             scans.pending.append(pending)
         scans.seen += 1
