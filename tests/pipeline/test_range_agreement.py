@@ -75,14 +75,15 @@ def test_an_anchor_that_disagrees_for_long_is_named_with_the_times_since_the_beg
     )
 
 
-def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretches=((0.0, 40.0), (60.0, 90.0))):
+def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretches=((0.0, 40.0), (60.0, 90.0)), count=1):
     """Return the stages of a map whose wheels and lidar contradict each other; residual(s) of three anchors' ranges."""
     stamps = np.arange(150.0)
     table = {"stamp": stamps, "anchor": stamps % 3, "residual": residual(stamps)}
     anchors = [SimpleNamespace(id=name, status=status) for name, status in zip(names, statuses, strict=True)]
     stages = Stages(None, None)
     stages.doubt("wheels-against-lidar", "they differ", stretches=stretches)
-    check_wheels_against_lidar(table, anchors, SimpleNamespace(stages=stages))
+    recordings = SimpleNamespace(each=[None] * count)
+    check_wheels_against_lidar(table, anchors, SimpleNamespace(stages=stages, recordings=recordings))
     return stages
 
 
@@ -103,9 +104,13 @@ def test_ranges_that_agree_with_the_map_decide_between_wheels_and_lidar():
         (np.zeros_like, {"names": ("A", "B", "B@2")}),
         (np.zeros_like, {"statuses": ("ok", "ok", "distrusted")}),
         (np.zeros_like, {"stretches": ((0.0, 40.0), (200.0, 210.0))}),
+        (np.zeros_like, {"count": 2}),
     ],
-    ids=["a fifth of all is off", "those of one stretch are off", "an anchor was moved", "two anchors", "none in a stretch"],
-)
+    ids=[
+        "a fifth of all is off", "those of one stretch are off", "an anchor was moved", "two anchors", "none in a stretch",
+        "two recordings",
+    ],
+)  # fmt: skip
 def test_too_few_ranges_that_agree_decide_nothing(residual, options):
     stages = against(residual, **options)
     assert ([n.kind for n in stages.doubts], stages.warnings) == (["wheels-against-lidar"], [])

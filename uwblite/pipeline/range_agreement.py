@@ -62,7 +62,7 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
 
     The map follows the lidar. Ranges to three anchors or more that agree with it, over the recording and in each stretch in
     question, would not agree with a path that the lidar has bent: then the wheels are at fault alone. Anchors that seem to have
-    been moved could have been taken along by such a path.
+    been moved could have been taken along by such a path; of several recordings the clocks may show the same times.
 
     Parameters
     ----------
@@ -70,7 +70,9 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
     """
     stages, kind = task.stages, "wheels-against-lidar"
     against = [notice for notice in stages.doubts if notice.kind == kind]
-    if not against or not len(table.get("stamp", ())) or any(name_and_number(a.id)[1] > 1 for a in anchors):
+    if not against or not len(table.get("stamp", ())) or len(task.recordings.each) > 1:
+        return
+    if any(name_and_number(a.id)[1] > 1 for a in anchors):
         return
     sound = np.array([a.status == "ok" for a in anchors])[table["anchor"].astype(np.int64)]
     stamps, anchor, near = table["stamp"], table["anchor"], np.abs(table["residual"]) < _NEAR
