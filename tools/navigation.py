@@ -305,9 +305,9 @@ def main(argv: list[str] | None = None) -> int:
         for label, name, dead in VARIANTS:
             place = Place(world, args.building, args.seed, args.easy)
             tally = driven(mapped(place, name, args.keep), place, args.goals, dead)
-            errors = np.array(tally.errors or [np.nan])
+            errors, nearest = np.array(tally.errors or [np.nan]), tally.nearest if np.isfinite(tally.nearest) else np.nan
             rows.append([world, label, f"{tally.reached} of {tally.goals}", float(np.median(errors)), float(errors.max()),
-                         tally.nearest, tally.touched, tally.lost, tally.recovered])  # fmt: skip
+                         nearest, tally.touched, tally.lost, tally.recovered])  # fmt: skip
             print(*rows[-1], flush=True)
     head = ("world", "pose by", "reached within 0.10 m", "error at the goal, median, m", "worst, m", "nearest obstacle, m",
             "touched", "lost", "found again")  # fmt: skip
