@@ -141,19 +141,21 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     return Hypotheses(mean, symmetric(covariance), bank.log_weight)
 
 
-def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypotheses:
+def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, found: bool) -> Hypotheses:
     """Correct every hypothesis by a scan: an iterated Kalman update with robust weights.
 
     Parameters
     ----------
     rays : in the present frame of the base. fresh : 0..1, how far the scan errs independently of the one before it: walls
-        are seen with the same cells' rounding until the robot has moved.
+        are seen with the same cells' rounding until the robot has moved. found : whether the pose is certain.
 
     Notes
     -----
     The scan measures the pose alone, so that the update is made for it, with prior information I and the scan's H and
     gradient, and carried over to the rest of the state by its covariance with the pose. Along an aisle H is that of the
     walls' normals, which scatter: it is left out (lidar.degeneracy), or a hundred scans would be sure of what none has seen.
+    Until the pose is certain it is not, since a search has compared the places along the aisle and another one must agree
+    before any is believed; without it a robot beside a single wall is found late.
     """
     if not len(bank):
         return bank
@@ -163,7 +165,8 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float) -> Hypothe
     hessian = np.zeros_like(prior)
     for gate, scale in _GATES:
         hessian, spurious, gradient, weight = walls.factors(pose, rays, gate, scale)
-        hessian, gradient = measured_part(hessian, spurious, gradient)
+        if found:
+            hessian, gradient = measured_part(hessian, spurious, gradient)
         share = fresh * np.minimum(_INDEPENDENT / np.maximum(weight, 1e-9), 1.0) / _FLIMSY**2
         hessian, gradient = hessian * share[:, None, None], gradient * share[:, None]
         away = pose - bank.poses
