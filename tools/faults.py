@@ -76,6 +76,9 @@ def _stopped(signum: int, frame: object) -> None:
     raise TimeoutError(f"stopped after {TIME_BAR:.0f} s")
 
 
+VERDICTS = ("right", "said, right", "said, wrong", "false alarm", "SILENTLY WRONG", "INTERNAL ERROR", "TOO LONG")
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What became of one case."""
@@ -99,7 +102,7 @@ class Outcome:
 
     @property
     def verdict(self) -> str:
-        """'right', 'said', or what is wrong with the answer."""
+        """One of VERDICTS; those in capitals are faults of the program."""
         wrong = self.ate > ATE_BAR or self.beyond > 0.0
         if self.exit_code == 4:
             return "TOO LONG" if "stopped after" in self.stated[0] else "INTERNAL ERROR"
@@ -283,8 +286,8 @@ def main(argv: list[str] | None = None) -> int:
         print(" | ".join(f"{c:.3f}" if isinstance(c, float) else str(c) for c in shown(outcome)), flush=True)
         if args.verbose:
             print(*(f"      warning: {w}" for w in outcome.warnings), sep="\n", flush=True)
-    counts = {v: sum(o.verdict == v for o in done) for v in sorted({o.verdict for o in done})}
-    summary = ", ".join(f"{v}: {n}" for v, n in counts.items())
+    counts = "; ".join(f"{v}: {sum(o.verdict == v for o in done)}" for v in VERDICTS)
+    summary = f"{counts}; of {len(done)} rows of {len({o.name for o in done})} kinds"
     print(summary)
     if not args.print:
         text = f"## Faults\n\n{__doc__.split(chr(10) * 2)[-1].strip()}\n\n{summary}.\n\n{table(HEAD, [shown(o) for o in done])}"
