@@ -160,7 +160,7 @@ class PlaceSearch:
             covariances = np.linalg.inv(hessian + np.diag([0.01, 0.01, 0.1])) + np.diag(np.square(_SIGMA_FLOOR))
         fresh = hypotheses.started(poses, covariances, self.anchors, self._slow)
         if self.walls is not None and rays.hit.sum() >= verdict.FEW_BESIDE:
-            fresh = hypotheses.matched(fresh, self.walls, rays.spread(TRACK_RAYS), 1.0, False)
+            fresh = hypotheses.matched(fresh, self.walls, rays.spread(TRACK_RAYS), 1.0, found=False)
         return fresh
 
 

@@ -141,7 +141,7 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     return Hypotheses(mean, symmetric(covariance), bank.log_weight)
 
 
-def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, found: bool) -> Hypotheses:
+def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, *, found: bool) -> Hypotheses:
     """Correct every hypothesis by a scan: an iterated Kalman update with robust weights.
 
     Parameters

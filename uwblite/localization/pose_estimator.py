@@ -110,7 +110,7 @@ class PoseEstimator:
         least = _LEAST_FRESH if driven > 1e-3 else _STANDING_FRESH
         before = self._bank
         fresh = float(np.clip(driven / _FRESH_WAY, least, 1.0))
-        self._bank = hypotheses.matched(before, walls, rays, fresh, self._certain)
+        self._bank = hypotheses.matched(before, walls, rays, fresh, found=self._certain)
         some = rays.spread(RAYS)
         found = walls.agreement(self._bank.poses, some)
         if self._certain and (found.fit[0] < FIT_LOST or found.known[0] < _KNOWN * int(some.hit.sum())):

@@ -62,6 +62,11 @@ class Stages:
         """Add a reason not to trust the result."""
         self.doubts.append(Notice(kind, text, figures))
 
+    def settle(self, doubt: Notice, by: str) -> None:
+        """Make a warning of a doubt, and say by what it is settled."""
+        self.doubts.remove(doubt)
+        self.warn(doubt.kind, f"{doubt.text}; {by}", **doubt.figures)
+
     def mark(self) -> tuple[int, int]:
         """Return how much was reported so far."""
         return len(self.warnings), len(self.doubts)

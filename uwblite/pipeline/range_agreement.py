@@ -68,8 +68,7 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
     ----------
     table : MapResult.range_table; empty without ranges. anchors : in the order of its numbers.
     """
-    stages, kind = task.stages, "wheels-against-lidar"
-    against = [notice for notice in stages.doubts if notice.kind == kind]
+    against = [notice for notice in task.stages.doubts if notice.kind == "wheels-against-lidar"]
     if not against or not len(table.get("stamp", ())) or len(task.recordings.each) > 1:
         return
     if any(name_and_number(a.id)[1] > 1 for a in anchors):
@@ -81,8 +80,7 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
     for notice in against:
         inside = [sound & (stamps >= a) & (stamps <= b) for a, b in notice.figures["stretches"]]
         if all(len(set(anchor[own].tolist())) >= _ENOUGH and near[own].mean() >= _MANY_NEAR for own in inside):
-            stages.doubts.remove(notice)
-            stages.warn(kind, f"{notice.text}; the ranges agree with the lidar there: check the wheels", **notice.figures)
+            task.stages.settle(notice, "the ranges agree with the lidar there: check the wheels")
 
 
 _ENOUGH, _NEAR = 3, 0.3
