@@ -1,19 +1,26 @@
-"""`uwblite` at work in a process of its own, for a page or a recorder."""
+"""`uwblite` at work in a process of its own, for a page or a recorder.
+
+Its standard input is a pipe that nobody writes to: where that ends, whoever started it is no more, however it came to its
+end, and the process ends as well. This module is what the process runs.
+"""
 
 import os
+import runpy
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 
 _ENDING = 10.0
 """s that a process has to end in when it is asked to."""
 
 
 class Child:
-    """A command that runs.
+    """A command that runs until its end, or that of the process that made this.
 
     Parameters
     ----------
@@ -21,13 +28,12 @@ class Child:
     """
 
     def __init__(self, words: Sequence[str], niceness: int = 0) -> None:
-        package = (__package__ or "uwblite.cli").rpartition(".")[0]
-        root = Path(__file__).resolve().parents[package.count(".") + 2]
+        root = Path(__file__).resolve().parents[__name__.count(".")]
         path = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
         self._output = tempfile.TemporaryFile("w+b")  # noqa: SIM115
         self._process = subprocess.Popen(
-            [sys.executable, "-m", package, *words],
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-m", __name__, *words],
+            stdin=subprocess.PIPE,
             stdout=self._output,
             stderr=subprocess.STDOUT,
             env={**os.environ, "PYTHONPATH": path},
@@ -55,3 +61,15 @@ class Child:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+
+def _end_with_parent() -> None:
+    with suppress(OSError):
+        while os.read(0, 1):
+            pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    Thread(target=_end_with_parent, daemon=True).start()
+    runpy.run_module((__package__ or "uwblite.cli").rpartition(".")[0], run_name="__main__")

@@ -183,12 +183,10 @@ class _Watching:
     """`uwblite watch` beside the recorder, which goes on whatever becomes of it."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        import os
-
         from .child import Child
 
         host, port = args.watch
-        words = ["watch", args.out, "--host", host, "--port", str(port), "--parent", str(os.getpid())]
+        words = ["watch", args.out, "--host", host, "--port", str(port)]
         self._child: Child | None = None
         try:
             self._child = Child(words, _PAGE_NICENESS)

@@ -41,7 +41,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="address to listen on (this computer alone)")
     parser.add_argument("--out", metavar="DIR", type=place, help="folder for the latest map (LOG_watch)")
     parser.add_argument("--force", action="store_true", help="replace a map that is already in --out")
-    parser.add_argument("--parent", type=number(1, whole=True), help=argparse.SUPPRESS)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
 
@@ -69,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
             console.say(f"open {address} in a browser; Ctrl-C ends it")
             console.note(f"uwblite: the latest map is in {folder}")
             console.flush()
-            while args.parent is None or os.getppid() == args.parent:
+            while True:
                 watch.step(time.monotonic())
                 time.sleep(_STEP)
         except KeyboardInterrupt:

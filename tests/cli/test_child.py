@@ -1,0 +1,34 @@
+"""A command in a process of its own ends with the one that started it."""
+
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from helpers.served import PATIENCE
+
+PARENT = "import sys; from uwblite.cli.child import Child; child = Child(sys.argv[1:]); print(flush=True); input()"
+
+
+def until(answers, port):
+    """Wait until somebody, or nobody, answers at a port of this computer."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        with socket.socket() as line:
+            if (line.connect_ex(("127.0.0.1", port)) == 0) == answers:
+                return
+        time.sleep(0.02)
+    pytest.fail(f"port {port}: {'nobody' if answers else 'somebody'} answers")
+
+
+@pytest.mark.slow
+def test_a_command_ends_with_a_parent_that_was_killed(tmp_path):
+    with socket.socket() as line:
+        line.bind(("127.0.0.1", 0))
+        port = line.getsockname()[1]
+    words = ["watch", str(tmp_path / "run.log"), "--port", str(port)]
+    with subprocess.Popen([sys.executable, "-c", PARENT, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as parent:
+        until(True, port)
+        parent.kill()
+    until(False, port)
