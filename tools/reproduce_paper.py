@@ -363,7 +363,8 @@ def document(results: Results, args: argparse.Namespace) -> str:
         + "\nOf the joint refinement, which has that place in the defaults:\n\n"
         + by_row(results, "IV", "rounds", ("default",)),
         "## Fitness threshold and outlier distance\n\nColumn error as drawn (accepted closures).\n" + grids(results),
-        "## Table V: time per stage\n\nFull method, first recording of the hall; this machine was not idle.\n\n"
+        "## Table V: time per stage\n\nFull method, first recording of the hall, while other maps were computed beside it "
+        "(`--jobs`).\n\n"
         + table_5(results, seeds[0]),
         "## Maps\n\n" + gallery(),
     ]
