@@ -119,6 +119,14 @@ def test_imports_within_the_package_are_relative(module):
         assert not [n for n in names if n.split(".")[0] == "uwblite"], f"{module}:{node.lineno} names the package by name"
 
 
+def test_type_checkers_see_what_is_resolved_on_first_use():
+    """`__getattr__` returns an object of any kind: without the imports beside it `build_map(log)` is an error to them."""
+    imports = [node for node in ast.walk(tree_of("__init__")) if isinstance(node, ast.ImportFrom) and node.level]
+    typed = {alias.name: node.module for node in imports for alias in node.names}
+    assert typed == uwblite._LAZY
+    assert {*typed, "__version__"} == set(uwblite.__all__)
+
+
 FORBIDDEN_CALLS = {
     "print": "print",
     "exit": "exit",

@@ -9,6 +9,14 @@ Reading order: ``se2``, ``sensor_log``, ``mapping`` (the page that is the algori
 Importing this package loads nothing but itself; names below are resolved on first use.
 """
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # for those who check types; at run time __getattr__ resolves them
+    from .io.carmen import read_log
+    from .map_result import MapResult
+    from .mapping import MappingConfig, build_map
+    from .sensor_log import SensorLog
+
 __version__ = "0.1.0"
 
 _LAZY = {
@@ -16,7 +24,7 @@ _LAZY = {
     "read_log": "io.carmen",
     "build_map": "mapping",
     "MappingConfig": "mapping",
-    "MapResult": "mapping",
+    "MapResult": "map_result",
 }
 
 __all__ = ["MapResult", "MappingConfig", "SensorLog", "__version__", "build_map", "read_log"]
