@@ -28,7 +28,8 @@ def wrap_angle(angle: ArrayLike) -> Floats:
     """Return the angle, rad, moved into (-pi, pi]; one that lies there already keeps every bit."""
     angle = np.asarray(angle, dtype=np.float64)
     wrapped = angle - 2.0 * np.pi * np.ceil(angle / (2.0 * np.pi) - 0.5)
-    return np.clip(wrapped, _ABOVE_MINUS_PI, np.pi)
+    inside: Floats = np.minimum(np.maximum(wrapped, _ABOVE_MINUS_PI), np.pi)
+    return inside
 
 
 def cos_sin(angle: ArrayLike) -> tuple[Floats, Floats]:

@@ -8,8 +8,10 @@ from helpers.localization_room import ANCHORS, EVEN, ODD, ROUND, SCANNER, cast, 
 
 from uwblite import se2
 from uwblite.errors import DataError
-from uwblite.localization import Scanner
+from uwblite.localization import Localizer, Scanner
+from uwblite.localization.comparison import PlaceSearch
 from uwblite.localization.known_map import from_result
+from uwblite.localization.pose_estimator import PoseEstimator
 from uwblite.localization.walls import walls_of
 
 
@@ -49,6 +51,23 @@ def test_the_same_input_gives_the_same_bytes(drive):
         assert one.pose.tobytes() == other.pose.tobytes()
         assert one.covariance.tobytes() == other.covariance.tobytes()
         assert (one.quality, one.lost, one.reason) == (other.quality, other.lost, other.reason)
+
+
+def test_a_step_that_uses_a_scan_leaves_the_search_to_the_others(monkeypatch):
+    def logged(owner, name):
+        before = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *words: (done.append(name), before(*words))[1])
+
+    done, poses = [], path(ROUND)[:40]
+    drive = robot(known())
+    logged(PlaceSearch, "advance")
+    logged(PoseEstimator, "use_scan")
+    for name in ("add_odometry", "add_ranges", "add_scan", "_work_off"):
+        logged(Localizer, name)
+    assert first_found(drive.along(poses)) < 25
+    steps = " ".join(done).split("_work_off")
+    assert sum("advance" in step for step in steps) > 10
+    assert not any("advance" in step and "use_scan" in step for step in steps)
 
 
 def test_walls_alone_find_the_place_where_no_other_looks_like_it():

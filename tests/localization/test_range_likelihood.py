@@ -1,6 +1,7 @@
 """The likelihood of ranges at a pose: the factors' gradient, and moments that hold the truth."""
 
 import numpy as np
+from scipy.special import ndtr
 
 from uwblite import se2
 from uwblite.localization import range_likelihood
@@ -45,3 +46,13 @@ def test_the_errors_alone_are_those_of_the_factors():
     np.testing.assert_allclose(
         range_likelihood._misfits(poses, ranges), range_likelihood.range_errors(poses, ranges)[0], atol=1e-12
     )
+
+
+def test_likelihoods_in_single_precision_are_those_in_double_to_a_hundredth():
+    pose, ranges = some_ranges(6)
+    poses = pose + np.random.default_rng(6).normal(0.0, 2.0, (200, 3))
+    error = range_likelihood._misfits(poses, ranges)
+    z = error / ranges.sigma
+    terms = 0.7 * np.exp(-0.5 * z**2) + 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z) + 0.02
+    expected = range_likelihood._INDEPENDENT * np.log(terms).sum(axis=1)
+    np.testing.assert_allclose(range_likelihood.range_likelihood(poses, ranges), expected, atol=0.01)

@@ -26,6 +26,8 @@ _SIGMA_FLOOR = (0.1, 0.1, 0.03)
 """m, m, rad; drift within the window, on top of what ranges say of a place."""
 _AT_ONCE = 8
 """Places whose rays are compared with the map at once, a unit of work of 3 ms."""
+_UNITS = 2
+"""Units of work of a step."""
 _RADIO_REACH = 15.0
 """m beyond the outermost anchors; where a robot may be in a map without a grid."""
 
@@ -96,7 +98,7 @@ class PlaceSearch:
         self._steps = None
 
     def advance(self, bank: Hypotheses, odom: Floats) -> Comparison | None:
-        """Do a unit of the work; return how well each place explains what the window held, if that was the last one.
+        """Do some units of the work; return how well each place explains what the window held, if that was the last one.
 
         Parameters
         ----------
@@ -107,7 +109,8 @@ class PlaceSearch:
             return None
         self._present = se2.compose(bank.poses, se2.between(odom, self._odom))
         try:
-            next(self._steps)
+            for _ in range(_UNITS):
+                next(self._steps)
         except StopIteration as end:
             self._steps = None
             return self._brought(end.value, bank, odom)
@@ -169,10 +172,9 @@ def _no_repetition(poses: Floats, weight: Floats, before: int) -> Bools:
 
     One near an earlier one stays if it is far better: what was tracked there has slid along a wall, or was carried so far.
     """
-    stays = np.ones(len(poses), bool)
-    for k in range(before):
-        stays[before:] &= hypotheses.apart(poses[k], poses[before:]) | (weight[before:] > weight[k] + verdict.CERTAIN)
-    return stays
+    better = weight[before:] > weight[:before, None] + verdict.CERTAIN
+    new = (hypotheses.apart(poses[:before, None], poses[before:]) | better).all(axis=0)
+    return np.concatenate([np.ones(before, bool), new])
 
 
 def _bounds(known: KnownMap) -> tuple[Floats, Floats]:

@@ -198,9 +198,9 @@ def mixture(bank: Hypotheses, which: int) -> tuple[Floats, Floats]:
 
 
 def apart(one: Floats, others: Floats) -> Bools:
-    """Return which poses (h, 3) are another place than a pose (3,): half a metre or 0.3 rad away."""
-    off = se2.between(one, others)
-    return (np.hypot(off[:, 0], off[:, 1]) > _SAME[0]) | (np.abs(off[:, 2]) > _SAME[1])
+    """Return which poses (..., 3) are another place than poses (..., 3): half a metre or 0.3 rad away."""
+    off = np.abs(others - one)
+    return (np.hypot(off[..., 0], off[..., 1]) > _SAME[0]) | (np.abs(se2.wrap_angle(off[..., 2])) > _SAME[1])
 
 
 _SAME = (0.5, 0.3)
@@ -210,13 +210,11 @@ _SAME = (0.5, 0.3)
 def pruned(bank: Hypotheses, most: int, least: float) -> Hypotheses:
     """Return the best hypotheses, at most so many, none near a better one and none below a log-weight."""
     order = np.argsort(-bank.log_weight, kind="stable")
-    kept: list[int] = []
-    for k in order.tolist():
-        if len(kept) == most or bank.log_weight[k] < least:
-            break
-        if not kept or apart(bank.poses[k], bank.poses[kept]).all():
-            kept.append(k)
-    return bank.rows(np.array(kept, dtype=np.int64))
+    order = order[bank.log_weight[order] >= least]
+    other, kept = apart(bank.poses[order, None], bank.poses[order]), np.zeros(len(order), bool)
+    for k in range(len(order)):
+        kept[k] = other[k, kept].all() and kept.sum() < most
+    return bank.rows(order[kept])
 
 
 def symmetric(matrices: Floats) -> Floats:

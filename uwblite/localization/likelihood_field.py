@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Ints
 from .walls import Walls
 
 CELL = 0.1
@@ -34,6 +34,8 @@ class Field:
     """(rows, cols) cells in which a robot may stand."""
     margin: int
     """Cells around the map, so that points outside of it find a cell."""
+    squares: Ints
+    """(k, 2) row and column of the lowest cell of each of the coarsest squares in which a robot may stand."""
 
 
 def field_of(walls: Walls) -> Field:
@@ -58,4 +60,11 @@ def field_of(walls: Walls) -> Field:
         higher = wider.copy()
         higher[:-reach] = np.maximum(wider[:-reach], wider[reach:])
         levels.append(higher)
-    return Field(cell, origin, tuple(levels), free, margin)
+    return Field(cell, origin, tuple(levels), free, margin, _squares(free))
+
+
+def _squares(free: Bools) -> Ints:
+    top = 2**LEVELS
+    rows, cols = (n // top for n in free.shape)
+    some = free[: rows * top, : cols * top].reshape(rows, top, cols, top).any(axis=(1, 3))
+    return np.argwhere(some).astype(np.int64) * top

@@ -193,12 +193,15 @@ class Localizer:
         if not len(self._odometer):
             return
         self._bridge_silence()
-        for until, entry in self._waiting.reached(self._odometer.stamp):
+        due = self._waiting.reached(self._odometer.stamp)
+        ranged = [until for until, entry in due if isinstance(entry, Range)]
+        poses = dict(zip(ranged, self._odometer.at(np.array(ranged)), strict=True)) if ranged else {}
+        for until, entry in due:
             if isinstance(entry, Scan):
                 self._estimator.use_scan(scan_rays(self._odometer, self._laser, entry))
             else:
-                self._use_range(entry, until)
-        self._estimator.search_or_check()
+                self._use_range(entry, until, poses[until])
+        self._estimator.search_or_check(free=not any(isinstance(entry, Scan) for _, entry in due))
 
     def _bridge_silence(self) -> None:
         """Where the odometry has fallen silent, let the robot stand, and the pose become unsure."""
@@ -208,10 +211,10 @@ class Localizer:
             self._odometer.add(latest - 0.1, self._odometer.pose.copy())
             self._estimator.wander(_UNSEEN_SPEED * min(gap, 3.0))
 
-    def _use_range(self, entry: Range, stamp: float) -> None:
+    def _use_range(self, entry: Range, stamp: float, then: Floats) -> None:
         anchors, tags, anchor = self.known.anchors, self.mounting.tags, entry.anchor
         fact = RangeFacts(
             anchor, anchors.positions[anchor], entry.metres - float(anchors.bias[anchor]), float(self._square[anchor]),
             float(anchors.sigma[anchor]), anchors.scale, anchors.errors[anchor] if anchors.errors else None,
         )  # fmt: skip
-        self._estimator.use_range(fact, tags[min(max(entry.tag, 0), len(tags) - 1), :2], stamp)
+        self._estimator.use_range(fact, tags[min(max(entry.tag, 0), len(tags) - 1), :2], stamp, then)

@@ -85,9 +85,8 @@ class PoseEstimator:
         self._window, self._confirmed = Window(), None
         self._places.drop()
 
-    def use_range(self, fact: RangeFacts, tag: Floats, stamp: float) -> None:
-        """Take a range of the tag at a place (2,) of the base, m, at a time, s."""
-        then = self._odometer.at(np.array([stamp]))[0]
+    def use_range(self, fact: RangeFacts, tag: Floats, stamp: float, then: Floats) -> None:
+        """Take a range of the tag at a place (2,) of the base, m, at a time, s, at which the odometry had a pose (3,)."""
         self._window.add_range(WindowRange(fact, then, tag, self._way, stamp))
         self._window.forget(self._way)
         if not len(self._bank):
@@ -123,19 +122,27 @@ class PoseEstimator:
             self.ends += found.known[best] * np.array([found.on_wall[best], 1.0])
         self._running.add_scan(float(found.fit[best]), bool(found.met[best] >= verdict.FEW_ENDS), self._odometer.stamp)
 
-    def search_or_check(self) -> None:
-        """Do a unit of a search that is under way, or begin one where it is time for it."""
-        if self._certain and (why := self._doubted()):
+    def search_or_check(self, *, free: bool) -> None:
+        """Look whether the pose still holds; do some units of a search that is under way, or begin one where it is time for it.
+
+        Parameters
+        ----------
+        free : no scan was used in this step: there is time to search, and to compare units. Every scan brings a free step.
+        """
+        if self._certain and (why := self._doubted(free)):
             self._lose(why)
         elif not self._certain and self._running.jumped():
             self._lose("the ranges do not fit what was measured before; was the robot carried?")
         odom = self._odometer.pose
-        if (compared := self._places.advance(self._bank, odom)) is not None:
+        if free and not self._places.idle:
+            compared = self._places.advance(self._bank, odom)
+            if compared is None:
+                return
             if not self._certain:
                 self._decide_by(compared)
             elif compared.elsewhere:
                 self._lose(_SCANS_DIFFER, self._running.matched)
-        if self._places.idle and (not self._certain or self._running.in_doubt()) and self._due():
+        elif free and (not self._certain or self._running.in_doubt()) and self._due():
             # Of a pose that is in doubt, places are compared by what was measured since scans fitted there: ranges to a wrong
             # place agree by chance.
             self._searched = self._window.since(self._running.matched) if self._certain else self._window.newest(self._parts)
@@ -169,12 +176,16 @@ class PoseEstimator:
         self._search_way, self._search_stamp = self._way, now
         return True
 
-    def _doubted(self) -> str:
+    def _doubted(self, free: bool) -> str:
         """Return why the pose counts as lost; "" = it does not.
 
         One that ranges vouch for is given up only where another place explains better what was measured since.
+
+        Parameters
+        ----------
+        free : there is time to compare units.
         """
-        if self._way - self._unit_way >= _UNIT_WAY:
+        if free and self._way - self._unit_way >= _UNIT_WAY:
             self._unit_way, self._compared = self._way, self._compared + 1
             if why := self._other_unit():
                 self._compared = 0

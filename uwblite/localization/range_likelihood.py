@@ -1,7 +1,6 @@
 """How likely a window's ranges are at poses of the map, and what they say of the pose."""
 
 import numpy as np
-from scipy.special import ndtr
 
 from .. import se2
 from ..arrays import Floats
@@ -45,10 +44,12 @@ def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Float
     """
     if not len(ranges):
         return np.zeros(len(poses))
-    error, sigma = _misfits(poses, ranges), ranges.sigma + wider
+    # Single precision, and the normal distribution by a tanh (Page, Applied Statistics 1977; off by 2e-4): a third of the time.
+    error, sigma = _misfits(poses, ranges).astype(np.float32), (ranges.sigma + wider).astype(np.float32)
     z = error / sigma
-    late = 0.3 * np.exp(-np.maximum(error, 0.0) / 0.5) * ndtr(z)
-    return _INDEPENDENT * np.log(0.7 * np.exp(-0.5 * z**2) + late + 0.02).sum(axis=1)
+    square = z * z
+    late = 0.15 * np.exp(-2.0 * np.maximum(error, 0.0)) * (1.0 + np.tanh(z * (0.7978846 + 0.0356774 * square)))
+    return _INDEPENDENT * np.log(0.7 * np.exp(-0.5 * square) + late + 0.02).sum(axis=1, dtype=np.float64)
 
 
 def refined_by_ranges(poses: Floats, ranges: Ranges) -> Floats:

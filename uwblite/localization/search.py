@@ -89,15 +89,16 @@ def _thinned(rays: Rays) -> Floats:
 def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Steps:
     """Match points (p, 2), of a share of all rays, by branch and bound where the ranges allow it."""
     top = 2**LEVELS
-    rows, cols = _coarse_cells(field, top)
+    rows, cols = field.squares.T
     centre = field.origin + (np.stack([cols, rows], axis=1) + 0.5 * top) * field.cell
     allowed = yield from _allowed(centre, 0.75 * top * field.cell, ranges)
     rows, cols = rows[allowed], cols[allowed]
     headings = np.arange(0.0, 2.0 * np.pi - 0.5 * _HEADING, _HEADING)
     if not len(rows):
         return Places(np.zeros((0, 3)), False)
+    yield
     offsets = _offsets(field, points, headings)
-    yield from _pause(len(headings) * len(rows))
+    yield
     nodes = yield from _top_nodes(len(headings), rows, cols)
     complete, least = True, 0.0
     scores = yield from _scored(field, LEVELS, offsets, nodes)
@@ -109,9 +110,12 @@ def _by_scans(field: Field, points: Floats, share: float, ranges: Ranges) -> Ste
             kept = kept[np.argpartition(-scores[kept], _MOST_NODES)[:_MOST_NODES]]
             yield
         nodes = _children(nodes[kept], 2 ** (level - 1))
+        yield from _pause(len(nodes))
         scores = yield from _scored(field, level - 1, offsets, nodes)
     kept = np.flatnonzero(scores >= max(least, _RIVAL * scores.max(initial=0.0)))
+    yield from _pause(len(scores))
     kept = kept[np.argsort(-scores[kept], kind="stable")]
+    yield from _pause(len(kept))
     poses = np.column_stack([field.origin + (nodes[kept, :0:-1] + 0.5) * field.cell, se2.wrap_angle(headings[nodes[kept, 0]])])
     inside = field.free[nodes[kept, 1], nodes[kept, 2]]
     yield from _pause(len(kept))
@@ -134,14 +138,6 @@ def _likeliest(poses: Floats, scores: Floats, ranges: Ranges, complete: bool) ->
     order = np.argsort(-weight, kind="stable")
     order = order[weight[order] >= weight[order[:1]] - _RANGE_RIVAL]
     return (yield from _distinct(tried[order], complete and len(tried) == len(poses)))
-
-
-def _coarse_cells(field: Field, top: int) -> tuple[Ints, Ints]:
-    """Return rows and columns of the squares of cells in which a robot may stand."""
-    high, wide = (n // top for n in field.free.shape)
-    some = field.free[: high * top, : wide * top].reshape(high, top, wide, top).any(axis=(1, 3))
-    row, col = np.nonzero(some)
-    return row.astype(np.int64) * top, col.astype(np.int64) * top
 
 
 def _top_nodes(headings: int, rows: Ints, cols: Ints) -> Generator[None, None, NDArray[np.int32]]:
@@ -171,9 +167,9 @@ def _scored(field: Field, level: int, offsets: Ints, nodes: NDArray[np.int32]) -
         part = slice(start, start + _AT_ONCE)
         heading, row, col = nodes[part].T.astype(np.int64)
         values = flat.take(offsets[heading] + (row * wide + col)[:, None], mode="clip")
-        scores[part] = values.sum(axis=1, dtype=np.int64)
+        scores[part] = values.sum(axis=1, dtype=np.int64) / (255.0 * offsets.shape[1])
         yield
-    return np.asarray(scores / (255.0 * offsets.shape[1]))
+    return scores
 
 
 _AT_ONCE = 4096
@@ -200,8 +196,8 @@ def _pause(count: int) -> Generator[None, None, None]:
 
 _CENTRES_AT_ONCE = 400_000
 """Places times ranges that are compared at once, a unit of work of 2 ms."""
-_MANY = 50_000
-"""Nodes or poses that take 1 ms or more to make, to compare or to sort."""
+_MANY = 20_000
+"""Nodes or poses that take a millisecond or so to make, to compare or to sort."""
 
 
 def _highest(scores: Floats, count: int = 64) -> Ints:
@@ -253,8 +249,8 @@ def _by_ranges(ranges: Ranges, bounds: tuple[Floats, Floats]) -> Steps:
         part = slice(start, start + _RANGED_AT_ONCE)
         cost[part] = -range_likelihood(poses[part], few, wider=0.6 * step)
         yield
-    order = np.argsort(cost, kind="stable")
-    order = order[cost[order] <= cost[order[:1]] + _RANGE_RIVAL]
+    order = np.flatnonzero(cost <= cost.min(initial=np.inf) + _RANGE_RIVAL)
+    order = order[np.argsort(cost[order], kind="stable")]
     tried = (yield from _distinct(poses[order[:_MOST_RIVALS]], True)).poses
     yield
     return (yield from _distinct(refined_by_ranges(tried, ranges), 0 < len(order) <= _MOST_RIVALS))

@@ -47,7 +47,7 @@ class Rays(Table):
 
     def spread(self, count: int) -> "Rays":
         """Return at most so many rays, evenly spread."""
-        return self.rows(np.unique(np.linspace(0, len(self.hit) - 1, count).astype(np.int64)))
+        return self if len(self.hit) <= count else self.rows(np.linspace(0, len(self.hit) - 1, count).astype(np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,12 +180,10 @@ class Walls:
         value = np.where(unknown, 0.5 * np.log(_STRANGE), value)
         value = np.where(rays.hit, value, 0.0)
         ox, oy = laid(rays.origins)
-        length = np.hypot(x - ox, y - oy)
-        passed = np.zeros(x.shape, dtype=bool)
-        for fraction in _LOOKS:
-            # Up to 0.3 m before the end: there the wall may be that it ends on.
-            t = fraction * np.maximum(1.0 - 0.3 / np.maximum(length, 0.3), 0.0)
-            passed |= self.state_at(ox + t * (x - ox), oy + t * (y - oy)) == OCCUPIED
+        along, across = x - ox, y - oy
+        # Up to 0.3 m before the end: there the wall may be that it ends on.
+        t = _LOOKS[:, None, None] * np.maximum(1.0 - 0.3 / np.maximum(np.hypot(along, across), 0.3), 0.0)
+        passed = (self.state_at(ox + t * along, oy + t * across) == OCCUPIED).any(axis=0)
         value = np.where(passed, np.where(rays.hit, np.log(_STRANGE), 0.5 * np.log(_STRANGE)), value)
         ends = rays.hit & ~unknown
         known = ends.sum(axis=1).astype(np.float64)
@@ -201,7 +199,7 @@ _ON_WALL, _FINE = 0.1, 0.05
 """m; standard deviation of an end about the wall in cells of the second: cells, lidar noise and a pose that is not refined."""
 _STRANGE = 0.1
 """Likelihood of an end that lies on no wall, of one on a wall being 1: people, and things that were moved."""
-_LOOKS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+_LOOKS = np.arange(1, 11) / 10.0
 """Places along a ray, as shares of its length, at which it is asked whether it passes a wall."""
 
 

@@ -123,14 +123,16 @@ class Window:
         looks = [k for k in self.looks if way - k.way <= length]
         if not looks:
             return Rays(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)), np.zeros(0)
-        laid = [k.rays.moved(se2.between(odom, k.odom)) for k in looks]
-        ago = np.concatenate([np.full(len(k.rays.hit), way - k.way) for k in looks])
-        return concatenated(laid), ago
+        rays, of = concatenated([k.rays for k in looks]), np.repeat(np.arange(len(looks)), [len(k.rays.hit) for k in looks])
+        poses = se2.between(odom, np.array([k.odom for k in looks]))
+        ends, origins = (se2.transform_each(poses, of, p) for p in (rays.ends, rays.origins))
+        return Rays(ends, origins, rays.hit), np.array([way - k.way for k in looks])[of]
 
     def ranges_since(self, odom: Floats, way: float) -> Ranges:
         """Return the ranges, with the tag's places in the present frame of the base."""
         rows = self.ranges
-        tags = np.array([se2.transform(se2.between(odom, r.odom), r.tag) for r in rows]).reshape(-1, 2)
+        then, tag = np.array([r.odom for r in rows]).reshape(-1, 3), np.array([r.tag for r in rows]).reshape(-1, 2)
+        tags = se2.transform(se2.between(odom, then), tag)
         ago = np.array([way - r.way for r in rows])
         measured = np.array([r.fact.range / (1.0 + r.fact.scale) for r in rows])
         level = np.sqrt(np.maximum(measured**2 - np.array([r.fact.square for r in rows]), 1e-2))
