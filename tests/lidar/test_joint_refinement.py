@@ -250,7 +250,7 @@ def test_the_gate_shrinks_at_its_own_pace_where_a_step_failed(monkeypatch, bette
 
     summary = SimpleNamespace(chi2_initial=1.0, chi2_history=[0.5 if better else 1.0])
     monkeypatch.setattr(joint_refinement, "match", recorded)
-    monkeypatch.setattr(joint_refinement, "minimise", lambda problem, *_: (problem, summary))
+    monkeypatch.setattr(joint_refinement.Optimizer, "optimize", lambda self, problem, config: (problem, summary))
     graph, config = Graph(truth).with_edges(chained(truth, NOISE)), replace(CONFIG, rounds=4, convergence=0.0)
     assert refined(graph, clouds, path, config, selections=1).rounds == 4
     np.testing.assert_allclose(asked, gates)

@@ -93,7 +93,7 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
         return estimate
 
     monkeypatch.setattr(lidar_stages, "with_range_noise", lambda estimate, config: estimate)
-    monkeypatch.setattr(lidar_stages, "solved", lambda estimate, task: made.append("solve") or estimate)
+    monkeypatch.setattr(lidar_stages, "solved", lambda estimate, task, optimizer: made.append("solve") or estimate)
     monkeypatch.setattr(lidar_stages, "_matched_once_more", matched)
     assert lidar_stages._by_own_errors(estimate, scans, task) is estimate
     assert " ".join(made) == done

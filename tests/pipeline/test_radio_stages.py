@@ -71,9 +71,8 @@ def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(mo
     estimate = Estimate(graph, graph.edges[0], None, ())
     assert select_range_priors(estimate, None) is estimate
     monkeypatch.setattr(radio_stages, "with_range_noise", lambda e, config, steady: made.append(f"noise {steady}") or e)
-    monkeypatch.setattr(
-        radio_stages, "optimize", lambda problem, solver: made.append(f"solve {solver.max_iterations}") or (graph, None)
-    )
+    solving = SimpleNamespace(optimize=lambda problem, solver: made.append(f"solve {solver.max_iterations}") or (graph, None))
+    monkeypatch.setattr(radio_stages, "Optimizer", lambda: solving)
     monkeypatch.setattr(radio_stages.prior_selection, "select_priors", lambda graph, *rest: made.append("priors") or graph)
     config = MappingConfig()
     task = Task(None, replace(config, solver=replace(config.solver, max_iterations=7)), Constraints(), None)

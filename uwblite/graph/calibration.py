@@ -6,7 +6,8 @@ import numpy as np
 
 from ..arrays import Bools, Ints
 from .graph import Calibration, Graph, PriorEdges, UnknownKey
-from .solver import SolverConfig, SolverSummary, optimize
+from .optimizer import Optimizer
+from .solver import SolverConfig, SolverSummary
 from .unknowns import free_unknowns
 
 ODOMETRY = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
@@ -171,13 +172,20 @@ def with_free(graph: Graph, *kinds: str) -> Graph:
     return replace(graph, fixed_calibration=graph.fixed_calibration & ~graph.calibration.of_kinds(*kinds))
 
 
-def optimize_with_heights(graph: Graph, config: SolverConfig = SolverConfig()) -> tuple[Graph, SolverSummary]:
+def optimize_with_heights(
+    graph: Graph, config: SolverConfig, optimizer: Optimizer | None = None
+) -> tuple[Graph, SolverSummary]:
     """Return the graph at its optimum without a squared height below 0, and how the last search went; see solver.optimize.
 
     Heights that come out negative are fixed at 0, and all else is solved again: it was at the optimum with them.
+
+    Parameters
+    ----------
+    optimizer : of graphs like this one.
     """
+    optimizer = optimizer or Optimizer()
     while True:
-        solved, summary = optimize(graph, config)
+        solved, summary = optimizer.optimize(graph, config)
         graph = with_nonnegative_heights(solved)
         anything_free = any(free.any() for free in free_unknowns(graph).values())
         if not anything_free or np.array_equal(graph.calibration.values, solved.calibration.values):

@@ -21,6 +21,7 @@ from ..arrays import Floats
 from .graph import Graph, Linearization, PriorEdges, linearize
 from .loop_edges import closing
 from .normal_equations import NormalEquations
+from .optimizer import Optimizer
 from .problem_checks import check
 from .robust import SQUARED, Kernel
 from .solver import Progress, SolverConfig, SolverSummary, minimise
@@ -38,16 +39,11 @@ def tightened(graph: Graph, chosen: Collection[int], scales: Sequence[float], so
     ----------
     chosen : their positions in ``graph.edges``.
     """
-    normal: NormalEquations | None = None
+    optimizer = Optimizer()
     for scale in scales:
         kernel = Kernel("geman-mcclure", scale)
         edges = tuple(replace(e, kernel=kernel) if k in chosen else e for k, e in enumerate(graph.edges))  # type: ignore[type-var]
-        graph = replace(graph, edges=edges)
-        check(graph)
-        linearized = linearize(graph)
-        # Kernels change no pattern.
-        normal = normal or NormalEquations(graph, linearized)
-        graph = minimise(graph, linearized, normal, solver)[0]
+        graph = optimizer.optimize(replace(graph, edges=edges), solver)[0]
     return graph
 
 

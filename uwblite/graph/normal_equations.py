@@ -26,6 +26,8 @@ _AT_ONCE = 1 << 15
 _NONE = np.zeros(0, dtype=np.int64)
 _Touched = tuple[Ints, bool]
 """Node (e,) touched by each edge, -1 = fixed; and whether it is a calibration value."""
+_Block = tuple[str, Ints, tuple[int, ...]]
+"""Name, unknown (e,) touched by each edge, and shape of an edge's Jacobian."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +56,8 @@ class NormalEquations:
         subtrees : order for the selected inverse, not for speed.
         last : poses to be eliminated after all others.
         """
-        free = free_unknowns(graph)
+        self._analysed = free_unknowns(graph), [_touched(lin) for lin in linearized]
+        free = self._analysed[0]
         counts = [int(mask.sum()) for mask in free.values()]
         self._values = sum(counts[:2])
         width = np.repeat(list(WIDTHS.values()), counts)
@@ -88,6 +91,15 @@ class NormalEquations:
             self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
+
+    def suits(self, graph: Graph, linearized: Sequence[Linearization]) -> bool:
+        """Return whether the same is free in another graph, and its linearised edges touch the same."""
+        free, kinds = self._analysed
+        return (
+            len(linearized) == len(kinds)
+            and all(np.array_equal(free[name], mask) for name, mask in free_unknowns(graph).items())
+            and all(_same(blocks, _touched(lin)) for blocks, lin in zip(kinds, linearized, strict=True))
+        )
 
     def _pairs(self, touched: list[list[_Touched]], nodes: int) -> tuple[Ints, list[Ints]]:
         """Return the pairs (b, 2) of nodes that share an edge, every node with itself first; and each edge's pair."""
@@ -220,6 +232,17 @@ class NormalEquations:
         values = self.values.copy()
         values[self._diagonal] += damping
         return self._layout.factor(values)
+
+
+def _touched(lin: Linearization) -> list[_Block]:
+    return [(name, index, jac.shape[1:]) for name, index, jac in lin.blocks]
+
+
+def _same(one: list[_Block], other: list[_Block]) -> bool:
+    return len(one) == len(other) and all(
+        a == b and shape == form and (index is place or np.array_equal(index, place))
+        for (a, index, shape), (b, place, form) in zip(one, other, strict=True)
+    )
 
 
 def filled(graph: Graph, subtrees: bool = False, last: Ints | None = None) -> NormalEquations:

@@ -16,12 +16,11 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..config import setting
 from ..graph.calibration import scan_indices
-from ..graph.graph import Graph, linearize
-from ..graph.normal_equations import NormalEquations
+from ..graph.graph import Graph
+from ..graph.optimizer import Optimizer
 from ..graph.pose_edges import ScanEdges
-from ..graph.problem_checks import check
 from ..graph.robust import Kernel
-from ..graph.solver import SolverConfig, SolverSummary, minimise
+from ..graph.solver import SolverConfig, SolverSummary
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .scan_matching import PairFactors, match, measured, pair_points
@@ -190,7 +189,7 @@ def refine(
     gate, sigma, rounds = config.first_gate, config.sigma, 0
     none = np.zeros((0, 3)), np.zeros((0, 3, 3))
     probe = ScanEdges(i, j, *none, twist[i], twist[j], names, delay, Kernel("cauchy", 5.0))
-    normal: NormalEquations | None = None
+    optimizer = Optimizer()
     # The next round looks all matches up again: one good step is enough, but one it has to be.
     brief = replace(solver, max_iterations=12, relative_decrease=0.5)
     T_i_j = probe.relative(graph)
@@ -206,11 +205,7 @@ def refine(
         z, sqrt_information = measured(factors, T_i_j, variance)
         # Pairs that do not count stay in with no weight: then all rounds share one pattern, analysed once.
         edges = replace(probe, T_i_j=z, sqrt_information=sqrt_information, weights=used.astype(np.float64))
-        problem = graph.with_edges(edges)
-        check(problem)
-        linearized = linearize(problem)
-        normal = normal or NormalEquations(problem, linearized)
-        solved, summary = minimise(problem, linearized, normal, brief)
+        solved, summary = optimizer.optimize(graph.with_edges(edges), brief)
         graph = graph.with_estimates_of(solved)
         before, T_i_j = T_i_j, probe.relative(graph)
         moved = _surfaces_moved(factors, used, T_i_j - before)

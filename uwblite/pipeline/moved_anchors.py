@@ -8,8 +8,9 @@ from ..arrays import Floats, Ints
 from ..graph.calibration import BIAS
 from ..graph.graph import Graph
 from ..graph.marginals import marginals
+from ..graph.optimizer import Optimizer
 from ..graph.robust import Kernel
-from ..graph.solver import SolverConfig, optimize
+from ..graph.solver import SolverConfig
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
 from ..sensor_log.anchor_names import numbered, radio_name
@@ -85,8 +86,9 @@ def _places_by_recording(
     # Outliers of the joint map may be of an anchor that was moved: first all ranges count alike.
     alike = np.ones(len(alive))
     edges = replace(ranges.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5), weights=alike)
-    edges, _ = learn_noise(edges, optimize(alone.with_edges(edges), solver)[0], len(pairs), noise)
-    solved = optimize(alone.with_edges(edges), solver)[0]
+    optimizer = Optimizer()
+    edges, _ = learn_noise(edges, optimizer.optimize(alone.with_edges(edges), solver)[0], len(pairs), noise)
+    solved = optimizer.optimize(alone.with_edges(edges), solver)[0]
     return solved.anchors, marginals(solved).anchors, pairs
 
 

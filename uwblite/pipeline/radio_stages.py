@@ -21,7 +21,8 @@ from ..graph.calibration import (
     with_nonnegative_heights,
 )
 from ..graph.graph import Graph
-from ..graph.solver import SolverConfig, optimize
+from ..graph.optimizer import Optimizer
+from ..graph.solver import SolverConfig
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.wheels import wheel_edges
@@ -103,14 +104,15 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     """Optimise odometry and ranges together, estimating the ranges' noise on the way."""
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
-    config = task.config
+    config, optimizer = task.config, Optimizer()
     for lap in range(_NOISE_ROUNDS):
         estimate = with_range_noise(estimate, config)
         if lap == _NOISE_ROUNDS - 1:
             graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
             estimate = replace(estimate, graph=with_free(graph, *RADIO))
         solver = config.solver if lap else rough(config.solver)
-        solved, result = optimize_with_heights(estimate.graph.with_edges(*estimate.odometry_and_ranges), solver)
+        problem = estimate.graph.with_edges(*estimate.odometry_and_ranges)
+        solved, result = optimize_with_heights(problem, solver, optimizer)
         graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
         estimate = replace(estimate, graph=graph.with_estimates_of(solved))
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
@@ -181,14 +183,14 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     Odometry alone is soft enough to be bent until ranges with errors that last for minutes seem to fit. On the stiffer
     chain such errors stand out.
     """
-    config, steps = task.config, estimate.steps
+    config, steps, optimizer = task.config, estimate.steps, Optimizer()
     if estimate.ranges is None or steps is None:
         return estimate
     for solver in (rough(config.solver), config.solver):
         graph = relocate(estimate.ranges, estimate.graph, ~estimate.graph.fixed_anchors, config.trilateration)
         estimate = with_range_noise(replace(estimate, graph=graph), config)
         problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
-        estimate = estimate.with_estimates_of(optimize(problem, solver)[0])
+        estimate = estimate.with_estimates_of(optimizer.optimize(problem, solver)[0])
     task.stages.end("ranges re-estimated")
     return replace(estimate, graph=with_nonnegative_heights(estimate.graph))
 
@@ -207,9 +209,10 @@ def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors."""
     if estimate.ranges is None:
         return estimate
+    optimizer = Optimizer()
     for solver in (rough(task.config.solver), task.config.solver):
         # The marginal likelihood is one about the optimum of the very weights that it is computed with.
         estimate = with_range_noise(estimate, task.config, steady=True)
         edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
-        estimate = estimate.with_estimates_of(optimize(estimate.graph.with_edges(*edges), solver)[0])
+        estimate = estimate.with_estimates_of(optimizer.optimize(estimate.graph.with_edges(*edges), solver)[0])
     return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))
