@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from uwblite.radio.change_points import _CARRIED, _returned, _split, find_move, find_moves
+from uwblite.radio.change_points import _CARRIED, _returned, _splits, find_move, find_moves
 from uwblite.radio.trilateration import TrilaterationConfig
 
 STAMPS = np.arange(0.0, 200.0, 1.0)
@@ -148,7 +148,7 @@ def test_the_moments_are_those_at_which_both_places_explain_most():
     ranges = measured(3, np.array([-2.0, 1.0]), np.array([1.0, 4.0]), 90)
     ranges[80:95] += 3.0
     width = 0.24
-    split = _split(PATH, ranges, 70, 110, width, TrilaterationConfig())
+    split = _splits(PATH, ranges, [(70, 110)], width, TrilaterationConfig())[70, 110]
 
     def misfit(place):
         off = np.abs(ranges - np.hypot(*(PATH - place.position).T) - place.bias)

@@ -16,6 +16,7 @@ from uwblite.radio.trilateration import (
     agreement,
     ambiguous,
     trilaterate,
+    trilaterate_each,
     usable,
 )
 
@@ -217,11 +218,29 @@ def test_the_score_of_a_place_is_its_truncated_cost_with_that_of_its_bias():
     assert _scored(path, ranges, state[None], -covariance[None], np.array([0.5]), 0.1, CONFIG)[0].position_sigma == 0.0
 
 
+def test_stretches_searched_together_have_the_places_of_each_alone():
+    """Of 100 ranges at most, of fewer, and of too few."""
+    rng = np.random.default_rng(6)
+    stretches = []
+    for count in (300, 60, 7, 150, 60, 100):
+        path = loop_path(rng, count=count)
+        stretches.append((path, measured(rng, path, rng.uniform(-6.0, 6.0, 2), 0.1, 0.2, 0.1)))
+    each = trilaterate_each(stretches, CONFIG, 0.1)
+    assert each[2] == []
+    for (path, ranges), together in zip(stretches, each, strict=True):
+        alone = trilaterate(path, ranges, CONFIG, 0.1)
+        assert len(together) == len(alone)
+        for one, other in zip(together, alone, strict=True):
+            np.testing.assert_allclose(one.position, other.position, atol=1e-9)
+            assert one.cost == pytest.approx(other.cost)
+
+
 def test_covariances_are_those_of_least_squares_with_the_bias_under_its_prior():
     """Of exact ranges, weighed fully: J^T J, the prior of a bias whose sigma is a multiple of the noise, and a thousandth."""
     rng, drift = np.random.default_rng(4), 0.3
     path, anchor = loop_path(rng), np.array([4.0, -2.5])
-    state, covariance, _ = _refine(path, np.hypot(*(path - anchor).T), np.array([[4.2, -2.6, 0.0]]), 0.5, drift, CONFIG)
+    ranges, start = np.hypot(*(path - anchor).T), np.array([[4.2, -2.6, 0.0]])
+    state, covariance, _ = _refine(path[None], ranges[None], start, np.array([0.5]), drift, CONFIG)
     np.testing.assert_allclose(state, [[*anchor, 0.0]], atol=1e-3)
     away = anchor - path
     jacobian = np.column_stack([away / np.hypot(*away.T)[:, None], np.ones(len(path))])

@@ -20,7 +20,7 @@ from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.solver import SolverConfig
-from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate
+from .trilateration import AnchorHypothesis, TrilaterationConfig, ambiguous, trilaterate_each
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,12 +199,10 @@ class Attempt:
     def _search(self, low: int, high: int, drift: float) -> dict[int, list[AnchorHypothesis]]:
         """Search the anchors not yet placed from the poses in [low, high)."""
         ranges, inside = self.ranges, self.live & (self.ranges.pose >= low) & (self.ranges.pose < high)
-        found = {}
-        for anchor in np.unique(ranges.anchor[inside]):
-            if not self.placed[anchor]:
-                own = ranges.rows(inside & (ranges.anchor == anchor))
-                found[int(anchor)] = trilaterate(own.tag_positions(self.poses), own.planar_ranges(), self.search, drift)
-        return found
+        anchors = [anchor for anchor in np.unique(ranges.anchor[inside]).tolist() if not self.placed[anchor]]
+        rows = [ranges.rows(inside & (ranges.anchor == anchor)) for anchor in anchors]
+        stretches = [(own.tag_positions(self.poses), own.planar_ranges()) for own in rows]
+        return dict(zip(anchors, trilaterate_each(stretches, self.search, drift), strict=True))
 
     def _adopt(self, found: dict[int, list[AnchorHypothesis]]) -> bool:
         """Place the anchors of which one hypothesis stands out; remember all; return whether any was placed."""

@@ -7,12 +7,13 @@ or a path that is wrong by some decimetres, has ranges that a place metres aside
 clearly more ranges than one place with another constant error from then on.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import Floats
-from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate
+from .trilateration import AnchorHypothesis, TrilaterationConfig, trilaterate_each
 
 _SPLITS = 7
 """Moments tried first, evenly spread over the ranges."""
@@ -129,14 +130,14 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     if len(ranges) < 2 * _LEAST_RANGES:
         return None
     width, gain = _width(sigma), max(_GAIN * len(ranges), _FEWEST)
-    alone = float(_misfit(path, ranges, _fitted(path, ranges, width, config), width).sum())
+    alone = float(_misfit(path, ranges, _fitted([(path, ranges)], width, config)[0], width).sum())
     if alone < gain:
         return None
     starts = np.unique(np.linspace(_LEAST_RANGES, len(ranges) - _LEAST_RANGES, _SPLITS).astype(np.int64)).tolist()
-    tried = {(k, k): _split(path, ranges, k, k, width, config) for k in starts[1::2] or starts}
+    tried = _splits(path, ranges, [(k, k) for k in starts[1::2] or starts], width, config)
     if alone - min(found.unexplained for found in tried.values()) < _PROMISING * gain:
         return None
-    tried |= {(k, k): _split(path, ranges, k, k, width, config) for k in starts[::2]}
+    tried |= _splits(path, ranges, [(k, k) for k in starts[::2]], width, config)
     likely = sorted(tried, key=lambda at: tried[at].cost)[:_LIKELY]
     best = min((_converged(path, ranges, at, width, config, tried) for at in likely), key=lambda found: found.cost)
     move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
@@ -177,7 +178,7 @@ def _converged(
     """
     for _ in range(_ROUNDS):
         if at not in tried:
-            tried[at] = _split(path, ranges, *at, width, config)
+            tried |= _splits(path, ranges, [at], width, config)
         found = tried[at]
         if (found.left, found.moment) == at:
             break
@@ -185,10 +186,19 @@ def _converged(
     return found
 
 
-def _split(path: Floats, ranges: Floats, left: int, first: int, width: float, config: TrilaterationConfig) -> _Split:
-    """Fit places to the ranges before and after two moments; the costs of all other moments follow from running sums."""
+def _splits(
+    path: Floats, ranges: Floats, moments: list[tuple[int, int]], width: float, config: TrilaterationConfig
+) -> dict[tuple[int, int], _Split]:
+    """Fit places to the ranges before and after several pairs of moments."""
+    parts = [part for left, first in moments for part in (slice(0, left), slice(first, None))]
+    places = _fitted([(path[part], ranges[part]) for part in parts], width, config)
+    each = zip(moments, places[::2], places[1::2], strict=True)
+    return {at: _split(path, ranges, before, after, width) for at, before, after in each}
+
+
+def _split(path: Floats, ranges: Floats, before: AnchorHypothesis, after: AnchorHypothesis, width: float) -> _Split:
+    """Choose the moments that suit two places best; the costs of all follow from running sums."""
     low, high = _LEAST_RANGES, len(ranges) - _LEAST_RANGES
-    before, after = (_fitted(path[part], ranges[part], width, config) for part in (slice(0, left), slice(first, None)))
     by_one, by_other = (_misfit(path, ranges, place, width) for place in (before, after))
     until, since = (np.concatenate([[0.0], np.cumsum(by - _CARRIED)])[low : high + 1] for by in (by_one, by_other))
     best = int(np.argmin(np.minimum.accumulate(until) - since))
@@ -205,15 +215,19 @@ def _with_step(path: Floats, ranges: Floats, split: _Split, width: float, config
     for place, others in ((split.before, late), (split.after, ~late)):
         off = ranges - np.hypot(*(place.position - path).T) - place.bias
         level = ranges - others * np.clip(np.median(off[others]), -_STEP, _STEP)
-        places = (place, _fitted(path, level, width, config))
+        places = (place, *_fitted([(path, level)], width, config))
         unexplained.append(min(float(_misfit(path, level, at, width).sum()) for at in places))
     return min(unexplained)
 
 
-def _fitted(path: Floats, ranges: Floats, width: float, config: TrilaterationConfig) -> AnchorHypothesis:
-    """Return the place that leaves the fewest ranges unexplained."""
-    found = trilaterate(path, ranges, config)[:3]
-    return min(found, key=lambda place: float(_misfit(path, ranges, place, width).sum()))
+def _fitted(
+    stretches: Sequence[tuple[Floats, Floats]], width: float, config: TrilaterationConfig
+) -> list[AnchorHypothesis]:
+    """Return the place that leaves the fewest ranges unexplained, for each stretch of path (m, 2) and ranges (m,)."""
+    return [
+        min(found[:3], key=lambda place: float(_misfit(path, ranges, place, width).sum()))
+        for (path, ranges), found in zip(stretches, trilaterate_each(stretches, config), strict=True)
+    ]
 
 
 def _misfit(path: Floats, ranges: Floats, place: AnchorHypothesis, width: float) -> Floats:

@@ -13,7 +13,7 @@ from ..odometry.attached import AttachedRanges
 from ..sensor_log import SensorMounting
 from . import nlos_mixture
 from .range_noise import RangeNoise, RangeNoiseConfig, assumed, effective_sigma, learn, steady_sigma
-from .trilateration import TrilaterationConfig, agreement, trilaterate, usable
+from .trilateration import TrilaterationConfig, agreement, trilaterate_each, usable
 
 _RANGES = Kernel("cauchy", 2.5)
 
@@ -58,10 +58,9 @@ def relocate(edges: RangeEdges, graph: Graph, placed: Bools, search: Trilaterati
     edges : ranges; those of weight 0 do not count. placed : (a,) anchors that may be moved.
     """
     positions, anchors = edges.tag_positions(graph.poses), graph.anchors.copy()
-    for anchor in np.flatnonzero(placed):
-        own = np.flatnonzero(edges.alive & (edges.anchor == anchor))
-        level = edges.rows(own).planar_ranges()
-        found = trilaterate(positions[own], level, search, _LEVEL_SIGMA)
+    rows = [np.flatnonzero(edges.alive & (edges.anchor == anchor)) for anchor in np.flatnonzero(placed)]
+    each = trilaterate_each([(positions[own], edges.rows(own).planar_ranges()) for own in rows], search, _LEVEL_SIGMA)
+    for anchor, own, found in zip(np.flatnonzero(placed), rows, each, strict=True):
         if not found:
             continue
         here, there = (

@@ -5,6 +5,7 @@ ranges agree with it up to one common bias (their median), so up to almost half 
 cells are refined one by one. A straight path leaves two mirrored positions of equal worth; both come back.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -69,19 +70,51 @@ def trilaterate(path: Floats, ranges: Floats, config: TrilaterationConfig, drift
     -------
     Hypotheses, best first; empty where there are fewer than min_ranges ranges.
     """
-    if len(ranges) < config.min_ranges:
-        return []
-    pick = np.unique(np.linspace(0, len(ranges) - 1, config.samples).astype(np.int64))
-    path, ranges = path[pick], ranges[pick]
-    cells, biases, step = _raster_search(path, ranges, config)
-    states, covariances, sigmas = _refine(path, ranges, _starts(cells, biases, step), step, drift, config)
-    floor = max(float(sigmas.min()), 0.5 * drift, 0.02)
-    distinct: list[AnchorHypothesis] = []
-    for hypothesis in _scored(path, ranges, states, covariances, sigmas, floor, config):
-        apart = [np.hypot(*(hypothesis.position - other.position)) for other in distinct]
-        if all(a > max(3.0 * floor, 0.5 * step) for a in apart):
-            distinct.append(hypothesis)
-    return distinct
+    return trilaterate_each([(path, ranges)], config, drift)[0]
+
+
+def trilaterate_each(
+    stretches: Sequence[tuple[Floats, Floats]], config: TrilaterationConfig, drift: float = 0.0
+) -> list[list[AnchorHypothesis]]:
+    """Find the same for several stretches of ranges, each with path and ranges as above, in a third of the time."""
+    found: list[list[AnchorHypothesis]] = [[] for _ in stretches]
+    of_size: dict[int, list[int]] = {}
+    for k, (_, ranges) in enumerate(stretches):
+        if len(ranges) >= config.min_ranges:
+            of_size.setdefault(min(len(ranges), config.samples), []).append(k)
+    for own in of_size.values():
+        for first in range(0, len(own), _AT_ONCE):
+            some = own[first : first + _AT_ONCE]
+            for k, hypotheses in zip(some, _of_one_size([stretches[k] for k in some], config, drift), strict=True):
+                found[k] = hypotheses
+    return found
+
+
+_AT_ONCE = 8
+"""Stretches searched together; more of them no longer fit into a processor's cache."""
+
+
+def _of_one_size(
+    stretches: Sequence[tuple[Floats, Floats]], config: TrilaterationConfig, drift: float
+) -> Iterator[list[AnchorHypothesis]]:
+    """Yield the hypotheses of stretches of ranges of which equally many are looked at."""
+    picks = [np.unique(np.linspace(0, len(ranges) - 1, config.samples).astype(np.int64)) for _, ranges in stretches]
+    picked = [(path[pick], ranges[pick]) for (path, ranges), pick in zip(stretches, picks, strict=True)]
+    searched = [_raster_search(path, ranges, config) for path, ranges in picked]
+    starts = [_starts(*found) for found in searched]
+    each = np.repeat(np.arange(len(starts)), [len(s) for s in starts])
+    steps = np.array([step for _, _, step in searched])[each]
+    paths, ranges = (np.stack(columns) for columns in zip(*picked, strict=True))
+    refined = _refine(paths[each], ranges[each], np.concatenate(starts), steps, drift, config)
+    for k, (path, own) in enumerate(picked):
+        states, covariances, sigmas = (values[each == k] for values in refined)
+        floor = max(float(sigmas.min()), 0.5 * drift, 0.02)
+        distinct: list[AnchorHypothesis] = []
+        for hypothesis in _scored(path, own, states, covariances, sigmas, floor, config):
+            apart = [np.hypot(*(hypothesis.position - other.position)) for other in distinct]
+            if all(a > max(3.0 * floor, 0.5 * searched[k][2]) for a in apart):
+                distinct.append(hypothesis)
+        yield distinct
 
 
 def ambiguous(hypotheses: list[AnchorHypothesis], config: TrilaterationConfig) -> bool:
@@ -144,38 +177,45 @@ _NO_BIAS = 0.5
 
 
 def _refine(
-    path: Floats, ranges: Floats, starts: Floats, step: float, drift: float, config: TrilaterationConfig
+    paths: Floats, ranges: Floats, starts: Floats, steps: Floats, drift: float, config: TrilaterationConfig
 ) -> tuple[Floats, Floats, Floats]:
-    """Refine starts (s, 3) by Gauss-Newton with a shrinking kernel.
+    """Refine starts (s, 3) by Gauss-Newton with a shrinking kernel, each with its own ranges.
+
+    Parameters
+    ----------
+    paths : (s, m, 2) positions of the tag, m. ranges : (s, m) m. steps : (s,) cell of the raster of each start, m.
 
     Returns
     -------
     Position and bias (s, 3), their covariances (s, 3, 3) for unit sigma, and robust sigmas (s,).
     """
     count, eye = len(starts), np.eye(3)
-    state = starts.copy()
-    scale, normal = np.full(count, 1.5 * step), np.tile(eye, (count, 1, 1))
+    state, x, y = starts.copy(), np.ascontiguousarray(paths[:, :, 0]), np.ascontiguousarray(paths[:, :, 1])
+    scale, normal = 1.5 * steps, np.tile(eye, (count, 1, 1))
     robust, on = np.zeros(count), np.arange(count)
     for _ in range(25):
-        dx, dy = (state[on, k, None] - path[:, k] for k in (0, 1))
+        here, width = state[on], scale[on]
+        dx, dy = here[:, :1] - x, here[:, 1:2] - y
         distance = np.maximum(np.sqrt(dx * dx + dy * dy), 1e-6)
-        error = ranges - distance - state[on, 2:]
-        weight = 1.0 / (1.0 + (error / scale[on, None]) ** 2) ** 2
-        jacobian = np.stack([dx / distance, dy / distance, np.ones_like(dx)], axis=1)
-        weighted = jacobian * weight[:, None]
-        equations, gradient = weighted @ jacobian.transpose(0, 2, 1), (weighted @ error[:, :, None])[:, :, 0]
-        robust[on] = MAD_TO_SIGMA * row_medians(np.abs(error))
-        prior = (np.clip(robust[on], drift, scale[on]) / config.bias_sigma) ** 2
+        rows = np.stack([dx / distance, dy / distance, np.ones_like(dx), ranges - distance - here[:, 2:]], axis=1)
+        error = rows[:, 3]
+        weight = 1.0 / np.square(1.0 + np.square(error / width[:, None]))
+        products = (rows[:, :3] * weight[:, None]) @ rows.transpose(0, 2, 1)
+        equations, gradient = products[:, :, :3], products[:, :, 3]
+        robust[on] = sigma = MAD_TO_SIGMA * row_medians(np.abs(error))
+        prior = (np.clip(sigma, drift, width) / config.bias_sigma) ** 2
         equations[:, 2, 2] += prior
-        gradient[:, 2] -= prior * state[on, 2]
+        gradient[:, 2] -= prior * here[:, 2]
         equations += 1e-3 * equations * eye + 1e-9 * eye
         delta = np.linalg.solve(equations, gradient[:, :, None])[:, :, 0]
-        state[on] += delta * np.minimum(1.0, 2.0 * step / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), 1e-12))[:, None]
+        farthest = 2.0 * steps[on] / np.maximum(np.hypot(delta[:, 0], delta[:, 1]), 1e-12)
+        state[on] = here + delta * np.minimum(1.0, farthest)[:, None]
         normal[on] = equations
-        tight = np.maximum(2.0 * robust[on], max(drift, 0.05))
-        done = (scale[on] <= tight * 1.01) & (np.abs(delta).max(axis=1) < 1e-3)
-        scale[on] = np.maximum(0.7 * scale[on], tight)
-        on = on[~done]
+        tight = np.maximum(2.0 * sigma, max(drift, 0.05))
+        going = (width > tight * 1.01) | (np.abs(delta).max(axis=1) >= 1e-3)
+        scale[on] = np.maximum(0.7 * width, tight)
+        if not going.all():
+            on, x, y, ranges = on[going], x[going], y[going], ranges[going]
         if not len(on):
             break
     return state, np.asarray(np.linalg.inv(normal), dtype=np.float64), np.maximum(robust, 1e-3)
