@@ -15,6 +15,7 @@ from uwblite.arrays import (
     sigma_of_median,
     spread,
     spread_about_median,
+    unique_rows,
 )
 
 
@@ -53,6 +54,17 @@ def test_renumbered_values_are_those_of_either_array_once():
     assert used.tolist() == [3, 7, 9]
     assert (used[one].tolist(), used[other].tolist()) == ([7, 3, 7], [9, 3, 3])
     assert [a.size for a in renumbered(np.zeros(0, int), np.zeros(0, int))] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3])
+@pytest.mark.parametrize("count", [0, 1, 200])
+def test_unique_rows_are_numpys(count, columns):
+    rows = np.random.default_rng(3).integers(-3, 4, (count, columns))
+    for table in (rows, np.floor(rows / 2.0)):
+        found, number = unique_rows(table)
+        expected, where = np.unique(table, axis=0, return_inverse=True)
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(number, where.reshape(-1))
 
 
 def test_runs_are_those_of_set_flags():

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _Joined = TypeVar("_Joined")
+_Number = TypeVar("_Number", np.float64, np.int64)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,6 +36,20 @@ def renumbered(one: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
     used, number = np.unique(np.concatenate([one, other]), return_inverse=True)
     where = number.reshape(-1).astype(np.int64)
     return used, where[: len(one)], where[len(one) :]
+
+
+def unique_rows(rows: NDArray[_Number]) -> tuple[NDArray[_Number], Ints]:
+    """Return the different rows (u, k) of a table (n, k), ascending, and which of them each row is (n,).
+
+    The same as numpy.unique with axis=0, which sorts rows as wholes and takes ten times as long.
+    """
+    order = np.lexsort(rows.T[::-1])
+    ascending = rows[order]
+    fresh = np.ones(len(rows), dtype=bool)
+    fresh[1:] = np.any(ascending[1:] != ascending[:-1], axis=1)
+    number = np.empty(len(rows), dtype=np.int64)
+    number[order] = np.cumsum(fresh) - 1
+    return ascending[fresh], number
 
 
 def concatenated(parts: Sequence[_Joined]) -> _Joined:

@@ -51,10 +51,12 @@ def seen_beyond(free: FreeSpace, points: Floats, margin: float) -> tuple[Ints, I
     -------
     through (m,), in_view (m,) : the latter within the seen free space or up to margin behind it.
     """
-    local = se2.transform(se2.inverse(free.poses)[:, None, :], points[None, :, :])
-    distance, parts = np.hypot(local[..., 0], local[..., 1]), free.ranges.shape[1]
-    bins = ((se2.bearing(local) + np.pi) / (2.0 * np.pi / parts)).astype(np.int64) % parts
-    until = free.ranges[np.arange(len(free.poses))[:, None], bins]
+    back, parts = se2.inverse(free.poses)[:, :, None], free.ranges.shape[1]
+    (c, s), (px, py) = se2.cos_sin(back[:, 2]), points.T
+    x, y = c * px - s * py + back[:, 0], s * px + c * py + back[:, 1]
+    distance = np.sqrt(x * x + y * y)
+    bins = ((np.arctan2(y, x) + np.pi) / (2.0 * np.pi / parts)).astype(np.int64) % parts
+    until = free.ranges.take(bins + parts * np.arange(len(free.poses))[:, None])
     reach = until > 0.0
     return (reach & (distance < until - margin)).sum(axis=0), (reach & (distance < until + margin)).sum(axis=0)
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, unique_rows
 from ..graph.graph import Graph, whiten
 from ..graph.marginals import CommonErrors
 from ..graph.pose_edges import ScanEdges
@@ -65,7 +65,7 @@ def _common(edges: ScanEdges, graph: Graph) -> CommonErrors:
 def _places(xy: Floats, size: float) -> Ints:
     """Return the number (e,) of the square of this size in which each point (e, 2) lies; of larger ones if these are many."""
     while True:
-        found, number = np.unique(np.floor(xy / size), axis=0, return_inverse=True)
+        found, number = unique_rows(np.floor(xy / size))
         if len(found) <= _MOST:
-            return np.asarray(number, dtype=np.int64).reshape(-1)
+            return number
         size *= 2.0

@@ -23,6 +23,8 @@ _SHORTEST = 2.0
 """Least mean detour, in standard deviations of the core; a shorter one is no tail but a part of the core."""
 _CLEAN = 15.0
 """Ranges to the core that are taken as seen beforehand: a few ranges alone show neither tail nor nonsense."""
+_NARROWED, _PARTS = 5, 32
+"""Times that the interval with the mode is cut into so many parts: what is left of it is below a ten millionth."""
 _WIDEST = 2.0
 """Nonsense is spread at least this wide, m."""
 
@@ -53,9 +55,10 @@ class RangeMixture:
     def mode(self) -> float:
         """Return the likeliest error, m."""
         low, high = 0.0, 3.0 * self.sigma
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if self._score(np.array([middle]))[0] > 0.0 else (middle, high)
+        for _ in range(_NARROWED):
+            at = np.linspace(low, high, _PARTS + 1)
+            first = int(np.argmax(np.append(self._score(at[1:-1]) > 0.0, True)))
+            low, high = float(at[first]), float(at[first + 1])
         return self.centre + low
 
     def weights(self, errors: Floats) -> Floats:

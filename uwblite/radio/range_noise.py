@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from ..arrays import Floats, Ints, spread
+from ..arrays import Floats, Ints, spread, unique_rows
 from ..config import setting
 from ..graph.robust import Kernel
 
@@ -203,8 +203,7 @@ def _alike(positions: Floats, length: float, weights: Floats | None) -> Floats:
 
 def _alike_sums(positions: Floats, length: float, values: Floats) -> Floats:
     """Return the sums (m, q) of exp(-distance / length) times values (m, q) over all ranges; places binned to length / 4."""
-    cells, inverse = np.unique(np.round(positions * (4.0 / length)).astype(np.int64), axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
+    cells, inverse = unique_rows(np.round(positions * (4.0 / length)).astype(np.int64))
     tree = cKDTree(cells / 4.0)
     alike = tree.sparse_distance_matrix(tree, 4.0, output_type="coo_matrix")
     alike.data = np.exp(-alike.data)
