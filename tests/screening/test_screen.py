@@ -293,6 +293,17 @@ def test_a_gap_in_which_the_robot_drove_on_keeps_nothing_that_others_saw_meanwhi
         assert not np.any((stamps > 140.5) & (stamps < 159.5))
 
 
+def test_a_base_that_counts_no_way_while_it_is_unplugged_is_a_doubt_though_its_gyro_turned(sound):
+    """Its pose is held, for nothing shows how far it went; the lidar sees that it went."""
+    stamps, poses = sound.odometry.stamps, sound.odometry.poses.copy()
+    before, after = (int(np.searchsorted(stamps, t)) for t in (140.0, 160.0))
+    poses[after:, :2] += poses[before - 1, :2] - poses[after, :2]
+    kept = np.r_[:before, after : len(stamps)]
+    done = screen(replace(sound, odometry=Odometry(stamps[kept], poses[kept])))
+    assert kinds(done, doubts=True) == {"carried"}
+    np.testing.assert_allclose(done.screening.breaks.stamps, stamps[before - 1])
+
+
 def test_a_clock_that_was_set_back_is_a_doubt(sound):
     done = screen(replace(sound.without(lidar=True), notes=LogNotes(set_back={"radio": 30.0, "odometry": 0.2})))
     assert [r.kind for r in done.screening.remarks if r.doubt] == ["clock-set-back"]
@@ -370,12 +381,17 @@ def test_readings_outside_the_time_of_the_odometry_are_counted_and_doubted_where
     assert all("by about 1000000 s" in r.text for r in remarks if r.doubt)
 
 
-def test_a_gap_is_a_stand_a_way_or_a_robot_that_was_carried(monkeypatch):
-    """Silences of 5 s: in the first the robot stands, in the second it was put elsewhere, in the third it drives on."""
+@pytest.mark.parametrize("turned", [0.0, 2.0])
+def test_a_gap_is_a_stand_a_way_or_a_robot_that_was_carried(monkeypatch, turned):
+    """Silences of 5 s: in the first the robot stands, in the second it was put elsewhere, in the third it drives on.
+
+    Where it was put elsewhere the gyro may have counted the turn.
+    """
     stamps = np.arange(0.0, 100.0, 0.1)
     stamps = stamps[~np.any([(stamps > at) & (stamps < at + 5.0) for at in (20.05, 40.05, 60.05)], axis=0)]
     x = 0.3 * stamps - 1.5 * (stamps > 22.0) - 1.5 * (stamps > 42.0)
-    odometry = Odometry(50.0 + stamps, np.column_stack([x, np.zeros((len(x), 2))]))
+    heading = turned * (stamps > 42.0)
+    odometry = Odometry(50.0 + stamps, np.column_stack([x, np.zeros(len(x)), heading]))
     times = 50.0 + np.arange(0.0, 100.0, 0.5)
     radio = UwbRanges(times, np.zeros(200, dtype=int), np.ones(200), np.ones(200), ("A",))
     lidar = LaserScans(times, np.ones((200, 3), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 9.0)
@@ -386,8 +402,8 @@ def test_a_gap_is_a_stand_a_way_or_a_robot_that_was_carried(monkeypatch):
     np.testing.assert_allclose(breaks.sigma, [[0.02] * 3, [20.0, 20.0, 3.0], [0.1] * 3])
     assert [(r.kind, r.doubt) for r in remarks] == [("carried", True), ("odometry-gap", False)]
     assert "silent for 5 s from t = 40 s" in remarks[0].text
-    # What others saw while the robot drove on is left out, but for what is next to the odometry.
-    kept = (times <= 110.2) | (times >= 114.9)
+    # What others saw while the robot drove on or was carried is left out, but for what is next to the odometry.
+    kept = ((times <= 90.2) | (times >= 94.9)) & ((times <= 110.2) | (times >= 114.9))
     np.testing.assert_array_equal(done.ranges.stamps, times[kept])
     np.testing.assert_array_equal(done.scans.stamps, times[kept])
 

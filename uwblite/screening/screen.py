@@ -115,8 +115,10 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
     for k in gaps.tolist():
         a, b = float(stamps[k]), float(stamps[k + 1])
         step = se2.between(poses[k], poses[k + 1])
-        stood = bool(np.hypot(*step[:2]) < _STANDS[0] and abs(step[2]) < _STANDS[1])
-        elsewhere = stood and _elsewhere(log, a, b)
+        held = bool(np.hypot(*step[:2]) < _STANDS[0])
+        stood = held and bool(abs(step[2]) < _STANDS[1])
+        # A gyro may have turned with the robot while nothing counted its way.
+        elsewhere = held and _elsewhere(log, a, b)
         when = f"the odometry is silent for {b - a:.0f} s from t = {a - stamps[0]:.0f} s"
         if elsewhere:
             text = f"{when} and counts no way, but the robot was moved meanwhile: other sensors alone tie the two sides"
@@ -124,6 +126,7 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
         elif not stood:
             text = f"{when}, while the robot drove on; what other sensors saw then was left out"
             remarks.append(Remark("odometry-gap", text))
+        if elsewhere or not stood:
             silent.append((a, b))
         at.append(a)
         sigma.append(_ANYWHERE if elsewhere else (0.02, 0.02, 0.02) if stood else (0.1, 0.1, 0.1))
