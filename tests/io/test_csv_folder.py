@@ -70,6 +70,7 @@ def test_odometry_alone_is_enough_and_order_does_not_matter(tmp_path):
         ("ranges.csv", "stamp,anchor,range,quality\n1,A,x,1\n", r"ranges\.csv:2: 'x'"),
         ("scans.csv", "stamp,r0,r1\n1,2,3\n1,2\n", "1 beams, the first scan has 2"),
         ("scans.csv", "stamp,r0\n1,two\n", "not a number"),
+        ("scans.csv", "stamp\n1\n2\n", "stamp without readings"),
         ("scans.csv", "stamp,r0\n1,2\n", "geometry"),
         ("sensors.toml", "[scans]\nangle_mn = 1\n", "did you mean 'scans.angle_min'"),
     ],

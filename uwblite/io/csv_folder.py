@@ -268,6 +268,8 @@ def _read_scans(path: Path, geometry: ScanGeometry, digest: "hashlib._Hash") -> 
         if k == 0 and _is_header(row):
             continue
         beams = beams or len(row) - 1
+        if not beams:
+            raise FormatError("a stamp without readings; each beam has a column", str(path), line)
         if len(row) != beams + 1:
             raise FormatError(f"{len(row) - 1} beams, the first scan has {beams}", str(path), line)
         try:
