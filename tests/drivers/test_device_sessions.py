@@ -14,6 +14,8 @@ from helpers.driver_harness import of_kind, simulate
 
 from uwblite.drivers.dwm1001_driver import Dwm1001Driver
 from uwblite.drivers.events import Corrupt, LaserScan, Lost, Note, Param, RangeEpoch, SetBaud
+from uwblite.drivers.scip import Reply
+from uwblite.drivers.scip_commands import Geometry
 from uwblite.drivers.scip_driver import ScipDriver
 from uwblite.drivers.session import Session
 
@@ -454,6 +456,29 @@ def test_lidar_scans_that_a_restart_cost_are_counted():
     stamps = [scan.stamp for scan in of_kind(actions, LaserScan)]
     assert sum(a.count for a in of_kind(actions, Lost)) == round((stamps[-1] - stamps[0]) / 0.1) + 1 - len(stamps)
     assert len(stamps) < 280
+
+
+def test_lidar_that_does_not_say_its_steps_again_after_a_restart_keeps_them():
+    """Half of a recording with other steps than the rest would not be used."""
+    facts = {"DMIN": 20, "DMAX": 5600, "ARES": 1024, "AMIN": 0, "AMAX": 768, "AFRT": 384, "SCAN": 600}
+    answer = Reply(0.0, "PP", "00", tuple(f"{key}:{value}" for key, value in facts.items()))
+    driver, answers = ScipDriver(), [answer]
+
+    def request(command, tries=2):
+        return answers[0]
+        yield
+
+    driver._request = request
+    assert not list(driver._take_geometry(answer))
+    answers[0] = Reply(1.0, "PP", "0E")
+    [note] = driver._take_geometry(answers[0])
+    assert driver.geometry.last == 768
+    assert note.text.endswith("going on with the last answer")
+    fresh = ScipDriver()
+    fresh._request = request
+    [note] = fresh._take_geometry(None)
+    assert fresh.geometry == Geometry()
+    assert note.text.endswith("the limits of a URG-04LX")
 
 
 def test_tag_with_status_bits_that_the_guide_does_not_name():

@@ -127,7 +127,10 @@ class ScipUnit(Driver):
                 yield Param(f"laser_{name}", self.facts[key].replace(" ", "_"))
 
     def _take_geometry(self, reply: Reply | None) -> Script[None]:
-        """Accept PP when it came twice alike: the sums of its lines are wrong in some units and cannot be asked for."""
+        """Accept PP when it came twice alike: the sums of its lines are wrong in some units and cannot be asked for.
+
+        Without an answer that of an earlier start holds.
+        """
         before, problem = None, "no answer to PP"
         for _ in range(PARAMETER_READS):
             try:
@@ -140,8 +143,9 @@ class ScipUnit(Driver):
                 problem = str(error)
             reply = yield from self._request("PP", 1)
         else:
-            self.geometry = before or Geometry()
-            text = f"lidar: {problem}; going on with {'the last answer' if before else 'the limits of a URG-04LX'}"
+            self.geometry = before or self.geometry
+            known = before or self.geometry != Geometry()
+            text = f"lidar: {problem}; going on with {'the last answer' if known else 'the limits of a URG-04LX'}"
             yield from self.say_once(Note("warning", "lidar-parameters", text))
 
     def _tie_clock(self) -> Script[None]:
