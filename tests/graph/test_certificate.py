@@ -218,6 +218,13 @@ def test_an_edge_that_measures_no_turn_is_as_good_as_any():
     assert certified.is_global, certified.reason
 
 
+def test_a_landmark_that_nothing_measures_takes_no_certificate_away():
+    graph, _ = ring(0)
+    lonely = replace(graph, anchors=np.array([[3.0, 4.0]]), fixed_anchors=np.zeros(1, dtype=bool))
+    certified = certify(optimize(lonely)[0])
+    assert certified.is_global, certified.reason
+
+
 @pytest.mark.parametrize("below", [0.0, 0.3, 4.0, 49.0, 51.0])
 def test_the_gap_is_what_must_be_added_to_all_headings_together(below):
     """Five numbers of headings and one of a place; the eigenvalues of the headings begin at a given one."""

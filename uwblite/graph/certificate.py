@@ -22,7 +22,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
 from .components import floating_components
 from .graph import Graph
@@ -75,21 +75,23 @@ def certify(graph: Graph) -> Certificate:
 def certificate_matrix(graph: Graph) -> tuple[sparse.csc_matrix, Floats]:
     """Return S (m, m) over the free places and headings and the heading of the map, and the diagonal (m,) of D."""
     form = TangentForm(graph)
-    free, spread = _reduction(graph, form)
-    M = (spread.conj().T @ form.matrix() @ spread).tocsc()
+    every = form.matrix()
+    free, spread = _reduction(graph, form, np.diff(every.indptr) > 0)
+    M = (spread.conj().T @ every @ spread).tocsc()
     x, D = np.append(form.x[free], 1.0), np.append(free >= form.places, True)
     return (M - sparse.diags(np.where(D, np.real(np.conj(x) * (M @ x)), 0.0))).tocsc(), D.astype(np.float64)
 
 
-def _reduction(graph: Graph, form: TangentForm) -> tuple[Ints, sparse.csr_matrix]:
+def _reduction(graph: Graph, form: TangentForm, measured: Bools) -> tuple[Ints, sparse.csr_matrix]:
     """Return which numbers (m - 1,) are free, and what makes all of them from these and the heading of the map.
 
-    What is fixed turns with the map.
+    What is fixed turns with the map. A place that no edge measured (all numbers,) costs nothing and stays where it is.
     """
     kinds, floating = free_unknowns(graph), floating_components(graph)
     # The place of a part that floats costs nothing; one of its poses is as good where it is as elsewhere.
     kinds["poses"][floating[floating >= 0]] = False
-    is_free = np.concatenate([kinds["poses"], kinds["anchors"], kinds["poses"], [False]])
+    places = np.concatenate([kinds["poses"], kinds["anchors"]]) & measured[: form.places]
+    is_free = np.concatenate([places, kinds["poses"], [False]])
     free, fixed = np.flatnonzero(is_free), np.flatnonzero(~is_free)
     rows, columns = np.concatenate([free, fixed]), np.minimum(np.arange(len(is_free)), len(free))
     values = np.concatenate([np.ones(len(free)), form.x[fixed]])
