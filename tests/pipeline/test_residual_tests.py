@@ -214,14 +214,15 @@ def test_ranges_of_another_scale_are_named_where_anchors_are_placed(scale, place
     check_scales(estimate, SimpleNamespace(recordings=SimpleNamespace(each=[], have_scans=lidar), stages=Stages(None, None)))
 
 
-@pytest.mark.parametrize(("placed", "outcome"), [(True, "the ranges agree with the wheels"), (False, "nothing shows which")])
-def test_whether_ranges_speak_for_the_wheels_is_said(placed, outcome):
+@pytest.mark.parametrize(("placed", "outcome"), [(True, "the ranges are 0.77 times the"), (False, "no ranges measure the")])
+def test_what_ranges_say_of_the_scale_of_wheels_and_lidar_is_said(placed, outcome):
     each = [SimpleNamespace(log=SimpleNamespace(screening=SimpleNamespace(lidar_by_wheels=1.3)))]
     stages = Stages(None, None)
-    estimate = SimpleNamespace(graph=Graph(np.zeros((3, 3))), placed=np.array([placed]))
+    calibration = Calibration((UnknownKey("range_scale"),), np.array([1.0 / 1.3 - 1.0]))
+    estimate = SimpleNamespace(graph=Graph(np.zeros((3, 3)), calibration=calibration), placed=np.array([placed]))
     check_scales(estimate, SimpleNamespace(recordings=SimpleNamespace(each=each, have_scans=True), stages=stages))
-    (notice,) = stages.doubts
-    assert f"measures 1.30 times the distance that the wheels count, and {outcome}" in notice.text
+    notice = stages.doubts[-1]
+    assert f"measures 1.30 times the distance that the wheels count, and {outcome} distances on the map" in notice.text
 
 
 @pytest.mark.parametrize(("off", "steps", "said"), [

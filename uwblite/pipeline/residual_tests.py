@@ -209,10 +209,10 @@ def check_scales(estimate: Estimate, task: Task) -> None:
     ratios = np.array([s.lidar_by_wheels for s in screenings if s is not None])
     off = ratios[np.isfinite(ratios) & (np.abs(ratios - 1.0) > _WAYS)]
     if len(off):
-        outcome = "the ranges agree with the wheels" if estimate.placed.any() else "nothing shows which of the two is right"
+        outcome = f"the ranges are {scale:.2f} times" if estimate.placed.any() else "no ranges measure"
         text = (
-            f"the lidar measures {off[0]:.2f} times the distance that the wheels count, and {outcome}: "
-            "the map has the lidar's scale; check the units of both"
+            f"the lidar measures {off[0]:.2f} times the distance that the wheels count, and {outcome} the distances on the "
+            "map, which has the lidar's scale; check the units of both"
         )
         task.stages.doubt("scales", text, lidar_by_wheels=float(off[0]))
 
