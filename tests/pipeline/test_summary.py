@@ -27,6 +27,7 @@ from uwblite.pipeline.summary import (
     _range_table,
     _reason_to_distrust,
     _with_times,
+    _without_leaps,
     _without_strange_biases,
 )
 from uwblite.radio.bootstrap_attempt import BootstrapResult
@@ -306,10 +307,11 @@ def test_an_anchor_without_a_place_says_how_many_ranges_it_has():
     assert anchor_of(recordings=SimpleNamespace(each=each)).ranges == 5
 
 
-def test_places_of_a_moved_anchor_say_from_when_on_they_hold():
-    def named(*ids):
-        return tuple(AnchorEstimate(i, np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for i in ids)
+def named(*ids):
+    return tuple(AnchorEstimate(i, np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "ok") for i in ids)
 
+
+def test_places_of_a_moved_anchor_say_from_when_on_they_hold():
     ranges = plain_ranges(np.zeros(6, int), np.array([0, 1, 1, 2, 2, 2]), np.ones(6), 0.1)
     ranges = replace(ranges, stamps=np.array([7.0, 9.0, 8.0, 30.0, 20.0, 25.0]))
     moved = _with_times(named("A", "B", "B@2", "C"), ranges)
@@ -320,6 +322,21 @@ def test_places_of_a_moved_anchor_say_from_when_on_they_hold():
     assert _with_times(pair, None) is pair
     unheard = _with_times(named("A", "B", "C", "C@2"), ranges)
     np.testing.assert_array_equal([a.since for a in unheard], [np.nan, np.nan, 20.0, np.nan])
+
+
+@pytest.mark.parametrize(("way", "silent", "other", "leaps"), [
+    (10.5, 4.0, 90.0, True), (9.5, 4.0, 90.0, False), (26.0, 12.0, 90.0, True), (26.0, 60.0, 90.0, False),
+    (26.0, 12.0, 27.0, False), (26.0, 12.0, 1.0, False), (np.nan, 4.0, 90.0, False),
+])  # fmt: skip
+def test_an_anchor_that_leaps_farther_than_it_is_carried_has_a_wrong_place(way, silent, other, leaps):
+    """Silent for so many seconds, a range left out apart; 6 m and 1 m/s are possible, and names of two that were exchanged."""
+    ranges = plain_ranges(np.zeros(5, int), np.array([0, 1, 1, 1, 2]), np.ones(5), 0.1)
+    left_out = np.array([1.0, 1.0, 1.0, 0.0, 1.0])
+    ranges = replace(ranges, stamps=np.array([0.0, 3.0, 10.0, 12.0, 10.0 + silent]), weights=left_out)
+    places = {"A": (other, 0.0), "B": (0.0, 0.0), "B@2": (way, 0.0)}
+    anchors = _with_times(tuple(replace(a, position=np.array(places[a.id])) for a in named(*places)), ranges)
+    assert [a.status for a in _without_leaps(anchors, ranges)] == ["ok", *["distrusted" if leaps else "ok"] * 2]
+    assert _without_leaps(anchors, None) == anchors
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,7 @@ _FEW_ON_A_SIDE, _ONE_SIDED = 10, 0.6
 """Ranges, and the difference of the shares that agree: behind furniture they fall by half."""
 _ONE_TIME = 30.0
 """Moves within so much of each other are of one time, s."""
-_SAME_PLACE = 1.5
+SAME_PLACE = 1.5
 """m; an anchor found so near to where another one was took its place, or only its name."""
 
 
@@ -174,7 +174,7 @@ def _exchanged(these: Sequence[int], anchors: Sequence[AnchorEstimate], names: S
     """Return whether each of these anchors was moved to where another one was before."""
     earlier = {names[k][0]: anchors[k].position for k in range(len(anchors)) if names[k][1] == 1}
     return all(
-        any(name != names[k][0] and np.hypot(*(anchors[k].position - place)) < _SAME_PLACE for name, place in earlier.items())
+        any(name != names[k][0] and np.hypot(*(anchors[k].position - place)) < SAME_PLACE for name, place in earlier.items())
         for k in these
     )
 

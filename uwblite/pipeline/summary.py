@@ -49,6 +49,7 @@ def summarise(estimate: Estimate, covariance: Marginals, grid: OccupancyGrid | N
     limit = 3.0 * max(typical, 0.05)
     anchors = tuple(_anchor(k, estimate, recordings, covariance, residuals, limit) for k in range(len(estimate.anchor_ids)))
     anchors = _with_times(_without_strange_biases(anchors), ranges)
+    anchors = anchors if recordings.have_scans else _without_leaps(anchors, ranges)
     listed = {
         u.key: u
         for r in recordings.each
@@ -193,6 +194,35 @@ def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) 
         replace(a, since=t) if bases.count(base) > 1 and np.isfinite(t) else a
         for a, base, t in zip(anchors, bases, first, strict=True)
     )
+
+
+def _without_leaps(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:
+    """Return the anchors, two places of one distrusted where nobody carries it from one to the other in the time between.
+
+    Without a lidar, ranges alone hold the path, and one of the two may be a mirror image, or the move may be false. Where names
+    were exchanged, they leap, too, but to the place of another anchor.
+    """
+    names = [name_and_number(a.id)[0] for a in anchors]
+    leaps: dict[int, str] = {}
+    for k, a in enumerate(anchors):
+        earlier = [j for j, b in enumerate(anchors) if names[j] == names[k] and b.since < a.since]
+        if ranges is None or not earlier:
+            continue
+        before = max(earlier, key=lambda j: anchors[j].since)
+        pause = a.since - float(ranges.stamps[(ranges.anchor == before) & ranges.alive].max(initial=-np.inf))
+        way = float(np.hypot(*(a.position - anchors[before].position)))
+        others = np.array([b.position for j, b in enumerate(anchors) if names[j] != names[k]]).reshape(-1, 1, 2)
+        apart = np.hypot(*np.moveaxis(others - [a.position, anchors[before].position], -1, 0))
+        if way > _LEAP + _CARRYING * pause and not np.any(apart < plausibility.SAME_PLACE):
+            leaps |= dict.fromkeys((before, k), f"it would have been carried {way:.0f} m within {pause:.0f} s")
+    return tuple(
+        replace(a, status="distrusted", reason=leaps[k]) if k in leaps and a.status == "ok" else a
+        for k, a in enumerate(anchors)
+    )  # fmt: skip
+
+
+_LEAP, _CARRYING = 6.0, 1.0
+"""m that both places may be off by together, and m/s at which an anchor is taken down, carried and put up again."""
 
 
 def _count(name: str, recordings: Recordings) -> int:
