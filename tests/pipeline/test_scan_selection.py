@@ -13,7 +13,8 @@ from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig, of
-from uwblite.pipeline.scan_selection import thinned
+from uwblite.pipeline import scan_selection
+from uwblite.pipeline.scan_selection import prepared, thinned
 
 FRAMES, GRID = KeyframeConfig(), GridConfig()
 
@@ -51,6 +52,17 @@ def test_a_map_of_the_thinned_recording_is_the_same_map():
     np.testing.assert_array_equal(whole.trajectory, part.trajectory)
     np.testing.assert_array_equal(whole.grid.log_odds, part.grid.log_odds)
     assert whole.grid.scans_used == part.grid.scans_used
+
+
+def test_a_recording_is_prepared_once(monkeypatch):
+    config = MappingConfig()
+    once = prepared(planted(4, 3.0), config)
+    assert once.screening is not None
+    assert once.notes.scans_left_out > 0
+    monkeypatch.setattr(scan_selection, "thinned", None)
+    again = prepared(once, config)
+    assert (again.scans, again.odometry, again.notes) == (once.scans, once.odometry, once.notes)
+    assert prepared(once, replace(config, use_lidar=False)).scans is None
 
 
 @pytest.mark.parametrize("change", ["no scans", "all"])

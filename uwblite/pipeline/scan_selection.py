@@ -23,8 +23,13 @@ _STEPS = 2
 
 
 def prepared(log: SensorLog, config: MappingConfig) -> SensorLog:
-    """Return a recording screened, with the sensors in use and only the scans that a map looks at."""
+    """Return a recording screened, with the sensors in use and only the scans that a map looks at.
+
+    Of one that was screened before, nothing but sensors is left out.
+    """
     log = log.without(uwb=not config.use_uwb, lidar=not config.use_lidar)
+    if log.screening is not None:
+        return log
     return thinned(screen(log, config.detect_laser_flip), config.keyframes, config.grid)
 
 
