@@ -70,7 +70,7 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monk
     graph = Graph(np.ones((3, 3)), np.zeros((2, 2)), (), Calibration(keys, np.ones(4)), np.arange(3) == 0)
     monkeypatch.setattr(final_stages, "with_range_noise", lambda estimate, *_, steady: estimate)
 
-    def solved(estimate, task):
+    def solved(estimate, solver):
         given = estimate.graph
         height = np.array([False, True, False, False])
         values = np.where(height, 0.0, given.calibration.values)

@@ -12,6 +12,7 @@ from ..arrays import rms_length
 from ..errors import SolverError
 from ..graph.calibration import HEIGHT, RADIO, optimize_with_heights, with_free
 from ..graph.graph import Graph
+from ..graph.optimizer import Optimizer
 from ..radio import prior_selection
 from .estimate import Estimate, OtherHeights, Task
 from .mapping_config import MappingConfig
@@ -20,6 +21,8 @@ _LIKELIER = float(np.log(3.0))
 """Difference of the logarithms of marginal likelihoods from which on the other hypothesis is taken (positive evidence)."""
 _REFUTED = 20.0
 """The same from which on a hypothesis is refuted: noise that is not quite as assumed makes up the half of it."""
+_COMPARED = 1e-5
+"""Share of chi2 that no longer matters where likelihoods are compared; a hypothesis that is taken is solved on."""
 _NOTICEABLE = 1.0
 """Height above the tag, m, from which on anchors can look like another unit; lower ones lengthen short ranges only."""
 _ELSEWHERE = 0.4
@@ -34,8 +37,9 @@ def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate
     if estimate.ranges is None or not heights.any():
         return estimate
     start = with_free(prior_selection.with_high_anchors(estimate.graph, config.calibration), *RADIO)
+    optimizer, quick = Optimizer(), replace(config.solver, relative_decrease=max(config.solver.relative_decrease, _COMPARED))
     try:
-        high, _ = optimize_with_heights(start.with_edges(*edges), config.solver)
+        high, _ = optimize_with_heights(start.with_edges(*edges), quick, optimizer)
         # Heights that were put back to 0 count as known no better than the others.
         likely = [prior_selection.laplace_marginal_likelihood(with_free(graph, HEIGHT)) for graph in (low, high)]
     except SolverError:
@@ -43,6 +47,7 @@ def with_likelier_heights(estimate: Estimate, config: MappingConfig) -> Estimate
     gain, height = likely[1] - likely[0], float(np.sqrt(np.median(high.calibration.values[heights])))
     taken = gain > _LIKELIER
     if taken:
+        high, _ = optimize_with_heights(high, config.solver, optimizer)
         graph = replace(start, fixed_calibration=high.fixed_calibration)
         estimate = replace(estimate, graph=graph.with_estimates_of(high))
     if abs(gain) > _REFUTED or height < _NOTICEABLE:

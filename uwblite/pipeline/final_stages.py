@@ -94,7 +94,7 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     graph, given = estimate.graph, at_given_poses(estimate.graph)
     if not any(free.any() for free in free_unknowns(given).values()):
         return estimate
-    done = solved(replace(estimate, graph=given), task).graph
+    done = solved(replace(estimate, graph=given), task.config.solver).graph
     # What the search itself has fixed are heights put back to 0.
     fixed = graph.fixed_calibration | (done.fixed_calibration & ~given.fixed_calibration)
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))

@@ -15,7 +15,7 @@ from ..graph.graph import Edges, Graph
 from ..graph.marginals import marginals
 from ..graph.optimizer import Optimizer
 from ..graph.robust import SQUARED
-from ..graph.solver import optimize
+from ..graph.solver import SolverConfig, optimize
 from ..lidar import joint_refinement, scan_to_scan, visibility
 from ..lidar.joint_refinement import RefinementConfig, RefinementResult
 from ..lidar.scan_to_scan import Steps
@@ -220,15 +220,15 @@ def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimat
     gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
     constrains these, and it is matched again.
     """
-    before, optimizer = estimate.graph.poses, Optimizer()
-    estimate = solved(with_range_noise(estimate, task.config), task, optimizer)
+    before, optimizer, quick = estimate.graph.poses, Optimizer(), rough(task.config.solver)
+    estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:
         estimate = _matched_once_more(estimate, scans, shift, task)
         before = estimate.graph.poses
-        estimate = solved(with_range_noise(estimate, task.config), task, optimizer)
-    if estimate.moved_since(before) < _STILL:
-        return estimate
-    return solved(with_range_noise(estimate, task.config), task, optimizer)
+        estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
+    if estimate.moved_since(before) >= _STILL:
+        estimate = with_range_noise(estimate, task.config)
+    return solved(estimate, task.config.solver, optimizer)
 
 
 _STILL = 0.001
@@ -245,9 +245,9 @@ def _matched_once_more(estimate: Estimate, scans: ScanClouds, shift: float, task
     return replace(estimate, graph=graph, joint=refined.edges)
 
 
-def solved(estimate: Estimate, task: Task, optimizer: Optimizer | None = None) -> Estimate:
-    """Return the estimate at the optimum of all of its measurements; for the optimizer see optimize_with_heights."""
-    found = optimize_with_heights(estimate.problem, task.config.solver, optimizer)[0]
+def solved(estimate: Estimate, solver: SolverConfig, optimizer: Optimizer | None = None) -> Estimate:
+    """Return the estimate at the optimum of all of its measurements; for the parameters see optimize_with_heights."""
+    found = optimize_with_heights(estimate.problem, solver, optimizer)[0]
     graph = replace(estimate.graph, fixed_calibration=found.fixed_calibration)
     return replace(estimate, graph=graph.with_estimates_of(found))
 
