@@ -13,6 +13,8 @@ turn), raw (the same without a radio, recordings of others first), injection (fa
 true the stated uncertainties are is measured by tools/consistency.py, which writes into the same page.
 """
 
+import one_thread  # noqa: F401
+
 import argparse
 import math
 import sys

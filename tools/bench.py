@@ -13,6 +13,8 @@ slows both. Start is wall time, whole runs are both. Recordings are made by tool
 ten-fold: --minutes 310).
 """
 
+import one_thread  # noqa: F401
+
 import argparse
 import os
 import resource
@@ -24,8 +26,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 

@@ -14,6 +14,8 @@ first pose and not by a best fit: a fit would share the error out over the run a
 is.
 """
 
+import one_thread  # noqa: F401
+
 import argparse
 import os
 import pickle

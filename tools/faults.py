@@ -12,6 +12,8 @@ count as well. Without lidar and without given anchors
 nothing but the odometry distinguishes a map from its mirror image: there the result is judged up to reflection.
 """
 
+import one_thread  # noqa: F401
+
 import argparse
 import signal
 import sys

@@ -1,5 +1,7 @@
 """Maps of simulated recordings, and other recordings in the same buildings; shared by the tools that measure the live pose."""
 
+import one_thread  # noqa: F401
+
 import tempfile
 from contextlib import nullcontext
 from dataclasses import dataclass, replace

@@ -14,6 +14,8 @@ than 0.5 m or 0.3 rad off the truth is a wrong one. Errors are in the map's fram
 errors are in them.
 """
 
+import one_thread  # noqa: F401
+
 import argparse
 import sys
 import time

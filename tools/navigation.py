@@ -11,6 +11,8 @@ is found. A goal is reached within 0.10 m of the truth; what it touches and how 
 true building. With the map of the defaults, that of the paper's settings, and by dead reckoning from a given start.
 """
 
+import one_thread  # noqa: F401
+
 import argparse
 import sys
 from collections import deque

@@ -12,6 +12,8 @@ covariance is the Cramer-Rao bound.
                 range    scale |tag - anchor| + bias + patterns - range, white noise + Gaussian process
 """
 
+import one_thread  # noqa: F401
+
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -10,6 +10,8 @@ distance, V (time per stage) and the maps. Its recordings are not public; the si
 driving time and, for the hall, its drift and two of four UWB nodes without line of sight.
 """
 
+import one_thread  # noqa: F401
+
 import argparse
 import math
 import sys

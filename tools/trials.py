@@ -1,5 +1,7 @@
 """Simulated recordings with their truth, and how far a map of one is from it; shared by the tools that measure accuracy."""
 
+import one_thread  # noqa: F401
+
 import os
 import re
 import sys
@@ -10,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
