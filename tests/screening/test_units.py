@@ -180,6 +180,13 @@ def test_stamps_of_a_recording(unit, name, speed, period):
     assert float(factor(text)) == unit
 
 
+@pytest.mark.parametrize(("unit", "name"), [(1e-3, "milliseconds"), (1e-9, "nanoseconds")])
+def test_stamps_since_1970_of_a_recording_of_wheels_alone(unit, name):
+    """Neighbouring numbers are 256 ns apart there: a second is a step of one, and is lost."""
+    odometry = straight(0.3, period=0.05)
+    assert name in times_said(SensorLog(replace(odometry, stamps=(1.7e9 + odometry.stamps) / unit)))
+
+
 def test_slow_robots_and_seldom_readings_are_in_seconds():
     """A reading for every keyframe, a stamp for every message, a crawl at a usual rate, and a robot that stands."""
     for speed, period in ((0.1, 10.0), (0.03, 2.0), (0.001, 0.1), (0.0, 100.0)):

@@ -126,7 +126,8 @@ def _period(stamps: Floats) -> float:
 def _speeds(odometry: Odometry) -> Floats:
     """Return the speeds (k,), m/s, of the readings that move, each taken over a second or to the next reading."""
     first = np.arange(len(odometry.stamps) - 1)
-    second = np.minimum(np.searchsorted(odometry.stamps, odometry.stamps[first] + _CHORD), len(first))
+    # A second added to nanoseconds since 1970 is lost in rounding.
+    second = np.clip(np.searchsorted(odometry.stamps, odometry.stamps[first] + _CHORD), first + 1, len(first))
     span = odometry.stamps[second] - odometry.stamps[first]
     length = np.hypot(*(odometry.poses[second] - odometry.poses[first])[:, :2].T)
     moving = (length > 1e-6) & (span > 0.5 * _CHORD)
