@@ -1,5 +1,6 @@
 """`uwblite batch`: a folder and a row for each recording, kept when it runs again, whatever becomes of the others."""
 
+import argparse
 import csv
 import json
 import os
@@ -14,7 +15,8 @@ import pytest
 from conftest import ROOT
 from helpers.results import contents
 
-from uwblite.cli import batch, main
+from uwblite.cli import batch, console, main
+from uwblite.cli.options import name_recordings_once
 from uwblite.errors import ConfigError
 from uwblite.io.carmen import read_log, write_log
 
@@ -165,3 +167,17 @@ def test_a_cluster_makes_the_same_bytes_though_a_worker_is_killed(made, recordin
 
 def contents_of_table(out):
     return [(out / f"batch.{kind}").read_bytes() for kind in ("csv", "html")]
+
+
+def test_a_recording_that_is_named_twice_counts_once(room_log, tmp_path, monkeypatch):
+    """As `*.log` names the parts of one that was cut; counted twice, all its errors would seem smaller than they are."""
+    other = tmp_path / "other.log"
+    other.touch()
+    said = []
+    monkeypatch.setattr(console, "note", said.append)
+    args = argparse.Namespace(logs=[str(room_log), str(other), str(room_log)])
+    for _ in range(2):
+        name_recordings_once(args)
+        assert args.logs == [str(room_log), str(other)]
+    [text] = said
+    assert "3 files are 2 recordings" in text

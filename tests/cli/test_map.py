@@ -118,7 +118,7 @@ def test_a_corrected_log_is_refused_before_the_work_where_it_cannot_be_written(r
     there = tmp_path / "there.log"
     there.write_text("")
     for logs, name, why in (
-        ([room_log, room_log], tmp_path / "new.log", "one CARMEN log"),
+        ([room_log, "second.log"], tmp_path / "new.log", "one CARMEN log"),
         (["record.bag"], tmp_path / "new.log", "one CARMEN log"),
         ([room_log], there, "give --force"),
     ):

@@ -10,7 +10,7 @@ import pytest
 from uwblite.drivers.events import OdometryPose
 from uwblite.drivers.log_file import LogFile, pose_line
 from uwblite.io.carmen import read_log
-from uwblite.io.log_parts import parts_of
+from uwblite.io.log_parts import each_once, parts_of
 
 
 @pytest.fixture
@@ -70,3 +70,11 @@ def test_other_files_are_alone(parts, tmp_path):
     assert parts_of(str(renamed)) == ([str(renamed)], "run.log")
     assert parts_of("-") == (["-"], "")
     assert parts_of(str(tmp_path / "absent.log")) == ([str(tmp_path / "absent.log")], "")
+
+
+def test_a_recording_that_is_named_by_several_of_its_parts_is_one(parts, tmp_path):
+    other = tmp_path / "walk.log"
+    shutil.copy(parts[-1], other)
+    assert each_once([parts[1], str(other), parts[3], parts[0]]) == [parts[0], str(other)]
+    assert each_once([parts[2], str(other)]) == [parts[2], str(other)]
+    assert each_once([str(other), str(other), "-"]) == [str(other), "-"]

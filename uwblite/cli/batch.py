@@ -54,7 +54,9 @@ def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from ..io.locks import sole_writer
     from . import console
+    from .options import name_recordings_once
 
+    name_recordings_once(args)
     tasks = tasks_of(args)
     with sole_writer(args.out):
         os.makedirs(args.out, exist_ok=True)

@@ -81,7 +81,9 @@ def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     from ..io.locks import sole_writer
     from ..io.results import check_target
+    from .options import name_recordings_once
 
+    name_recordings_once(args)
     _check_corrected_log(args)
     if args.dry_run:
         return _map(args)

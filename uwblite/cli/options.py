@@ -21,6 +21,18 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=example)
 
 
+def name_recordings_once(args: argparse.Namespace) -> None:
+    """Let what `*.log` names stand for recordings, each once, where it names several parts of one, or one twice."""
+    from ..io.log_parts import each_once
+    from . import console
+
+    logs = each_once(args.logs)
+    if len(logs) < len(args.logs):
+        files = f"{len(args.logs)} files are {len(logs)} recording{'s' * (len(logs) > 1)}"
+        console.note(f"uwblite: {files}: a recording in several parts, or named twice, counts once")
+    args.logs = logs
+
+
 def effective_config(args: argparse.Namespace) -> "MappingConfig":
     """Return the settings that --preset, --config and --set amount to.
 

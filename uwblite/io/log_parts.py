@@ -8,6 +8,7 @@ import gzip
 import os
 import re
 import zlib
+from collections.abc import Sequence
 
 HEAD_BYTES = 1 << 16
 """Bytes at the beginning of a part among which the comment stands."""
@@ -48,6 +49,14 @@ def parts_of(path: str) -> tuple[list[str], str]:
         parts, last = [*parts, after], last + 1
     absent = name(first - 1) if first > 1 else name(last + 1) if _goes_on(parts[-1]) else ""
     return parts, os.path.basename(absent)
+
+
+def each_once(paths: Sequence[str]) -> list[str]:
+    """Return the recordings that files are or are part of, each once: the first part stands for several that are named."""
+    named: dict[str, list[str]] = {}
+    for path in paths:
+        named.setdefault(parts_of(path)[0][0], []).append(path)
+    return [first if len(files) > 1 else files[0] for first, files in named.items()]
 
 
 def _continues(path: str) -> tuple[int, str]:
