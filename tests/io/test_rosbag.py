@@ -73,6 +73,14 @@ def test_a_recording_survives_a_bag(tmp_path, storage, flipped):
         write_bag(tmp_path / "bag", recording())
 
 
+def test_a_recording_whose_clock_begins_at_0_carries_its_times(tmp_path):
+    stamps, log = 0.1 * np.arange(40), recording()
+    write_bag(tmp_path / "bag", SensorLog(replace(log.odometry, stamps=stamps)))
+    read = read_bag(tmp_path / "bag")
+    assert not read.notes.warnings
+    np.testing.assert_allclose(read.odometry.stamps, stamps, atol=1e-9)
+
+
 def test_topics_are_listed_and_wrong_ones_refused(tmp_path):
     write_bag(tmp_path / "bag", recording())
     topics = {t.name: t for t in plan_bag(tmp_path / "bag")[0]}

@@ -151,7 +151,7 @@ class _Collector:
     def _time(self, stamp: Any, recorded: float) -> float:
         seconds = float(stamp.sec) + 1e-9 * float(stamp.nanosec)
         if seconds <= 0.0:
-            self.unstamped += 1
+            self.unstamped += recorded != seconds  # a simulated clock begins at 0
             return recorded
         self.late.append(recorded - seconds)
         return seconds
