@@ -28,6 +28,16 @@ def test_ranges_of_which_one_in_four_disagrees_confirm_no_scans():
     assert "ranges" in nowhere(-0.1, ENOUGH_ENDS, RangeFit(29, 0.52, 3))
 
 
+def test_in_a_map_in_which_the_robot_was_tracked_half_of_the_ranges_beside_scans_may_have_detours():
+    half, fewer = RangeFit(10, 0.5, 4), RangeFit(10, 0.4, 4)
+    assert "ranges" in nowhere(-0.1, 0.0, half, proven=True)
+    for ends in (0.5 * ENOUGH_ENDS, ENOUGH_ENDS):
+        assert nowhere(-0.1, ends, half, proven=True) == ""
+        assert "ranges" in nowhere(-0.1, ends, half)
+        assert "ranges" in nowhere(-0.1, ends, fewer, proven=True)
+    assert "ranges" in nowhere(-0.1, ENOUGH_ENDS, RangeFit(10, 0.5, 1), proven=True)
+
+
 def test_people_beside_a_few_ranges_contradict_no_place_in_a_map_that_is_the_right_one():
     assert "scans" in nowhere(-0.4, ENOUGH_ENDS, TWO_ANCHORS)
     assert nowhere(-0.4, ENOUGH_ENDS, TWO_ANCHORS, proven=True) == ""

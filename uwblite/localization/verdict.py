@@ -24,6 +24,8 @@ close by -0.5; rooms that are alike in part reach -0.3, other buildings beside r
 RANGES_FOUND, RANGES_ALONE = 0.6, 0.8
 """Share of the ranges that must agree with a start, beside scans and alone: in the right place 0.9 to 1 alone, with anchors of
 another building 0.75 to 0.8."""
+_RANGES_AGAIN = 0.5
+"""The same beside scans in a map that is the right one: what disagrees there has taken detours."""
 FEW_ENDS, FEW_BESIDE = 12, 4
 """Rays' ends in known space from which a scan counts; the second beside ranges to three anchors."""
 ENOUGH_ENDS, ENOUGH_RANGES = 40, 6
@@ -69,13 +71,15 @@ def doubt(
 def nowhere(fit: float, ends: float, fitting: "RangeFit", proven: bool = False) -> str:
     """Return what contradicts even the best place; "" = nothing does.
 
-    In a map that is the right one, ranges to two anchors leave no other building for scans to exclude.
+    In a map that is the right one, ranges to two anchors leave no other building for scans to exclude; half of them may have
+    taken detours where scans fit.
     """
     seen = share_of_needed(ends)
     beside = fitting.enough or (proven and fitting.anchors >= 2)
     if seen and fit < (FIT_BESIDE_RANGES if beside else FIT_ALONE):
         return "the scans fit the walls nowhere well; is this the right map?"
-    if fitting.count >= ENOUGH_RANGES and fitting.share < RANGES_ALONE + seen * (RANGES_FOUND - RANGES_ALONE):
+    needed = _RANGES_AGAIN if proven and seen and fitting.anchors >= 2 else RANGES_ALONE + seen * (RANGES_FOUND - RANGES_ALONE)
+    if fitting.count >= ENOUGH_RANGES and fitting.share < needed:
         return f"the ranges fit the anchors nowhere (best place: {fitting.share:.0%} of them); is this the right map?"
     return ""
 
