@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # for those who check types; at run time __getattr__ resolves them
     from .io.carmen import read_log
-    from .map_result import MapResult
-    from .mapping import MappingConfig, build_map
-    from .sensor_log import SensorLog
+    from .mapping import MappingConfig, MapResult, SensorLog, build_map
 
 __version__ = "0.1.0"
 

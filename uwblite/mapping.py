@@ -35,7 +35,7 @@ from .pipeline.progress import Progress, Stage, Stages
 from .pipeline.recordings import gather
 from .sensor_log import SensorLog
 
-__all__ = ["MappingConfig", "Progress", "Stage", "build_map"]
+__all__ = ["MapResult", "MappingConfig", "Progress", "SensorLog", "Stage", "build_map"]
 
 
 def build_map(
