@@ -43,6 +43,8 @@ WRONG = (0.5, 0.3)
 """m and rad; a pose that counts as found and is farther off is a wrong one."""
 BEFORE = 40.0
 """s of driving before a robot is carried away, in which it is found and has tracked its pose: eight metres."""
+RUNS = 2
+"""How often a drive is tracked: other programs on the computer slow down a step of one run, hardly the same one of both."""
 WRONG_SECONDS = 40.0
 """s of each drive in a map that is not the building's."""
 ELSEWHERE = {"hall": "lab", "lab": "hall", "warehouse": "lab"}
@@ -166,19 +168,22 @@ class Track:
 
 
 def track(on: Bench, seconds: float, uwb: bool = True, lidar: bool = True) -> Track:
-    """Play a recording from its beginning."""
-    localizer, states, begin = on.localizer(), [], float(on.trial.log.odometry.stamps[0])
-    spent, scans = [], 0
-    for _, kind, k in on.played(begin, begin + seconds, uwb, lidar):
-        clock = time.process_time()
-        state = on.feed(localizer, kind, k)
-        spent.append(time.process_time() - clock)
-        scans += kind == 2
-        if kind == 0:
-            states.append(state)
+    """Play a recording from its beginning; every step's processor time is the lowest of some runs."""
+    begin, runs = float(on.trial.log.odometry.stamps[0]), []
+    for _ in range(RUNS):
+        localizer, states, seconds_each, scans = on.localizer(), [], [], 0
+        for _, kind, k in on.played(begin, begin + seconds, uwb, lidar):
+            clock = time.process_time()
+            state = on.feed(localizer, kind, k)
+            seconds_each.append(time.process_time() - clock)
+            scans += kind == 2
+            if kind == 0:
+                states.append(state)
+        runs.append(seconds_each)
+    spent = np.min(runs, axis=0)
     states = [s for s, inside in zip(states, on.mapped(np.array([s.stamp for s in states])), strict=True) if inside]
     lost = np.array([s.lost for s in states])
-    per_scan, slowest = 1e3 * sum(spent) / scans if scans else np.nan, 1e3 * max(spent)
+    per_scan, slowest = 1e3 * float(spent.sum()) / scans if scans else np.nan, 1e3 * float(spent.max())
     if lost.all():
         return Track(np.nan, np.nan, 1.0, per_scan, slowest, np.nan, np.nan)
     sure = [s for s in states if not s.lost]
