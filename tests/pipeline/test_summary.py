@@ -394,8 +394,9 @@ def test_anchors_err_alike_at_given_poses_by_ranges_and_priors_alone(monkeypatch
     asked = []
     monkeypatch.setattr("uwblite.pipeline.summary.by_alike_errors", lambda graph, *others: asked.append(graph.edges) or 7.0)
     config, estimate = MappingConfig().ranges, Estimate(graph.with_edges(scan), wheels, graph.edges[2], ("A", "B", "C"))
-    assert _by_alike_ranges(estimate, config) == 7.0
+    whole = np.full((3, 2, 2), 3.0)
+    assert _by_alike_ranges(estimate, whole, config) == 7.0
     assert asked == [graph.edges[1:]]
     for other, steady in ((estimate, 0.0), (replace(estimate, graph=graph), 0.1), (replace(estimate, ranges=None), 0.1)):
-        np.testing.assert_array_equal(_by_alike_ranges(other, replace(config, steady=steady)), np.zeros((3, 2, 2)))
+        np.testing.assert_array_equal(_by_alike_ranges(other, whole, replace(config, steady=steady)), whole)
     assert len(asked) == 1

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from uwblite import se2
 from uwblite.graph.calibration import BIAS, CalibrationConfig, block, prior_edges, range_indices, unknowns, with_free
 from uwblite.graph.graph import Graph, edge_weights
 from uwblite.graph.marginals import marginals
@@ -15,6 +16,7 @@ from uwblite.radio.range_noise import RangeNoiseConfig
 PLACES = np.array([[2.0, 1.0], [9.0, 14.0]])
 COUNT = 160
 CONFIG = RangeNoiseConfig(steady=0.01)
+WHOLE = np.array([[[0.5, 0.1], [0.1, 0.2]], [[0.01, 0.0], [0.0, 0.03]]])
 
 
 def known_world(count=COUNT):
@@ -74,8 +76,8 @@ def test_the_stated_covariance_is_that_of_estimates_from_errors_that_are_alike()
                 residual = errors.copy()
                 residual[exact.anchor == anchor] -= jacobian @ moved
                 edges = replace(exact, ranges=exact.ranges + residual)
-                stated += by_alike_errors(graph.with_edges(edges), edges, CONFIG)[anchor] / (draws / 20)
-        ratio = np.linalg.eigvals(np.linalg.solve(plain[anchor] + stated, found.T @ found / draws)).real
+                stated += by_alike_errors(graph.with_edges(edges), edges, plain, CONFIG)[anchor] / (draws / 20)
+        ratio = np.linalg.eigvals(np.linalg.solve(stated, found.T @ found / draws)).real
         np.testing.assert_allclose(ratio, 1.0, atol=3.0 * np.sqrt(2.0 / draws) + 0.2)
         by_weights = np.linalg.eigvals(np.linalg.solve(plain[anchor], found.T @ found / draws)).real
         assert np.abs(np.log(by_weights)).max() > np.log(2.0)
@@ -96,14 +98,27 @@ def test_an_anchor_that_is_given_and_one_without_ranges_stay_as_they_are():
     graph, edges = known_world()
     graph = replace(graph, fixed_anchors=np.array([True, False]))
     first = edges.rows(np.flatnonzero(edges.anchor == 0))
-    assert not by_alike_errors(graph.with_edges(first), first, CONFIG).any()
+    np.testing.assert_array_equal(by_alike_errors(graph.with_edges(first), first, WHOLE, CONFIG), WHOLE)
 
 
 def test_few_ranges_and_open_directions_change_nothing():
     """Ranges from one place leave the direction open: the inverse there is round-off, and a product with it still is."""
     graph, edges = known_world()
     few = edges.rows(np.arange(29))
-    assert not by_alike_errors(graph.with_edges(few), few, CONFIG).any()
+    np.testing.assert_array_equal(by_alike_errors(graph.with_edges(few), few, WHOLE, CONFIG), WHOLE)
     standing = replace(edges, pose=np.zeros_like(edges.pose))
     standing = replace(standing, ranges=standing.distances(graph))
-    assert not by_alike_errors(graph.with_edges(standing), standing, CONFIG).any()
+    np.testing.assert_array_equal(by_alike_errors(graph.with_edges(standing), standing, WHOLE, CONFIG), WHOLE)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, 1.2])
+def test_errors_of_the_poses_come_on_top_and_never_below(turn):
+    """A covariance of the whole graph that was linearised elsewhere may be smaller than that of the anchors alone."""
+    graph, edges = known_world()
+    problem = graph.with_edges(edges)
+    alone, turned = marginals(problem).anchors, se2.rotation(turn)[:2, :2]
+    alike = by_alike_errors(problem, edges, alone, CONFIG)
+    larger, smaller = turned @ np.diag([0.3, 0.1]) @ turned.T, turned @ np.diag([0.3, -10.0]) @ turned.T
+    np.testing.assert_allclose(by_alike_errors(problem, edges, alone + larger, CONFIG), alike + larger, atol=1e-9)
+    kept = turned @ np.diag([0.3, 0.0]) @ turned.T
+    np.testing.assert_allclose(by_alike_errors(problem, edges, alone + smaller, CONFIG), alike + kept, atol=1e-9)

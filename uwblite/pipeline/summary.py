@@ -39,7 +39,7 @@ _SHOWN = 0.7
 def summarise(estimate: Estimate, covariance: Marginals, grid: OccupancyGrid | None, task: Task) -> MapResult:
     """Gather the result; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
-    covariance.anchors += _by_alike_ranges(estimate, task.config.ranges)
+    covariance.anchors = _by_alike_ranges(estimate, covariance.anchors, task.config.ranges)
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
     if ranges is not None and estimate.placed.any():
@@ -91,13 +91,13 @@ def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Notice]) -
     return tuple(replace(a, status="distrusted", reason="the map is doubted") if a.status == "ok" else a for a in anchors)
 
 
-def _by_alike_ranges(estimate: Estimate, config: RangeNoiseConfig) -> Floats:
-    """Return by how much the covariances of anchors (a, 2, 2) differ from the inverse of their weights; 0 without a lidar."""
+def _by_alike_ranges(estimate: Estimate, whole: Floats, config: RangeNoiseConfig) -> Floats:
+    """Return the covariances of anchors (a, 2, 2) with what ranges err alike; those by the weights alone without a lidar."""
     graph, ranges = estimate.graph, estimate.ranges
     if ranges is None or config.steady == 0.0 or not any(isinstance(e, ScanEdges) for e in graph.edges):
-        return np.zeros((len(graph.anchors), 2, 2))
+        return whole
     about_anchors = tuple(e for e in graph.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
-    return by_alike_errors(at_given_poses(replace(graph, edges=about_anchors)), ranges, config)
+    return by_alike_errors(at_given_poses(replace(graph, edges=about_anchors)), ranges, whole, config)
 
 
 def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, Floats]:

@@ -12,8 +12,8 @@ are, the residuals say: R is such that it would leave in them the scatter that t
 So an anchor behind obstacles, whose ranges scatter by decimetres, is stated to be decimetres off though it fits: its ranges are
 all late, by an exponentially distributed way whose mean is as large as its scatter.
 
-What the errors of the poses add is in the marginal covariances of the whole graph beside H^-1, so only the difference is
-computed here.
+What the errors of the poses add is the marginal covariance of the whole graph less H^-1. That is positive but for how far the
+two are linearised at different places; along a line of sight, where the curvature is all but nothing, that decides.
 """
 
 import numpy as np
@@ -31,20 +31,21 @@ _ENOUGH = 30
 """Ranges to an anchor from which on its errors are learnt, and its covariance with them."""
 
 
-def by_alike_errors(graph: Graph, edges: RangeEdges, config: RangeNoiseConfig) -> Floats:
-    """Return what is to be added to (J^T W J)^-1 of the anchors (a, 2, 2), m^2: H^-1 J^T W (R - W^-1) W J H^-1.
+def by_alike_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: RangeNoiseConfig) -> Floats:
+    """Return the covariances of the anchors (a, 2, 2), m^2, with the errors that their ranges have alike; see above.
 
     Parameters
     ----------
     graph : whatever is not estimated with the anchors is fixed.
     edges : the graph's ranges, with the weights that the anchors were estimated with.
+    whole : (a, 2, 2) m^2, marginal covariances of the anchors estimated with the poses, by the weights.
     """
     around, each = marginals(graph), np.arange(len(edges))
     # Of an error of 1 m in each range.
     slopes = around.slopes(CommonErrors(edges, each, each, 1.0 / edges.sigma[:, None], each)).T.tocsr()
     weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
     offsets = edges.tag_positions(graph.poses) - graph.anchors[edges.anchor]
-    added = np.zeros((len(graph.anchors), 2, 2))
+    found = whole.copy()
     for anchor, place in enumerate(around.unknowns.number["anchors"]):
         own = np.flatnonzero((edges.anchor == anchor) & (weights > 0.0))
         if place[0] < 0 or len(own) < _ENOUGH or np.trace(around.anchors[anchor]) > np.mean(np.sum(offsets[own] ** 2, axis=1)):
@@ -57,8 +58,15 @@ def by_alike_errors(graph: Graph, edges: RangeEdges, config: RangeNoiseConfig) -
         scatter = max(config.steady, float(edges.sigma[own].max()), spread_about_median(residuals[own]))
         unlike = scatter**2 / _shown(inverse, jacobian, factors, alike) * alike - jacobian
         here = inverse[np.searchsorted(columns, place)]
-        added[anchor] = here @ (factors.T @ unlike) @ here.T
-    return added
+        by_ranges = around.anchors[anchor] + here @ (factors.T @ unlike) @ here.T
+        found[anchor] = by_ranges + _positive(whole[anchor] - around.anchors[anchor])
+    return found
+
+
+def _positive(matrix: Floats) -> Floats:
+    """Return a symmetric matrix (k, k) without its negative part."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
 def _shown(inverse: Floats, jacobian: Floats, factors: Floats, alike: Floats) -> float:
