@@ -26,26 +26,15 @@ def relative_eigen(information: Floats, spurious: Floats) -> tuple[Floats, Float
     return basis, inverse, values, vectors
 
 
-def measured_step(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
-    """Return the Gauss-Newton step (..., 3) in directions that were measured, none in the others, and L (..., 3, 3) with
-    L^T L the information in those directions, less what the scatter of the normals may have added.
+def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+    """Return information (..., 3, 3) and gradient (..., 3) less what the scatter of the normals may have added.
 
-    A direction keeps the share 1 - MEASURED / l of its information, none where l is below MEASURED. Gradients (..., 3) may
-    have more leading axes than the rest.
+    A direction keeps its Gauss-Newton step with the share 1 - MEASURED / l of its information, none where l is below MEASURED.
     """
     basis, inverse, values, vectors = relative_eigen(information, spurious)
-    kept = np.maximum(values - MEASURED, 0.0)
-    divisor = np.where(kept > 0.0, values, np.inf)
-    within = np.swapaxes(vectors, -1, -2) @ inverse
-    step = -np.swapaxes(within, -1, -2) @ ((within @ gradient[..., None]) / divisor[..., None])
-    return step[..., 0], np.sqrt(kept)[..., None] * np.swapaxes(basis @ vectors, -1, -2)
-
-
-def measured_part(information: Floats, spurious: Floats, gradient: Floats) -> tuple[Floats, Floats]:
-    """Return the information (..., 3, 3) and the gradient (..., 3) of the same step."""
-    step, root = measured_step(information, spurious, gradient)
-    measured = np.swapaxes(root, -1, -2) @ root
-    return measured, -(measured @ step[..., None])[..., 0]
+    kept = np.maximum(1.0 - MEASURED / np.maximum(values, _TINY), 0.0)
+    share = (basis @ vectors * kept[..., None, :]) @ (np.swapaxes(vectors, -1, -2) @ inverse)
+    return share @ information, (share @ gradient[..., None])[..., 0]
 
 
 def _inverse(lower: Floats) -> Floats:

@@ -5,7 +5,7 @@ pose (3 x 3), which is all that the graph needs to know of them.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints, Table, concatenated
 from .cloud_rasters import NOBODY, CloudRasters, look_up
 from .clouds import Clouds
-from .degeneracy import measured_step
+from .degeneracy import MEASURED, relative_eigen
 
 _AT_ONCE = 16384
 """Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
@@ -199,7 +199,7 @@ def shifts_by_range_error(
             sums = [(own * nx).sum(1), (own * ny).sum(1), (own * (ny * rx - nx * ry)).sum(1)]
             slopes[found.pairs, k] = np.stack(sums, axis=1)
     factors = concatenated(parts)
-    moved = measured_step(factors.hessian[:, None], factors.spurious[:, None], slopes)[0]
+    moved = np.stack([nondegenerate_step(replace(factors, gradient=slopes[:, k]))[0] for k in range(4)], axis=1)
     moved[..., :2] = se2.rotate(-T_i_j[:, None, 2], moved[..., :2])
     return -moved
 
@@ -210,9 +210,17 @@ _NEAREST = 0.05
 
 def nondegenerate_step(factors: PairFactors) -> tuple[Floats, Floats]:
     """Return the Gauss-Newton step (e, 3) in directions that were measured, none in the others, and L (e, 3, 3) with
-    L^T L the information in those directions (unscaled by noise); see degeneracy.
+    L^T L the information in those directions (unscaled by noise).
+
+    In the basis B that diagonalises both, spurious = B B^T and hessian = B V diag(l) V^T B^T; l must exceed a multiple
+    of 1, see degeneracy.
     """
-    return measured_step(factors.hessian, factors.spurious, factors.gradient)
+    basis, inverse, values, vectors = relative_eigen(factors.hessian, factors.spurious)
+    kept = np.maximum(values - MEASURED, 0.0)
+    divisor = np.where(kept > 0.0, values, np.inf)
+    within = np.swapaxes(vectors, 1, 2) @ inverse
+    step = -np.einsum("eji,ej->ei", within, np.einsum("eij,ej->ei", within, factors.gradient) / divisor)
+    return step, np.sqrt(kept)[:, :, None] * np.swapaxes(basis @ vectors, 1, 2)
 
 
 def measured(factors: PairFactors, T_i_j: Floats, variance: Floats) -> tuple[Floats, Floats]:
