@@ -90,9 +90,23 @@ def jumping(t, by, at=30.0):
 def test_excess_is_how_much_farther_the_ranges_went_than_the_wheels(by, speed):
     """Beyond half a metre and five times the least noise, and the way that the wheels count meanwhile."""
     log = line(lambda a, t: jumping(t, by), speed=speed)
-    # Three readings before and after span two seconds each; the times asked about are two seconds apart.
-    expected = max(0.0, abs(by) - speed * (2.0 + 2.0 + 2.0) - 0.5 - 5.0 * 0.03)
+    # From the middle one of three readings before, and to that of those after, it is 1.5 s each; the times asked about are two
+    # seconds apart.
+    expected = max(0.0, abs(by) - speed * (1.5 + 1.5 + 2.0) - 0.5 - 5.0 * 0.03)
     assert excess(log, 29.5, 31.5) == pytest.approx(expected, abs=1e-9)
+
+
+def test_what_the_wheels_count_while_the_radio_is_silent_is_no_motion_beyond_theirs():
+    """A radio that measures now and then: its last readings before a stand are of another place."""
+    stamps = np.arange(0.0, 60.0, 0.1)
+    way = 0.5 * (np.minimum(stamps, 25.0) + np.maximum(stamps - 35.0, 0.0))
+    log = line(lambda a, t: 10.0 + np.interp(t, stamps, way))
+    log = SensorLog(Odometry(stamps, np.column_stack([way, np.zeros((600, 2))])), log.ranges)
+    silent = log.ranges.rows((log.ranges.stamps < 16.0) | (log.ranges.stamps > 43.0))
+    assert excess(SensorLog(log.odometry, silent), 25.0, 35.0) == 0.0
+    carried = line(lambda a, t: 10.0 + np.interp(t, stamps, way) + 8.0 * (t > 30.0)).ranges
+    carried = carried.rows((carried.stamps < 16.0) | (carried.stamps > 43.0))
+    assert excess(SensorLog(log.odometry, carried), 25.0, 35.0) > 0.0
 
 
 def test_what_changes_in_between_counts_too():

@@ -11,6 +11,8 @@ from ..sensor_log import SensorLog, plausible
 
 _WINDOW = 3
 """Readings whose median is taken."""
+_MIDDLE = _WINDOW // 2 + 1
+"""The middle one of them."""
 _LONG = 8
 """Readings over which a jump must last."""
 _SILENCE = 6.0
@@ -41,9 +43,11 @@ def excess(log: SensorLog, start: float, end: float) -> float:
         parts = [ranges[(inside == k) & (stamps > start) & (stamps < end)] for k in range(len(edges) - 1)]
         parts = [ranges[stamps <= start][-_WINDOW:], *parts, ranges[stamps >= end][:_WINDOW]]
         level = np.array([np.median(part) if len(part) >= _WINDOW else np.nan for part in parts])
-        # Where the readings before and after stand, the robot may have driven a little.
+        # From the middle one of the readings before, and to that of those after, the robot may have driven; wherever the median
+        # is another one of the three, it lies between two that are nearer in time.
+        before, after = stamps[stamps <= start][-_MIDDLE:], stamps[stamps >= end][:_MIDDLE]
         extra = np.zeros(len(level))
-        extra[[0, -1]] = _way(log, stamps[stamps <= start][-_WINDOW:]), _way(log, stamps[stamps >= end][:_WINDOW])
+        extra[[0, -1]] = _way(log, np.append(before, start)), _way(log, np.append(after, end))
         change = np.abs(level[:, None] - level) - extra[:, None] - extra - _MARGIN - _TIMES_NOISE * _noise(ranges)
         if np.isfinite(level).sum() >= 2:
             found.append(np.where(np.isfinite(change), change, -np.inf))
