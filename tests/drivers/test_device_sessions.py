@@ -528,6 +528,22 @@ def test_tag_on_a_link_whose_delay_comes_and_goes(seed):
     assert len(epochs) + lost == pytest.approx(begun, abs=0.05 * begun)
 
 
+@pytest.mark.parametrize(("least", "most", "share"), [(0.1, 0.15, 0.7), (0.15, 0.45, 0.25), (0.5, 0.9, 0.0)])
+def test_tag_whose_answers_take_longer_than_a_fix_lasts(least, most, share):
+    """No fix can be read twice then. What is known to 0.6 s is logged, within its bracket, the rest counted, and both said."""
+    device, sent = tag()
+    rng = random.Random(0)
+    actions, _ = simulate(Dwm1001Driver(), device, 60.0, jitter=lambda: rng.uniform(least, most))
+    fixes = {tuple((f"{a:04X}", d) for a, d, _ in readings): t for t, readings in sent}
+    epochs = of_kind(actions, RangeEpoch)
+    for epoch in epochs:
+        true = fixes.pop(tuple((r.anchor_id, round(1000 * r.range)) for r in epoch.readings))
+        assert abs(epoch.stamp - true) <= epoch.spread + 1e-9
+    assert len(epochs) >= share * len(sent)
+    assert sum(a.count for a in of_kind(actions, Lost)) > 0 or share > 0.5
+    assert "uwb-slow" in names(actions)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_lidar_on_a_busy_computer_is_tied_as_well_as_is_stated(seed):
     """Answers and scans take 0 to 25 ms: more readings of the clock are asked for, and what is left is stated."""

@@ -17,8 +17,8 @@ from .events import Action, Corrupt, Lost, Note, Param, RangeEpoch, Reopen, Send
 from .session import Driver, Identity, Script, Wait
 
 DRAIN = 0.25
-PATIENCE = 0.25
-"""s to wait for an answer during start-up."""
+PATIENCE, SETTLE = 1.0, 0.25
+"""s to wait for an answer during start-up, as the vendor's host does, and after leaving the shell."""
 PROBES = ((STATUS_GET, PATIENCE), (ENTER, 0.6), (STATUS_GET, PATIENCE), (STATUS_GET, PATIENCE), (b"\r", 1.0))
 """What finds out the mode: the status in generic mode; Enter in the shell, which also wakes a sleeping tag."""
 QUIET = 0.15, 0.35
@@ -127,7 +127,7 @@ class Dwm1001Driver(Driver):
         if shell:
             self._text, self._binary = True, False
             yield Send(b"quit\r")
-            yield from self.sleep(PATIENCE)
+            yield from self.sleep(SETTLE)
         self._text, self._binary = False, True
         self._tlv.reset()
         return not shell or (yield from self.ask(STATUS_GET, lambda e: isinstance(e, Status), PATIENCE, 4)) is not None

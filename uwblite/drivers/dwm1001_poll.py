@@ -35,12 +35,21 @@ QUICK = 0.12
 """Share of a period: with a shorter round trip every fix is read twice."""
 READS = 5
 """Times a fix is read before it is given up."""
-WIDEST = 0.2
-"""s; a fix with a wider bracket is not logged but counted as lost."""
+WIDE, SEVERAL, WIDEST = 0.2, 5, 0.6
+"""s; so many fixes in turn with a wider bracket are worth a note; s; one with a still wider bracket counts as lost and is not
+logged."""
 MAX_FAILURES = 40
 """Requests without an answer after which the module is started again."""
 UNJOINED = 3.0
 """s without a fix after which a tag is reported to have no network."""
+
+
+
+def _slow(width: float) -> Note:
+    """Return the note on answers that take so long that fixes are known to so many seconds only."""
+    text = f"uwb: answers are slow: the time of a range is known to {width:.1f} s only, and beyond {WIDEST} s it is not logged"
+    return Note("warning", "uwb-slow", f"{text}; read the module's stream instead (--uwb shell:PORT), or connect it directly")
+
 
 Readings = tuple[RangeReading, ...]
 Bracket = tuple[float, float]
@@ -69,6 +78,7 @@ class FixPoller:
         self._low: float | None = None  # s, when the last look was sent that would have shown any fix made before it
         # Bracket and readings of a fix, and the bracket to take if another fix is found to be close behind.
         self._pending: tuple[Bracket, Readings, Bracket] | None = None
+        self._wide = 0  # fixes in turn with a wide bracket
         self._hidden = False  # an answer was lost that may have announced a fix
         self._stale = False  # the status may still announce a fix that was read without asking for the status
         self._missed = self._latest is not None  # a fix may have been missed
@@ -135,6 +145,9 @@ class FixPoller:
         """Log a fix; where its bracket holds several, the last of them was read."""
         low, high = bracket
         stamp, unsure = (low + high) / 2, high - low > WIDEST
+        self._wide = self._wide + 1 if high - low > WIDE else 0
+        if self._wide >= SEVERAL:
+            yield from self._driver.say_once(_slow(high - low))
         gap = round((stamp - self._last_fix) / self._period) - 1 if self._latest is not None else 0
         if (gap > 0 and self._missed) or unsure:
             yield Lost(stamp, max(0, gap) + unsure)
@@ -168,6 +181,9 @@ class FixPoller:
             quick = self._trip is None or self._trip < QUICK * self._period
             if readings == before or not (quick or fresh or self._driver.now < self._distrust_until):
                 return readings
+            if not quick and before is not None:
+                # Over a slow link the next fix comes before this one is read again: an anchor that is in both is one.
+                self._known |= {r.anchor_id for r in readings} & {r.anchor_id for r in before}
             before = readings
         yield Corrupt(b"", f"a fix read {READS} times never came twice alike")
         return None
