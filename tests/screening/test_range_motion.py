@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from uwblite.screening import range_motion
-from uwblite.screening.range_motion import _agreed, _by_anchor, _jumps, _noise, _together, excess
+from uwblite.screening.range_motion import _agreed, _by_anchor, _jumps, _noise, _together, change_by_way, excess
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog, SensorMounting, UwbRanges
 
 
@@ -182,3 +182,15 @@ def test_the_moment_of_a_cut_is_in_all_the_spans_that_jump():
     assert _together(spans, np.zeros(0)) == [3.0]
     assert _together([spans[0], spans[1][:, [0, 1, 2]] * [1, 1, -1]], np.zeros(0)) == []
     assert _together([spans[0], spans[1] * [1, 1, 0]], np.zeros(0)) == []
+
+
+@pytest.mark.parametrize("times", [0.3048, 1.0, 3.28])
+def test_ranges_change_as_much_as_a_robot_drives_towards_an_anchor(times):
+    """One anchor lies ahead; of another at the side one range in ten changes by more than 0.87 of the way, at last."""
+    log = line(lambda a, t: times * (30.0 - 0.5 * t if a == 0 else np.hypot(2.0, 0.5 * t - 5.0)), speed=0.5, noise=0.02)
+    assert change_by_way(log) == pytest.approx(times, abs=0.05)
+
+
+def test_ranges_that_change_now_and_then_show_no_unit():
+    assert np.isnan(change_by_way(line(lambda a, t: 10.0 + 9.0 * (t % 20 < 1), speed=0.5)))
+    assert np.isnan(change_by_way(line(lambda a, t: 10.0, speed=0.5, seconds=15.0)))

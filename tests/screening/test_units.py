@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from uwblite.errors import DataError
-from uwblite.screening.units import heading_agreement, refuse_degrees, refuse_wrong_lengths, refuse_wrong_times
+from uwblite.screening.units import (
+    heading_agreement,
+    likely_unit,
+    refuse_degrees,
+    refuse_other_ranges,
+    refuse_wrong_lengths,
+    refuse_wrong_times,
+)
 from uwblite.sensor_log import Gyro, LaserScans, Odometry, SensorLog, UwbRanges
 
 
@@ -205,3 +212,55 @@ def test_one_sensor_s_stamps():
     assert "stamps of the odometry look like milliseconds" in times_said(replace(log, odometry=replace(ms, poses=0 * ms.poses)))
     # A sensor that was started late, or died, is of the same clock.
     assert times_said(replace(log, ranges=replace(log.ranges, stamps=0.001 * log.ranges.stamps))) == ""
+
+
+def by_time(odometry, unit):
+    return replace(odometry, stamps=odometry.stamps / unit)
+
+
+def stamps_said(odometry, ranges=None):
+    try:
+        refuse_wrong_times(SensorLog(odometry, ranges))
+    except DataError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(("unit", "name"), [(1.0, ""), (60.0, "minutes"), (3600.0, "hours"), (86400.0, "days")])
+@pytest.mark.parametrize("period", [0.02, 0.1])
+def test_stamps_in_long_units_are_told_from_lengths_in_short_ones(unit, name, period):
+    """In minutes a robot drives and turns sixty times as fast; in centimetres it does not turn so, in degrees not drive so."""
+    path = arc()
+    stamps = period * np.arange(len(path.stamps))
+    path = Odometry(stamps, np.column_stack([path.poses[:, :2] * period / 0.1, 0.4 * stamps]))
+    assert (f"look like {name}:" if name else "") in stamps_said(by_time(path, unit))
+    assert stamps_said(replace(path, poses=path.poses * [100.0, 100.0, 1.0])) == ""
+    assert stamps_said(replace(path, poses=path.poses * [1.0, 1.0, np.degrees(1.0)])) == ""
+
+
+def test_stamps_of_one_sensor_in_minutes():
+    path = arc()
+    values = replace(ranges([5.0] * 900), stamps=np.linspace(0.0, path.stamps[-1], 900))
+    assert stamps_said(path, values) == ""
+    text = stamps_said(path, replace(values, stamps=values.stamps / 60.0))
+    assert "the stamps of the radio look like minutes: odometry and radio would last 59.9 s and" in text
+
+
+@pytest.mark.parametrize(
+    ("times", "by_lidar", "unit"),
+    [(1.0, np.nan, ""), (2.0, np.nan, ""), (3.2, np.nan, "0.3048"), (3.2, 1.0, "0.3048"), (3.2, 3.3, ""), (96.0, 1.0, "0.01"),
+     (1050.0, np.nan, "0.001"), (np.nan, 1.0, "")],
+)  # fmt: skip
+def test_ranges_that_change_as_much_as_another_unit_would(times, by_lidar, unit):
+    try:
+        refuse_other_ranges(times, by_lidar)
+        text = ""
+    except DataError as error:
+        text = str(error)
+    assert factor(text) == unit
+
+
+def test_factors_that_a_unit_explains():
+    assert "ranges in yards" in likely_unit(1.10)
+    assert "odometry in feet" in likely_unit(0.31)
+    assert likely_unit(1.0) == likely_unit(1.15) == likely_unit(1.41) == ""

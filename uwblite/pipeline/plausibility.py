@@ -12,6 +12,7 @@ from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
 from .drift_tests import check_drifts
 from .estimate import Estimate, Task
@@ -222,7 +223,8 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
         task.stages.warn(
             "unusual-calibration",
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
-            + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings"),
+            + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings")
+            + (likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""),
             name=value.name, value=value.value, sigma=value.sigma, usual=sigma,
         )  # fmt: skip
 

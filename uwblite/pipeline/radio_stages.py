@@ -30,6 +30,7 @@ from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
+from ..screening.units import likely_unit
 from . import anchor_heights, joining, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
@@ -142,7 +143,7 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
             whose = f"{recording.name}: " if len(recordings) > 1 else ""
             text = (
                 f"{whose}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its "
-                f"odometry has: {reason}"
+                f"odometry has: {reason}{likely_unit(factor)}"
             )
             high = other is not None and not other.taken
             if other is not None and high:

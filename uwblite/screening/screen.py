@@ -66,14 +66,20 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
         remarks += more
     log, gaps, more = _gaps(log)
     log, pairs, turned = _looking_ahead(log)
+    units.refuse_other_ranges(range_motion.change_by_way(log), _way_ratio(pairs))
     log, pairs, lost, standing = _lost_wheels(log, pairs)
     remarks += [*more, *turned, *standing]
     cut, more = _cuts(log, jumps.stamps, OdometryBreaks.of_all([gaps, lost]).stamps)
     if pairs is not None:
         more += wheel_motion.unmatched(pairs) + wheel_motion.disagreeing(pairs, float(log.odometry.stamps[0]))
     more += _hardly_moving(log.odometry)
-    ratio = float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
-    return replace(log, screening=Screening((*remarks, *more), OdometryBreaks.of_all([jumps, gaps, lost, cut]), ratio))
+    breaks = OdometryBreaks.of_all([jumps, gaps, lost, cut])
+    return replace(log, screening=Screening((*remarks, *more), breaks, _way_ratio(pairs)))
+
+
+def _way_ratio(pairs: Pairs | None) -> float:
+    """Return the way that the lidar measures by that of the wheels; nan where it measures none."""
+    return float("nan") if pairs is None else wheel_motion.way_ratio(pairs)
 
 
 def _looking_ahead(log: SensorLog) -> tuple[SensorLog, Pairs | None, list[Remark]]:

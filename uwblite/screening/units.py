@@ -20,9 +20,19 @@ _CHORD = 1.0
 """Time over which speed is taken, s: readings of two robots by turns, or in bursts, jump from one to the next."""
 _ENOUGH = 10
 """Readings from which a unit is judged."""
+_LENGTHS = {"feet": 0.3048, "centimetres": 0.01, "millimetres": 0.001}
+_YARD, _SAME_UNIT = 0.9144, 0.03
+"""m; and by how much, relatively, a factor that a map found may differ from that of a unit."""
+_OTHER_LENGTH = 1.2
+"""Ranges in another unit change by its factor as much as the wheels drive, up to this factor."""
 _TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-_SELDOM = 1.0
-"""Time between readings of the odometry, s, up to which stamps are taken for seconds."""
+_LONG_TIMES = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+_SELDOM, _OFTEN = 1.0, 0.005
+"""Times between readings, s, between which stamps are taken for seconds."""
+_RAPID, _SPIN = 0.002, 3.0
+"""Time between readings of the odometry, s, that is shorter than any; and mean turn rate, rad/s, that no robot keeps."""
+_USUAL_SPEED = 0.3
+"""m/s."""
 _PERIODS, _SPEEDS = (5e-4, 2.0), (0.01, _FAR_TOO_FAST)
 """Times between readings, s, and highest usual speeds, m/s, of a robot: what the right unit of time gives."""
 _SAME_LENGTH = 2.0
@@ -54,6 +64,32 @@ def refuse_degrees(odometry: Odometry) -> None:
         raise DataError(text)
 
 
+def refuse_other_ranges(change_by_way: float, lidar_by_wheels: float) -> None:
+    """Raise DataError where ranges change by more than the wheels drive, and by the factor of another unit.
+
+    Parameters
+    ----------
+    change_by_way : see range_motion.change_by_way.
+    lidar_by_wheels : the way that the lidar measures by the way of the wheels, nan where it does not: a lidar that agrees with
+        the ranges shows that the wheels are wrong.
+    """
+    if abs(np.log(change_by_way / lidar_by_wheels)) < np.log(_OTHER_LENGTH):
+        return
+    for name, unit in _LENGTHS.items():
+        if abs(np.log(change_by_way * unit)) < np.log(_OTHER_LENGTH):
+            usual = f"usual change would be {change_by_way:.3g} times the way that the wheels count"
+            raise DataError(_other_unit("the ranges", usual, name, "range"))
+
+
+def likely_unit(times: float) -> str:
+    """Return words on what looks as if the robot drove so many times as far as its wheels count; '' where nothing does."""
+    if abs(np.log(times * _YARD)) < _SAME_UNIT:
+        return f"; ranges in yards would look like this (uwblite convert --range-unit {_YARD})"
+    if abs(np.log(times / _LENGTHS["feet"])) < _SAME_UNIT:
+        return f"; odometry in feet would look like this (uwblite convert --odometry-unit {_LENGTHS['feet']})"
+    return ""
+
+
 def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, bool]:
     """Compare the heading times a factor with the direction of motion.
 
@@ -79,17 +115,42 @@ def heading_agreement(odometry: Odometry, factor: float = 1.0) -> tuple[float, b
 
 def _odometry_stamps(odometry: Odometry) -> str:
     """Return the words on stamps with which neither the time between readings nor the speed is a robot's."""
+    if text := _seldom_stamps(odometry):
+        return text
     period, speeds = _period(odometry.stamps), _speeds(odometry)
     if period <= _SELDOM or len(speeds) < _ENOUGH:
         return ""
     fast = float(np.quantile(speeds, 0.9))
     for name, unit in _TIMES.items():
         if _PERIODS[0] <= period * unit <= _PERIODS[1] and _SPEEDS[0] <= fast / unit <= _SPEEDS[1]:
-            return (
-                f"the stamps look like {name}: the odometry would come every {period:.3g} s, at {fast:.1g} m/s; "
-                f"write seconds into the log (uwblite convert --time-unit {unit:g})"
-            )
+            return _other_time(name, unit, period, fast)
     return ""
+
+
+def _seldom_stamps(odometry: Odometry) -> str:
+    """Return the words on stamps with which the robot would be too fast, and report that too often.
+
+    With positions in centimetres it would be as fast, but would not spin.
+    """
+    span = float(np.ptp(odometry.stamps))
+    steps = np.abs(np.diff(odometry.poses, axis=0))
+    period = span / max(len(steps), 1)
+    if len(steps) < _ENOUGH or not 0.0 < period < _OFTEN:
+        return ""
+    turns = np.minimum(steps[:, 2] % (2.0 * np.pi), -steps[:, 2] % (2.0 * np.pi))
+    speed, spin = float(np.hypot(steps[:, 0], steps[:, 1]).sum()) / span, float(turns.sum()) / span
+    found = [(abs(np.log(speed / unit / _USUAL_SPEED)), name, unit) for name, unit in _LONG_TIMES.items()
+             if speed > FASTEST and (spin > _SPIN or period < _RAPID) and spin / unit < _SPIN
+             and _PERIODS[0] <= period * unit <= _PERIODS[1] and _SPEEDS[0] <= speed / unit <= _SPEEDS[1]]  # fmt: skip
+    return _other_time(*min(found)[1:], period, speed) if found else ""
+
+
+def _other_time(name: str, unit: float, period: float, speed: float) -> str:
+    """Return the words on stamps in another unit, s."""
+    return (
+        f"the stamps look like {name}: the odometry would come every {period:.3g} s, at {speed:.1g} m/s; "
+        f"write seconds into the log (uwblite convert --time-unit {unit:g})"
+    )
 
 
 def _other_stamps(log: SensorLog) -> str:
@@ -110,9 +171,10 @@ def _other_stamps(log: SensorLog) -> str:
 
 def _finer(stamps: Floats, others: Floats) -> str:
     """Return the unit of stamps (n,) that makes them last as long as others (m,), s, at a sensor's rate; '' without one."""
-    for name, unit in _TIMES.items():
+    period = _period(stamps)
+    for name, unit in (_TIMES | (_LONG_TIMES if period < _OFTEN else {})).items():
         alike = np.ptp(others) / _SAME_LENGTH < np.ptp(stamps) * unit < np.ptp(others) * _SAME_LENGTH
-        if alike and _PERIODS[0] <= _period(stamps) * unit <= _PERIODS[1]:
+        if alike and _PERIODS[0] <= period * unit <= _PERIODS[1]:
             return name
     return ""
 
@@ -141,13 +203,14 @@ def _positions(odometry: Odometry) -> str:
     speed = float(np.median(speeds))
     if speed <= _FAR_TOO_FAST:
         return ""
-    return _other_unit("the odometry's positions", f"usual speed would be {speed:.0f} m/s", speed > _CENTIMETRES, "odometry")
+    unit = "millimetres" if speed > _CENTIMETRES else "centimetres"
+    return _other_unit("the odometry's positions", f"usual speed would be {speed:.0f} m/s", unit, "odometry")
 
 
-def _other_unit(what: str, usual: str, millimetres: bool, option: str) -> str:
-    """Return the words on lengths in millimetres or centimetres."""
-    unit, factor = ("millimetres", 0.001) if millimetres else ("centimetres", 0.01)
-    return f"{what} look like {unit}: the {usual}; write metres into the log (uwblite convert --{option}-unit {factor:g})"
+def _other_unit(what: str, usual: str, unit: str, option: str) -> str:
+    """Return the words on lengths in another unit."""
+    factor = f"{_LENGTHS[unit]:g}"
+    return f"{what} look like {unit}: the {usual}; write metres into the log (uwblite convert --{option}-unit {factor})"
 
 
 def _heading(odometry: Odometry) -> str:
@@ -179,7 +242,8 @@ def _of_ranges(log: SensorLog) -> str:
     if len(positive) < _ENOUGH or np.median(positive) <= LONGEST_RANGE:
         return ""
     usual = float(np.median(positive))
-    return _other_unit("the ranges", f"usual one would be {usual:.0f} m", usual > 1500.0, "range")
+    unit = "millimetres" if usual > 1500.0 else "centimetres"
+    return _other_unit("the ranges", f"usual one would be {usual:.0f} m", unit, "range")
 
 
 def _of_scans(log: SensorLog) -> str:
@@ -194,4 +258,5 @@ def _of_scans(log: SensorLog) -> str:
     if len(seen) < _ENOUGH or np.median(seen) <= _LONGEST_READING:
         return ""
     usual = float(np.median(seen))
-    return _other_unit("the laser's readings", f"usual one would be {usual:.0f} m", usual > 500.0, "laser")
+    unit = "millimetres" if usual > 500.0 else "centimetres"
+    return _other_unit("the laser's readings", f"usual one would be {usual:.0f} m", unit, "laser")
