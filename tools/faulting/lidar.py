@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from uwblite import se2
 from uwblite.sensor_log import LaserScans
 
 from .case import Case, Fault, Rng, shifted, with_scans
@@ -115,6 +116,20 @@ def companion(case: Case, rng: Rng) -> Case:
             legs = away[:, None] + rng.normal(0.0, 0.01, readings.shape)
             readings = np.where(hit, legs, readings).astype(np.float32)
         return replace(s, ranges=readings)
+
+    return with_scans(case, change)
+
+
+def mirrors(case: Case, rng: Rng) -> Case:
+    """A third of the walls, in places of 2 m, are mirrors: the lidar sees twice as far there."""
+
+    def change(s: LaserScans) -> LaserScans:
+        base = se2.interpolate_trajectory(case.log.odometry.stamps, case.truth, s.stamps)
+        angle = s.angle_min + s.angle_increment * np.arange(s.ranges.shape[1]) + base[:, 2:3]
+        seen = np.where(np.isfinite(s.ranges), s.ranges, 0.0)
+        x, y = base[:, :1] + seen * np.cos(angle), base[:, 1:2] + seen * np.sin(angle)
+        mirror = (np.floor(x / 2.0) + 2.0 * np.floor(y / 2.0)) % 3.0 == 0.0
+        return replace(s, ranges=np.where(mirror, 2.0 * s.ranges, s.ranges).astype(np.float32))
 
     return with_scans(case, change)
 

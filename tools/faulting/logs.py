@@ -9,6 +9,7 @@ from uwblite import se2
 from uwblite.sensor_log import Odometry, UwbRanges
 
 from .case import Case, Fault, Floats, Ints, Rng, kept, rows, shifted, with_odometry
+from .wheels import reset
 
 
 def clock_back(kinds: str) -> Fault:
@@ -24,6 +25,16 @@ def clock_forward(kinds: str) -> Fault:
 def late(kinds: str, seconds: float) -> Fault:
     """All stamps of a sensor are late."""
     return lambda case, rng: shifted(case, lambda t: np.full(len(t), seconds), kinds)
+
+
+def in_unit(kinds: str, seconds: float) -> Fault:
+    """Stamps are written in a unit of so many seconds."""
+    return lambda case, rng: shifted(case, lambda t: t / seconds - t, kinds)
+
+
+def joined_with_overlap(case: Case, rng: Rng) -> Case:
+    """Two logs in one file: the second begins at zero, by a clock with which it overlaps the first by 25 s."""
+    return shifted(reset(case, rng), lambda t: np.where(t >= case.middle, -25.0, 0.0))
 
 
 def absent(kinds: str, share: float = 0.4) -> Fault:

@@ -53,13 +53,46 @@ def moved_anchor(case: Case, rng: Rng) -> Case:
     return case if case.log.ranges is None else elsewhere(case, {case.log.ranges.anchor_ids[0]: np.array([1.8, 2.4])})
 
 
-def elsewhere(case: Case, by: dict[str, Floats]) -> Case:
-    """Return the case with anchors moved half-way by so much (2,), m."""
+def one_after_the_other(case: Case, rng: Rng) -> Case:
+    """Two anchors are put 1.2 m away, one at a third of the time, one at two thirds."""
+    if case.log.ranges is None:
+        return case
+    names = case.log.ranges.anchor_ids
+    return elsewhere(elsewhere(case, {names[0]: np.array([1.2, 0.0])}, 0.3), {names[2]: np.array([0.0, -1.2])}, 0.6)
+
+
+def moved_as_one(case: Case, rng: Rng) -> Case:
+    """Half-way all anchors are put elsewhere as one, as if the room were another."""
+    places = np.array([case.anchors[name][0] for name in case.anchors])
+    middle = places.mean(axis=0)
+    after = middle + se2.transform(np.array([4.0, 1.0, 0.5]), places - middle)
+    return elsewhere(case, dict(zip(case.anchors, after - places, strict=True)))
+
+
+def names_of_the_reading_before(case: Case, rng: Rng) -> Case:
+    """From half-way on each range carries the name that the reading before it should have."""
+
+    if case.log.ranges is None:
+        return case
+    r, names, places = case.log.ranges, case.log.ranges.anchor_ids, dict(case.anchors)
+    given, later = np.roll(r.anchor, 1), r.stamps >= case.middle
+    for k, name in enumerate(names):
+        # In turn, a name is that of one other anchor throughout.
+        usual = np.bincount(r.anchor[later & (given == k)], minlength=len(names)).argmax()
+        if name in places and names[usual] in places:
+            places[name] = [*case.anchors[name], case.anchors[names[usual]][0]]
+    return replace(with_ranges(case, lambda r: replace(r, anchor=np.where(later, given, r.anchor))), anchors=places)
+
+
+def elsewhere(case: Case, by: dict[str, Floats], share: float = 0.5) -> Case:
+    """Return the case with anchors moved by so much (2,), m, at a share of its time."""
+    first, last = case.log.odometry.stamps[[0, -1]]
+    since = first + share * (last - first)
 
     def change(r: UwbRanges) -> UwbRanges:
         ranges = r.ranges.copy()
         for name in set(by) & set(r.anchor_ids):
-            moved = (r.anchor == r.anchor_ids.index(name)) & (r.stamps >= case.middle)
+            moved = (r.anchor == r.anchor_ids.index(name)) & (r.stamps >= since)
             longer = _longer(case, r, case.anchors[name][0], by[name])
             ranges[moved] = np.maximum(ranges + longer, 0.05)[moved]
         return replace(r, ranges=ranges)

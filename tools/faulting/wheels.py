@@ -196,6 +196,19 @@ def one_wheel(factor: float, seconds: float = 1e9) -> Fault:
     return fault
 
 
+def loose_encoder(case: Case, rng: Rng) -> Case:
+    """The plug of the left encoder is loose: for 6 s of 50 the left wheel counts nothing, on a track of 0.3 m."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps = se2.between(poses[:-1], poses[1:])
+        off = (stamps[1:] - stamps[0]) % 50.0 < 6.0
+        right = steps[:, 0] + 0.15 * steps[:, 2]
+        steps[off, 0], steps[off, 2] = 0.5 * right[off], right[off] / 0.3
+        return chained(poses[0], steps)
+
+    return with_odometry(case, change)
+
+
 def wrapped_counters(case: Case, rng: Rng) -> Case:
     """The counters of both wheels have 16 bits, 0.2 mm each, and the base does not notice that they wrap."""
 
