@@ -3,6 +3,7 @@
 
     python tools/consistency.py                              20 recordings of 7 min of each world; writes into docs/accuracy.md
     python tools/consistency.py --runs 4 --minutes 4 --only hall --print     a quick look
+    python tools/consistency.py --of "corridor, no lidar" --of "lab, one anchor" --minutes 4 --print
     python tools/consistency.py --easy --print               rooms without errors that stay with places
     python tools/consistency.py --set refinement.correlation=8 --print
     python tools/consistency.py --minutes 4 --first 9000 --keep rows.pkl     as many as time allows; the next call goes on
@@ -23,6 +24,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +53,12 @@ RECORDINGS = {
     "hall, no lidar": Settings(world="hall", without=("laser",)),
     "hall, no UWB": Settings(world="hall", without=("uwb",)),
 }
+SENSORS: dict[str, dict[str, Any]] = {
+    "one anchor": {"anchors": 1},
+    "no lidar": {"without": ("laser",)},
+    "no UWB": {"without": ("uwb",)},
+}
+"""What may be added to a world's name with --of."""
 LONGER = {"warehouse": 3.0}
 """Worlds whose recordings are so many times as long. After 110 m in the warehouse, 60 x 40 m, some anchors are yet measured
 from one aisle only, a straight line, and rightly have two places; after 220 m all are from places 2 m or more off a line."""
@@ -119,6 +127,21 @@ def compare(name: str, result: MapResult, trial: Trial) -> Consistency:
     )
 
 
+def settings_of(name: str) -> Settings:
+    """Return the settings of a row, or of a world with other sensors, as "lab, one anchor, no lidar".
+
+    Raises
+    ------
+    KeyError : there is no such world, or no such sensors.
+    """
+    if name in RECORDINGS:
+        return RECORDINGS[name]
+    world, *sensors = name.split(", ")
+    worlds = {row.partition(", ")[0]: settings for row, settings in reversed(RECORDINGS.items())}
+    changes = {key: value for sensor in sensors for key, value in SENSORS[sensor].items()}
+    return replace(worlds[world], **changes)
+
+
 def work(task: Task) -> Consistency:
     """Simulate a recording, map it and compare; the grid does not matter and is drawn coarsely."""
     trial = made(task.settings)
@@ -185,6 +208,8 @@ def main(argv: list[str] | None = None) -> int:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--runs", type=int, default=20, metavar="N", help="recordings of each world (20)")
     p.add_argument("--only", action="append", default=[], metavar="WORD", help="worlds whose names contain it; repeatable")
+    p.add_argument("--of", action="append", default=[], metavar="NAME", help='a world and its sensors instead of those worlds, '
+                   'as "corridor, no lidar"; repeatable')
     p.add_argument("--easy", action="store_true", help="rooms without errors that stay with places, walls and floors")
     p.add_argument("--first", type=int, default=FIRST_SEED, metavar="SEED", help=f"seed of the first recordings ({FIRST_SEED})")
     p.add_argument("--minutes", type=float, default=7.0, metavar="N", help="length of each (7)")
@@ -195,13 +220,13 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     args = p.parse_args(argv)
     rooms = None if args.easy else RealRooms()
-    chosen = [name for name in RECORDINGS if not args.only or any(word in name for word in args.only)]
+    chosen = args.of or [name for name in RECORDINGS if not args.only or any(word in name for word in args.only)]
     found = kept(args.keep)
     seeds = range(args.first, args.first + args.runs)
     changes = {"scan_rate": 5.0, "rooms": rooms}
     tasks = []
     for name, seed in ((name, seed) for seed in seeds for name in chosen if (name, seed) not in found):
-        settings = replace(RECORDINGS[name], seed=seed, minutes=args.minutes * LONGER.get(name, 1.0), **changes)
+        settings = replace(settings_of(name), seed=seed, minutes=args.minutes * LONGER.get(name, 1.0), **changes)
         tasks.append(Task(name, settings, tuple(args.set)))
     for task, c in zip(tasks, spread_out(work, tasks, args.jobs), strict=True):
         found[task.name, task.settings.seed] = c
@@ -209,7 +234,8 @@ def main(argv: list[str] | None = None) -> int:
         found_text = f"poses {c.poses.mean():.2f}, anchors {c.anchors.mean() if len(c.anchors) else float('nan'):.2f}"
         found_text += f", {c.error:.4f} m of {c.stated:.4f} m stated"
         print(f"{len(found)} recordings, {c.name}: {found_text}", file=sys.stderr, flush=True)
-    text = document([found[key] for key in sorted(found, key=lambda k: list(RECORDINGS).index(k[0]))], args.minutes, args.easy)
+    order = list(dict.fromkeys([*RECORDINGS, *(name for name, _ in found)]))
+    text = document([found[key] for key in sorted(found, key=lambda k: order.index(k[0]))], args.minutes, args.easy)
     if args.print:
         print(text)
     else:

@@ -49,6 +49,16 @@ def test_errors_are_taken_in_the_frame_of_the_first_pose(trial, result):
     np.testing.assert_allclose(consistency.compare("", turned, trial).poses, one.poses / 4.0)
 
 
+def test_consistency_takes_any_world_with_other_sensors():
+    both = consistency.settings_of("warehouse, one anchor, no lidar")
+    assert (both.world, both.anchors, both.without, both.speed) == ("warehouse", 1, ("laser",), 0.4)
+    assert consistency.settings_of("hall, bad wheels") is consistency.RECORDINGS["hall, bad wheels"]
+    assert consistency.settings_of("hall, no lidar") == consistency.RECORDINGS["hall, no lidar"]
+    assert consistency.settings_of("tunnel, no UWB").without == ("uwb",)
+    with pytest.raises(KeyError):
+        consistency.settings_of("hall, no wheels")
+
+
 def test_consistency_goes_on_where_an_earlier_call_stopped(tmp_path, monkeypatch, capsys):
     """Each world and seed is mapped once; a world that needs it gets a longer recording."""
     asked = []
