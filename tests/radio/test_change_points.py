@@ -38,6 +38,19 @@ def test_an_anchor_that_stands_still_was_not_moved_however_often_its_line_of_sig
     assert find_move(PATH, measured(seed, np.array([-2.0, 1.0]), share=share), STAMPS, SIGMA, TrilaterationConfig()) is None
 
 
+def test_a_high_anchor_that_is_passed_nearby_and_then_seen_from_afar_was_not_moved():
+    """Nobody gave its height: level distances would place it elsewhere in each part of the drive."""
+    rng, height, k = np.random.default_rng(0), 3.0, np.arange(50)
+    near = np.column_stack([np.linspace(-4.0, 4.0, 50), 1.0 + 0.5 * np.sin(0.4 * k)])
+    far = np.column_stack([12.0 + 3.0 * np.cos(0.14 * k), 9.0 + 3.0 * np.sin(0.22 * k)])
+    path, stamps = np.vstack([near, far]), STAMPS[:100]
+    ranges = np.hypot(np.hypot(*path.T), height) + 0.1 + rng.normal(0.0, SIGMA, len(path))
+    assert find_moves(path, ranges, stamps, SIGMA, TrilaterationConfig()) == []
+    moved = np.hypot(np.hypot(*(path - [6.0, -5.0]).T), height) + 0.1 + rng.normal(0.0, SIGMA, len(path))
+    (move,) = find_moves(path, np.where(stamps < 50.0, ranges, moved), stamps, SIGMA, TrilaterationConfig())
+    assert abs(move.stamp - 50.0) <= 5.0
+
+
 def test_a_few_ranges_show_no_move():
     few = slice(0, 30)
     ranges = measured(1, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), moment=15)[few]

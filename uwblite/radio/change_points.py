@@ -4,7 +4,7 @@ With the path of the tag known well enough, all ranges to an anchor are explaine
 by one place and those from that or a later moment on by another: an anchor that is carried is at neither meanwhile. What
 competes with a move is a change of the constant error: a robot that drives towards an anchor from afar, with a rack in between
 or a path that is wrong by some decimetres, has ranges that a place metres aside explains as well. So two places must explain
-clearly more ranges than one place with another constant error from then on.
+clearly more ranges than one place with another constant error from then on, and than one high above the tag.
 """
 
 from collections.abc import Sequence
@@ -37,6 +37,11 @@ _WORST_BIAS = 1.0
 """Constant error of ranges to a place, m, beyond that of the worst radios: no anchor stood there."""
 _STEP = 0.5
 """Change of a constant error that a line of sight blocked from some moment on explains, m."""
+_HEIGHTS, _LEAST_LEVEL = (1.0, 2.0, 3.0, 4.0), 0.1
+"""Heights that nobody gave, m, and the least level distance below an anchor, m: an anchor passed nearby and seen from afar at
+another time seems to have two places."""
+_LIKE_HEIGHT = 0.5
+"""Part of the least gain that suffices against a place with a height, which has fewer unknowns than two places."""
 _WIDTH = 4.0
 """Ranges farther from a place than so many of their standard deviations are not explained by it."""
 _CARRIED = 0.5
@@ -147,7 +152,9 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
         return None
     if max(abs(move.first.bias), abs(move.second.bias)) > _WORST_BIAS:
         return None
-    return move if _with_step(path, ranges, best, width, config) - best.unexplained >= gain else None
+    if _with_step(path, ranges, best, width, config) - best.unexplained < gain:
+        return None
+    return move if _with_height(path, ranges, width, config) - best.unexplained >= _LIKE_HEIGHT * gain else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,6 +224,17 @@ def _with_step(path: Floats, ranges: Floats, split: _Split, width: float, config
         level = ranges - others * np.clip(np.median(off[others]), -_STEP, _STEP)
         places = (place, *_fitted([(path, level)], width, config))
         unexplained.append(min(float(_misfit(path, level, at, width).sum()) for at in places))
+    return min(unexplained)
+
+
+def _with_height(path: Floats, ranges: Floats, width: float, config: TrilaterationConfig) -> float:
+    """Return how many ranges one place leaves unexplained that is higher above the tag than the level distances suppose."""
+    level = [np.sqrt(np.maximum(ranges**2 - height**2, _LEAST_LEVEL**2)) for height in _HEIGHTS]
+    places = _fitted([(path, each) for each in level], width, config)
+    unexplained = []
+    for height, place in zip(_HEIGHTS, places, strict=True):
+        slant = np.hypot(np.hypot(*(place.position - path).T), height) + place.bias
+        unexplained.append(float(np.sum(np.minimum(np.abs(ranges - slant) / width, 1.0) ** 2)))
     return min(unexplained)
 
 
