@@ -288,6 +288,23 @@ def test_messages_out_of_order_are_sorted_and_equal_stamps_keep_their_places(tmp
     ]
 
 
+@pytest.mark.parametrize(
+    ("stamps", "by"),
+    [
+        ([5, 6, 7, 8, 1, 2, 3, 4], 0.0),  # halves swapped
+        ([1, 2, 7, 8, 3, 4, 5, 6], 0.0),  # a block too early
+        ([11, 12, 1, 2, 9, 10], 0.0),  # a silence within a part is none between parts
+        ([1, 2, 3, 4, 2.5, 3.5, 4.5], 1.5),  # the same time twice
+        ([30, 31, 32, 1, 2, 3], 31.0),  # a clock set back long before the time that it had counted
+    ],
+)
+def test_parts_in_another_order_are_no_clock_that_was_set_back(tmp_path, stamps, by):
+    log = read(tmp_path, "".join(ODOM.format(x=0.1 * t, t=t) for t in stamps))
+    assert log.odometry.stamps.tolist() == sorted(stamps)
+    assert log.notes.set_back == {"odometry": by}
+    assert any("came out of time order" in w for w in log.notes.warnings)
+
+
 def test_params_set_the_mounting(tmp_path):
     params = {
         "uwb_tag_offset_x": 0.05, "uwb_tag_offset_y": -0.1, "uwb_tag_height": 0.3, "uwb_anchor_height": 2,

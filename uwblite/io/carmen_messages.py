@@ -50,6 +50,8 @@ def why_broken(error: ValueError) -> str:
 
 _CONFIRMED = 0.5
 """s; a recorder may hold a range back until the next one confirms it."""
+_NEXT = 2.0
+"""s; a part of a log that follows another begins so much later at most."""
 
 
 def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[str, float] | None = None) -> NDArray[np.int64]:
@@ -63,5 +65,18 @@ def time_order(stamps: Floats, what: str, warnings: list[str], set_back: dict[st
     if late:
         warnings.append(f"{late} of {len(stamps)} {what} messages came out of time order; sorted by stamp")
         if set_back is not None:
-            set_back[what] = float(np.max(np.maximum.accumulate(stamps) - stamps))
+            set_back[what] = 0.0 if _in_parts(stamps) else float(np.max(np.maximum.accumulate(stamps) - stamps))
     return np.argsort(stamps, kind="stable")
+
+
+def _in_parts(stamps: Floats) -> bool:
+    """Return whether stamps (n,) are those of one clock in parts that only stand in another order, as `cat` writes them.
+
+    Sorted, one part follows the other; a clock that was set back goes through the same time again, or leaves a gap.
+    """
+    steps = np.diff(stamps, prepend=np.inf)
+    begins = np.flatnonzero((steps < -_CONFIRMED) | (steps > _NEXT))
+    first, last = np.minimum.reduceat(stamps, begins), np.maximum.reduceat(stamps, begins)
+    order = np.argsort(first)
+    gap, as_written = first[order][1:] - last[order][:-1], np.diff(order) == 1
+    return bool(np.all((gap >= -_CONFIRMED) & (as_written | (gap <= _NEXT))))
