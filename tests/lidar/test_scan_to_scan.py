@@ -149,10 +149,11 @@ def test_keyframes_without_neighbours_on_both_sides_stay(walk):
 
 
 def test_searches_begin_behind_the_last_step_that_nothing_measured(monkeypatch, walk):
-    """Step 3 is blind; 2, 5, 7 and 8 are doubtful. 5 ends clear and 7 lost: behind that a new sub-map begins, too."""
+    """Step 3 is blind; 2, 4, 5, 7 and 8 are doubtful. 4 leaves free space free and is not searched for, 7 matches too little to
+    be asked. 5 ends clear and 7 lost: behind that a new sub-map begins, too."""
     _, clouds, _ = walk
     count = len(clouds)
-    enough, doubtful = np.ones(count - 1, dtype=bool), np.isin(np.arange(count - 1), [2, 5, 7, 8])
+    enough, doubtful = np.ones(count - 1, dtype=bool), np.isin(np.arange(count - 1), [2, 4, 5, 7, 8])
     enough[3] = False
     share = np.full(count - 1, _LEAST_SHARE)
     share[7] -= 0.01
@@ -163,13 +164,18 @@ def test_searches_begin_behind_the_last_step_that_nothing_measured(monkeypatch, 
         def __init__(self, *options):
             assert options == (clouds, TrackingConfig().distance, TrackingConfig().angle)
 
+        def through(self, k, poses):
+            np.testing.assert_array_equal(poses, [[0.1] * 3])
+            return np.array([{2: 0.05, 4: 0.03, 5: 0.8, 8: 0.05}[k]])
+
         def find(self, k, first, chain, guesses):
             calls.append((k, first, float(chain[5, 0])))
             np.testing.assert_array_equal(guesses, [[0.2] * 3, [0.1] * 3, [0.0, 0.0, 0.2]])
             return SimpleNamespace(clear=k == 5, contradicts=False, pose=np.full(3, 0.7))
 
     monkeypatch.setattr("uwblite.lidar.scan_to_scan.StepSearch", Search)
-    pose, lost = _searched(clouds, steps.i, steps, doubtful, TrackingConfig())
+    pose, lost, searched = _searched(clouds, steps.i, steps, doubtful, TrackingConfig())
+    assert searched == len(calls)
     assert calls == [(2, 0, 0.1), (5, 4, 0.1), (7, 4, 0.7), (8, 8, 0.7)]
     assert np.flatnonzero(lost).tolist() == [7]
     np.testing.assert_array_equal(pose, np.where(np.arange(count - 1)[:, None] == 5, 0.7, 0.1) * np.ones(3))

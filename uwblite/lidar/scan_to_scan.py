@@ -123,11 +123,10 @@ def follow(
     good = steps.enough & (steps.share >= config.good_share)
     learnt = reestimate_wheel_noise(wheels, _edges(clouds, raster, i[good], steps.pose[good], tight, config), graph)
     miss = _miss(clouds, learnt)
-    pose, lost = _searched(clouds, i, steps, steps.enough & ~good, config)
+    pose, lost, searched = _searched(clouds, i, steps, steps.enough & ~good, config)
     kept = steps.enough & ~lost
     measured_steps = _edges(clouds, raster, i[kept], pose[kept], tight, config)
     learnt = reestimate_wheel_noise(wheels, measured_steps, graph)
-    searched = int((steps.enough & ~good).sum())
     return ScanOdometry(measured_steps, learnt, float(np.median(miss)) if len(miss) else 0.0, searched)
 
 
@@ -173,14 +172,17 @@ def _lines_of(clouds: Clouds) -> Ints:
     return np.bincount(clouds.owner[np.any(clouds.normals != 0.0, axis=1)], minlength=len(clouds))
 
 
-def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig) -> tuple[Floats, Bools]:
+def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: TrackingConfig) -> tuple[Floats, Bools, int]:
     """Search for doubtful steps (e,), each against the sub-map of those before it.
+
+    Noise of decimetres, leaves or few beams leave few matches in every step. Where as many match as measure a step, and no
+    surface stands in free space, there is nothing to search for.
 
     Returns
     -------
-    Poses of all steps (e, 3), and which were not found (e,).
+    Poses of all steps (e, 3), which were not found (e,), and how many were searched for.
     """
-    pose, lost = steps.pose.copy(), np.zeros(len(i), dtype=bool)
+    pose, lost, searched = steps.pose.copy(), np.zeros(len(i), dtype=bool), 0
     searching = StepSearch(clouds, config.distance, config.angle)
     chain = np.zeros((len(clouds), 3))
     chain[i] = pose
@@ -190,19 +192,24 @@ def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: Tr
     for row in np.flatnonzero(doubtful).tolist():
         k, before = int(i[row]), blind[blind < i[row]]
         first = max(first, int(before[-1]) + 1 if len(before) else 0)
-        guess = steps.guess[row]
-        found = searching.find(k, first, chain, np.stack([guess, steps.pose[row], guess * [0.0, 0.0, 1.0]]))
+        guess, ended = steps.guess[row], steps.pose[row]
+        if steps.share[row] >= _LEAST_SHARE and searching.through(k, ended[None])[0] <= _THROUGH:
+            continue
+        searched += 1
+        found = searching.find(k, first, chain, np.stack([guess, ended, guess * [0.0, 0.0, 1.0]]))
         # Where no search is clear, descent near to the odometry's guess still measures what the surfaces fix.
         lost[row] = not found.clear and (found.contradicts or steps.share[row] < _LEAST_SHARE)
         if found.clear:
             chain[k] = pose[row] = found.pose
         elif lost[row]:
             first = k + 1
-    return pose, lost
+    return pose, lost, searched
 
 
 _LEAST_SHARE = 0.4
 """Share of points that match from which descent from the odometry's guess measures a step."""
+_THROUGH = 0.04
+"""Share of points in free space up to which it does; one point in twenty-five may be a foot or a leaf."""
 
 
 def _miss(clouds: Clouds, wheels: OdometryEdges) -> Floats:

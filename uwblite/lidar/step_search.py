@@ -103,7 +103,7 @@ class StepSearch:
         target = np.zeros(len(starts), dtype=np.int64)
         points = pair_points(pair, target + 1, _POINTS)
         tried = align_pairs(pair, raster, target, target + 1, starts, points, _FIRST_GATE, _LAST_GATE, _ITERATIONS)
-        through = self._through(k, tried.pose)
+        through = self.through(k, tried.pose)
         score = tried.share - through
         best = int(np.argmax(score))
         measurably = _measurably(best, tried)
@@ -113,10 +113,10 @@ class StepSearch:
         distinct = _apart(tried.pose[best], tried.pose) & measurably
         second = float(score[distinct].max(initial=-1.0))
         near = np.flatnonzero(~_apart(motion, tried.pose))
-        there = through[near[np.argmax(score[near])]] if len(near) else self._through(k, motion[None])[0]
+        there = through[near[np.argmax(score[near])]] if len(near) else self.through(k, motion[None])[0]
         return FoundStep(tried.pose[best], float(score[best]), second, float(there))
 
-    def _through(self, k: int, poses: Floats) -> Floats:
+    def through(self, k: int, poses: Floats) -> Floats:
         """Return the shares (c,) of either scan that would stand in free space for poses (c, 3) of keyframe k + 1 in k."""
         return pair_violations(self._clouds, self._nearest, k, k + 1, poses)
 
