@@ -17,7 +17,7 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import final_stages
 from uwblite.pipeline.estimate import Estimate
-from uwblite.pipeline.final_stages import _sweeps, _with_steady_errors, at_given_poses
+from uwblite.pipeline.final_stages import _sweeps, at_given_poses
 from uwblite.pipeline.recordings import gather
 
 
@@ -85,19 +85,16 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monk
     assert (found.anchors == 2.0).all()
 
 
-@pytest.mark.parametrize(("steady", "lidar", "counted"), [(0.1, False, True), (0.0, False, False), (0.1, True, False)])
-def test_what_ranges_err_alike_counts_in_covariances_where_no_lidar_holds_the_poses(monkeypatch, steady, lidar, counted):
+@pytest.mark.parametrize("lidar", [False, True])
+def test_what_ranges_err_alike_counts_in_covariances_of_all_where_no_lidar_holds_the_poses(monkeypatch, lidar):
     asked = []
-
-    def learnt(edges, graph, anchors, config, *, steady):
-        asked.append((edges, anchors, steady))
-        return edges, ()
-
-    monkeypatch.setattr("uwblite.pipeline.final_stages.learn_noise", learnt)
-    graph = loop()[0]
+    monkeypatch.setattr(final_stages, "count_alike_errors", lambda *arguments: asked.append(arguments))
+    graph, config = loop()[0], MappingConfig()
     i, none = np.zeros(1, dtype=int), np.zeros((1, 3))
     scans = ScanEdges(i, i + 1, none, np.eye(3)[None], none, none, np.full(4, -1))
     graph = graph.with_edges(scans) if lidar else graph
-    found = _with_steady_errors(graph, 3, replace(MappingConfig().ranges, steady=steady))
-    assert found.edges == graph.edges
-    assert asked == ([(graph.edges[2], 3, True)] if counted else [])
+    estimate = Estimate(graph, None, None, ())
+    found, covariance = final_stages.without_range_errors(estimate, SimpleNamespace(config=config))
+    assert found is estimate
+    given = [(a[0] is covariance, len(a[2]), a[3] is config.ranges) for a in asked]
+    assert given == ([] if lidar else [(True, len(graph.edges[2]), True)])

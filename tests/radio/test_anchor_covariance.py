@@ -9,8 +9,10 @@ from uwblite import se2
 from uwblite.graph.calibration import BIAS, CalibrationConfig, block, prior_edges, range_indices, unknowns, with_free
 from uwblite.graph.graph import Graph, edge_weights
 from uwblite.graph.marginals import marginals
+from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
-from uwblite.radio.anchor_covariance import _STEADY, _shown, by_alike_errors
+from uwblite.graph.solver import optimize
+from uwblite.radio.anchor_covariance import _STEADY, _by_each_range, _scatter, _shown, by_alike_errors, count_alike_errors
 from uwblite.radio.range_noise import RangeNoiseConfig
 
 PLACES = np.array([[2.0, 1.0], [9.0, 14.0]])
@@ -122,3 +124,98 @@ def test_errors_of_the_poses_come_on_top_and_never_below(turn):
     np.testing.assert_allclose(by_alike_errors(problem, edges, alone + larger, CONFIG), alike + larger, atol=1e-9)
     kept = turned @ np.diag([0.3, 0.0]) @ turned.T
     np.testing.assert_allclose(by_alike_errors(problem, edges, alone + smaller, CONFIG), alike + kept, atol=1e-9)
+
+
+def driven_world(size, seed, scale=1.0):
+    """Return a graph of a path among three anchors, at its optimum, and the correlations (m, m) of the errors of its ranges.
+
+    Parameters
+    ----------
+    size : standard deviation of these errors, m. scale : of the odometry's standard deviations.
+    """
+    rng, ids, count = np.random.default_rng(seed), ("1", "2", "3"), 60
+    turn = np.linspace(0.0, 2.0 * np.pi, count)
+    poses = np.column_stack([5.0 * np.sin(turn), 4.0 - 4.0 * np.cos(turn), turn])
+    anchors = np.array([[9.0, 3.0], [-6.0, 12.0], [-7.0, -3.0]])
+    listed = unknowns(CalibrationConfig(range_bias=0.2), ids, np.ones(3, dtype=bool))
+    calibration = block(listed)
+    graph = Graph(poses, anchors, (), calibration, fixed_poses=np.arange(count) == 0)
+    graph = with_free(replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool)), BIAS)
+    i = np.arange(count - 1)
+    information = np.tile(np.diag([50.0, 50.0, 200.0]) / scale, (count - 1, 1, 1))
+    noise = scale * rng.standard_normal((count - 1, 3)) / [50.0, 50.0, 200.0]
+    steps = RelativePoseEdges(i, i + 1, se2.between(poses[:-1], poses[1:]) + noise, information)
+    pose, anchor = np.repeat(np.arange(count), 3), np.tile(np.arange(3), count)
+    still, none = np.zeros(len(pose)), np.zeros((len(pose), 2))
+    edges = RangeEdges(
+        pose, anchor, still, np.full(len(pose), 0.05), none, still, none, np.zeros(2), still,
+        range_indices(calibration, anchor, ids), weights=np.full(len(pose), 0.1),
+    )  # fmt: skip
+    offsets = poses[pose, :2] - anchors[anchor]
+    logs = np.log(np.hypot(*offsets.T))
+    by_distance = np.exp(-np.abs(logs[:, None] - logs) / 0.5)
+    own = (alike(offsets) - (1.0 - _STEADY) * np.eye(len(pose))) * (anchor[:, None] == anchor)
+    correlation = 0.5 * own + 0.5 * _STEADY * by_distance + (1.0 - _STEADY) * np.eye(len(pose))
+    errors = size * np.linalg.cholesky(correlation) @ rng.standard_normal(len(pose))
+    edges = replace(edges, ranges=edges.distances(graph) + errors)
+    return optimize(graph.with_edges(prior_edges(listed), steps, edges))[0], correlation
+
+
+def test_of_poses_that_rest_on_ranges_the_covariance_is_the_sandwich_of_what_these_err_alike():
+    """Against dense matrices, at the size that the recording shows: the planted one, but for the scatter of some ten errors."""
+    graph, correlation = driven_world(0.3, 1)
+    edges, chosen = graph.edges[-1], np.arange(0, 60, 4)
+    found, plain = marginals(graph, among=chosen), marginals(graph, among=chosen)
+    count_alike_errors(found, graph, edges, RangeNoiseConfig(sigma=0.3))
+    size = plain.unknowns.size
+    inverse = plain.columns(np.arange(size))[:-1]
+    linear, jacobian = edges.linearize(graph), np.zeros((len(edges), size + 1))
+    for name, index, values in linear.blocks:
+        number = plain.unknowns.number[name][index]
+        np.add.at(jacobian, (np.arange(len(edges))[:, None], number), values[:, 0])
+    jacobian = jacobian[:, :-1] * edges.sigma[:, None]
+    weights = edge_weights(edges, graph) / edges.sigma**2
+    gain = inverse @ (jacobian.T * weights)
+
+    def dense(scatter):
+        return inverse + gain @ (scatter**2 * correlation - np.diag(1.0 / weights)) @ gain.T
+
+    number = plain.unknowns.number["anchors"]
+    grown, least = (np.trace(found.anchors[0]) - np.trace(dense(0.0)[np.ix_(number[0], number[0])])), dense(0.0)
+    unit = np.trace(dense(1.0)[np.ix_(number[0], number[0])]) - np.trace(least[np.ix_(number[0], number[0])])
+    scatter = np.sqrt(grown / unit)
+    assert 0.5 * 0.3 < scatter < 2.0 * 0.3
+    # Directions and distances are binned to a quarter of their correlation length.
+    true = dense(scatter)
+    for k, own in enumerate(number):
+        np.testing.assert_allclose(found.anchors[k], true[np.ix_(own, own)], rtol=0.1, atol=0.1 * np.trace(found.anchors[k]))
+    own = plain.unknowns.number["poses"][chosen[1:]].ravel()
+    np.testing.assert_allclose(np.diagonal(found.among)[3:], np.diagonal(true)[own], rtol=0.15)
+    blocks = found.poses[chosen[1:]]
+    np.testing.assert_allclose(np.einsum("nii->ni", blocks).ravel(), np.diagonal(found.among)[3:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.1, 5.0])
+def test_how_large_errors_are_is_found_whether_stiff_odometry_shows_them_or_soft_odometry_hides_half(scale):
+    """A standard deviation from some 20 errors that are not alike, in each of five draws, scatters by 7 %."""
+    found, seen = [], []
+    for seed in range(5):
+        graph, _ = driven_world(0.3, seed, scale)
+        around, edges = marginals(graph, among=np.arange(3)), graph.edges[-1]
+        offsets = edges.tag_positions(graph.poses) - graph.anchors[edges.anchor]
+        found.append(_scatter(around, graph, edges, RangeNoiseConfig(sigma=0.3), _by_each_range(around, edges), offsets))
+        seen.append(np.std(edges.residuals(graph)[:, 0] * edges.sigma))
+    assert np.mean(found) == pytest.approx(0.3, rel=0.2)
+    assert (np.mean(seen) < 0.2) == (scale > 1.0)
+
+
+def test_where_nothing_is_assumed_to_be_steady_or_no_range_counts_covariances_stay():
+    graph, _ = driven_world(0.3, 1)
+    edges = graph.edges[-1]
+    unused = replace(edges, weights=np.zeros(len(edges)))
+    for ranges, config in ((edges, RangeNoiseConfig(steady=0.0)), (unused, RangeNoiseConfig())):
+        found = marginals(graph, among=np.arange(0, 60, 4))
+        poses, among = found.poses.copy(), found.among.copy()
+        count_alike_errors(found, graph, ranges, config)
+        np.testing.assert_array_equal(found.poses, poses)
+        np.testing.assert_array_equal(found.among, among)

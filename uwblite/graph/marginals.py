@@ -200,6 +200,10 @@ class Marginals:
             cross[here] = columns[number[i[here]][:, :, None], at]
         return cross
 
+    def solve(self, right: Floats) -> Floats:
+        """Return H^-1 times right (size, m)."""
+        return np.asarray(self._factor.solve(right))
+
     def columns(self, numbers: Ints) -> Floats:
         """Return columns (size + 1, m) of the covariance; the last row and the columns of fixed scalars (-1) are 0."""
         right = np.zeros((self.unknowns.size + 1, len(numbers)))

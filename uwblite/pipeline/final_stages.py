@@ -17,8 +17,7 @@ from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors, with_range_errors
 from ..odometry.wheels import with_noise_shown
-from ..radio.range_measurements import learn_noise
-from ..radio.range_noise import RangeNoiseConfig
+from ..radio.anchor_covariance import count_alike_errors
 from .estimate import Estimate, Task
 from .lidar_stages import solved
 from .map_frame import cropped
@@ -50,8 +49,10 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Marg
     poses = len(estimate.graph.poses)
     along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.int64))
     stated = with_noise_shown(with_fewer_pairs(estimate.graph))
-    stated = _with_steady_errors(stated, len(estimate.anchor_ids), task.config.ranges)
     covariance = marginals(stated, common := common_range_errors(stated), among=along)
+    if not any(isinstance(e, ScanEdges) for e in stated.edges):
+        for ranges in (e for e in stated.edges if isinstance(e, RangeEdges)):
+            count_alike_errors(covariance, stated, ranges, task.config.ranges)
     if not common:
         return estimate, covariance
     return estimate.with_estimates_of(with_nonnegative_heights(covariance.corrected())), covariance
@@ -59,19 +60,6 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Marg
 
 _ALONG = 60
 """Poses along the trajectory whose errors stand for those of all."""
-
-
-def _with_steady_errors(graph: Graph, anchors: int, config: RangeNoiseConfig) -> Graph:
-    """Return the graph with ranges that count once what they err alike by direction and distance; poses stay where they are.
-
-    Where a lidar holds the poses, the final optimisation has done so. Where ranges alone do, the poses follow such errors as
-    the anchors do, and no residual shows it.
-    """
-    if config.steady == 0.0 or any(isinstance(e, ScanEdges) for e in graph.edges):
-        return graph
-    return replace(graph, edges=tuple(
-        learn_noise(e, graph, anchors, config, steady=True)[0] if isinstance(e, RangeEdges) else e for e in graph.edges
-    ))  # fmt: skip
 
 
 def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:

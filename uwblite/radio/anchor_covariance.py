@@ -1,4 +1,4 @@
-"""Covariances of anchors where the lidar holds the poses, by what their ranges err alike.
+"""Covariances by what ranges err alike: of anchors where the lidar holds the poses, of all that ranges alone hold.
 
 A weight that lets many alike errors count once treats each of them as a large error of its own. That suits the estimate, but
 the inverse H^-1 = (J^T W J)^-1 is not its covariance: too large in directions that few ranges determine, too small where alike
@@ -14,21 +14,34 @@ all late, by an exponentially distributed way whose mean is as large as its scat
 
 What the errors of the poses add is the marginal covariance of the whole graph less H^-1. That is positive but for how far the
 two are linearised at different places; along a line of sight, where the curvature is all but nothing, that decides.
+
+Without a lidar the poses follow such errors as the anchors do. Then H is that of the whole graph, and R counts in the place of
+W^-1 for its ranges alone: H^-1 + H^-1 J^T W (R - W^-1) W J H^-1. The path also follows what the ranges to all anchors err
+alike: behind more walls all of them are later, never earlier, and there are more walls on a longer way. So half of the errors
+that last are of one anchor, by direction and distance, and half are of all, by distance. They are as large as the residuals of
+all anchors together say: a path that is bent towards ranges late through the same walls hides half of their errors.
 """
 
 import numpy as np
+from scipy import sparse
 
-from ..arrays import Floats, spread_about_median
+from ..arrays import Floats, spread, spread_about_median
 from ..graph.graph import Graph, edge_weights
-from ..graph.marginals import CommonErrors, marginals
+from ..graph.marginals import CommonErrors, Marginals, marginals
 from ..graph.range_edges import RangeEdges
-from .range_noise import RangeNoiseConfig, steady_sums
+from .range_noise import RangeNoiseConfig, distance_sums, steady_sums
 
 _STEADY = 0.7
 """Share of the variance that changes with direction and distance alone: a half is assumed to be slow while nothing is learnt,
 and antennas, received power and the robot's own body make more of it than noise does."""
 _ENOUGH = 30
-"""Ranges to an anchor from which on its errors are learnt, and its covariance with them."""
+"""Ranges to an anchor from which on its errors are learnt, and its covariance with them; as many count the assumed error."""
+_SAMPLE = 200
+"""Ranges that stand for all where it is asked how much of an error shows in residuals."""
+_NO_WEIGHT = 1e-12
+"""Weight of a range that counts for nothing."""
+_OUTLYING = 3.0
+"""Robust standard deviations as which residuals count at most."""
 
 
 def by_alike_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: RangeNoiseConfig) -> Floats:
@@ -40,9 +53,8 @@ def by_alike_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: Rang
     edges : the graph's ranges, with the weights that the anchors were estimated with.
     whole : (a, 2, 2) m^2, marginal covariances of the anchors estimated with the poses, by the weights.
     """
-    around, each = marginals(graph), np.arange(len(edges))
-    # Of an error of 1 m in each range.
-    slopes = around.slopes(CommonErrors(edges, each, each, 1.0 / edges.sigma[:, None], each)).T.tocsr()
+    around = marginals(graph)
+    slopes = _by_each_range(around, edges)
     weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
     offsets = edges.tag_positions(graph.poses) - graph.anchors[edges.anchor]
     found = whole.copy()
@@ -61,6 +73,85 @@ def by_alike_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: Rang
         by_ranges = around.anchors[anchor] + here @ (factors.T @ unlike) @ here.T
         found[anchor] = by_ranges + _positive(whole[anchor] - around.anchors[anchor])
     return found
+
+
+def count_alike_errors(found: Marginals, graph: Graph, edges: RangeEdges, config: RangeNoiseConfig) -> None:
+    """Give the marginal covariances of a graph whose poses rest on ranges what these err alike; see above.
+
+    Those of the chosen poses, anchors and calibration are computed; the standard deviations of poses between two chosen ones
+    grow as theirs do.
+
+    Parameters
+    ----------
+    found : marginals of the graph, with chosen poses; changed in place.
+    """
+    number, weights = found.unknowns.number, edge_weights(edges, graph)
+    moving = np.all(number["poses"][found.chosen] >= 0, axis=1)
+    if config.steady == 0.0 or not np.any(weights > 0.0) or not moving.any():
+        return
+    offsets, variance = edges.tag_positions(graph.poses) - graph.anchors[edges.anchor], _variance(edges, weights)
+    factors = _by_each_range(found, edges)
+    scatter = _scatter(found, graph, edges, config, factors, offsets)
+    parts = [number["poses"][found.chosen].ravel(), number["anchors"].ravel(), number["calibration"].ravel()]
+    poses, anchors, calibration = np.split(np.arange(sum(map(len, parts))), np.cumsum([len(part) for part in parts[:2]]))
+    columns = found.columns(np.concatenate(parts))
+    seen = factors @ columns[:-1]
+    added = seen.T @ (scatter**2 * _alike(edges, offsets, seen) - variance[:, None] * seen)
+    whole = columns[np.concatenate(parts)] + 0.5 * (added + added.T)
+    before, found.among = np.diagonal(found.among).reshape(-1, 3)[moving], whole[np.ix_(poses, poses)]
+    grown = np.sqrt(np.maximum(np.diagonal(found.among), 0.0).reshape(-1, 3)[moving] / before)
+    by = np.stack([np.interp(np.arange(len(found.poses)), found.chosen[moving], own) for own in grown.T], axis=1)
+    found.poses = found.poses * by[:, :, None] * by[:, None, :]
+    pairs = anchors.reshape(-1, 2)
+    # What no edge touches stays infinite.
+    found.anchors = np.where(np.isfinite(found.anchors), whole[pairs[:, :, None], pairs[:, None, :]], found.anchors)
+    sigmas = np.sqrt(np.maximum(np.diagonal(whole)[calibration], 0.0))
+    found.calibration = np.where(np.isfinite(found.calibration), sigmas, found.calibration)
+
+
+def _variance(edges: RangeEdges, weights: Floats) -> Floats:
+    """Return W^-1 (m,), m^2, finite where a range counts for nothing."""
+    return np.asarray(edges.sigma**2 / np.maximum(weights, _NO_WEIGHT))
+
+
+def _by_each_range(found: Marginals, edges: RangeEdges) -> sparse.csr_matrix:
+    """Return W J (m, unknowns): of an error of 1 m in each range."""
+    each = np.arange(len(edges))
+    return found.slopes(CommonErrors(edges, each, each, 1.0 / edges.sigma[:, None], each)).T.tocsr()
+
+
+def _alike(edges: RangeEdges, offsets: Floats, values: Floats) -> Floats:
+    """Return R (m, m), by 1 on its diagonal, times values (m, q)."""
+    found = (1.0 - _STEADY) * values + 0.5 * _STEADY * distance_sums(offsets, values)
+    for anchor in np.unique(edges.anchor):
+        own = edges.anchor == anchor
+        found[own] += 0.5 * _STEADY * steady_sums(offsets[own], values[own])
+    return found
+
+
+def _scatter(
+    found: Marginals, graph: Graph, edges: RangeEdges, config: RangeNoiseConfig, factors: sparse.csr_matrix, offsets: Floats
+) -> float:
+    """Return the standard deviation of ranges, m, that leaves residuals as large as they are.
+
+    A residual is (I - J H^-1 J^T W) times the errors of all ranges, and what other measurements move it by.
+    """
+    weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
+    alive = np.flatnonzero(weights > 0.0)
+    most = _OUTLYING * max(spread(residuals[alive]), config.steady)
+    some = alive[np.linspace(0, len(alive) - 1, min(len(alive), _SAMPLE)).round().astype(np.int64)]
+    variance = _variance(edges, weights)
+    jacobian = factors[some].multiply(variance[some, None]).toarray()
+    moved = found.solve(jacobian.T)
+    taken = factors @ moved
+    by_others = np.einsum("sk,ks->s", jacobian, moved) - np.einsum("ms,m,ms->s", taken, variance, taken)
+    left = -taken
+    left[some, np.arange(len(some))] += 1.0
+    shown = np.einsum("ms,ms->s", left, _alike(edges, offsets, left))
+    unexplained = max(float(np.mean(np.minimum(np.abs(residuals[alive]), most) ** 2) - np.mean(by_others)), 0.0)
+    checks = len(alive) * float(np.mean(shown))
+    scatter = np.sqrt((_ENOUGH * config.sigma**2 + len(alive) * unexplained) / (_ENOUGH + checks))
+    return max(config.steady, float(scatter))
 
 
 def _positive(matrix: Floats) -> Floats:

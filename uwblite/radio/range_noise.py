@@ -184,6 +184,16 @@ def steady_sums(offsets: Floats, values: Floats) -> Floats:
     return _alike_sums(_polar(offsets), _STEADY_LENGTH, values)
 
 
+def distance_sums(offsets: Floats, values: Floats) -> Floats:
+    """Return the sums (m, q) of the values (m, q) of all ranges, to whatever anchor, by how alike errors by distance are.
+
+    Parameters
+    ----------
+    offsets : (m, 2) from the anchor to the tag, m.
+    """
+    return _alike_sums(_polar(offsets)[:, 2:], _STEADY_LENGTH, values)
+
+
 _STEADY_LENGTH = 0.5
 """Half a radian of direction is alike, and half an e-fold of distance."""
 
