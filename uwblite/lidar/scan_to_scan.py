@@ -14,7 +14,7 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges
-from ..odometry.wheels import reestimate_wheel_noise
+from ..odometry.wheels import reestimate_wheel_noise, with_uncounted_ways
 from .cloud_rasters import CloudRasters
 from .clouds import Clouds
 from .pair_alignment import align_pairs
@@ -126,7 +126,7 @@ def follow(
     pose, lost, searched = _searched(clouds, i, steps, steps.enough & ~good, config)
     kept = steps.enough & ~lost
     measured_steps = _edges(clouds, raster, i[kept], pose[kept], tight, config)
-    learnt = reestimate_wheel_noise(wheels, measured_steps, graph)
+    learnt = with_uncounted_ways(reestimate_wheel_noise(wheels, measured_steps, graph), measured_steps, graph)
     return ScanOdometry(measured_steps, learnt, float(np.median(miss)) if len(miss) else 0.0, searched)
 
 

@@ -86,6 +86,41 @@ _ENOUGH_STEPS = 20
 """Measured steps from which the noise of the wheels may be learnt."""
 
 
+def with_uncounted_ways(wheels: OdometryEdges, steps: RelativePoseEdges, graph: Graph) -> OdometryEdges:
+    """Give wheels that count nothing over a step the noise of the way that the lidar certainly measures there.
+
+    An odometry that stands still while the robot drives on would else claim a standing robot's half millimetre: a step that
+    even a robust kernel does not let go of.
+
+    Parameters
+    ----------
+    wheels : edges between neighbouring poses, in the order of the poses. steps : see reestimate_wheel_noise.
+    """
+    own, counted = np.searchsorted(wheels.i, steps.i), wheels.corrected(graph)
+    variance, way = 1.0 / np.einsum("eii->ei", wheels.sqrt_information) ** 2, _way(counted)
+    missed, moving, root = np.zeros(len(wheels)), way > _MOVING, steps.sqrt_information
+    off = root @ se2.between(steps.T_i_j, counted[own])[:, :, None]
+    scatter = np.eye(3) + root * variance[own, None, :] @ np.swapaxes(root, 1, 2)
+    stood = ~moving[own] & (np.sum(off * np.linalg.solve(scatter, off), axis=(1, 2)) > _CERTAIN**2)
+    missed[own[stood]] = _way(steps.T_i_j[stood])
+    if not stood.any() or not moving.any():
+        return wheels
+    least = missed[:, None] * np.median(variance[moving] / way[moving, None], axis=0)
+    factor = np.sqrt(np.maximum(least / variance, 1.0))
+    return replace(wheels, sqrt_information=wheels.sqrt_information / factor[:, None])
+
+
+def _way(motion: Floats) -> Floats:
+    """Return how much motions (e, 3) travel and turn, m + rad."""
+    return np.asarray(np.hypot(motion[:, 0], motion[:, 1]) + np.abs(motion[:, 2]))
+
+
+_CERTAIN = 5.0
+"""Standard deviations of their difference from which a measured step contradicts the wheels for certain."""
+_MOVING = 0.05
+"""m + rad; over shorter steps wheels count nothing, and do not show how noise grows with the way."""
+
+
 def with_noise_shown(graph: Graph) -> Graph:
     """Return the graph with the noise of its odometry as the residuals show it, for covariances; poses stay where they are.
 
