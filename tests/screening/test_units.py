@@ -249,7 +249,7 @@ def test_stamps_of_one_sensor_in_minutes():
 @pytest.mark.parametrize(
     ("times", "by_lidar", "unit"),
     [(1.0, np.nan, ""), (2.0, np.nan, ""), (3.2, np.nan, "0.3048"), (3.2, 1.0, "0.3048"), (3.2, 3.3, ""), (96.0, 1.0, "0.01"),
-     (1050.0, np.nan, "0.001"), (np.nan, 1.0, "")],
+     (1050.0, np.nan, "0.001"), (np.nan, 1.0, ""), (3.2, 0.0, "0.3048"), (np.nan, 0.0, "")],
 )  # fmt: skip
 def test_ranges_that_change_as_much_as_another_unit_would(times, by_lidar, unit):
     try:

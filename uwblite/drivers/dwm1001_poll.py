@@ -44,7 +44,6 @@ UNJOINED = 3.0
 """s without a fix after which a tag is reported to have no network."""
 
 
-
 def _slow(width: float) -> Note:
     """Return the note on answers that take so long that fixes are known to so many seconds only."""
     text = f"uwb: answers are slow: the time of a range is known to {width:.1f} s only, and beyond {WIDEST} s it is not logged"

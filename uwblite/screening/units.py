@@ -73,7 +73,7 @@ def refuse_other_ranges(change_by_way: float, lidar_by_wheels: float) -> None:
     lidar_by_wheels : the way that the lidar measures by the way of the wheels, nan where it does not: a lidar that agrees with
         the ranges shows that the wheels are wrong.
     """
-    if abs(np.log(change_by_way / lidar_by_wheels)) < np.log(_OTHER_LENGTH):
+    if lidar_by_wheels > 0.0 and abs(np.log(change_by_way / lidar_by_wheels)) < np.log(_OTHER_LENGTH):
         return
     for name, unit in _LENGTHS.items():
         if abs(np.log(change_by_way * unit)) < np.log(_OTHER_LENGTH):
