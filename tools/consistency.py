@@ -219,6 +219,11 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--keep", type=Path, metavar="FILE", help="add to the recordings kept in FILE, which must be of one state")
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     args = p.parse_args(argv)
+    for name in args.of:
+        try:
+            settings_of(name)
+        except KeyError as error:
+            p.error(f"--of {name!r}: there is no {error}; worlds are the first words of {sorted(RECORDINGS)}, sensors {list(SENSORS)}")
     rooms = None if args.easy else RealRooms()
     chosen = args.of or [name for name in RECORDINGS if not args.only or any(word in name for word in args.only)]
     found = kept(args.keep)
