@@ -223,7 +223,8 @@ def main(argv: list[str] | None = None) -> int:
         try:
             settings_of(name)
         except KeyError as error:
-            p.error(f"--of {name!r}: there is no {error}; worlds are the first words of {sorted(RECORDINGS)}, sensors {list(SENSORS)}")
+            worlds = sorted({row.partition(", ")[0] for row in RECORDINGS})
+            p.error(f"--of {name!r}: there is no {error}; worlds are {worlds}, sensors {list(SENSORS)}")
     rooms = None if args.easy else RealRooms()
     chosen = args.of or [name for name in RECORDINGS if not args.only or any(word in name for word in args.only)]
     found = kept(args.keep)
