@@ -146,7 +146,8 @@ def test_a_cluster_makes_the_same_bytes_though_a_worker_is_killed(made, recordin
 
     try:
         start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(ready))
-        while not ready.exists():
+        # It is there for a moment before it is written.
+        while not ready.exists() or not ready.read_text().rstrip().endswith("}"):
             time.sleep(0.05)
         address = json.loads(ready.read_text())["address"]
         one, _ = (start("worker", address, "--nthreads", "1", "--no-nanny") for _ in range(2))
