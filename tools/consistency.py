@@ -40,6 +40,12 @@ from uwblite.mapping import MappingConfig, build_map
 
 Floats = NDArray[np.float64]
 
+SENSORS: dict[str, dict[str, Any]] = {
+    "one anchor": {"anchors": 1},
+    "no lidar": {"without": ("laser",)},
+    "no UWB": {"without": ("uwb",)},
+}
+"""What may be added to a world's name with --of."""
 RECORDINGS = {
     "hall": Settings(world="hall"),
     "corridor": Settings(world="corridor"),
@@ -49,16 +55,8 @@ RECORDINGS = {
     "arena, nearly empty": Settings(world="arena", speed=0.4),
     "hall, bad wheels": Settings(world="hall", odometry_scale=2.0),
     "hall, bad radio": Settings(world="hall", nlos="heavy", nlos_anchors=(3, 4), outliers=0.03),
-    "hall, one anchor": Settings(world="hall", anchors=1),
-    "hall, no lidar": Settings(world="hall", without=("laser",)),
-    "hall, no UWB": Settings(world="hall", without=("uwb",)),
+    **{f"hall, {name}": Settings(world="hall", **changes) for name, changes in SENSORS.items()},
 }
-SENSORS: dict[str, dict[str, Any]] = {
-    "one anchor": {"anchors": 1},
-    "no lidar": {"without": ("laser",)},
-    "no UWB": {"without": ("uwb",)},
-}
-"""What may be added to a world's name with --of."""
 LONGER = {"warehouse": 3.0}
 """Worlds whose recordings are so many times as long. After 110 m in the warehouse, 60 x 40 m, some anchors are yet measured
 from one aisle only, a straight line, and rightly have two places; after 220 m all are from places 2 m or more off a line."""

@@ -110,7 +110,7 @@ def test_directions_that_steps_do_not_see_teach_nothing_about_the_wheels():
 
 
 def test_wheels_that_count_nothing_do_not_hold_a_measured_step():
-    """Half a millimetre of a standing robot, from where descent starts, held it there against 15 sigma of the clouds."""
+    """Half a millimetre of a standing robot, from where descent starts, kept it there against 15 sigma of the clouds."""
     rng = np.random.default_rng(4)
     stamps, truth = wander(rng, 30.0)
     frames = select(Odometry(stamps, truth), KeyframeConfig())

@@ -92,7 +92,7 @@ def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Notice]) -
 
 
 def _by_alike_ranges(estimate: Estimate, whole: Floats, config: RangeNoiseConfig) -> Floats:
-    """Return the covariances of anchors (a, 2, 2) with what ranges err alike; those by the weights alone without a lidar."""
+    """Return the covariances of anchors (a, 2, 2) with what ranges err alike; without a lidar they count it already."""
     graph, ranges = estimate.graph, estimate.ranges
     if ranges is None or config.steady == 0.0 or not any(isinstance(e, ScanEdges) for e in graph.edges):
         return whole

@@ -99,8 +99,8 @@ def count_alike_errors(found: Marginals, graph: Graph, edges: RangeEdges, config
     added = seen.T @ (scatter**2 * _alike(edges, offsets, seen) - variance[:, None] * seen)
     whole = columns[np.concatenate(parts)] + 0.5 * (added + added.T)
     before, found.among = np.diagonal(found.among).reshape(-1, 3)[moving], whole[np.ix_(poses, poses)]
-    grown = np.sqrt(np.maximum(np.diagonal(found.among), 0.0).reshape(-1, 3)[moving] / before)
-    by = np.stack([np.interp(np.arange(len(found.poses)), found.chosen[moving], own) for own in grown.T], axis=1)
+    factor = np.sqrt(np.maximum(np.diagonal(found.among), 0.0).reshape(-1, 3)[moving] / before)
+    by = np.stack([np.interp(np.arange(len(found.poses)), found.chosen[moving], own) for own in factor.T], axis=1)
     found.poses = found.poses * by[:, :, None] * by[:, None, :]
     pairs = anchors.reshape(-1, 2)
     # What no edge touches stays infinite.
