@@ -86,15 +86,18 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monk
 
 
 @pytest.mark.parametrize("lidar", [False, True])
-def test_what_ranges_err_alike_counts_in_covariances_of_all_where_no_lidar_holds_the_poses(monkeypatch, lidar):
-    asked = []
-    monkeypatch.setattr(final_stages, "count_alike_errors", lambda *arguments: asked.append(arguments))
+def test_what_ranges_err_alike_counts_for_all_or_for_anchors_at_given_poses_where_there_is_a_lidar(monkeypatch, lidar):
+    of_all, of_anchors, marker = [], [], np.full((1, 2, 2), 7.0)
+    monkeypatch.setattr(final_stages, "count_alike_errors", lambda *arguments: of_all.append(arguments))
+    monkeypatch.setattr(final_stages, "by_alike_errors", lambda *arguments: of_anchors.append(arguments) or marker)
     graph, config = loop()[0], MappingConfig()
     i, none = np.zeros(1, dtype=int), np.zeros((1, 3))
     scans = ScanEdges(i, i + 1, none, np.eye(3)[None], none, none, np.full(4, -1))
-    graph = graph.with_edges(scans) if lidar else graph
-    estimate = Estimate(graph, None, None, ())
+    ranges = graph.edges[2]
+    estimate = Estimate(graph.with_edges(scans) if lidar else graph, None, ranges, ())
     found, covariance = final_stages.without_range_errors(estimate, SimpleNamespace(config=config))
     assert found is estimate
-    given = [(a[0] is covariance, len(a[2]), a[3] is config.ranges) for a in asked]
-    assert given == ([] if lidar else [(True, len(graph.edges[2]), True)])
+    assert [(a[0] is covariance, a[2] is ranges, a[3] is config.ranges) for a in of_all] == [(True, True, True)] * (not lidar)
+    assert [(a[1] is ranges, a[3] is config.ranges) for a in of_anchors] == [(True, True)] * lidar
+    assert all(a[0].fixed_poses.all() and not any(isinstance(e, ScanEdges) for e in a[0].edges) for a in of_anchors)
+    assert (covariance.anchors is marker) == lidar

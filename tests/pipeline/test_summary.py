@@ -6,14 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.planted import odometry, ranges, recording, wander
-from helpers.planted_graphs import loop, plain_ranges
+from helpers.planted_graphs import plain_ranges
 
 from uwblite import se2
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.calibration import CalibrationConfig, Unknown
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.marginals import marginals
-from uwblite.graph.pose_edges import OdometryEdges, ScanEdges
 from uwblite.map_result import AnchorEstimate, Notice
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.wheels import with_noise_shown
@@ -21,7 +20,6 @@ from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.mapping_config import preset
 from uwblite.pipeline.summary import (
     _anchor,
-    _by_alike_ranges,
     _calibration,
     _distrusted,
     _range_table,
@@ -381,22 +379,3 @@ def test_the_table_of_ranges_says_where_each_was_taken():
         [1, 0, 1],
         [0, 1, 2],
     ]
-
-
-def test_anchors_err_alike_at_given_poses_by_ranges_and_priors_alone(monkeypatch):
-    graph = loop()[0]
-    i, none = np.zeros(1, dtype=int), np.zeros((1, 3))
-    scan = ScanEdges(i, i + 1, none, np.eye(3)[None], none, none, np.full(4, -1))
-    each = np.arange(len(graph.poses) - 1)
-    root, unused = np.tile(np.eye(3), (59, 1, 1)), np.full((59, 4), -1)
-    wheels = OdometryEdges(each, each + 1, np.zeros((59, 3)), np.zeros(59), np.zeros(59), root, unused)
-    graph = replace(graph, edges=(wheels, *graph.edges[1:]), fixed_calibration=np.zeros(0, dtype=bool))
-    asked = []
-    monkeypatch.setattr("uwblite.pipeline.summary.by_alike_errors", lambda graph, *others: asked.append(graph.edges) or 7.0)
-    config, estimate = MappingConfig().ranges, Estimate(graph.with_edges(scan), wheels, graph.edges[2], ("A", "B", "C"))
-    whole = np.full((3, 2, 2), 3.0)
-    assert _by_alike_ranges(estimate, whole, config) == 7.0
-    assert asked == [graph.edges[1:]]
-    for other, steady in ((estimate, 0.0), (replace(estimate, graph=graph), 0.1), (replace(estimate, ranges=None), 0.1)):
-        np.testing.assert_array_equal(_by_alike_ranges(other, whole, replace(config, steady=steady)), whole)
-    assert len(asked) == 1

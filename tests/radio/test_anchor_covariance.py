@@ -219,3 +219,5 @@ def test_where_nothing_is_assumed_to_be_steady_or_no_range_counts_covariances_st
         count_alike_errors(found, graph, ranges, config)
         np.testing.assert_array_equal(found.poses, poses)
         np.testing.assert_array_equal(found.among, among)
+    whole = np.full((len(graph.anchors), 2, 2), 3.0)
+    assert by_alike_errors(graph, edges, whole, RangeNoiseConfig(steady=0.0)) is whole

@@ -8,7 +8,7 @@ from .. import se2
 from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_nonnegative_heights
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
-from ..graph.pose_edges import ScanEdges
+from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..graph.unknowns import free_unknowns
 from ..grid.geometry import GridGeometry
@@ -17,7 +17,8 @@ from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors, with_range_errors
 from ..odometry.wheels import with_noise_shown
-from ..radio.anchor_covariance import count_alike_errors
+from ..radio.anchor_covariance import by_alike_errors, count_alike_errors
+from ..radio.range_noise import RangeNoiseConfig
 from .estimate import Estimate, Task
 from .lidar_stages import solved
 from .map_frame import cropped
@@ -45,21 +46,35 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
 
 
 def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Marginals]:
-    """Return the estimate moved by what errors of ranges to surfaces did to it, as far as these show, and its covariances."""
+    """Return the estimate moved by what errors of ranges to surfaces did to it, as far as these show, and its covariances.
+
+    These count what ranges of the lidar, and those of the radio, err alike.
+    """
     poses = len(estimate.graph.poses)
     along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.int64))
     stated = with_noise_shown(with_fewer_pairs(estimate.graph))
     covariance = marginals(stated, common := common_range_errors(stated), among=along)
-    if not any(isinstance(e, ScanEdges) for e in stated.edges):
-        for ranges in (e for e in stated.edges if isinstance(e, RangeEdges)):
-            count_alike_errors(covariance, stated, ranges, task.config.ranges)
-    if not common:
-        return estimate, covariance
-    return estimate.with_estimates_of(with_nonnegative_heights(covariance.corrected())), covariance
+    if common:
+        estimate = estimate.with_estimates_of(with_nonnegative_heights(covariance.corrected()))
+    if estimate.ranges is not None:
+        _count_alike_ranges(covariance, stated, estimate.graph, estimate.ranges, task.config.ranges)
+    return estimate, covariance
 
 
 _ALONG = 60
 """Poses along the trajectory whose errors stand for those of all."""
+
+
+def _count_alike_ranges(
+    covariance: Marginals, stated: Graph, found: Graph, ranges: RangeEdges, config: RangeNoiseConfig
+) -> None:
+    """Count what ranges err alike: in the covariances of anchors where the lidar holds the poses, else in those of all."""
+    if any(isinstance(e, ScanEdges) for e in stated.edges):
+        about_anchors = tuple(e for e in found.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
+        given = at_given_poses(replace(found, edges=about_anchors))
+        covariance.anchors = by_alike_errors(given, ranges, covariance.anchors, config)
+    else:
+        count_alike_errors(covariance, stated, ranges, config)
 
 
 def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:

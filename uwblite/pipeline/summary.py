@@ -10,16 +10,12 @@ from ..arrays import Bools, Floats, spread_about_median
 from ..graph.calibration import Unknown, unknowns
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, shape_error
-from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
-from ..radio.anchor_covariance import by_alike_errors
-from ..radio.range_noise import RangeNoiseConfig
 from ..sensor_log.anchor_names import name_and_number
 from . import plausibility
 from .estimate import Estimate, Task
-from .final_stages import at_given_poses
 from .radio_stages import heights_given, tag_rises
 from .recordings import Recordings
 from .residual_tests import NO_DISTANCES
@@ -39,7 +35,6 @@ _SHOWN = 0.7
 def summarise(estimate: Estimate, covariance: Marginals, grid: OccupancyGrid | None, task: Task) -> MapResult:
     """Gather the result; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
-    covariance.anchors = _by_alike_ranges(estimate, covariance.anchors, task.config.ranges)
     residuals, weights = _range_residuals(graph, ranges)
     typical = 0.0
     if ranges is not None and estimate.placed.any():
@@ -89,15 +84,6 @@ def _distrusted(anchors: tuple[AnchorEstimate, ...], doubts: Sequence[Notice]) -
     if all(doubt.kind in _ABOUT_PARTS for doubt in doubts):
         return anchors
     return tuple(replace(a, status="distrusted", reason="the map is doubted") if a.status == "ok" else a for a in anchors)
-
-
-def _by_alike_ranges(estimate: Estimate, whole: Floats, config: RangeNoiseConfig) -> Floats:
-    """Return the covariances of anchors (a, 2, 2) with what ranges err alike; without a lidar they count it already."""
-    graph, ranges = estimate.graph, estimate.ranges
-    if ranges is None or config.steady == 0.0 or not any(isinstance(e, ScanEdges) for e in graph.edges):
-        return whole
-    about_anchors = tuple(e for e in graph.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
-    return by_alike_errors(at_given_poses(replace(graph, edges=about_anchors)), ranges, whole, config)
 
 
 def _range_residuals(graph: Graph, ranges: RangeEdges | None) -> tuple[Floats, Floats]:

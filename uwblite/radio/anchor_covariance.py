@@ -53,6 +53,8 @@ def by_alike_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: Rang
     edges : the graph's ranges, with the weights that the anchors were estimated with.
     whole : (a, 2, 2) m^2, marginal covariances of the anchors estimated with the poses, by the weights.
     """
+    if config.steady == 0.0:
+        return whole
     around = marginals(graph)
     slopes = _by_each_range(around, edges)
     weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
