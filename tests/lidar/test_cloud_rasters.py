@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from uwblite.lidar.cloud_rasters import rasterize
+from uwblite.lidar.cloud_rasters import _RUN, rasterize
 
 
 @settings(max_examples=15)
@@ -15,10 +15,12 @@ def test_the_raster_names_the_nearest_point_to_a_cell(seed):
     rng = np.random.default_rng(seed)
     clouds, cell, reach = scattered(rng, [40, 0, 1, 80]), 0.05, 0.3
     raster = rasterize(clouds, cell, reach)
+    # Runs of cells that name no point are kept once for all.
+    assert np.flatnonzero(raster.nearest.reshape(-1, _RUN).max(axis=1) < 0).tolist() == [0]
     usable = np.any(clouds.normals != 0.0, axis=1)
     for k in range(4):
         own = np.flatnonzero(usable & (clouds.owner == k))
-        cells = raster.nearest[raster.start[k] : raster.start[k] + raster.shape[k].prod()].reshape(raster.shape[k])
+        cells = raster.cells(k)
         if not len(own):
             assert np.all(cells == -1)
             continue

@@ -40,7 +40,7 @@ def by_hand(clouds, raster, i, pose, rows, gate, scale):
         cx, cy = np.floor((at - raster.origin[i]) / raster.cell).astype(int)
         if not (0 <= cx < raster.shape[i, 0] and 0 <= cy < raster.shape[i, 1]):
             continue
-        number = raster.nearest[raster.start[i] + cx * raster.shape[i, 1] + cy]
+        number = raster.cells(i)[cx, cy]
         target = clouds.offsets[i] + number
         if number < 0 or np.hypot(*(at - clouds.points[target])) > gate:
             continue

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.planted import box, odometry, recording, scans, wander
 
-from uwblite.lidar import cloud_rasters
 from uwblite.pipeline import scan_clouds
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.recordings import denser, gather
@@ -32,14 +31,8 @@ def test_clouds_taken_over_are_those_made_again(steps):
     for name in ("offsets", "points", "normals", "owner", "normal_variance"):
         np.testing.assert_array_equal(getattr(mixed.clouds, name), getattr(fresh.clouds, name))
     for k in range(len(fresh.clouds)):
-        np.testing.assert_array_equal(cells(mixed.raster, k), cells(fresh.raster, k))
+        np.testing.assert_array_equal(mixed.raster.cells(k), fresh.raster.cells(k))
     assert mixed.delay == fresh.delay == 0.02
     # Steps that were cut and their neighbours alone are made again.
     assert 0 < np.sum(former < 0) < len(former) / 2
     np.testing.assert_array_equal(before.stamps[former[former >= 0]], after.stamps[former >= 0])
-
-
-def cells(raster: cloud_rasters.CloudRasters, k: int) -> np.ndarray:
-    """The cells of one cloud's raster."""
-    start = int(raster.start[k])
-    return raster.nearest[start : start + int(raster.shape[k].prod())]

@@ -5,6 +5,7 @@ Looking up a million points is a handful of array operations and no tree.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +13,22 @@ from numpy.typing import NDArray
 from ..arrays import Floats, Ints
 from .clouds import Clouds
 
-_CLOUDS_AT_ONCE = 256
-"""Clouds whose rasters are made at once."""
+_CLOUDS_AT_ONCE = 64
+"""Clouds whose rasters are made at once; a bound on the memory."""
+_RUN_BITS = 4
+_RUN = 1 << _RUN_BITS
+"""Cells in y that are kept together: a wall and the cells within reach of it are about as wide."""
 NOBODY = -1
 """In place of the number of a point: there is none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudRasters:
-    """A raster for every cloud: which of its points is nearest to each cell around it."""
+    """A raster for every cloud: which of its points is nearest to each cell around it.
+
+    Most of the box around a cloud is far from any of its points. Columns of cells are cut into runs, and only runs that name a
+    point are kept.
+    """
 
     cell: float
     """m."""
@@ -28,10 +36,20 @@ class CloudRasters:
     """(k, 2) lower corner of each cloud's raster in its own frame, m."""
     shape: Ints
     """(k, 2) cells in x and y; the outermost ones name no point."""
-    start: Ints
-    """(k,) first cell of each raster in `nearest`."""
+    start: NDArray[np.int32]
+    """(k,) first run of each raster in `run`; those in y follow each other."""
+    run: NDArray[np.int32]
+    """(runs,) first cell of each run in `nearest`; the first run is that of what lies outside of all rasters."""
     nearest: NDArray[np.signedinteger]
-    """(cells,) number of the nearest point within its cloud, -1 = none within reach; 16 bits where they suffice."""
+    """(cells,) number of the nearest point within its cloud, -1 = none within reach; 16 bits where they suffice. Those of the
+    first run name none: they stand for all runs that name none."""
+
+    def cells(self, k: int) -> NDArray[np.signedinteger]:
+        """Return the raster (x, y) of one cloud."""
+        wide, high = self.shape[k].tolist()
+        runs = -(-high // _RUN)
+        first = self.run[self.start[k] : self.start[k] + wide * runs]
+        return self.nearest[first[:, None] + np.arange(_RUN)].reshape(wide, runs * _RUN)[:, :high]
 
 
 def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
@@ -46,24 +64,33 @@ def rasterize(clouds: Clouds, cell: float, reach: float) -> CloudRasters:
     margin = reach + cell
     low = np.where(filled, low - margin, 0.0)
     shape = np.where(filled, np.ceil((high + margin - low) / cell), 0.0).astype(np.int64) + filled
-    size = shape[:, 0] * shape[:, 1]
-    start = np.concatenate([[0], np.cumsum(size)[:-1]])
+    runs = shape[:, 0] * -(-shape[:, 1] // _RUN)
+    start = (np.concatenate([[0], np.cumsum(runs)]) + 1).astype(np.int32)
     narrow = int(clouds.counts.max(initial=0)) <= np.iinfo(np.int16).max
-    raster = CloudRasters(cell, low, shape, start, np.full(int(size.sum()), NOBODY, dtype=np.int16 if narrow else np.int32))
+    kind = np.dtype(np.int16 if narrow else np.int32)
     steps = int(np.floor(reach / cell))
     offsets = [(dx, dy) for dx in range(-steps, steps + 1) for dy in range(-steps, steps + 1)]
     offsets = sorted((o for o in offsets if np.hypot(*o) * cell <= reach), key=lambda o: (-(o[0] ** 2 + o[1] ** 2), o))
+    run, kept, count = np.zeros(start[-1], dtype=np.int32), [np.full((1, _RUN), NOBODY, dtype=kind)], 1
     for some in _blocks(clouds):
-        _claim_cells(clouds, some, raster, offsets)
-    return raster
+        rows = slice(start[some.start], start[some.stop])
+        block = np.full((rows.stop - rows.start, _RUN), NOBODY, dtype=kind)
+        _claim_cells(clouds, some, block.reshape(-1), (start[some] - rows.start) * _RUN, low, shape, cell, offsets)
+        # All bits of -1 are set: the words of a run that names no point are -1 together, too.
+        named = np.flatnonzero(reduce(np.bitwise_and, block.view(np.int64).T) != NOBODY)
+        run[rows][named] = (count + np.arange(len(named))) * _RUN
+        kept.append(block[named])
+        count += len(named)
+    return CloudRasters(cell, low, shape, start[:-1], run, np.concatenate(kept).reshape(-1))
 
 
 def chosen_rasters(one: CloudRasters, other: CloudRasters, which: Ints) -> CloudRasters:
     """Return the rasters of some clouds (w,), those of the other numbered on behind those of the one."""
+    run = np.concatenate([one.run, other.run + np.int32(len(one.nearest))])
     nearest = np.concatenate([one.nearest, other.nearest])
     origin, shape = np.concatenate([one.origin, other.origin]), np.concatenate([one.shape, other.shape])
-    start = np.concatenate([one.start, other.start + len(one.nearest)])
-    return CloudRasters(one.cell, origin[which], shape[which], start[which], nearest)
+    start = np.concatenate([one.start, other.start + np.int32(len(one.run))])
+    return CloudRasters(one.cell, origin[which], shape[which], start[which], run, nearest)
 
 
 def _blocks(clouds: Clouds) -> Iterator[slice]:
@@ -72,15 +99,23 @@ def _blocks(clouds: Clouds) -> Iterator[slice]:
         yield slice(first, min(first + _CLOUDS_AT_ONCE, len(clouds)))
 
 
-def _claim_cells(clouds: Clouds, some: slice, raster: CloudRasters, offsets: list[tuple[int, int]]) -> None:
-    """Let the points of some clouds claim the cells at these offsets from their own, the last offset with most right."""
+def _claim_cells(
+    clouds: Clouds, some: slice, cells: NDArray[np.signedinteger], start: Ints, low: Floats, shape: Ints, cell: float,
+    offsets: list[tuple[int, int]],
+) -> None:
+    """Let the points of some clouds claim the cells at these offsets from their own, the last offset with most right.
+
+    Parameters
+    ----------
+    cells : of these clouds, all runs of each. start : (s,) first of each cloud's. low, shape : (k, 2), see CloudRasters.
+    """
     usable, owner, x, y = _usable(clouds, some)
-    rows = (usable - clouds.offsets[owner]).astype(raster.nearest.dtype)
-    stride, low = raster.shape[owner, 1], raster.origin[owner]
-    cx, cy = ((x - low[:, 0]) / raster.cell).astype(np.int64), ((y - low[:, 1]) / raster.cell).astype(np.int64)
-    base = cx * stride + cy + raster.start[owner]
+    rows = (usable - clouds.offsets[owner]).astype(cells.dtype)
+    stride = -(-shape[owner, 1] // _RUN) * _RUN
+    cx, cy = ((x - low[owner, 0]) / cell).astype(np.int64), ((y - low[owner, 1]) / cell).astype(np.int64)
+    base = cx * stride + cy + start[owner - some.start]
     for dx, dy in offsets:
-        raster.nearest[base + (dx * stride + dy)] = rows
+        cells[base + (dx * stride + dy)] = rows
 
 
 def _usable(clouds: Clouds, some: slice) -> tuple[Ints, Ints, Floats, Floats]:
@@ -111,11 +146,13 @@ def look_up(raster: CloudRasters, i: Ints, x: Floats, y: Floats) -> NDArray[np.s
     cy = ((y - raster.origin[i, 1:]) * per_cell).astype(np.int32)
     wide, high = raster.shape[i, :1].astype(np.uint32), raster.shape[i, 1:].astype(np.uint32)
     inside = (cx.view(np.uint32) < wide) & (cy.view(np.uint32) < high)
-    cell = cx * raster.shape[i, 1:] + cy
-    cell += raster.start[i, None]
-    # The first cell of all is in the rim of a raster, as what lies outside of any.
-    cell *= inside
-    return raster.nearest.take(cell) if len(raster.nearest) else np.full(x.shape, NOBODY)
+    run = cx * (-(-raster.shape[i, 1:] // _RUN)).astype(np.int32)
+    run += cy >> _RUN_BITS
+    run += raster.start[i, None]
+    run *= inside
+    cy &= _RUN - 1
+    cy += raster.run.take(run)
+    return raster.nearest.take(cy)
 
 
 def surface_field(clouds: Clouds, raster: CloudRasters, spread: float) -> NDArray[np.complex64]:
@@ -123,8 +160,8 @@ def surface_field(clouds: Clouds, raster: CloudRasters, spread: float) -> NDArra
 
     d is the distance from the cell's centre to the point that the raster names; 0 where it names none.
     """
-    wide, high = raster.shape[0].tolist()
-    nearest = raster.nearest[: wide * high].astype(np.int64)
+    high = int(raster.shape[0, 1])
+    nearest = raster.cells(0).reshape(-1).astype(np.int64)
     cells = np.flatnonzero(nearest >= 0)
     own = nearest[cells]
     centre = raster.origin[0] + (np.column_stack([cells // high, cells % high]) + 0.5) * raster.cell

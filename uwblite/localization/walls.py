@@ -214,10 +214,9 @@ def walls_of(grid: OccupancyGrid) -> Walls:
     extent = np.ptp(occupied, axis=0) + 2.0 * REACH
     cell = max(grid.geometry.resolution, float(np.sqrt(extent[0] * extent[1] / _MOST_CELLS)))
     raster = rasterize(cloud, cell, REACH)
-    shape = (int(raster.shape[0, 0]), int(raster.shape[0, 1]))
     bare = Walls(
         grid.geometry, states, *cloud.cloud(0), np.zeros(len(cloud.points), bool), cloud.normal_variance.astype(np.float64),
-        cell, raster.origin[0], raster.nearest.reshape(shape) if raster.nearest.size else np.zeros((0, 0), np.int32),
+        cell, raster.origin[0], raster.cells(0),
     )  # fmt: skip
     return _facing_free_space(bare)
 
