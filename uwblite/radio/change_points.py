@@ -24,7 +24,8 @@ _LIKELY = 2
 _ROUNDS = 6
 """Times, at most, that places and moment are found in turn; two or three are usual."""
 _LEAST_RANGES = 20
-"""Ranges on either side of a moment."""
+"""Ranges before the first moment tried and after the last. A moment at one of these ends is no minimum: it lies beyond, or a
+path that is bent looks like a move; both places would hold ranges of each other."""
 _LEAST_MOVE = 0.8
 """Shorter moves cannot be distinguished from a blocked line of sight, m; what the constant errors of both places differ by
 counts off."""
@@ -145,6 +146,8 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     tried |= _splits(path, ranges, [(k, k) for k in starts[::2]], width, config)
     likely = sorted(tried, key=lambda at: tried[at].cost)[:_LIKELY]
     best = min((_converged(path, ranges, at, width, config, tried) for at in likely), key=lambda found: found.cost)
+    if best.left == _LEAST_RANGES or best.moment == len(ranges) - _LEAST_RANGES:
+        return None
     move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
     # A place is traded against a constant error; that of a radio does not change because the radio is moved.
     beyond = move.distance - abs(move.second.bias - move.first.bias)
