@@ -324,6 +324,11 @@ class Oracle:
             normal = np.where(wall[:, None], normal, outwards)
             incidence = (normal * direction).sum(axis=1)
             residual = np.where(wall, flat, -shift * incidence)
+            # Derivatives where the ray should end, not where noise made it end: residual and lever arm of an oblique ray
+            # would hold the same noise, and their product would turn every scan, along a wall always to the same side.
+            oblique = np.where(np.abs(incidence) > 0.05, incidence, np.inf)
+            ahead = -(residual / oblique)[:, None] * direction
+            arm, at = arm + ahead, at + ahead
             # A grazing ray errs along the wall; what the estimator could at best know of it is kept finite.
             sd = rays.sd[part] * np.maximum(np.abs(incidence), 0.05)
             sd = np.where(wall | (np.abs(incidence) > _GRAZING), sd, np.inf)
