@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.planted_graphs import plain_ranges, random_poses
 
+from uwblite.constraints import Constraints
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import SolverConfig
@@ -51,7 +52,7 @@ def test_an_anchor_that_stands_elsewhere_in_a_recording_is_another_one_there(mon
     bootstrap = BootstrapResult(graph, yes, (("a",), ("b",)), ~yes)
     recordings = type("Recordings", (), {"of_keyframe": np.arange(3), "__len__": lambda self: 3})()
     stages = Stages(None, None)
-    task = SimpleNamespace(recordings=recordings, config=MappingConfig(), stages=stages)
+    task = SimpleNamespace(recordings=recordings, config=MappingConfig(), stages=stages, given=Constraints())
     estimate = separate_moved_anchors(Estimate(graph, None, ranges, ("A", "B"), bootstrap), task)
     assert estimate.anchor_ids == ("A", "B", "B#2")
     assert estimate.ranges.anchor.tolist() == [0, 1, 0, 2, 0, 2]
@@ -59,6 +60,49 @@ def test_an_anchor_that_stands_elsewhere_in_a_recording_is_another_one_there(mon
     assert (estimate.bootstrap.hypotheses, estimate.placed.tolist()) == ((("a",), ("b",), ()), [True] * 3)
     names = ("anchor", "recording", "new_id", "distance")
     assert [[w.figures[name] for name in names] for w in stages.warnings] == [["B", 2, "B#2", 4.0], ["B", 3, "B#2", 4.1]]
+
+
+def united(monkeypatch, places, *given, variance=0.01):
+    """Three recordings that were joined with a second place of A in the second one; places (3,) as the poses show them."""
+    found = np.column_stack([places, np.zeros(3)]), np.tile(variance * np.eye(2), (3, 1, 1)), np.array([[0, 0], [0, 2], [2, 1]])
+    monkeypatch.setattr(moved_anchors, "_places_by_recording", lambda *args: found)
+    monkeypatch.setattr(moved_anchors, "refine_jointly", lambda estimate, task: estimate)
+    yes = np.ones(3, dtype=bool)
+    graph = Graph(np.zeros((3, 3)), np.array([[0.0, 0.0], [5.0, 0.0], [27.0, 0.0]]))
+    ranges = plain_ranges(np.array([0, 0, 1, 2]), np.array([0, 1, 2, 0]), np.ones(4), 0.1)
+    bootstrap = BootstrapResult(graph, yes, (("a",), ("b",), ("c",)), ~yes)
+    recordings = type("Recordings", (), {"of_keyframe": np.arange(3), "__len__": lambda self: 3})()
+    stages = Stages(None, None)
+    stages.warn("moved-anchor", "", new_id="A#2", distance=27.0)
+    stages.warn("moved-anchor", "from its earlier place")
+    task = SimpleNamespace(recordings=recordings, config=MappingConfig(), stages=stages, given=Constraints(given))
+    estimate = separate_moved_anchors(Estimate(graph, None, ranges, ("A", "B", "A#2"), bootstrap), task)
+    return estimate, [w.figures.get("distance") for w in stages.warnings]
+
+
+def test_an_anchor_that_stands_where_it_stood_was_not_moved(monkeypatch):
+    """The bootstrap of one recording found its mirror image, so that joining gave it a second place."""
+    estimate, distances = united(monkeypatch, [0.0, 0.1, 0.1])
+    assert (estimate.anchor_ids, distances) == (("A", "B"), [None])
+    assert estimate.ranges.anchor.tolist() == [0, 1, 0, 0]
+    assert (estimate.bootstrap.hypotheses, len(estimate.graph.anchors)) == ((("a",), ("b",)), 2)
+
+
+def test_an_anchor_that_was_moved_keeps_both_places_and_the_way_between_them_is_said_anew(monkeypatch):
+    estimate, distances = united(monkeypatch, [0.0, 0.1, 3.0])
+    assert (estimate.anchor_ids, distances) == (("A", "B", "A#2"), [None, 3.0])
+    assert estimate.ranges.anchor.tolist() == [0, 1, 2, 0]
+
+
+@pytest.mark.parametrize(("off", "ids"), [(0.84, ("A", "B")), (0.89, ("A", "B", "A#2"))])
+def test_places_that_were_apart_stay_so_beyond_what_joining_allows(monkeypatch, off, ids):
+    """With variances of 0.0081 and 0.0081 of either place: 0.5 m and twice the standard deviation of both, 0.18 m."""
+    monkeypatch.setattr(moved_anchors, "_MOVED", 100.0)
+    assert united(monkeypatch, [0.0, 0.1, off], variance=0.0081)[0].anchor_ids == ids
+
+
+def test_places_that_the_user_names_stay(monkeypatch):
+    assert united(monkeypatch, [0.0, 0.1, 0.1], SimpleNamespace(id="A#2"))[0].anchor_ids == ("A", "B", "A#2")
 
 
 @pytest.mark.parametrize("wild", [0.0, 0.1])

@@ -21,7 +21,7 @@ from ..graph.pose_edges import OdometryEdges
 from ..graph.range_edges import RangeEdges
 from ..radio.bootstrap_attempt import BootstrapResult
 from ..radio.trilateration import AnchorHypothesis
-from ..sensor_log.anchor_names import numbered, radio_name
+from ..sensor_log.anchor_names import first_place, numbered, radio_name
 from .constraint_edges import consensus
 from .estimate import Estimate, Task
 from .recordings import Recording, Recordings
@@ -80,12 +80,12 @@ def warn_of_moved_anchor(task: Task, anchor: str, distance: float, recording: in
 def _other_name(name: str, here: Floats, spread: float, number: int, placed: dict[str, tuple[Floats, float]]) -> str:
     """Return what to call an anchor that does not stand at its first place: as a recording that found it here does."""
     for other, (place, sigma) in placed.items():
-        if radio_name(other) == radio_name(name) and np.hypot(*(place - here)) < _tolerance(spread, sigma):
+        if radio_name(other) == radio_name(name) and np.hypot(*(place - here)) < tolerance(spread, sigma):
             return other
     return numbered(name, number)
 
 
-def _tolerance(one: float, other: float) -> float:
+def tolerance(one: float, other: float) -> float:
     """Return how far two first places of one anchor with these standard deviations may lie apart, m."""
     return _FIRST_TOLERANCE + 2.0 * float(np.hypot(one, other))
 
@@ -115,17 +115,18 @@ def _laid_on(
             "or more are needed to bring it into their frame: map it alone, or record where common anchors are in reach"
         )
     here, there = (np.array([side[name][0] for name in common]) for side in (found, placed))
-    tolerance = np.array([_tolerance(found[name][1], placed[name][1]) for name in common])
-    motion = consensus(here, there, tolerance)
+    most = np.array([tolerance(found[name][1], placed[name][1]) for name in common])
+    motion = consensus(here, there, most)
     off = np.hypot(*(se2.transform(motion, here) - there).T)
-    return motion, {name: float(d) for name, d, most in zip(common, off, tolerance, strict=True) if d > most}
+    return motion, {name: float(d) for name, d, limit in zip(common, off, most, strict=True) if d > limit}
 
 
 def _one_graph(
     estimates: Sequence[Estimate], motions: Sequence[Floats], names: Sequence[Sequence[str]], recordings: Recordings
 ) -> Estimate:
     """Make the estimates one, each moved by its motion, its anchors under the given names."""
-    ids = tuple(dict.fromkeys(name for own in names for name in own))
+    # Second places stand last: they may be found to be none, and what the user gives is counted by number.
+    ids = tuple(sorted(dict.fromkeys(name for own in names for name in own), key=lambda name: name != first_place(name)))
     place = [np.array([ids.index(name) for name in own], dtype=np.int64) for own in names]
     block, priors, fixed, at = _one_calibration([estimate.graph for estimate in estimates])
     poses = np.concatenate([se2.compose(m, estimate.graph.poses) for m, estimate in zip(motions, estimates, strict=True)])

@@ -1,5 +1,6 @@
 """Anchors that were moved, added or taken away between recordings, found once all poses are known well."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +14,9 @@ from ..graph.robust import Kernel
 from ..graph.solver import SolverConfig
 from ..radio.range_measurements import learn_noise
 from ..radio.range_noise import RangeNoiseConfig
-from ..sensor_log.anchor_names import numbered, radio_name
+from ..sensor_log.anchor_names import first_place, numbered, radio_name
 from .estimate import Estimate, Task
-from .joining import warn_of_moved_anchor
+from .joining import tolerance, warn_of_moved_anchor
 from .lidar_stages import refine_jointly
 
 _LEAST_MOVE = 0.25
@@ -26,10 +27,12 @@ freedom; 5e-5 by chance, the rest for errors that the sigmas leave out)."""
 
 
 def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
-    """Give anchors that were moved between recordings a place of their own, once the poses are known well.
+    """Give anchors that were moved between recordings a place of their own, and one to others, once poses are known well.
 
     With the poses fixed, every recording's ranges determine where each anchor stood then; places whose distance their
-    uncertainty does not explain are not the same. Where one was moved, the joint refinement is done again.
+    uncertainty does not explain are not the same. Recordings that were joined may have had an anchor and its mirror image: such
+    an anchor was not moved, if its places are now as near as joining would have asked. Where anything changes, the joint
+    refinement is done again.
     """
     if len(task.recordings) == 1 or estimate.ranges is None or estimate.bootstrap is None:
         return estimate
@@ -37,33 +40,52 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
     place, covariance, pairs = _places_by_recording(estimate, recording_of, task.config.solver, task.config.ranges)
     ids, anchors, anchor = list(estimate.anchor_ids), estimate.graph.anchors.copy(), estimate.ranges.anchor.copy()
     source = list(range(len(ids)))
-    moved = False
-    for k, name in enumerate(estimate.anchor_ids):
-        rows = np.flatnonzero(pairs[:, 0] == k).tolist()
-        number_of = dict.fromkeys(rows[:1], k)
-        for row in rows[1:]:
-            recording = int(pairs[row, 1])
-            same = [n for r, n in number_of.items() if not _differ(place[row] - place[r], covariance[row] + covariance[r])]
-            if not same:
-                ids.append(numbered(name, recording))
+    first = np.array([ids.index(name) for name in map(_first_of(ids, task), ids)], dtype=np.int64)
+    sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2)).tolist()
+    task.stages.withdraw("moved-anchor", "new_id")
+    for k in np.unique(first).tolist():
+        rows = np.flatnonzero(first[pairs[:, 0]] == k)
+        rows = rows[np.argsort(pairs[rows, 1], kind="stable")].tolist()
+        number_of: dict[int, int] = {}
+        for row in rows:
+            named, recording = pairs[row].tolist()
+            same = [
+                n for r, n in number_of.items() if not _differ(place[row] - place[r], covariance[row] + covariance[r])
+                and (pairs[r, 0] == named or np.hypot(*(place[row] - place[r])) <= tolerance(sigma[row], sigma[r]))
+            ]  # fmt: skip
+            number = same[0] if same else named if number_of else k
+            if not same and number in number_of.values():
+                number = len(ids)
+                ids.append(numbered(ids[k], recording))
                 source.append(k)
                 anchors = np.vstack([anchors, place[row]])
-            number_of[row] = same[0] if same else len(ids) - 1
-            if number_of[row] != k:
-                moved = True
-                anchor[(estimate.ranges.anchor == k) & (recording_of == recording)] = number_of[row]
+            elif not same and number != named:
+                anchors[number] = place[row]
+            number_of[row] = number
+            anchor[(estimate.ranges.anchor == named) & (recording_of == recording)] = number
+            if number != number_of[rows[0]]:
                 off = float(np.hypot(*(place[row] - place[rows[0]])))
-                warn_of_moved_anchor(task, name, off, recording, ids[number_of[row]])
-    if not moved:
+                warn_of_moved_anchor(task, ids[number_of[rows[0]]], off, recording, ids[number])
+    if np.array_equal(anchor, estimate.ranges.anchor):
         return estimate
-    found = estimate.bootstrap
+    found, kept = estimate.bootstrap, [n for n in range(len(ids)) if n >= len(first) or first[n] == n or np.any(anchor == n)]
+    fresh = [source[n] for n in kept]
     found = replace(
-        found, placed=found.placed[source], ambiguous=found.ambiguous[source],
-        hypotheses=tuple(found.hypotheses[k] if n < len(estimate.anchor_ids) else () for n, k in enumerate(source)),
+        found, placed=found.placed[fresh], ambiguous=found.ambiguous[fresh],
+        hypotheses=tuple(found.hypotheses[source[n]] if n < len(first) else () for n in kept),
     )  # fmt: skip
-    graph = replace(estimate.graph, anchors=anchors, fixed_anchors=~found.placed)
-    ranges = replace(estimate.ranges, anchor=anchor)
-    return refine_jointly(replace(estimate, graph=graph, ranges=ranges, bootstrap=found, anchor_ids=tuple(ids)), task)
+    graph = replace(estimate.graph, anchors=anchors[kept], fixed_anchors=~found.placed)
+    ranges = replace(estimate.ranges, anchor=np.searchsorted(kept, anchor))
+    names = tuple(ids[n] for n in kept)
+    return refine_jointly(replace(estimate, graph=graph, ranges=ranges, bootstrap=found, anchor_ids=names), task)
+
+
+def _first_of(ids: Sequence[str], task: Task) -> Callable[[str], str]:
+    """Return what gives for the name of a place that of the anchor's first one; itself where the user names such places."""
+    given = {a.id for a in task.given.anchors} | {name for d in task.given.distances for name in d.anchors}
+    if any(name != first_place(name) for name in given):
+        return str
+    return lambda name: first_place(name) if first_place(name) in ids else name
 
 
 def _differ(off: Floats, covariance: Floats) -> bool:

@@ -58,6 +58,10 @@ class Stages:
         """Add something the user should know."""
         self.warnings.append(Notice(kind, text, figures))
 
+    def withdraw(self, kind: str, figure: str) -> None:
+        """Take back all warnings of a kind that have a figure, to be said anew by what is known now."""
+        self.warnings = [notice for notice in self.warnings if notice.kind != kind or figure not in notice.figures]
+
     def doubt(self, kind: str, text: str, **figures: object) -> None:
         """Add a reason not to trust the result."""
         self.doubts.append(Notice(kind, text, figures))

@@ -29,6 +29,11 @@ def numbered(anchor: str, recording: int) -> str:
     return f"{anchor}#{recording + 1}"
 
 
+def first_place(anchor: str) -> str:
+    """Return the name of an anchor where the first of several recordings has it: ``ID@2`` of ``ID@2#3``."""
+    return re.sub(r"#\d+$", "", anchor)
+
+
 def radio_name(anchor: str) -> str:
     """Return what the radio calls an anchor, given the name of one of its places, as ``5C0B@2#3``."""
     return re.sub(r"(@\d+)?(#\d+)?$", "", anchor)
