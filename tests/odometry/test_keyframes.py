@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwblite import se2
+from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import (
     KeyframeConfig,
     _broken_steps,
@@ -123,6 +124,17 @@ def test_keyframes_are_scans_where_there_are_any():
     assert step.max() <= 0.6 + 1e-9
     assert step[1:-1].min() > 0.6 - 0.17
     assert frames.path.sum() == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize(("first", "moving"), [(0.3, True), (0.02, False)])
+def test_the_first_scan_of_a_robot_under_way_has_a_keyframe_of_its_own(first, moving):
+    """Laid to the first pose it would turn the whole map by what the wheels erred by until then."""
+    stamps, truth = drive([(0.2, 0, 0.2)], [5.0])
+    begin = np.arange(first, 4.9, 0.1)
+    lidar = LaserScans(begin, np.ones((len(begin), 10), dtype=np.float32), 0.0, 0.1, 0.0, 0.1, 5.0)
+    frames = select(Odometry(stamps, truth), KeyframeConfig(), scans=lidar)
+    owner, _ = choose_scans(lidar, frames, KeyframeConfig())
+    assert (frames.stamps[1] == begin[0], 0 in owner) == (moving, not moving)
 
 
 @pytest.mark.parametrize("creeping", [(0.05, 0.0, 0.0), (0.0, 0.0, 0.06)])

@@ -175,6 +175,8 @@ def _advance(ways: Floats, preferred: Bools) -> Ints:
     chosen = [0]
     last = ways.shape[1] - 1
     stops = np.flatnonzero(preferred)
+    if len(stops) and stops[0] < last and ways[:2, stops[0]].max() > _AT_REST:
+        chosen.append(int(stops[0]))
     while chosen[-1] < last:
         here = chosen[-1]
         within = _reached(ways, here, 1.0)
@@ -190,6 +192,9 @@ def _advance(ways: Floats, preferred: Bools) -> Ints:
     return np.array(chosen, dtype=np.int64)
 
 
+_AT_REST = 0.05
+"""Keyframe distances or angles up to which the first scan is one of the first pose: a way over which wheels err by little.
+After a longer one the cloud would stand in the frame of all poses with an error that none of them knows of."""
 _GAP = 10.0
 """Keyframe distances, angles or durations without any scan after which keyframes go on without."""
 _STANDING = 0.1
