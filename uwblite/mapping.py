@@ -28,6 +28,7 @@ from .pipeline import (
     radio_stages,
     scan_selection,
     summary,
+    turn_checks,
 )
 from .pipeline.estimate import Estimate, Task
 from .pipeline.mapping_config import MappingConfig
@@ -111,6 +112,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         if config.scan_to_scan.on:
             yield lidar_stages.match_scan_to_scan
             yield radio_stages.reestimate_ranges
+            yield turn_checks.with_slip_in_turns
         if config.use_loops:
             yield closure_rounds.close_loops if config.loop_closure.method == "search" else closure_rounds.close_loops_as_paper
             yield radio_stages.select_range_priors

@@ -52,7 +52,8 @@ def test_height_is_unknown_only_where_none_is_given():
         ("odometry_scale", {"odometry_scale"}), ("heading_scale", {"heading_scale"}), ("heading_rate", {"heading_rate"}),
         ("heading_per_metre", {"heading_per_metre"}), ("laser_offset", {"laser_x", "laser_y"}),
         ("laser_angle", {"laser_theta"}), ("laser_delay", {"laser_delay"}), ("range_scale", {"range_scale"}),
-        ("tag_offset", {"tag_x", "tag_y"}), ("range_delay", {"range_delay"}),
+        ("tag_offset", {"tag_x", "tag_y"}), ("range_delay", {"range_delay"}), ("sideways_scale", {"sideways_scale"}),
+        ("sideways_per_turn", {"sideways_per_turn"}), ("sideways_per_metre", {"sideways_per_metre"}),
         ("range_bias", {f"bias:{a}" for a in IDS}), ("anchor_height", {"height2:1E05", "height2:91A3"}),
     ],
 )
@@ -101,13 +102,16 @@ def test_tables_name_the_right_scalar_in_the_right_column():
         height = None if GIVEN[a] else f"height2:{IDS[a]}"
         assert stated == ["range_scale", f"bias:{IDS[a]}", height, "tag_x", "tag_y", "range_delay"]
     wheels = odometry_indices(calibration, 3)
-    assert wheels.shape == (3, 4)
+    assert wheels.shape == (3, 7)
     for row in wheels:
         assert [calibration.keys[k].label for k in row] == [
             "odometry_scale",
             "heading_scale",
             "heading_per_metre",
             "heading_rate",
+            "sideways_per_turn",
+            "sideways_scale",
+            "sideways_per_metre",
         ]
     assert [calibration.keys[k].label for k in scan_indices(calibration)] == [
         "laser_x",

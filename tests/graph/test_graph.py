@@ -90,7 +90,7 @@ def test_scan_jacobians_equal_differences_whatever_of_mounting_and_delay_is_free
 @pytest.mark.parametrize(("scale", "turn"), [(-0.95, 0.2), (-1.5, 0.2), (0.3, -0.97), (-0.99, -2.0), (-0.85, -0.85)])
 def test_wheels_that_count_more_than_ten_times_what_they_do_divide_by_a_tenth(scale, turn):
     graph, kinds = every_kind(10)
-    edges = replace(kinds["odometry"], calibration=np.tile([0, 1, 2, 3], (8, 1)))
+    edges = replace(kinds["odometry"], calibration=np.tile([0, 1, 2, 3, -1, -1, -1], (8, 1)))
     values = np.concatenate([[scale, turn], graph.calibration.values[2:]])
     graph = graph.updated(graph.poses, graph.anchors, values)
     assert_jacobians_equal_differences(graph, edges)
@@ -123,10 +123,13 @@ def test_relative_pose_residual_is_the_chart_of_g2o():
 def test_calibrated_odometry_stretches_and_turns_the_motion():
     graph, kinds = every_kind(3)
     edges = kinds["odometry"]
-    s, k, b, g = graph.calibration.values[:4] * (edges.calibration >= 0)[0]
-    x, y, turn = edges.motion[0]
+    s, k, b, g, p, q, r = np.append(graph.calibration.values, 0.0)[edges.calibration[0]]
+    turn = edges.motion[0, 2]
     extra = k * turn + b * edges.length[0] + g * edges.duration[0]
-    straight = se2.rotate(extra / 2, np.array([x, y]) * (1 + s))
+    ahead, left = se2.rotate(-turn / 2, edges.motion[0, :2])
+    left += left * q + ahead * r
+    straight = se2.rotate((turn + extra) / 2, np.array([ahead, left]) * (1 + s))
+    straight += se2.rotate(turn + extra, np.array([p, 0.0])) - [p, 0.0]
     np.testing.assert_allclose(edges.corrected(graph)[0], [*straight, turn + extra], atol=1e-12)
 
 
@@ -138,7 +141,7 @@ def covariance_of_the_end(motion, sqrt_information):
     n = len(motion)
     edges = OdometryEdges(
         np.arange(n), np.arange(1, n + 1), motion, np.hypot(*motion[:, :2].T), np.ones(n), sqrt_information,
-        np.full((n, 4), -1),
+        np.full((n, 7), -1),
     )  # fmt: skip
     jacobian = np.zeros((3 * n, 3 * (n + 1)))
     for _, index, block in edges.linearize(Graph(np.array(poses))).blocks:
@@ -167,7 +170,7 @@ def test_the_end_of_a_step_is_displaced_by_half_the_way_times_the_heading_of_the
     half = np.append(se2.rotate(-motion[0, 2], 0.5 * motion[0, :2]), 0.0)
     root = rng.normal(size=(1, 3, 3))
     edges = OdometryEdges(
-        np.zeros(1, dtype=int), np.ones(1, dtype=int), motion, np.ones(1), np.ones(1), root, np.full((1, 4), -1)
+        np.zeros(1, dtype=int), np.ones(1, dtype=int), motion, np.ones(1), np.ones(1), root, np.full((1, 7), -1)
     )
     end = se2.compose(motion[0], se2.between(half, se2.compose(e, half)))
     np.testing.assert_allclose(edges.residuals(Graph(np.array([np.zeros(3), end])))[0], root[0] @ e, rtol=1e-4, atol=1e-11)

@@ -15,6 +15,7 @@ from uwblite.graph.solver import optimize
 
 NAMES = ("scale", "turn", "per_metre", "per_second", "x", "y", "theta", "delay")
 RANGE_NAMES = ("range_scale", "bias", "height2", "tag_x", "tag_y", "range_delay")
+SLIP_NAMES = ("sideways_per_turn", "sideways_scale", "sideways_per_metre")
 
 
 def random_poses(rng, n, spread=3.0):
@@ -25,11 +26,12 @@ def every_kind(seed, calibrated=True, edges=8):
     """Return a graph of random estimates and one instance of every kind of edges, random measurements in each."""
     rng = np.random.default_rng(seed)
     n, a, e = 6, 3, edges
+    every = NAMES + RANGE_NAMES + SLIP_NAMES
     graph = Graph(
         random_poses(rng, n, 2.0),
         rng.normal(scale=4.0, size=(a, 2)),
         (),
-        Calibration(tuple(map(UnknownKey, NAMES + RANGE_NAMES)), rng.normal(scale=0.1, size=len(NAMES + RANGE_NAMES))),
+        Calibration(tuple(map(UnknownKey, every)), rng.normal(scale=0.1, size=len(every))),
     )
     i = rng.integers(0, n, e)
     j = (i + rng.integers(1, n, e)) % n
@@ -42,7 +44,7 @@ def every_kind(seed, calibrated=True, edges=8):
     laser = np.arange(4, 8) if calibrated else np.full(4, -1)
     kinds = {
         "relative pose": RelativePoseEdges(i, j, poses, L),
-        "odometry": OdometryEdges(i, j, poses, rng.normal(size=e), rng.uniform(size=e), L, which(0, 1, 2, 3)),
+        "odometry": OdometryEdges(i, j, poses, rng.normal(size=e), rng.uniform(size=e), L, which(0, 1, 2, 3, 14, 15, 16)),
         "scan": ScanEdges(i, j, poses, L, rng.normal(size=(e, 3)), rng.normal(size=(e, 3)), laser, 0.3),
         "range": RangeEdges(
             pose=i,

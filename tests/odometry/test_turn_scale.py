@@ -131,7 +131,7 @@ def test_drifts_by_way_and_time_are_no_scale():
     wheels = replace(wheels, motion=np.column_stack([motion[:, :2], stated]), duration=duration)
     object.__setattr__(wheels, "calibration", odometry_indices(CALIBRATION, STEPS))
     values = np.zeros(len(CALIBRATION.values))
-    values[wheels.calibration[0, 2:]] = 0.2, 0.05
+    values[wheels.calibration[0, 2:4]] = 0.2, 0.05
     none = np.zeros((STEPS, 3))
     k = np.arange(STEPS)
     seen = ScanEdges(k, k + 1, motion, none[:, None] + np.eye(3), none, none, scan_indices(CALIBRATION))

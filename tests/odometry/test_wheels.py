@@ -21,6 +21,7 @@ from uwblite.odometry.wheels import (
     OdometryNoiseConfig,
     drift_time,
     reestimate_wheel_noise,
+    sideways_priors,
     wheel_edges,
     with_noise_shown,
     with_uncounted_ways,
@@ -40,7 +41,7 @@ def test_wheel_edges_hold_the_chain_and_name_the_calibration():
     np.testing.assert_array_equal(edges.j, edges.i + 1)
     graph = Graph(frames.odometry, calibration=calibration)
     np.testing.assert_allclose(edges.residuals(graph), 0.0, atol=1e-8)
-    assert edges.calibration.shape == (len(edges), 4)
+    assert edges.calibration.shape == (len(edges), 7)
 
 
 @pytest.mark.parametrize(("twist", "sigma"), [
@@ -151,6 +152,15 @@ def test_noise_does_not_draw_the_wheels_scale(calibration):
     reach = sigma[0] / np.sqrt((wheels.motion**2).sum(axis=0))
     assert solved.calibration.get("odometry_scale") == pytest.approx(scale, abs=4 * reach[0])
     assert solved.calibration.get("heading_scale") == pytest.approx(turn, abs=4 * reach[2])
+
+
+@pytest.mark.parametrize(("sideways", "counted"), [(0.0, False), (0.1, True), (-0.4, True)])
+def test_ways_to_the_side_are_calibrated_where_the_odometry_counts_some(sideways, counted):
+    """A robot in curves, whose readings a second apart hold arcs and not ways to the side, drives none."""
+    stamps, truth = drive([(0.3, sideways, 0.4), (0.3, sideways, -0.5)], [10.0, 10.0])
+    priors = sideways_priors(Odometry(stamps[::10], truth[::10]), CalibrationConfig())
+    assert (priors.sideways_scale > 0.0, priors.sideways_per_metre > 0.0) == (counted, counted)
+    assert replace(priors, sideways_scale=0.1, sideways_per_metre=0.015) == CalibrationConfig()
 
 
 @pytest.mark.parametrize(("alike", "factor"), [(0.0, 1.0), (0.8, 2.0)])

@@ -12,6 +12,8 @@ from .unknowns import free_unknowns
 
 ODOMETRY = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
 """Kinds of unknowns of the odometry."""
+TURNING, OMNI = "sideways_per_turn", ("sideways_scale", "sideways_per_metre")
+"""Kinds of unknowns of an odometry that slips sideways: in turns, and of wheels that drive sideways."""
 LASER = ("laser_x", "laser_y", "laser_theta", "laser_delay")
 """Kinds of unknowns of the lidar."""
 BIAS, HEIGHT, RANGE_SCALE = "bias", "height2", "range_scale"
@@ -35,6 +37,13 @@ class CalibrationConfig:
     """Heading drift per travelled metre (unequal wheels), rad/m."""
     heading_rate: float = 0.0005
     """Heading drift per second while the robot moves (gyro bias), rad/s."""
+    sideways_per_turn: float = 0.15
+    """How far ahead of the base's origin or behind it a robot turns that slips in turns, m (skid steering); used as far as the
+    recording shows it."""
+    sideways_scale: float = 0.1
+    """Relative error of ways to the side; only of an odometry that counts some (mecanum and omni wheels)."""
+    sideways_per_metre: float = 0.015
+    """Angle between the base's x axis and its way straight ahead, rad; of the same odometry."""
     range_scale: float = 0.15
     """Relative error of all ranges where the unit of the radios is wrong (0.07 has been seen); used as far as the recording
     shows it."""
@@ -91,6 +100,9 @@ def unknowns(
         ("heading_scale", config.heading_scale, "1", "relative error of turned angle"),
         ("heading_per_metre", config.heading_per_metre, "rad/m", "heading drift per travelled metre"),
         ("heading_rate", config.heading_rate, "rad/s", "heading drift per second of motion"),
+        (TURNING, config.sideways_per_turn, "m/rad", "way to the left per turn"),
+        (OMNI[0], config.sideways_scale, "1", "relative error of ways to the side"),
+        (OMNI[1], config.sideways_per_metre, "1", "way to the left per metre ahead"),
         ("laser_x", config.laser_offset, "m", "correction of the laser's x on the base"),
         ("laser_y", config.laser_offset, "m", "correction of the laser's y on the base"),
         ("laser_theta", config.laser_angle, "rad", "correction of the laser's heading on the base"),
@@ -158,8 +170,8 @@ def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str,
 
 
 def odometry_indices(calibration: Calibration, edges: int) -> Ints:
-    """Return the (e, 4) calibration indices of OdometryEdges."""
-    return np.broadcast_to(indices(calibration, *ODOMETRY), (edges, 4))
+    """Return the (e, 7) calibration indices of OdometryEdges."""
+    return np.broadcast_to(indices(calibration, *ODOMETRY, TURNING, *OMNI), (edges, 7))
 
 
 def scan_indices(calibration: Calibration) -> Ints:

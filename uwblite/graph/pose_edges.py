@@ -83,6 +83,10 @@ class OdometryEdges(EdgeTable):
     x and y and by 1 + k in heading: it is the odometry's own, before the correction. Without that, noise alone would
     draw s and k towards smaller motions (errors in variables).
 
+    The wheels turn about the point (-p, 0) of the base, and it is the motion of a frame there that they measure. To their way v
+    to the left ``v q + u r`` is added, u being the way ahead, both in the frame in the middle of the step: they move sideways
+    1 + q times as far as counted, and crab by r.
+
     The error is that of the middle of the step: a heading that errs anywhere along the way displaces the end by half the
     way times it, in the mean, and what is left across is independent of it.
     """
@@ -98,17 +102,19 @@ class OdometryEdges(EdgeTable):
     sqrt_information: Floats
     """(e, 3, 3), of the error in the middle of the step."""
     calibration: Ints
-    """(e, 4) indices of s, k, b (rad/m), g (rad/s) in the calibration block; -1 = not an unknown (taken as 0)."""
+    """(e, 7) indices of s, k, b (rad/m), g (rad/s), p (m/rad), q, r (rad) in the calibration block; -1 = not an unknown
+    (taken as 0)."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
     def corrected(self, graph: Graph) -> Floats:
         """Return the motion (e, 3) with the present calibration applied."""
-        return self._corrected(graph)[0]
+        turning = self._turning_point(graph)
+        return se2.compose(turning, se2.compose(self._corrected(graph)[0], se2.inverse(turning)))
 
     def own_scale(self, graph: Graph) -> Floats:
         """Return by what (e, 3) an error of the corrected motion is divided to be one of the raw odometry."""
-        s, k, _, _ = np.append(graph.calibration.values, 0.0)[self.calibration].T
+        s, k = np.append(graph.calibration.values, 0.0)[self.calibration[:, :2]].T
         return np.maximum(np.stack([1.0 + s, 1.0 + s, 1.0 + k], axis=1), _LEAST_SCALE)
 
     @property
@@ -121,37 +127,61 @@ class OdometryEdges(EdgeTable):
 
     def _corrected(self, graph: Graph) -> tuple[Floats, Floats, Floats]:
         padded = np.append(graph.calibration.values, 0.0)
-        s, k, b, g = padded[self.calibration].T
+        s, k, b, g, _, *slip = padded[self.calibration].T
         delta = k * self.motion[:, 2] + b * self.length + g * self.duration
-        direction = se2.rotate(delta / 2.0, self.motion[:, :2])
+        way = self.motion[:, :2]
+        if np.any(slip):
+            left = se2.rotate(self.motion[:, 2] / 2.0, np.array([0.0, 1.0]))
+            way = way + left * np.sum(self._slipping() * slip, axis=0)[:, None]
+        direction = se2.rotate(delta / 2.0, way)
         z = np.concatenate([direction * (1.0 + s)[:, None], (self.motion[:, 2] + delta)[:, None]], axis=1)
         return z, direction, s
 
+    def _slipping(self) -> Floats:
+        """Return what (2, e) q and r multiply, m."""
+        ahead, left = se2.rotate(-self.motion[:, 2] / 2.0, self.motion[:, :2]).T
+        return np.stack([left, ahead])
+
+    def _turning_point(self, graph: Graph) -> Floats:
+        """Return the frame (e, 3) on the base whose motion the wheels measure."""
+        p = np.append(graph.calibration.values, 0.0)[self.calibration[:, 4]]
+        return np.stack([-p, np.zeros_like(p), np.zeros_like(p)], axis=1)
+
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
-        d = se2.between(graph.poses[self.i], graph.poses[self.j])
-        return whiten(self.end_sqrt_information, se2.between(self.corrected(graph), d) / self.own_scale(graph))
+        turning = self._turning_point(graph)
+        d = se2.between(se2.compose(graph.poses[self.i], turning), se2.compose(graph.poses[self.j], turning))
+        return whiten(self.end_sqrt_information, se2.between(self._corrected(graph)[0], d) / self.own_scale(graph))
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses and the calibration in use."""
         xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
+        turning = self._turning_point(graph)
+        si, sj = (se2.compose(graph.poses[k], turning).T for k in (self.i, self.j))
         z, direction, s = self._corrected(graph)
         stretch = self.own_scale(graph)
         axes = _map_axes(self.end_sqrt_information / stretch[:, None, :], xi[2] + z[:, 2])
-        residuals, m = _relative_residuals(axes, z.T, xi, xj)
-        by_i, by_j = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, xj)), _by_pose(*axes)
+        residuals, m = _relative_residuals(axes, z.T, si, sj)
+        by_i = _by_pose(-axes[0], -axes[1], _turned_about(axes, xi, sj))
+        by_j = _by_pose(axes[0], axes[1], -_turned_about(axes, xj, sj))
         blocks: list[Block] = [("poses", self.i, by_i), ("poses", self.j, by_j)]
         if np.any(self.calibration >= 0):
             nx, ny = se2.rotate(xi[2], direction).T
             half = 0.5 * (1.0 + s)
             shift = axes[0] * m[0] + axes[1] * m[1]
             # A scale clamped at its least no longer changes what errors are divided by.
-            across, turning = np.where(stretch[:, 1:] > _LEAST_SCALE, 1.0 / stretch[:, 1:], 0.0).T
+            across, around = np.where(stretch[:, 1:] > _LEAST_SCALE, 1.0 / stretch[:, 1:], 0.0).T
             by_scale = -axes[0] * nx - axes[1] * ny - shift * across
             by_delta = axes[0] * (m[1] + half * ny) - axes[1] * (m[0] + half * nx) - axes[2]
-            by_turn = by_delta * self.motion[:, 2] - (residuals - shift) * turning
-            columns = (by_scale, by_turn, by_delta * self.length, by_delta * self.duration)
-            for index, column in zip(self.calibration.T, columns, strict=True):
+            by_turn = by_delta * self.motion[:, 2] - (residuals - shift) * around
+            columns = [by_scale, by_turn, by_delta * self.length, by_delta * self.duration]
+            if np.any(self.calibration[:, 4:] >= 0):
+                cos, sin = (before - after for before, after in zip(se2.cos_sin(xi[2]), se2.cos_sin(xj[2]), strict=True))
+                columns.append(axes[0] * cos + axes[1] * sin)
+                # The middle of the step is turned by (delta + dtheta) / 2.
+                cos, sin = se2.cos_sin(xi[2] + z[:, 2] / 2.0)
+                columns += list((1.0 + s) * (axes[0] * sin - axes[1] * cos) * self._slipping()[:, None])
+            for index, column in zip(self.calibration.T, columns, strict=False):
                 if np.any(index >= 0):
                     blocks.append(("calibration", np.maximum(index, 0), _by_pose(np.where(index >= 0, column, 0.0))))
         return Linearization(residuals.T, tuple(blocks))

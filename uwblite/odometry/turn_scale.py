@@ -64,7 +64,7 @@ def turn_scales(wheels: OdometryEdges, steps: ScanEdges, graph: Graph) -> dict[i
     graph : its calibration holds the drifts per metre and per second.
     """
     row, lidar = _neighbours(wheels, steps)
-    drift = np.append(graph.calibration.values, 0.0)[wheels.calibration[row, 2:]]
+    drift = np.append(graph.calibration.values, 0.0)[wheels.calibration[row, 2:4]]
     turned = wheels.motion[row, 2] + drift[:, 0] * wheels.length[row] + drift[:, 1] * wheels.duration[row]
     # Wheels that count nothing at all stand still or broke down: that is no scale.
     clear = (np.abs(turned) + np.abs(lidar) > 2.0 * _TURNING) & np.any(wheels.motion[row] != 0.0, axis=1)

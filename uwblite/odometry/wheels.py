@@ -7,11 +7,12 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, spread
 from ..config import setting
-from ..graph.calibration import odometry_indices
+from ..graph.calibration import CalibrationConfig, odometry_indices
 from ..graph.graph import Calibration, Graph, edge_weights
 from ..graph.marginals import marginals
 from ..graph.pose_edges import OdometryEdges, RelativePoseEdges, ScanEdges
 from ..graph.robust import Kernel
+from ..sensor_log import Odometry
 from .keyframes import Keyframes
 
 _STEPS = Kernel("cauchy", 5.0)
@@ -52,6 +53,19 @@ def wheel_edges(keyframes: Keyframes, config: OdometryNoiseConfig, calibration: 
         odometry_indices(calibration, n),
         config.kernel,
     )
+
+
+def sideways_priors(odometry: Odometry, priors: CalibrationConfig) -> CalibrationConfig:
+    """Return the priors of the calibration without those of ways to the side where the odometry counts hardly any."""
+    steps = odometry.steps
+    aside = se2.rotate(-steps[:, 2] / 2.0, steps[:, :2])[:, 1]
+    if np.abs(aside).sum() > _OMNI * np.hypot(steps[:, 0], steps[:, 1]).sum():
+        return priors
+    return replace(priors, sideways_scale=0.0, sideways_per_metre=0.0)
+
+
+_OMNI = 0.1
+"""Share of ways to the side among all from which on wheels drive sideways; rounding and slow clocks make some of any."""
 
 
 def drift_time(keyframes: Keyframes) -> Floats:

@@ -14,6 +14,7 @@ from ..graph import calibration
 from ..graph.calibration import (
     BIAS,
     ODOMETRY,
+    OMNI,
     RADIO,
     RANGE_SCALE,
     optimize_with_heights,
@@ -25,7 +26,7 @@ from ..graph.optimizer import Optimizer
 from ..graph.solver import SolverConfig
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
-from ..odometry.wheels import wheel_edges
+from ..odometry.wheels import sideways_priors, wheel_edges
 from ..radio import bootstrap, prior_selection
 from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, range_edges, relocate
@@ -54,13 +55,13 @@ def first_optimisation(task: Task) -> Estimate:
 def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
     """Return a recording's graph by dead reckoning, with its calibration priors, odometry edges and range edges."""
     log, frames, ids = recording.log, recording.frames, recording.anchor_ids
-    priors, noise = gyro.settings(log, config.calibration, config.odometry)
+    priors, noise = gyro.settings(log, sideways_priors(log.odometry, config.calibration), config.odometry)
     listed = calibration.unknowns(priors, ids, heights_given(recording), rises=tag_rises(recording))
     block = calibration.block(listed)
     graph = Graph(frames.odometry.copy(), np.zeros((len(ids), 2)), (), block)
     graph = graph.with_edges(calibration.prior_edges(listed))
     graph = replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool))
-    graph = with_free(graph, *ODOMETRY, BIAS, RANGE_SCALE)
+    graph = with_free(graph, *ODOMETRY, *OMNI, BIAS, RANGE_SCALE)
     odometry = wheel_edges(frames, noise, block)
     if log.ranges is None:
         return Estimate(graph, odometry, None, ids)

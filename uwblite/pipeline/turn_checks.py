@@ -1,9 +1,16 @@
-"""The scale of the wheels' turns: a calibration where it is one constant, never what a turn that went wrong makes of it."""
+"""What the odometry does in turns: its scale, where it is one constant, never what a turn that went wrong makes of it; and
+the point about which the robot turns."""
 
 from dataclasses import replace
 
+import numpy as np
+
+from ..graph.calibration import TURNING, with_free
+from ..graph.marginals import marginals
+from ..graph.optimizer import Optimizer
 from ..graph.pose_edges import ScanEdges
 from ..odometry.turn_scale import TurnScale, turn_scales
+from ..radio.prior_selection import prior_sigma, with_prior_sigma
 from .estimate import Estimate, Task
 
 
@@ -65,3 +72,44 @@ def _shown(found: TurnScale) -> str:
 
 _WRONG = 0.1
 """Difference of the scale of turns that does not come from noise: a tenth of all turns missing or too much."""
+
+
+def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
+    """Let the robot turn about another point than the base's origin, where the lidar seems to be mounted off its place.
+
+    Wheels that slip in turns (skid steering) look like a lidar mounted elsewhere, to the last residual: a base whose origin is
+    shifted has the same scans and the same wheels. So the offset h that the lidar has without slip is shared out by how likely
+    it is beforehand: p that the robot slips, 1 - p that the lidar is not where it is said to be. Priors N(0, p h^2) of the slip
+    and N(0, (1 - p) h^2) of the mounting give mean p h and variance p (1 - p) h^2, those of the two alternatives. Where no
+    mounting is given, the base's origin is wherever the wheels turn about.
+    """
+    graph, config = estimate.graph, task.config.calibration
+    at, slips = graph.calibration.index("laser_x"), graph.calibration.of_kinds(TURNING)
+    offset = graph.calibration.get("laser_x")
+    given = all(np.any(r.log.mounting.T_base_laser != 0.0) for r in task.recordings.each if r.has_scans)
+    if not given or not slips.any() or abs(offset) < _SMALL or graph.fixed_calibration[at]:
+        return estimate
+    if abs(offset) < _SIGNIFICANT * marginals(estimate.problem).calibration[at]:
+        return estimate
+    widths = (config.sideways_per_turn, min(_BY_TAPE, config.laser_offset), config.laser_offset)
+    slip, right, other = (np.exp(-0.5 * (offset / width) ** 2) / width for width in widths)
+    share = float(_SLIPS * slip / max(_SLIPS * slip + (1.0 - _WRONG_FRAME) * right + _WRONG_FRAME * other, _NEVER))
+    sigma = prior_sigma(graph)
+    sigma[slips] = max(abs(offset) * np.sqrt(share), _SMALL)
+    sigma[at] = max(abs(offset) * np.sqrt(1.0 - share), _SMALL)
+    estimate = replace(estimate, graph=with_free(with_prior_sigma(graph, sigma), TURNING))
+    return estimate.with_estimates_of(Optimizer().optimize(estimate.problem, task.config.solver)[0])
+
+
+_SMALL = 0.01
+"""m; nobody measures a mounting, or says where a base begins, better than to this."""
+_BY_TAPE = 0.03
+"""Standard deviation of a mounting that is given and right, m."""
+_SIGNIFICANT = 3.0
+"""Standard deviations from which an offset of the lidar is none of noise."""
+_WRONG_FRAME = 0.1
+"""Share of given mountings that are those of another robot or frame, and off by the setting's `laser_offset`."""
+_NEVER = 1e-300
+"""Probability density of an offset that nothing explains; the mounting then takes it."""
+_SLIPS = 0.5
+"""Odds beforehand of a robot that slips in turns against one that does not."""

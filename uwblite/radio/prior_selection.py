@@ -58,9 +58,9 @@ def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
     poses = np.column_stack([graph.poses[:, :2] / stretched, graph.poses[:, 2]])
     graph = graph.updated(poses, graph.anchors / stretched, np.where(scales, 0.0, graph.calibration.values))
     graph = replace(graph, fixed_calibration=graph.fixed_calibration & ~heights)
-    sigma = _prior_sigma(graph)
+    sigma = prior_sigma(graph)
     sigma[scales], sigma[heights] = config.odometry_scale, _HIGH**2
-    return _with_prior_sigma(graph, sigma)
+    return with_prior_sigma(graph, sigma)
 
 
 def laplace_marginal_likelihood(graph: Graph) -> float:
@@ -76,7 +76,7 @@ def laplace_marginal_likelihood(graph: Graph) -> float:
     """
     which = np.flatnonzero(~graph.fixed_calibration)
     determinant = np.linalg.slogdet(calibration_covariance(graph)[np.ix_(which, which)])[1]
-    return float(0.5 * (determinant - graph.chi2()) - np.sum(np.log(_prior_sigma(graph)[which])))
+    return float(0.5 * (determinant - graph.chi2()) - np.sum(np.log(prior_sigma(graph)[which])))
 
 
 def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfig) -> Graph:
@@ -90,7 +90,7 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     """
     groups = [_free(graph, name) for name in ("range_scale", "odometry_scale", "bias")]
     which, radios, scales = np.concatenate(groups), len(groups[0]), len(groups[0]) + len(groups[1])
-    sigma = _prior_sigma(graph)
+    sigma = prior_sigma(graph)
     if not radios + len(groups[2]) or not np.all(np.isfinite(sigma[which])):
         return graph
     try:
@@ -119,7 +119,7 @@ def select_priors(graph: Graph, edges: Sequence[Edges], config: CalibrationConfi
     likely, units = likely[rows], units[rows]
     sigma[which[:scales]] = _unit_widths(units, likely.sum(axis=1))
     sigma[which[scales:]] = np.exp(likely.sum(axis=0) @ np.log(biases) / likely.sum())
-    return _with_prior_sigma(graph, sigma)
+    return with_prior_sigma(graph, sigma)
 
 
 def _unit_widths(units: Floats, likely: Floats) -> Floats:
@@ -196,7 +196,7 @@ def _free(graph: Graph, name: str) -> Ints:
     return np.flatnonzero(graph.calibration.of_kinds(name) & ~graph.fixed_calibration)
 
 
-def _prior_sigma(graph: Graph) -> Floats:
+def prior_sigma(graph: Graph) -> Floats:
     """Return the prior standard deviation (c,) of each calibration value, inf without a prior."""
     sigma = np.full(len(graph.calibration.values), np.inf)
     for priors in graph.calibration_priors:
@@ -204,7 +204,8 @@ def _prior_sigma(graph: Graph) -> Floats:
     return sigma
 
 
-def _with_prior_sigma(graph: Graph, sigma: Floats) -> Graph:
+def with_prior_sigma(graph: Graph, sigma: Floats) -> Graph:
+    """Return the graph with other prior standard deviations (c,) of its calibration values."""
     def changed(edges: object) -> bool:
         return isinstance(edges, PriorEdges) and edges.block == "calibration"
 
