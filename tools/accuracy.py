@@ -7,10 +7,11 @@
     python tools/accuracy.py ablation --set keyframes.scans=3
 
 Parts: simulated (buildings x seeds against bars), oracle (against what the measurements allow, and the Cramer-Rao bound),
-real (recordings of others, where they are: UWBLITE_SHARED_DATA; with it benchmark: two of them against relations and
-published figures; --perturb N: N perturbed runs of each that has a lidar as well), ablation (each ingredient switched off in
-turn), raw (the same without a radio, recordings of others first), injection (false closures and ranges into a good graph). How
-true the stated uncertainties are is measured by tools/consistency.py, which writes into the same page.
+fusion (all sensors against some of them), real (recordings of others, where they are: UWBLITE_SHARED_DATA; with it benchmark:
+two of them against relations and published figures; --perturb N: N perturbed runs of each that has a lidar as well), ablation
+(each ingredient switched off in turn), raw (the same without a radio, recordings of others first), injection (false closures
+and ranges into a good graph). How true the stated uncertainties are is measured by tools/consistency.py, which writes into the
+same page.
 """
 
 import one_thread  # noqa: F401
@@ -48,7 +49,7 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.se2 import align
 from uwblite.sensor_log import SensorLog
 
-PARTS = ("simulated", "oracle", "real", "benchmark", "ablation", "raw", "injection")
+PARTS = ("simulated", "oracle", "fusion", "real", "benchmark", "ablation", "raw", "injection")
 WORST = 1.6
 """The worst seed may exceed the bar on the mean by this factor."""
 
@@ -248,6 +249,44 @@ def oracles(args: argparse.Namespace) -> str:
         "*in pieces*: ATE and bound of an oracle that does not know which metres of wall are one\nstraight line of one offset, "
         "nor that what is seen of a column from all sides is one circle. Arena and tunnel as simulated, "
         f"the\nothers with errors of real rooms.\n\n{table(head, rows)}"
+    )
+
+
+FUSION_ROWS = {
+    world: Settings(
+        world=world, minutes=12.0 if world == "warehouse" else 4.0, speed=speed, scan_rate=5.0, rooms=RealRooms()
+    )
+    for world, speed in (
+        ("hall", 0.2), ("corridor", 0.2), ("lab", 0.2), ("warehouse", 0.4), ("arena", 0.4), ("tunnel", 0.4)
+    )
+}  # fmt: skip
+"""Recordings as short as those of tools/consistency.py, with errors of real rooms."""
+WITHOUT: dict[str, tuple[str, ...]] = {
+    "everything": (), "no lidar": ("use_lidar=false",), "no refinement": ("refinement.rounds=0",), "no UWB": ("use_uwb=false",),
+}  # fmt: skip
+"""What fusion must not be worse than, and how it is left out."""
+WORSE = 1.05, 0.003
+"""Times the best part's error, or m more than it, that fusion may have."""
+
+
+def fusion(args: argparse.Namespace) -> str:
+    """Compare maps from all sensors with maps from parts of what is known; return the table."""
+    names, seeds = asked(args, list(FUSION_ROWS)), range(args.seed, args.seed + args.seeds)
+    tasks = [
+        Task(n, replace(FUSION_ROWS[n], seed=seed), tuple(WITHOUT.items()), tuple(args.set)) for n in names for seed in seeds
+    ]
+    done = [row for rows in follow(tasks, args) for row in rows]
+    lines = []
+    for name in names:
+        means = [float(np.mean([f.ate for n, run, f in done if (n, run) == (name, part)])) for part in WITHOUT]
+        best = min(means[1:])
+        bar = max(WORSE[0] * best, best + WORSE[1])
+        lines.append([name, *means, bar, "yes" if means[0] <= bar else "**no**"])
+    text = table(["recording", *WITHOUT, "bar", "kept"], lines)
+    return (
+        f"## All sensors against some of them\n\nATE, m, mean of {len(seeds)} seeds from {args.seed} on; 4 min, warehouse 12 "
+        "min; rooms whose errors stay with places. *No refinement*:\nloops are closed by sub-maps alone. The bar is "
+        f"{WORSE[0]} times the best of the other columns, or {1000 * WORSE[1]:.0f} mm more than it.\n\n{text}"
     )
 
 
@@ -505,7 +544,8 @@ def solved(graph: Graph, trial: Trial, stamps: np.ndarray) -> float:
 
 
 NAMES = {
-    "simulated": ROWS, "oracle": ORACLE_ROWS, "real": REAL, "benchmark": BENCHMARK, "ablation": ABLATION_RECORDINGS,
+    "simulated": ROWS, "oracle": ORACLE_ROWS, "fusion": FUSION_ROWS, "real": REAL, "benchmark": BENCHMARK,
+    "ablation": ABLATION_RECORDINGS,
     "raw": (*RAW, *RAW_SIMULATED),
 }  # fmt: skip
 """Recordings of each part."""
@@ -520,14 +560,14 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--out", type=Path, default=ROOT / "docs" / "accuracy.md", metavar="FILE", help="page to write into")
     p.add_argument("--print", action="store_true", help="print instead of writing")
     p.add_argument("--seeds", type=int, default=3, metavar="N", help="recordings per row (3)")
-    p.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the ablation's recordings (1)")
+    p.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the ablation, first of fusion (1)")
     p.add_argument("--only", default="", metavar="NAMES", help="recordings, separated by commas")
     p.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting; repeatable")
     p.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
     p.add_argument("--perturb", type=int, default=0, metavar="N", help="perturbed runs of each benchmark recording (0)")
     p.add_argument("--quick", action="store_true", help="recordings of 6 min")
     args = p.parse_args(argv)
-    parts = (simulated, oracles, real, benchmark, ablation, raw, injection)
+    parts = (simulated, oracles, fusion, real, benchmark, ablation, raw, injection)
     made_by = dict(zip(PARTS, parts, strict=True))
     if not args.print and not args.out.exists():
         args.out.write_text(HEAD)
