@@ -23,6 +23,7 @@ from uwblite.pipeline.summary import (
     _calibration,
     _distrusted,
     _range_table,
+    _reason_of_short_ranges,
     _reason_to_distrust,
     _with_times,
     _without_leaps,
@@ -335,6 +336,23 @@ def test_an_anchor_that_leaps_farther_than_it_is_carried_has_a_wrong_place(way, 
     anchors = _with_times(tuple(replace(a, position=np.array(places[a.id])) for a in named(*places)), ranges)
     assert [a.status for a in _without_leaps(anchors, ranges)] == ["ok", *["distrusted" if leaps else "ok"] * 2]
     assert _without_leaps(anchors, None) == anchors
+
+
+@pytest.mark.parametrize(("short", "count", "distrusted"), [(3, 20, False), (4, 20, True), (4, 80, False), (5, 80, True)])
+def test_an_anchor_with_ranges_shorter_than_the_distance_is_elsewhere_at_times(short, count, distrusted):
+    """More than three, and more than a twentieth: gross errors are fewer, and what is in the way makes ranges longer."""
+    found = _reason_of_short_ranges(short, count)
+    assert bool(found) == distrusted
+    assert not distrusted or f"{short} of its {count} ranges" in found
+
+
+def test_both_places_of_an_anchor_are_uncertain_where_one_is_mirror_ambiguous():
+    ranges = replace(plain_ranges(np.zeros(3, int), np.array([0, 1, 2]), np.ones(3), 0.1), stamps=np.array([0.0, 3.0, 10.0]))
+    a, b, later = _with_times(named("A", "B", "B@2"), ranges)
+    found = _without_leaps((a, replace(b, status="mirror-ambiguous"), later), ranges)
+    assert [anchor.status for anchor in found] == ["ok", "mirror-ambiguous", "distrusted"]
+    found = _without_leaps((a, b, replace(later, status="mirror-ambiguous")), ranges)
+    assert [anchor.status for anchor in found] == ["ok", "distrusted", "mirror-ambiguous"]
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,8 @@ def _anchor(
         reason = "the path past it is too straight: a mirrored place explains its ranges about as well"
     sigma, longest = float(np.sqrt(np.trace(covariance.anchors[k]))), float(ranges.ranges[ranges.anchor == k].max())
     scatter = spread_about_median(own)
-    if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter):
+    short = int(np.sum(own - max(bias, 0.0) > max(limit, _SHORT)))
+    if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(own)):
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, scatter, status, reason,
@@ -170,6 +171,19 @@ def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, 
     return ""
 
 
+def _reason_of_short_ranges(short: int, count: int) -> str:
+    """Return why an anchor is distrusted of whose ranges so many are shorter than the way to its place, '' where it is not."""
+    if short <= max(_FEW_SHORT, _SHARE_SHORT * count):
+        return ""
+    return f"{short} of its {count} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere meanwhile?"
+
+
+_SHORT = 0.5
+"""m by which no obstacle and no radio makes a range shorter than the distance; errors of the path stay below it."""
+_FEW_SHORT, _SHARE_SHORT = 3, 0.05
+"""Of an anchor's ranges, gross errors; in recordings without faults there was one at most."""
+
+
 def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:
     """Report of anchors that were moved from when on each place holds."""
     bases = [name_and_number(a.id)[0] for a in anchors]
@@ -185,8 +199,8 @@ def _with_times(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) 
 def _without_leaps(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | None) -> tuple[AnchorEstimate, ...]:
     """Return the anchors, two places of one distrusted where nobody carries it from one to the other in the time between.
 
-    Without a lidar, ranges alone hold the path, and one of the two may be a mirror image, or the move may be false. Where names
-    were exchanged, they leap, too, but to the place of another anchor.
+    Without a lidar, ranges alone hold the path, and one of the two may be a mirror image, or the move may be false; where one
+    is known to be ambiguous, so is the move. Where names were exchanged, they leap, too, but to the place of another anchor.
     """
     names = [name_and_number(a.id)[0] for a in anchors]
     leaps: dict[int, str] = {}
@@ -201,6 +215,8 @@ def _without_leaps(anchors: tuple[AnchorEstimate, ...], ranges: RangeEdges | Non
         apart = np.hypot(*np.moveaxis(others - [a.position, anchors[before].position], -1, 0))
         if way > _LEAP + _CARRYING * pause and not np.any(apart < plausibility.SAME_PLACE):
             leaps |= dict.fromkeys((before, k), f"it would have been carried {way:.0f} m within {pause:.0f} s")
+        elif "mirror-ambiguous" in (a.status, anchors[before].status):
+            leaps |= dict.fromkeys((before, k), "its other place is mirror-ambiguous, and so is whether and when it was moved")
     return tuple(
         replace(a, status="distrusted", reason=leaps[k]) if k in leaps and a.status == "ok" else a
         for k, a in enumerate(anchors)
