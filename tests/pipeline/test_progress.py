@@ -49,3 +49,15 @@ def test_what_the_screening_found_is_taken_over(count, where):
     stages.note([*logs, SimpleNamespace(screening=Screening(remarks, OdometryBreaks.none()))])
     assert [(n.kind, n.text) for n in stages.warnings] == [("jump", where + "it jumps")]
     assert [(n.kind, n.text) for n in stages.doubts] == [("gap", where + "it is silent")]
+
+
+def test_what_was_withdrawn_since_is_said_again_where_stages_run_again():
+    stages = Stages(None, None)
+    stages.warn("moved-anchor", "first", new_id="A#2")
+    stages.warn("other", "second")
+    before = stages.mark()
+    stages.withdraw("moved-anchor", "new_id")
+    stages.warn("other", "third")
+    assert [w.text for w in stages.warnings] == ["second", "third"]
+    stages.back_to(before)
+    assert [w.text for w in stages.warnings] == ["first", "second"]

@@ -71,13 +71,13 @@ class Stages:
         self.doubts.remove(doubt)
         self.warn(doubt.kind, f"{doubt.text}; {by}", **doubt.figures)
 
-    def mark(self) -> tuple[int, int]:
-        """Return how much was reported so far."""
-        return len(self.warnings), len(self.doubts)
+    def mark(self) -> tuple[tuple[Notice, ...], tuple[Notice, ...]]:
+        """Return the warnings and doubts reported so far."""
+        return tuple(self.warnings), tuple(self.doubts)
 
-    def back_to(self, mark: tuple[int, int]) -> None:
-        """Forget what was reported since, because the stages that reported it run again."""
-        del self.warnings[mark[0] :], self.doubts[mark[1] :]
+    def back_to(self, mark: tuple[tuple[Notice, ...], tuple[Notice, ...]]) -> None:
+        """Return to what had been reported then, because the stages that reported the rest run again."""
+        self.warnings, self.doubts = list(mark[0]), list(mark[1])
 
     def end(self, stage: str, **figures: object) -> None:
         """Close a stage."""
