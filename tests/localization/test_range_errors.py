@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwblite.localization.range_errors import HARMONICS, pattern_waves, range_errors
+from uwblite.localization.range_errors import range_errors
 
 WHITE = 0.04
 
@@ -63,11 +63,3 @@ def test_ranges_of_one_square_are_averaged_and_long_recordings_stay_small():
 def test_no_ranges_no_errors():
     (found,) = range_errors(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0), 1)
     np.testing.assert_array_equal(found.at(np.zeros((3, 2))), 0.0)
-
-
-def test_waves_are_the_harmonics():
-    angle = np.array([0.0, 0.5, -2.0])
-    waves = pattern_waves(angle)
-    assert waves.shape == (3, 2 * HARMONICS)
-    np.testing.assert_allclose(waves[:, 0] ** 2 + waves[:, HARMONICS] ** 2, 1.0)
-    np.testing.assert_allclose(waves[:, 2], np.cos(3 * angle))

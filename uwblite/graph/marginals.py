@@ -82,6 +82,10 @@ class Marginals:
         """
         return moved(self._graph, self.unknowns, self._correction)
 
+    def estimated(self, common: CommonErrors) -> Floats:
+        """Return the values (k,) of errors that edges of the graph have in common, estimated with all else."""
+        return self._estimated(common)[1]
+
     def _add_common(self, common: CommonErrors, blocks: dict[str, Floats]) -> None:
         """Add what estimated common errors u make: H^-1 J^T W S times u to the estimates, times their covariance to these."""
         times, errors, covariance = self._estimated(common)

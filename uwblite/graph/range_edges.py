@@ -52,6 +52,8 @@ class RangeEdges(EdgeTable):
     FIRST: ClassVar[str] = "pose"
     stamps: Floats = field(default_factory=lambda: np.zeros(0))
     """(e,) s, where known; not used by the graph."""
+    late: Floats = field(default_factory=lambda: np.zeros(0))
+    """(e,) m, by how much each range is known to be too long; empty = nothing is known of any."""
 
     SHARED: ClassVar[tuple[str, ...]] = ("tag",)
 
@@ -60,9 +62,14 @@ class RangeEdges(EdgeTable):
         arm = self.lever_arm + se2.rotate(self.turn, np.broadcast_to(self.tag, (len(self), 2)))
         return se2.transform(poses[self.pose], arm)
 
+    @property
+    def corrected(self) -> Floats:
+        """The ranges (e,) without what they are known to be too long by, m."""
+        return self.ranges - self.late if len(self.late) else self.ranges
+
     def planar_ranges(self) -> Floats:
         """Return the measured distances (e,) in the plane, m."""
-        return np.sqrt(np.maximum(self.ranges**2 - self.height**2, _LEAST_SQUARE))
+        return np.sqrt(np.maximum(self.corrected**2 - self.height**2, _LEAST_SQUARE))
 
     def _geometry(self, graph: Graph) -> tuple[Floats, Floats, Floats, Floats]:
         """Return R(theta) u (2, e), the vector anchor -> tag (2, e), P and sqrt(P^2 + |q|) (2, e), the calibration (6, e)."""
@@ -86,7 +93,7 @@ class RangeEdges(EdgeTable):
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 1), expected minus measured."""
         _, _, reach, cal = self._geometry(graph)
-        return (((1.0 + cal[0]) * _slant(reach, cal) + cal[1] - self.ranges) / self.sigma)[:, None]
+        return (((1.0 + cal[0]) * _slant(reach, cal) + cal[1] - self.corrected) / self.sigma)[:, None]
 
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by pose, anchor and the calibration in use."""
@@ -101,7 +108,7 @@ class RangeEdges(EdgeTable):
             for index, column in zip(self.calibration.T, columns, strict=True):
                 if np.any(index >= 0):
                     blocks.append(("calibration", np.maximum(index, 0), np.where(index >= 0, column, 0.0)[:, None, None]))
-        residuals = (((1.0 + cal[0]) * distance + cal[1] - self.ranges) / self.sigma)[:, None]
+        residuals = (((1.0 + cal[0]) * distance + cal[1] - self.corrected) / self.sigma)[:, None]
         return Linearization(residuals, tuple(blocks))
 
     def _by_calibration(self, theta: Floats, direction: Floats, distance: Floats, by_q: Floats) -> tuple[Floats, ...]:

@@ -14,14 +14,14 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, Table
 from ..lidar.degeneracy import measured_part
-from .range_errors import HARMONICS, PATTERN_SIGMA
+from ..radio.tag_pattern import HARMONICS, PATTERN_SIGMA
 from .walls import Rays, Walls
 
 POSE, WHEELS = slice(0, 3), slice(3, 6)
 """Of the state: x, y, theta; relative error of distance, of turned angle, and heading per metre, rad/m."""
 FIRST_ANCHOR = 6 + 2 * HARMONICS
 PATTERN = slice(6, FIRST_ANCHOR)
-"""Of the state: m, by how much ranges err by the direction of the anchor in the robot's frame (range_errors.pattern_waves): the
+"""Of the state: m, by how much ranges err by the direction of the anchor in the robot's frame (tag_pattern.pattern_waves): the
 tag's radiation pattern and the shadow of the robot's own body, the same for all anchors."""
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""

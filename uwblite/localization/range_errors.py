@@ -14,11 +14,8 @@ from scipy.spatial.distance import cdist
 
 from ..arrays import Floats, Ints, spread
 from ..radio.range_noise import RangeNoise, RangeNoiseConfig, learn
+from ..radio.tag_pattern import HARMONICS, PATTERN_SIGMA, pattern_waves
 
-HARMONICS = 3
-"""Of the direction of an anchor in the robot's frame, of which the pattern of antenna and body is made."""
-PATTERN_SIGMA = 0.05
-"""m; of each of the pattern's coefficients, 0.09 m together: 0.06 m of radiation patterns and 0.1 m behind a body."""
 _CONSTANT = 0.1
 """m; what the ranges to one anchor err alike everywhere."""
 _CELL = 0.25
@@ -45,12 +42,6 @@ class RangeErrors:
     def at(self, places: Floats) -> Floats:
         """Return the errors (h,) to expect at places (h, 2) of the tag, m."""
         return np.asarray(_covariance(places, self.places, self.noise) @ self.coefficients)
-
-
-def pattern_waves(angles: Floats) -> Floats:
-    """Return the harmonics (m, 2 HARMONICS) of an anchor's direction (m,) in the robot's frame, rad."""
-    times = angles[:, None] * np.arange(1, HARMONICS + 1)
-    return np.concatenate([np.cos(times), np.sin(times)], axis=1)
 
 
 def range_errors(anchor: Ints, tags: Floats, bearings: Floats, errors: Floats, count: int) -> tuple[RangeErrors, ...]:

@@ -7,8 +7,9 @@ from scipy.special import ndtr
 
 from .. import se2
 from ..arrays import Floats
+from ..radio.tag_pattern import pattern_waves
 from .hypotheses import FIRST_ANCHOR, PATTERN, Hypotheses, symmetric
-from .range_errors import RangeErrors, pattern_waves
+from .range_errors import RangeErrors
 
 _TAIL, _DETOUR, _WILD, _WIDTH = 0.4, 0.4, 0.05, 60.0
 """Share of ranges with a detour and its mean, m; share of nonsense and its extent, m: the mixture of radio.nlos_mixture. The

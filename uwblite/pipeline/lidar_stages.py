@@ -17,8 +17,9 @@ from ..graph.optimizer import Optimizer
 from ..graph.robust import SQUARED
 from ..graph.solver import SolverConfig, optimize
 from ..lidar import joint_refinement, scan_to_scan, visibility
-from ..lidar.joint_refinement import RefinementConfig, RefinementResult
+from ..lidar.joint_refinement import RefinementConfig, RefinementResult, with_fewer_pairs
 from ..lidar.scan_to_scan import Steps
+from ..radio.tag_pattern import without_pattern
 from . import scan_clouds, turn_checks
 from .estimate import Estimate, ScanClouds, Task
 from .keyframe_changes import with_keyframes
@@ -228,7 +229,15 @@ def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimat
         estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if estimate.moved_since(before) >= _STILL:
         estimate = with_range_noise(estimate, task.config)
-    return solved(estimate, task.config.solver, optimizer)
+    return solved(_without_pattern(estimate, task), task.config.solver, optimizer)
+
+
+def _without_pattern(estimate: Estimate, task: Task) -> Estimate:
+    """Return the estimate with ranges corrected by what they err alike in each direction from the robot."""
+    if estimate.ranges is None or task.config.ranges.steady == 0.0:
+        return estimate
+    graph = with_fewer_pairs(estimate.problem)
+    return replace(estimate, ranges=without_pattern(estimate.ranges, graph, marginals(graph)))
 
 
 _STILL = 0.001

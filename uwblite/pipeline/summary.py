@@ -101,7 +101,7 @@ def _range_table(
     x, y = ranges.tag_positions(graph.poses).T
     return {
         "stamp": ranges.stamps, "anchor": ranges.anchor.astype(np.float64), "range": ranges.ranges,
-        "residual": residuals, "weight": weights, "agrees": agrees.astype(np.float64),
+        "residual": residuals + ranges.corrected - ranges.ranges, "weight": weights, "agrees": agrees.astype(np.float64),
         "x": x, "y": y, "theta": se2.wrap_angle(graph.poses[ranges.pose, 2] + ranges.turn),
         "recording": recordings.of_keyframe[ranges.pose].astype(np.float64),
     }  # fmt: skip
