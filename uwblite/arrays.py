@@ -106,3 +106,10 @@ def row_medians(values: Floats) -> Floats:
     upper = parted[:, middle]
     lower = upper if values.shape[1] % 2 else parted[:, :middle].max(axis=1)
     return np.asarray(0.5 * (lower + upper))
+
+
+def weighted_median(values: Floats, weights: Floats) -> float:
+    """Return the value up to which half of the weight lies, of values and weights (m,), m >= 1."""
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])

@@ -96,6 +96,15 @@ def test_a_jump_forward_is_undone_where_the_sensors_end_together_without_it(whic
     assert f"moved by {moved:+.1f} s" in remark.text
 
 
+def test_a_jump_between_two_bursts_is_undone_beside_the_usual_silence():
+    """Eight ranges within 0.4 s and 7.6 s of silence, where a median over steps would move the rest by the silence too."""
+    own = (8.0 * np.arange(13)[:, None] + 0.05 * np.arange(8)).ravel()
+    jumped = own + 30.0 * (own > 45.0)
+    done, (remark,) = clocks.without_jumps(SensorLog(moving(np.linspace(0.0, 97.0, 401)), ranges(jumped)))
+    np.testing.assert_allclose(done.ranges.stamps, own, atol=1e-9)
+    assert "set forward by 30.0 s" in remark.text
+
+
 def test_a_few_stamps_show_no_jump():
     for count, undone in ((20, True), (19, False)):
         stamps = np.linspace(0.0, 100.0, count) + 50.0 * (np.arange(count) > 8)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se2
-from ..arrays import MEDIAN_TO_MEAN, Floats, Ints, spread_about_median
+from ..arrays import MEDIAN_TO_MEAN, Floats, Ints, spread_about_median, weighted_median
 from ..graph.graph import Graph
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 
@@ -111,9 +111,9 @@ def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
     for _ in range(2):
         # Left and right turns are one direction: it is known up to half a turn.
         direction = centre + se2.wrap_angle(2.0 * (direction - centre)) / 2.0
-        centre = _weighted_median(direction, weight)
+        centre = weighted_median(direction, weight)
     parts = np.array_split(np.arange(len(weight)), _STRETCHES)
-    centres = np.array([_weighted_median(direction[p], weight[p]) for p in parts])
+    centres = np.array([weighted_median(direction[p], weight[p]) for p in parts])
     steepness = 1.0 + np.tan(centre) ** 2
     count = _independent(direction - centre, weight, turn)
     by_steps = steepness * MEDIAN_TO_MEAN * spread_about_median(direction) / np.sqrt(count)
@@ -134,10 +134,3 @@ def _independent(error: Floats, weight: Floats, turn: Ints) -> float:
     alike = float(np.sin(0.5 * np.pi * np.clip(same.mean(), 0.0, 1.0))) if len(same) else 0.0
     sums, squares = np.bincount(turn, weight), np.square(weight).sum()
     return float(weight.sum() ** 2 / (squares + alike * (np.square(sums).sum() - squares)))
-
-
-def _weighted_median(values: Floats, weights: Floats) -> float:
-    """Return the value up to which half of the weight lies."""
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])

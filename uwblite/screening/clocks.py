@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, weighted_median
 from ..errors import DataError
 from ..odometry.attached import OUTSIDE
 from ..sensor_log import LaserScans, Remark, SensorLog, UwbRanges
@@ -81,12 +81,17 @@ def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
 
 
 def _jump(stamps: Floats, end: float) -> tuple[float, float] | None:
-    """Return the stamp before a jump of the clock and its size, s, where stamps (n,) end with the others without it alone."""
+    """Return the stamp before a jump of the clock and its size, s, where stamps (n,) end with the others without it alone.
+
+    A jump takes the place of a usual step: the one in which half of the time passes, between bursts where readings come in
+    bursts.
+    """
     if len(stamps) < _FEW_STAMPS or stamps[-1] - end < _JUMP:
         return None
     steps = np.diff(stamps)
     longest = int(np.argmax(steps))
-    by = float(steps[longest] - np.median(steps))
+    others = np.delete(steps, longest)
+    by = float(steps[longest]) - weighted_median(others, others)
     return (float(stamps[longest]), by) if abs(stamps[-1] - by - end) < _SAME_END else None
 
 
