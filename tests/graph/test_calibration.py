@@ -54,6 +54,7 @@ def test_height_is_unknown_only_where_none_is_given():
         ("laser_angle", {"laser_theta"}), ("laser_delay", {"laser_delay"}), ("range_scale", {"range_scale"}),
         ("tag_offset", {"tag_x", "tag_y"}), ("range_delay", {"range_delay"}), ("sideways_scale", {"sideways_scale"}),
         ("sideways_per_turn", {"sideways_per_turn"}), ("sideways_per_metre", {"sideways_per_metre"}),
+        ("ahead_per_sideways", {"ahead_per_sideways"}),
         ("range_bias", {f"bias:{a}" for a in IDS}), ("anchor_height", {"height2:1E05", "height2:91A3"}),
     ],
 )
@@ -102,7 +103,7 @@ def test_tables_name_the_right_scalar_in_the_right_column():
         height = None if GIVEN[a] else f"height2:{IDS[a]}"
         assert stated == ["range_scale", f"bias:{IDS[a]}", height, "tag_x", "tag_y", "range_delay"]
     wheels = odometry_indices(calibration, 3)
-    assert wheels.shape == (3, 7)
+    assert wheels.shape == (3, 8)
     for row in wheels:
         assert [calibration.keys[k].label for k in row] == [
             "odometry_scale",
@@ -112,6 +113,7 @@ def test_tables_name_the_right_scalar_in_the_right_column():
             "sideways_per_turn",
             "sideways_scale",
             "sideways_per_metre",
+            "ahead_per_sideways",
         ]
     assert [calibration.keys[k].label for k in scan_indices(calibration)] == [
         "laser_x",

@@ -123,11 +123,11 @@ def test_relative_pose_residual_is_the_chart_of_g2o():
 def test_calibrated_odometry_stretches_and_turns_the_motion():
     graph, kinds = every_kind(3)
     edges = kinds["odometry"]
-    s, k, b, g, p, q, r = np.append(graph.calibration.values, 0.0)[edges.calibration[0]]
+    s, k, b, g, p, q, r, w = np.append(graph.calibration.values, 0.0)[edges.calibration[0]]
     turn = edges.motion[0, 2]
     extra = k * turn + b * edges.length[0] + g * edges.duration[0]
     ahead, left = se2.rotate(-turn / 2, edges.motion[0, :2])
-    left += left * q + ahead * r
+    ahead, left = ahead + left * w, left + left * q + ahead * r
     straight = se2.rotate((turn + extra) / 2, np.array([ahead, left]) * (1 + s))
     straight += se2.rotate(turn + extra, np.array([p, 0.0])) - [p, 0.0]
     np.testing.assert_allclose(edges.corrected(graph)[0], [*straight, turn + extra], atol=1e-12)
@@ -141,7 +141,7 @@ def covariance_of_the_end(motion, sqrt_information):
     n = len(motion)
     edges = OdometryEdges(
         np.arange(n), np.arange(1, n + 1), motion, np.hypot(*motion[:, :2].T), np.ones(n), sqrt_information,
-        np.full((n, 7), -1),
+        np.full((n, 8), -1),
     )  # fmt: skip
     jacobian = np.zeros((3 * n, 3 * (n + 1)))
     for _, index, block in edges.linearize(Graph(np.array(poses))).blocks:
@@ -170,7 +170,7 @@ def test_the_end_of_a_step_is_displaced_by_half_the_way_times_the_heading_of_the
     half = np.append(se2.rotate(-motion[0, 2], 0.5 * motion[0, :2]), 0.0)
     root = rng.normal(size=(1, 3, 3))
     edges = OdometryEdges(
-        np.zeros(1, dtype=int), np.ones(1, dtype=int), motion, np.ones(1), np.ones(1), root, np.full((1, 7), -1)
+        np.zeros(1, dtype=int), np.ones(1, dtype=int), motion, np.ones(1), np.ones(1), root, np.full((1, 8), -1)
     )
     end = se2.compose(motion[0], se2.between(half, se2.compose(e, half)))
     np.testing.assert_allclose(edges.residuals(Graph(np.array([np.zeros(3), end])))[0], root[0] @ e, rtol=1e-4, atol=1e-11)

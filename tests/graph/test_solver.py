@@ -62,10 +62,10 @@ FIXED = [
     {},
     {"fixed_poses": np.zeros(6, dtype=bool)},
     {"fixed_poses": np.array([False, True, True, False, False, False]), "fixed_anchors": np.array([True, False, True])},
-    {"fixed_anchors": np.ones(3, dtype=bool), "fixed_calibration": np.arange(17) % 2 == 0},
+    {"fixed_anchors": np.ones(3, dtype=bool), "fixed_calibration": np.arange(18) % 2 == 0},
     {"fixed_poses": np.ones(6, dtype=bool)},
     {"fixed_poses": np.ones(6, dtype=bool), "fixed_anchors": np.ones(3, dtype=bool)},
-    {"fixed_calibration": np.ones(17, dtype=bool)},
+    {"fixed_calibration": np.ones(18, dtype=bool)},
 ]
 
 
@@ -383,7 +383,7 @@ def test_a_long_chain_takes_up_a_wrong_wheel_in_a_few_steps():
     i = np.arange(n - 1)
     wheels = OdometryEdges(
         i, i + 1, noisy, np.full(n - 1, 0.3), np.full(n - 1, 0.5), np.tile(np.diag([100.0, 200.0, 100.0]), (n - 1, 1, 1)),
-        np.tile([-1, -1, 0, -1, -1, -1, -1], (n - 1, 1)), Kernel("cauchy", 5.0),
+        np.tile([-1, -1, 0, -1, -1, -1, -1, -1], (n - 1, 1)), Kernel("cauchy", 5.0),
     )
     seen = i[i % 97 != 0]
     matched = step[seen] + rng.normal(scale=0.002, size=(len(seen), 3))

@@ -15,7 +15,7 @@ from uwblite.graph.solver import optimize
 
 NAMES = ("scale", "turn", "per_metre", "per_second", "x", "y", "theta", "delay")
 RANGE_NAMES = ("range_scale", "bias", "height2", "tag_x", "tag_y", "range_delay")
-SLIP_NAMES = ("sideways_per_turn", "sideways_scale", "sideways_per_metre")
+SLIP_NAMES = ("sideways_per_turn", "sideways_scale", "sideways_per_metre", "ahead_per_sideways")
 
 
 def random_poses(rng, n, spread=3.0):
@@ -44,7 +44,7 @@ def every_kind(seed, calibrated=True, edges=8):
     laser = np.arange(4, 8) if calibrated else np.full(4, -1)
     kinds = {
         "relative pose": RelativePoseEdges(i, j, poses, L),
-        "odometry": OdometryEdges(i, j, poses, rng.normal(size=e), rng.uniform(size=e), L, which(0, 1, 2, 3, 14, 15, 16)),
+        "odometry": OdometryEdges(i, j, poses, rng.normal(size=e), rng.uniform(size=e), L, which(0, 1, 2, 3, 14, 15, 16, 17)),
         "scan": ScanEdges(i, j, poses, L, rng.normal(size=(e, 3)), rng.normal(size=(e, 3)), laser, 0.3),
         "range": RangeEdges(
             pose=i,

@@ -74,7 +74,7 @@ def calibrated_graph(seed=0):
     names = ("odometry_scale", "laser_x", "laser_theta", "laser_delay", "bias")
     calibration = Calibration(tuple(map(UnknownKey, names)), np.array([0.02, 0.05, 0.03, 0.02, 0.3]))
     odometry = OdometryEdges(
-        i, j, T, np.ones(8), np.ones(8), roots(rng, 8, 3), np.broadcast_to(np.append(0, np.full(6, -1)), (8, 7))
+        i, j, T, np.ones(8), np.ones(8), roots(rng, 8, 3), np.broadcast_to(np.append(0, np.full(7, -1)), (8, 8))
     )
     twist = rng.normal(size=(2, 8, 3))
     scans = ScanEdges(i, j, T, roots(rng, 8, 3), twist[0], twist[1], np.array([1, -1, 2, 3]), 0.01)

@@ -41,7 +41,7 @@ def test_wheel_edges_hold_the_chain_and_name_the_calibration():
     np.testing.assert_array_equal(edges.j, edges.i + 1)
     graph = Graph(frames.odometry, calibration=calibration)
     np.testing.assert_allclose(edges.residuals(graph), 0.0, atol=1e-8)
-    assert edges.calibration.shape == (len(edges), 7)
+    assert edges.calibration.shape == (len(edges), 8)
 
 
 @pytest.mark.parametrize(("twist", "sigma"), [
@@ -159,8 +159,9 @@ def test_ways_to_the_side_are_calibrated_where_the_odometry_counts_some(sideways
     """A robot in curves, whose readings a second apart hold arcs and not ways to the side, drives none."""
     stamps, truth = drive([(0.3, sideways, 0.4), (0.3, sideways, -0.5)], [10.0, 10.0])
     priors = sideways_priors(Odometry(stamps[::10], truth[::10]), CalibrationConfig())
-    assert (priors.sideways_scale > 0.0, priors.sideways_per_metre > 0.0) == (counted, counted)
-    assert replace(priors, sideways_scale=0.1, sideways_per_metre=0.015) == CalibrationConfig()
+    kinds = (priors.sideways_scale, priors.sideways_per_metre, priors.ahead_per_sideways)
+    assert [sigma > 0.0 for sigma in kinds] == [counted] * 3
+    assert replace(priors, sideways_scale=0.1, sideways_per_metre=0.015, ahead_per_sideways=0.015) == CalibrationConfig()
 
 
 @pytest.mark.parametrize(("alike", "factor"), [(0.0, 1.0), (0.8, 2.0)])

@@ -1,5 +1,5 @@
 """A constant scale of turns is a calibration; one that a bad turn made is not used, and a map that rests on one is doubted.
-Slip in turns does not bend the lidar's mounting."""
+Slip in turns does not bend the lidar's mounting, nor do crooked ways to the side turn it."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,7 +9,16 @@ import pytest
 from helpers.laser_walks import chained
 
 from uwblite import se2
-from uwblite.graph.calibration import CalibrationConfig, block, odometry_indices, prior_edges, scan_indices, unknowns, with_free
+from uwblite.graph.calibration import (
+    OMNI,
+    CalibrationConfig,
+    block,
+    odometry_indices,
+    prior_edges,
+    scan_indices,
+    unknowns,
+    with_free,
+)
 from uwblite.graph.graph import Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
@@ -129,3 +138,26 @@ def test_what_slip_and_mounting_explain_alike_is_shared_by_their_odds_and_stated
 def test_a_robot_that_turns_about_its_origin_or_has_none_keeps_its_estimate(slip, given):
     before, after, _ = slipping(slip, 0.0, given)
     assert after is before
+
+
+@pytest.mark.parametrize("crooked", [0.02, -0.02])
+def test_wheels_that_go_crooked_to_the_side_do_not_turn_the_lidar(crooked):
+    """Ways ahead and to the side that are crooked by different angles; one angle and a turned lidar explain both as well."""
+    rng = np.random.default_rng(6)
+    listed = unknowns(CalibrationConfig(), (), np.zeros(0, dtype=bool))
+    truth = se2.chain(np.zeros(3), np.column_stack([rng.uniform(-0.3, 0.3, (STEPS, 2)), np.zeros(STEPS)]))
+    motion = se2.between(truth[:-1], truth[1:])
+    motion[:, 0] += crooked * motion[:, 1]
+    wheels = replace(chained(truth, (0.005, 0.005, 0.005)), motion=motion + 0.005 * rng.standard_normal((STEPS, 3)))
+    object.__setattr__(wheels, "calibration", odometry_indices(CALIBRATION, STEPS))
+    i, none = np.arange(STEPS), np.zeros((STEPS, 3))
+    seen = se2.between(truth[:-1], truth[1:]) + 0.003 * rng.standard_normal((STEPS, 3))
+    steps = ScanEdges(i, i + 1, seen, np.tile(np.eye(3) / 0.003, (STEPS, 1, 1)), none, none, scan_indices(CALIBRATION))
+    graph = Graph(truth, edges=(prior_edges(listed),), calibration=CALIBRATION)
+    graph = replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool))
+    graph = with_free(graph, *OMNI, "laser_theta").with_edges(wheels, steps)
+    solved, _ = optimize(graph)
+    sigma = marginals(solved).calibration[CALIBRATION.index("laser_theta")]
+    assert abs(solved.calibration.get("laser_theta")) < 2.0 * sigma
+    # Which part of the angle is the lidar's, the priors alone say.
+    assert 0.5 < sigma / (CalibrationConfig().ahead_per_sideways / np.sqrt(2.0)) < 1.1

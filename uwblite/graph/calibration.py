@@ -12,7 +12,7 @@ from .unknowns import free_unknowns
 
 ODOMETRY = ("odometry_scale", "heading_scale", "heading_per_metre", "heading_rate")
 """Kinds of unknowns of the odometry."""
-TURNING, OMNI = "sideways_per_turn", ("sideways_scale", "sideways_per_metre")
+TURNING, OMNI = "sideways_per_turn", ("sideways_scale", "sideways_per_metre", "ahead_per_sideways")
 """Kinds of unknowns of an odometry that slips sideways: in turns, and of wheels that drive sideways."""
 LASER = ("laser_x", "laser_y", "laser_theta", "laser_delay")
 """Kinds of unknowns of the lidar."""
@@ -44,6 +44,9 @@ class CalibrationConfig:
     """Relative error of ways to the side; only of an odometry that counts some (mecanum and omni wheels)."""
     sideways_per_metre: float = 0.015
     """Angle between the base's x axis and its way straight ahead, rad; of the same odometry."""
+    ahead_per_sideways: float = 0.015
+    """Angle between the base's y axis and its way straight to the side, rad; of the same odometry. Wheels of unequal load drive
+    both ways crooked, not by one angle: with one alone the lidar's heading on the base would seem to be known."""
     range_scale: float = 0.15
     """Relative error of all ranges where the unit of the radios is wrong (0.07 has been seen); used as far as the recording
     shows it."""
@@ -103,6 +106,7 @@ def unknowns(
         (TURNING, config.sideways_per_turn, "m/rad", "way to the left per turn"),
         (OMNI[0], config.sideways_scale, "1", "relative error of ways to the side"),
         (OMNI[1], config.sideways_per_metre, "1", "way to the left per metre ahead"),
+        (OMNI[2], config.ahead_per_sideways, "1", "way ahead per metre to the left"),
         ("laser_x", config.laser_offset, "m", "correction of the laser's x on the base"),
         ("laser_y", config.laser_offset, "m", "correction of the laser's y on the base"),
         ("laser_theta", config.laser_angle, "rad", "correction of the laser's heading on the base"),
@@ -170,8 +174,8 @@ def range_indices(calibration: Calibration, anchor: Ints, anchor_ids: tuple[str,
 
 
 def odometry_indices(calibration: Calibration, edges: int) -> Ints:
-    """Return the (e, 7) calibration indices of OdometryEdges."""
-    return np.broadcast_to(indices(calibration, *ODOMETRY, TURNING, *OMNI), (edges, 7))
+    """Return the (e, 8) calibration indices of OdometryEdges."""
+    return np.broadcast_to(indices(calibration, *ODOMETRY, TURNING, *OMNI), (edges, 8))
 
 
 def scan_indices(calibration: Calibration) -> Ints:

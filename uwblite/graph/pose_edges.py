@@ -84,8 +84,8 @@ class OdometryEdges(EdgeTable):
     draw s and k towards smaller motions (errors in variables).
 
     The wheels turn about the point (-p, 0) of the base, and it is the motion of a frame there that they measure. To their way v
-    to the left ``v q + u r`` is added, u being the way ahead, both in the frame in the middle of the step: they move sideways
-    1 + q times as far as counted, and crab by r.
+    to the left ``v q + u r`` and to their way u ahead ``v w`` is added, both in the frame in the middle of the step: they move
+    sideways 1 + q times as far as counted, crab by r on the way ahead, and by -w on the way to the side.
 
     The error is that of the middle of the step: a heading that errs anywhere along the way displaces the end by half the
     way times it, in the mean, and what is left across is independent of it.
@@ -102,8 +102,8 @@ class OdometryEdges(EdgeTable):
     sqrt_information: Floats
     """(e, 3, 3), of the error in the middle of the step."""
     calibration: Ints
-    """(e, 7) indices of s, k, b (rad/m), g (rad/s), p (m/rad), q, r (rad) in the calibration block; -1 = not an unknown
-    (taken as 0)."""
+    """(e, 8) indices of s, k, b (rad/m), g (rad/s), p (m/rad), q, r (rad), w (rad) in the calibration block; -1 = not an
+    unknown (taken as 0)."""
     kernel: Kernel = SQUARED
     weights: Floats | None = None
 
@@ -131,14 +131,15 @@ class OdometryEdges(EdgeTable):
         delta = k * self.motion[:, 2] + b * self.length + g * self.duration
         way = self.motion[:, :2]
         if np.any(slip):
-            left = se2.rotate(self.motion[:, 2] / 2.0, np.array([0.0, 1.0]))
-            way = way + left * np.sum(self._slipping() * slip, axis=0)[:, None]
+            left, ahead = self._ways()
+            q, r, w = slip
+            way = way + se2.rotate(self.motion[:, 2] / 2.0, np.stack([w * left, q * left + r * ahead], axis=1))
         direction = se2.rotate(delta / 2.0, way)
         z = np.concatenate([direction * (1.0 + s)[:, None], (self.motion[:, 2] + delta)[:, None]], axis=1)
         return z, direction, s
 
-    def _slipping(self) -> Floats:
-        """Return what (2, e) q and r multiply, m."""
+    def _ways(self) -> Floats:
+        """Return the ways (2, e) to the left and ahead, in the frame in the middle of the step, m."""
         ahead, left = se2.rotate(-self.motion[:, 2] / 2.0, self.motion[:, :2]).T
         return np.stack([left, ahead])
 
@@ -180,7 +181,9 @@ class OdometryEdges(EdgeTable):
                 columns.append(axes[0] * cos + axes[1] * sin)
                 # The middle of the step is turned by (delta + dtheta) / 2.
                 cos, sin = se2.cos_sin(xi[2] + z[:, 2] / 2.0)
-                columns += list((1.0 + s) * (axes[0] * sin - axes[1] * cos) * self._slipping()[:, None])
+                left, ahead = (1.0 + s) * self._ways()
+                to_left, to_ahead = axes[0] * sin - axes[1] * cos, -axes[0] * cos - axes[1] * sin
+                columns += [to_left * left, to_left * ahead, to_ahead * left]
             for index, column in zip(self.calibration.T, columns, strict=False):
                 if np.any(index >= 0):
                     blocks.append(("calibration", np.maximum(index, 0), _by_pose(np.where(index >= 0, column, 0.0))))

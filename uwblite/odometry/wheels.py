@@ -61,7 +61,7 @@ def sideways_priors(odometry: Odometry, priors: CalibrationConfig) -> Calibratio
     aside = se2.rotate(-steps[:, 2] / 2.0, steps[:, :2])[:, 1]
     if np.abs(aside).sum() > _OMNI * np.hypot(steps[:, 0], steps[:, 1]).sum():
         return priors
-    return replace(priors, sideways_scale=0.0, sideways_per_metre=0.0)
+    return replace(priors, sideways_scale=0.0, sideways_per_metre=0.0, ahead_per_sideways=0.0)
 
 
 _OMNI = 0.1
