@@ -65,6 +65,15 @@ def test_scans_that_see_nothing_decide_nothing(mounting):
     assert seen.turned_over is (mounting is DOWN)
 
 
+@pytest.mark.parametrize(("seconds", "shown"), [(1.0, False), (3.9, True)])
+def test_a_few_scans_that_see_something_decide_nothing(seconds, shown):
+    """In a yard only scans beside the one post match at all, and a single pair fits a laser either way up."""
+    log, _ = turner()
+    begin = log.scans.stamps[0]
+    ranges = np.where((log.scans.stamps < begin + seconds)[:, None], log.scans.ranges, np.inf)
+    assert (compare(replace(log, scans=replace(log.scans, ranges=ranges))) is not None) == shown
+
+
 def test_a_robot_that_never_turns_reports_nothing():
     stamps, truth = drive([(0.5, 0.0, 0.0)], [20.0])
     log = recording(odometry(stamps, truth), None, scans(stamps, truth, box(40, 6)))

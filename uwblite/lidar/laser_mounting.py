@@ -55,7 +55,7 @@ class Turning:
 
 
 def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
-    """Compare the turns that laser and wheels see; None where the scans are too few or the robot hardly turns in place.
+    """Compare the turns that laser and wheels see; None where scans, turns in place or scans that show turns are too few.
 
     Parameters
     ----------
@@ -72,6 +72,8 @@ def compare(log: SensorLog, pairs: int = PAIRS) -> Turning | None:
     wheels = _wheel_turns(log, scans, first, second, middle + _LAGS)
     sign = -1.0 if log.mounting.laser_flipped else 1.0
     both = [_differences(log, scans, first, second, wheels, s * sign) for s in (1.0, -1.0)]
+    if any(errors.shape[1] < _LEAST_CLEAR for _, errors in both):
+        return None
     as_given, other = misfits = [errors.mean(axis=1) for _, errors in both]
     right = int(other.min() < 0.5 * as_given.min())
     (turn, errors), misfit = both[right], misfits[right]
@@ -104,7 +106,7 @@ def _differences(
     """
     turn, sharp = _matched_turn(scans, first, second, _laser_shift(log, scans, first, second) * (1.0, sign))
     some = sharp > 0.0
-    clear = some & (sharp >= np.quantile(sharp[some], 0.5)) if some.any() else ~some
+    clear = some & (sharp >= np.quantile(sharp[some], 0.5)) if some.any() else some
     # A wrong track width makes all turns wrong by one factor; they go the same way all the same.
     by_wheels, seen = wheels[len(wheels) // 2], sign * turn
     large = clear & (np.abs(by_wheels) > 0.05)
@@ -112,6 +114,8 @@ def _differences(
     return seen, np.minimum(np.abs(factor * wheels[:, clear] - seen[clear]), 0.3)
 
 
+_LEAST_CLEAR = LEAST_PAIRS // 2
+"""Fewer of the clearer half show nothing: where a laser sees a post or two, single pairs fit either way up."""
 _NOISE = 0.02
 """Mean difference of ranges that means nothing, m."""
 _LEAST_SEEN = 0.05
