@@ -67,6 +67,7 @@ def build_map(
     config, stages = config or MappingConfig(), Stages(progress, clock)
     logs = [logs] if isinstance(logs, SensorLog) else logs
     logs = [scan_selection.prepared(log, config) for log in logs]
+    config = radio_stages.with_units_checked(config, logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
     estimate = radio_stages.first_optimisation(task)
     if np.any((factors := radio_stages.odometry_unit_factors(estimate, task)) != 1.0):

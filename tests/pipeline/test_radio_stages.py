@@ -13,7 +13,7 @@ from uwblite.pipeline import radio_stages
 from uwblite.pipeline.estimate import Estimate, OtherHeights, Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.radio_stages import odometry_unit_factors, select_range_priors
+from uwblite.pipeline.radio_stages import odometry_unit_factors, select_range_priors, with_units_checked
 from uwblite.pipeline.recordings import Recordings
 
 
@@ -63,6 +63,21 @@ def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, hei
     assert factors == pytest.approx([factor if warned or doubted else 1.0])
     assert (len(stages.warnings), len(stages.doubts)) == (warned, doubted)
     assert all(("4.7 m above the tag" in notice.text) == (height is not None) for notice in stages.doubts)
+
+
+@pytest.mark.parametrize(("ways", "checked"), [
+    ([1.1], True), ([0.9], True), ([1.13], False), ([0.23], False), ([None], False), ([float("nan")], False),
+    ([1.0, 0.95], True), ([1.0, float("nan")], False), ([1.0, 1.3], False),
+])  # fmt: skip
+def test_wheels_whose_ways_a_lidar_measures_are_in_metres_whatever_the_ranges_say(ways, checked):
+    """None: a recording that was not screened."""
+    logs = [SimpleNamespace(screening=None if w is None else SimpleNamespace(lidar_by_wheels=w)) for w in ways]
+    config = MappingConfig()
+    found = with_units_checked(config, logs)
+    assert (found.calibration.odometry_unit <= found.calibration.odometry_scale) == checked
+    assert replace(found, calibration=config.calibration) == config
+    if not checked:
+        assert found is config
 
 
 def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(monkeypatch):

@@ -4,6 +4,7 @@ Each recording is bootstrapped on its own, then the recordings are joined. Once 
 the ranges are re-estimated: first the anchors' places, then the noise and the priors of systematic errors.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,7 @@ from ..radio.line_of_sight import blocked
 from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
 from ..screening.units import likely_unit
+from ..sensor_log import SensorLog
 from . import anchor_heights, joining, map_frame
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
@@ -124,6 +126,19 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
 
 _NOISE_ROUNDS = 3
 """Times that noise is estimated and the graph optimised; in the last one the radio's calibration is free too."""
+
+
+def with_units_checked(config: MappingConfig, logs: Sequence[SensorLog]) -> MappingConfig:
+    """Return the settings without the hypothesis that a unit of the wheels is wrong, where a lidar has measured their ways.
+
+    Ranges through walls to an anchor or two may fit wheels several times too short better than a path that is right. Lidar and
+    wheels that agree would both have to be wrong, by one factor. With recordings of which some show nothing, it stays.
+    """
+    ways = np.array([float("nan") if log.screening is None else log.screening.lidar_by_wheels for log in logs])
+    if not np.all(np.abs(ways - 1.0) <= _OTHER_UNIT):
+        return config
+    priors = config.calibration
+    return replace(config, calibration=replace(priors, odometry_unit=min(priors.odometry_unit, priors.odometry_scale)))
 
 
 def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
