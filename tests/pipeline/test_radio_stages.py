@@ -38,23 +38,30 @@ def test_wheels_are_in_another_unit_from_an_eighth_on(errors, factors):
 @pytest.mark.parametrize(
     ("factor", "lidar", "given", "height", "warned", "doubted"),
     [
-        (1.1, False, 0, None, 0, 0),
-        (1.41, False, 0, None, 1, 0),
-        (2.06, False, 0, None, 0, 1),
-        (0.515, False, 0, None, 0, 1),
-        (0.515, True, 0, None, 1, 0),
-        (0.515, False, 2, None, 1, 0),
-        (4.0, False, 0, None, 1, 0),
-        (1.1, False, 0, 4.7, 0, 0),
-        (1.41, True, 0, 4.7, 0, 1),
-        (0.7, False, 0, 4.7, 0, 1),
+        (1.1, None, 0, None, 0, 0),
+        (1.41, None, 0, None, 1, 0),
+        (2.06, None, 0, None, 0, 1),
+        (0.515, None, 0, None, 0, 1),
+        (0.515, 1.0, 0, None, 1, 0),
+        (0.515, None, 2, None, 1, 0),
+        (4.0, None, 0, None, 1, 0),
+        (1.1, None, 0, 4.7, 0, 0),
+        (1.41, 1.0, 0, 4.7, 0, 1),
+        (1.41, float("nan"), 0, 4.7, 0, 1),
+        (1.41, 1.35, 0, 4.7, 1, 0),
+        (0.7, None, 0, 4.7, 0, 1),
     ],
 )
 def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, height, warned, doubted):
-    """Twice and half may be the radio's; anchors that hang high may look like either unit."""
+    """Twice and half may be the radio's; anchors that hang high may look like either unit, where no lidar measures the ways.
+
+    lidar: its ways by those of the wheels, nan where it shows none, None without.
+    """
     stages = Stages(None, None)
     calibration = Calibration((UnknownKey("odometry_scale", recording=0),), np.array([factor - 1.0]))
-    recordings = Recordings((SimpleNamespace(name="run.log", number=0, has_scans=lidar),), *(np.zeros(0),) * 4)
+    log = SimpleNamespace(screening=lidar and SimpleNamespace(lidar_by_wheels=lidar))
+    recording = SimpleNamespace(name="run.log", number=0, has_scans=lidar is not None, log=log)
+    recordings = Recordings((recording,), *(np.zeros(0),) * 4)
     given = Constraints(anchors=tuple(GivenAnchor(name, (0.0, 0.0)) for name in "AB"[:given]))
     task = SimpleNamespace(stages=stages, recordings=recordings, given=given, config=None)
     other = None if height is None else OtherHeights(height, taken=False, apart=1.0)

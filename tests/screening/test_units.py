@@ -263,4 +263,4 @@ def test_ranges_that_change_as_much_as_another_unit_would(times, by_lidar, unit)
 def test_factors_that_a_unit_explains():
     assert "ranges in yards" in likely_unit(1.10)
     assert "odometry in feet" in likely_unit(0.31)
-    assert likely_unit(1.0) == likely_unit(1.15) == likely_unit(1.41) == ""
+    assert likely_unit(1.0) == likely_unit(1.15) == likely_unit(1.41) == likely_unit(-0.31) == ""

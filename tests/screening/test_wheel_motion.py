@@ -56,8 +56,15 @@ def test_stands_at_the_ends_are_within_the_recording_and_short_ones_none():
 @pytest.mark.parametrize(("speed", "span"), [(0.4, 0.25), (0.05, 1.0), (5.0, 0.1), (0.0, 1.0 / 3.0)])
 def test_the_scans_of_a_pair_are_a_tenth_of_a_metre_apart(speed, span):
     """As the robot usually drives when it moves; a third of a second where it never does, a tenth and a whole one at most."""
-    speeds = np.where(np.arange(200) % 3 == 0, 0.0, speed)
+    speeds = np.where(np.arange(600) % 300 < 100, 0.0, speed)
     assert _span(driven(speeds, 0.0 * speeds)) == pytest.approx(span)
+
+
+def test_rounded_odometry_drives_no_faster():
+    """0.2 m/s in steps of 0.05 m, each within one of 20 readings a second."""
+    exact = driven(np.full(2000, 0.2), np.zeros(2000), 0.05)
+    rounded = Odometry(exact.stamps, np.round(exact.poses / 0.05) * 0.05)
+    assert _span(rounded) == pytest.approx(_span(exact), rel=0.05)
 
 
 def scanned(odometry, stamps, beams=40):
@@ -160,6 +167,21 @@ def test_the_way_ratio_is_of_measured_pairs_with_a_clear_way():
     found.wheels[10:15, 0] = 0.05
     assert way_ratio(found) == pytest.approx(1.1)
     assert np.isnan(way_ratio(found.rows(np.arange(40) < 20)))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5])
+@pytest.mark.parametrize("rounded", ["wheels", "lidar"])
+def test_rounding_of_either_sensor_hardly_changes_the_way_ratio(rounded, factor):
+    """Ways of 0.1 m into all directions, x and y rounded up or down to 0.1 m: along the rounded ones they are shorter."""
+    rng = np.random.default_rng(0)
+    found, angle = pairs(400), rng.uniform(0.0, 0.5 * np.pi, 400)
+    way = 0.1 * np.column_stack([np.cos(angle), np.sin(angle)])
+    found.wheels[:, :2], found.lidar[:, :2] = way, way
+    noisy = getattr(found, rounded)
+    noisy[:, :2] = 0.1 * np.floor(way / 0.1 + rng.uniform(0.0, 1.0, (400, 2)))
+    found.wheels[:, :2] *= factor
+    assert abs(np.log(way_ratio(found) * factor)) < 0.3
+    assert abs(np.log(way_ratio(found) * factor)) < 0.1 or factor > 1.0
 
 
 @pytest.mark.parametrize(("share", "said"), [(0.39, True), (0.41, False)])

@@ -153,7 +153,7 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     other = estimate.other_heights
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:
-            double = abs(abs(np.log2(factor)) - 1.0) < _DOUBLE
+            double = abs(abs(np.log2(abs(factor))) - 1.0) < _DOUBLE
             unclear = double and not (recording.has_scans or len(task.given.anchors) > 1 or task.given.distances)
             reason = _TWICE if unclear else "the unit of the wheels is wrong; the odometry was multiplied by that"
             whose = f"{recording.name}: " if len(recordings) > 1 else ""
@@ -161,12 +161,19 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
                 f"{whose}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its "
                 f"odometry has: {reason}{likely_unit(factor)}"
             )
-            high = other is not None and not other.taken
+            high = other is not None and not other.taken and not _lidar_agrees(recording, factor)
             if other is not None and high:
                 text += f"; or the wheels are right and the anchors hang {other.high:.1f} m above the tag: give their heights"
             add = task.stages.doubt if unclear or high else task.stages.warn
             add("odometry-unit", text, recording=recording.number + 1, factor=round(factor, 4))
     return factors
+
+
+def _lidar_agrees(recording: Recording, factor: float) -> bool:
+    """Return whether the lidar measures ways that are longer than the wheels' by a factor, more likely than as long."""
+    screening = recording.log.screening
+    ratio = float("nan") if screening is None else screening.lidar_by_wheels
+    return abs(ratio - factor) < abs(ratio - 1.0)
 
 
 _OTHER_UNIT = 0.12

@@ -83,6 +83,8 @@ def refuse_other_ranges(change_by_way: float, lidar_by_wheels: float) -> None:
 
 def likely_unit(times: float) -> str:
     """Return words on what looks as if the robot drove so many times as far as its wheels count; '' where nothing does."""
+    if times <= 0.0:
+        return ""
     if abs(np.log(times * _YARD)) < _SAME_UNIT:
         return f"; ranges in yards would look like this (uwblite convert --range-unit {_YARD})"
     if abs(np.log(times / _LENGTHS["feet"])) < _SAME_UNIT:

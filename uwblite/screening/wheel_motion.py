@@ -124,12 +124,18 @@ def _chosen(log: SensorLog, middle: Floats) -> tuple[Ints, Ints]:
     return chosen, chosen + apart
 
 
+_SPEED_OVER = 1.0
+"""Time over which speeds are taken, s: over shorter ones rounded odometry stands, or leaps."""
+
+
 def _span(odometry: Odometry) -> float:
     """Return the time between the scans of a pair, s, in which the robot usually drives a little way."""
-    steps, span = odometry.steps, np.diff(odometry.stamps)
-    length = np.hypot(steps[:, 0], steps[:, 1])
-    moving = (length > 1e-4) & (span > 0)
-    speed = float(np.median(length[moving] / span[moving])) if moving.any() else 0.3
+    stamps = odometry.stamps
+    at = np.arange(stamps[0], stamps[-1], _SPEED_OVER)
+    place = np.column_stack([np.interp(at, stamps, column) for column in odometry.poses[:, :2].T])
+    speeds = np.hypot(*np.diff(place, axis=0).T) / _SPEED_OVER
+    moving = speeds > _STILL[0]
+    speed = float(np.median(speeds[moving])) if moving.any() else 0.3
     return float(np.clip(_APART / max(speed, 1e-3), 0.1, 1.0))
 
 
@@ -214,9 +220,17 @@ _NOISE_SHARE = 0.4
 
 
 def way_ratio(pairs: Pairs) -> float:
-    """Return the way by the lidar / the way by the wheels; nan where there are too few clear motions."""
-    own = pairs.rows(pairs.measured)
-    return _factor(own.wheels[:, :2], own.lidar[:, :2], _CLEAR_WAY, float("nan"))
+    """Return the way by the lidar / the way by the wheels; nan where there are too few clear motions.
+
+    Noise of one sensor, such as rounding, draws the ratio to its own motions down (regression dilution). So the ratio to the
+    other's motions is taken as well, and of both the one that is nearer to 1.
+    """
+    own, nan = pairs.rows(pairs.measured), float("nan")
+    wheels, lidar = own.wheels[:, :2], own.lidar[:, :2]
+    ratio, inverse = _factor(wheels, lidar, _CLEAR_WAY, nan), _factor(lidar, wheels, _CLEAR_WAY, nan)
+    if not (ratio > 0.0 and inverse > 0.0):
+        return ratio
+    return min(ratio, 1.0 / inverse, key=lambda value: abs(np.log(value)))
 
 
 def _other_scale(own: Pairs, start: float) -> list[tuple[float, float]]:
