@@ -10,12 +10,13 @@ from helpers.planted import aligned_error, box, odometry, ranges, recording, sca
 from uwblite import se2
 from uwblite.constraints import Constraints, GivenAnchor
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
-from uwblite.map_result import AnchorEstimate
+from uwblite.map_result import AnchorEstimate, CalibrationEstimate
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.odometry.attached import OUTSIDE
 from uwblite.pipeline import plausibility
 from uwblite.pipeline.plausibility import (
     check_anchors,
+    check_calibration,
     check_certainty,
     check_closures,
     check_fit,
@@ -319,3 +320,18 @@ def test_residuals_twice_as_large_as_noise_allows_after_the_last_optimisation_ar
     stages.end("summary")
     check_fit(SimpleNamespace(stages=stages))
     assert [n.figures["chi2_per_dof"] for n in stages.doubts] == ([fits[-1]] if doubted else [])
+
+
+@pytest.mark.parametrize(
+    ("scale", "wheels", "doubted"), [(0.08, True, True), (0.02, True, False), (-0.08, True, False), (0.08, False, False)]
+)
+def test_ranges_that_are_too_long_show_ways_that_wheels_lost(scale, wheels, doubted):
+    """Where it is known that the wheels lost some of their way, and by more than a radio is usually off."""
+    stages, key = Stages(None, None), UnknownKey("range_scale")
+    if wheels:
+        stages.warn("wheels-stand-still", "the wheels count nothing from t = 3 to 5 s")
+    value = CalibrationEstimate(key, scale, 0.004, "1", "relative error of all ranges", "estimated")
+    check_calibration([value], {}, SimpleNamespace(stages=stages, config=MappingConfig()))
+    of_scale = [notice.kind == "unusual-calibration" for notice in (*stages.warnings[wheels:], *stages.doubts)]
+    assert of_scale == [True]
+    assert len(stages.doubts) == doubted

@@ -25,6 +25,8 @@ from .untied_parts import check_untied_parts
 _UNUSUAL = 3.0
 """Prior standard deviations beyond which an estimate is worth a warning."""
 _RADIO_OR_WHEELS = "check the radio's settings and, where no lidar measures the distances, the scale of the wheels"
+_LOST_WAY = 0.03
+"""Share of their way that wheels have lost by the ranges, where they lost some, from which on a map is too short."""
 _WRONG_TURNS = 0.25
 """Relative error of the odometry's turns beyond which their sign is no longer sure."""
 _POOR_FIT = 4.0
@@ -209,10 +211,14 @@ def check_closures(estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: 
 def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[UnknownKey, Unknown], task: Task) -> None:
     """Warn of each calibration value far outside what is usual.
 
+    Ranges that are too long where the wheels were seen to count nothing are a doubt: scans along a bare wall show some of
+    such stretches only, and a map that lacks the others is too short.
+
     Parameters
     ----------
     usual : unknowns with their prior standard deviations; of sound radios it is the settings' range_scale_sound.
     """
+    said = {notice.kind for notice in task.stages.warnings}
     for value in calibrated:
         scale = value.key.kind == RANGE_SCALE
         sigma = task.config.calibration.range_scale_sound if scale else usual[value.key].sigma
@@ -220,11 +226,14 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
         if value.state != "estimated" or value.key.kind == HEIGHT or not clear:
             continue
         unit = "" if value.unit == "1" else f" {value.unit}"
-        task.stages.warn(
+        short = scale and value.value > _LOST_WAY and "wheels-stand-still" in said
+        add = task.stages.doubt if short else task.stages.warn
+        add(
             "unusual-calibration",
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
             + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings")
-            + (likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""),
+            + (likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else "")
+            + ("; the wheels lost some of their way: the map lacks what was not found of it" if short else ""),
             name=value.name, value=value.value, sigma=value.sigma, usual=sigma,
         )  # fmt: skip
 
