@@ -447,6 +447,16 @@ def test_one_recording_may_stand_alone_and_several_in_any_sequence(minute, monke
     assert [log is minute for log in asked] == [True] * 3
 
 
+def test_clouds_are_made_by_the_stage_that_may_replace_them():
+    """A stage of their own, whose estimate is held while the next one runs, is left for the paper's way alone."""
+    recordings, config = SimpleNamespace(have_scans=True), MappingConfig()
+    for on in (True, False):
+        settings = replace(config, scan_to_scan=replace(config.scan_to_scan, on=on))
+        names = [s.__name__ for s in _stages(Task(recordings, settings, Constraints(), None))]
+        assert ("make_clouds" in names, "match_scan_to_scan" in names) == (not on, on)
+        assert ("reestimate_ranges" in names) is on
+
+
 def test_the_joint_refinement_is_a_stage_where_rounds_are_asked_for():
     recordings = SimpleNamespace(have_scans=True)
     for rounds in (12, 0):
@@ -454,5 +464,5 @@ def test_the_joint_refinement_is_a_stage_where_rounds_are_asked_for():
         config = replace(config, refinement=replace(config.refinement, rounds=rounds))
         names = [s.__name__ for s in _stages(Task(recordings, config, Constraints(), None))]
         assert ("refine_jointly" in names) is (rounds > 0)
-        assert names[0] == "make_clouds"
+        assert names[0] == "match_scan_to_scan"
         assert names[-3:] == ["final_optimisation", "find_mirror_images", "align_axes"]

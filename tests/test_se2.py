@@ -57,7 +57,9 @@ def test_transform_follows_compose(a, b, p):
     np.testing.assert_allclose(se2.transform(se2.compose(a, b), p), se2.transform(a, se2.transform(b, p)), atol=1e-9)
 
 
-def test_points_of_several_poses_are_transformed_as_one_by_one():
+@pytest.mark.parametrize("at_once", [1 << 15, 7])
+def test_points_of_several_poses_are_transformed_as_one_by_one(monkeypatch, at_once):
+    monkeypatch.setattr(se2, "_AT_ONCE", at_once)
     rng = np.random.default_rng(0)
     poses, owner, points = rng.normal(size=(7, 3)) * 4.0, rng.integers(7, size=50), rng.normal(size=(50, 2))
     one_by_one = np.array([se2.transform(poses[k], p) for k, p in zip(owner, points, strict=True)])

@@ -109,9 +109,8 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
     if given != Constraints():
         yield constraint_edges.apply_given
     if task.recordings.have_scans:
-        yield lidar_stages.make_clouds
+        yield lidar_stages.match_scan_to_scan if config.scan_to_scan.on else lidar_stages.make_clouds
         if config.scan_to_scan.on:
-            yield lidar_stages.match_scan_to_scan
             yield radio_stages.reestimate_ranges
             yield turn_checks.with_slip_in_turns
         if config.use_loops:

@@ -76,16 +76,27 @@ def transform(pose: ArrayLike, points: ArrayLike) -> Floats:
 
 def rotate_each(theta: Floats, owner: NDArray[np.signedinteger], vectors: ArrayLike) -> Floats:
     """Turn vectors (p, 2), each by its own one (p,) of the angles (k,), rad: rotate with few sines for many vectors."""
-    c, s = (v.take(owner) for v in cos_sin(theta))
-    x, y = np.asarray(vectors, dtype=np.float64).T
-    return np.column_stack([c * x - s * y, s * x + c * y])
+    cosine, sine = cos_sin(theta)
+    vectors = np.asarray(vectors)
+    turned = np.empty((len(vectors), 2))
+    for first in range(0, len(vectors), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        c, s = cosine.take(owner[part]), sine.take(owner[part])
+        x, y = vectors[part].astype(np.float64).T
+        turned[part, 0] = c * x - s * y
+        turned[part, 1] = s * x + c * y
+    return turned
+
+
+_AT_ONCE = 1 << 15
+"""Vectors turned at once; a bound on the memory."""
 
 
 def transform_each(poses: Floats, owner: NDArray[np.signedinteger], points: ArrayLike) -> Floats:
     """Express points (p, 2), each given in the frame of its own one (p,) of the poses (k, 3), as transform does."""
     moved = rotate_each(poses[:, 2], owner, points)
-    for axis in (0, 1):
-        moved[:, axis] += poses[:, axis].take(owner)
+    for first in range(0, len(moved), _AT_ONCE):
+        moved[first : first + _AT_ONCE] += poses[:, :2].take(owner[first : first + _AT_ONCE], axis=0)
     return moved
 
 

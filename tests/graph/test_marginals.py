@@ -38,11 +38,13 @@ def test_marginals_are_blocks_of_the_dense_inverse(n):
 
 
 @pytest.mark.parametrize("fixed", [[False, False], [False, True], [True, False], [True, True]])
-def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(fixed):
+def test_the_covariance_of_the_calibration_is_that_of_the_dense_inverse(monkeypatch, fixed):
     graph = replace(calibrated_loop()[0], fixed_calibration=np.array(fixed))
     covariance = dense_covariance(graph)
     expected = np.block([[covariance("calibration", a, "calibration", b) for b in (0, 1)] for a in (0, 1)])
-    np.testing.assert_allclose(calibration_covariance(graph), expected, rtol=1e-6, atol=1e-15)
+    for columns in (16, 1):
+        monkeypatch.setattr("uwblite.graph.marginals._COLUMNS_AT_ONCE", columns)
+        np.testing.assert_allclose(calibration_covariance(graph), expected, rtol=1e-6, atol=1e-15)
 
 
 def test_fixed_unknowns_have_no_covariance():

@@ -15,7 +15,7 @@ from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.solver import SolverConfig
-from uwblite.lidar import joint_refinement
+from uwblite.lidar import joint_refinement, scan_matching
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.joint_refinement import (
     RefinementConfig,
@@ -173,6 +173,20 @@ def test_neighbours_are_of_one_recording():
     recording = (np.arange(len(truth)) >= 20).astype(np.int64)
     i, j = choose_pairs(clouds, truth, path, recording, replace(CONFIG, partners=0))
     assert np.all(recording[i] == recording[j])
+
+
+def test_surface_cells_and_listed_points_do_not_depend_on_how_many_are_at_hand_at_once(monkeypatch):
+    truth, _, clouds = room(4)
+    j = np.arange(len(clouds))[::-1]
+    whole, listed = joint_refinement.surface_cells(clouds, truth), scan_matching.pair_points(clouds, j, 7).row
+    monkeypatch.setattr(joint_refinement, "_POINTS_AT_ONCE", 37)
+    monkeypatch.setattr(scan_matching, "_PAIRS_AT_ONCE", 3)
+    parts = joint_refinement.surface_cells(clouds, truth)
+    assert len(clouds.points) > 200
+    assert parts.shape == whole.shape
+    assert (parts != whole).nnz == 0
+    assert parts.nnz == whole.nnz == whole.sum()
+    np.testing.assert_array_equal(scan_matching.pair_points(clouds, j, 7).row, listed)
 
 
 def test_surface_cells_distinguish_the_sides_of_a_wall():

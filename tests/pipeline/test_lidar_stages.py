@@ -71,7 +71,8 @@ def test_steps_between_keyframes_that_stay_neighbours_are_not_measured_again(mon
     before = SimpleNamespace(stamps=np.arange(5.0))
     task = SimpleNamespace(recordings=before, config=MappingConfig(), stages=Stages(None, None))
     estimate = Estimate(None, None, None, (), scans=ScanClouds(None, None, 0.0))
-    _, found = lidar_stages._without_contradicted(estimate, steps, task)
+    estimate, place = lidar_stages._with_keyframes_where_contradicted(estimate, steps, task)
+    found = lidar_stages._with_new_steps(estimate, steps, place, task)
     assert asked == [[1, 2, 3]]
     assert found.i.tolist() == [0, 1, 2, 3, 4, 5]
     assert found.pose[:, 0].tolist() == [0.0, 9.0, 9.0, 9.0, 2.0, 3.0]

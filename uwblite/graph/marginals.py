@@ -273,9 +273,14 @@ def calibration_covariance(graph: Graph) -> Floats:
     normal = filled(graph)
     number = normal.unknowns.number["calibration"][:, 0]
     free = np.flatnonzero(number >= 0)
-    right = np.zeros((normal.unknowns.size, len(free)))
-    right[number[free], np.arange(len(free))] = 1.0
-    columns = normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0)).solve(right)
+    factor = normal.factor(np.where(normal.diagonal > 0, 0.0, 1.0))
     covariance = np.zeros((len(number), len(number)))
-    covariance[np.ix_(free, free)] = columns[number[free]]
+    for some in np.split(free, np.arange(_COLUMNS_AT_ONCE, len(free), _COLUMNS_AT_ONCE)):
+        right = np.zeros((normal.unknowns.size, len(some)))
+        right[number[some], np.arange(len(some))] = 1.0
+        covariance[np.ix_(free, some)] = factor.solve(right)[number[free]]
     return covariance
+
+
+_COLUMNS_AT_ONCE = 16
+"""Columns of an inverse solved for at once; a bound on the memory, for each is as long as there are unknowns."""

@@ -5,11 +5,12 @@ relative-pose edge and solves the whole graph again, wheels, radio and calibrati
 round to round. Both poses of a pair are free, so errors spread over the loop instead of piling up in one scan.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
@@ -109,12 +110,26 @@ def surface_cells(clouds: Clouds, poses: Floats) -> sparse.csr_matrix:
         facing[part] = np.floor(bearing * (4.0 / np.pi) + 0.5).astype(np.int64) % 8
     cell -= cell.min(axis=0, initial=0)
     wide = int(cell[:, 1].max(initial=0)) + 1
-    key = (cell[:, 0].astype(np.int64) * wide + cell[:, 1]) * 8 + facing
+    row, key = (np.concatenate(parts) for parts in zip(*_seen_cells(clouds.owner[usable], cell, facing, wide), strict=True))
     _, column = np.unique(key, return_inverse=True)
     shape = (len(clouds), int(column.max(initial=-1)) + 1)
-    seen = sparse.csr_matrix((np.ones(len(column)), (clouds.owner[usable], column)), shape=shape)
+    seen = sparse.csr_matrix((np.ones(len(column)), (row, column)), shape=shape)
     seen.data[:] = 1.0
     return seen
+
+
+def _seen_cells(
+    owner: NDArray[np.signedinteger], cell: NDArray[np.int32], facing: NDArray[np.int8], wide: int
+) -> Iterator[tuple[Ints, Ints]]:
+    """Yield clouds and numbers of the surface cells of points (p,), some points at a time, each pair once or a few times."""
+    for first in range(0, max(len(owner), 1), _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        key = (cell[part, 0].astype(np.int64) * wide + cell[part, 1]) * 8 + facing[part]
+        order = np.lexsort((key, owner[part]))
+        row, key = owner[part][order], key[order]
+        fresh = np.ones(len(key), dtype=bool)
+        fresh[1:] = (row[1:] != row[:-1]) | (key[1:] != key[:-1])
+        yield row[fresh].astype(np.int64), key[fresh]
 
 
 def choose_pairs(clouds: Clouds, poses: Floats, path: Floats, recording: Ints, config: RefinementConfig) -> tuple[Ints, Ints]:

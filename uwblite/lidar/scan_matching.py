@@ -18,6 +18,8 @@ from .degeneracy import MEASURED, relative_eigen
 
 _AT_ONCE = 16384
 """Points looked up at once: what fits into a processor's cache, and a bound on the memory."""
+_PAIRS_AT_ONCE = 4096
+"""Pairs whose points are listed at once; a bound on the memory."""
 _SAME_FACING = float(np.sqrt(0.5))
 """Least cosine between the normals of two matched points."""
 
@@ -63,8 +65,13 @@ def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
     begin, end = ranks[clouds.offsets[j]], ranks[clouds.offsets[j + 1]]
     take = np.minimum(end - begin, limit)
     rank = np.arange(take.max(initial=0))
-    picked = begin[:, None] + (rank * (end - begin)[:, None]) // np.maximum(take, 1)[:, None]
-    return PairPoints(rows[np.where(rank < take[:, None], picked, len(rows) - 1)])
+    row = np.empty((len(j), len(rank)), dtype=np.int32)
+    for first in range(0, len(j), _PAIRS_AT_ONCE):
+        part = slice(first, first + _PAIRS_AT_ONCE)
+        number, taken = (end - begin)[part, None], take[part, None]
+        picked = begin[part, None] + (rank * number) // np.maximum(taken, 1)
+        row[part] = rows[np.where(rank < taken, picked, len(rows) - 1)]
+    return PairPoints(row)
 
 
 def match(

@@ -36,18 +36,23 @@ def make_clouds(estimate: Estimate, task: Task) -> Estimate:
 
 
 def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
-    """Match neighbouring clouds; where the lidar's clock is found to be off, move keyframes and clouds with it, and repeat.
+    """Make clouds and match neighbouring ones; where the lidar's clock is found to be off, move keyframes and clouds with it.
 
     Keyframes then stand at the moments of the scans: between these the odometry's own velocity would have to bridge the
-    offset, and that is poor where the robot turns fast.
+    offset, and that is poor where the robot turns fast. The clouds are made here, and not in a stage before, so that nobody
+    holds those that are replaced.
     """
-    estimate, steps = _without_contradicted(*_descended(estimate, task), task)
+    estimate, steps = _descended(make_clouds(estimate, task), task)
+    estimate, former = _with_keyframes_where_contradicted(estimate, steps, task)
+    if former is not None:
+        steps = _with_new_steps(estimate, steps, former, task)
     estimate = _match_neighbours(estimate, steps, task.following(estimate))
     for _ in range(_RETIMINGS):
         late = _late(estimate)
         if late == 0.0:
             break
-        estimate = _at_delay(estimate, late, task)
+        delay, estimate = estimate.lidar.delay + late, replace(estimate, scans=None)
+        estimate = _at_delay(estimate, late, delay, task)
         now = task.following(estimate)
         if abs(late) < _SAME_STEPS:
             gate = task.config.refinement.later_gate
@@ -67,9 +72,9 @@ def _late(estimate: Estimate) -> float:
     return late if abs(late) > _SIGNIFICANT * sigma else 0.0
 
 
-def _at_delay(estimate: Estimate, late: float, task: Task) -> Estimate:
-    """Return the estimate with keyframes and clouds made for a lidar whose clock is later by `late` s."""
-    before, delay = task.following(estimate).recordings, estimate.lidar.delay + late
+def _at_delay(estimate: Estimate, late: float, delay: float, task: Task) -> Estimate:
+    """Return the estimate with keyframes later by `late` s and clouds made for a lidar whose clock is late by `delay` s."""
+    before = task.following(estimate).recordings
     estimate = with_keyframes(estimate, before, later(before, late))
     estimate = replace(estimate, scans=scan_clouds.make(task.following(estimate).recordings, task.config, delay))
     task.stages.end("clouds made again", laser_delay=round(delay, 4))
@@ -96,24 +101,31 @@ def _steps(estimate: Estimate, rows: Ints, task: Task) -> Steps:
     )
 
 
-def _without_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Steps]:
-    """Cut the steps of the odometry that the clouds contradict at the scans within them, and measure those again.
+def _with_keyframes_where_contradicted(estimate: Estimate, steps: Steps, task: Task) -> tuple[Estimate, Ints | None]:
+    """Cut the steps of the odometry that the clouds contradict at the scans within them.
 
     Where little happens between two scans, the second is found by any odometry.
+
+    Returns
+    -------
+    The estimate, and (k,) the number that each keyframe had before, see scan_clouds.remake; None where nothing changes.
     """
     before = task.recordings
     doubtful = steps.contradicted(task.config.scan_to_scan)
     after = denser(before, doubtful, _CUTS)
     if len(after.stamps) == len(before.stamps):
-        return estimate, steps
+        return estimate, None
     scans, former = scan_clouds.remake(estimate.lidar, before, after, task.config)
-    estimate = replace(with_keyframes(estimate, before, after), scans=scans)
+    task.stages.end("keyframes added", steps=len(doubtful), keyframes=len(after.stamps))
+    return replace(with_keyframes(estimate, before, after), scans=scans), former
+
+
+def _with_new_steps(estimate: Estimate, steps: Steps, former: Ints, task: Task) -> Steps:
+    """Return steps measured before keyframes were added, those of changed clouds measured anew; former: see remake."""
     i = estimate.odometry.i
     kept = (former[i] >= 0) & (former[i + 1] == former[i] + 1)
     rows = np.searchsorted(steps.i, former[i[kept]])
-    steps = steps.with_others(i[kept], rows, _steps(estimate, np.flatnonzero(~kept), task))
-    task.stages.end("keyframes added", steps=len(doubtful), keyframes=len(after.stamps))
-    return estimate, steps
+    return steps.with_others(i[kept], rows, _steps(estimate, np.flatnonzero(~kept), task))
 
 
 _CUTS = 4

@@ -18,7 +18,7 @@ _NEAR_ANCHOR = 1.0
 """Nor the last metre: an anchor hangs on a wall, and its place is not yet known better than that."""
 _MOST_CELLS = 100_000_000
 """A larger map (2 x 2 km) gets coarser cells; a bound on the memory."""
-_SAMPLES_AT_ONCE = 1 << 20
+_SAMPLES_AT_ONCE = 1 << 18
 """Places looked up at once."""
 
 
@@ -62,12 +62,16 @@ def _over_map(start: Floats, ahead: Floats, length: Floats, cell: float, size: F
 
 def _occupied(surfaces: Floats) -> tuple[Floats, float, Bools]:
     """Return the lower corner (2,) of the map, the side of its cells and which of them (x, y) hold a surface."""
-    x, y = np.ascontiguousarray(surfaces.T)  # reductions along pairs are slow
-    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+    blocks = [slice(first, first + _SAMPLES_AT_ONCE) for first in range(0, len(surfaces), _SAMPLES_AT_ONCE)]
+    ends = [(block.min(axis=1), block.max(axis=1)) for block in (np.ascontiguousarray(surfaces[b].T) for b in blocks)]
+    low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
     cell = max(_CELL, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
-    column, row = _cells(x, low[0], cell), _cells(y, low[1], cell)
-    shape = int(column.max()) + 1, int(row.max()) + 1
-    hits = np.bincount(column * shape[1] + row, minlength=shape[0] * shape[1])
+    shape = tuple(int(_cells(high[axis], low[axis], cell)) + 1 for axis in (0, 1))
+    number = np.empty(len(surfaces), dtype=np.int64)
+    for block in blocks:
+        x, y = surfaces[block].T
+        number[block] = _cells(x, low[0], cell) * shape[1] + _cells(y, low[1], cell)
+    hits = np.bincount(number, minlength=shape[0] * shape[1])
     return low, cell, (hits >= _LEAST_POINTS).reshape(shape)
 
 
