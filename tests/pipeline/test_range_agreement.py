@@ -39,6 +39,8 @@ def test_a_stretch_has_fewer_than_four_of_ten_readings_that_agree(agreeing, foun
     [
         (False, ["odometry-unit"], ["A", "B"], False),
         (False, ["odometry-unit", "sustained-outliers"], ["A", "B"], True),
+        (False, ["odometry-unit"], ["A", "B", "C", "bad D"], True),
+        (False, ["odometry-unit"], ["A", "B", "C", "D", "bad E"], False),
         (False, ["odometry-unit"], ["A", "A@2"], True),
         (True, ["odometry-unit", "sustained-outliers"], ["A", "A@2"], False),
         (False, ["sustained-outliers"], ["A", "A@2"], False),
@@ -48,7 +50,8 @@ def test_another_unit_is_doubted_where_it_rests_on_ranges_that_contradict_each_o
     stages = Stages(None, None)
     for kind in kinds:
         stages.warn(kind, "warned of before")
-    check_unit(names, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
+    anchors = [SimpleNamespace(id=n.split()[-1], status="distrusted" if "bad" in n else "ok") for n in names]
+    check_unit(anchors, SimpleNamespace(recordings=SimpleNamespace(have_scans=have_scans), stages=stages))
     assert [notice.kind for notice in stages.doubts] == ["odometry-unit"] * doubted
 
 

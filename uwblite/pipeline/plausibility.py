@@ -55,7 +55,7 @@ def judge(
         check_residuals(estimate, table["residual"], task)
     else:
         check_residuals(estimate, np.zeros(0), task)
-    check_unit(estimate.anchor_ids, task)
+    check_unit(anchors, task)
     check_halves(estimate, task)
     check_drifts(estimate, task)
     check_untied_parts(estimate, task)

@@ -44,15 +44,18 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
             )  # fmt: skip
 
 
-def check_unit(anchor_ids: Sequence[str], task: Task) -> None:
+def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     """Doubt another unit of the wheels where it rests on ranges alone, and these contradict each other."""
     kinds = {notice.kind for notice in task.stages.warnings}
     if task.recordings.have_scans or "odometry-unit" not in kinds:
         return
-    if "sustained-outliers" in kinds or any(name_and_number(name)[1] > 1 for name in anchor_ids):
+    statuses = [anchor.status for anchor in anchors]
+    few = "distrusted" in statuses and sum(status not in ("distrusted", "unplaced") for status in statuses) <= _ENOUGH
+    if few or "sustained-outliers" in kinds or any(name_and_number(anchor.id)[1] > 1 for anchor in anchors):
         text = (
-            "the unit that the wheels were given rests on the ranges alone, and an anchor was moved or disagrees for long; "
-            "give the anchors' places, or the distance between two"
+            "the unit that the wheels were given rests on the ranges alone, and "
+            + ("an anchor is distrusted: too few are left to check it" if few else "an anchor was moved or disagrees for long")
+            + "; give the anchors' places, or the distance between two"
         )
         task.stages.doubt("odometry-unit", text)
 
