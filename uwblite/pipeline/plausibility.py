@@ -27,8 +27,10 @@ _UNUSUAL = 3.0
 _RADIO_OR_WHEELS = "check the radio's settings and, where no lidar measures the distances, the scale of the wheels"
 _LOST_WAY = 0.03
 """Share of their way that wheels have lost by the ranges, where they lost some, from which on a map is too short."""
-_WRONG_TURNS = 0.25
-"""Relative error of the odometry's turns beyond which their sign is no longer sure."""
+_WRONG_TURNS, _SLIPS_AT_MOST = 0.25, 0.4
+"""Relative error of the odometry's turns beyond which their sign is no longer sure: where they are too small, and where too
+large. Wheels that slip in turns count too much, never too little: skid steering turns as if its track were wider, here by
+two thirds at most."""
 _POOR_FIT = 4.0
 """chi2 per degree of freedom beyond which errors are twice what the noise allows: the model does not hold."""
 
@@ -266,7 +268,7 @@ def check_handedness(estimate: Estimate, task: Task) -> None:
                 f"and by {-factor:.2f} its mirror image fits as well; check sign and scale of the odometry's heading, "
                 "or give the places of three anchors"
             )
-        if wrong and abs(error) > _WRONG_TURNS:
+        if wrong and not -_SLIPS_AT_MOST <= error <= _WRONG_TURNS:
             task.stages.doubt("mirrored", text, factor=factor)
 
 
