@@ -1,4 +1,4 @@
-"""Parts of a map that only the odometry ties are a doubt; a gap that scans, closures or anchors bridge is none."""
+"""Parts of a map that only the odometry ties, or holds, are a doubt; a gap that scans, closures or anchors bridge is none."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,7 @@ from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.untied_parts import check_untied_parts
+from uwblite.pipeline.untied_parts import _PER_METRE, _PER_SECOND, check_untied_parts, dead_reckoning_error
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog
 
 STAMPS = np.arange(100.0)
@@ -34,20 +34,32 @@ def scan_edge(i, j):
     return ScanEdges(np.array([i]), np.array([j]), none, np.eye(3)[None], none, none, scan_indices(Calibration()))
 
 
-def untied(ranges=None, scans_at=None, edges=(), poses=POSES):
-    """Return from when to when the parts of a drive of 100 keyframes are untied."""
+def doubts(ranges=None, scans_at=None, edges=(), poses=POSES):
+    """Return the figures of the doubts of a drive of 100 keyframes."""
     readings = None if scans_at is None else np.ones((len(scans_at), 3), np.float32)
     scans = None if scans_at is None else LaserScans(scans_at, readings, -1.0, 1.0, 0.0, 0.0, 5.0)
     log = SensorLog(Odometry(STAMPS, poses), None, scans)
+    lengths = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    frames = SimpleNamespace(stamps=STAMPS, path=lengths, duration=np.diff(STAMPS))
     recording = SimpleNamespace(
-        log=log, frames=SimpleNamespace(stamps=STAMPS), rows=slice(0, 100), has=lambda keyframe: keyframe < 100,
+        log=log, frames=frames, rows=slice(0, 100), has=lambda keyframe: keyframe < 100,
         has_scans=scans is not None,
     )  # fmt: skip
     stages = Stages(None, None)
     graph = Graph(poses, np.zeros((4, 2)), edges=edges)
     task = SimpleNamespace(recordings=SimpleNamespace(each=[recording]), stages=stages)
     check_untied_parts(SimpleNamespace(graph=graph, ranges=ranges), task)
-    return [(n.figures["start"], n.figures["end"]) for n in stages.doubts]
+    return [n.figures for n in stages.doubts]
+
+
+def untied(*args, **settings):
+    """Return from when to when the parts of a drive of 100 keyframes are untied."""
+    return [(found["start"], found["end"]) for found in doubts(*args, **settings) if "start" in found]
+
+
+def loose(*args, **settings):
+    """Return until when and from when no sensor holds a drive of 100 keyframes."""
+    return [found["at"] for found in doubts(*args, **settings) if "at" in found]
 
 
 @pytest.mark.parametrize("gap", [1.0, 20.0])
@@ -91,3 +103,59 @@ def test_a_robot_that_stands_needs_no_scans():
 def test_a_part_of_a_few_keyframes_is_too_small_for_a_word(first, last, named):
     """At either end: so many keyframes before the silence, or behind it."""
     assert len(untied(scans_at=np.concatenate([np.arange(0.0, first), np.arange(last, 100.0)]))) == named
+
+
+def test_a_sensor_that_is_silent_for_good_leaves_a_loose_end():
+    assert loose(measured((0, 100))) == []
+    assert loose(measured((0, 50), (0, 40))) == [47.0], "the third keyframe from the end of what is held"
+    assert loose(measured((50, 100))) == [52.0]
+    assert loose(measured((30, 60))) == [32.0, 57.0]
+    assert loose(measured((0, 30), (70, 100))) == [], "held from both sides"
+    assert loose(measured((0, 90))) == [], "3 m only"
+
+
+def test_a_few_ranges_hold_nothing():
+    assert loose(measured((0, 50), (98, 100))) == [49.0]
+    assert loose(measured((0, 50), (97, 100))) == []
+    assert loose(measured((50, 52))) == [0.0], "the whole way"
+
+
+def test_scans_and_closures_hold_an_end_as_ranges_do():
+    neighbours = tuple(scan_edge(k, k + 1) for k in range(50))
+    assert loose(edges=neighbours) == [48.0]
+    assert loose(edges=(*neighbours, scan_edge(20, 97), scan_edge(21, 98), scan_edge(22, 99))) == []
+    assert loose(measured((0, 100)), edges=neighbours) == []
+
+
+def test_a_robot_that_stands_goes_not_astray():
+    assert loose(measured((0, 50)), poses=0.01 * POSES) == []
+
+
+def test_an_end_without_any_measurement_anywhere_is_another_doubt():
+    assert doubts() == []
+
+
+def test_dead_reckoning_error_is_what_a_drifting_heading_does():
+    """To first order: places rebuilt from headings that drift by little."""
+    rng = np.random.default_rng(4)
+    durations = rng.uniform(0.5, 2.0, 60)
+    steps = rng.uniform(0.1, 0.4, (60, 1)) * np.column_stack([np.cos(a := np.cumsum(rng.normal(0, 0.4, 60))), np.sin(a)])
+    lengths, small = np.hypot(*steps.T), 1e-4
+    places = np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    moved = []
+    for drift in (_PER_METRE * lengths, _PER_SECOND * durations):
+        turned = small * (np.cumsum(drift) - drift / 2.0)
+        c, s = np.cos(turned), np.sin(turned)
+        bent = np.column_stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]])
+        moved.append(np.append(0.0, np.hypot(*(np.cumsum(bent - steps, axis=0)).T)) / small)
+    assert np.allclose(dead_reckoning_error(places, lengths, durations), np.hypot(*moved), rtol=1e-2, atol=1e-4)
+
+
+def test_a_way_around_errs_less_than_one_straight_on():
+    turn = np.linspace(0.0, 2.0 * np.pi, 101)
+    circle = np.column_stack([np.cos(turn), np.sin(turn)]) * 10.0 / np.pi
+    straight = np.column_stack([np.linspace(0.0, 20.0, 101), np.zeros(101)])
+    lengths, none = np.full(100, 0.2), np.zeros(100)
+    around, ahead = (dead_reckoning_error(places, lengths, none)[-1] for places in (circle, straight))
+    assert ahead == pytest.approx(_PER_METRE * 20.0**2 / 2.0)
+    assert around == pytest.approx(_PER_METRE * 20.0 * 10.0 / np.pi, rel=0.01)
