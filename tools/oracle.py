@@ -1,9 +1,9 @@
 """What the measurements of a simulated recording allow: least squares with true associations and true noise, from the truth.
 
-Poses, anchors, walls, columns and their radii, the range offsets of surfaces, the wheels' calibration, the anchors' biases and
-the antennas' patterns are all unknown. Known are which surface each ray hit, which steps slipped, which ranges were
-shadowed by what, and how all errors are distributed: the multipath of an anchor, and what patches of floor add to steps,
-as Gaussian processes over the floor. The maximum-likelihood optimum is found by Gauss-Newton from the truth; its
+Poses, anchors, walls, columns and their radii, the range offsets of surfaces, the wheels' calibration, the radio's unit, the
+anchors' biases and the antennas' patterns are all unknown. Known are which surface each ray hit, which steps slipped, which
+ranges were shadowed by what, and how all errors are distributed: the multipath of an anchor, and what patches of floor add to
+steps, as Gaussian processes over the floor. The maximum-likelihood optimum is found by Gauss-Newton from the truth; its
 covariance is the Cramer-Rao bound.
 
     residuals   wheels   log of the step against the calibrated step, (x, y, theta)
@@ -26,6 +26,7 @@ from simulation.recording import Recording, hidden_ranges
 
 from uwblite import se2
 from uwblite.evaluation.trajectory import align
+from uwblite.graph.calibration import CalibrationConfig
 from uwblite.odometry import keyframes
 from uwblite.odometry.attached import attach_ranges, choose_scans, scan_points
 from uwblite.odometry.keyframes import KeyframeConfig
@@ -55,6 +56,8 @@ _WHEELS = 3
 """Unknowns of the wheels: scale of distance, scale of heading, heading per metre."""
 _PATTERN = 6
 """Unknowns of an antenna's pattern: cosine and sine of one, two and three times the direction."""
+_UNIT = CalibrationConfig().range_scale_sound
+"""Relative standard deviation of the unit of a sound radio: what a map assumes, too."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,8 @@ class _Layout:
         begin += _WHEELS
         self.bias = begin + np.arange(anchors)
         begin += anchors
+        self.scale = begin
+        begin += 1
         self.patterns = begin + np.arange(_PATTERN * (anchors + 1)).reshape(-1, _PATTERN)
         self.shared = begin + _PATTERN * (anchors + 1)
         """Unknowns in front of those of surfaces."""
@@ -152,6 +157,7 @@ class Oracle:
         """Return the truth as the vector of unknowns."""
         x, layout = np.zeros(self.layout.size), self.layout
         x[layout.poses[1:].ravel()] = self.truth[1:].ravel()
+        x[layout.scale] = self.recording.settings.radio.scale
         if self.anchors:
             x[layout.anchors] = self.recording.anchors
         for k, surface in enumerate(self.seen.tolist()):
@@ -287,16 +293,22 @@ class Oracle:
         return np.asarray((effects[0] + effects[1]).reshape(alike.shape[0] * 3, -1))
 
     def _priors(self) -> tuple[sparse.csr_matrix, Floats]:
-        """Return what is known of the scalars beforehand: the distributions they were drawn from."""
+        """Return what is known of the scalars beforehand: the distributions they were drawn from.
+
+        The radio's unit is drawn from none; it is taken for that of a sound radio.
+        """
         layout, model = self.layout, self.recording.settings.radio
         pattern = self._antenna_sd() * np.sqrt(0.5 / 3.0)
         offset = self.recording.settings.laser.surface_sd if self.rooms is None else self.rooms.surface_sd
-        which = np.concatenate([layout.wheels, layout.bias, layout.patterns.ravel(), layout.offset, layout.radius])
+        scalars = [layout.wheels, layout.bias, [layout.scale], layout.patterns.ravel(), layout.offset, layout.radius]
+        which = np.concatenate(scalars)
         bias = np.full(len(layout.bias), max(model.bias_sd, 1e-4))
         patterns = np.full(layout.patterns.size, max(pattern, 1e-6))
         offsets, radii = np.full(len(layout.offset), max(offset, 1e-6)), np.full(len(layout.radius), _ANY_RADIUS)
-        sd = np.concatenate([[0.05, 0.05, 0.02], bias, patterns, offsets, radii])
-        return self._rows(which[:, None], 1.0 / sd[:, None]), self.x[which] / sd
+        sd = np.concatenate([[0.05, 0.05, 0.02], bias, [_UNIT], patterns, offsets, radii])
+        off = self.x.copy()
+        off[layout.scale] -= model.scale
+        return self._rows(which[:, None], 1.0 / sd[:, None]), off[which] / sd
 
     def _antenna_sd(self) -> float:
         """Return the standard deviation of what the direction in which an antenna is hit adds to a range, m."""
@@ -360,17 +372,19 @@ class Oracle:
         wave = [_harmonics(bearing - heading), _harmonics(bearing)]
         body, world = layout.patterns[-1], layout.patterns[number]
         patterns = (wave[0] * self.x[body]).sum(axis=1) + (wave[1] * self.x[world]).sum(axis=1)
-        residual = model.scale * distance + self.x[layout.bias[number]] + patterns - attached.ranges
-        unit = model.scale * away / distance[:, None]
+        scale = self.x[layout.scale]
+        residual = scale * distance + self.x[layout.bias[number]] + patterns - attached.ranges
+        unit = scale * away / distance[:, None]
         values = np.concatenate(
             [
-                unit, (unit[:, 1] * arm[:, 0] - unit[:, 0] * arm[:, 1])[:, None], -unit, np.ones((len(unit), 1)), *wave
+                unit, (unit[:, 1] * arm[:, 0] - unit[:, 0] * arm[:, 1])[:, None], -unit, np.ones((len(unit), 1)),
+                distance[:, None], *wave,
             ], axis=1,
         )
         columns = np.concatenate(
             [
                 layout.poses[attached.keyframe], layout.anchors[number], layout.bias[number][:, None],
-                np.broadcast_to(body, (len(unit), _PATTERN)), world,
+                np.full((len(unit), 1), layout.scale), np.broadcast_to(body, (len(unit), _PATTERN)), world,
             ], axis=1,
         )
         if self._excesses is None:
