@@ -5,11 +5,10 @@
     python tools/faults.py --only frozen --print         cases whose names contain a word
     python tools/faults.py --worlds hall,kasdorf --minutes 5 --sensors all,no-lidar --print
 
-A case is silently wrong when the map is trusted (exit code 0) and yet the trajectory is off by more than 0.5 m (rms), or
-an anchor that is called ok by more than 1 m and three standard deviations. "Said" is what is doubted, or refused with exit
-code 1, which counts as wrong. The truth of a real recording is its map without a fault, whose own standard deviations
-count as well. Without lidar and without given anchors
-nothing but the odometry distinguishes a map from its mirror image: there the result is judged up to reflection.
+A map is wrong when its trajectory is off by more than 0.5 m (rms), or an anchor that is called ok by more than 1 m and
+three standard deviations. The truth of a real recording is its map without a fault, whose own standard deviations count as
+well. Without lidar and without given anchors nothing but the odometry distinguishes a map from its mirror image: there the
+result is judged up to reflection.
 """
 
 import one_thread  # noqa: F401
@@ -21,7 +20,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ import numpy as np
 from faulting.case import Case, Fault, Floats, Ints
 from faulting.every import FAULTS
 from faulting.logs import two_buildings, two_robots
+from faulting.outcome import ANCHOR_BAR, CRASHED, VERDICTS, Outcome, by_kind, counted, summary
 from simulation.recording import Settings
 from trials import ROOT, SHARED, made, table, write_section
 
@@ -44,10 +44,6 @@ from uwblite.map_result import AnchorEstimate, MapResult
 from uwblite.mapping import build_map
 from uwblite.sensor_log import Odometry, SensorLog, UwbRanges
 
-ATE_BAR = 0.5
-"""m; a trusted map with more is silently wrong."""
-ANCHOR_BAR = 1.0
-"""m, beyond three standard deviations."""
 TIME_BAR = 60.0
 """s."""
 
@@ -76,41 +72,6 @@ def sorted_log(case: Case) -> tuple[SensorLog, Floats]:
 
 def _stopped(signum: int, frame: object) -> None:
     raise TimeoutError(f"stopped after {TIME_BAR:.0f} s")
-
-
-VERDICTS = ("right", "said, right", "said, wrong", "false alarm", "SILENTLY WRONG", "INTERNAL ERROR", "TOO LONG")
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of one case."""
-
-    world: str
-    name: str
-    sensors: str
-    ate: float
-    """m; nan where there is no map."""
-    anchor: float
-    """Worst error among the anchors that are called ok, m; nan without any."""
-    beyond: float
-    """By how much the worst of them exceeds 1 m and three standard deviations, m."""
-    exit_code: int
-    stated: tuple[str, ...]
-    """Doubts, or the error."""
-    check: int
-    """Exit code of `uwblite check`."""
-    seconds: float
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def verdict(self) -> str:
-        """One of VERDICTS; those in capitals are faults of the program."""
-        wrong = self.ate > ATE_BAR or self.beyond > 0.0
-        if self.exit_code == 4:
-            return "TOO LONG" if "stopped after" in self.stated[0] else "INTERNAL ERROR"
-        if self.exit_code == 0:
-            return "SILENTLY WRONG" if wrong else "right"
-        return "false alarm" if self.name == "none" else "said, wrong" if wrong or self.exit_code == 1 else "said, right"
 
 
 def judged(
@@ -169,6 +130,7 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
     case = fault(case, np.random.default_rng(7))
     figures = (float("nan"), float("nan"), -np.inf)
     stated: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     check, seconds = -1, 0.0
     log, truth = sorted_log(case)
@@ -179,20 +141,22 @@ def tried(task: tuple[str, str, str, Case, Fault]) -> Outcome:
         result = build_map(log)
         figures = judged(result, log.odometry.stamps, truth, case, sensors == "no-lidar")
         stated, warnings = tuple(map(str, result.doubts)), tuple(map(str, result.warnings))
+        kinds = tuple(doubt.kind for doubt in result.doubts)
         code, seconds = 3 if result.doubts else 0, time.process_time() - began
         signal.setitimer(signal.ITIMER_PROF, TIME_BAR)
         check = checked(log, anchors=result.anchors, calibration=result.calibration, doubts=result.doubts)
     except TimeoutError as error:
-        stated, code = (str(error),), 4
+        stated, code = (str(error),), CRASHED
     except UwbliteError as error:
         stated, code = (str(error),), 1
         check = checked(log, refused=str(error))
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
-        stated, code = (f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})",), 4
+        stated, code = (f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})",), CRASHED
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
-    return Outcome(world, name, sensors, *figures, code, stated, check, seconds or time.process_time() - began, warnings)
+    seconds = seconds or time.process_time() - began
+    return Outcome(world, name, sensors, *figures, code, stated, kinds, check, seconds, warnings)
 
 
 WITH_ANOTHER = {"two robots in one log": two_robots, "two buildings in one log": two_buildings}
@@ -247,16 +211,26 @@ def real_case(path: Path) -> Case:
     return Case(log, result.trajectory, {a.id: [a.position] for a in placed}, known)
 
 
-def shown(outcome: Outcome) -> list[object]:
-    """Return the row of an outcome."""
-    stated = "; ".join(outcome.stated)
-    return [
-        outcome.world, outcome.name, outcome.sensors, outcome.ate, outcome.anchor, outcome.exit_code, outcome.check,
-        outcome.verdict, stated if len(stated) < 160 else stated[:157] + "...", f"{outcome.seconds:.0f}",
-    ]  # fmt: skip
+def line(outcome: Outcome) -> str:
+    """Return what became of a case in one line of text."""
+    anchor = f"anchor {outcome.anchor:.3f}, exit code {outcome.exit_code}, check {outcome.check}, {outcome.seconds:.0f} s"
+    case = f"{outcome.world} | {outcome.name} | {outcome.sensors}"
+    return f"{case} | {outcome.verdict} | ATE {outcome.ate:.3f}, {anchor} | {'; '.join(outcome.stated)}"
 
 
-HEAD = ("recording", "fault", "sensors", "ATE", "worst anchor called ok", "exit code", "check", "verdict", "what is said", "s")
+def write_page(page: Path, done: Sequence[Outcome], minutes: float) -> None:
+    """Write the tables of all outcomes, and the line that sums them up, between their marks in the page."""
+    words = "\n".join(f"- *{verdict}*: {meaning}" for verdict, meaning in VERDICTS.items())
+    meaning = (__doc__ or "").split("\n\n")[-1].strip()
+    text = (
+        f"## Faults\n\nFaults of sensors and of users, put into {minutes:g} min of a simulated recording or into a real one.\n"
+        f"{meaning}\n\n{words}\n\n{summary(done)}.\n\n{table(*counted(done))}\n"
+        "### Every kind of fault\n\nThe number is the error of the trajectory (ATE), m. The last column has the kinds of all "
+        "doubts of the row, the most\nfrequent first; [formats.md](formats.md#warnings-and-doubts) explains them.\n\n"
+        f"{table(*by_kind(done))}"
+    )
+    write_section(page, "faults", text)
+    write_section(page, "faults in short", f"{summary(done)}.")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -285,15 +259,12 @@ def main(argv: list[str] | None = None) -> int:
     done = []
     for outcome in outcomes(tasks, args.jobs):
         done.append(outcome)
-        print(" | ".join(f"{c:.3f}" if isinstance(c, float) else str(c) for c in shown(outcome)), flush=True)
+        print(line(outcome), flush=True)
         if args.verbose:
             print(*(f"      warning: {w}" for w in outcome.warnings), sep="\n", flush=True)
-    counts = "; ".join(f"{v}: {sum(o.verdict == v for o in done)}" for v in VERDICTS)
-    summary = f"{counts}; of {len(done)} rows of {len({o.name for o in done})} kinds"
-    print(summary)
+    print(summary(done))
     if not args.print:
-        text = f"## Faults\n\n{__doc__.split(chr(10) * 2)[-1].strip()}\n\n{summary}.\n\n{table(HEAD, [shown(o) for o in done])}"
-        write_section(ROOT / "docs" / "accuracy.md", "faults", text)
+        write_page(ROOT / "docs" / "accuracy.md", done, args.minutes)
     return 1 if any(o.verdict.isupper() for o in done) else 0
 
 

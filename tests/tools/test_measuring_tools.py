@@ -149,6 +149,14 @@ def test_what_is_left_out_of_recordings_of_others_has_settings():
     assert accuracy.WITHOUT_RADIO[0] == next(iter(accuracy.INGREDIENTS))
 
 
+def test_perturbed_runs_of_a_recording_are_one_row():
+    """The worst and the mean are of the perturbed runs alone; a doubt names the run that has it."""
+    runs = [(0.1, []), (0.2, []), (0.4, ["uncertain", "no-closure"])]
+    row = accuracy.row_of_runs(runs, "0.3", [True, True, False])
+    assert row == [0.1, "0.3", "yes", "1 of 2", pytest.approx(0.3), 0.4, "uncertain, no-closure (perturbed 2)"]
+    assert accuracy.row_of_runs([(0.5, ["mirrored"])], "0.3", [False]) == [0.5, "0.3", "**no**", "-", "-", "-", "mirrored"]
+
+
 def test_recordings_that_no_part_has_are_named(capsys):
     with pytest.raises(SystemExit):
         accuracy.main(["simulated", "--only", "hall,bungalow", "--print"])
