@@ -88,7 +88,7 @@ def test_wheels_that_turn_too_much(sound):
 def test_jumps_gaps_and_equal_stamps(without_scans):
     jumped = without_scans.odometry.poses.copy()
     jumped[700:] += (2.0, 0.0, 0.0)
-    assert_named(with_poses(without_scans, jumped), "warning", "breaks at t = 34.9 s (by up to 2.00 m)")
+    assert_named(with_poses(without_scans, jumped), "warning", "jumps at t = 34.9 s (by up to 2.00 m)")
     stamps = without_scans.odometry.stamps
     late = replace(without_scans.odometry, stamps=stamps + np.where(np.arange(len(stamps)) > 700, 9.0, 0.0))
     assert_named(replace(without_scans, odometry=late), "warning", "longest is 9.1 s")

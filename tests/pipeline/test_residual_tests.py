@@ -226,8 +226,8 @@ def test_what_ranges_say_of_the_scale_of_wheels_and_lidar_is_said(placed, outcom
 
 
 @pytest.mark.parametrize(("off", "steps", "said"), [
-    (0.29, 0.0, None), (0.31, 0.0, "the ranges lie 0.31 m (typically) off the map, and only 0.0"), (0.31, 0.2, None),
-    (1.6, 0.6, "the ranges scatter by 1.6 m: they are no distances"), (1.4, 0.6, None),
+    (0.29, 0.0, None), (0.31, 0.0, "the ranges differ from the map by 0.31 m (median), but from one to the next by 0.0"),
+    (0.31, 0.2, None), (1.6, 0.6, "the ranges scatter by 1.6 m about the map: they are not distances"), (1.4, 0.6, None),
 ])  # fmt: skip
 def test_ranges_scatter_more_than_from_one_to_the_next(off, steps, said):
     """Three anchors whose residuals, of either sign for a whole half, are off by so much; the typical one counts."""

@@ -48,8 +48,8 @@ def test_a_heading_against_its_path_is_mended_as_the_laser_shows(monkeypatch, se
     done, (remark,) = heading_with_the_path(SensorLog(odometry))
     sign = [1.0, 1.0, -1.0] if "heading" in changed else [1.0, -1.0, 1.0]
     np.testing.assert_array_equal(done.odometry.poses, odometry.poses * sign)
-    assert (remark.kind, f"path: {changed} was changed" in remark.text) == ("heading-against-path", True)
-    assert ("mirror image" in remark.text) == open_sign
+    assert (remark.kind, f"path: {changed} was inverted" in remark.text) == ("heading-against-path", True)
+    assert ("whether the map is mirrored" in remark.text) == open_sign
     assert heading_with_the_path(done) == (done, [])
 
 
@@ -79,4 +79,4 @@ def test_turns_show_whether_the_laser_or_the_way_of_driving_is_turned(angle, aro
     assert abs(se2.wrap_angle(done.mounting.T_base_laser[2] - mount[2])) < 0.05
     moved = np.append(se2.rotate(angle, tag[:2]), 0.6) if around else tag
     np.testing.assert_allclose(done.mounting.tag_position, moved, atol=0.01)
-    assert f"looks {np.degrees(angle):+.0f}"[:8] in remark.text
+    assert f"differs by {np.degrees(angle):+.0f}"[:13] in remark.text

@@ -46,7 +46,7 @@ def test_two_anchors_with_one_name_are_left_out(seed):
     done, (remark,) = without_shared_names(log)
     assert remark.kind == "shared-name"
     assert not remark.doubt
-    assert "two anchors answer to the name A:" in remark.text
+    assert "two anchors seem to have the name A:" in remark.text
     assert done.ranges.anchor_ids == ("C",)
     np.testing.assert_array_equal(done.ranges.ranges, log.ranges.ranges[log.ranges.anchor == 1])
     assert without_shared_names(done) == (done, [])

@@ -101,7 +101,7 @@ def test_a_scan_that_stands_three_times_was_not_measured_again(repeats, seen, le
     log = SensorLog(driving(), None, scans(readings))
     done, remarks = without_repeated_scans(log)
     np.testing.assert_array_equal(done.scans.stamps, np.delete(np.arange(20.0), np.arange(6, 6 + left_out)))
-    assert [r.text.split(" to the")[0] for r in remarks] == [f"{left_out} of 20 scans repeat the one before"] * bool(left_out)
+    assert [r.text.split(" (t =")[0] for r in remarks] == [f"{left_out} of 20 scans equal the scan before"] * bool(left_out)
     assert all(f"t = 6 to {5 + left_out} s" in r.text for r in remarks)
 
 
@@ -203,7 +203,7 @@ def test_a_mark_counts_once_at_each_place_and_of_each_anchor():
     log, values = at_places(10)
     done, (remark,) = without_marks(log)
     np.testing.assert_array_equal(done.ranges.ranges, values[values < 60.0])
-    assert remark.text.startswith("20 of 40 ranges are 65.5 m")
+    assert remark.text.startswith("20 of 40 ranges are exactly 65.5 m")
     for other in (at_places(9)[0], at_places(40, standing=True)[0]):
         assert without_marks(other) == (other, [])
     # What one anchor alone repeats is stuck; no reading at all is another matter.
@@ -225,14 +225,14 @@ def test_readings_of_the_lidar_that_are_marks():
         done, remarks = without_lidar_marks(log)
         assert len(remarks) == found
         if found:
-            assert remarks[0].text.startswith(f"{places * 5} of {places * 50} readings of the lidar are 5.5 m")
-            assert "a mark, or the robot itself" in remarks[0].text
+            assert remarks[0].text.startswith(f"{places * 5} of {places * 50} readings of the lidar are exactly 5.5 m")
+            assert "a code, or a part of the robot" in remarks[0].text
             assert np.isnan(done.scans.ranges[:, ::10]).all()
             assert done.scans.range_max == 30.0
             np.testing.assert_array_equal(np.delete(done.scans.ranges, np.s_[::10], 1), np.delete(readings, np.s_[::10], 1))
             farthest = replace(log, scans=replace(log.scans, ranges=np.where(readings == 5.5, np.float32(9.5), readings)))
             done, remarks = without_lidar_marks(farthest)
-            assert "marks with it what it did not see" in remarks[0].text
+            assert "reports its reach where it sees nothing" in remarks[0].text
             assert np.isposinf(done.scans.ranges[:, ::10]).all()
             assert done.scans.range_max == 9.5
             for limits in ({"range_max": 9.4}, {"range_min": 9.6, "range_max": 30.0}):

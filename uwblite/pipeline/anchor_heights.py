@@ -68,7 +68,7 @@ def check_heights(estimate: Estimate, task: Task) -> None:
         return
     taken, instead = ("high", "low") if other.taken else ("low", "high")
     text = (
-        f"the ranges fit anchors that hang {other.high:.1f} m above the tag and low ones nearly alike: taken as {taken}; "
-        f"if they are {instead}, the trajectory is another one by {other.apart:.1f} m (rms); give the anchors' heights"
+        f"the ranges fit anchors {other.high:.1f} m above the tag about as well as low ones: taken as {taken}; if they are "
+        f"{instead}, the trajectory differs by {other.apart:.1f} m (rms); give the anchors' heights (--anchor-height)"
     )
     task.stages.doubt("anchor-heights", text, height=other.high, taken=taken, apart=other.apart)

@@ -107,8 +107,9 @@ def _check_open_loops(base: Graph, found: Closures, stretches: Submaps, with_ran
     a, b = (float(recordings.stamps[stretches.reference[k[0]]] - recordings.stamps[0]) for k in (left.target, left.source))
     sigma = float(left.spread[0]) / 3.0
     text = (
-        f"what was seen at t = {a:.0f} s and at t = {b:.0f} s may be the same place, known to {sigma:.1f} m only, and no scans "
-        f"decide it ({len(left.target)} such pairs): drive there once more in the same direction, or give the closure"
+        f"the scans at t = {a:.0f} s and at t = {b:.0f} s may show the same place, but their relative position is known to "
+        f"{sigma:.1f} m only and no scan match confirms it ({len(left.target)} such pairs): drive there once more in the same "
+        "direction, or force the closure (uwblite view)"
     )
     task.stages.doubt("open-loops", text, pairs=len(left.target), first=a, second=b, sigma=sigma)
 

@@ -50,12 +50,12 @@ def check_drifts(estimate: Estimate, task: Task) -> None:
         of_wheels = added_unknown(graph, wheels, scale[None])
         (grown, delay, scaled), sigmas = (np.concatenate(parts) for parts in zip(of_ranges, of_wheels, strict=True))
         for value, sigma, limit, text in (
-            (grown, sigmas[0], _LONGER, f"all ranges seem to grow by {grown:.1f} m over the recording: a radio that warms up?"),
-            (delay, sigmas[1], _LATE, f"the ranges seem {-delay:.1f} s late, or more: do radio and odometry share a clock?"),
-            (scaled, sigmas[2], _SCALE, f"the wheels' ways seem to change by {scaled:+.0%} over the recording: worn, or flat?"),
+            (grown, sigmas[0], _LONGER, f"all ranges seem to grow by {grown:.1f} m over the recording (radio warming up?)"),
+            (delay, sigmas[1], _LATE, f"the ranges seem to be late by {-delay:.1f} s or more (two clocks?)"),
+            (scaled, sigmas[2], _SCALE, f"the odometry's scale seems to change by {scaled:+.0%} (tyres flat or worn?)"),
         ):
             if abs(value) > max(limit, _SIGMAS * sigma):
-                why = f"{text} Without a lidar such a drift bends path and anchors and leaves small residuals"
+                why = f"{text}: without a lidar this bends path and anchors and leaves small residuals; record with a lidar"
                 task.stages.doubt("drift", why, value=float(value), sigma=float(sigma))
     _check_turns(graph, wheels, rec.stamps, task)
 
@@ -73,7 +73,7 @@ def _check_turns(graph: Graph, wheels: OdometryEdges, stamps: Floats, task: Task
     if len(wrong):
         worst = wrong[np.argmax(np.abs(turns[wrong]) / sigmas[wrong])]
         at, turn = float(stamps[wheels.i[steps[worst, 0]]] - stamps[0]), float(np.abs(turns[worst]))
-        why = f"from t = {at:.0f} s the odometry turns by {turn:.1f} rad too much or little in some metres: does a wheel slip?"
+        why = f"from t = {at:.0f} s the ranges contradict the odometry by {turn:.1f} rad within some metres: did a wheel slip?"
         task.stages.doubt("odometry-slips", why, turn=turn, sigma=float(sigmas[worst]), at=at)
 
 

@@ -128,8 +128,8 @@ def occupancy_grid(estimate: Estimate, task: Task) -> OccupancyGrid | None:
     if grid.scans_astray:
         stages.doubt(
             "scans-astray",
-            f"{grid.scans_astray} of {grid.scans_astray + grid.scans_used} scans lie so far from the others that no map holds"
-            " both; they are not drawn",
+            f"{grid.scans_astray} of {grid.scans_astray + grid.scans_used} scans are so far from the others that no grid"
+            " can hold both; they are not drawn",
             scans=grid.scans_astray,
         )
     _check_resolution(grid.geometry, config.grid.resolution, task)

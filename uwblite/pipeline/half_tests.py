@@ -55,8 +55,9 @@ def _compare(one: Floats, other: Floats, task: Task) -> None:
     for k, (kind, most) in enumerate(_CHANGES.items()):
         if difference[k] > max(most, _SIGMAS * sigma[k]):
             text = (
-                f"the halves of the recording need different wheels ({kind} {one[k, 0]:+.3f} and {other[k, 0]:+.3f}, where the "
-                f"difference is known to {sigma[k]:.3f}): wheels, gyro or ranges changed on the way"
+                f"the halves of the recording need different calibrations of the wheels ({kind} {one[k, 0]:+.3f} and "
+                f"{other[k, 0]:+.3f}, difference known to {sigma[k]:.3f}): wheels, gyro or ranges changed meanwhile; "
+                "map the halves separately"
             )
             task.stages.doubt("halves-disagree", text, first=float(one[k, 0]), second=float(other[k, 0]), sigma=float(sigma[k]))
 
@@ -105,8 +106,8 @@ def _check_sign_of_turns(recording: Recording, task: Task) -> None:
     turned, mirrored = _misfit(p, q), _misfit(p * (1.0, -1.0), q)
     if turned > max(_FAR, _CLEARLY * mirrored):
         text = (
-            f"the anchors by the first and the second half of the recording are mirror images of each other ({turned:.1f} m "
-            f"apart, {mirrored:.1f} m as mirror images): the turns that the odometry counts are wrong in one of them"
+            f"the anchors found from the first and from the second half of the recording are mirror images ({turned:.1f} m "
+            f"apart, {mirrored:.1f} m when mirrored): the odometry's turns are wrong in one of the halves"
         )
         task.stages.doubt("halves-disagree", text, apart=turned, mirrored=mirrored)
 

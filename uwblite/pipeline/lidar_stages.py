@@ -282,7 +282,7 @@ def check_map_consistency(estimate: Estimate, task: Task) -> Estimate:
         task.stages.doubt(
             "free-space-violation",
             f"{share:.0%} of what was seen on one visit to a place stands where another visit saw free space: "
-            "parts of the map lie in a wrong place to each other",
+            "parts of the map are misplaced to each other; look at the closures in report.html",
             share=round(share, 4), visits=visits,
         )  # fmt: skip
     return estimate

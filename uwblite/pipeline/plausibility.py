@@ -78,7 +78,7 @@ def check_certainty(estimate: Estimate, sigma: float, task: Task) -> None:
     if sigma > min(_UNCERTAIN, _UNCERTAIN_SHARE * extent):
         text = (
             f"the shape of the path is known to {sigma:.1f} m (rms) only, in an area {extent:.0f} m across: too few ranges and "
-            "scans hold the trajectory"
+            "scans constrain the trajectory; add anchors, or drive where the lidar sees walls"
         )
         task.stages.doubt("uncertain", text, sigma=sigma, extent=extent)
 
@@ -100,14 +100,14 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
             text = f"anchor {anchor.id} is {anchor.status}: {anchor.reason}"
             add(f"anchor-{anchor.status}", text, anchor=anchor.id)
     if anchors and all(a.status == "unplaced" for a in anchors):
-        text = "no anchor could be placed: the trajectory rests on odometry and lidar alone"
+        text = "no anchor could be placed: the trajectory rests on odometry and lidar alone; drive curves near the anchors"
         task.stages.doubt("no-anchor", text)
     count = sum(a.ranges for a in anchors if a.status != "unplaced")
     agreeing = sum(a.used_share * a.ranges for a in anchors if a.status != "unplaced")
     if agreeing < _LEAST_AGREEING * count:
         text = (
-            f"only {agreeing / count:.0%} of the ranges agree with the map: they are no distances to anchors that stand still, "
-            "or the trajectory is wrong"
+            f"only {agreeing / count:.0%} of the ranges agree with the map: they are not distances to stationary anchors, or "
+            "the trajectory is wrong; check the anchors' ids, and the unit and the clock of the radio"
         )
         task.stages.doubt("ranges-disagree", text, share=agreeing / count)
     if task.recordings.have_scans:
@@ -116,8 +116,9 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     placed, wrong = (left_out + sum(a.status in kinds for a in anchors) for kinds in (_PLACED, _PLACED[-1:]))
     if wrong and 2 * wrong >= placed:
         text = (
-            f"{wrong} of {placed} anchors are distrusted or left out, and only ranges and odometry hold the trajectory: "
+            f"{wrong} of {placed} anchors are distrusted or left out, and only ranges and odometry constrain the trajectory: "
             + ("the others may be too few" if wrong == left_out else "a wrong trajectory is likelier than so many bad anchors")
+            + "; check the odometry, or give the anchors' places"
         )
         task.stages.doubt("ranges-disagree", text, distrusted=wrong, placed=placed)
 
@@ -152,9 +153,10 @@ def check_moved_together(anchors: Sequence[AnchorEstimate], table: dict[str, Flo
             when = float(start - task.recordings.stamps[0])
             task.stages.doubt(
                 "anchors-moved-together",
-                f"{len(changed)} of {len(both | changed)} anchors were moved at about t = {when:.0f} s: rather "
-                + ("lidar, radio or clocks lead the map astray" if lidar else
-                   "the wheels, tag or radio changed then, and nothing but the odometry ties the two parts of the map"),
+                f"{len(changed)} of {len(both | changed)} anchors seem to have moved at about t = {when:.0f} s: "
+                + ("an error of lidar, radio or clocks is likelier" if lidar else
+                   "a change of wheels, tag or radio is likelier, and only the odometry connects the two parts of the map")
+                + "; map both parts separately and compare",
                 at=when, moved=len(changed), measured=len(both),
             )  # fmt: skip
             return
@@ -190,10 +192,10 @@ def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:
     if not any(log.ranges is not None and len(log.ranges.ranges) for log in logs):
         task.stages.warn("no-ranges", "no UWB ranges in use: the map rests on odometry and lidar")
     if grid is None:
-        text = "no lidar in use: trajectory and anchors only, no map; left and right rest on the odometry's turns"
+        text = "no lidar in use: no map, and only the odometry's turns show that trajectory and anchors are not mirrored"
         task.stages.warn("no-lidar", text)
     elif not any(log.scans is not None and np.isfinite(log.scans.ranges).any() for log in logs):
-        task.stages.warn("empty-scans", "the lidar saw nothing in any scan: the map is empty")
+        task.stages.warn("empty-scans", "no scan has a reading: the map is empty")
 
 
 def check_closures(estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task) -> None:
@@ -203,10 +205,11 @@ def check_closures(estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: 
     placed = any(a.status != "unplaced" for a in anchors)
     if grid is not None and candidates and accepted == 0:
         add = task.stages.warn if placed else task.stages.doubt
-        add("no-closure", "no loop closure was accepted", candidates=len(candidates))
+        text = "no loop closure was accepted: drift is not corrected; drive through places twice"
+        add("no-closure", text, candidates=len(candidates))
     contradicted = sum(c.outcome == "contradicts-closures" for c in candidates)
     if contradicted > max(accepted, 4):
-        text = f"{contradicted} loop closures contradict the rest, {accepted} agree"
+        text = f"{contradicted} loop closures contradict the rest, {accepted} agree; look at them in uwblite view"
         task.stages.doubt("contradicting-closures", text, contradicted=contradicted, accepted=accepted)
 
 
@@ -235,7 +238,7 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
             + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings")
             + (likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else "")
-            + ("; the wheels lost some of their way: the map lacks what was not found of it" if short else ""),
+            + ("; the wheels missed some of the travelled distance: the map may be too short" if short else ""),
             name=value.name, value=value.value, sigma=value.sigma, usual=sigma,
         )  # fmt: skip
 
@@ -277,5 +280,8 @@ def check_fit(task: Task) -> None:
     fits = [float(stage.figures["chi2_per_dof"]) for stage in task.stages.done if "chi2_per_dof" in stage.figures]
     if fits and fits[-1] > _POOR_FIT:
         times = float(np.sqrt(fits[-1]))
-        text = f"measurements lie {times:.1f} times as far off as their noise allows (chi2/dof {fits[-1]:.1f})"
+        text = (
+            f"the residuals are {times:.1f} times as large as the noise allows (chi2/dof {fits[-1]:.1f}): a sensor or one of "
+            "its settings is wrong; see the residuals in report.html"
+        )
         task.stages.doubt("poor-fit", text, chi2_per_dof=fits[-1])

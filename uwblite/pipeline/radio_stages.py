@@ -155,15 +155,15 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
         if factor != 1.0:
             double = abs(abs(np.log2(abs(factor))) - 1.0) < _DOUBLE
             unclear = double and not (recording.has_scans or len(task.given.anchors) > 1 or task.given.distances)
-            reason = _TWICE if unclear else "the unit of the wheels is wrong; the odometry was multiplied by that"
+            reason = _TWICE if unclear else "the odometry has a wrong unit and was multiplied by that"
             whose = f"{recording.name}: " if len(recordings) > 1 else ""
             text = (
-                f"{whose}by the ranges, which measure times of flight, the robot drove {factor:.3f} times as far as its "
-                f"odometry has: {reason}{likely_unit(factor)}"
+                f"{whose}by the ranges (times of flight) the robot drove {factor:.3f} times the distance that its "
+                f"odometry counts: {reason}{likely_unit(factor)}"
             )
             high = other is not None and not other.taken and not _lidar_agrees(recording, factor)
             if other is not None and high:
-                text += f"; or the wheels are right and the anchors hang {other.high:.1f} m above the tag: give their heights"
+                text += f"; or the odometry is right and the anchors are {other.high:.1f} m above the tag: give their heights"
             add = task.stages.doubt if unclear or high else task.stages.warn
             add("odometry-unit", text, recording=recording.number + 1, factor=round(factor, 4))
     return factors
@@ -181,8 +181,8 @@ _OTHER_UNIT = 0.12
 _DOUBLE = 0.1
 """A factor is 2 or 1/2 up to this, by its logarithm to the base 2."""
 _TWICE = (
-    "either the wheels' radius and diameter were mistaken for each other, or the radio reports the way there and back, or half "
-    "of it, and without a lidar or given anchors nothing decides; the map has the radio's lengths: compare one distance "
+    "either the wheels' radius and diameter were mistaken for each other, or the radio reports twice or half "
+    "the distance, and without a lidar or given anchors nothing decides; the map has the radio's lengths: compare one distance "
     "between two anchors"
 )
 

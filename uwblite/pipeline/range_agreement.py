@@ -39,7 +39,7 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
             task.stages.warn(
                 "sustained-outliers",
                 f"anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
-                "its line of sight was blocked, or it was moved; these ranges count for little",
+                "its line of sight was blocked, or it was moved; these ranges are down-weighted",
                 anchor=name, stretches=stretches,
             )  # fmt: skip
 
@@ -53,9 +53,9 @@ def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     few = "distrusted" in statuses and sum(status not in ("distrusted", "unplaced") for status in statuses) <= _ENOUGH
     if few or "sustained-outliers" in kinds or any(name_and_number(anchor.id)[1] > 1 for anchor in anchors):
         text = (
-            "the unit that the wheels were given rests on the ranges alone, and "
+            "the odometry was rescaled by the ranges alone, and "
             + ("an anchor is distrusted: too few are left to check it" if few else "an anchor was moved or disagrees for long")
-            + "; give the anchors' places, or the distance between two"
+            + "; give the anchors' places, or the distance between two of them"
         )
         task.stages.doubt("odometry-unit", text)
 

@@ -61,11 +61,11 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, task: Task) -> No
     typical = float(np.median(_spread_by_anchor(residuals[alive], ranges.anchor[alive])))
     if typical <= min(max(_SCATTER, _TIMES_NOISE * short), NO_DISTANCES):
         return
-    text = f"the ranges scatter by {typical:.1f} m: they are no distances to anchors that stand still"
+    text = f"the ranges scatter by {typical:.1f} m about the map: they are not distances to stationary anchors; check the ids"
     if typical > _TIMES_NOISE * short:
         text = (
-            f"the ranges lie {typical:.2f} m (typically) off the map, and only {short:.2f} m from one to the next: clocks, ids "
-            "or the trajectory are wrong"
+            f"the ranges differ from the map by {typical:.2f} m (median), but from one to the next by {short:.2f} m only: the "
+            "radio's clock, anchor ids or the trajectory are wrong"
         )
     task.stages.doubt("range-scatter", text, typical=typical, short_term=short)
 
@@ -85,10 +85,10 @@ def check_odometry_steps(estimate: Estimate, task: Task) -> None:
     fixed = confirmed[wheels.i] & confirmed[wheels.j]
     if not any(notice.kind in _CONTRADICTED for notice in task.stages.doubts):
         fixed |= _fixed_by_neighbours(graph)[wheels.i]
-    say, text = task.stages.doubt, "most steps of the odometry disagree with the map far beyond their noise"
+    say, text = task.stages.doubt, "most steps of the odometry contradict the map far beyond their noise"
     stretch = _stretch(off & ~fixed)
     if stretch is None and (stretch := _stretch(off)) is not None:
-        say, text = task.stages.warn, text + "; there the lidar fixes every pose, and the map follows it: check the odometry"
+        say, text = task.stages.warn, text + "; the map follows the lidar, which determines every pose there: check them"
     if stretch is not None:
         a, b = (float(stamps[wheels.i[k]] - stamps[0]) for k in stretch)
         say("odometry-steps", f"between t = {a:.0f} and {b:.0f} s {text}", start=a, end=b)
@@ -111,8 +111,8 @@ def check_slips(estimate: Estimate, task: Task) -> None:
         when = ", ".join(f"{stamps[wheels.i[k]] - stamps[0]:.0f}" for k in at[:5])
         way, turn = float(np.hypot(off[at, 0], off[at, 1]).max()), float(off[at, 2].max())
         text = (
-            f"at t = {when}{' ...' if len(at) > 5 else ''} s the odometry is off by up to {way:.2f} m and {turn:.2f} rad "
-            "by the ranges: wheels that slip or stand still, or a robot that was carried"
+            f"at t = {when}{' ...' if len(at) > 5 else ''} s the ranges contradict the odometry by up to {way:.2f} m and "
+            f"{turn:.2f} rad: the wheels slipped or were stuck, or the robot was carried"
         )
         say = task.stages.doubt if max(way, turn) > _CARRIED else task.stages.warn
         say("odometry-slips", text, way=way, turn=turn)
@@ -160,8 +160,8 @@ def check_odometry_jumps(estimate: Estimate, task: Task) -> None:
     when = float(stamps[wheels.i[rows[worst]]] - stamps[0])
     task.stages.doubt(
         "odometry-jumps",
-        f"at t = {when:.0f} s the map moves by {far[worst]:.1f} m more or less than the odometry counts, and no scan "
-        f"measures it ({len(rows)} such steps): closures there may be of places that look alike",
+        f"at t = {when:.0f} s map and odometry differ by {far[worst]:.1f} m over one step, and no scan "
+        f"measures it ({len(rows)} such steps): loop closures there may join different places that look the same",
         steps=len(rows), metres=float(far[worst]), at=when,
     )  # fmt: skip
 
@@ -181,9 +181,9 @@ def check_untied_breaks(estimate: Estimate, task: Task) -> None:
     if at:
         task.stages.doubt(
             "loose-links",
-            f"at t = {', '.join(f'{when:.0f}' for when in at[:5])}{' ...' if len(at) > 5 else ''} s odometry breaks off where "
-            "the lidar does not see how far the robot went, as along a bare wall, and no later visit ties what was mapped "
-            "before to what was mapped after: the two parts may lie wrong to each other",
+            f"at t = {', '.join(f'{when:.0f}' for when in at[:5])}{' ...' if len(at) > 5 else ''} s the odometry fails where "
+            "the lidar cannot measure the travelled distance, as along a bare wall, and no loop closure connects the parts "
+            "before and after: they may be misplaced to each other; drive through the first part once more",
             at=at,
         )  # fmt: skip
 
@@ -202,7 +202,7 @@ def check_scales(estimate: Estimate, task: Task) -> None:
     scale = 1.0 + (float(calibration.values[place]) if place >= 0 else 0.0)
     if estimate.placed.any() and abs(scale - 1.0) > _SCALE:
         text = f"the ranges are {scale:.2f} times the distances on the map: " + (
-            "lidar or radio has a wrong unit" if lidar else "a radio measures time of flight, so the wheels' ways are wrong"
+            "lidar or radio has a wrong unit" if lidar else "a radio measures time of flight, so the odometry has a wrong unit"
         )
         task.stages.doubt("scales", text, range_scale=scale)
     screenings = [recording.log.screening for recording in task.recordings.each]
@@ -223,7 +223,7 @@ def check_support(estimate: Estimate, task: Task) -> None:
     constrained = ranges is not None and bool(ranges.alive.any())
     constrained |= any(isinstance(edges, ScanEdges | RelativePoseEdges) for edges in estimate.graph.edges)
     if not constrained and len(estimate.graph.poses) > 2:
-        text = "neither ranges nor scans hold the trajectory: it is the odometry's alone, and drifts"
+        text = "neither ranges nor scans constrain the trajectory: it is the odometry's, which drifts; check the other sensors"
         task.stages.doubt("odometry-alone", text)
 
 

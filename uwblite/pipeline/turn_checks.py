@@ -52,15 +52,15 @@ def _judge(found: TurnScale, used: float, task: Task) -> None:
         parts = ", ".join(f"{1.0 + value:.2f}" for value in found.stretches)
         task.stages.doubt(
             "turn-scale",
-            f"the lidar turns {parts} times as much as the odometry in the four quarters of the recording: no wheels change "
-            "so; the map lost its heading, or the odometry broke down",
+            f"the lidar turns {parts} times as much as the odometry in the four quarters of the recording: no calibration "
+            "changes so; the map's heading is wrong, or the odometry failed",
             stretches=found.stretches.tolist(),
         )  # fmt: skip
     elif abs(used - found.value) > _WRONG and found.contradicts(used):
         task.stages.doubt(
             "turn-scale",
             f"the map multiplies the odometry's turns by {1.0 + used:.2f}, but from step to step the lidar turns "
-            f"{_shown(found)} times as much: a turn is wrong in the map, or closures are",
+            f"{_shown(found)} times as much: a turn of the map or a loop closure is wrong",
             by_steps=found.value, sigma=found.sigma, by_all=used,
         )  # fmt: skip
 

@@ -39,12 +39,12 @@ def check_untied_parts(estimate: Estimate, task: Task) -> None:
             sizes = first - recording.rows.start, recording.rows.stop - last
             if min(sizes) < _PART or _tied(estimate.graph, alive, first, last):
                 continue
-            what = "the lidar is silent" if recording.has_scans else "all anchors give way to others"
+            what = "the lidar is silent" if recording.has_scans else "all anchors are replaced by others"
             task.stages.doubt(
                 "untied-parts",
-                f"from t = {before - stamps[0]:.0f} to {after - stamps[0]:.0f} s {what}, and neither scans nor anchors tie "
-                "what comes later to what was mapped before: both parts may be right, but how they lie to each other rests on "
-                "the odometry alone; drive through the first part once more, or map the parts on their own",
+                f"from t = {before - stamps[0]:.0f} to {after - stamps[0]:.0f} s {what}, and neither scans nor anchors "
+                "connect the parts before and after: each may be right, but their relative pose rests on the odometry alone; "
+                "drive through the first part once more, or map the parts separately",
                 start=before, end=after,
             )  # fmt: skip
 
@@ -71,9 +71,9 @@ def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) 
             if off > _ASTRAY:
                 task.stages.doubt(
                     "untied-parts",
-                    f"{word} t = {seconds:.0f} s, over {lengths.sum():.0f} m, neither scans nor ranges hold the trajectory: "
-                    f"it is the odometry's alone, and usual wheels go {off:.1f} m astray on such a way; cut that part off, or "
-                    "see why no sensor measured there",
+                    f"{word} t = {seconds:.0f} s, over {lengths.sum():.0f} m, neither scans nor ranges constrain the "
+                    f"trajectory: usual wheels drift by {off:.1f} m over that distance; cut that part off, or find out "
+                    "why no sensor measured there",
                     at=float(frames.stamps[at]), way=float(lengths.sum()), error=off,
                 )  # fmt: skip
 

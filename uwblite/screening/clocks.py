@@ -43,8 +43,8 @@ def made_up(log: SensorLog) -> list[Remark]:
     if period < _COARSE or any(np.ptp(s) > _SAME_STEP for s in steps):
         return []
     text = (
-        f"odometry and scans are stamped every {period:g} s to the last digit, as made-up stamps are: speeds, durations and "
-        "the delay of the laser are in that unit of time, whatever it was"
+        f"odometry and scans are stamped exactly every {period:g} s: these stamps were generated, not measured, so speeds, "
+        "durations and the delay of the laser are in an unknown unit of time; stamp each reading with a clock"
     )
     return [Remark("made-up-stamps", text)]
 
@@ -52,7 +52,7 @@ def made_up(log: SensorLog) -> list[Remark]:
 def set_back(log: SensorLog) -> list[Remark]:
     """Return a doubt for each sensor whose clock was set back."""
     return [
-        Remark("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: part the log there", doubt=True)
+        Remark("clock-set-back", f"the clock of the {sensor} was set back by up to {by:.1f} s: cut the log there", doubt=True)
         for sensor, by in log.notes.set_back.items()
         if by > 1.0
     ]
@@ -74,7 +74,7 @@ def without_jumps(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         log = replace(log, **{name: replace(sensor, stamps=np.where(own > at, own + moved, own))})  # type: ignore[arg-type]
         text = (
             f"the clock of the {what if ahead else 'odometry'} was set forward by {by:.1f} s at t = {at - odometry[0]:.0f} s, "
-            f"as where it ends shows: the {what}'s stamps from then on were moved by {moved:+.1f} s"
+            f"as the ends of the sensors show: the {what}'s later stamps were moved by {moved:+.1f} s"
         )
         remarks.append(Remark("clock-jump", text))
     return log, remarks

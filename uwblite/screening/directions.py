@@ -33,9 +33,9 @@ def heading_with_the_path(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     fits = {what: _fits_laser(other) for what, other in tried.items()}
     best = max(fits, key=lambda what: fits[what])
     one_fits = fits[best] > 0.0
-    text = f"the odometry's heading turns against its path: {best} was changed"
+    text = f"the odometry's heading turns against its path: {best} was inverted"
     if not one_fits:
-        text += ", and nothing shows whether the map is the place or its mirror image"
+        text += "; nothing in the recording shows whether the map is mirrored, so compare it with the building"
     return tried[best], [Remark("heading-against-path", text)]
 
 
@@ -61,9 +61,9 @@ def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         return log, []
     flipped = not log.mounting.laser_flipped
     text = (
-        f"laser and wheels turn opposite ways: the laser was taken as mounted {'upside down' if flipped else 'upright'}, "
-        "not as given; if the wheels are swapped instead, the map is a mirror image: decide it by "
-        f"{'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
+        "laser and wheels turn in opposite directions: the laser was taken as mounted "
+        f"{'upside down' if flipped else 'upright'}, not as given; if the wheels are swapped instead, the map is mirrored: "
+        f"settle it by {'--laser-flipped' if flipped else 'leaving out --laser-flipped'}, or by the odometry's sign"
     )
     return replace(log, mounting=replace(log.mounting, laser_flipped=flipped)), [Remark("laser-turned-over", text, doubt=True)]
 
@@ -89,8 +89,8 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
     if _lever_error(pairs, clear, given, around) < _lever_error(pairs, clear, given, turned):
         mount, tags = around, np.column_stack([se2.rotate(np.full(len(tags), angle), tags[:, :2]), tags[:, 2]])
     text = (
-        f"the laser looks {np.degrees(angle):+.0f} degrees away from its given pose, or the wheels drive so; it was taken "
-        f"so: --laser-pose={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}"
+        f"the laser's direction differs by {np.degrees(angle):+.0f} degrees from its given pose, by the motion that both "
+        f"measure; corrected: --laser-pose={mount[0]:.3f},{mount[1]:.3f},{mount[2]:.3f}"
     )
     mounting = replace(log.mounting, T_base_laser=mount, tag_position=tags[0], more_tags=tags[1:])
     return replace(log, mounting=mounting), [Remark("laser-turned-away", text)]

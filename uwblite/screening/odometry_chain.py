@@ -90,7 +90,7 @@ def without_glitches(odometry: Odometry) -> tuple[Odometry, list[Remark]]:
     if not wrong.any():
         return odometry, []
     first = float(odometry.stamps[np.argmax(wrong)] - odometry.stamps[0])
-    text = f"{int(wrong.sum())} odometry readings lie far off the path (the first at t = {first:.1f} s) and were left out"
+    text = f"{int(wrong.sum())} odometry readings lie far from the path (the first at t = {first:.1f} s) and were left out"
     return Odometry(odometry.stamps[~wrong], odometry.poses[~wrong]), [Remark("odometry-glitches", text)]
 
 
@@ -112,8 +112,8 @@ def rejoined(odometry: Odometry) -> tuple[Odometry, OdometryBreaks, list[Remark]
     where = ", ".join(f"{odometry.stamps[k] - odometry.stamps[0]:.1f}" for k in at[:5])
     largest = float(np.hypot(*motion.steps[at, :2].T).max())
     text = (
-        f"the odometry breaks at t = {where}{' ...' if len(at) > 5 else ''} s (by up to {largest:.2f} m): other "
-        "sensors alone tie the two sides"
+        f"the odometry jumps at t = {where}{' ...' if len(at) > 5 else ''} s (by up to {largest:.2f} m): only other "
+        "sensors connect the path before and after"
     )
     joined = Odometry(odometry.stamps, se2.chain(odometry.poses[0], steps))
     return joined, OdometryBreaks(odometry.stamps[at], np.array(sigma)), [Remark("odometry-breaks", text)]

@@ -101,13 +101,13 @@ def _hardly_moving(odometry: Odometry) -> list[Remark]:
     turned = float(np.ptp(np.unwrap(odometry.poses[:, 2])))
     text = (
         f"the robot hardly moves: {path:.2f} m in {np.ptp(odometry.stamps):.0f} s (turning {turned:.1f} rad); does the base "
-        "report its wheels, in metres? Drive through the place"
+        "report its wheels, in metres? Drive through the building"
     )
     return [Remark("hardly-moving", text, doubt=True)]
 
 
 def _repeats(count: int) -> list[Remark]:
-    text = f"{count} odometry readings stand in the log twice and were left out once"
+    text = f"{count} odometry readings are in the log twice; one of each was left out"
     return [Remark("repeated-odometry", text)] if count else []
 
 
@@ -127,10 +127,10 @@ def _gaps(log: SensorLog) -> tuple[SensorLog, OdometryBreaks, list[Remark]]:
         elsewhere = held and _elsewhere(log, a, b)
         when = f"the odometry is silent for {b - a:.0f} s from t = {a - stamps[0]:.0f} s"
         if elsewhere:
-            text = f"{when} and counts no way, but the robot was moved meanwhile: other sensors alone tie the two sides"
+            text = f"{when}, but the robot was moved meanwhile: only other sensors connect the path before and after"
             remarks.append(Remark("carried", text, doubt=True))
         elif not stood:
-            text = f"{when}, while the robot drove on; what other sensors saw then was left out"
+            text = f"{when}, while the robot drove on; ranges and scans of that time were left out"
             remarks.append(Remark("odometry-gap", text))
         if elsewhere or not stood:
             silent.append((a, b))
@@ -178,7 +178,7 @@ def _lost_wheels(log: SensorLog, pairs: Pairs | None) -> tuple[SensorLog, Pairs 
     if not stretches:
         return log, pairs, unknown, remarks
     odometry, breaks = replaced_wheels.replaced(log, stretches)
-    remarks += [_lost_remark(a - start, b - start, "the motion from scan to scan stands in for them") for a, b in stretches]
+    remarks += [_lost_remark(a - start, b - start, "the motion between scans is used instead") for a, b in stretches]
     log = replace(log, odometry=odometry)
     return log, wheel_motion.compare(log), OdometryBreaks.of_all([unknown, breaks]), remarks
 
@@ -210,6 +210,6 @@ def _cuts(log: SensorLog, jumps: Floats, others: Floats) -> tuple[OdometryBreaks
     where = ", ".join(f"t = {t - start:.0f} s" for t in times[:4])
     text = (
         f"at {where}{' ...' if len(times) > 4 else ''} the robot is suddenly elsewhere: it was carried, or the log was cut; "
-        "other sensors alone tie the two sides"
+        "only other sensors connect the path before and after"
     )
     return OdometryBreaks(before, np.tile(_ANYWHERE, (len(times), 1))), [Remark("carried", text, doubt=True)]

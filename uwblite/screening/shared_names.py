@@ -43,9 +43,9 @@ def without_shared_names(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         leaps = np.abs(np.diff(ranges.ranges[own])) > _most(np.diff(driven[own]), noise)
         if _two_distances(ranges.ranges[own], driven[own], leaps, noise) and not wrong[own].any():
             text = (
-                f"two anchors answer to the name {ranges.anchor_ids[anchor]}: its ranges leap between two distances "
+                f"two anchors seem to have the name {ranges.anchor_ids[anchor]}: its ranges jump between two distances "
                 f"({int(leaps.sum())} of {len(leaps)} times by more than the robot drove); they were left out, "
-                "give each anchor a name of its own"
+                "give each anchor its own name"
             )
             remarks.append(Remark("shared-name", text))
             wrong |= ranges.anchor == anchor

@@ -61,7 +61,7 @@ def _spread(stamps: Floats) -> tuple[Floats, float, float] | None:
 def _burst_remark(what: str, size: float, between: float) -> Remark:
     text = (
         f"{what} come in bursts of about {size:.0f} with one stamp, every {between:.2f} s: they were spread over the time "
-        "since the burst before; stamp each reading when it is made"
+        "since the previous burst; stamp each reading when it is made"
     )
     return Remark("stamps-in-bursts", text)
 
@@ -86,8 +86,8 @@ def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     if stuck.any():
         start = float(log.odometry.stamps[0])
         when = _when(scans.stamps, stuck, start)
-        share = f"{int(stuck.sum())} of {len(stuck)} scans repeat the one before to the last digit ({when})"
-        remarks.append(Remark("repeated-scans", f"{share}: the lidar or its driver stood still; they were left out"))
+        share = f"{int(stuck.sum())} of {len(stuck)} scans equal the scan before ({when})"
+        remarks.append(Remark("repeated-scans", f"{share}: the lidar or its driver was stuck; they were left out"))
     return replace(log, scans=scans.rows(~wrong)), remarks
 
 
@@ -192,8 +192,8 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
     if len(np.unique(ranges.anchor[wrong])) < 2:  # one that is stuck
         return log, []
     text = (
-        f"{int(wrong.sum())} of {len(wrong)} ranges are {mark:g} m to the last digit, wherever the robot is: the radio "
-        "marks with it what it could not measure; these were left out"
+        f"{int(wrong.sum())} of {len(wrong)} ranges are exactly {mark:g} m, wherever the robot is: the radio reports "
+        "this value where it has no measurement; they were left out"
     )
     return replace(log, ranges=ranges.rows(~wrong)), [Remark("repeated-ranges", text)]
 
@@ -211,11 +211,11 @@ def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         return log, []
     wrong = scans.ranges == np.float32(mark)
     farthest = mark == float(apart[holds].max())
-    what = "it marks with it what it did not see" if farthest else "it is a mark, or the robot itself that it sees"
-    share = f"{int(wrong.sum())} of {wrong.size} readings of the lidar are {mark:g} m to the last digit, wherever the robot is"
+    what = "the lidar reports its reach where it sees nothing" if farthest else "a code, or a part of the robot in view"
+    share = f"{int(wrong.sum())} of {wrong.size} readings of the lidar are exactly {mark:g} m, wherever the robot is"
     ranges = np.where(wrong, np.float32(np.inf if farthest else np.nan), scans.ranges)
     scans = replace(scans, ranges=ranges, range_max=mark if farthest else scans.range_max)
-    return replace(log, scans=scans), [Remark("repeated-readings", f"{share}: {what}; they were taken as no wall")]
+    return replace(log, scans=scans), [Remark("repeated-readings", f"{share}: {what}; they are not taken as walls")]
 
 
 def _mark(values: Floats | NDArray[np.float32]) -> float | None:

@@ -197,8 +197,8 @@ def disagreeing(pairs: Pairs, start: float) -> list[Remark]:
     when = ", ".join(f"t = {a - start:.0f} to {b - start:.0f} s" for a, b in runs[:3])
     more = f", and {len(runs) - 3} more stretches" if len(runs) > 3 else ""
     text = (
-        f"wheels and lidar measure different motions ({when}{more}): one of the two stands still, slips or is wrong by another "
-        "factor there than elsewhere"
+        f"wheels and lidar measure different motions ({when}{more}): one of the two is stuck, slips or has another scale there "
+        "than elsewhere; cut that part off, or drive it again"
     )
     return [Remark("wheels-against-lidar", text, doubt=True, stretches=tuple((float(a), float(b)) for a, b in runs))]
 
@@ -209,8 +209,8 @@ def unmatched(pairs: Pairs) -> list[Remark]:
     if len(seen) < 4 * _LEAST_PAIRS or (most := float(np.quantile(seen, 0.9))) >= _NOISE_SHARE:
         return []
     text = (
-        f"scans a moment apart do not show the same things (nine of ten pairs share less than {100 * most:.0f} % of their "
-        "points): the readings are noise, or the order of the beams or their angles are not as stated"
+        f"successive scans do not match (nine of ten pairs share less than {100 * most:.0f} % of their "
+        "points): the readings are noise, or beam order or angles are not as stated; check the lidar's driver"
     )
     return [Remark("scans-do-not-match", text, doubt=True)]
 
