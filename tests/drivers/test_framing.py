@@ -1,9 +1,11 @@
 """Bytes keep the stamp of the piece they came in, whatever is dropped before them."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.drivers.framing import StampedBuffer
+from uwblite.drivers.framing import FixedPackets, FrameReader, HeadedFrames, PacketReader, StampedBuffer
+from uwblite.drivers.text_lines import LineDriver
 
 
 @given(st.lists(st.one_of(st.binary(max_size=5), st.integers(1, 6)), max_size=30))
@@ -27,3 +29,10 @@ def test_nothing_is_left_of_what_was_cleared():
     buffer.clear()
     buffer.append(b"new", 2.0)
     assert (bytes(buffer.data), buffer.stamp_at(0)) == (b"new", 2.0)
+
+
+@pytest.mark.parametrize("base", [FrameReader, HeadedFrames, PacketReader, FixedPackets, LineDriver])
+def test_a_protocol_that_leaves_something_undefined_cannot_be_made(base):
+    """The error names what is missing, when the driver is made and not when the first frame comes."""
+    with pytest.raises(TypeError, match=f"abstract class '?{base.__name__}"):
+        type("Protocol", (base,), {}).__new__(base)

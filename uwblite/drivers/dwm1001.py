@@ -13,7 +13,7 @@ Sources: DWM1001 firmware API guide 2.3; the vendor's host code.
 
 from .dwm1001_blocks import Answer, Event, block_length, decode
 from .events import Corrupt
-from .framing import FrameReader
+from .framing import HeadedFrames
 
 BAUD = 115200
 
@@ -23,10 +23,10 @@ QUERIES = {"ver_get": b"\x15\x00", "nodeid_get": b"\x30\x00", "panid_get": b"\x2
 """What a module is asked once; nothing is ever set."""
 
 
-class TlvProtocol(FrameReader):
+class TlvProtocol(HeadedFrames):
     """Bytes of the module in, blocks and Corrupt out. Holds at most one block (257 bytes)."""
 
-    lead, head_size, unique_head, noise = 0x40, 5, True, "no TLV answer"
+    lead, head_size, noise = 0x40, 5, "no TLV answer"
 
     def __init__(self) -> None:
         super().__init__()

@@ -5,6 +5,7 @@ not lend it its time. A binary protocol is a `FrameReader` that returns how long
 text lines uses a `line_reader.LineReader`. What is no frame becomes `Corrupt`.
 """
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 from .events import Corrupt, corrupt
@@ -50,19 +51,13 @@ class StampedBuffer:
         self._marks.clear()
 
 
-class FrameReader:
-    """Binary frames; a protocol derives from this and defines `frame_size` and `decode`.
+class FrameReader(ABC):
+    """Binary frames; a protocol derives from this and defines `measure` and `decode`.
 
     A frame is decoded when it is complete. If it is damaged, the search for the next one goes on at its second byte, so a
     frame that broke off does not take the next one with it. At most one frame and CHUNK bytes are kept.
     """
 
-    lead = 0
-    """First byte of every frame."""
-    head_size = 2
-    """Bytes by which a frame is known: as many as `frame_size` is shown."""
-    unique_head = False
-    """A head cannot occur inside a frame by chance: then one found there means that the frame broke off."""
     noise = "no frame"
     """What bytes between frames are called in the counters."""
 
@@ -72,18 +67,17 @@ class FrameReader:
         """Bytes of `pending` that belong to a frame that was decoded."""
         self._told = 0
 
-    def frame_size(self, head: bytes) -> int:
-        """Return the size of the frame that begins so; 0 = more bytes are needed to say, -1 = none begins so.
-
-        Parameters
-        ----------
-        head : the first `head_size` bytes, or as many as have come.
-        """
-        raise NotImplementedError
-
+    @abstractmethod
     def decode(self, frame: bytes, stamp: float) -> Any:
         """Return the event that a frame of the right size holds, or Corrupt; `stamp` s, arrival of its first byte."""
-        raise NotImplementedError
+
+    @abstractmethod
+    def measure(self, at: int) -> int:
+        """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
+
+    def overlap(self, frame: bytes) -> int:
+        """Return how many of the last bytes may be the head of the next frame, if this one had lost as many."""
+        return 0
 
     def feed(self, data: bytes, stamp: float) -> list[Any]:
         """Take bytes that arrived at `stamp` s and return the events they complete, in the order of the bytes.
@@ -108,28 +102,6 @@ class FrameReader:
         self.pending.clear()
         self.taken = self._told = 0
 
-    def measure(self, at: int) -> int:
-        """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
-        buffer = self.pending.data
-        size = self.frame_size(bytes(buffer[at : at + self.head_size]))
-        if size < 0:
-            following = buffer.find(self.lead, at + 1)
-            return at - (following if following >= 0 else len(buffer))
-        end = at + size if size else len(buffer) + 1
-        broken = self.head_inside(at + 1, min(end, len(buffer))) if self.unique_head else 0
-        if broken:
-            return at - broken
-        return size if end <= len(buffer) else 0
-
-    def head_inside(self, start: int, end: int) -> int:
-        """Return where a whole head stands between two offsets, 0 = nowhere."""
-        buffer, at = self.pending.data, start
-        while 0 <= (at := buffer.find(self.lead, at, end)) <= end - self.head_size:
-            if self.frame_size(bytes(buffer[at : at + self.head_size])) >= 0:
-                return at
-            at += 1
-        return 0
-
     def _scan(self, events: list[Any]) -> None:
         buffer, at, noise = self.pending.data, 0, 0
         while at < len(buffer) and (size := self.measure(at)):
@@ -145,21 +117,64 @@ class FrameReader:
                 at = self.taken = at + 1
             else:
                 at = self.taken = at + size
-                at -= self._overlap(frame)
+                at -= self.overlap(frame)
             noise = at
         self._report(noise, at, events)
         self.pending.drop(at)
         self.taken, self._told = max(0, self.taken - at), max(0, self._told - at)
 
-    def _overlap(self, frame: bytes) -> int:
-        """Return how many of the last bytes may be the head of the next frame, if this one had lost as many."""
-        sizes = range(min(self.head_size, len(frame)) - 1, 0, -1) if self.unique_head else ()
-        return next((k for k in sizes if self.frame_size(frame[-k:]) >= 0), 0)
-
     def _report(self, start: int, end: int, events: list[Any]) -> None:
         start = max(start, self._told)
         if end > start:
             events.append(corrupt(bytes(self.pending.data[start:end]), self.noise))
+
+
+class HeadedFrames(FrameReader):
+    """Frames whose head tells their size; a protocol derives from this and defines `frame_size` and `decode`.
+
+    A head cannot occur inside a frame by chance: one found there means that the frame broke off.
+    """
+
+    lead = 0
+    """First byte of every frame."""
+    head_size = 2
+    """Bytes by which a frame is known: as many as `frame_size` is shown."""
+
+    @abstractmethod
+    def frame_size(self, head: bytes) -> int:
+        """Return the size of the frame that begins so; 0 = more bytes are needed to say, -1 = none begins so.
+
+        Parameters
+        ----------
+        head : the first `head_size` bytes, or as many as have come.
+        """
+
+    def measure(self, at: int) -> int:
+        """Return the size of the frame at `at`; 0 = it is not complete; -n = the first n bytes are noise."""
+        buffer = self.pending.data
+        size = self.frame_size(bytes(buffer[at : at + self.head_size]))
+        if size < 0:
+            following = buffer.find(self.lead, at + 1)
+            return at - (following if following >= 0 else len(buffer))
+        end = at + size if size else len(buffer) + 1
+        broken = self.head_inside(at + 1, min(end, len(buffer)))
+        if broken:
+            return at - broken
+        return size if end <= len(buffer) else 0
+
+    def head_inside(self, start: int, end: int) -> int:
+        """Return where a whole head stands between two offsets, 0 = nowhere."""
+        buffer, at = self.pending.data, start
+        while 0 <= (at := buffer.find(self.lead, at, end)) <= end - self.head_size:
+            if self.frame_size(bytes(buffer[at : at + self.head_size])) >= 0:
+                return at
+            at += 1
+        return 0
+
+    def overlap(self, frame: bytes) -> int:
+        """Return how many of the last bytes may be the head of the next frame, if this one had lost as many."""
+        sizes = range(min(self.head_size, len(frame)) - 1, 0, -1)
+        return next((k for k in sizes if self.frame_size(frame[-k:]) >= 0), 0)
 
 
 class PacketReader(FrameReader):
@@ -172,9 +187,9 @@ class PacketReader(FrameReader):
     smallest = 1
     """Bytes of the smallest frame, before which nobody looks for one."""
 
+    @abstractmethod
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the good frame that begins at `at`; 0 = wait for more; -n = none begins in the next n bytes."""
-        raise NotImplementedError
 
     def is_checked(self, lead: int) -> bool:
         """Return whether frames that begin with this byte have a check."""
@@ -205,9 +220,9 @@ class FixedPackets(PacketReader):
         super().__init__()
         self.smallest = self.size
 
+    @abstractmethod
     def is_good(self, packet: bytearray) -> bool:
         """Return whether a whole packet with the right head has a right check, and holds what the device can send."""
-        raise NotImplementedError
 
     def size_at(self, buffer: bytearray, at: int) -> int:
         """Return the size of the good packet at `at`; 0 = wait for more; -n = none begins in the next n bytes."""

@@ -17,7 +17,7 @@ from operator import xor
 
 from .clock import DeviceClock
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, corrupt
-from .framing import FrameReader
+from .framing import HeadedFrames
 from .odometer import BaseDriver, WheelOdometer
 
 PERIOD = 0.020
@@ -66,10 +66,10 @@ class Feedback:
     """V."""
 
 
-class KobukiProtocol(FrameReader):
+class KobukiProtocol(HeadedFrames):
     """Bytes of the base in, Feedback and Corrupt out."""
 
-    lead, head_size, unique_head, noise = SIGNATURE[0], len(SIGNATURE), True, "no packet"
+    lead, head_size, noise = SIGNATURE[0], len(SIGNATURE), "no packet"
 
     def frame_size(self, head: bytes) -> int:
         """Return the size of the packet that begins so; 0 = more bytes are needed to say, -1 = none begins so."""

@@ -92,8 +92,8 @@ class Driver:
                 yield from self.take(event)
 
     def take(self, event: Any) -> list[Action]:
-        """Return what an event of a device that talks unasked means."""
-        raise NotImplementedError
+        """Return what an event of a device that talks unasked means; a device with a script of its own needs none."""
+        return []
 
     def stop(self) -> list[Action]:
         """Return what to send so that the device falls quiet."""

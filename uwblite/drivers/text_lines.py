@@ -2,6 +2,7 @@
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -101,7 +102,7 @@ class LineProtocol:
         return self._parse(text) if text.replace("\t", " ").isprintable() else "line with characters that nobody prints"
 
 
-class LineDriver(Driver):
+class LineDriver(Driver, ABC):
     """A device that is only listened to, perhaps with its own time in what it sends. Nothing is ever sent.
 
     Parameters
@@ -137,13 +138,13 @@ class LineDriver(Driver):
         given_up: list[Action] = [Corrupt(b"", "line that leaps away and back")] * len(dropped)
         return [*given_up, *(action for line in passed for action in self.measured(line))]
 
+    @abstractmethod
     def measured(self, line: Line) -> list[Action]:
         """Return what a line means that goes on from the one before."""
-        raise NotImplementedError
 
+    @abstractmethod
     def time_of(self, content: Any) -> float | None:
         """Return the device's time in a line, its own unit; None = there is none."""
-        raise NotImplementedError
 
     def follows(self, before: Line, after: Line) -> bool:
         """Return whether the device's clock can have gone on so: a digit that is lost makes another number."""
