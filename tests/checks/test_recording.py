@@ -199,3 +199,11 @@ def test_the_shortest_recordings_are_examined_too(sound, samples):
     ranges = replace(sound.ranges, **{n: getattr(sound.ranges, n)[:samples] for n in PER_RANGE})
     scans = replace(sound.scans, stamps=sound.scans.stamps[:samples], ranges=sound.scans.ranges[:samples])
     assert diagnose(SensorLog(odometry, ranges, scans)).serious
+
+
+def test_a_doubt_of_the_screening_is_serious_where_the_map_has_one_of_its_kind(poses):
+    """Whatever its words: a map of several recordings puts their number in front."""
+    log = recording(poses, flipped=True)
+    kept = Notice("laser-turned-over", "recording 1: laser and wheels turn in opposite directions")
+    assert_named(log, "serious", "upside down", doubts=(kept,))
+    assert_named(log, "warning", "upside down", doubts=(Notice("uncertain", "another one"),))

@@ -85,9 +85,9 @@ def _check_screening(log: SensorLog, doubts: tuple[Notice, ...] | None, found: F
     screening = repaired.screening
     sensors = [s for s in (repaired.ranges, repaired.scans) if s is not None and len(s.stamps) > 1]
     if not sensors:
-        found.serious("log", "neither ranges nor scans are left to hold the trajectory", "odometry alone drifts")
+        found.serious("log", "neither ranges nor scans are left to constrain the trajectory", "odometry alone drifts")
     for remark in screening.remarks if screening is not None else ():
-        if remark.doubt and (doubts is None or any(remark.text == doubt.text for doubt in doubts)):
+        if remark.doubt and (doubts is None or remark.kind in {doubt.kind for doubt in doubts}):
             found.serious("log", remark.text, "the map will be doubted: repair the recording, or cut it there")
         else:
             found.warning("log", remark.text, "a map repairs it so; the files stay as they are")

@@ -193,7 +193,7 @@ def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: Tr
         k, before = int(i[row]), blind[blind < i[row]]
         first = max(first, int(before[-1]) + 1 if len(before) else 0)
         guess, ended = steps.guess[row], steps.pose[row]
-        if steps.share[row] >= _LEAST_SHARE and searching.through(k, ended[None])[0] <= _THROUGH:
+        if steps.share[row] >= _LEAST_SHARE and searching.through(k, ended[None])[0] <= _MOST_THROUGH:
             continue
         searched += 1
         found = searching.find(k, first, chain, np.stack([guess, ended, guess * [0.0, 0.0, 1.0]]))
@@ -208,7 +208,7 @@ def _searched(clouds: Clouds, i: Ints, steps: Steps, doubtful: Bools, config: Tr
 
 _LEAST_SHARE = 0.4
 """Share of points that match from which descent from the odometry's guess measures a step."""
-_THROUGH = 0.04
+_MOST_THROUGH = 0.04
 """Share of points in free space up to which it does; one point in twenty-five may be a foot or a leaf."""
 
 

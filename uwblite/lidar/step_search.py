@@ -45,7 +45,7 @@ _SAME = 3.0
 """Standard deviations up to which a match cannot separate two places."""
 _MARGIN = 0.08
 """By how much the score of a place must exceed that of every distinct one."""
-_THROUGH = 0.12
+_CONTRADICTED = 0.12
 """Share in free space that a true place does not have."""
 _LEAST = 0.45
 """Least score of a step: share of points that match, less the share that stands in free space."""
@@ -72,7 +72,7 @@ class FoundStep:
     @property
     def contradicts(self) -> bool:
         """Whether the odometry's guess is wrong whatever is right: surfaces would stand in free space there."""
-        return self.through > _THROUGH
+        return self.through > _CONTRADICTED
 
 
 class StepSearch:

@@ -24,7 +24,7 @@ _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
 """Doubts that do not speak against all anchors."""
 _AGREE = 0.5
 """Share of an anchor's ranges that must agree with the map."""
-_NO_BIAS = 1.6
+_IMPLAUSIBLE_BIAS = 1.6
 """Constant error of an anchor's ranges, m, twice that of the worst radios: rather its place is what is wrong."""
 _OTHER_BIAS = 1.0
 """m, and three standard deviations, by which constant errors of anchors do not differ: rather a place is wrong."""
@@ -145,7 +145,7 @@ def _without_strange_biases(anchors: tuple[AnchorEstimate, ...]) -> tuple[Anchor
         return anchors
     off = biases - np.nanmedian(biases)
     return tuple(
-        replace(a, status="distrusted", reason=f"its ranges fit only with a constant error {by:+.1f} m from that of the others")
+        replace(a, status="distrusted", reason=f"its ranges fit only with a constant error {by:+.1f} m from the others'")
         if a.status == "ok" and abs(by) > max(_OTHER_BIAS, 3.0 * a.bias_sigma) else a
         for a, by in zip(anchors, off.tolist(), strict=True)
     )  # fmt: skip
@@ -164,10 +164,10 @@ def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, 
         return f"only {used:.0%} of its ranges agree with the map"
     if not sigma < longest:
         return f"its place is known to {sigma:.3g} m only, and its longest range is {longest:.1f} m"
-    if abs(bias) > _NO_BIAS:
+    if abs(bias) > _IMPLAUSIBLE_BIAS:
         return f"its ranges fit only with a constant error of {bias:.1f} m, which no radio has"
     if scatter > NO_DISTANCES:
-        return f"its ranges scatter by {scatter:.1f} m about the map: they are no distances to one place"
+        return f"its ranges scatter by {scatter:.1f} m about the map: they are not distances to one place"
     return ""
 
 
@@ -175,7 +175,7 @@ def _reason_of_short_ranges(short: int, count: int) -> str:
     """Return why an anchor is distrusted of whose ranges so many are shorter than the way to its place, '' where it is not."""
     if short <= max(_FEW_SHORT, _SHARE_SHORT * count):
         return ""
-    return f"{short} of its {count} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere meanwhile?"
+    return f"{short} of its {count} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere for a time?"
 
 
 _SHORT = 0.5

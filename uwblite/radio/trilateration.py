@@ -169,10 +169,10 @@ _MOST_STARTS = 10
 def _starts(cells: Floats, bias: Floats, step: float) -> Floats:
     """Return where descent starts (s, 3): each cell with no bias, and with the one that suits it where that is not small."""
     plain, biased = np.column_stack([cells, np.zeros(len(cells))]), np.column_stack([cells, bias])
-    return np.concatenate([plain, biased[np.abs(bias) > _NO_BIAS * step]])
+    return np.concatenate([plain, biased[np.abs(bias) > _SMALL_BIAS * step]])
 
 
-_NO_BIAS = 0.5
+_SMALL_BIAS = 0.5
 """Cells; descent takes up a smaller bias by itself."""
 
 
