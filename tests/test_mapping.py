@@ -27,7 +27,7 @@ from uwblite.odometry.wheels import with_noise_shown
 from uwblite.pipeline import anchor_moves
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.final_stages import at_given_poses
-from uwblite.radio.anchor_covariance import by_alike_errors
+from uwblite.radio.anchor_covariance import anchors_with_correlated_errors
 from uwblite.screening.screen import screen
 from uwblite.sensor_log import Odometry, UwbRanges
 
@@ -59,9 +59,9 @@ def ate(result, truth) -> float:
 
 def test_anchors_covariances_are_those_of_all_measurements_and_of_what_their_ranges_err_alike(result):
     stated = with_noise_shown(with_fewer_pairs(result.graph))
-    whole = marginals(stated, common_range_errors(stated)).anchors
+    whole = marginals(stated, common_range_errors(stated)).covariances.anchors
     (ranges,) = [e for e in result.graph.edges if isinstance(e, RangeEdges)]
-    alike = by_alike_errors(at_given_poses(result.graph), ranges, whole, MappingConfig().ranges)
+    alike = anchors_with_correlated_errors(at_given_poses(result.graph), ranges, whole, MappingConfig().ranges)
     assert all(np.abs(own).max() > 1e-4 for own in alike - whole)
     # They are linearised where the estimate was before errors of ranges to surfaces were taken off: some millimetres.
     np.testing.assert_allclose([a.covariance for a in result.anchors], alike, rtol=1e-3)

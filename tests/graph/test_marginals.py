@@ -10,7 +10,6 @@ from uwblite.graph.marginals import (
     CommonErrors,
     calibration_covariance,
     marginals,
-    shape_error,
 )
 from uwblite.graph.solver import optimize
 from uwblite.graph.unknowns import Unknowns, moved
@@ -30,11 +29,11 @@ def test_marginals_are_blocks_of_the_dense_inverse(n):
     graph, _ = calibrated_loop(n=n)
     covariance, found = dense_covariance(graph), marginals(graph)
     for i in range(n):
-        np.testing.assert_allclose(found.poses[i], covariance("poses", i, "poses", i), rtol=1e-6, atol=1e-14)
+        np.testing.assert_allclose(found.covariances.poses[i], covariance("poses", i, "poses", i), rtol=1e-6, atol=1e-14)
     for a in range(3):
-        np.testing.assert_allclose(found.anchors[a], covariance("anchors", a, "anchors", a), rtol=1e-6)
+        np.testing.assert_allclose(found.covariances.anchors[a], covariance("anchors", a, "anchors", a), rtol=1e-6)
     sigmas = [np.sqrt(covariance("calibration", c, "calibration", c)[0, 0]) for c in range(2)]
-    np.testing.assert_allclose(found.calibration, sigmas, rtol=1e-6)
+    np.testing.assert_allclose(found.covariances.calibration, sigmas, rtol=1e-6)
 
 
 @pytest.mark.parametrize("fixed", [[False, False], [False, True], [True, False], [True, True]])
@@ -51,10 +50,10 @@ def test_fixed_unknowns_have_no_covariance():
     graph, _ = calibrated_loop()
     is_fixed = replace(graph, fixed_poses=np.arange(60) % 7 == 0, fixed_anchors=np.array([False, True, False]))
     covariance, found = dense_covariance(is_fixed), marginals(is_fixed)
-    assert not found.poses[7].any()
-    assert not found.anchors[1].any()
-    np.testing.assert_allclose(found.poses[8], covariance("poses", 8, "poses", 8), rtol=1e-6)
-    np.testing.assert_allclose(found.anchors[2], covariance("anchors", 2, "anchors", 2), rtol=1e-6)
+    assert not found.covariances.poses[7].any()
+    assert not found.covariances.anchors[1].any()
+    np.testing.assert_allclose(found.covariances.poses[8], covariance("poses", 8, "poses", 8), rtol=1e-6)
+    np.testing.assert_allclose(found.covariances.anchors[2], covariance("anchors", 2, "anchors", 2), rtol=1e-6)
 
 
 @pytest.mark.parametrize("few", [True, False])
@@ -101,9 +100,9 @@ def test_covariances_are_those_of_repeated_experiments():
         across = se2.between(graph.poses[3], graph.poses[12]) - se2.between(truth[3], truth[12])
         away = graph.anchors[0] - anchors[0]
         sums += [
-            error @ np.linalg.solve(found.poses[8], error) / 3,
+            error @ np.linalg.solve(found.covariances.poses[8], error) / 3,
             across @ np.linalg.solve(found.relative([3], [12])[0], across) / 3,
-            away @ np.linalg.solve(found.anchors[0], away) / 2,
+            away @ np.linalg.solve(found.covariances.anchors[0], away) / 2,
         ]
     np.testing.assert_allclose(sums / repeats, 1.0, atol=4.0 * np.sqrt(2.0 / 2 / repeats))
 
@@ -112,9 +111,9 @@ def test_what_nothing_measures_is_infinitely_uncertain():
     graph, _, _ = loop(2)
     lonely = Graph(np.vstack([graph.poses, np.zeros(3)]), np.vstack([graph.anchors, [9.0, 9.0]]), graph.edges)
     found, without = marginals(lonely), marginals(graph)
-    assert np.all(np.isinf(np.diag(found.poses[-1])))
-    assert np.all(np.isinf(np.diag(found.anchors[-1])))
-    np.testing.assert_allclose(found.poses[:-1], without.poses, rtol=1e-6, atol=1e-14)
+    assert np.all(np.isinf(np.diag(found.covariances.poses[-1])))
+    assert np.all(np.isinf(np.diag(found.covariances.anchors[-1])))
+    np.testing.assert_allclose(found.covariances.poses[:-1], without.covariances.poses, rtol=1e-6, atol=1e-14)
 
 
 def test_a_floating_part_is_very_uncertain_and_the_rest_is_not():
@@ -125,8 +124,8 @@ def test_a_floating_part_is_very_uncertain_and_the_rest_is_not():
         np.vstack([graph.poses, graph.poses[:3] + 1.0]), edges=(*graph.edges[:2], replace(apart, i=apart.i + n, j=apart.j + n))
     )
     found, without = marginals(joined), marginals(replace(graph, edges=graph.edges[:2]))
-    assert np.all(np.sqrt(np.diagonal(found.poses[n:], axis1=1, axis2=2)) > 1e3)
-    np.testing.assert_allclose(found.poses[:n], without.poses, rtol=1e-5, atol=1e-14)
+    assert np.all(np.sqrt(np.diagonal(found.covariances.poses[n:], axis1=1, axis2=2)) > 1e3)
+    np.testing.assert_allclose(found.covariances.poses[:n], without.covariances.poses, rtol=1e-5, atol=1e-14)
 
 
 def test_an_anchor_seen_from_one_place_is_uncertain_along_the_circle_only():
@@ -137,8 +136,8 @@ def test_an_anchor_seen_from_one_place_is_uncertain_along_the_circle_only():
     towards = graph.anchors[0] - truth[0, :2]
     towards /= np.linalg.norm(towards)
     along = np.array([-towards[1], towards[0]])
-    assert towards @ found.anchors[0] @ towards == pytest.approx(0.1**2, rel=1e-3)
-    assert along @ found.anchors[0] @ along > 1e3
+    assert towards @ found.covariances.anchors[0] @ towards == pytest.approx(0.1**2, rel=1e-3)
+    assert along @ found.covariances.anchors[0] @ along > 1e3
 
 
 def dense_jacobian(graph):
@@ -192,11 +191,11 @@ def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(m
     chosen = [0, 3, len(graph.poses) - 1]
     found, number = marginals(graph, [common], among=chosen), dense_system(graph)[2]
     rows = number["poses"][chosen].ravel()
-    np.testing.assert_allclose(found.among, covariance[np.ix_(rows, rows)], rtol=1e-4, atol=1e-10)
-    for name, blocks in (("poses", found.poses), ("anchors", found.anchors)):
+    np.testing.assert_allclose(found.covariances.among, covariance[np.ix_(rows, rows)], rtol=1e-4, atol=1e-10)
+    for name, blocks in (("poses", found.covariances.poses), ("anchors", found.covariances.anchors)):
         own = number[name]
         np.testing.assert_allclose(blocks, covariance[own[:, :, None], own[:, None, :]], rtol=1e-4, atol=1e-10)
-    np.testing.assert_allclose(found.calibration**2, np.diag(covariance)[number["calibration"][:, 0]], rtol=1e-4)
+    np.testing.assert_allclose(found.covariances.calibration**2, np.diag(covariance)[number["calibration"][:, 0]], rtol=1e-4)
 
     without = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residuals)
     step = without - np.linalg.solve(information, both.T @ residuals)[:size]
@@ -205,31 +204,6 @@ def test_common_errors_are_unknowns_with_the_variances_that_the_residuals_show(m
         np.testing.assert_allclose(getattr(estimated, name), getattr(expected, name), atol=1e-7)
     np.testing.assert_allclose(estimated.calibration.values, expected.calibration.values, atol=1e-7)
     assert np.abs(estimated.poses - graph.poses).max() > 1e-4
-
-
-def test_the_error_of_a_shape_is_what_alignment_leaves_of_many_draws():
-    """Errors drawn from a covariance of no structure, small beside the path; a similarity is z -> a z + b."""
-    rng = np.random.default_rng(2)
-    poses = rng.normal(loc=[40.0, -20.0, 0.0], scale=10.0, size=(7, 3))
-    root = 1e-3 * rng.normal(size=(21, 21))
-    errors = (root @ rng.normal(size=(21, 4000))).reshape(7, 3, -1)
-    path, drawn = poses[:, 0] + 1j * poses[:, 1], errors[:, 0] + 1j * errors[:, 1]
-    fit = np.column_stack([path, np.ones(7)])
-    left = drawn - fit @ np.linalg.lstsq(fit, drawn, rcond=None)[0]
-    # Of a mean of 4,000 squares that scatter by about themselves.
-    expected = pytest.approx(np.mean(np.abs(left) ** 2), rel=4 / np.sqrt(4000))
-    assert shape_error(poses, root @ root.T) ** 2 == expected
-
-
-def test_moves_turns_and_growth_of_the_whole_are_no_error_of_its_shape():
-    poses = np.random.default_rng(3).normal(scale=5.0, size=(9, 3))
-    modes = np.zeros((4, 9, 3))
-    modes[0, :, 0] = modes[1, :, 1] = 1.0
-    modes[2, :, 0], modes[2, :, 1] = -poses[:, 1], poses[:, 0]
-    modes[3] = poses
-    modes = modes.reshape(4, -1).T
-    assert shape_error(poses, modes @ modes.T) == pytest.approx(0.0, abs=1e-6)
-    assert shape_error(poses, np.eye(27)) == pytest.approx(np.sqrt((18 - 4) / 9))
 
 
 def test_redundancy_is_the_diagonal_of_the_dense_projection():

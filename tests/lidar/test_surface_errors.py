@@ -64,11 +64,11 @@ def test_along_a_wall_the_heading_errs_with_the_way_and_not_with_its_root(metres
     by_surface[:, 1, 2] = BEND
     graph = Graph(poses).with_edges(replace(edges_between(i, i + 1, poses), by_surface=by_surface))
     alone, together = marginals(graph), marginals(graph, common_range_errors(graph))
-    assert alone.poses[-1, 2, 2] == pytest.approx(n * SIGMA**2)
+    assert alone.covariances.poses[-1, 2, 2] == pytest.approx(n * SIGMA**2)
     first = int(np.sum(x[:-1] < 8.0))
     piece = n**2 if places == 1 else first**2 + (n - first) ** 2
     added = BEND**2 * ((0.010**2 + 0.014**2) * n**2 + 0.014**2 * piece)
-    assert together.poses[-1, 2, 2] - alone.poses[-1, 2, 2] == pytest.approx(added, rel=1e-6)
+    assert together.covariances.poses[-1, 2, 2] - alone.covariances.poses[-1, 2, 2] == pytest.approx(added, rel=1e-6)
 
 
 def test_edges_of_unknown_errors_have_none_in_common():

@@ -88,8 +88,8 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monk
 @pytest.mark.parametrize("lidar", [False, True])
 def test_what_ranges_err_alike_counts_for_all_or_for_anchors_at_given_poses_where_there_is_a_lidar(monkeypatch, lidar):
     of_all, of_anchors, marker = [], [], np.full((1, 2, 2), 7.0)
-    monkeypatch.setattr(final_stages, "count_alike_errors", lambda *arguments: of_all.append(arguments))
-    monkeypatch.setattr(final_stages, "by_alike_errors", lambda *arguments: of_anchors.append(arguments) or marker)
+    monkeypatch.setattr(final_stages, "with_correlated_errors", lambda *a: of_all.append(a) or a[0].covariances)
+    monkeypatch.setattr(final_stages, "anchors_with_correlated_errors", lambda *a: of_anchors.append(a) or marker)
     graph, config = loop()[0], MappingConfig()
     i, none = np.zeros(1, dtype=int), np.zeros((1, 3))
     scans = ScanEdges(i, i + 1, none, np.eye(3)[None], none, none, np.full(4, -1))
@@ -97,7 +97,8 @@ def test_what_ranges_err_alike_counts_for_all_or_for_anchors_at_given_poses_wher
     estimate = Estimate(graph.with_edges(scans) if lidar else graph, None, ranges, ())
     found, covariance = final_stages.without_range_errors(estimate, SimpleNamespace(config=config))
     assert found is estimate
-    assert [(a[0] is covariance, a[2] is ranges, a[3] is config.ranges) for a in of_all] == [(True, True, True)] * (not lidar)
+    found = [(a[0].covariances is covariance, a[2] is ranges, a[3] is config.ranges) for a in of_all]
+    assert found == [(True, True, True)] * (not lidar)
     assert [(a[1] is ranges, a[3] is config.ranges) for a in of_anchors] == [(True, True)] * lidar
     assert all(a[0].fixed_poses.all() and not any(isinstance(e, ScanEdges) for e in a[0].edges) for a in of_anchors)
     assert (covariance.anchors is marker) == lidar

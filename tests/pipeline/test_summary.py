@@ -186,9 +186,9 @@ def test_without_lidar_what_ranges_err_alike_is_stated(run):
     """Errors of 6 cm by direction and distance are in no residual; they count once in the sigmas."""
     result = run[-1]
     unaware = marginals(with_noise_shown(result.graph))
-    one, other = (np.einsum("kii->k", c[1:, :2, :2]) for c in (result.keyframe_covariances, unaware.poses))
+    one, other = (np.einsum("kii->k", c[1:, :2, :2]) for c in (result.keyframe_covariances, unaware.covariances.poses))
     assert np.all(one > other)
-    assert all(np.trace(a.covariance) > np.trace(c) for a, c in zip(result.anchors, unaware.anchors, strict=True))
+    assert all(np.trace(a.covariance) > np.trace(c) for a, c in zip(result.anchors, unaware.covariances.anchors, strict=True))
 
 
 def test_a_doubt_about_the_whole_map_distrusts_the_anchors_that_were_well():

@@ -115,7 +115,7 @@ def test_slip_in_turns_does_not_bend_a_given_mounting(slip):
     assert after.graph.calibration.get("sideways_per_turn") == pytest.approx(slip, abs=0.03)
     assert after.graph.calibration.get("laser_x") == pytest.approx(0.0, abs=0.03)
     off = after.graph.poses - truth
-    covariance = marginals(after.problem).poses
+    covariance = marginals(after.problem).covariances.poses
     whitened = np.einsum("ni,ni->n", off[1:], np.linalg.solve(covariance[1:], off[1:, :, None])[:, :, 0])
     assert whitened.mean() < 6.0
 
@@ -130,7 +130,8 @@ def test_what_slip_and_mounting_explain_alike_is_shared_by_their_odds_and_stated
     most = np.hypot(slip, mounting)
     assert calibration.get("sideways_per_turn") == pytest.approx(offset * (slip / most) ** 2, abs=0.004)
     assert calibration.get("laser_x") == pytest.approx(offset * (mounting / most) ** 2, abs=0.004)
-    sigma = marginals(after.problem).calibration[[calibration.index("laser_x"), calibration.index("sideways_per_turn")]]
+    both = [calibration.index("laser_x"), calibration.index("sideways_per_turn")]
+    sigma = marginals(after.problem).covariances.calibration[both]
     np.testing.assert_allclose(sigma, slip * mounting / most, rtol=0.1)
 
 
@@ -157,7 +158,7 @@ def test_wheels_that_go_crooked_to_the_side_do_not_turn_the_lidar(crooked):
     graph = replace(graph, fixed_calibration=np.ones(len(listed), dtype=bool))
     graph = with_free(graph, *OMNI, "laser_theta").with_edges(wheels, steps)
     solved, _ = optimize(graph)
-    sigma = marginals(solved).calibration[CALIBRATION.index("laser_theta")]
+    sigma = marginals(solved).covariances.calibration[CALIBRATION.index("laser_theta")]
     assert abs(solved.calibration.get("laser_theta")) < 2.0 * sigma
     # Which part of the angle is the lidar's, the priors alone say.
     assert 0.5 < sigma / (CalibrationConfig().ahead_per_sideways / np.sqrt(2.0)) < 1.1

@@ -12,7 +12,14 @@ from uwblite.graph.marginals import marginals
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.solver import optimize
-from uwblite.radio.anchor_covariance import _STEADY, _by_each_range, _scatter, _shown, by_alike_errors, count_alike_errors
+from uwblite.radio.anchor_covariance import (
+    _STEADY,
+    _by_each_range,
+    _scatter,
+    _shown,
+    anchors_with_correlated_errors,
+    with_correlated_errors,
+)
 from uwblite.radio.range_noise import RangeNoiseConfig
 
 PLACES = np.array([[2.0, 1.0], [9.0, 14.0]])
@@ -60,7 +67,7 @@ def test_the_stated_covariance_is_that_of_estimates_from_errors_that_are_alike()
     the correlation length change the stated one by up to a fifth; that of the weights is off by several times.
     """
     graph, exact = known_world()
-    rng, draws, plain = np.random.default_rng(5), 200, marginals(graph.with_edges(exact)).anchors
+    rng, draws, plain = np.random.default_rng(5), 200, marginals(graph.with_edges(exact)).covariances.anchors
     for anchor, size in enumerate((0.1, 0.4)):
         jacobian, weights, prior = system(graph, exact, anchor)
         gain = np.linalg.solve(
@@ -78,7 +85,7 @@ def test_the_stated_covariance_is_that_of_estimates_from_errors_that_are_alike()
                 residual = errors.copy()
                 residual[exact.anchor == anchor] -= jacobian @ moved
                 edges = replace(exact, ranges=exact.ranges + residual)
-                stated += by_alike_errors(graph.with_edges(edges), edges, plain, CONFIG)[anchor] / (draws / 20)
+                stated += anchors_with_correlated_errors(graph.with_edges(edges), edges, plain, CONFIG)[anchor] / (draws / 20)
         ratio = np.linalg.eigvals(np.linalg.solve(stated, found.T @ found / draws)).real
         np.testing.assert_allclose(ratio, 1.0, atol=3.0 * np.sqrt(2.0 / draws) + 0.2)
         by_weights = np.linalg.eigvals(np.linalg.solve(plain[anchor], found.T @ found / draws)).real
@@ -100,17 +107,17 @@ def test_an_anchor_that_is_given_and_one_without_ranges_stay_as_they_are():
     graph, edges = known_world()
     graph = replace(graph, fixed_anchors=np.array([True, False]))
     first = edges.rows(np.flatnonzero(edges.anchor == 0))
-    np.testing.assert_array_equal(by_alike_errors(graph.with_edges(first), first, WHOLE, CONFIG), WHOLE)
+    np.testing.assert_array_equal(anchors_with_correlated_errors(graph.with_edges(first), first, WHOLE, CONFIG), WHOLE)
 
 
 def test_few_ranges_and_open_directions_change_nothing():
     """Ranges from one place leave the direction open: the inverse there is round-off, and a product with it still is."""
     graph, edges = known_world()
     few = edges.rows(np.arange(29))
-    np.testing.assert_array_equal(by_alike_errors(graph.with_edges(few), few, WHOLE, CONFIG), WHOLE)
+    np.testing.assert_array_equal(anchors_with_correlated_errors(graph.with_edges(few), few, WHOLE, CONFIG), WHOLE)
     standing = replace(edges, pose=np.zeros_like(edges.pose))
     standing = replace(standing, ranges=standing.distances(graph))
-    np.testing.assert_array_equal(by_alike_errors(graph.with_edges(standing), standing, WHOLE, CONFIG), WHOLE)
+    np.testing.assert_array_equal(anchors_with_correlated_errors(graph.with_edges(standing), standing, WHOLE, CONFIG), WHOLE)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4, 1.2])
@@ -118,12 +125,13 @@ def test_errors_of_the_poses_come_on_top_and_never_below(turn):
     """A covariance of the whole graph that was linearised elsewhere may be smaller than that of the anchors alone."""
     graph, edges = known_world()
     problem = graph.with_edges(edges)
-    alone, turned = marginals(problem).anchors, se2.rotation(turn)[:2, :2]
-    alike = by_alike_errors(problem, edges, alone, CONFIG)
+    alone, turned = marginals(problem).covariances.anchors, se2.rotation(turn)[:2, :2]
+    alike = anchors_with_correlated_errors(problem, edges, alone, CONFIG)
     larger, smaller = turned @ np.diag([0.3, 0.1]) @ turned.T, turned @ np.diag([0.3, -10.0]) @ turned.T
-    np.testing.assert_allclose(by_alike_errors(problem, edges, alone + larger, CONFIG), alike + larger, atol=1e-9)
+    grown = anchors_with_correlated_errors(problem, edges, alone + larger, CONFIG)
+    np.testing.assert_allclose(grown, alike + larger, atol=1e-9)
     kept = turned @ np.diag([0.3, 0.0]) @ turned.T
-    np.testing.assert_allclose(by_alike_errors(problem, edges, alone + smaller, CONFIG), alike + kept, atol=1e-9)
+    np.testing.assert_allclose(anchors_with_correlated_errors(problem, edges, alone + smaller, CONFIG), alike + kept, atol=1e-9)
 
 
 def driven_world(size, seed, scale=1.0):
@@ -165,8 +173,10 @@ def test_of_poses_that_rest_on_ranges_the_covariance_is_the_sandwich_of_what_the
     """Against dense matrices, at the size that the recording shows: the planted one, but for the scatter of some ten errors."""
     graph, correlation = driven_world(0.3, 1)
     edges, chosen = graph.edges[-1], np.arange(0, 60, 4)
-    found, plain = marginals(graph, among=chosen), marginals(graph, among=chosen)
-    count_alike_errors(found, graph, edges, RangeNoiseConfig(sigma=0.3))
+    plain = marginals(graph, among=chosen)
+    before = plain.covariances.poses.copy()
+    found = with_correlated_errors(plain, graph, edges, RangeNoiseConfig(sigma=0.3))
+    np.testing.assert_array_equal(plain.covariances.poses, before)
     size = plain.unknowns.size
     inverse = plain.columns(np.arange(size))[:-1]
     linear, jacobian = edges.linearize(graph), np.zeros((len(edges), size + 1))
@@ -215,9 +225,6 @@ def test_where_nothing_is_assumed_to_be_steady_or_no_range_counts_covariances_st
     unused = replace(edges, weights=np.zeros(len(edges)))
     for ranges, config in ((edges, RangeNoiseConfig(steady=0.0)), (unused, RangeNoiseConfig())):
         found = marginals(graph, among=np.arange(0, 60, 4))
-        poses, among = found.poses.copy(), found.among.copy()
-        count_alike_errors(found, graph, ranges, config)
-        np.testing.assert_array_equal(found.poses, poses)
-        np.testing.assert_array_equal(found.among, among)
+        assert with_correlated_errors(found, graph, ranges, config) is found.covariances
     whole = np.full((len(graph.anchors), 2, 2), 3.0)
-    assert by_alike_errors(graph, edges, whole, RangeNoiseConfig(steady=0.0)) is whole
+    assert anchors_with_correlated_errors(graph, edges, whole, RangeNoiseConfig(steady=0.0)) is whole

@@ -12,6 +12,7 @@ from scipy.sparse.linalg import SuperLU
 from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
+from .covariances import Covariances
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
@@ -46,10 +47,10 @@ class CommonErrors:
 
 
 class Marginals:
-    """Covariances of the unknowns of a graph given all its measurements.
+    """The inverse of a graph's normal equations, and the covariances of its unknowns given all its measurements.
 
-    Zero where an unknown is fixed, infinite on the diagonal where no edge touches it. A direction that edges
-    leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
+    `solve`, `columns` and `relative` are of the inverse alone, `covariances` contains what common errors add. A direction that
+    edges leave open (a mirror, a floating part of the graph) shows as a variance of about 1e12 in units of its curvature.
     """
 
     def __init__(
@@ -59,20 +60,15 @@ class Marginals:
         self._factor = factor_of(normal)
         unseen = np.append(normal.diagonal <= 0, False)
         blocks = self._block_diagonal(unseen)
-        self.chosen = np.asarray(among, dtype=np.int64)
-        """(k,) poses of which `among` is."""
-        self._chosen = self.unknowns.number["poses"][self.chosen].ravel()
-        self.among = self.columns(self._chosen)[self._chosen]
-        """(3 k, 3 k) covariance of the k chosen poses with each other, x, y, theta of each in turn."""
+        chosen = np.asarray(among, dtype=np.int64)
+        self._chosen = self.unknowns.number["poses"][chosen].ravel()
+        self._among = self.columns(self._chosen)[self._chosen]
         self._correction = np.zeros(self.unknowns.size)
         for errors in common:
             self._add_common(errors, blocks)
-        self.poses = blocks["poses"]
-        """(n, 3, 3) of x, y, theta, map frame, m and rad."""
-        self.anchors = blocks["anchors"]
-        """(a, 2, 2) m^2, map frame."""
-        self.calibration = np.sqrt(blocks["calibration"][:, 0, 0])
-        """(c,) standard deviations, unit by name."""
+        sigmas = np.sqrt(blocks["calibration"][:, 0, 0])
+        self.covariances = Covariances(blocks["poses"], blocks["anchors"], sigmas, chosen, self._among)
+        """With what common errors add."""
 
     def corrected(self) -> Graph:
         """Return the graph, an optimised one, at the optimum that it has when its common errors are estimated with all else.
@@ -97,7 +93,7 @@ class Marginals:
             for name, number in self.unknowns.number.items():
                 own = moves[number]
                 blocks[name] += own @ own.transpose(0, 2, 1)
-            self.among += moves[self._chosen] @ moves[self._chosen].T
+            self._among += moves[self._chosen] @ moves[self._chosen].T
 
     def _estimated(self, common: CommonErrors) -> tuple[Callable[[Floats], Floats], Floats, Floats]:
         """Estimate errors that edges have in common: return H^-1 J^T W S as what multiplies by it, values (k,) and covariance
@@ -187,7 +183,7 @@ class Marginals:
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for poses i (m,) and j (m,)."""
         i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
-        return relative_covariances(self._graph, i, j, self.poses[i], self.poses[j], self._cross(i, j))
+        return relative_covariances(self._graph, i, j, self.covariances.poses[i], self.covariances.poses[j], self._cross(i, j))
 
     def _cross(self, i: Ints, j: Ints) -> Floats:
         """Return the covariances (m, 3, 3) between poses i and j, by solving for the columns of the fewer of them."""
@@ -245,22 +241,6 @@ def marginals(graph: Graph, common: Sequence[CommonErrors] = (), among: ArrayLik
     Those of single unknowns, and of the poses `among`, contain what common errors add.
     """
     return Marginals(graph, filled(graph, subtrees=True), common, among)
-
-
-def shape_error(poses: Floats, covariance: Floats) -> float:
-    """Return the rms error of places (m) that is expected after alignment by a similarity.
-
-    sqrt(tr(P C P) / k) with P = 1 - Q Q^T, where Q (2 k, 4) spans the moves, the turn and the growth of the whole.
-
-    Parameters
-    ----------
-    poses : (k, 3), as far apart as to stand for all. covariance : (3 k, 3 k) of them with each other.
-    """
-    places = poses[:, :2] - poses[:, :2].mean(axis=0)
-    own = covariance.reshape(len(poses), 3, len(poses), 3)[:, :2, :, :2].reshape(places.size, places.size)
-    turn = places @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-    q = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(poses), 1)), turn.ravel(), places.ravel()]))[0]
-    return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
 
 
 def calibration_covariance(graph: Graph) -> Floats:

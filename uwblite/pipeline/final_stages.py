@@ -6,6 +6,7 @@ import numpy as np
 
 from .. import se2
 from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_nonnegative_heights
+from ..graph.covariances import Covariances
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
 from ..graph.pose_edges import OdometryEdges, ScanEdges
@@ -17,7 +18,7 @@ from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors, with_range_errors
 from ..odometry.wheels import with_noise_shown
-from ..radio.anchor_covariance import by_alike_errors, count_alike_errors
+from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
 from .estimate import Estimate, Task
 from .lidar_stages import solved
@@ -45,36 +46,35 @@ def final_optimisation(estimate: Estimate, task: Task) -> Estimate:
     return replace(estimate, graph=estimate.problem, scans=scans, steps=None, joint=None)
 
 
-def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Marginals]:
+def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Covariances]:
     """Return the estimate moved by what errors of ranges to surfaces did to it, as far as these show, and its covariances.
 
-    These count what ranges of the lidar, and those of the radio, err alike.
+    These contain the correlated errors of the lidar's ranges and of the radio's.
     """
     poses = len(estimate.graph.poses)
     along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.int64))
     stated = with_noise_shown(with_fewer_pairs(estimate.graph))
-    covariance = marginals(stated, common := common_range_errors(stated), among=along)
+    found = marginals(stated, common := common_range_errors(stated), among=along)
     if common:
-        estimate = estimate.with_estimates_of(with_nonnegative_heights(covariance.corrected()))
-    if estimate.ranges is not None:
-        _count_alike_ranges(covariance, stated, estimate.graph, estimate.ranges, task.config.ranges)
-    return estimate, covariance
+        estimate = estimate.with_estimates_of(with_nonnegative_heights(found.corrected()))
+    if estimate.ranges is None:
+        return estimate, found.covariances
+    return estimate, _with_correlated_ranges(found, stated, estimate.graph, estimate.ranges, task.config.ranges)
 
 
 _ALONG = 60
 """Poses along the trajectory whose errors stand for those of all."""
 
 
-def _count_alike_ranges(
-    covariance: Marginals, stated: Graph, found: Graph, ranges: RangeEdges, config: RangeNoiseConfig
-) -> None:
-    """Count what ranges err alike: in the covariances of anchors where the lidar holds the poses, else in those of all."""
-    if any(isinstance(e, ScanEdges) for e in stated.edges):
-        about_anchors = tuple(e for e in found.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
-        given = at_given_poses(replace(found, edges=about_anchors))
-        covariance.anchors = by_alike_errors(given, ranges, covariance.anchors, config)
-    else:
-        count_alike_errors(covariance, stated, ranges, config)
+def _with_correlated_ranges(
+    found: Marginals, stated: Graph, graph: Graph, ranges: RangeEdges, config: RangeNoiseConfig
+) -> Covariances:
+    """Add the correlated errors of ranges: to anchors alone where the lidar determines the poses, else to all."""
+    if not any(isinstance(e, ScanEdges) for e in stated.edges):
+        return with_correlated_errors(found, stated, ranges, config)
+    about_anchors = tuple(e for e in graph.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
+    given, plain = at_given_poses(replace(graph, edges=about_anchors)), found.covariances
+    return replace(plain, anchors=anchors_with_correlated_errors(given, ranges, plain.anchors, config))
 
 
 def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:

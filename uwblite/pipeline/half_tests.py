@@ -81,7 +81,7 @@ def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Ta
     fixed_values[places] = False
     alone = Graph(graph.poses, graph.anchors, priors, graph.calibration, fixed, unseen, fixed_values)
     solved = optimize(alone.with_edges(wheels.rows(steps), ranges.rows(used)), task.config.solver)[0]
-    return np.column_stack([solved.calibration.values[places], marginals(solved).calibration[places]])
+    return np.column_stack([solved.calibration.values[places], marginals(solved).covariances.calibration[places]])
 
 
 def _loose(priors: PriorEdges, place: int) -> PriorEdges:

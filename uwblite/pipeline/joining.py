@@ -97,7 +97,7 @@ def _places(estimate: Estimate) -> dict[str, tuple[Floats, float]]:
     placed = np.flatnonzero(estimate.placed & ~estimate.bootstrap.ambiguous)
     if len(placed) < 2:
         placed = np.flatnonzero(estimate.placed)
-    spread = marginals(estimate.graph.with_edges(*estimate.odometry_and_ranges)).anchors
+    spread = marginals(estimate.graph.with_edges(*estimate.odometry_and_ranges)).covariances.anchors
     return {
         estimate.anchor_ids[k]: (estimate.graph.anchors[k], float(np.sqrt(np.clip(np.trace(spread[k]), 0.0, _MOST_VARIANCE))))
         for k in placed

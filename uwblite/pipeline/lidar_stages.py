@@ -68,7 +68,7 @@ def _late(estimate: Estimate) -> float:
     late = calibration.get("laser_delay") - estimate.lidar.delay
     if abs(late) < _CLOCK_TOLERANCE:
         return 0.0
-    sigma = marginals(_with_inflated_ranges(estimate).problem).calibration[calibration.index("laser_delay")]
+    sigma = marginals(_with_inflated_ranges(estimate).problem).covariances.calibration[calibration.index("laser_delay")]
     return late if abs(late) > _SIGNIFICANT * sigma else 0.0
 
 

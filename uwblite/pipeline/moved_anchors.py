@@ -111,7 +111,7 @@ def _places_by_recording(
     optimizer = Optimizer()
     edges, _ = learn_noise(edges, optimizer.optimize(alone.with_edges(edges), solver)[0], len(pairs), noise)
     solved = optimizer.optimize(alone.with_edges(edges), solver)[0]
-    return solved.anchors, marginals(solved).anchors, pairs
+    return solved.anchors, marginals(solved).covariances.anchors, pairs
 
 
 def name_new_and_absent_anchors(estimate: Estimate, task: Task) -> Estimate:

@@ -8,8 +8,8 @@ import numpy as np
 from .. import se2
 from ..arrays import Bools, Floats, spread_about_median
 from ..graph.calibration import Unknown, unknowns
+from ..graph.covariances import Covariances, shape_error
 from ..graph.graph import Graph
-from ..graph.marginals import Marginals, shape_error
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
@@ -32,7 +32,7 @@ _SHOWN = 0.7
 """A calibration value is 'estimated' when the recording brought its sigma below this share of the prior's."""
 
 
-def summarise(estimate: Estimate, covariance: Marginals, grid: OccupancyGrid | None, task: Task) -> MapResult:
+def summarise(estimate: Estimate, covariance: Covariances, grid: OccupancyGrid | None, task: Task) -> MapResult:
     """Gather the result; see MapResult."""
     recordings, stages, graph, ranges = task.recordings, task.stages, estimate.graph, estimate.ranges
     residuals, weights = _range_residuals(graph, ranges)
@@ -108,7 +108,7 @@ def _range_table(
 
 
 def _anchor(
-    k: int, estimate: Estimate, recordings: Recordings, covariance: Marginals, residuals: Floats, limit: float
+    k: int, estimate: Estimate, recordings: Recordings, covariance: Covariances, residuals: Floats, limit: float
 ) -> AnchorEstimate:
     graph, found, ranges, name = estimate.graph, estimate.bootstrap, estimate.ranges, estimate.anchor_ids[k]
     count = _count(name, recordings) if ranges is None else int(np.sum(ranges.anchor == k))
@@ -233,7 +233,9 @@ def _count(name: str, recordings: Recordings) -> int:
     return sum(int(np.sum(ranges.anchor == k)) for ranges, k in measured if ranges is not None)
 
 
-def _calibration(k: int, unknown: Unknown, graph: Graph, covariance: Marginals, by_steps: float | None) -> CalibrationEstimate:
+def _calibration(
+    k: int, unknown: Unknown, graph: Graph, covariance: Covariances, by_steps: float | None
+) -> CalibrationEstimate:
     """Return one value; by_steps: its standard deviation where the lidar's own turns fixed it before (turn_checks)."""
     value = float(graph.calibration.values[k])
     if by_steps is not None:

@@ -89,7 +89,7 @@ def with_slip_in_turns(estimate: Estimate, task: Task) -> Estimate:
     given = all(np.any(r.log.mounting.T_base_laser != 0.0) for r in task.recordings.each if r.has_scans)
     if not given or not slips.any() or abs(offset) < _SMALL or graph.fixed_calibration[at]:
         return estimate
-    if abs(offset) < _SIGNIFICANT * marginals(estimate.problem).calibration[at]:
+    if abs(offset) < _SIGNIFICANT * marginals(estimate.problem).covariances.calibration[at]:
         return estimate
     widths = (config.sideways_per_turn, min(_BY_TAPE, config.laser_offset), config.laser_offset)
     slip, right, other = (np.exp(-0.5 * (offset / width) ** 2) / width for width in widths)

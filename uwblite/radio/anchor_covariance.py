@@ -22,10 +22,13 @@ that last are of one anchor, by direction and distance, and half are of all, by 
 all anchors together say: a path that is bent towards ranges late through the same walls hides half of their errors.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import sparse
 
 from ..arrays import Floats, spread, spread_about_median
+from ..graph.covariances import Covariances
 from ..graph.graph import Graph, edge_weights
 from ..graph.marginals import CommonErrors, Marginals, marginals
 from ..graph.range_edges import RangeEdges
@@ -44,7 +47,7 @@ _OUTLYING = 3.0
 """Robust standard deviations as which residuals count at most."""
 
 
-def by_alike_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: RangeNoiseConfig) -> Floats:
+def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: RangeNoiseConfig) -> Floats:
     """Return the covariances of the anchors (a, 2, 2), m^2, with the errors that their ranges have alike; see above.
 
     Parameters
@@ -56,13 +59,14 @@ def by_alike_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: Rang
     if config.steady == 0.0:
         return whole
     around = marginals(graph)
+    own_covariances = around.covariances.anchors
     slopes = _by_each_range(around, edges)
     weights, residuals = edge_weights(edges, graph), edges.residuals(graph)[:, 0] * edges.sigma
     offsets = edges.tag_positions(graph.poses) - graph.anchors[edges.anchor]
     found = whole.copy()
     for anchor, place in enumerate(around.unknowns.number["anchors"]):
         own = np.flatnonzero((edges.anchor == anchor) & (weights > 0.0))
-        if place[0] < 0 or len(own) < _ENOUGH or np.trace(around.anchors[anchor]) > np.mean(np.sum(offsets[own] ** 2, axis=1)):
+        if place[0] < 0 or len(own) < _ENOUGH or np.trace(own_covariances[anchor]) > np.mean(np.sum(offsets[own] ** 2, axis=1)):
             continue  # given, hardly measured, or in a direction less known than it is far: nothing is linear there
         columns = np.unique(slopes[own].indices)
         inverse, factors = around.columns(columns)[columns], slopes[own][:, columns].toarray()
@@ -72,43 +76,46 @@ def by_alike_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: Rang
         scatter = max(config.steady, float(edges.sigma[own].max()), spread_about_median(residuals[own]))
         unlike = scatter**2 / _shown(inverse, jacobian, factors, alike) * alike - jacobian
         here = inverse[np.searchsorted(columns, place)]
-        by_ranges = around.anchors[anchor] + here @ (factors.T @ unlike) @ here.T
-        found[anchor] = by_ranges + _positive(whole[anchor] - around.anchors[anchor])
+        by_ranges = own_covariances[anchor] + here @ (factors.T @ unlike) @ here.T
+        found[anchor] = by_ranges + _positive(whole[anchor] - own_covariances[anchor])
     return found
 
 
-def count_alike_errors(found: Marginals, graph: Graph, edges: RangeEdges, config: RangeNoiseConfig) -> None:
-    """Give the marginal covariances of a graph whose poses rest on ranges what these err alike; see above.
+def with_correlated_errors(found: Marginals, graph: Graph, edges: RangeEdges, config: RangeNoiseConfig) -> Covariances:
+    """Return the covariances of a graph whose poses rest on ranges, with the correlated errors of these; see above.
 
     Those of the chosen poses, anchors and calibration are computed; the standard deviations of poses between two chosen ones
     grow as theirs do.
 
     Parameters
     ----------
-    found : marginals of the graph, with chosen poses; changed in place.
+    found : marginals of the graph, with chosen poses.
     """
-    number, weights = found.unknowns.number, edge_weights(edges, graph)
-    moving = np.all(number["poses"][found.chosen] >= 0, axis=1)
+    number, weights, plain = found.unknowns.number, edge_weights(edges, graph), found.covariances
+    moving = np.all(number["poses"][plain.chosen] >= 0, axis=1)
     if config.steady == 0.0 or not np.any(weights > 0.0) or not moving.any():
-        return
+        return plain
     offsets, variance = edges.tag_positions(graph.poses) - graph.anchors[edges.anchor], _variance(edges, weights)
     factors = _by_each_range(found, edges)
     scatter = _scatter(found, graph, edges, config, factors, offsets)
-    parts = [number["poses"][found.chosen].ravel(), number["anchors"].ravel(), number["calibration"].ravel()]
+    parts = [number["poses"][plain.chosen].ravel(), number["anchors"].ravel(), number["calibration"].ravel()]
     poses, anchors, calibration = np.split(np.arange(sum(map(len, parts))), np.cumsum([len(part) for part in parts[:2]]))
     columns = found.columns(np.concatenate(parts))
     seen = factors @ columns[:-1]
     added = seen.T @ (scatter**2 * _alike(edges, offsets, seen) - variance[:, None] * seen)
     whole = columns[np.concatenate(parts)] + 0.5 * (added + added.T)
-    before, found.among = np.diagonal(found.among).reshape(-1, 3)[moving], whole[np.ix_(poses, poses)]
-    factor = np.sqrt(np.maximum(np.diagonal(found.among), 0.0).reshape(-1, 3)[moving] / before)
-    by = np.stack([np.interp(np.arange(len(found.poses)), found.chosen[moving], own) for own in factor.T], axis=1)
-    found.poses = found.poses * by[:, :, None] * by[:, None, :]
-    pairs = anchors.reshape(-1, 2)
+    before, among = np.diagonal(plain.among).reshape(-1, 3)[moving], whole[np.ix_(poses, poses)]
+    factor = np.sqrt(np.maximum(np.diagonal(among), 0.0).reshape(-1, 3)[moving] / before)
+    by = np.stack([np.interp(np.arange(len(plain.poses)), plain.chosen[moving], own) for own in factor.T], axis=1)
+    pairs, sigmas = anchors.reshape(-1, 2), np.sqrt(np.maximum(np.diagonal(whole)[calibration], 0.0))
     # What no edge touches stays infinite.
-    found.anchors = np.where(np.isfinite(found.anchors), whole[pairs[:, :, None], pairs[:, None, :]], found.anchors)
-    sigmas = np.sqrt(np.maximum(np.diagonal(whole)[calibration], 0.0))
-    found.calibration = np.where(np.isfinite(found.calibration), sigmas, found.calibration)
+    return replace(
+        plain,
+        poses=plain.poses * by[:, :, None] * by[:, None, :],
+        anchors=np.where(np.isfinite(plain.anchors), whole[pairs[:, :, None], pairs[:, None, :]], plain.anchors),
+        calibration=np.where(np.isfinite(plain.calibration), sigmas, plain.calibration),
+        among=among,
+    )
 
 
 def _variance(edges: RangeEdges, weights: Floats) -> Floats:

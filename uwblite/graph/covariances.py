@@ -1,0 +1,42 @@
+"""Covariances of the unknowns of an optimised graph, and what they say of the shape of its path."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covariances:
+    """Marginal covariances of all unknowns, and the joint one of some poses.
+
+    Zero where an unknown is fixed, infinite on the diagonal where no edge touches it.
+    """
+
+    poses: Floats
+    """(n, 3, 3) of x, y, theta, map frame, m and rad."""
+    anchors: Floats
+    """(a, 2, 2) m^2, map frame."""
+    calibration: Floats
+    """(c,) standard deviations, unit by name."""
+    chosen: Ints
+    """(k,) poses whose joint covariance is known."""
+    among: Floats
+    """(3 k, 3 k) of the k chosen poses with each other, x, y, theta of each in turn."""
+
+
+def shape_error(poses: Floats, covariance: Floats) -> float:
+    """Return the rms error of places (m) that is expected after alignment by a similarity.
+
+    sqrt(tr(P C P) / k) with P = 1 - Q Q^T, where Q (2 k, 4) spans the moves, the turn and the growth of the whole.
+
+    Parameters
+    ----------
+    poses : (k, 3), as far apart as to stand for all. covariance : (3 k, 3 k) of them with each other.
+    """
+    places = poses[:, :2] - poses[:, :2].mean(axis=0)
+    own = covariance.reshape(len(poses), 3, len(poses), 3)[:, :2, :, :2].reshape(places.size, places.size)
+    turn = places @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    q = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(poses), 1)), turn.ravel(), places.ravel()]))[0]
+    return float(np.sqrt(max(np.trace(own) - np.trace(q.T @ own @ q), 0.0) / len(poses)))
