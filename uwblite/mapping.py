@@ -69,34 +69,47 @@ def build_map(
     logs = [scan_selection.prepared(log, config) for log in logs]
     config = radio_stages.with_units_checked(config, logs)
     task = Task(gather(logs, config.keyframes), config, constraints or Constraints(), stages, executor)
-    estimate = radio_stages.first_optimisation(task)
-    if np.any((factors := radio_stages.odometry_unit_factors(estimate, task)) != 1.0):
-        logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
-        # A unit that the ranges have set says nothing about the ranges' own.
-        free = replace(config.calibration, odometry_scale=config.calibration.odometry_unit)
-        task = replace(task, recordings=gather(logs, config.keyframes), config=replace(config, calibration=free))
-        estimate = radio_stages.first_optimisation(task)
+    estimate, task, logs = _in_sound_units(task, logs)
     anchor_heights.check_heights(estimate, task)
-    before, as_recorded = stages.mark(), (estimate, task)
+    estimate, task = _with_moves_apart(estimate, task, logs)
+    # Last of all: moves of anchors are sought on the trajectory before, on which their limits were set.
+    estimate, covariance = final_stages.without_range_errors(estimate, task)
+    stages.note([recording.log for recording in task.recordings.each])
+    grid = final_stages.occupancy_grid(estimate, task)
+    return summary.summarise(estimate, covariance, grid, task)
+
+
+def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task, list[SensorLog]]:
+    """Return the first optimisation, with odometry multiplied by a factor where the ranges show that its unit is wrong."""
+    estimate, config = radio_stages.first_optimisation(task), task.config
+    factors = radio_stages.odometry_unit_factors(estimate, task)
+    if np.all(factors == 1.0):
+        return estimate, task, logs
+    logs = [log.with_odometry_times(factor) for log, factor in zip(logs, factors.tolist(), strict=True)]
+    # A unit that the ranges have set says nothing about the ranges' own.
+    free = replace(config.calibration, odometry_scale=config.calibration.odometry_unit)
+    task = replace(task, recordings=gather(logs, config.keyframes), config=replace(config, calibration=free))
+    return radio_stages.first_optimisation(task), task, logs
+
+
+def _with_moves_apart(estimate: Estimate, task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
+    """Go through all stages, and again with each place of an anchor that was moved as an anchor of its own."""
+    before, as_recorded = task.stages.mark(), (estimate, task)
     renamed = anchor_moves.first_with_moves_apart(estimate, task, logs)
     for _ in range(_MOST_MOVES):
         if renamed is not None:
-            stages.back_to(before)
+            task.stages.back_to(before)
             estimate, task = as_recorded
             # Moves that were taken back leave the recordings as they were.
             if any(log is not other for log, other in zip(renamed, logs, strict=True)):
-                task = replace(task, recordings=gather(renamed, config.keyframes))
+                task = replace(task, recordings=gather(renamed, task.config.keyframes))
                 estimate = radio_stages.first_optimisation(task)
         for stage in _stages(task):
             estimate = stage(estimate, task)
             task = task.following(estimate)
         if (renamed := anchor_moves.with_moves_apart(estimate, task, logs)) is None:
             break
-    # Last of all: moves of anchors are sought on the trajectory before, on which their limits were set.
-    estimate, covariance = final_stages.without_range_errors(estimate, task)
-    stages.note([recording.log for recording in task.recordings.each])
-    grid = final_stages.occupancy_grid(estimate, task)
-    return summary.summarise(estimate, covariance, grid, task)
+    return estimate, task
 
 
 _MOST_MOVES = 3
