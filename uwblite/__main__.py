@@ -1,7 +1,7 @@
 """``python -m uwblite`` and the command ``uwblite``.
 
 This file and the package's ``__init__`` import as little as they can: until `start` runs, Ctrl-C ends in a traceback.
-Numerical libraries are told how many threads they have before they are imported.
+The number of threads of numerical libraries is set before they are imported.
 """
 
 import os

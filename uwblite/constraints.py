@@ -92,7 +92,7 @@ class GivenClosure:
 
 @dataclass(frozen=True, slots=True)
 class ForbiddenClosure:
-    """Two times whose places must not be matched with each other: they only look alike."""
+    """Two times whose places must not be matched with each other: they only look the same."""
 
     stamps: tuple[float, float] = (0.0, 0.0)
     """s, on the recording's clock."""

@@ -14,7 +14,7 @@ examples:
   uwblite evaluate both/ --truth monday.tum --truth tuesday.tum    a map of two recordings
   uwblite evaluate both/ --truth tuesday.tum --recording 2         only the second of them
 
-The trajectory is laid over the truth by the best rigid motion, without scale; ATE and RPE are those of evo_ape -a and
+The trajectory is aligned with the truth by the best rigid motion, without scale; ATE and RPE are those of evo_ape -a and
 evo_rpe. Several truths, in one frame, are of the recordings in their order: each is judged alone and all together, under
 one motion. Columns are searched in the map; the distances between them are what is judged.
 

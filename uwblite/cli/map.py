@@ -18,7 +18,7 @@ HELP = "map a recording: trajectory, anchors, occupancy grid, report"
 EPILOG = """\
 examples:
   uwblite map run.log --out map/                       everything at its best
-  uwblite map run.log.gz --out map/ --laser-flipped    the laser hangs upside down
+  uwblite map run.log.gz --out map/ --laser-flipped    the laser is mounted upside down
   uwblite map run.log --out a/ --without uwb           what wheels and lidar alone can do
   uwblite map run.log --out b/ --preset paper          the paper's plain choices
   uwblite map run.log --out c/ --set grid.resolution=0.02

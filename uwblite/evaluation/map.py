@@ -158,7 +158,7 @@ def visible_from(points: Floats, walls: Floats, columns: Floats, viewpoints: Flo
 
 
 def _blocked(start: Floats, end: Floats, walls: Floats, columns: Floats) -> Bools:
-    """Return which of the straight ways (n,) from start (n, 2) to end (n, 2) cross a wall or a column."""
+    """Return which of the straight lines (n,) from start (n, 2) to end (n, 2) cross a wall or a column."""
     way = end - start
     blocked = np.zeros(len(start), dtype=bool)
     for x1, y1, x2, y2 in walls:

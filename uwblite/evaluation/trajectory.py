@@ -1,6 +1,6 @@
 """How far an estimate is from the truth: trajectory (ATE, RPE, heading) and anchors. Maps: see evaluate_map.
 
-The estimate's frame is arbitrary: it is first laid over the truth by the rigid motion that fits the positions best
+The estimate's frame is arbitrary: it is first aligned with the truth by the rigid motion that fits the positions best
 (Umeyama 1991 without scale). Stamps are associated by interpolation: the estimate, which has a pose per odometry stamp, is
 read at the stamps of the truth; where it has no pose within `max_gap`, that stamp of the truth is left out.
 """
@@ -51,7 +51,7 @@ class TrajectoryErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorErrors:
-    """Estimated anchors against the true ones, laid over by the alignment of the trajectory."""
+    """Estimated anchors against the true ones, after the alignment of the trajectory."""
 
     ids: tuple[str, ...]
     """Anchors that were compared, in the order of the truth."""

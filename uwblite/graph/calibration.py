@@ -41,18 +41,18 @@ class CalibrationConfig:
     """How far ahead of the base's origin or behind it a robot turns that slips in turns, m (skid steering); used as far as the
     recording shows it."""
     sideways_scale: float = 0.1
-    """Relative error of ways to the side; only of an odometry that counts some (mecanum and omni wheels)."""
+    """Relative error of sideways motion; only where the odometry measures some (mecanum and omni wheels)."""
     sideways_per_metre: float = 0.015
     """Angle between the base's x axis and its way straight ahead, rad; of the same odometry."""
     ahead_per_sideways: float = 0.015
-    """Angle between the base's y axis and its way straight to the side, rad; of the same odometry. Wheels of unequal load drive
-    both ways crooked, not by one angle: with one alone the lidar's heading on the base would seem to be known."""
+    """Angle between the base's y axis and the direction of sideways motion, rad; of the same odometry. Wheels of unequal load
+    deflect both directions of motion, by two angles: with one alone the lidar's heading on the base would seem to be known."""
     range_scale: float = 0.15
     """Relative error of all ranges where the unit of the radios is wrong (0.07 has been seen); used as far as the recording
     shows it."""
     range_scale_sound: float = 0.001
-    """The same for radios whose unit is right, as it is for most: their clocks err by 2e-5, air slows the signal by 3e-4, and
-    the correction for received power leaves a few centimetres in tens of metres."""
+    """The same for radios whose unit is right, as it is for most: their clocks are off by 2e-5, air slows the signal by 3e-4,
+    and the correction for received power leaves a few centimetres in tens of metres."""
     range_bias: float = 0.8
     """Constant error of one anchor's ranges where the radios' antenna delays are not calibrated, m."""
     range_bias_sound: float = 0.1
@@ -96,7 +96,7 @@ def unknowns(
     given_height : (a,) anchors whose height is given.
     recording : which one of the graph's.
     rises : m, height of each of the robot's tags above the first. A further tag has its own place and antenna delay, and
-        where it hangs higher or lower its own height below the anchors.
+        where it is mounted higher or lower its own height below the anchors.
     """
     common = (
         ("odometry_scale", config.odometry_scale, "1", "relative error of travelled distance"),
@@ -104,7 +104,7 @@ def unknowns(
         ("heading_per_metre", config.heading_per_metre, "rad/m", "heading drift per travelled metre"),
         ("heading_rate", config.heading_rate, "rad/s", "heading drift per second of motion"),
         (TURNING, config.sideways_per_turn, "m/rad", "way to the left per turn"),
-        (OMNI[0], config.sideways_scale, "1", "relative error of ways to the side"),
+        (OMNI[0], config.sideways_scale, "1", "relative error of sideways motion"),
         (OMNI[1], config.sideways_per_metre, "1", "way to the left per metre ahead"),
         (OMNI[2], config.ahead_per_sideways, "1", "way ahead per metre to the left"),
         ("laser_x", config.laser_offset, "m", "correction of the laser's x on the base"),

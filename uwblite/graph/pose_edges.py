@@ -87,7 +87,7 @@ class OdometryEdges(EdgeTable):
     to the left ``v q + u r`` and to their way u ahead ``v w`` is added, both in the frame in the middle of the step: they move
     sideways 1 + q times as far as counted, crab by r on the way ahead, and by -w on the way to the side.
 
-    The error is that of the middle of the step: a heading that errs anywhere along the way displaces the end by half the
+    The error is that of the middle of the step: a heading error anywhere along the step displaces the end by half the
     way times it, in the mean, and what is left across is independent of it.
     """
 
@@ -139,7 +139,7 @@ class OdometryEdges(EdgeTable):
         return z, direction, s
 
     def _ways(self) -> Floats:
-        """Return the ways (2, e) to the left and ahead, in the frame in the middle of the step, m."""
+        """Return the motion (2, e) to the left and ahead, in the frame in the middle of the step, m."""
         ahead, left = se2.rotate(-self.motion[:, 2] / 2.0, self.motion[:, :2]).T
         return np.stack([left, ahead])
 

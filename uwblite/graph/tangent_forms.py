@@ -7,7 +7,7 @@ gradient, and lies below everywhere:
   1 - d / rho at the estimate rho: negative where the range was measured longer than the estimate has it;
 * of an angle: delta^2 is convex in 2 - 2 cos(delta), and so lies above the tangent with slope delta / sin(delta);
 * of a relative pose: terms of second order about the estimate are replaced by those of the largest information below it that
-  is diagonal, and alike in x and y; terms of first order stay.
+  is diagonal, and equal in x and y; terms of first order stay.
 """
 
 from collections.abc import Sequence

@@ -50,7 +50,7 @@ def moved_along(graph: Graph, unknowns: Unknowns, step: Floats, linked: Bools) -
 
     Parameters
     ----------
-    linked : (n - 1,) pose k + 1 hangs on pose k.
+    linked : (n - 1,) pose k + 1 is defined relative to pose k.
     """
     shift, start = unknowns.spread("poses", step), moved(graph, unknowns, step).poses
     link = se2.between(graph.poses[:-1], graph.poses[1:])
@@ -82,7 +82,7 @@ _LARGE_TURN = 0.05
 
 
 def linked_poses(poses: int, linearized: Sequence[Linearization]) -> Bools:
-    """Return which poses (n - 1,) hang together with the next one, in chains.
+    """Return which poses (n - 1,) are linked with the next one, in chains.
 
     Where edges of one kind all join neighbours, as odometry does, only these count: where one recording ends and another
     begins, clouds may be paired as well, and even with no weight.

@@ -57,7 +57,7 @@ class GraphFile:
 
         Raises
         ------
-        FormatError : a pose hangs on nothing.
+        FormatError : a pose is connected with nothing.
         """
         started, chains = along_edges(graph)
         file = GraphFile(started, pose_ids, anchor_ids, stamps, chains, dict(sorted(content.skipped.items())))

@@ -50,7 +50,7 @@ class Clouds:
     """(k + 1,)."""
     points: NDArray[np.floating]
     """(p, 2) m, base frame of the keyframe, ordered by bearing within a cloud. Where there is a line, the mean of the
-    neighbourhood: that takes out noise, and on curved surfaces every cloud errs alike."""
+    neighbourhood: that takes out noise, and on curved surfaces every cloud has the same error."""
     normals: NDArray[np.floating]
     """(p, 2) unit, towards the laser; 0 where the neighbourhood is no line."""
     owner: NDArray[np.signedinteger]

@@ -69,7 +69,7 @@ class RefinementConfig:
     sigma: float = setting(0.02, advanced=True)
     """Standard deviation of a point-to-line distance before it is learnt, m."""
     correlation: float = setting(4.0, advanced=True)
-    """Matches of one pair that together weigh as one independent match: neighbouring rays err alike."""
+    """Matches of one pair that together weigh as one independent match: errors of neighbouring rays are correlated."""
     convergence: float = setting(0.0002, advanced=True)
     """Rounds end early when the surfaces of clouds move against those of their partners by less than this (root mean square)
     at the last gate, m."""

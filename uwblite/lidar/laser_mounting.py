@@ -32,7 +32,7 @@ class Turning:
     as_given: float
     """Mean difference of turns, laser mounted as given, at the best clock offset, rad."""
     other: float
-    """The same with the laser mounted the other way up."""
+    """The same with the laser turned upside down."""
     misfit: float
     """The same the way that is right."""
     delay: float
@@ -45,12 +45,12 @@ class Turning:
 
     @property
     def agree(self) -> bool:
-        """Whether laser and wheels see the same turns at all, one way up or the other."""
+        """Whether laser and wheels see the same turns at all, with the laser upright or upside down."""
         return self.misfit <= 0.5 * self.typical
 
     @property
     def turned_over(self) -> bool:
-        """Whether the laser is mounted the other way up than given."""
+        """Whether the laser is upside down against what was given."""
         return self.other < 0.5 * self.as_given
 
 
@@ -115,7 +115,7 @@ def _differences(
 
 
 _LEAST_CLEAR = LEAST_PAIRS // 2
-"""Fewer of the clearer half show nothing: where a laser sees a post or two, single pairs fit either way up."""
+"""Fewer of the clearer half show nothing: where a laser sees a post or two, single pairs fit upright and upside down."""
 _NOISE = 0.02
 """Mean difference of ranges that means nothing, m."""
 _LEAST_SEEN = 0.05
@@ -180,7 +180,7 @@ def _matched_turn(scans: LaserScans, first: Ints, second: Ints, shift: Floats) -
     rows = np.arange(len(first))
     left, middle, right = cost[rows, best - 1], cost[rows, best], cost[rows, best + 1]
     fine = best - most + 0.5 * (left - right) / np.maximum(left - 2.0 * middle + right, 1e-9)
-    # Scans that see nothing fit every turn alike, to the bit, and a lone wall fits best where it leaves the view.
+    # Scans that see nothing fit every turn equally well, to the bit, and a lone wall fits best where it leaves the view.
     clear = 1.0 - (middle + _NOISE) / (np.median(cost, axis=1) + _NOISE)
     seen = np.mean(profile < reach, axis=1) > _LEAST_SEEN
     clear *= seen[one] & seen[other]

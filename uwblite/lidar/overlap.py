@@ -1,6 +1,6 @@
 """How much surface two clouds show in common, in the direction in which they show least.
 
-In corridors walls match wherever one is laid along the other: of two places that look alike most points match, but not the few
+In corridors walls match wherever one is laid along the other: of two equal places most points match, but not the few
 surfaces that face along the corridor. So only the direction counts in which least speaks for a place: with the normals n of
 points and weights w, a direction u has the sum u^T (sum w n n^T) u, and eigenvalues give the least of all directions.
 """
@@ -20,7 +20,7 @@ _NOISE = 0.005
 """Share of the points added in every direction: where fewer face, as along a bare wall, the noise of normals does."""
 _AGAINST = 2.0
 """Matches that one miss in view outweighs, by the ratio of likelihoods: in the true place five of six points match, in a wrong
-one that looks alike half of them; log((1/2) / (1/6)) / log((5/6) / (1/2)) = 2.2."""
+one that looks the same half of them; log((1/2) / (1/6)) / log((5/6) / (1/2)) = 2.2."""
 _MARGIN = 0.3
 """How far behind the farthest seen free space a point counts as in view, m."""
 

@@ -180,7 +180,7 @@ def shifts_by_range_error(
     A range too long by c puts points c farther out along their rays. Seen from one place, that moves a wall by less where the
     ray is oblique; from the next place it is another part of the wall that is moved less, and the pair comes out shifted and
     turned: r changes by n . (R ray_p - ray_q) for each match. The ray is taken from the origin of the base: where exactly the
-    laser stands changes both rays alike.
+    laser stands changes both rays by the same.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Errors of ranges that stay with surfaces, and what they do to poses.
 
-A lidar errs by one or two centimetres with colour, material and temperature (Kneip et al., Characterization of the compact
-Hokuyo URG-04LX, ICRA 2009), always alike. A wall moved by that much does no harm; but the error lies along the ray, so that
-it bends the wall towards its oblique parts, and the bend travels with the robot. Along a corridor whose two walls differ by
-3 cm, each step of 0.25 m comes out turned by a quarter of a milliradian, always to the same side: no residual shows it, and no
-number of pairs averages it out. Where the robot sees the wall again from elsewhere, or knows its heading otherwise, scan edges
+A lidar's ranges have errors of one or two centimetres that depend on colour, material and temperature (Kneip et al.,
+Characterization of the compact Hokuyo URG-04LX, ICRA 2009) and do not change. A wall moved by that much does no harm; but the
+error lies along the ray, so that it bends the wall towards its oblique parts, and the bend travels with the robot. Along a
+corridor whose two walls differ by 3 cm, each step of 0.25 m comes out turned by a quarter of a milliradian, always to the same
+side: no residual shows it, and no number of pairs averages it out. Where the robot sees the wall again from elsewhere, or knows its heading otherwise, scan edges
 contradict each other by it, and the error is estimated (graph/marginals.py).
 """
 
@@ -26,8 +26,8 @@ _DEVICE = 0.010
 _SURFACE = 0.014
 """Constant error of one surface for each of the sizes below, m: together 20 mm, of the 10 to 40 mm of Kneip et al."""
 _SIZES = (32.0, 8.0)
-"""Over how far surfaces err alike, m: a wall as long as a corridor, a piece of furniture. How far one colour reaches is not
-known: equal parts, of which the recording may show otherwise (graph/variance_components.py)."""
+"""Correlation length of errors of surfaces, m: a wall as long as a corridor, a piece of furniture. How far one colour
+reaches is not known: equal parts, of which the recording may show otherwise (graph/variance_components.py)."""
 _MOST = 64
 """Places of one size; more of them would cost more than all else, and larger ones state larger errors."""
 

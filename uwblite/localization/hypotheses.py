@@ -21,16 +21,16 @@ POSE, WHEELS = slice(0, 3), slice(3, 6)
 """Of the state: x, y, theta; relative error of distance, of turned angle, and heading per metre, rad/m."""
 FIRST_ANCHOR = 6 + 2 * HARMONICS
 PATTERN = slice(6, FIRST_ANCHOR)
-"""Of the state: m, by how much ranges err by the direction of the anchor in the robot's frame (tag_pattern.pattern_waves): the
+"""Of the state: m, range error as a function of the anchor's direction in the robot's frame (tag_pattern.pattern_waves): the
 tag's radiation pattern and the shadow of the robot's own body, the same for all anchors."""
 WHEEL_SIGMA = (0.02, 0.03, 0.01)
 """Prior standard deviations of the wheels' calibration; 1, 1, rad/m."""
 SLOW_SIGMA = 0.12
-"""m; what ranges to one anchor err alike, as the spread of RangeNoiseConfig: multipath, antennas, the anchor's place."""
+"""m; common error of ranges to one anchor, as the spread of RangeNoiseConfig: multipath, antennas, the anchor's place."""
 SLOW_LEFT = 0.08
-"""m; the same where the map says by how much ranges err at a place: what a few ranges nearby leave of it."""
+"""m; the same where the map says the range error at a place: what a few ranges nearby leave of it."""
 SLOW_LENGTH = 5.0
-"""m; the distance over which it stays alike: fields of a room's size last longer than the 1.5 m of single reflections."""
+"""m; its correlation length: fields of a room's size last longer than the 1.5 m of single reflections."""
 _DISTANCE, _HEADING_PER_METRE, _HEADING_PER_TURN = 0.02, 0.02, 0.03
 """Random errors of the wheels after one metre (m and rad) and one radian (rad), as in OdometryNoiseConfig, where the heading
 per metre is what a recording begins with before it is learnt; here nothing is learnt."""
@@ -39,7 +39,7 @@ _STANDING = 2e-4
 _FLIMSY = 0.03
 """m; standard deviation of a point about its wall: half a cell of 0.05 m and the lidar's noise at 3 m."""
 _INDEPENDENT = 20.0
-"""Points of a scan that err independently: those of one wall share the cells' rounding."""
+"""Points of a scan whose errors are independent: those of one wall share the cells' rounding."""
 _GATES = ((0.5, 0.3), (0.4, 0.2), (0.3, 0.1), (0.3, 0.1))
 """m; gate and kernel width of each iteration of a scan's match."""
 
@@ -80,7 +80,7 @@ def started(poses: Floats, covariances: Floats, anchors: int, slow: float = SLOW
 
     Parameters
     ----------
-    slow : standard deviation of what ranges to one anchor err alike, m.
+    slow : standard deviation of the common error of ranges to one anchor, m.
     """
     empty = none(anchors)
     n = empty.mean.shape[1]
@@ -107,7 +107,7 @@ def moved(bank: Hypotheses, step: Floats, slack: float = 0.0, slow_sigma: float 
     Parameters
     ----------
     step : (3,) pose of the base in the frame that it had before, by the wheels. slack : m and rad, standard deviation of
-        motion that the wheels did not see. slow_sigma : standard deviation of what ranges to one anchor err alike, m.
+        motion that the wheels did not see. slow_sigma : standard deviation of the common error of ranges to one anchor, m.
 
     Notes
     -----
@@ -146,7 +146,7 @@ def matched(bank: Hypotheses, walls: Walls, rays: Rays, fresh: float, *, found: 
 
     Parameters
     ----------
-    rays : in the present frame of the base. fresh : 0..1, how far the scan errs independently of the one before it: walls
+    rays : in the present frame of the base. fresh : 0..1, how far the scan's error is independent of the one before: walls
         are seen with the same cells' rounding until the robot has moved. found : whether the pose is certain.
 
     Notes

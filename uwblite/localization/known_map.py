@@ -35,7 +35,7 @@ class KnownAnchors:
 
     @property
     def slow_sigma(self) -> float:
-        """Standard deviation of what ranges to one anchor err alike besides, m."""
+        """Standard deviation of further common error of ranges to one anchor, m."""
         return SLOW_LEFT if self.errors else SLOW_SIGMA
 
 
@@ -53,7 +53,7 @@ class KnownMap:
 
     @property
     def covariance(self) -> Floats:
-        """(3, 3) m^2, rad^2; what the map itself is off by: alike in neighbouring scans, no filter averages it."""
+        """(3, 3) m^2, rad^2; error of the map itself: common to neighbouring scans, so that no filter averages it."""
         cells = 0.0 if self.walls is None else self.walls.rounding / np.sqrt(12.0)
         return np.diag(np.square(_OFF) + np.square((cells, cells, 0.0)))
 

@@ -41,7 +41,7 @@ class Odometer:
     def add(self, stamp: float, pose: Floats) -> Floats | None:
         """Take a pose (3,) and return the step (3,) since the one before; None where it is not used, or is the first.
 
-        A jump goes into the trajectory, with what was there before moved along: what hangs on the last pose stays there.
+        A jump goes into the trajectory, with what was there before moved along: what is relative to the last pose stays there.
         """
         if not np.isfinite(stamp) or not np.isfinite(pose).all():
             self.late += 1

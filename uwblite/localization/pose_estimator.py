@@ -23,7 +23,7 @@ from .walls import Rays
 from .window import RAYS, Window, WindowLook, WindowRange, way_of
 
 _FRESH_WAY = 0.1
-"""m; a scan taken so far from the last one errs independently of it; a nearer one in proportion."""
+"""m; the error of a scan taken so far from the last one is independent of the last one's; nearer, in proportion."""
 _LEAST_FRESH, _STANDING_FRESH = 0.1, 0.02
 """Least share of a scan that is new; the second for a robot that stands: its scans repeat one another."""
 _SEARCH_WAY, _SEARCH_TIME = 0.5, 0.5
@@ -79,7 +79,7 @@ class PoseEstimator:
     def wander(self, sigma: float) -> None:
         """Let the pose become unsure by a standard deviation, m and rad, of motion that nothing has measured.
 
-        What came before it cannot be laid together with what comes after.
+        What came before it cannot be joined with what comes after.
         """
         self._bank = hypotheses.moved(self._bank, np.zeros(3), sigma, self.known.anchors.slow_sigma)
         self._window, self._confirmed = Window(), None

@@ -17,9 +17,9 @@ from ..radio.range_noise import RangeNoise, RangeNoiseConfig, learn
 from ..radio.tag_pattern import HARMONICS, PATTERN_SIGMA, pattern_waves
 
 _CONSTANT = 0.1
-"""m; what the ranges to one anchor err alike everywhere."""
+"""m; common error of the ranges to one anchor, everywhere."""
 _CELL = 0.25
-"""m; ranges from one square of this size are averaged: they err alike."""
+"""m; ranges from one square of this size are averaged: their errors are correlated."""
 _MOST_CELLS = 400
 """Of one anchor; where there are more the squares are larger, for the time that a matrix of them takes."""
 _GATE = 2.0

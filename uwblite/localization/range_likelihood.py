@@ -7,7 +7,7 @@ from ..arrays import Floats
 from .window import Ranges
 
 _INDEPENDENT = 0.5
-"""Share of the window's ranges that are worth a new one: they are a quarter of a metre apart, and their errors are alike
+"""Share of the window's ranges that are worth a new one: they are a quarter of a metre apart, and their errors are correlated
 over 1.5 m in part."""
 _LATTICE, _LATTICE_STEPS = (1.5, 1.5, 0.6), (8, 8, 4)
 """m, m, rad about a pose, and steps to either side: several times what a start may be off by."""
@@ -36,7 +36,7 @@ def _misfits(poses: Floats, ranges: Ranges) -> Floats:
 def range_likelihood(poses: Floats, ranges: Ranges, wider: float = 0.0) -> Floats:
     """Return the log-likelihoods (h,) of the ranges at poses (h, 3), 0 = all as expected; detours and nonsense happen.
 
-    Ranges to one anchor err alike, see _INDEPENDENT.
+    Errors of ranges to one anchor are correlated, see _INDEPENDENT.
 
     Parameters
     ----------

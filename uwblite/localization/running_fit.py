@@ -68,7 +68,7 @@ class RunningFit:
         """Take the weight, 0..1, of a range at the pose, and the logarithm of how much likelier it is there than anywhere.
 
         The sum since it was last above 0 is Page's test for a sudden change (Continuous inspection schemes, Biometrika 1954);
-        ranges to one anchor err alike, so that each anchor counts once, as far as it was trusted.
+        errors of ranges to one anchor are correlated, so that each anchor counts once, as far as it was trusted.
         """
         self.against[anchor] = self.trust[anchor, 0] * ratio
         self.first = min(self.first, stamp)

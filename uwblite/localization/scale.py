@@ -22,7 +22,7 @@ _NO_SCALE = 1e-6
 _GATES = ((0.5, 0.3), (0.5, 0.3), (0.4, 0.2), (0.4, 0.15), (0.4, 0.15))
 """m; gate and kernel width of each iteration, wide: in a map 5 % too large the far wall of a room of 5 m is off by 0.25 m."""
 _WALL_SIGMA, _PER_LOOK = 0.03, 20.0
-"""m, of a point about its wall, and points of a scan that err independently, as in hypotheses.matched."""
+"""m, of a point about its wall, and points of a scan whose errors are independent, as in hypotheses.matched."""
 _ANCHOR_SIGMA = 0.12
 """m; what all ranges to one anchor are off by."""
 _ITERATIONS = 6

@@ -55,7 +55,7 @@ def doubt(
     rivals = bank.log_weight[hypotheses.apart(bank.poses[best], bank.poses)]
     if not complete:
         return "too many places are as likely; drive on"
-    # Rays and ranges err independently: half of what either needs is enough where there is half of the other as well.
+    # Errors of rays and ranges are independent: half of what either needs is enough where there is half of the other as well.
     if share_of_needed(ends) + fitting.share_of_needed < 1.0:
         return "too little was measured yet; drive on"
     if why := nowhere(fit, ends, fitting, proven):

@@ -1,6 +1,6 @@
 """What was measured during the last metres of driving, in the frame of the robot as it stands now: all that a start goes by.
 
-Poses of the past hang on the present one by the odometry. The place of the robot now fixes where everything was
+Poses of the past are relative to the present one, by the odometry. The place of the robot now fixes where everything was
 measured, so that a start is a search over one pose.
 """
 
@@ -142,7 +142,7 @@ class Window:
 
 
 _SLOW = 0.1
-"""m; what ranges to one anchor err alike."""
+"""m; common error of ranges to one anchor."""
 _DRIFT = 0.03
 """m of drift per metre driven: scale and heading of wheels that are not calibrated."""
 

@@ -24,7 +24,7 @@ class Candidates(Table):
     target: Ints
     """(c,) number of the sub-map that is matched against."""
     source: Ints
-    """(c,) number of the sub-map that is laid onto it."""
+    """(c,) number of the sub-map that is matched with it."""
     guess: Floats
     """(c, 3) relative pose of the reference keyframes by the graph."""
     covariance: Floats

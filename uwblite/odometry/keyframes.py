@@ -193,7 +193,7 @@ def _advance(ways: Floats, preferred: Bools) -> Ints:
 
 
 _AT_REST = 0.05
-"""Keyframe distances or angles up to which the first scan is one of the first pose: a way over which wheels err by little.
+"""Keyframe distances or angles up to which the first scan is one of the first pose: the wheels' error is small there.
 After a longer one the cloud would stand in the frame of all poses with an error that none of them knows of."""
 _GAP = 10.0
 """Keyframe distances, angles or durations without any scan after which keyframes go on without."""
@@ -251,6 +251,6 @@ def _error_ways(odometry: Odometry, stamps: Floats) -> Floats:
 
 
 _STANDING_ERROR = 1e-3
-"""m/s or rad/s of travelling and turning that err as much as standing does."""
+"""m/s or rad/s of travelling and turning with the same error as standing."""
 _BY_PATH = 0.1
-"""rad/m of turning that errs as much in heading as driving straight does; of the order of the wheels' noise settings."""
+"""rad/m of turning with the same error in heading as driving straight; of the order of the wheels' noise settings."""

@@ -18,7 +18,7 @@ _TURNING = 0.1
 _ENOUGH = 40
 """Turning steps that show a scale."""
 _STRETCHES = 4
-"""Parts of a recording, alike in turning steps, whose scales are compared."""
+"""Parts of a recording, equal in turning steps, whose scales are compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +28,7 @@ class TurnScale:
     value: float
     """Turn by the lidar / turn by the wheels - 1, 1: what ``heading_scale`` should be."""
     sigma: float
-    """Standard deviation, by the scatter of steps, whose errors within a turn are alike, and by that of the stretches, 1."""
+    """Standard deviation, by the scatter of steps (correlated within a turn) and by that of the stretches, 1."""
     stretches: Floats
     """(4,) the same of each quarter of the turning steps."""
     stretch_sigma: float
@@ -125,7 +125,7 @@ def _scale(lidar: Floats, wheels: Floats, turn: Ints) -> TurnScale:
 
 
 def _independent(error: Floats, weight: Floats, turn: Ints) -> float:
-    """Return how many independent steps weighted ones (s,) are worth whose errors are partly alike within a turn.
+    """Return how many independent steps weighted ones (s,) are worth whose errors are partly correlated within a turn.
 
     Tyres slip, and floors give way, for as long as a turn lasts. The correlation of neighbouring steps of one turn is taken
     from how often their errors have the same sign: of normal values with correlation r it is 1/2 + arcsin(r) / pi.

@@ -56,7 +56,7 @@ def wheel_edges(keyframes: Keyframes, config: OdometryNoiseConfig, calibration: 
 
 
 def sideways_priors(odometry: Odometry, priors: CalibrationConfig) -> CalibrationConfig:
-    """Return the priors of the calibration without those of ways to the side where the odometry counts hardly any."""
+    """Return the priors of the calibration without those of sideways motion where the odometry has hardly any."""
     steps = odometry.steps
     aside = se2.rotate(-steps[:, 2] / 2.0, steps[:, :2])[:, 1]
     if np.abs(aside).sum() > _OMNI * np.hypot(steps[:, 0], steps[:, 1]).sum():
@@ -65,7 +65,7 @@ def sideways_priors(odometry: Odometry, priors: CalibrationConfig) -> Calibratio
 
 
 _OMNI = 0.1
-"""Share of ways to the side among all from which on wheels drive sideways; rounding and slow clocks make some of any."""
+"""Share of sideways motion from which on wheels drive sideways; rounding and slow clocks make some of any."""
 
 
 def drift_time(keyframes: Keyframes) -> Floats:
@@ -138,7 +138,7 @@ _MOVING = 0.05
 def with_noise_shown(graph: Graph) -> Graph:
     """Return the graph with the noise of its odometry as the residuals show it, for covariances; poses stay where they are.
 
-    A carpet's nap, a cross slope or a smooth patch makes all steps on it wrong alike, over some three metres, ten steps. Their
+    A carpet's nap, a cross slope or a smooth patch makes all steps on it wrong by the same, for three metres (ten steps). Their
     errors then add up faster than with the square root of the way, and the noise of single steps does not show it; where the
     lidar measured every one of ten consecutive steps, their sum does, and nothing becomes smaller by it. Where it did not,
     the noise is the assumed one, as far as the residuals, of which ranges and the few scans check a part, say nothing else.
@@ -177,7 +177,7 @@ def _by_redundancy(wheels: OdometryEdges, graph: Graph) -> Floats:
 _ASSUMED = 2.0
 """What the assumed noise counts, in residuals: it is right within a factor of two."""
 _PATCH = 10
-"""Steps over which errors of the floor are alike: 3 m."""
+"""Steps over which errors of the floor are correlated: 3 m."""
 _ENOUGH_SUMS = 60
 """Sums, of which six do not overlap, that show how errors add up."""
 _MOST_FLOOR = 3.0

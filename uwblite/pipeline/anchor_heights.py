@@ -1,4 +1,4 @@
-"""How high do anchors hang of which no height is given? Slant ranges to high ones look like another unit of the wheels.
+"""How high are anchors of which no height is given? Slant ranges to high ones look like another unit of the wheels.
 
 Two hypotheses, low or as high as in a large hall, are solved and compared by marginal likelihood at their optima.
 """
@@ -62,7 +62,7 @@ def _apart(one: Graph, other: Graph) -> float:
 
 
 def check_heights(estimate: Estimate, task: Task) -> None:
-    """Doubt a map without lidar where the ranges do not decide how high the anchors hang, and it would be another map."""
+    """Doubt a map without lidar where the ranges do not decide how high the anchors are, and the map depends on it."""
     other = estimate.other_heights
     if other is None or task.recordings.have_scans or other.apart < _ELSEWHERE:
         return

@@ -54,7 +54,7 @@ class Applied:
     motion: Floats
     """(3,) T_new_old: what the frame was moved by."""
     moved: dict[str, float]
-    """Anchors that are not where they were given, by id: how far off they are, m."""
+    """Anchors that are not where they were given, by id: their distance from there, m."""
 
 
 def apply(given: Constraints, graph: Graph, anchor_ids: tuple[str, ...], placed: Bools, clock: Clock) -> Applied:

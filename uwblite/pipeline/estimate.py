@@ -58,7 +58,7 @@ class OtherHeights:
     """A hypothesis about heights of anchors that the ranges do not refute."""
 
     high: float
-    """How far the anchors hang above the tag where they hang high, m."""
+    """Height of the anchors above the tag where they are high, m."""
     taken: bool
     """Whether they are taken as high; otherwise as low."""
     apart: float

@@ -85,7 +85,7 @@ def _calibration(estimate: Estimate, recording: Recording, rows: slice, task: Ta
 
 
 def _loose(priors: PriorEdges, place: int) -> PriorEdges:
-    """Return priors of the calibration that leave the unit of the wheels' ways to the data."""
+    """Return priors of the calibration that leave the scale of the wheels to the data."""
     factor = np.where(priors.index == place, 1.0 / _LOOSER, 1.0)
     return replace(priors, sqrt_information=factor[:, None, None] * priors.sqrt_information)
 

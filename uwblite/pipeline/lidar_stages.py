@@ -121,7 +121,7 @@ def _with_keyframes_where_contradicted(estimate: Estimate, steps: Steps, task: T
 
 
 def _with_new_steps(estimate: Estimate, steps: Steps, former: Ints, task: Task) -> Steps:
-    """Return steps measured before keyframes were added, those of changed clouds measured anew; former: see remake."""
+    """Return steps measured before keyframes were added, those of changed clouds measured again; former: see remake."""
     i = estimate.odometry.i
     kept = (former[i] >= 0) & (former[i + 1] == former[i] + 1)
     rows = np.searchsorted(steps.i, former[i[kept]])
@@ -229,7 +229,7 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
 def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimate:
     """Solve everything with ranges that weigh by their own errors alone.
 
-    What all ranges from one direction are wrong by alike moves an anchor, and no number of them averages it out; but it
+    The common error of all ranges from one direction moves an anchor, and no number of them averages it out; but it
     gives a pose nothing false, since the anchor's place absorbs it. Where such ranges move poses by much, the lidar hardly
     constrains these, and it is matched again.
     """
@@ -245,7 +245,7 @@ def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimat
 
 
 def _without_pattern(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate with ranges corrected by what they err alike in each direction from the robot."""
+    """Return the estimate with ranges corrected by their common error in each direction from the robot."""
     if estimate.ranges is None or task.config.ranges.steady == 0.0:
         return estimate
     graph = with_fewer_pairs(estimate.problem)

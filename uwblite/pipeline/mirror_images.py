@@ -1,7 +1,7 @@
 """Has an anchor a second place that explains its ranges? A path that is nearly straight leaves its mirror image.
 
 The bootstrap asks this of ranges along odometry that drifts. Here it is asked once more along the final trajectory and with
-the ranges' final noise, which counts how alike neighbouring errors are: a curve, other anchors or the lidar decide then.
+the ranges' final noise, which contains the correlation of neighbouring errors: a curve, other anchors or the lidar decide then.
 Without a lidar, the ranges have bent a straight trajectory to suit the place that was found; there the poses are free too.
 """
 
@@ -20,7 +20,7 @@ _CLEAR = 30.0
 """Difference of chi2 between two places from which on the worse one is excluded. By chance alone 9 would do, but
 poses that are off by decimetres, which chi2 does not count, brought it to 11; the wrong side of a bent path, to hundreds."""
 _LIKELIER = 4.0
-"""The same where ranges that err alike count once, two standard deviations: a hundred ranges that come along one aisle may
+"""The same where correlated ranges count once, two standard deviations: a hundred ranges that come along one aisle may
 prefer the wrong side of it by 34, and by 1.3 as what they are worth."""
 _APART = 0.5
 """Places nearer to each other than this are the same, m."""

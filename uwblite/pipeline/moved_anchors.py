@@ -105,7 +105,7 @@ def _places_by_recording(
         fixed_poses=np.ones(len(graph.poses), dtype=bool),
         fixed_calibration=graph.fixed_calibration | ~graph.calibration.of_kinds(BIAS),
     )  # fmt: skip
-    # Outliers of the joint map may be of an anchor that was moved: first all ranges count alike.
+    # Outliers of the joint map may be of an anchor that was moved: first all ranges have the same weight.
     alike = np.ones(len(alive))
     edges = replace(ranges.rows(alive), anchor=which.reshape(-1).astype(np.int64), kernel=Kernel("cauchy", 2.5), weights=alike)
     optimizer = Optimizer()

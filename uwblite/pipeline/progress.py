@@ -59,7 +59,7 @@ class Stages:
         self.warnings.append(Notice(kind, text, figures))
 
     def withdraw(self, kind: str, figure: str) -> None:
-        """Take back all warnings of a kind that have a figure, to be said anew by what is known now."""
+        """Remove all warnings of a kind that have a figure: they are made again from what is known now."""
         self.warnings = [notice for notice in self.warnings if notice.kind != kind or figure not in notice.figures]
 
     def doubt(self, kind: str, text: str, **figures: object) -> None:

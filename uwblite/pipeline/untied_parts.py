@@ -86,10 +86,10 @@ def _held(graph: Graph, ranges: RangeEdges | None) -> Ints:
 
 
 def dead_reckoning_error(places: Floats, lengths: Floats, durations: Floats) -> Floats:
-    """Return how far (k,) usual wheels err at each place (k, 2) of a way from its first on, m.
+    """Return the error (k,) of usual wheels at each place (k, 2) of a way from its first on, m.
 
-    A turn too many at one place moves each later one to the side by its distance from there; of a heading that drifts alike
-    all along the way these moves add up with their signs: a way around and back errs less than one straight on.
+    A turn too many at one place moves each later one to the side by its distance from there; of a heading that drifts evenly
+    all along the way these moves add up with their signs: a path around and back has a smaller error than a straight one.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Covariances by what ranges err alike: of anchors where the lidar holds the poses, of all that ranges alone hold.
+"""Covariances with correlated range errors: of anchors where the lidar holds the poses, of all that ranges alone hold.
 
-A weight that lets many alike errors count once treats each of them as a large error of its own. That suits the estimate, but
-the inverse H^-1 = (J^T W J)^-1 is not its covariance: too large in directions that few ranges determine, too small where alike
-errors all push one way. With the covariance R of the errors it is
+A weight that counts many correlated errors as one treats each of them as a large error of its own. That suits the estimate, but
+the inverse H^-1 = (J^T W J)^-1 is not its covariance: too large in directions that few ranges determine, too small where
+correlated errors all have one sign. With the covariance R of the errors it is
 
     H^-1 J^T W R W J H^-1
 
@@ -16,8 +16,8 @@ What the errors of the poses add is the marginal covariance of the whole graph l
 two are linearised at different places; along a line of sight, where the curvature is all but nothing, that decides.
 
 Without a lidar the poses follow such errors as the anchors do. Then H is that of the whole graph, and R counts in the place of
-W^-1 for its ranges alone: H^-1 + H^-1 J^T W (R - W^-1) W J H^-1. The path also follows what the ranges to all anchors err
-alike: behind more walls all of them are later, never earlier, and there are more walls on a longer way. So half of the errors
+W^-1 for its ranges alone: H^-1 + H^-1 J^T W (R - W^-1) W J H^-1. The path also follows the common error of the ranges to all
+anchors: behind more walls all of them are later, never earlier, and there are more walls on a longer way. So half of the errors
 that last are of one anchor, by direction and distance, and half are of all, by distance. They are as large as the residuals of
 all anchors together say: a path that is bent towards ranges late through the same walls hides half of their errors.
 """
@@ -48,7 +48,7 @@ _OUTLYING = 3.0
 
 
 def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Floats, config: RangeNoiseConfig) -> Floats:
-    """Return the covariances of the anchors (a, 2, 2), m^2, with the errors that their ranges have alike; see above.
+    """Return the covariances of the anchors (a, 2, 2), m^2, with the correlated errors of their ranges; see above.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 Raw odometry of a long recording is too bent to linearise about, and anchors of unknown position cannot straighten it
 before they are placed. So the stretch whose anchors are clearest comes first; from there the interval of known
-poses extends at both ends. Each piece is laid on by the calibrated odometry, pulled onto the anchors already placed
+poses extends at both ends. Each piece is appended by the calibrated odometry, pulled onto the anchors already placed
 (graduated kernel: wide first, then tight), and whenever the interval has become longer by a share, all of it is solved
 again and anchors not yet placed are searched from the poses so far.
 """
@@ -30,7 +30,7 @@ class BootstrapConfig:
     seed_distances: ClassVar[tuple[float, ...]] = (25.0, 10.0, 4.0, 60.0, 150.0)
     """Travelled distances of the first stretch, m, tried in this order until the anchors in it are clear; then all of it."""
     piece: ClassVar[float] = 0.3
-    """Distance laid on at once, as a share of the first stretch; more where the prediction holds."""
+    """Distance appended at once, as a share of the first stretch; more where the prediction holds."""
     resolve_factor: ClassVar[float] = 1.35
     """All poses so far are solved again when their number has increased by this factor."""
     range_sigma: float = setting(0.15, advanced=True)
@@ -47,7 +47,7 @@ class BootstrapConfig:
     enough: ClassVar[float] = 50.0
     """Travelled distance over which a heading error is tried before it is worth the whole path, m."""
     tear: ClassVar[float] = 1.0
-    """No slip throws a step between keyframes off by more than this, m or rad: then a piece was laid on mirrored or in the
+    """No slip throws a step between keyframes off by more than this, m or rad: then a piece was appended mirrored or in the
     wrong place, however well its ranges agree."""
     clear_enough: ClassVar[float] = 0.35
     """A first stretch is good when its anchors (up to three) are worth this each; 1 = placed without error, 0 = unclear."""

@@ -1,6 +1,6 @@
 """What one anchor's range errors are made of: a core, a tail of detours, and nonsense.
 
-A radio ray that meets no obstacle errs a little and either way; one that goes around or through something comes late,
+A radio ray that meets no obstacle has a small error of either sign; one that goes around or through something comes late,
 never early. So the errors of an anchor are taken as a mixture of a normal core, the same core lengthened by an
 exponentially distributed detour, and a uniform rest of readings that mean nothing (lies, reflections, false detections)::
 

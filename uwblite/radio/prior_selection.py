@@ -2,7 +2,7 @@
 
 Most radios are sound: their clocks are right to parts of a million and the maker calibrated the antennas to a few
 centimetres. Some are not: scales 7 % off and biases of a metre and more are on record. A prior wide enough for those
-leaves the others' anchors and the map's scale hanging in the air, wherever bias and distance look alike along a path.
+leaves the others' anchors and the map's scale undetermined, wherever bias and distance have the same effect along a path.
 So the priors' standard deviations are chosen by marginal likelihood, the probability of all measurements with the unknowns
 integrated out (I. J. Good 1965; D. MacKay, Bayesian interpolation, 1992).
 
@@ -13,7 +13,7 @@ widths from sound to unsound are tried, and what is taken is their mean on the s
 marginal likelihood. A scale that is clearly off floats with the widest. So a scale stays where it is as long as the
 recording does not show it, moves a part of the way where it leans to one side, and floats where the posterior odds are clear.
 Slant ranges to anchors high above the tag look like a wrong unit of the wheels, too. The marginal likelihood (Laplace) at the
-optimum is compared with that of another hypothesis: the wheels' unit is right, and the anchors hang high.
+optimum is compared with that of another hypothesis: the wheels' unit is right, and the anchors are high.
 
 With the posterior N(a, P) found under the prior N(0, D), the marginal likelihood of another prior N(0, D') is, relative to it,
 
@@ -45,11 +45,11 @@ _SHORT, _TOO_SHORT = -0.01, 0.01
 """Relative error from which on ranges are shorter than light allows, and the factor on the odds of a radio that says so: too
 long may come from late first paths, too short only from a wrong constant."""
 _HIGH = 6.0
-"""Height above the tag at which anchors of a large hall hang, m."""
+"""Height above the tag of anchors in a large hall, m."""
 
 
 def with_high_anchors(graph: Graph, config: CalibrationConfig) -> Graph:
-    """Return the graph with priors under which the wheels' unit is right and the anchors hang as high as in a large hall.
+    """Return the graph with priors under which the wheels' unit is right and the anchors are as high as in a large hall.
 
     Lengths that a wrong unit stretched are put back, for a start; heights that were put back to 0 are free again.
     """

@@ -1,10 +1,10 @@
-"""How wrong ranges are, and how alike the errors of neighbouring ranges are.
+"""How wrong ranges are, and how correlated the errors of neighbouring ranges are.
 
 A radio's error is not white: multipath and antenna angle change slowly with the place, so a robot that stands or
 returns reads the same error again. Thousands of ranges taken as independent would outvote everything else. Here an
-anchor's residuals are split into a white part and a slow part that is alike within a correlation length in space
-(variogram: Matheron 1963); a range with n alike neighbours then gets the variance white + n slow, so that together
-they weigh what one draw of the slow part is worth.
+anchor's residuals are split into a white part and a slow part that is correlated within a correlation length in space
+(variogram: Matheron 1963); a range with n correlated neighbours then gets the variance white + n slow, so that together
+they weigh as one sample of the slow part.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class RangeNoiseConfig:
     slow_share: float = setting(0.5, advanced=True)
     """Assumed share of the variance that is slow."""
     correlation_length: float = setting(1.5, advanced=True)
-    """Distance over which the slow part stays alike, m, before it is learnt."""
+    """Correlation length of the slow part, m, before it is learnt."""
     min_sigma: float = setting(0.03, advanced=True)
     """Smallest standard deviation that is learnt, m."""
     steady: float = 0.06
@@ -48,7 +48,7 @@ class RangeNoise:
     white: float
     """Standard deviation of what is new in every range, m."""
     slow: float
-    """Standard deviation of what stays alike, m."""
+    """Standard deviation of the correlated part, m."""
     length: float
     """Correlation length, m."""
 
@@ -163,7 +163,7 @@ def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None
 
 
 def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | None = None) -> Floats:
-    """Return the standard deviation (m,) to give each of one anchor's ranges for what they err alike by direction and distance.
+    """Return the standard deviation (m,) to give each of one anchor's ranges for their common error by direction and distance.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | No
 
 
 def steady_sums(offsets: Floats, values: Floats) -> Floats:
-    """Return the sums (m, q) of the values (m, q) of all ranges to an anchor, each by how alike errors steady by direction are.
+    """Return the sums (m, q) of values (m, q) of all ranges to an anchor, weighted by the correlation of errors by direction.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def steady_sums(offsets: Floats, values: Floats) -> Floats:
 
 
 def distance_sums(offsets: Floats, values: Floats) -> Floats:
-    """Return the sums (m, q) of the values (m, q) of all ranges, to whatever anchor, by how alike errors by distance are.
+    """Return the sums (m, q) of values (m, q) of all ranges, to any anchor, weighted by the correlation of errors by distance.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def distance_sums(offsets: Floats, values: Floats) -> Floats:
 
 
 _STEADY_LENGTH = 0.5
-"""Half a radian of direction is alike, and half an e-fold of distance."""
+"""Correlation lengths: half a radian of direction, half an e-fold of distance."""
 
 
 def _polar(offsets: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""By how much ranges err with the direction of the anchor in the robot's frame.
+"""Range errors as a function of the anchor's direction in the robot's frame.
 
 The robot's own body shadows its tag (Otim et al., Electronics 8(11):1351, 2019), and an antenna's delay changes with the
 direction by centimetres to decimetres (bitcraze/crazyflie-firmware, issue 680): alike for all anchors, and however often a

@@ -10,7 +10,7 @@ from ..odometry.attached import OUTSIDE
 from ..sensor_log import LaserScans, Remark, SensorLog, UwbRanges
 
 _FEW_STAMPS = 20
-"""Stamps that may be alike by chance."""
+"""Stamps that may be equal by chance."""
 _COARSE = 0.4
 """s; sensors of moving robots are faster."""
 _SAME_STEP = 1e-4

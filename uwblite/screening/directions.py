@@ -14,7 +14,7 @@ from .wheel_motion import Pairs
 _AGREEMENT, _CLEARLY = 0.7, 0.2
 """Agreement of heading and path below which the sign is looked at, and by how much the other sign must agree better."""
 _TURNS = 300
-"""Scan pairs looked at for the way up of the laser."""
+"""Scan pairs that decide whether the laser is upside down."""
 _LEAST_TURNED, _ALIKE, _CONCENTRATED = 0.3, 0.5, 0.7
 """Angle by which a laser points elsewhere than given, difference up to which directions of motion agree, both rad, and share
 of them that must agree. Along bare walls a match stays at the wheels' guess, whichever way the laser looks."""
@@ -52,10 +52,11 @@ def _fits_laser(log: SensorLog) -> float:
 
 
 def laser_upright(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Return the recording with the laser the way up that its turns show.
+    """Return the recording with the laser mounted upright or upside down, as its turns show.
 
-    A laser upside down, beams in the wrong order and swapped wheels look alike: scans and wheels turn opposite ways. The first
-    two are repaired so; the third would give the mirror image of the place, and nothing in the recording shows which.
+    A laser upside down, beams in the wrong order and swapped wheels have the same effect: scans and wheels turn in
+    opposite directions. The first two are repaired so; the third would give the mirror image of the place, and nothing in
+    the recording shows which.
     """
     if _fits_laser(log) >= 0.0:
         return log, []
@@ -97,7 +98,7 @@ def laser_ahead(log: SensorLog, pairs: Pairs) -> tuple[SensorLog, list[Remark]]:
 
 
 def _lever_error(pairs: Pairs, clear: Bools, given: Floats, mount: Floats) -> float:
-    """Return how far ways by lidar and wheels differ with the laser mounted so, m, mean over turning pairs.
+    """Return by how much motions of lidar and wheels differ with the laser mounted so, m, mean over turning pairs.
 
     A laser that was mounted another way round stands where it was given; where the wheels drive another way instead, it
     stands elsewhere on their base, and its tag as well. Turns swing the laser about the base: that distinguishes the two.

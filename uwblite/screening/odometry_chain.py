@@ -1,4 +1,4 @@
-"""Breaks in the chain of odometry: single readings far off, jumps and resets, two sources in one log.
+"""Breaks in the chain of odometry: single outliers, jumps and resets, two sources in one log.
 
 A wheeled base moves continuously. A step between neighbouring readings that is much longer than the usual speed allows
 is no motion. Where leaving out a few readings makes the chain continuous again, they were wrong; elsewhere the chain is

@@ -75,4 +75,4 @@ class Screening:
     remarks: tuple[Remark, ...]
     breaks: OdometryBreaks
     lidar_by_wheels: float = float("nan")
-    """Way by the lidar / way by the wheels; nan where nothing shows it."""
+    """Distance by the lidar / distance by the wheels; nan where nothing shows it."""

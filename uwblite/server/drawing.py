@@ -1,4 +1,4 @@
-"""What the pages of this package have alike: their frame, colours and elements, and how a map is drawn.
+"""What the pages of this package have in common: their frame, colours and elements, and how a map is drawn.
 
 The scripts build everything with text nodes, so that no name out of a recording becomes markup.
 """
