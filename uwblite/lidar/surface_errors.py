@@ -4,8 +4,8 @@ A lidar's ranges have errors of one or two centimetres that depend on colour, ma
 Characterization of the compact Hokuyo URG-04LX, ICRA 2009) and do not change. A wall moved by that much does no harm; but the
 error lies along the ray, so that it bends the wall towards its oblique parts, and the bend travels with the robot. Along a
 corridor whose two walls differ by 3 cm, each step of 0.25 m comes out turned by a quarter of a milliradian, always to the same
-side: no residual shows it, and no number of pairs averages it out. Where the robot sees the wall again from elsewhere, or knows its heading otherwise, scan edges
-contradict each other by it, and the error is estimated (graph/marginals.py).
+side: no residual shows it, and no number of pairs averages it out. Where the robot sees the wall again from elsewhere, or
+knows its heading otherwise, scan edges contradict each other by it, and the error is estimated (graph/marginals.py).
 """
 
 from dataclasses import replace
