@@ -50,7 +50,7 @@ def test_no_way_names_the_nearest_reachable_point_and_writes_nothing(rooms, tmp_
     words = [*rooms[:-1], "0.35", "--from", "3,1", "--to", "3,3", "--json"]
     assert main(words) == 1
     output = capsys.readouterr()
-    assert "no way to (3.00, 3.00); the nearest reachable point is (" in output.err
+    assert "no path to (3.00, 3.00); the nearest reachable point is (" in output.err
     answer = json.loads(output.out)
     assert answer["exit_code"] == 1
     assert answer["nearest"][1] < 2.0

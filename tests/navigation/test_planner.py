@@ -134,7 +134,7 @@ def test_a_narrow_door_is_passed_in_the_middle_and_too_narrow_a_one_not():
     start, goal = np.array([2.05, 0.8]), np.array([2.05, 3.4])
     path = make_planner(grid, 0.15).plan(start, [goal])
     assert np.abs(path.poses[:, 0] - 2.05).max() < 0.06
-    with pytest.raises(NoPathError, match=r"no way to .* nearest reachable point") as caught:
+    with pytest.raises(NoPathError, match=r"no path to .* nearest reachable point") as caught:
         make_planner(grid, 0.25).plan(start, [goal])
     assert caught.value.nearest[1] < 2.0
     assert np.hypot(*(caught.value.nearest - goal)) < 1.8
@@ -185,7 +185,7 @@ def test_a_robot_in_unknown_space_leaves_it_and_keeps_clear_of_what_is_known():
     # Around the nearer end of the wall, at the price of unknown space, and as short as that way can be.
     assert path.poses[:, 0].min() < 0.9
     assert path.length < 1.1 * priced.plan(start, [goal]).length
-    with pytest.raises(NoPathError, match="no way to"):
+    with pytest.raises(NoPathError, match="no path to"):
         planner.plan(goal, [start])
     with pytest.raises(NoPathError, match="has an obstacle there"):
         planner.plan(np.array([2.0, 1.65]), [goal])
@@ -194,7 +194,7 @@ def test_a_robot_in_unknown_space_leaves_it_and_keeps_clear_of_what_is_known():
 def test_a_robot_that_unknown_space_and_walls_shut_in_cannot_leave():
     text = "\n".join(["." * 30] * 14 + ["." * 10 + "#" * 10 + "." * 10] + ["." * 10 + "#????????#" + "." * 10] * 8
                      + ["." * 10 + "#" * 10 + "." * 10])  # fmt: skip
-    with pytest.raises(NoPathError, match=r"no way leads from the start .* out of unknown space"):
+    with pytest.raises(NoPathError, match=r"no path leads from the start .* out of unknown space"):
         make_planner(grid_of(text), 0.2).plan(np.array([1.5, 0.5]), [np.array([0.5, 2.0])])
 
 

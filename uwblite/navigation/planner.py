@@ -141,7 +141,7 @@ class Planner:
         costs[self.node_of.ravel()[priced.nodes] < 0] = np.inf
         last = int(np.argmin(costs))
         if not np.isfinite(costs[last]):
-            raise NoPathError(f"no way leads from the start {_place(start)} out of unknown space")
+            raise NoPathError(f"no path leads from the start {_place(start)} out of unknown space")
         line = smoothed(priced.clearance, np.concatenate([way[-1:], priced._places(walk_back(before, first, last))]))
         return np.concatenate([way, line[1:]]), int(self.node_of.ravel()[priced.nodes[last]])
 
@@ -168,7 +168,7 @@ class Planner:
     def _no_path(self, goal: Floats, reached: Bools) -> NoPathError:
         places = self._places(np.flatnonzero(reached))
         nearest = places[np.argmin(np.hypot(*(places - goal).T))]
-        return NoPathError(f"no way to {_place(goal)}; the nearest reachable point is {_place(nearest)}", nearest)
+        return NoPathError(f"no path to {_place(goal)}; the nearest reachable point is {_place(nearest)}", nearest)
 
 
 def make_planner(grid: OccupancyGrid, radius: float, *, unknown: str = "refuse") -> Planner:

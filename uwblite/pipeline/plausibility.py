@@ -262,7 +262,7 @@ def check_handedness(estimate: Estimate, task: Task) -> None:
             wrong = factor < 0.0
             text = (
                 f"the map may be mirrored: the odometry's turns agree with the laser's only when multiplied by {factor:.2f}; "
-                "is the laser upside down (--laser-flipped), or does the odometry's heading count the other way?"
+                "is the laser upside down (--laser-flipped), or has the odometry's heading the wrong sign?"
             )
         else:
             wrong = True

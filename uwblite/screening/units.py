@@ -70,14 +70,14 @@ def refuse_other_ranges(change_by_way: float, lidar_by_wheels: float) -> None:
     Parameters
     ----------
     change_by_way : see range_motion.change_by_way.
-    lidar_by_wheels : the way that the lidar measures by the way of the wheels, nan where it does not: a lidar that agrees with
+    lidar_by_wheels : distance by the lidar / distance by the wheels, nan where it does not: a lidar that agrees with
         the ranges shows that the wheels are wrong.
     """
     if lidar_by_wheels > 0.0 and abs(np.log(change_by_way / lidar_by_wheels)) < np.log(_OTHER_LENGTH):
         return
     for name, unit in _LENGTHS.items():
         if abs(np.log(change_by_way * unit)) < np.log(_OTHER_LENGTH):
-            usual = f"usual change would be {change_by_way:.3g} times the way that the wheels count"
+            usual = f"usual change would be {change_by_way:.3g} times the distance that the wheels count"
             raise DataError(_other_unit("the ranges", usual, name, "range"))
 
 
