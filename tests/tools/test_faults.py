@@ -72,5 +72,16 @@ def test_the_page_gets_both_parts_and_keeps_the_rest(tmp_path):
     assert page.read_text() == written
 
 
+@pytest.mark.parametrize(("options", "written"), [([], True), (["--print"], False), (["--only", "swapped"], False)])
+def test_a_run_of_some_cases_leaves_the_page(monkeypatch, options, written):
+    """Its tables would take the place of those of all."""
+    pages = []
+    monkeypatch.setattr(faults, "clean_cases", lambda *_: {})
+    monkeypatch.setattr(faults, "outcomes", lambda *_: iter(DONE))
+    monkeypatch.setattr(faults, "write_page", lambda page, done, minutes: pages.append((page.name, done, minutes)))
+    assert faults.main([*options, "--minutes", "2"]) == 1
+    assert pages == [("accuracy.md", DONE, 2.0)] * written
+
+
 def test_every_fault_is_tried_with_sensors_that_exist():
     assert all(set(sensors) <= set(SENSORS) for _, sensors in FAULTS.values())
