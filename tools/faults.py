@@ -239,7 +239,8 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--worlds", default="lab")
     p.add_argument("--minutes", type=float, default=3.0)
     p.add_argument("--seed", type=int, default=1)
-    p.add_argument("--only", action="append", default=[], metavar="WORD", help="faults whose names contain it; repeatable; the page stays")
+    only = "faults whose names contain it; repeatable; the page stays"
+    p.add_argument("--only", action="append", default=[], metavar="WORD", help=only)
     p.add_argument("--sensors", default="all,no-lidar,no-uwb")
     p.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
     p.add_argument("--print", action="store_true", help="do not write docs/accuracy.md")
