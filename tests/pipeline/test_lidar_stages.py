@@ -49,7 +49,8 @@ def test_clouds_are_made_and_their_points_counted(monkeypatch):
 def test_a_clock_is_late_beyond_a_tolerance_and_three_standard_deviations(monkeypatch, clock, made, sigma, late):
     """Of 4 ms, against the offset with which the clouds were made."""
     calibration = Calibration((UnknownKey("laser_x"), UnknownKey("laser_delay")), np.array([9.0, clock]))
-    monkeypatch.setattr(lidar_stages, "marginals", lambda graph: SimpleNamespace(calibration=np.array([0.0, sigma])))
+    covariances = SimpleNamespace(calibration=np.array([0.0, sigma]))
+    monkeypatch.setattr(lidar_stages, "marginals", lambda graph: SimpleNamespace(covariances=covariances))
     graph = replace(loop()[0], calibration=calibration)
     estimate = Estimate(graph, graph.edges[0], None, (), scans=ScanClouds(None, None, made))
     assert lidar_stages._late(estimate) == pytest.approx(late)
