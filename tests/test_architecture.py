@@ -26,6 +26,7 @@ FLOORS = (
     ("screening",),
     ("loop_closure", "checks", "evaluation", "io"),
     ("pipeline",),
+    ("assessment",),
     ("mapping",),
     ("localization",),
     ("server",),
@@ -80,7 +81,7 @@ def imports_of(module: str):
 
 @pytest.mark.parametrize("module", [m for m in MODULES if m.startswith(("io/", "drivers/"))])
 def test_files_and_devices_know_no_algorithm(module):
-    algorithms = ("radio", "lidar", "loop_closure", "pipeline", "mapping", "localize", "localization")
+    algorithms = ("radio", "lidar", "loop_closure", "pipeline", "assessment", "mapping", "localize", "localization")
     solver = ("graph/solver", "graph/marginals")
     assert not [m for m in imports_of(module) if room_of(m) in algorithms or m in solver]
 

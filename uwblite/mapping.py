@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .assessment import summary
 from .constraints import Constraints
 from .map_result import MapResult
 from .pipeline import (
@@ -27,7 +28,6 @@ from .pipeline import (
     moved_anchors,
     radio_stages,
     scan_selection,
-    summary,
     turn_checks,
 )
 from .pipeline.estimate import Estimate, Task

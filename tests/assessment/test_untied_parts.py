@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from uwblite.assessment.untied_parts import _PER_METRE, _PER_SECOND, check_untied_parts, dead_reckoning_error
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.untied_parts import _PER_METRE, _PER_SECOND, check_untied_parts, dead_reckoning_error
 from uwblite.sensor_log import LaserScans, Odometry, SensorLog
 
 STAMPS = np.arange(100.0)

@@ -14,7 +14,7 @@ from ..arrays import Floats
 from ..graph.added_unknown import added_unknown
 from ..graph.graph import Edges, Graph, edge_weights
 from ..graph.pose_edges import OdometryEdges
-from .estimate import Estimate, Task
+from ..pipeline.estimate import Estimate, Task
 
 _SIGMAS = 2.5
 """Standard deviations that a drift must exceed, besides its limit."""

@@ -13,8 +13,8 @@ from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
 from ..loop_closure.loose_links import ANOTHER_VISIT, untied_breaks
 from ..loop_closure.slid_stretches import jumps, scans_fixing
+from ..pipeline.estimate import Estimate, Task
 from ..radio.range_noise import short_term_sigma
-from .estimate import Estimate, Task
 
 _SCATTER, _TIMES_NOISE = 0.3, 3.0
 """Typical scatter of ranges about the map, m, and in units of their scatter from one to the next, that multipath and blocked

@@ -11,8 +11,8 @@ from ..arrays import Floats, Ints
 from ..graph.graph import Graph
 from ..graph.pose_edges import RelativePoseEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
-from .estimate import Estimate, Task
-from .recordings import Recording
+from ..pipeline.estimate import Estimate, Task
+from ..pipeline.recordings import Recording
 
 _SILENT, _DRIVEN = 10.0, 3.0
 """Time without any scan, s, and way meanwhile, m, after which the odometry may be anywhere where it failed."""

@@ -10,13 +10,8 @@ from helpers.planted_graphs import plain_ranges
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
-from uwblite.graph.calibration import scan_indices
-from uwblite.graph.graph import Calibration, Graph, UnknownKey
-from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
-from uwblite.mapping import build_map
-from uwblite.pipeline import residual_tests
-from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.residual_tests import (
+from uwblite.assessment import residual_tests
+from uwblite.assessment.residual_tests import (
     check_odometry_jumps,
     check_odometry_steps,
     check_range_scatter,
@@ -24,6 +19,11 @@ from uwblite.pipeline.residual_tests import (
     check_slips,
     check_support,
 )
+from uwblite.graph.calibration import scan_indices
+from uwblite.graph.graph import Calibration, Graph, UnknownKey
+from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
+from uwblite.mapping import build_map
+from uwblite.pipeline.progress import Stages
 from uwblite.radio.range_noise import RangeNoiseConfig
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from ..arrays import Bools, Floats, runs_of
 from ..map_result import AnchorEstimate
+from ..pipeline.estimate import Task
 from ..sensor_log.anchor_names import name_and_number
-from .estimate import Task
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:

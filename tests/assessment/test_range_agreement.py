@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.range_agreement import (
+from uwblite.assessment.range_agreement import (
     check_sustained_outliers,
     check_unit,
     check_wheels_against_lidar,
     outlier_stretches,
 )
+from uwblite.pipeline.progress import Stages
 
 
 def test_stretches_in_which_most_readings_disagree_are_found():

@@ -8,10 +8,10 @@ import pytest
 from helpers.room_recording import recording, two_rounds
 
 from uwblite import se2
+from uwblite.assessment import half_tests
 from uwblite.constraints import Constraints
 from uwblite.graph.graph import PriorEdges
 from uwblite.mapping import build_map
-from uwblite.pipeline import half_tests
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages

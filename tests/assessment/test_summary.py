@@ -9,16 +9,7 @@ from helpers.planted import odometry, ranges, recording, wander
 from helpers.planted_graphs import plain_ranges
 
 from uwblite import se2
-from uwblite.evaluation.trajectory import evaluate_trajectory
-from uwblite.graph.calibration import CalibrationConfig, Unknown
-from uwblite.graph.graph import Calibration, Graph, UnknownKey
-from uwblite.graph.marginals import marginals
-from uwblite.map_result import AnchorEstimate, Notice
-from uwblite.mapping import MappingConfig, build_map
-from uwblite.odometry.wheels import with_noise_shown
-from uwblite.pipeline.estimate import Estimate
-from uwblite.pipeline.mapping_config import preset
-from uwblite.pipeline.summary import (
+from uwblite.assessment.summary import (
     _anchor,
     _calibration,
     _distrusted,
@@ -29,6 +20,15 @@ from uwblite.pipeline.summary import (
     _without_leaps,
     _without_strange_biases,
 )
+from uwblite.evaluation.trajectory import evaluate_trajectory
+from uwblite.graph.calibration import CalibrationConfig, Unknown
+from uwblite.graph.graph import Calibration, Graph, UnknownKey
+from uwblite.graph.marginals import marginals
+from uwblite.map_result import AnchorEstimate, Notice
+from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.wheels import with_noise_shown
+from uwblite.pipeline.estimate import Estimate
+from uwblite.pipeline.mapping_config import preset
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.sensor_log import SensorMounting

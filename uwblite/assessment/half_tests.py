@@ -19,10 +19,10 @@ from ..graph.calibration import RANGE_SCALE
 from ..graph.graph import Graph, PriorEdges
 from ..graph.marginals import marginals
 from ..graph.solver import optimize
-from .estimate import Estimate, Task
-from .progress import Stages
-from .radio_stages import bootstrapped, dead_reckoning
-from .recordings import Recording, gather
+from ..pipeline.estimate import Estimate, Task
+from ..pipeline.progress import Stages
+from ..pipeline.radio_stages import bootstrapped, dead_reckoning
+from ..pipeline.recordings import Recording, gather
 
 _CHANGES = {"odometry_scale": 0.1, "heading_scale": 0.2, "heading_per_metre": 0.05}
 """Differences between halves that no sound base has: of lengths, of turns, and of turns per metre, rad/m."""

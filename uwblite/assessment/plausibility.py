@@ -12,14 +12,14 @@ from ..graph.calibration import HEIGHT, RANGE_SCALE, Unknown
 from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
+from ..pipeline.estimate import Estimate, Task
+from ..pipeline.turn_checks import check_turn_scales
 from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
 from .drift_tests import check_drifts
-from .estimate import Estimate, Task
 from .half_tests import check_halves
 from .range_agreement import check_sustained_outliers, check_unit, check_wheels_against_lidar
 from .residual_tests import check_residuals
-from .turn_checks import check_turn_scales
 from .untied_parts import check_untied_parts
 
 _UNUSUAL = 3.0

@@ -8,13 +8,8 @@ import pytest
 from helpers.planted import aligned_error, box, odometry, ranges, recording, scans, wander
 
 from uwblite import se2
-from uwblite.constraints import Constraints, GivenAnchor
-from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
-from uwblite.map_result import AnchorEstimate, CalibrationEstimate
-from uwblite.mapping import MappingConfig, build_map
-from uwblite.odometry.attached import OUTSIDE
-from uwblite.pipeline import plausibility
-from uwblite.pipeline.plausibility import (
+from uwblite.assessment import plausibility
+from uwblite.assessment.plausibility import (
     check_anchors,
     check_calibration,
     check_certainty,
@@ -23,6 +18,11 @@ from uwblite.pipeline.plausibility import (
     check_handedness,
     check_moved_together,
 )
+from uwblite.constraints import Constraints, GivenAnchor
+from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
+from uwblite.map_result import AnchorEstimate, CalibrationEstimate
+from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.attached import OUTSIDE
 from uwblite.pipeline.progress import Stages
 from uwblite.sensor_log import SensorMounting
 

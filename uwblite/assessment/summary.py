@@ -13,11 +13,11 @@ from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
+from ..pipeline.estimate import Estimate, Task
+from ..pipeline.radio_stages import heights_given, tag_rises
+from ..pipeline.recordings import Recordings
 from ..sensor_log.anchor_names import name_and_number
 from . import plausibility
-from .estimate import Estimate, Task
-from .radio_stages import heights_given, tag_rises
-from .recordings import Recordings
 from .residual_tests import NO_DISTANCES
 
 _ABOUT_PARTS = ("anchor-mirror-ambiguous", "no-anchor", "no-closure")
