@@ -43,7 +43,7 @@ class CalibrationConfig:
     sideways_scale: float = 0.1
     """Relative error of sideways motion; only where the odometry measures some (mecanum and omni wheels)."""
     sideways_per_metre: float = 0.015
-    """Angle between the base's x axis and its way straight ahead, rad; of the same odometry."""
+    """Angle between the base's x axis and the direction of forward motion, rad; of the same odometry."""
     ahead_per_sideways: float = 0.015
     """Angle between the base's y axis and the direction of sideways motion, rad; of the same odometry. Wheels of unequal load
     deflect both directions of motion, by two angles: with one alone the lidar's heading on the base would seem to be known."""
