@@ -335,16 +335,20 @@ find a column in. *ATE* is the root mean square error of the trajectory after al
 """
 
 NOTES = """
-Why it differs where it does: the rooms err as data sheets and papers say (tools/simulation/real_rooms.py). Two choices are the
-paper's own hall: the floor, so uneven that odometry alone is as far off on average as in the paper, and nodes 3 and 4, which
-have no line of sight (its table II). Nothing is fitted to the error of its full method. With a line of sight to all four nodes
-that error is 0.13 m, since errors of 4 to 12 cm each average; with two of four late by decimetres, which preset paper neither
-models nor weighs down, it is above 0.2 m. Anchors 1.9 m above the tag (2.44 and 0.57 m, Qorvo forum, topic 5059), which preset
-paper takes for level with it, would add another 0.02 m: the paper does not say, so here all are level. The fitness score of
-the paper counts every point of a sub-map, also those that the other never saw, so most of the pairs that overlap in part are
-rejected. The defaults match neighbouring scans in every method, also in *odometry* and *odometry + UWB*: there only what
-would join different times is left out. GMapping, the fifth method of its table, is not repeated: it is another
-program.
+Where results differ from the paper's, this is why.
+
+- **Rooms.** The simulated errors are those that data sheets and papers report (tools/simulation/real_rooms.py). Two choices
+  follow the paper's hall: a floor so uneven that odometry alone has the paper's mean error, and nodes 3 and 4 without line
+  of sight (its table II). Nothing is fitted to the error of its full method.
+- **Line of sight.** With line of sight to all four nodes the error is 0.13 m, since errors of 4 to 12 cm average out. With
+  two of four late by decimetres, which the paper's preset neither models nor down-weights, it is above 0.2 m.
+- **Heights.** Anchors 1.9 m above the tag (2.44 and 0.57 m, Qorvo forum, topic 5059), which the paper's preset takes for
+  level with it, would add 0.02 m. The paper does not give heights, so all are level here.
+- **Fitness.** The paper's score counts every point of a sub-map, also those that the other sub-map never saw, so most pairs
+  that overlap in part are rejected.
+- **Methods.** The defaults match neighbouring scans in every method, also in *odometry* and *odometry + UWB*, which leave
+  out only what would join different times. GMapping, the fifth method of the paper's table, is another program and not
+  repeated.
 """
 
 
