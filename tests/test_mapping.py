@@ -57,7 +57,7 @@ def ate(result, truth) -> float:
     return evaluate_trajectory(result.stamps, result.trajectory, *truth, max_gap=30.0).ate.rmse
 
 
-def test_anchors_covariances_are_those_of_all_measurements_and_of_what_their_ranges_err_alike(result):
+def test_anchors_covariances_contain_the_correlated_errors_of_their_ranges(result):
     stated = with_noise_shown(with_fewer_pairs(result.graph))
     whole = marginals(stated, common_range_errors(stated)).covariances.anchors
     (ranges,) = [e for e in result.graph.edges if isinstance(e, RangeEdges)]

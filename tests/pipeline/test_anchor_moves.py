@@ -14,10 +14,10 @@ from uwblite.graph.graph import Graph
 from uwblite.mapping import build_map
 from uwblite.pipeline import anchor_moves
 from uwblite.pipeline.anchor_moves import (
-    _alike,
     _moves,
     _of_all,
     _renamed,
+    _same,
     first_with_moves_apart,
     with_moves_apart,
 )
@@ -102,18 +102,18 @@ def test_readings_of_an_anchor_that_is_carried_are_no_distances():
     said = "moved by 1.0 m between t = 1 and 3 s (its 2 ranges meanwhile were left out); from then on it is called A@2"
     assert log.screening.remarks[0].text == f"anchor A was {said}"
     # Where it was put down is looked for in all ranges again.
-    assert not _alike(four_ranges(A=[moved(3.0)]).ranges, log.ranges, {})
-    assert _alike(four_ranges(A=[moved(3.0)]).ranges, log.ranges, {"A": [moved(3.0)]})
+    assert not _same(four_ranges(A=[moved(3.0)]).ranges, log.ranges, {})
+    assert _same(four_ranges(A=[moved(3.0)]).ranges, log.ranges, {"A": [moved(3.0)]})
 
 
 def test_two_ranges_at_each_move_may_be_called_otherwise():
     one, none = four_ranges(A=[moved(1.0)]).ranges, four_ranges().ranges
     moves = {"A": [moved(1.0)]}
-    assert not _alike(one, none, moves)  # three ranges have another name
-    assert _alike(one, four_ranges(A=[moved(3.0)]).ranges, moves)
-    assert not _alike(one, four_ranges(A=[moved(3.0)]).ranges, {})
-    assert _alike(one, none, {"A": [moved(1.0)], "B": [moved(2.0)]})
-    assert _alike(None, none, {})
+    assert not _same(one, none, moves)  # three ranges have another name
+    assert _same(one, four_ranges(A=[moved(3.0)]).ranges, moves)
+    assert not _same(one, four_ranges(A=[moved(3.0)]).ranges, {})
+    assert _same(one, none, {"A": [moved(1.0)], "B": [moved(2.0)]})
+    assert _same(None, none, {})
 
 
 def test_moves_of_about_the_same_time_are_one_for_all_anchors():

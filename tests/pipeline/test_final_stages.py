@@ -86,7 +86,7 @@ def test_of_anchors_alone_heights_that_the_search_puts_back_to_0_stay_fixed(monk
 
 
 @pytest.mark.parametrize("lidar", [False, True])
-def test_what_ranges_err_alike_counts_for_all_or_for_anchors_at_given_poses_where_there_is_a_lidar(monkeypatch, lidar):
+def test_correlated_range_errors_count_for_all_or_for_anchors_at_given_poses_where_there_is_a_lidar(monkeypatch, lidar):
     of_all, of_anchors, marker = [], [], np.full((1, 2, 2), 7.0)
     monkeypatch.setattr(final_stages, "with_correlated_errors", lambda *a: of_all.append(a) or a[0].covariances)
     monkeypatch.setattr(final_stages, "anchors_with_correlated_errors", lambda *a: of_anchors.append(a) or marker)

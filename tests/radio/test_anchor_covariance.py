@@ -60,7 +60,7 @@ def system(graph, edges, anchor):
     return np.column_stack([towards, np.ones(len(own))]), edge_weights(own, graph) / own.sigma**2, np.diag([0.0, 0.0, 25.0])
 
 
-def test_the_stated_covariance_is_that_of_estimates_from_errors_that_are_alike():
+def test_the_stated_covariance_is_that_of_estimates_from_correlated_errors():
     """Planted errors have a scatter of their own, which only residuals show; the weights do not count it.
 
     A variance from n draws scatters by sqrt(2 / n). The median of few independent residuals and places binned to a quarter of
@@ -169,7 +169,7 @@ def driven_world(size, seed, scale=1.0):
     return optimize(graph.with_edges(prior_edges(listed), steps, edges))[0], correlation
 
 
-def test_of_poses_that_rest_on_ranges_the_covariance_is_the_sandwich_of_what_these_err_alike():
+def test_of_poses_that_rest_on_ranges_the_covariance_is_the_sandwich_of_their_correlated_errors():
     """Against dense matrices, at the size that the recording shows: the planted one, but for the scatter of some ten errors."""
     graph, correlation = driven_world(0.3, 1)
     edges, chosen = graph.edges[-1], np.arange(0, 60, 4)

@@ -244,7 +244,7 @@ def test_what_is_steady_depends_on_directions_and_ratios_of_distances(radius, fa
 
 
 @pytest.mark.parametrize(("other", "apart"), [((0.0, 1.0), 2.0**0.5), ((-1.0, 0.0), 2.0), ((np.exp(0.5), 0.0), 0.5)])
-def test_half_a_radian_of_direction_or_half_an_e_fold_of_distance_is_alike(other, apart):
+def test_half_a_radian_of_direction_or_half_an_e_fold_of_distance_is_a_correlation_length(other, apart):
     """By chords of the unit circle and logarithms of distance."""
     alike = np.exp(-apart / 0.5)
     for turn in (0.0, np.pi / 2):

@@ -68,7 +68,7 @@ def judge(
 
 
 def check_certainty(estimate: Estimate, sigma: float, task: Task) -> None:
-    """Doubt a map whose shape is known roughly at most, by its own uncertainties.
+    """Doubt a map whose own uncertainties say that its shape is not known well.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ half a metre; rooms mapped by odometry and ranges have 0.08 to 0.15 m."""
 
 
 def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
-    """Name anchors that are not ok, and doubt a map with which most ranges, or without a lidar half of the anchors, disagree.
+    """Warn of anchors that are not ok; doubt a map with which most ranges, or without lidar half of the anchors, disagree.
 
     A name of two anchors counts as a distrusted one. Mirror ambiguity is a doubt where no anchor in reach has one place alone.
     """
@@ -199,7 +199,7 @@ def check_sensors(grid: OccupancyGrid | None, task: Task) -> None:
 
 
 def check_closures(estimate: Estimate, anchors: Sequence[AnchorEstimate], grid: OccupancyGrid | None, task: Task) -> None:
-    """Name a map without loop closures, or one that more of them contradict than hold together."""
+    """Warn of a map without loop closures; doubt one that more of them contradict than support."""
     candidates = estimate.closures.candidates
     accepted = sum(c.accepted for c in candidates)
     placed = any(a.status != "unplaced" for a in anchors)

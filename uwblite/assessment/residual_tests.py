@@ -218,7 +218,7 @@ def check_scales(estimate: Estimate, task: Task) -> None:
 
 
 def check_support(estimate: Estimate, task: Task) -> None:
-    """Doubt a map that nothing but the odometry holds."""
+    """Doubt a map that nothing but the odometry constrains."""
     ranges = estimate.ranges
     constrained = ranges is not None and bool(ranges.alive.any())
     constrained |= any(isinstance(edges, ScanEdges | RelativePoseEdges) for edges in estimate.graph.edges)

@@ -1,4 +1,4 @@
-"""From the optimised graph to the result: anchors, calibration, doubts, in the user's words."""
+"""From the optimised graph to the result: anchors, calibration, warnings and doubts."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -172,7 +172,7 @@ def _reason_to_distrust(used: float, sigma: float, longest: float, bias: float, 
 
 
 def _reason_of_short_ranges(short: int, count: int) -> str:
-    """Return why an anchor is distrusted of whose ranges so many are shorter than the way to its place, '' where it is not."""
+    """Return why an anchor with so many ranges shorter than the distance to its place is distrusted, '' where it is not."""
     if short <= max(_FEW_SHORT, _SHARE_SHORT * count):
         return ""
     return f"{short} of its {count} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere for a time?"

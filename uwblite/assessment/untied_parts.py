@@ -1,4 +1,4 @@
-"""Is there a moment that neither scans, closures nor anchors tie to what came before it, or to anything?
+"""Parts of a recording that only the odometry connects with the rest: neither scans, closures nor anchors do.
 
 Where the lidar is silent while the robot drives, or where all anchors give way to others at once, the odometry alone lays
 the later part of the map onto the earlier one. Whatever went wrong with it meanwhile (wheels that stood still, a log that
@@ -26,7 +26,7 @@ _AT_ONCE = 10.0
 
 
 def check_untied_parts(estimate: Estimate, task: Task) -> None:
-    """Doubt a map whose parts the odometry alone ties, where a sensor that should tie them broke off."""
+    """Doubt a map whose parts only the odometry connects, where another sensor fell silent in between."""
     ranges = estimate.ranges
     alive = None if ranges is None else ranges.rows(np.flatnonzero(ranges.alive))
     check_loose_ends(estimate, alive, task)
@@ -50,7 +50,7 @@ def check_untied_parts(estimate: Estimate, task: Task) -> None:
 
 
 def check_loose_ends(estimate: Estimate, ranges: RangeEdges | None, task: Task) -> None:
-    """Doubt a map with a beginning or an end that no scan, closure or range holds, where usual wheels would go astray on it.
+    """Doubt a map with a beginning or an end that no scan, closure or range holds, where usual wheels drift too far.
 
     What goes wrong with the wheels there leaves no residual, and sigmas speak of sound wheels alone. The middle of a recording
     is held from both sides.

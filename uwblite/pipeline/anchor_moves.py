@@ -34,7 +34,7 @@ def with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) 
     moves = _moves_of_all(estimate, task, logs)
     renamed = [_renamed(log, found) for log, found in zip(logs, moves, strict=True)]
     now = [recording.log.ranges for recording in task.recordings.each]
-    same = all(_alike(log.ranges, ranges, found) for log, ranges, found in zip(renamed, now, moves, strict=True))
+    same = all(_same(log.ranges, ranges, found) for log, ranges, found in zip(renamed, now, moves, strict=True))
     return None if same else renamed
 
 
@@ -65,8 +65,8 @@ _TOGETHER = 30.0
 """Moves within so much of each other are taken for one, s."""
 
 
-def _alike(a: UwbRanges | None, b: UwbRanges | None, moves: Moves) -> bool:
-    """Return whether ranges are called the same and left out alike, but for a few at each move."""
+def _same(a: UwbRanges | None, b: UwbRanges | None, moves: Moves) -> bool:
+    """Return whether ranges have the same names and the same ones are left out, but for a few at each move."""
     if a is None or b is None:
         return True
     differ = np.asarray(a.anchor_ids)[a.anchor] != np.asarray(b.anchor_ids)[b.anchor]

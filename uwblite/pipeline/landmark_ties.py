@@ -1,4 +1,4 @@
-"""True distances between landmarks: what somebody measured between columns or corners makes the map as long as measured.
+"""Measured distances between landmarks (columns, corners) as constraints on the poses that see them.
 
 A landmark is a place in the map as it comes out before its distances are used. The keyframes that see what stands there
 carry it along: of each visit the one that saw most keeps the landmark's place in its own frame. A measured distance ties each

@@ -72,11 +72,11 @@ def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Float
         inverse, factors = around.columns(columns)[columns], slopes[own][:, columns].toarray()
         variance = edges.sigma[own] ** 2 / weights[own]
         jacobian = variance[:, None] * factors
-        alike = _STEADY * steady_sums(offsets[own], factors) + (1.0 - _STEADY) * factors
+        correlated = _STEADY * steady_sums(offsets[own], factors) + (1.0 - _STEADY) * factors
         scatter = max(config.steady, float(edges.sigma[own].max()), spread_about_median(residuals[own]))
-        unlike = scatter**2 / _shown(inverse, jacobian, factors, alike) * alike - jacobian
+        excess = scatter**2 / _shown(inverse, jacobian, factors, correlated) * correlated - jacobian
         here = inverse[np.searchsorted(columns, place)]
-        by_ranges = own_covariances[anchor] + here @ (factors.T @ unlike) @ here.T
+        by_ranges = own_covariances[anchor] + here @ (factors.T @ excess) @ here.T
         found[anchor] = by_ranges + _positive(whole[anchor] - own_covariances[anchor])
     return found
 
@@ -102,7 +102,7 @@ def with_correlated_errors(found: Marginals, graph: Graph, edges: RangeEdges, co
     poses, anchors, calibration = np.split(np.arange(sum(map(len, parts))), np.cumsum([len(part) for part in parts[:2]]))
     columns = found.columns(np.concatenate(parts))
     seen = factors @ columns[:-1]
-    added = seen.T @ (scatter**2 * _alike(edges, offsets, seen) - variance[:, None] * seen)
+    added = seen.T @ (scatter**2 * _times_correlation(edges, offsets, seen) - variance[:, None] * seen)
     whole = columns[np.concatenate(parts)] + 0.5 * (added + added.T)
     before, among = np.diagonal(plain.among).reshape(-1, 3)[moving], whole[np.ix_(poses, poses)]
     factor = np.sqrt(np.maximum(np.diagonal(among), 0.0).reshape(-1, 3)[moving] / before)
@@ -129,7 +129,7 @@ def _by_each_range(found: Marginals, edges: RangeEdges) -> sparse.csr_matrix:
     return found.slopes(CommonErrors(edges, each, each, 1.0 / edges.sigma[:, None], each)).T.tocsr()
 
 
-def _alike(edges: RangeEdges, offsets: Floats, values: Floats) -> Floats:
+def _times_correlation(edges: RangeEdges, offsets: Floats, values: Floats) -> Floats:
     """Return R (m, m), by 1 on its diagonal, times values (m, q)."""
     found = (1.0 - _STEADY) * values + 0.5 * _STEADY * distance_sums(offsets, values)
     for anchor in np.unique(edges.anchor):
@@ -156,7 +156,7 @@ def _scatter(
     by_others = np.einsum("sk,ks->s", jacobian, moved) - np.einsum("ms,m,ms->s", taken, variance, taken)
     left = -taken
     left[some, np.arange(len(some))] += 1.0
-    shown = np.einsum("ms,ms->s", left, _alike(edges, offsets, left))
+    shown = np.einsum("ms,ms->s", left, _times_correlation(edges, offsets, left))
     unexplained = max(float(np.mean(np.minimum(np.abs(residuals[alive]), most) ** 2) - np.mean(by_others)), 0.0)
     checks = len(alive) * float(np.mean(shown))
     scatter = np.sqrt((_ENOUGH * config.sigma**2 + len(alive) * unexplained) / (_ENOUGH + checks))
@@ -169,14 +169,14 @@ def _positive(matrix: Floats) -> Floats:
     return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
-def _shown(inverse: Floats, jacobian: Floats, factors: Floats, alike: Floats) -> float:
+def _shown(inverse: Floats, jacobian: Floats, factors: Floats, correlated: Floats) -> float:
     """Return the share of the variance of errors that least squares leaves in residuals: of their covariance R (m, m), by 1 on
     its diagonal, the trace of (I - J H^-1 J^T W) R (I - J H^-1 J^T W)^T over m.
 
     Parameters
     ----------
-    inverse : (q, q) H^-1. jacobian : (m, q) J. factors : (m, q) W J. alike : (m, q) R W J.
+    inverse : (q, q) H^-1. jacobian : (m, q) J. factors : (m, q) W J. correlated : (m, q) R W J.
     """
-    absorbed = 2.0 * np.trace(inverse @ (alike.T @ jacobian))
-    absorbed -= np.trace(inverse @ (factors.T @ alike) @ inverse @ (jacobian.T @ jacobian))
+    absorbed = 2.0 * np.trace(inverse @ (correlated.T @ jacobian))
+    absorbed -= np.trace(inverse @ (factors.T @ correlated) @ inverse @ (jacobian.T @ jacobian))
     return 1.0 - float(absorbed) / len(factors)

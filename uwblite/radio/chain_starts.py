@@ -1,4 +1,4 @@
-"""Starting places for the chains of several robots that nothing but ranges and landmarks ties together.
+"""Initial poses for the trajectories of several robots that only ranges and landmarks connect.
 
 Each chain is taken as rigid, as its odometry has it. Chains are placed one after another, the best tied first: for every
 heading R on a circle of starts, a range d from its point b to a placed point a (0 where the chain sees the landmark a at

@@ -159,7 +159,7 @@ def effective_sigma(positions: Floats, noise: RangeNoise, weights: Floats | None
     """
     if noise.slow == 0.0 or len(positions) == 0:
         return np.full(len(positions), max(noise.sigma, 1e-6))
-    return np.sqrt(noise.white**2 + noise.slow**2 * _alike(positions, noise.length, weights))
+    return np.sqrt(noise.white**2 + noise.slow**2 * _correlation_sum(positions, noise.length, weights))
 
 
 def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | None = None) -> Floats:
@@ -171,7 +171,7 @@ def steady_sigma(offsets: Floats, config: RangeNoiseConfig, weights: Floats | No
     """
     if config.steady == 0.0 or len(offsets) == 0:
         return np.zeros(len(offsets))
-    return config.steady * np.sqrt(_alike(_polar(offsets), _STEADY_LENGTH, weights))
+    return config.steady * np.sqrt(_correlation_sum(_polar(offsets), _STEADY_LENGTH, weights))
 
 
 def steady_sums(offsets: Floats, values: Floats) -> Floats:
@@ -181,7 +181,7 @@ def steady_sums(offsets: Floats, values: Floats) -> Floats:
     ----------
     offsets : (m, 2) from the anchor to the tag, m.
     """
-    return _alike_sums(_polar(offsets), _STEADY_LENGTH, values)
+    return _correlated_sums(_polar(offsets), _STEADY_LENGTH, values)
 
 
 def distance_sums(offsets: Floats, values: Floats) -> Floats:
@@ -191,7 +191,7 @@ def distance_sums(offsets: Floats, values: Floats) -> Floats:
     ----------
     offsets : (m, 2) from the anchor to the tag, m.
     """
-    return _alike_sums(_polar(offsets)[:, 2:], _STEADY_LENGTH, values)
+    return _correlated_sums(_polar(offsets)[:, 2:], _STEADY_LENGTH, values)
 
 
 _STEADY_LENGTH = 0.5
@@ -205,17 +205,17 @@ def _polar(offsets: Floats) -> Floats:
     return np.stack([np.cos(bearing), np.sin(bearing), np.log(distance)], axis=1)
 
 
-def _alike(positions: Floats, length: float, weights: Floats | None) -> Floats:
-    """Return the sum (m,) of exp(-distance / length) over all ranges, itself included, at least 1; see _alike_sums."""
+def _correlation_sum(positions: Floats, length: float, weights: Floats | None) -> Floats:
+    """Return the sum (m,) of exp(-distance / length) over all ranges, itself included, at least 1; see _correlated_sums."""
     counts = np.ones(len(positions)) if weights is None else weights
-    return np.maximum(_alike_sums(positions, length, counts[:, None])[:, 0], 1.0)
+    return np.maximum(_correlated_sums(positions, length, counts[:, None])[:, 0], 1.0)
 
 
-def _alike_sums(positions: Floats, length: float, values: Floats) -> Floats:
+def _correlated_sums(positions: Floats, length: float, values: Floats) -> Floats:
     """Return the sums (m, q) of exp(-distance / length) times values (m, q) over all ranges; places binned to length / 4."""
     cells, inverse = unique_rows(np.round(positions * (4.0 / length)).astype(np.int64))
     tree = cKDTree(cells / 4.0)
-    alike = tree.sparse_distance_matrix(tree, 4.0, output_type="coo_matrix")
-    alike.data = np.exp(-alike.data)
+    correlated = tree.sparse_distance_matrix(tree, 4.0, output_type="coo_matrix")
+    correlated.data = np.exp(-correlated.data)
     binned = sparse.csc_matrix((np.ones(len(inverse)), inverse, np.arange(len(inverse) + 1)), shape=(len(cells), len(inverse)))
-    return np.asarray((alike @ (binned @ values))[inverse])
+    return np.asarray((correlated @ (binned @ values))[inverse])

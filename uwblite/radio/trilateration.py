@@ -1,4 +1,4 @@
-"""First positions of anchors that nobody surveyed, from ranges along a path alone.
+"""Initial positions of anchors from ranges along a path alone.
 
 An anchor's circle intersections are searched, not linearised: every cell of a coarse raster is scored by how many
 ranges agree with it up to one common bias (their median), so up to almost half of the ranges may lie. The best
