@@ -189,7 +189,7 @@ def bench_icp(repeats: int) -> None:
 
     def align(prepared, guess):
         clouds, raster, points = prepared
-        return align_pairs(clouds, raster, first, second, guess[None], points, 0.5, 0.15).pose[0]
+        return align_pairs(clouds, raster, first, guess[None], points, 0.5, 0.15).pose[0]
 
     columns = ("uwblite", "small_gicp ICP", "Open3D point to line")
     head("Registration, ms (error, mm), 8 pairs", "points", *columns, "ratio to small_gicp", "prepared")

@@ -108,7 +108,7 @@ def test_planted_poses_are_found_from_metres_and_tens_of_degrees(seed):
     assert (np.diff(found.scores) <= 0.0).all()
     clouds, i, j = joined([target, source]), np.array([0]), np.array([1])
     points = pair_points(clouds, j, len(source.points))
-    aligned = align_pairs(clouds, rasterize(clouds, 0.1, 0.5), i, j, found.poses[:1], points, 0.5, 0.15)
+    aligned = align_pairs(clouds, rasterize(clouds, 0.1, 0.5), i, found.poses[:1], points, 0.5, 0.15)
     assert np.hypot(*se2.between(aligned.pose[0], truth)[:2]) < 0.015
 
 

@@ -28,7 +28,7 @@ def test_one_iteration_is_one_step_of_the_matches(world):
     guess = exact + np.array([0.05, -0.04, 0.03])
     step = nondegenerate_step(match(clouds, raster, I, guess, points, 0.3, 0.15))[0]
     assert 0.01 < np.abs(step).max() < 0.15
-    found = align_pairs(clouds, raster, I, J, guess, points, 0.3, 0.3, iterations=1)
+    found = align_pairs(clouds, raster, I, guess, points, 0.3, 0.3, iterations=1)
     np.testing.assert_allclose(se2.between(found.pose, guess + step), 0.0, atol=1e-12)
     np.testing.assert_array_equal(found.factors.matched, match(clouds, raster, I, found.pose, points, 0.3, 0.15).matched)
 
@@ -38,7 +38,7 @@ def test_no_step_is_longer_than_allowed(world):
     clouds, raster, points, exact = world
     guess = exact + np.array([0.6, 0.5, 0.1])
     step = nondegenerate_step(match(clouds, raster, I, guess, points, 0.8, 0.4))[0]
-    found = align_pairs(clouds, raster, I, J, guess, points, 0.8, 0.8, iterations=1)
+    found = align_pairs(clouds, raster, I, guess, points, 0.8, 0.8, iterations=1)
     taken = found.pose - guess
     taken[:, 2] = se2.wrap_angle(taken[:, 2])
     long = (np.hypot(step[:, 0], step[:, 1]) > 0.3) | (np.abs(step[:, 2]) > 0.15)
@@ -53,7 +53,7 @@ def test_a_step_that_turns_too_far_is_shortened_as_a_whole(world, monkeypatch):
     clouds, raster, points, exact = world
     steps = np.array([[0.04, 0.0, -0.6], [0.1, 0.0, 0.075], [0.0, 0.6, 0.3]])
     monkeypatch.setattr(pair_alignment, "nondegenerate_step", lambda factors: (steps, None))
-    found = align_pairs(clouds, raster, I, J, exact, points, 0.8, 0.8, iterations=1)
+    found = align_pairs(clouds, raster, I, exact, points, 0.8, 0.8, iterations=1)
     taken = se2.wrap_angle(found.pose[:, 2] - exact[:, 2])
     np.testing.assert_allclose(taken, [-0.15, 0.075, 0.15])
     np.testing.assert_allclose((found.pose - exact)[:, :2], [[0.01, 0.0], [0.1, 0.0], [0.0, 0.3]], atol=1e-12)
@@ -64,7 +64,7 @@ def test_pairs_go_on_at_the_last_gate_until_none_moves(world):
     clouds, raster, points, exact = world
     guess = exact + np.array([0.2, -0.15, 0.1])
     moves = []
-    for pose in (guess, align_pairs(clouds, raster, I, J, guess, points, 0.5, 0.5, iterations=60).pose):
+    for pose in (guess, align_pairs(clouds, raster, I, guess, points, 0.5, 0.5, iterations=60).pose):
         moves.append(np.abs(nondegenerate_step(match(clouds, raster, I, pose, points, 0.5, 0.25))[0]).max())
     assert moves[0] > 0.05
     assert moves[1] < 1e-3
@@ -72,7 +72,7 @@ def test_pairs_go_on_at_the_last_gate_until_none_moves(world):
 
 def test_motions_are_recovered_and_distinguished_from_guesses(world):
     clouds, raster, points, exact = world
-    found = align_pairs(clouds, raster, I, J, exact + np.array([0.15, -0.1, 0.08]), points, 0.5, 0.1)
+    found = align_pairs(clouds, raster, I, exact + np.array([0.15, -0.1, 0.08]), points, 0.5, 0.1)
     error = se2.between(exact, found.pose)
     # Points err by 5 mm and are means in cells of 2 cm; some 150 of them hold a pose.
     assert np.abs(error[:, :2]).max() < 0.01
@@ -88,7 +88,7 @@ def aligned(target, source, guesses):
     """Align one pair of clouds from several guesses (g, 3)."""
     clouds, i = joined([target, source]), np.zeros(len(guesses), dtype=np.int64)
     points = pair_points(clouds, i + 1, len(source.points))
-    return align_pairs(clouds, rasterize(clouds, 0.05, 0.8), i, i + 1, guesses, points, 0.8, 0.15, 30)
+    return align_pairs(clouds, rasterize(clouds, 0.05, 0.8), i, guesses, points, 0.8, 0.15, 30)
 
 
 def distance(found):
@@ -134,8 +134,8 @@ def test_a_pair_ends_where_it_ends_alone(world):
     clouds, raster, _, exact = world
     guess = exact + np.array([[0.0, 0.0, 0.0], [0.2, -0.2, 0.1], [-0.02, 0.01, 0.0]])
     points = pair_points(clouds, J, 200)
-    together = align_pairs(clouds, raster, I, J, guess, points, 0.5, 0.15)
+    together = align_pairs(clouds, raster, I, guess, points, 0.5, 0.15)
     for k in range(3):
         row = slice(k, k + 1)
-        alone = align_pairs(clouds, raster, I[row], J[row], guess[row], pair_points(clouds, J[row], 200), 0.5, 0.15)
+        alone = align_pairs(clouds, raster, I[row], guess[row], pair_points(clouds, J[row], 200), 0.5, 0.15)
         np.testing.assert_allclose(alone.pose[0], together.pose[k], atol=1e-9)

@@ -37,8 +37,8 @@ class Aligned:
 
 
 def align_pairs(
-    clouds: Clouds, raster: CloudRasters, i: Ints, j: Ints, guess: Floats, points: PairPoints, first_gate: float,
-    last_gate: float, iterations: int = 20,
+    clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, points: PairPoints, first_gate: float, last_gate: float,
+    iterations: int = 20,
 ) -> Aligned:
     """Align many pairs of clouds at once, each on its own: point-to-line ICP with a shrinking gate.
 
@@ -46,8 +46,8 @@ def align_pairs(
 
     Parameters
     ----------
-    i, j : (e,) target and source clouds. guess : (e, 3) start poses.
-    points : see pair_points. first_gate, last_gate : farthest match in the first and last iteration, m.
+    i : (e,) target clouds. guess : (e, 3) start poses of the source clouds.
+    points : of the source clouds, see pair_points. first_gate, last_gate : farthest match in the first and last iteration, m.
     """
     pose, gate, moving = guess.copy(), first_gate, np.arange(len(guess))
     for _ in range(iterations):

@@ -105,7 +105,7 @@ def _block(
     scans: LaserScans, mounting: SensorMounting, first: Ints, second: Ints, guess: Floats, searches: int
 ) -> tuple[Floats, Floats]:
     built, raster, i, j, points = _pairs(scans, mounting, first, second)
-    aligned = align_pairs(built, raster, i, j, guess, points, _FIRST_GATE, _LAST_GATE)
+    aligned = align_pairs(built, raster, i, guess, points, _FIRST_GATE, _LAST_GATE)
     enough = aligned.factors.asked >= _LEAST_POINTS
     pose, share = aligned.pose.copy(), np.where(enough, aligned.share, 0.0)
     poor = np.flatnonzero((share < _GOOD_SHARE) & enough)
@@ -124,7 +124,7 @@ def _searched(built: Clouds, raster: CloudRasters, i: int, j: int, guess: Floats
         return None
     one = np.ones(len(places.poses), dtype=np.int64)
     points = scan_matching.pair_points(built, one * j, _POINTS)
-    aligned = align_pairs(built, raster, one * i, one * j, places.poses, points, 0.3, _LAST_GATE)
+    aligned = align_pairs(built, raster, one * i, places.poses, points, 0.3, _LAST_GATE)
     best = int(np.argmax(aligned.share))
     return aligned.pose[best], float(aligned.share[best])
 

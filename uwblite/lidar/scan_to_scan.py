@@ -104,7 +104,7 @@ def descend(clouds: Clouds, raster: CloudRasters, i: Ints, guess: Floats, gate: 
     clouds, raster : see clouds.build and cloud_rasters.rasterize. gate : reach of the raster, m.
     """
     points = pair_points(clouds, i + 1, config.points)
-    aligned = align_pairs(clouds, raster, i, i + 1, guess, points, gate, min(config.gate, gate))
+    aligned = align_pairs(clouds, raster, i, guess, points, gate, min(config.gate, gate))
     return Steps(i, guess, aligned.pose, aligned.share, aligned.factors.asked >= config.min_points)
 
 
@@ -156,7 +156,7 @@ def reattached(
     share = (stamps[lone] - stamps[before]) / np.maximum(stamps[after] - stamps[before], 1e-9)
     guess = se2.between(poses[before], se2.interpolate(poses[before], poses[after], share))
     points, tight = pair_points(clouds, lone, config.points), min(config.gate, gate)
-    aligned = align_pairs(clouds, raster, before, lone, guess, points, gate, tight)
+    aligned = align_pairs(clouds, raster, before, guess, points, gate, tight)
     fits = aligned.share >= config.good_share
     found, laid = poses.copy(), lone[fits]
     found[laid] = se2.compose(poses[before[fits]], aligned.pose[fits])

@@ -102,7 +102,7 @@ class StepSearch:
         starts = np.concatenate([guesses, best_poses(pair, raster, rows, motion, window, _STARTS)])
         target = np.zeros(len(starts), dtype=np.int64)
         points = pair_points(pair, target + 1, _POINTS)
-        tried = align_pairs(pair, raster, target, target + 1, starts, points, _FIRST_GATE, _LAST_GATE, _ITERATIONS)
+        tried = align_pairs(pair, raster, target, starts, points, _FIRST_GATE, _LAST_GATE, _ITERATIONS)
         through = self.through(k, tried.pose)
         score = tried.share - through
         best = int(np.argmax(score))

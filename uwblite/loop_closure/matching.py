@@ -102,7 +102,7 @@ def _fit(batch: _Batch) -> ClosureMatches:
     raster = rasterize(clouds, 0.1, 0.5)
     row, guess = _guesses(batch)
     points = pair_points(clouds, candidates.source[row], config.points)
-    tries = align_pairs(clouds, raster, candidates.target[row], candidates.source[row], guess, points, 0.5, config.gate)
+    tries = align_pairs(clouds, raster, candidates.target[row], guess, points, 0.5, config.gate)
     wide = candidates.spread > config.search_limit
     score, some = tries.share, np.flatnonzero(wide[row])
     target, source = candidates.target[row[some]], candidates.source[row[some]]
