@@ -50,6 +50,18 @@ def test_a_perfect_gyro_makes_wheels_that_turn_wrongly_perfect():
     assert "rests" in remarks[0].text
 
 
+def test_a_false_stamp_years_away_takes_no_memory():
+    """Windows all the way until then are gigabytes."""
+    stamps, truth = planted.wander(np.random.default_rng(3), 60.0)
+    wheels, gyro = planted.odometry(stamps, truth), gyro_of(stamps, truth)
+    far = Odometry(np.append(wheels.stamps, 1e9), np.vstack([wheels.poses, wheels.poses[-1:]]))
+    late = Gyro(np.append(gyro.stamps, 1e9), np.append(gyro.heading, gyro.heading[-1]))
+    usual, found = _changes(gyro, wheels, WINDOW), _changes(late, far, WINDOW)
+    assert len(found[0]) < len(usual[0]) + 5
+    for some, all_of in zip(usual, found, strict=True):
+        np.testing.assert_allclose(all_of[: len(some)], some, atol=1e-9)
+
+
 def test_without_a_rest_the_bias_is_found_against_the_wheels():
     rng = np.random.default_rng(2)
     stamps, truth = planted.wander(rng, 60.0)

@@ -67,6 +67,13 @@ def test_rounded_odometry_drives_no_faster():
     assert _span(rounded) == pytest.approx(_span(exact), rel=0.05)
 
 
+def test_a_false_stamp_years_away_takes_no_memory():
+    """Speeds at every second until then are 8 GB; those of the real seconds stay."""
+    usual = driven(np.full(600, 0.2), np.zeros(600))
+    last = Odometry(np.append(usual.stamps, 1e9), np.vstack([usual.poses, usual.poses[-1:]]))
+    assert _span(last) == pytest.approx(_span(usual))
+
+
 def scanned(odometry, stamps, beams=40):
     return SensorLog(
         odometry, None, LaserScans(stamps, np.ones((len(stamps), beams), dtype=np.float32), 0.0, 0.01, 0.0, 0.1, 9.0)

@@ -130,7 +130,9 @@ def reading_of(gyro: Gyro, odometry: Odometry) -> tuple[float, str]:
 def _changes(gyro: Gyro, odometry: Odometry, span: float) -> tuple[Floats, Floats, Floats]:
     """Return by what gyro and wheels turned in windows of `span` s, rad, and how far the wheels came, m, (w,) each."""
     begin, end = max(gyro.stamps[0], odometry.stamps[0]), min(gyro.stamps[-1], odometry.stamps[-1])
-    at = np.arange(begin, end - span, 0.5 * span)
+    # Not every window from first to last: one false stamp may lie years away.
+    at = begin + np.unique((odometry.stamps - begin) // (0.5 * span)) * (0.5 * span)
+    at = at[(at >= begin) & (at < end - span)]
 
     def change(values: Floats, stamps: Floats) -> Floats:
         return np.asarray(np.interp(at + span, stamps, values) - np.interp(at, stamps, values))

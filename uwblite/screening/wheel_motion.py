@@ -131,9 +131,11 @@ _SPEED_OVER = 1.0
 def _span(odometry: Odometry) -> float:
     """Return the time between the scans of a pair, s, in which the robot usually drives a little way."""
     stamps = odometry.stamps
-    at = np.arange(stamps[0], stamps[-1], _SPEED_OVER)
+    # Not every second of the time from first to last: one false stamp may lie years away.
+    at = stamps[0] + np.unique((stamps - stamps[0]) // _SPEED_OVER) * _SPEED_OVER
+    at = at[at < stamps[-1]]
     place = np.column_stack([np.interp(at, stamps, column) for column in odometry.poses[:, :2].T])
-    speeds = np.hypot(*np.diff(place, axis=0).T) / _SPEED_OVER
+    speeds = (np.hypot(*np.diff(place, axis=0).T) / _SPEED_OVER)[np.diff(at) < 1.5 * _SPEED_OVER]
     moving = speeds > _STILL[0]
     speed = float(np.median(speeds[moving])) if moving.any() else 0.3
     return float(np.clip(_APART / max(speed, 1e-3), 0.1, 1.0))
