@@ -89,6 +89,22 @@ def test_a_gap_is_unknown_and_a_turn_with_too_few_rays_is_lost():
     assert assembler.lost == 1
 
 
+@pytest.mark.parametrize(("stand", "lost"), [(0.02, 0), (0.1, 1), (2.0, 1)])
+def test_a_turn_in_which_the_motor_stood_is_lost(stand, lost):
+    """The lidar measured on meanwhile, always in one direction: when its rays were measured, nobody knows."""
+    assembler, scans, time, place = SweepAssembler(FAN), [], 100.0, 0.0
+    while place < 5.0:
+        times, places = [], []
+        for _ in range(10):
+            time += 0.1 / 400
+            place += 0.0 if 0.25 < time - 100.0 <= 0.25 + stand else 1.0 / 400
+            times.append(time)
+            places.append(place % 1.0)
+        scans += assembler.add(times, Samples(time, None, 0.1 / 400, tuple(places), tuple(places), (2.0,) * 10))
+    assert assembler.lost == lost
+    assert len(scans) == 4 - lost
+
+
 def test_readings_that_point_elsewhere_than_the_motor_keep_their_own_time():
     assembler, scans = SweepAssembler(FAN), []
     for i in range(0, 1200, 10):

@@ -20,6 +20,8 @@ NOISE = 0.05
 """m; two ranges that differ less are of one surface: three sigma of a triangulating lidar at 2 m."""
 GAP = 3.0
 """Spacings of the rays; between samples further apart than that nothing is known (frames were lost)."""
+UNEVEN = 0.15
+"""Turns; a motor that is further from where an even speed has it stood still on the way, and the rays' times are unknown."""
 LEAST_RAYS = 0.5
 """Share of the rays that must lie between samples; a turn with fewer is lost."""
 BACKLASH = 0.02
@@ -68,7 +70,7 @@ class SweepAssembler:
     def __init__(self, fan: Fan) -> None:
         self.fan = fan
         self.lost = 0
-        """Turns too few of whose rays were seen; the owner takes and clears it."""
+        """Turns too few of whose rays were seen, or with unknown times; the owner takes and clears it."""
         self._duration = 0.0
         self.clear()
 
@@ -125,7 +127,8 @@ class SweepAssembler:
         rays = sorted(zip(self._bearings, self._ranges, strict=True))
         rays = [*([self._before] if self._before else []), *rays, after]
         ranges, known = _resample(rays, fan.rays, spacing)
-        if known < LEAST_RAYS * fan.rays:
+        uneven = max(abs(time - begin - turned * (end - begin)) for time, turned in zip(self._times, self._turned, strict=True))
+        if known < LEAST_RAYS * fan.rays or uneven > UNEVEN * (end - begin):
             self.lost += 1
             return None
         # The reading that points at ray 0 is made a little before or after the motor passes zero.
