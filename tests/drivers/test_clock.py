@@ -116,6 +116,20 @@ def test_a_clock_that_is_read_after_a_replug_is_tied_again_however_short_it_ran(
             assert clock.read(100 * k, true + 0.101).stamp == pytest.approx(true, abs=0.002)
 
 
+@pytest.mark.parametrize("ahead", [0.3, 3.0, 40.0])
+def test_a_clock_that_leaps_ahead_is_of_another_power_up(ahead):
+    """No frame comes before it is made, so the delay that was measured stays, and nothing was lost."""
+    clock, errors, resets, missing = DeviceClock(1e-3, 1 << 24, period=0.1), [], 0, 0
+    clock.tie(5000.5, 5.0, 5.001)
+    for k in range(600):
+        true = 10.0 + 0.1 * k
+        reading = clock.read(1000 * (true + ahead * (k >= 300)), true + 0.101)
+        resets, missing = resets + reading.reset, missing + reading.missing
+        errors.append(reading.stamp - true)
+    assert (resets, missing) == (1, 0)
+    assert max(map(abs, errors)) < 0.002
+
+
 def test_frames_that_are_missing_are_counted_across_a_reset_and_with_a_learned_period():
     for period in (0.05, None):
         clock = DeviceClock(1e-3, 1 << 16, period=period)

@@ -2,6 +2,7 @@
 
 import math
 import random
+from dataclasses import astuple, replace
 from functools import reduce
 from operator import xor
 
@@ -122,7 +123,8 @@ def test_gyro_heading_is_relative_to_the_first_and_wraps():
 
 def test_without_gyro_the_encoders_turn():
     quarter = math.pi / 2 * kobuki.WHEEL_BASE / 2 / kobuki.TICK
-    pose = poses(drive([feedback(0, 0, 0, None), feedback(1, -round(quarter), round(quarter), None)]))[-1]
+    ticks = [round(quarter * k / 20) for k in range(21)]
+    pose = poses(drive(feedback(k, -tick, tick, None) for k, tick in enumerate(ticks)))[-1]
     assert pose.theta == pytest.approx(math.pi / 2, abs=1e-3)
     assert pose.x == pytest.approx(0.0, abs=1e-4)
 
@@ -156,6 +158,37 @@ def test_a_base_that_was_switched_on_again_holds_its_pose():
     assert pose.stamp == pytest.approx(9.02)
 
 
+def test_a_part_that_comes_twice_counts_once():
+    """Damage whose sum is right by chance makes another part out of two; the basic data have their length by the head."""
+    (packet,) = packets(1)
+    for size in (0, 5, 15):
+        (event,) = feed_whole(KobukiProtocol, encode_packet([(0x01, packet[5:20]), (0x01, bytes(range(100, 100 + size)))]))
+        assert (event.left, event.right) == (0, 0)
+
+
+FALSE = {
+    "wheels": lambda p: replace(p, left=(p.left + 20000) % 65536),
+    "gyro": lambda p: replace(p, heading=p.heading + 2.0),
+    "clock ahead": lambda p: replace(p, time=(p.time + 3000) % 65536),
+    "clock behind": lambda p: replace(p, time=(p.time - 500) % 65536),
+}
+
+
+@pytest.mark.parametrize("at", [0, 30])
+@pytest.mark.parametrize("what", FALSE)
+def test_one_false_packet_changes_no_pose_and_no_stamp(what, at):
+    """Its sum is right, as of one in 256 that are damaged."""
+    sound = [feedback(k, 100 * k, 90 * k, 0.01 * k) for k in range(60)]
+    false = [*sound[:at], FALSE[what](sound[at]), *sound[at + 1 :]]
+    expected, actions = poses(drive(sound)), drive(false)
+    if at:
+        del expected[at]
+        for pose, true in zip(poses(actions), expected, strict=True):
+            assert astuple(pose)[:4] == pytest.approx(astuple(true)[:4], abs=1e-6)
+    assert [action.why for action in actions if isinstance(action, Corrupt)] == ["packet that leaps away and back"]
+    assert [action.count for action in actions if isinstance(action, Lost)] == [1] * (at > 0)
+
+
 def test_parts_of_any_length_are_skipped_by_their_length():
     """Controller info (15) has 13 bytes in kobuki_core, 21 in the protocol description; both are passed over."""
     (packet,) = packets(1)
@@ -178,10 +211,10 @@ def test_odometer_follows_the_emulated_circle(skew):
     now, rng = 100.0, random.Random(0)
     while now < 340.0:
         for event in driver.parse(device.advance(now), now + rng.expovariate(1000.0)):
-            (pose,) = driver.take(event)
-            true = truth.pop(0)
-            errors.append(math.hypot(pose.x - true[1], pose.y - true[2]))
-            stamps.append(abs(pose.stamp - true[0]))
+            for pose in driver.take(event):
+                true = truth.pop(0)
+                errors.append(math.hypot(pose.x - true[1], pose.y - true[2]))
+                stamps.append(abs(pose.stamp - true[0]))
         now = device.next_time(now)
     assert max(errors) < 0.01
     assert max(stamps[1000:]) < 0.002

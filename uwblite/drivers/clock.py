@@ -153,6 +153,9 @@ class DeviceClock:
         Reading : `elapsed` is 0 for a frame sent twice.
         """
         device, reset = self._unwrapper.unwrap(count, arrival)
+        # No frame arrives earlier than the quickest before it: a clock that is further ahead is one of another power-up.
+        ahead = self._last is not None and self._expected and arrival - self._map.host(device) < -LEAP
+        reset = reset or ahead
         if reset:
             self._begin_again()
         elapsed = None if self._last is None else device - self._last

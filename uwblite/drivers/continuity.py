@@ -28,7 +28,22 @@ MOST_ANCHORS = 256
 FORGET = 10.0
 """s after which an anchor that was seen too seldom is given up."""
 
+LEAP = 0.25
+"""s by which the clocks of device and host may have gone on differently between two frames: the host reads late, or a frame
+was damaged and its sum is right by chance, one in 256 for sums of eight bits."""
+
 Item = TypeVar("Item")
+
+
+def device_time(counted: float, elapsed: float, turn: float) -> float | None:
+    """Return the time between two frames by the device's clock, s; None = it did not keep pace with the host's.
+
+    Parameters
+    ----------
+    counted : difference of the clock's readings, s. elapsed : by the host, s. turn : after how long the clock wraps, s.
+    """
+    ahead = math.remainder(counted - elapsed, turn)
+    return elapsed + ahead if abs(ahead) < LEAP else None
 
 
 class Continuity(Generic[Item]):

@@ -16,9 +16,10 @@ from functools import reduce
 from operator import xor
 
 from .clock import DeviceClock
+from .continuity import Continuity, device_time
 from .events import Action, Corrupt, Lost, OdometryPose, Pose, corrupt
 from .framing import HeadedFrames
-from .odometer import BaseDriver, WheelOdometer
+from .odometer import BaseDriver, WheelOdometer, wrapped
 
 PERIOD = 0.020
 """s between packets."""
@@ -33,6 +34,8 @@ MAX_BLIND = ENCODER_MODULUS / 2 * TICK / MAX_SPEED
 """s after which an encoder may have turned by half its range unseen, so that its difference is ambiguous."""
 MAX_GUESS = 2 * MAX_BLIND
 """s up to which the smaller of the possible travels is taken all the same: it is right below half the top speed."""
+FASTEST, FASTEST_TURN = 3.0, 4 * math.pi
+"""m/s, rad/s; no base moves or is carried faster. A sum of eight bits passes one in 256 damaged packets."""
 LOW_BATTERY = 13.5
 """V; a full battery has 16.5 V, the base switches off at 13.2 V."""
 
@@ -80,7 +83,9 @@ class KobukiProtocol(HeadedFrames):
         """Decode a packet."""
         if reduce(xor, frame[2:], 0):
             return corrupt(frame, "packet with a wrong sum")
-        subs = dict(_sub_payloads(frame[3:-1]))
+        subs: dict[int | None, bytes] = {}
+        for kind, data in _sub_payloads(frame[3:-1]):
+            subs.setdefault(kind, data)
         if None in subs:
             return corrupt(frame, "packet whose parts do not fill it")
         basic, inertia = subs[BASIC], subs.get(INERTIA, b"")
@@ -115,10 +120,20 @@ class KobukiDriver(BaseDriver):
         odometer = WheelOdometer(TICK, WHEEL_BASE, ENCODER_MODULUS, start)
         super().__init__(KobukiProtocol(), "Kobuki base", odometer, LOW_BATTERY)
         self._clock = DeviceClock(1e-3, STAMP_MODULUS, period=PERIOD)
+        self._series = Continuity(_follows)
         self._packets = 0
 
     def take(self, event: Feedback) -> list[Action]:
-        """Turn a packet into a pose."""
+        """Turn packets into poses. One that leaps, and the first, count only if the next one goes on from it."""
+        passed, dropped = self._series.take(event, 1)
+        given_up: list[Action] = [Corrupt(b"", "packet that leaps away and back")] * len(dropped)
+        return [*given_up, *(action for packet in passed for action in self._pose(packet))]
+
+    def stop(self) -> list[Action]:
+        """Return Corrupt for a packet that nothing confirmed."""
+        return [Corrupt(b"", "packet that nothing confirmed")] * len(self._series.waiting)
+
+    def _pose(self, event: Feedback) -> list[Action]:
         self._packets += 1
         self.ready = self._packets > 2
         reading = self._clock.read(event.time, event.stamp)
@@ -135,3 +150,15 @@ class KobukiDriver(BaseDriver):
             actions.append(self.gap("restarted, the pose is held: its motion" if reading.reset else silent))
         actions += self.state(event.wheel_drop, event.battery)
         return [*actions, OdometryPose(reading.stamp, *self._odometer.pose, travel / elapsed, event.turn_rate)]
+
+
+def _follows(before: Feedback, after: Feedback) -> bool:
+    """Return whether clock, wheels and gyro can have gone on so."""
+    seconds = device_time((after.time - before.time) * 1e-3, after.stamp - before.stamp, STAMP_MODULUS * 1e-3)
+    if seconds is None:
+        return False
+    ticks = (after.left - before.left, after.right - before.right)
+    moved = max(abs(wrapped(difference, ENCODER_MODULUS)) for difference in ticks) * TICK
+    turned = math.remainder((after.heading or 0.0) - (before.heading or 0.0), 2 * math.pi)
+    most = max(seconds, 0.0) + PERIOD
+    return moved <= FASTEST * most and abs(turned) <= FASTEST_TURN * most

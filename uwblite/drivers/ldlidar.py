@@ -13,6 +13,8 @@ import math
 import struct
 
 from .clock import DeviceClock
+from .continuity import Continuity, device_time
+from .events import Action, Corrupt
 from .framing import FixedPackets
 from .spinning import SpinningDriver
 from .sweep import Fan, Samples
@@ -85,3 +87,16 @@ class LdLidarDriver(SpinningDriver):
     def __init__(self) -> None:
         clock = DeviceClock(CLOCK_TICK, CLOCK_MODULUS, period=READINGS / RATE)
         super().__init__(LdLidarProtocol(), FAN, clock)
+        self._series = Continuity(_follows)
+
+    def take(self, event: Samples) -> list[Action]:
+        """Turn packets into scans. One whose time leaps, and the first, count only if the next one goes on from it."""
+        passed, dropped = self._series.take(event, 1)
+        given_up: list[Action] = [Corrupt(b"", "packet whose time leaps away and back")] * len(dropped)
+        return [*given_up, *(action for packet in passed for action in super(LdLidarDriver, self).take(packet))]
+
+
+def _follows(before: Samples, after: Samples) -> bool:
+    """Return whether the clock can have gone on so."""
+    counted = ((after.clock or 0) - (before.clock or 0)) * CLOCK_TICK
+    return device_time(counted, after.stamp - before.stamp, CLOCK_MODULUS * CLOCK_TICK) is not None

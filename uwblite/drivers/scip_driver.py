@@ -10,8 +10,9 @@ import math
 from typing import Any
 
 from .clock import Reading
+from .continuity import Continuity, device_time
 from .events import Action, Corrupt, LaserScan, Lost, Note, Reopen, Send, SetBaud
-from .scip import Distances, Reply
+from .scip import TIME_MODULUS, Distances, Reply
 from .scip_codes import status_meaning
 from .scip_commands import BAUD_RATES, rate_command, scan_command, text_command, to_ranges
 from .scip_unit import PATIENCE, SETTLE, TRUNCATION, ScipUnit
@@ -59,10 +60,11 @@ class ScipDriver(ScipUnit):
         self._stream = stream
         self._rates_tried: set[int] = set()
         self._rounds = 0
+        self._series = Continuity(_follows)
 
     def stop(self) -> list[Action]:
         """Return what switches the laser off and ends the stream."""
-        return [Send(text_command("QT"))]
+        return [*[Corrupt(b"", "scan whose time nothing confirmed")] * len(self._series.waiting), Send(text_command("QT"))]
 
     def script(self) -> Script[None]:
         """Find the unit, learn who it is, and read scans; begin again when none come."""
@@ -183,6 +185,14 @@ class ScipDriver(ScipUnit):
         return False
 
     def _scan(self, scan: Distances) -> Script[None]:
+        """Log scans. One whose time leaps, and the first, count only if the next one goes on from it."""
+        passed, dropped = self._series.take(scan, 1)
+        for _ in dropped:
+            yield Corrupt(b"", "scan whose time leaps away and back")
+        for taken in passed:
+            yield from self._timed(taken)
+
+    def _timed(self, scan: Distances) -> Script[None]:
         reading = self._clock.read(scan.time + TRUNCATION, scan.stamp)
         if reading.reset:
             yield Note("warning", "lidar-clock-reset", "lidar: its clock was reset; time mapping starts again")
@@ -227,3 +237,8 @@ class ScipDriver(ScipUnit):
             text = f"it reports {state!r}: power it down and up; if that stays, it needs service"
             findings.append(Note("error", "lidar-state", text))
         return Identity(f"{self.title} {facts.get('MODL', unit.model).partition('(')[0]}", tuple(details), tuple(findings))
+
+
+def _follows(before: Distances, after: Distances) -> bool:
+    """Return whether the clock can have gone on so; sums of six bits pass one in 64 damaged lines."""
+    return device_time((after.time - before.time) * 1e-3, after.stamp - before.stamp, TIME_MODULUS * 1e-3) is not None
