@@ -4,9 +4,12 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import pytest
 
+import uwblite
 from uwblite import __version__
 from uwblite.cli import VERBS, main
 
@@ -49,6 +52,8 @@ def test_version(capsys):
         (["map", "x.log", "--out", "y", "--no-such"], "--no-such"),
         (["map", "x.log", "--out", "y", "--laser-pose", "-1,2"], "'-1,2' is not 3 numbers"),
         (["map", "x.log", "--out", "y", "--jobs", "0"], "above 0"),
+        (["map", "x.log", "--out=--"], "argument --out: '--' is no value"),
+        (["check", "x.log", "--scan-topic=--"], "argument --scan-topic: '--' is no value"),
     ],
 )
 def test_wrong_usage_exits_with_2(words, message, capsys):
@@ -106,6 +111,7 @@ def test_an_unforeseen_fault_is_one_line_and_a_traceback_on_request(monkeypatch,
         (KeyboardInterrupt(), 130, "uwblite: interrupted"),
         (MemoryError(), 1, "out of memory"),
         (OSError(28, "No space left on device", "map.pgm"), 1, "map.pgm: No space left on device; free some space"),
+        (ImportError("libx.so: failed to map segment"), 1, "error: a library could not be loaded: libx.so: failed to map"),
     ],
 )
 def test_what_the_system_throws(monkeypatch, capsys, error, code, message):
@@ -117,6 +123,15 @@ def test_what_the_system_throws(monkeypatch, capsys, error, code, message):
     monkeypatch.setattr(config, "run", fault)
     assert main(["config"]) == code
     assert message in capsys.readouterr().err
+
+
+def test_a_current_folder_that_is_gone_is_said():
+    command = f'mkdir gone && cd gone && rmdir ../gone && "{sys.executable}" -m uwblite batch x.log --out y'
+    environment = os.environ | {"PYTHONPATH": str(Path(uwblite.__file__).parents[1])}
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False, cwd=folder, env=environment)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("uwblite: error: the current folder is no more")
 
 
 def test_a_reader_that_leaves_early_does_not_disturb():

@@ -1,9 +1,13 @@
 """Folders replaced as a whole: what goes, what stays, what a crash leaves. Kills and full disks: see test_results.py."""
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+from uwblite.errors import ConfigError
 from uwblite.io import folders
 from uwblite.io.files import WAITING
 from uwblite.io.folders import mend, replacing_folder
@@ -68,6 +72,30 @@ def test_an_error_leaves_everything(tmp_path):
         interrupted()
     assert texts(folder) == {"our_a": "1"}
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+def test_a_folder_in_the_place_of_a_file_is_said_before_anything_is_replaced(tmp_path):
+    folder = tmp_path / "map"
+    fill(folder, our_a="1")
+    (folder / "our_b").mkdir()
+    with pytest.raises(ConfigError, match="our_b is a folder"):
+        fill(folder, our_a="2", our_b="2")
+    assert sorted(p.name for p in folder.iterdir()) == ["our_a", "our_b"]
+    assert (folder / "our_a").read_text() == "1"
+
+
+def test_few_open_files_are_enough(tmp_path):
+    """A dozen for whatever number of files; what cannot be opened leaves nothing behind."""
+    program = (
+        "import resource, sys; from pathlib import Path; from uwblite.io.folders import replacing_folder\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (12, 12))\n"
+        "with replacing_folder(sys.argv[1], lambda name: True) as waiting:\n"
+        "    [(waiting / str(k)).write_text('x') for k in range(40)]\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(folders.__file__).parents[2])}
+    subprocess.run([sys.executable, "-c", program, str(tmp_path / "map")], check=True, env=environment)
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+    assert len(list((tmp_path / "map").iterdir())) == 40
 
 
 def test_what_killed_writers_left_goes(tmp_path):

@@ -45,3 +45,7 @@ def test_small_files_are_small(tmp_path):
     assert read_bounded(str(tmp_path / "a"), 5) == b"12345"
     with pytest.raises(FormatError, match="larger than"):
         read_bounded(str(tmp_path / "a"), 4)
+    for most, size in ((1 << 16, "66 kB"), (3 << 20, "3 MB")):
+        (tmp_path / "a").write_bytes(bytes(most + 1))
+        with pytest.raises(FormatError, match=f"is larger than {size},"):
+            read_bounded(str(tmp_path / "a"), most)

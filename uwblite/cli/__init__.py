@@ -127,6 +127,12 @@ class _VerbParser(argparse.ArgumentParser):
 
         console.write(file or sys.stderr, message)
 
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        # argparse takes away what only separates options from names, and hands on a list where one word is meant.
+        if action.option_strings and arg_strings == ["--"]:
+            raise argparse.ArgumentError(action, "'--' is no value")
+        return super()._get_values(action, arg_strings)
+
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and leave with code 2."""
         name, _, wrong = message.partition(": ")
@@ -231,6 +237,8 @@ def failure(error: BaseException) -> tuple[int, str]:
         return 1, _OUT_OF_MEMORY
     if isinstance(error, OSError):
         return 1, console.os_error_text(error)
+    if isinstance(error, ImportError):
+        return 1, f"a library could not be loaded: {error}; is there memory enough, and is the installation whole?"
     return 1, f"internal error: {type(error).__name__}: {error} (please report it; --debug shows where)"
 
 

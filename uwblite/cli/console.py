@@ -80,6 +80,8 @@ def fail(text: str, code: int, *, trace: bool = False) -> int:
 def os_error_text(error: OSError) -> str:
     """Return one line about an error of the operating system, with the way out where it is known."""
     reason = error.strerror or str(error) or type(error).__name__
+    if error.filename is None and _folder_is_gone():
+        return "the current folder is no more; go to one that is there, or name whole paths"
     where = f"{error.filename}: " if error.filename else ""
     hint = {
         "ENOSPC": "; free some space, or write to another disk with --out",
@@ -88,6 +90,14 @@ def os_error_text(error: OSError) -> str:
         "ENOENT": "; check the spelling",
     }.get(_name_of(error.errno), "")
     return f"{where}{reason}{hint}"
+
+
+def _folder_is_gone() -> bool:
+    try:
+        os.getcwd()
+    except OSError:
+        return True
+    return False
 
 
 def _name_of(number: int | None) -> str:

@@ -89,17 +89,21 @@ def sync_files(folder: str | os.PathLike[str]) -> None:
     ------
     OSError : the disk cannot take them.
     """
-    handles = [os.open(entry.path, os.O_RDONLY) for entry in os.scandir(folder) if entry.is_file(follow_symlinks=False)]
-    try:
-        if hasattr(os, "posix_fadvise"):
-            for handle in handles:
-                os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
-        for handle in handles:
-            os.fsync(handle)
-    finally:
-        for handle in handles:
-            os.close(handle)
+    files = [entry.path for entry in os.scandir(folder) if entry.is_file(follow_symlinks=False)]
+    for work in (_begin_writing, os.fsync):
+        # One at a time: a process may have few files open.
+        for file in files:
+            handle = os.open(file, os.O_RDONLY)
+            try:
+                work(handle)
+            finally:
+                os.close(handle)
     sync_folder(folder)
+
+
+def _begin_writing(handle: int) -> None:
+    if hasattr(os, "posix_fadvise"):
+        os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from ..errors import ConfigError
 from .files import WAITING, shortened, sync_files, sync_folder, write_text
 from .locks import one_at_a_time
 
@@ -35,12 +36,27 @@ def replacing_folder(path: str | os.PathLike[str], owned: Owned) -> Iterator[Pat
 
     Raises
     ------
+    ConfigError : a folder stands where a file belongs.
     OSError : the disk is full or may not be written; the folder is as it was.
     """
     folder = Path(os.path.realpath(path))
+    check_free(folder, owned)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with one_at_a_time(folder):
         yield from _replacing(folder, owned)
+
+
+def check_free(folder: str | os.PathLike[str], owned: Owned) -> None:
+    """Refuse a folder in which another folder has the name of a file, for then only some of the files could be replaced.
+
+    Raises
+    ------
+    ConfigError : there is one.
+    """
+    inside = Path(folder).iterdir() if os.path.isdir(folder) else iter(())
+    blocked = next((p for p in inside if owned(p.name) and p.is_dir() and not p.is_symlink()), None)
+    if blocked is not None:
+        raise ConfigError(f"{blocked} is a folder, and a file of this name is to be written; move it away")
 
 
 def _replacing(folder: Path, owned: Owned) -> Iterator[Path]:

@@ -34,7 +34,7 @@ from ..report.html import render
 from ..report.picture import PictureAnchor, draw_map
 from ..sensor_log import SensorLog
 from .files import write_text
-from .folders import mend, replacing_folder
+from .folders import check_free, mend, replacing_folder
 from .g2o import write_g2o
 from .map_server import trinary_image, write_map
 from .png import encode_png, write_png
@@ -75,7 +75,7 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
 
     Raises
     ------
-    ConfigError : it holds a result and force is not given, or it is not a folder.
+    ConfigError : it holds a result and force is not given, it is not a folder, or a folder in it has the name of a file.
     OSError : it cannot be written.
     """
     path = Path(folder)
@@ -84,6 +84,7 @@ def check_target(folder: str | os.PathLike[str], *, force: bool) -> None:
     present = sorted(p.name for p in path.iterdir() if is_of_result(p.name)) if path.is_dir() else []
     if present and not force:
         raise ConfigError(f"{path} already holds a result ({present[0]}, ...); use --force to replace it, or another --out")
+    check_free(path, is_of_result)
     nearest = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise PermissionError(13, os.strerror(13), str(nearest))

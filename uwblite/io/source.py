@@ -188,7 +188,8 @@ def read_bounded(name: str, most: int) -> bytes:
         except OSError as error:
             raise FormatError(f"cannot be read: {error.strerror or error}", name) from None
     if len(data) > most:
-        raise FormatError(f"is larger than {most / 1e6:.0f} MB, far too large for what it should be", name)
+        size = f"{most / 1e6:.0f} MB" if most >= 1e6 else f"{most / 1e3:.0f} kB"
+        raise FormatError(f"is larger than {size}, far too large for what it should be", name)
     return data
 
 
