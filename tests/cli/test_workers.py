@@ -1,9 +1,14 @@
 """Who does the work: this process, some processes, or a scheduler that may be absent."""
 
 import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+import uwblite
 from uwblite.cli import main, workers
 from uwblite.errors import ConfigError
 
@@ -65,3 +70,30 @@ def test_workers_with_another_uwblite_are_refused_and_other_libraries_named(monk
     assert "worker a has numpy 1.0 for" in capsys.readouterr().err
     workers._compare_versions(Client({}))
     assert "no worker yet" in capsys.readouterr().err
+
+
+KILLED = """
+import os, sys, time
+from uwblite.cli.workers import processes
+
+def number(_):
+    time.sleep(0.3)
+    return os.getpid()
+
+if __name__ == "__main__":
+    with processes(2) as executor:
+        print(*set(executor.map(number, range(6))), flush=True)
+        time.sleep(600)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "getppid"), reason="needs the number of the parent")
+def test_workers_end_with_the_process_that_started_them(tmp_path):
+    """A worker that waits for work hears nothing of a main process that was killed, and would wait for ever."""
+    (tmp_path / "killed.py").write_text(KILLED)
+    environment = os.environ | {"PYTHONPATH": str(Path(uwblite.__file__).parents[1])}
+    main_process = subprocess.Popen([sys.executable, "killed.py"], cwd=tmp_path, env=environment, stdout=subprocess.PIPE)
+    found = [int(word) for word in main_process.stdout.readline().split()]
+    main_process.kill()
+    main_process.communicate(timeout=120)  # ends when the last worker has closed what it inherited
+    assert len(found) == 2

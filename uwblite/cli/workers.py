@@ -10,6 +10,8 @@ from .options import number
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+_PARENT_LOOK = 1.0
+"""s between looks at whether the main process lives."""
 _SECONDS_TO_CONNECT = 10
 """A scheduler that runs answers within milliseconds."""
 
@@ -40,7 +42,7 @@ def processes(jobs: int) -> "Iterator[Executor]":
     """Start so many processes; what waits is dropped at the end."""
     from concurrent.futures import ProcessPoolExecutor
 
-    executor = ProcessPoolExecutor(jobs, initializer=_leave_interrupts)
+    executor = ProcessPoolExecutor(jobs, initializer=_begin)
     try:
         yield executor
     finally:
@@ -106,8 +108,21 @@ def versions() -> dict[str, str]:
     return {"uwblite": __version__, "Python": platform.python_version(), "numpy": numpy.__version__, "scipy": scipy.__version__}
 
 
-def _leave_interrupts() -> None:
-    """Let Ctrl-C reach the main process alone, which stops the workers."""
+def _begin() -> None:
+    """Let Ctrl-C reach the main process alone, which stops the workers; end where it was killed."""
     import signal
+    from threading import Thread
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process once its parent has: nobody else would ever tell a worker that waits for work."""
+    import os
+    import time
+
+    parent = os.getppid()
+    while os.getppid() == parent:
+        time.sleep(_PARENT_LOOK)
+    os._exit(1)
