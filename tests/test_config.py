@@ -8,7 +8,7 @@ from typing import ClassVar
 import pytest
 from helpers.example_settings import Outer
 
-from uwblite.config import from_dict, leaves, merge, override, parse_toml, to_dict
+from uwblite.config import from_dict, leaves, merge, override, parse_toml, setting, to_dict
 from uwblite.errors import ConfigError
 from uwblite.pipeline.mapping_config import MappingConfig
 
@@ -62,6 +62,25 @@ def test_a_number_with_a_natural_default_must_not_be_negative():
 
     with pytest.raises(ConfigError, match=r"sigma = -1\.0 is out of range; it must be >= 0"):
         from_dict(Plain, {"sigma": -1})
+
+
+@pytest.mark.parametrize("value", [1e9, -1e9, math.inf, 1e308, 1e-308, 10**10])
+def test_a_number_beyond_all_measure_is_refused(value):
+    """Its square would overflow, or its inverse; inf stays where it is the default and means that there is no limit."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Plain:
+        sigma: float = setting(0.1, minimum=-math.inf)
+        count: int = 3
+        pair: tuple[float, float] = (1.0, 2.0)
+        heights: dict[str, float] = dataclasses.field(default_factory=dict)
+        limit: float = math.inf
+
+    wrong = [{"sigma": value}, {"pair": [1.0, value]}, {"heights": {"a": value}}]
+    for data in [{"count": value}] if isinstance(value, int) else wrong:
+        with pytest.raises(ConfigError, match="is out of range; its size must be"):
+            from_dict(Plain, data)
+    assert from_dict(Plain, {"limit": math.inf, "sigma": 1e6, "count": 10**9, "pair": [0, -1e-15]}).limit == math.inf
 
 
 def test_assignments_on_the_command_line():

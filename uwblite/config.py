@@ -128,7 +128,8 @@ def _merge(config: Any, data: Any, path: tuple[str, ...], root: type) -> Any:
         if dataclasses.is_dataclass(old):
             changes[name] = _merge(old, value, where, root)
         else:
-            changes[name] = _check_range(_convert(value, hints[name], where), _limits(fields[name]), where)
+            converted = _check_size(_convert(value, hints[name], where), fields[name].default, where)
+            changes[name] = _check_range(converted, _limits(fields[name]), where)
     try:
         return dataclasses.replace(config, **changes)
     except ConfigError as error:
@@ -216,6 +217,22 @@ def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]
         )
         if not all(inside):
             raise ConfigError(f"{'.'.join(where)} = {_shown(v)} is out of range; it must be {range_text(limits)}")
+    return value
+
+
+_SMALLEST, _LARGEST, _MOST_COUNTED = 1e-15, 1e6, 10**9
+"""In whatever unit, no setting means anything beyond, and squares of what is within do not overflow; of what is counted."""
+
+
+def _check_size(value: Any, default: Any, where: tuple[str, ...]) -> Any:
+    """Refuse a number that is too large or too small to mean anything, unless the default is."""
+    several = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else (value,)
+    for v in several:
+        if not isinstance(v, int | float) or v in (default, 0):
+            continue
+        least, most = (_SMALLEST, _LARGEST) if isinstance(v, float) else (1, _MOST_COUNTED)
+        if not least <= abs(v) <= most:
+            raise ConfigError(f"{'.'.join(where)} = {_shown(v)} is out of range; its size must be {least:g} to {most:g}")
     return value
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uwblite.config import from_dict, to_dict
+from uwblite.config import from_dict, override, to_dict
 from uwblite.errors import ConfigError
 from uwblite.evaluation.trajectory import evaluate_trajectory
 from uwblite.graph.pose_edges import OdometryEdges
@@ -13,6 +13,13 @@ from uwblite.graph.range_edges import RangeEdges
 from uwblite.io.tum import read_tum
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.mapping_config import PRESETS, preset
+
+
+@pytest.mark.parametrize("name", ["ranges.correlation_length", "trilateration.raster", "trilateration.bias_sigma"])
+def test_what_is_divided_by_is_not_zero(name):
+    for value in ("0", "-0.0" if name.endswith(("length", "sigma")) else "-1"):
+        with pytest.raises(ConfigError, match=f"{name} = .* is out of range"):
+            override(MappingConfig(), [f"{name}={value}"])
 
 
 @pytest.mark.parametrize("name", PRESETS)

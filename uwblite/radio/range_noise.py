@@ -28,7 +28,7 @@ class RangeNoiseConfig:
     """Assumed standard deviation, m, before it is learnt."""
     slow_share: float = setting(0.5, advanced=True)
     """Assumed share of the variance that is slow."""
-    correlation_length: float = setting(1.5, advanced=True)
+    correlation_length: float = setting(1.5, above=0.0, advanced=True)
     """Correlation length of the slow part, m, before it is learnt."""
     min_sigma: float = setting(0.03, advanced=True)
     """Smallest standard deviation that is learnt, m."""

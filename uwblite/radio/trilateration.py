@@ -20,7 +20,7 @@ from ..sensor_log import LONGEST_RANGE, SHORTEST_RANGE
 class TrilaterationConfig:
     """Search for anchor positions."""
 
-    raster: int = setting(40, advanced=True)
+    raster: int = setting(40, minimum=2, maximum=1000, advanced=True)
     """Cells along the longer side of the searched area."""
     samples: ClassVar[int] = 100
     """Ranges used for the search, spread evenly over the path."""
@@ -28,7 +28,7 @@ class TrilaterationConfig:
     """An anchor with fewer usable ranges is not placed."""
     max_range: float = LONGEST_RANGE
     """Longer readings are no ranges of such a radio, m."""
-    bias_sigma: float = 0.6
+    bias_sigma: float = setting(0.6, above=0.0)
     """Plausible size of one anchor's constant error, m."""
     outlier: ClassVar[float] = 3.0
     """Standard deviations beyond which a range counts as an outlier when hypotheses are compared."""
