@@ -44,9 +44,10 @@ def test_what_is_no_result_is_one_clear_error(tmp_path):
 
 def test_a_damaged_report_is_named_and_a_missing_one_is_none(written):
     folder = written[1]
-    (folder / "report.json").write_text("{")
-    with pytest.raises(FormatError, match=r"report.json.*no JSON"):
-        read_result(folder)
+    for damaged in ("{", "[" * 200_000):
+        (folder / "report.json").write_text(damaged)
+        with pytest.raises(FormatError, match=r"report.json.*no JSON"):
+            read_result(folder)
     (folder / "report.json").write_text("[]")
     with pytest.raises(FormatError, match="not a report"):
         read_result(folder)

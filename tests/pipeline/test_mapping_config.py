@@ -15,9 +15,11 @@ from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.mapping_config import PRESETS, preset
 
 
-@pytest.mark.parametrize("name", ["ranges.correlation_length", "trilateration.raster", "trilateration.bias_sigma"])
+@pytest.mark.parametrize(
+    "name", ["ranges.correlation_length", "trilateration.raster", "trilateration.bias_sigma", "refinement.first_gate"]
+)
 def test_what_is_divided_by_is_not_zero(name):
-    for value in ("0", "-0.0" if name.endswith(("length", "sigma")) else "-1"):
+    for value in ("0", "-0.0" if not name.endswith("raster") else "-1"):
         with pytest.raises(ConfigError, match=f"{name} = .* is out of range"):
             override(MappingConfig(), [f"{name}={value}"])
 

@@ -143,7 +143,7 @@ def _report(path: Path) -> dict[str, Any]:
         return {}
     try:
         content = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"is no JSON ({error})", os.fspath(path)) from None
     if not isinstance(content, dict):
         raise FormatError("is not a report of uwblite map", os.fspath(path))

@@ -44,7 +44,7 @@ class RefinementConfig:
     """Most rounds of matching neighbouring clouds before loops are sought."""
     same_pairs: ClassVar[float] = 0.04
     """Clouds are not matched again when ranges move the poses by less than this (root mean square), m."""
-    first_gate: float = setting(0.5, advanced=True)
+    first_gate: float = setting(0.5, above=0.0, advanced=True)
     """Farthest match in the first round, m."""
     later_gate: ClassVar[float] = 0.2
     """Farthest match in the first round where poses are good already: after matching scan to scan, or once matched."""
@@ -231,7 +231,7 @@ def refine(
         if rounds >= config.rounds or (last and moved < config.convergence):
             return RefinementResult(graph, replace(edges.rows(used), weights=None), i, j, factors, used, sigma, rounds, summary)
         # After a step that failed or was braked, as much may be left as before.
-        whole = used.any() and summary.chi2_history[0] < summary.chi2_initial
+        whole = used.any() and len(summary.chi2_history) > 0 and summary.chi2_history[0] < summary.chi2_initial
         farthest = float(np.hypot(*(T_i_j - before)[used, :2].T).max()) if whole else gate
         gate = max(min(gate * config.shrink, _GATE_PER_SHIFT * farthest), config.last_gate)
 

@@ -181,7 +181,7 @@ def app_of(
 def _parsed(body: bytes) -> dict[str, Any]:
     try:
         wish = json.loads(body)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise ConfigError("the request is no JSON") from None
     if not isinstance(wish, dict):
         raise ConfigError("the request is no JSON object")
