@@ -5,15 +5,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import loop
+from helpers.laser_walks import chained
+from helpers.planted_graphs import loop, plain_ranges
+from scipy.spatial.distance import pdist
 
+from uwblite import se2
+from uwblite.arrays import spread
 from uwblite.constraints import Constraints, GivenAnchor
-from uwblite.graph.graph import Calibration, UnknownKey
+from uwblite.graph.graph import Calibration, Graph, UnknownKey
+from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.pipeline import radio_stages
 from uwblite.pipeline.estimate import Estimate, OtherHeights, Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.radio_stages import odometry_unit_factors, select_range_priors, with_units_checked
+from uwblite.pipeline.radio_stages import odometry_unit_factors, reestimate_ranges, select_range_priors, with_units_checked
 from uwblite.pipeline.recordings import Recordings
 
 
@@ -96,10 +101,61 @@ def test_noise_is_re_estimated_and_solved_with_twice_before_priors_are_chosen(mo
     solving = SimpleNamespace(optimize=lambda problem, solver: made.append(f"solve {solver.max_iterations}") or (graph, None))
     monkeypatch.setattr(radio_stages, "Optimizer", lambda: solving)
     monkeypatch.setattr(radio_stages.prior_selection, "select_priors", lambda graph, *rest: made.append("priors") or graph)
+    gone = iter([False, True])
+    monkeypatch.setattr(radio_stages, "_let_go", lambda held, weak: next(gone))
     config = MappingConfig()
     task = Task(None, replace(config, solver=replace(config.solver, max_iterations=7)), Constraints(), None)
     select_range_priors(replace(estimate, ranges=graph.edges[2]), task)
     assert made == ["noise True", "solve 7"] * 2 + ["priors"]
+    # Where nothing but the ranges holds the poses, these weigh by their own errors alone.
+    made.clear()
+    select_range_priors(replace(estimate, ranges=graph.edges[2]), task)
+    assert made == ["noise True", "solve 7"] * 2 + ["noise False", "solve 7"] * 2 + ["priors"]
+
+
+@pytest.mark.parametrize(("growth", "gone"), [
+    ((1.25, 1.2, 1.29, 1.0), False), ((1.4, 1.35, 1.4, 1.0), True), ((1.0, 9.0, 1.0, 1.1), False), ((), False),
+])  # fmt: skip
+def test_poses_have_let_ranges_go_where_those_of_most_anchors_scatter_more(growth, gone):
+    """By a third and more; an anchor that lies is one alone."""
+    rng = np.random.default_rng(5)
+    count = len(growth)
+    graph = Graph(np.zeros((1, 3)), np.array([[30.0, 0.0]] * count).reshape(-1, 2), ())
+    anchor = np.repeat(np.arange(count), 200)
+    off = 0.1 * rng.standard_normal(200)
+    off *= 0.1 / spread(off)
+    of = [
+        Estimate(graph, None, plain_ranges(0 * anchor, anchor, 30.0 + np.repeat(times, 200) * np.tile(off, count), 0.1), ())
+        for times in (np.ones(count), np.array(growth))
+    ]
+    assert radio_stages._let_go(*of) is gone
+
+
+def test_ranges_keep_a_path_that_scans_hardly_see():
+    """Wheels that turn by 4 mrad a step too much, no step measured: noise learnt from a path that ranges were too weak to hold
+    would be this path's own error, metres, and leave it where it is."""
+    rng = np.random.default_rng(6)
+    angle = np.arange(240) * 0.03
+    truth = np.column_stack([15.0 * np.sin(angle), 15.0 - 15.0 * np.cos(angle), angle])
+    anchors = np.array([[-20.0, -5.0], [22.0, -3.0], [20.0, 36.0], [-18.0, 33.0]])
+    pose, anchor = np.repeat(np.arange(240), 2), rng.integers(0, 4, 480)
+    exact = np.hypot(*(truth[pose, :2] - anchors[anchor]).T)
+    ranges = plain_ranges(pose, anchor, exact + 0.1 * rng.standard_normal(480), 0.12)
+    steps = se2.between(truth[:-1], truth[1:]) + np.array([0.0, 0.0, 0.004])
+    wheels = chained(truth, np.array([0.01, 0.01, 0.005]))
+    path = [truth[0]]
+    for step in steps:
+        path.append(se2.compose(path[-1], step))
+    graph = Graph(np.array(path), anchors, ())
+    none = RelativePoseEdges(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    estimate = Estimate(graph, replace(wheels, motion=steps), ranges, ("A", "B", "C", "D"), steps=none)
+    task = Task(None, MappingConfig(), Constraints(), Stages(None, None))
+    found = reestimate_ranges(estimate, task)
+    assert np.hypot(*(np.array(path)[-1, :2] - truth[-1, :2])) > 2.0
+    # Where the map lies as a whole is free.
+    error = pdist(found.graph.poses[::5, :2]) - pdist(truth[::5, :2])
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert np.all((found.ranges.sigma > 0.07) & (found.ranges.sigma < 0.15))
 
 
 def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last(monkeypatch):

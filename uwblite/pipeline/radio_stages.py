@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, spread
 from ..graph import calibration
 from ..graph.calibration import (
     BIAS,
@@ -205,12 +205,16 @@ def reestimate_ranges(estimate: Estimate, task: Task) -> Estimate:
     """Re-estimate anchors and range noise on the trajectory that matches of neighbouring clouds have stiffened.
 
     Odometry alone is soft enough to be bent until ranges with errors that last for minutes seem to fit. On the stiffer
-    chain such errors stand out.
+    chain, to which ranges gave way so far, such errors stand out; unless scans see so little that this chain is soft as well.
     """
     config, steps, optimizer = task.config, estimate.steps, Optimizer()
     if estimate.ranges is None or steps is None:
         return estimate
+    problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
+    held = estimate.with_estimates_of(optimizer.optimize(problem, rough(config.solver))[0])
+    estimate = held if _let_go(held, estimate) else estimate
     for solver in (rough(config.solver), config.solver):
+        assert estimate.ranges is not None
         graph = relocate(estimate.ranges, estimate.graph, ~estimate.graph.fixed_anchors, config.trilateration)
         estimate = with_range_noise(replace(estimate, graph=graph), config)
         problem = estimate.graph.with_edges(*estimate.odometry_and_ranges, steps)
@@ -230,13 +234,48 @@ _ROUGH_ITERATIONS, _ROUGH_DECREASE = 12, 1e-4
 
 
 def select_range_priors(estimate: Estimate, task: Task) -> Estimate:
-    """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors."""
+    """Re-estimate the ranges' noise on the trajectory with loops closed, and the priors of their systematic errors.
+
+    Ranges weigh little meanwhile, so that an anchor that lies for long stands out; unless nothing but ranges holds the poses.
+    """
     if estimate.ranges is None:
         return estimate
+    weak = _with_learnt_ranges(estimate, task, steady=True)
+    estimate = _with_learnt_ranges(estimate, task, steady=False) if _let_go(estimate, weak) else weak
+    edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
+    return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))
+
+
+def _with_learnt_ranges(estimate: Estimate, task: Task, *, steady: bool) -> Estimate:
+    """Return the optimum with ranges whose noise was learnt there; steady: see range_measurements.learn_noise."""
     optimizer = Optimizer()
     for solver in (rough(task.config.solver), task.config.solver):
         # The marginal likelihood is one about the optimum of the very weights that it is computed with.
-        estimate = with_range_noise(estimate, task.config, steady=True)
+        estimate = with_range_noise(estimate, task.config, steady=steady)
         edges = (*estimate.odometry_and_ranges, *estimate.steps_and_closures)
         estimate = estimate.with_estimates_of(optimizer.optimize(estimate.graph.with_edges(*edges), solver)[0])
-    return replace(estimate, graph=prior_selection.select_priors(estimate.graph, edges, task.config.calibration))
+    return estimate
+
+
+def _let_go(held: Estimate, weak: Estimate) -> bool:
+    """Return whether poses left most anchors' ranges where these weighed little: nothing else holds the poses.
+
+    Noise learnt there would be the poses' own error, and hold them where they are. An anchor that lies leaves residuals too,
+    but its own alone.
+    """
+    growth = np.array([b / max(a, _LEAST_SCATTER) for a, b in zip(_scatter(held), _scatter(weak), strict=True)])
+    return len(growth) > 0 and float(np.median(growth)) > _MOST_GROWTH
+
+
+def _scatter(estimate: Estimate) -> list[float]:
+    """Return how far the ranges of each anchor that has any scatter about the estimate, m."""
+    ranges = estimate.ranges
+    assert ranges is not None
+    off, alive = ranges.residuals(estimate.graph)[:, 0] * ranges.sigma, ranges.alive
+    return [spread(off[alive & (ranges.anchor == anchor)]) for anchor in np.unique(ranges.anchor[alive])]
+
+
+_MOST_GROWTH = 1.3
+"""Scatter of a typical anchor's ranges, as a multiple, that weaker ranges leave where the lidar holds the poses."""
+_LEAST_SCATTER = 0.03
+"""Scatter below which ranges are as good as any radio's, m."""
