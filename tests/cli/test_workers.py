@@ -1,9 +1,11 @@
 """Who does the work: this process, some processes, or a scheduler that may be absent."""
 
 import argparse
+import multiprocessing
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,30 @@ def test_one_job_needs_no_executor_and_two_answer_in_order():
         assert list(executor.map(abs, range(-3, 3))) == [3, 2, 1, 0, 1, 2]
 
 
+def waiting(name, folder):
+    """Leave a file, and another one after longer than any test lasts."""
+    (folder / name).touch()
+    time.sleep(600.0)
+    (folder / "done").touch()
+
+
+def interrupted(executor, folder):
+    """Hand out seven tasks and be interrupted once two of them run."""
+    for name in "abcdefg":
+        executor.submit(waiting, name, folder)
+    while not {"a", "b"} <= {path.name for path in folder.iterdir()}:
+        time.sleep(0.01)
+    raise KeyboardInterrupt
+
+
+def test_what_processes_do_ends_with_an_interrupt(tmp_path):
+    """A pool hands out one task more than it has processes; Ctrl-C waits for none of them."""
+    with pytest.raises(KeyboardInterrupt), workers.workers(2) as executor:
+        interrupted(executor, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
+    assert not multiprocessing.active_children()
+
+
 def test_without_the_package_the_command_that_installs_it_is_reported(monkeypatch, room_log, tmp_path, capsys):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "--scheduler", "tcp://127.0.0.1:1"]) == 1
@@ -45,7 +71,10 @@ def test_without_the_package_the_command_that_installs_it_is_reported(monkeypatc
 def test_a_scheduler_that_does_not_answer_is_one_line(monkeypatch):
     pytest.importorskip("distributed", reason="dask.distributed is not installed (extra: cluster)")
     monkeypatch.setattr(workers, "_SECONDS_TO_CONNECT", 0.2)
-    with pytest.raises(ConfigError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1 "), workers.cluster("tcp://127.0.0.1:1"):
+    with (
+        pytest.raises(ConfigError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1 "),
+        workers.cluster("tcp://127.0.0.1:1"),
+    ):
         pass
 
 

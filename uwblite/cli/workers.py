@@ -39,12 +39,18 @@ def workers(jobs: int, scheduler: str = "") -> "Iterator[Executor | None]":
 
 @contextmanager
 def processes(jobs: int) -> "Iterator[Executor]":
-    """Start so many processes; what waits is dropped at the end."""
+    """Start so many processes; what waits is dropped at the end, and what runs too where an exception ends it."""
     from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import active_children
 
     executor = ProcessPoolExecutor(jobs, initializer=_begin)
     try:
         yield executor
+    except BaseException:
+        # Each worker has been handed another task already, which cannot be taken back: Ctrl-C would wait for all of them.
+        for child in active_children():
+            child.terminate()
+        raise
     finally:
         executor.shutdown(cancel_futures=True)
 
