@@ -9,6 +9,7 @@ from ..arrays import Bools, Floats
 from ..odometry.gyro import heading_from_gyro
 from ..sensor_log import Odometry, OdometryBreaks, Remark, Screening, SensorLog
 from . import clocks, cuts, directions, odometry_chain, range_motion, replaced_wheels, stuck_sensors, units, wheel_motion
+from .own_body import without_own_body
 from .shared_names import without_shared_names
 from .wheel_motion import Pairs
 
@@ -58,7 +59,7 @@ def screen(log: SensorLog, turn_laser: bool = True) -> SensorLog:
     odometry, jumps, broken = odometry_chain.rejoined(odometry)
     log, turned = heading_from_gyro(replace(log, odometry=odometry))
     remarks += [*_repeats(repeats), *bursts, *glitches, *broken, *turned]
-    repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_lidar_marks]
+    repairs = [stuck_sensors.without_repeated_scans, stuck_sensors.without_lidar_marks, without_own_body]
     repairs += [stuck_sensors.without_marks, stuck_sensors.without_repeated_ranges, without_shared_names]
     repairs += [directions.heading_with_the_path] + [directions.laser_upright] * turn_laser
     for repair in repairs:

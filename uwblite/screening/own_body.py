@@ -1,0 +1,51 @@
+"""Beams that see the robot itself: a mast, a tray, a cable of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Bools, Ints, runs_of
+from ..sensor_log import LaserScans, Remark, SensorLog
+
+_SECTOR = np.deg2rad(30.0)
+"""Turn after which walls are elsewhere in a scan, rad: a robot that follows a wall has it beside it only on the straight."""
+_SECTORS, _WAY = 8, 3.0
+"""Such turns, and travelled distance, m, without which a recording does not show what moves with the robot."""
+_NEAR = 0.8
+"""m; what belongs to a robot is nearer to its lidar."""
+_STEADY, _SHARE, _ENOUGH = 0.04, 0.8, 500
+"""Deviation from a beam's median that noise of lidars makes nearby, m, share of the readings within it, and scans that show
+the median."""
+
+
+def without_own_body(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
+    """Take readings that stay the same wherever the robot is and however it is turned as no wall."""
+    scans = log.scans
+    if scans is None or not len(scans.stamps) or log.odometry.travelled_at(scans.stamps[-1:])[0] < _WAY:
+        return log, []
+    _, sector = np.unique(np.floor(log.odometry.at(scans.stamps)[:, 2] / _SECTOR), return_inverse=True)
+    if sector.max() + 1 < _SECTORS:
+        return log, []
+    own = _steady(scans, sector)
+    if not own.any():
+        return log, []
+    ranges = np.where(own, np.float32(np.nan), scans.ranges)
+    where, runs = np.rad2deg(scans.angles), runs_of(own)
+    parts = ", ".join(f"{where[a]:.0f} to {where[b - 1]:.0f}" for a, b in runs[:3]) + " ..." * (len(runs) > 3)
+    text = (
+        f"{int(own.sum())} of {len(own)} beams of the lidar (at {parts} degrees) see the same nearby however the robot is "
+        "turned: the robot itself; they were left out"
+    )
+    return replace(log, scans=replace(scans, ranges=ranges)), [Remark("repeated-readings", text)]
+
+
+def _steady(scans: LaserScans, sector: Ints) -> Bools:
+    """Return which beams (b,) see the same nearby in nearly all scans (k,), those of every sector weighing alike."""
+    some = scans.ranges[:: max(1, len(sector) // _ENOUGH)]
+    middle = np.median(np.where(scans.hits(some), some, np.inf), axis=0)
+    own = middle < _NEAR
+    with np.errstate(invalid="ignore"):
+        alike = np.abs(scans.ranges[:, own] - middle[own]) < _STEADY
+    share = alike / np.bincount(sector)[sector, None]
+    own[own] = share.sum(axis=0) >= _SHARE * (sector.max() + 1)
+    return own
