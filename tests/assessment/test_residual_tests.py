@@ -22,6 +22,8 @@ from uwblite.assessment.residual_tests import (
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.pose_edges import RelativePoseEdges, ScanEdges
+from uwblite.grid.geometry import GridGeometry
+from uwblite.grid.occupancy_grid import OccupancyGrid
 from uwblite.mapping import build_map
 from uwblite.pipeline.progress import Stages
 from uwblite.radio.range_noise import RangeNoiseConfig
@@ -240,9 +242,33 @@ def test_ranges_scatter_more_than_from_one_to_the_next(off, steps, said):
     object.__setattr__(ranges, "stamps", stamps)
     stages = Stages(None, None)
     task = SimpleNamespace(config=SimpleNamespace(ranges=RangeNoiseConfig()), stages=stages)
-    check_range_scatter(SimpleNamespace(ranges=ranges), residuals, task)
+    check_range_scatter(SimpleNamespace(ranges=ranges), residuals, None, task)
     assert len(stages.doubts) == (said is not None)
     assert all(said in n.text for n in stages.doubts)
+
+
+@pytest.mark.parametrize(("walled", "late", "free", "said"), [
+    (True, 0.5, 0.0, 0), (False, 0.5, 0.0, 1), (True, 0.5, 0.5, 1), (False, 0.1, 0.0, 0),
+    (True, -0.5, 0.0, 1), (True, 1.5, 0.0, 1),
+])  # fmt: skip
+def test_ranges_through_walls_may_be_late_where_the_map_shows_the_walls(walled, late, free, said):
+    """Most of the poses stand behind a wall; ranges from there are late (or early), those in free sight are wrong or not."""
+    behind = np.arange(600) >= 150
+    away = np.where(behind, 8.0, 4.0)
+    poses = np.column_stack([away, np.linspace(-1.0, 1.0, 600), np.zeros(600)])
+    rng = np.random.default_rng(0)
+    wrong = np.where(np.arange(600) % 2, free, -free)
+    residuals = np.where(behind, -late * np.linspace(-1.0, 3.0, 600), wrong) + 0.05 * rng.standard_normal(600)
+    ranges = plain_ranges(np.arange(600), np.zeros(600, dtype=int), away - residuals, 0.1)
+    object.__setattr__(ranges, "stamps", np.arange(600.0))
+    geometry = GridGeometry(0.05, np.array([0.0, -5.0]), 200, 200)
+    log_odds = np.zeros((200, 200), dtype=np.float32)
+    log_odds[:, 120] = 5.0 * walled
+    stages = Stages(None, None)
+    task = SimpleNamespace(config=SimpleNamespace(ranges=RangeNoiseConfig()), stages=stages)
+    estimate = SimpleNamespace(ranges=ranges, graph=Graph(poses, np.zeros((1, 2))))
+    check_range_scatter(estimate, residuals, OccupancyGrid(geometry, log_odds), task)
+    assert len(stages.doubts) == said
 
 
 def test_every_check_is_made_once(monkeypatch):
@@ -250,6 +276,6 @@ def test_every_check_is_made_once(monkeypatch):
     names = [n for n in vars(residual_tests) if n.startswith("check_") and n != "check_residuals"]
     for name in names:
         monkeypatch.setattr(residual_tests, name, lambda *given, name=name: made.append((name, *given)))
-    residual_tests.check_residuals("estimate", "residuals", "task")
+    residual_tests.check_residuals("estimate", "residuals", "grid", "task")
     assert sorted(n for n, *_ in made) == sorted(names)
-    assert {tuple(given) for _, *given in made} == {("estimate", "task"), ("estimate", "residuals", "task")}
+    assert {tuple(given) for _, *given in made} == {("estimate", "task"), ("estimate", "residuals", "grid", "task")}

@@ -54,9 +54,9 @@ def judge(
     check_calibration(calibrated, usual, task)
     if table:
         check_sustained_outliers(table, estimate.anchor_ids, task)
-        check_residuals(estimate, table["residual"], task)
+        check_residuals(estimate, table["residual"], grid, task)
     else:
-        check_residuals(estimate, np.zeros(0), task)
+        check_residuals(estimate, np.zeros(0), grid, task)
     check_unit(anchors, task)
     check_halves(estimate, task)
     check_drifts(estimate, task)

@@ -10,7 +10,7 @@ from ..arrays import Bools, Floats, Ints
 
 _CELL = 0.2
 """Side of a cell of the map, m; a wall is about as thick."""
-_LEAST_POINTS = 3
+LEAST_POINTS = 3
 """Points of clouds from which a cell is taken as a surface: people who pass leave fewer."""
 _NEAR_TAG = 0.4
 """The way through the robot itself does not count, m."""
@@ -72,7 +72,7 @@ def _occupied(surfaces: Floats) -> tuple[Floats, float, Bools]:
         x, y = surfaces[block].T
         number[block] = _cells(x, low[0], cell) * shape[1] + _cells(y, low[1], cell)
     hits = np.bincount(number, minlength=shape[0] * shape[1])
-    return low, cell, (hits >= _LEAST_POINTS).reshape(shape)
+    return low, cell, (hits >= LEAST_POINTS).reshape(shape)
 
 
 def _cells(places: Floats, low: float, cell: float) -> Ints:
