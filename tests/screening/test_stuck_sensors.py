@@ -105,6 +105,18 @@ def test_a_scan_that_stands_three_times_was_not_measured_again(repeats, seen, le
     assert all(f"t = 6 to {5 + left_out} s" in r.text for r in remarks)
 
 
+@pytest.mark.parametrize(("count", "left_out"), [(10, 0), (12, 12), (50, 50)])
+def test_scans_that_a_driver_sends_again_and_again_are_left_out(count, left_out):
+    """Of a hundred scans some repeat the one before, never two in a row: a tenth may be chance."""
+    readings = np.random.default_rng(3).uniform(1.0, 2.0, (100, 40))
+    again = 1 + 2 * np.arange(count)
+    readings[again] = readings[again - 1]
+    done, remarks = without_repeated_scans(SensorLog(driving(), None, scans(readings)))
+    np.testing.assert_array_equal(done.scans.stamps, np.delete(np.arange(100.0), again[:left_out]))
+    assert [r.text.partition(" scans")[0] for r in remarks] == [f"{left_out} of 100"] * bool(left_out)
+    assert all("the driver sends scans again" in r.text for r in remarks)
+
+
 def test_a_scan_written_twice_is_left_out_without_a_word():
     readings = np.random.default_rng(2).uniform(1.0, 2.0, (10, 40))
     log = SensorLog(driving(), None, scans(np.repeat(readings, 2, axis=0), np.repeat(np.arange(10.0), 2)))

@@ -28,6 +28,9 @@ _USUAL_NOISE, _LEAST_NOISE = 0.03, 0.005
 """Noise of such radios, m, where the recording does not show it, and the least that is assumed."""
 _SAME_SCANS = 3
 """Equal scans in a row that no lidar gives: some beam of hundreds always changes."""
+_OFTEN, _FEW_REPEATS = 0.1, 5
+"""Share of the scans, and number, from which on even single repeats are no chance; of seven real recordings one has any
+(0.5 %)."""
 _LEAST_SEEN = 10
 """Beams that must see something; scans that see nothing are rightly equal."""
 
@@ -71,14 +74,19 @@ _BURST, _LEAST_BURSTS = 4, 5
 
 
 def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
-    """Leave out scans that repeat the one before to the last digit."""
+    """Leave out scans that repeat the one before to the last digit.
+
+    Two in a row may be alike by chance. A driver that sends at twice the lidar's rate repeats many: each is a step of the
+    wheels on which the lidar would stand still.
+    """
     scans = log.scans
     if scans is None or len(scans.stamps) < _SAME_SCANS:
         return log, []
     again = _repeats(scans.ranges)
     twice = again & np.concatenate([[False], np.diff(scans.stamps) == 0.0])
     seen = np.isfinite(scans.ranges).sum(axis=1) >= _LEAST_SEEN
-    stuck = again & seen & _in_runs(again & seen & ~twice, _SAME_SCANS - 1)
+    often = int(np.sum(again & seen & ~twice)) > max(_OFTEN * len(again), _FEW_REPEATS)
+    stuck = again & seen & _in_runs(again & seen & ~twice, 1 if often else _SAME_SCANS - 1)
     wrong = twice | stuck
     if not wrong.any():
         return log, []
@@ -87,7 +95,8 @@ def without_repeated_scans(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         start = float(log.odometry.stamps[0])
         when = _when(scans.stamps, stuck, start)
         share = f"{int(stuck.sum())} of {len(stuck)} scans equal the scan before ({when})"
-        remarks.append(Remark("repeated-scans", f"{share}: the lidar or its driver was stuck; they were left out"))
+        why = "the driver sends scans again" if often else "the lidar or its driver was stuck"
+        remarks.append(Remark("repeated-scans", f"{share}: {why}; they were left out"))
     return replace(log, scans=scans.rows(~wrong)), remarks
 
 
