@@ -217,3 +217,48 @@ def angles_times(factor: float) -> Fault:
     return lambda case, rng: with_scans(
         case, lambda s: replace(s, angle_min=factor * s.angle_min, angle_increment=factor * s.angle_increment)
     )
+
+
+def own_body(angle: float, distance: float) -> Fault:
+    """A tray of the robot stands before the lidar: a sector, rad, sees it at its distance, m, all the time."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        def change(s: LaserScans) -> LaserScans:
+            readings, beams = s.ranges.copy(), round(angle / abs(s.angle_increment))
+            first = readings.shape[1] // 5
+            tray = readings[:, first : first + beams]
+            readings[:, first : first + beams] = distance + rng.normal(0.0, 0.006, tray.shape)
+            return replace(s, ranges=readings)
+
+        return with_scans(case, change)
+
+    return fault
+
+
+def sent_twice(case: Case, rng: Rng) -> Case:
+    """The driver sends at twice the lidar's rate: every other scan is the one before, with a stamp of its own."""
+
+    def change(s: LaserScans) -> LaserScans:
+        readings = s.ranges.copy()
+        readings[1::2] = readings[: len(readings) // 2 * 2 : 2]
+        return replace(s, ranges=readings)
+
+    return with_scans(case, change)
+
+
+def alternating_halves(case: Case, rng: Rng) -> Case:
+    """Packets are lost: half of the beams is missing in each scan, the left and the right one in turn."""
+
+    def change(s: LaserScans) -> LaserScans:
+        readings, middle = s.ranges.copy(), s.ranges.shape[1] // 2
+        readings[::2, :middle] = readings[1::2, middle:] = np.float32(np.nan)
+        return replace(s, ranges=readings)
+
+    return with_scans(case, change)
+
+
+def swapped_rotation(case: Case, rng: Rng) -> Case:
+    """From half-way on the beams come in the other order: the lidar was restarted with another setting."""
+    return with_scans(
+        case, lambda s: replace(s, ranges=np.where((s.stamps >= case.middle)[:, None], s.ranges[:, ::-1], s.ranges))
+    )

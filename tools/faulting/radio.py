@@ -273,3 +273,59 @@ def warming_up(metres: float) -> Fault:
     return lambda case, rng: with_ranges(
         case, lambda r: replace(r, ranges=r.ranges + metres * (r.stamps - r.stamps[0]) / np.ptp(r.stamps))
     )
+
+
+def averaged(count: int) -> Fault:
+    """The firmware reports the mean of the last so many ranges to each anchor: they lag."""
+
+    def change(r: UwbRanges) -> UwbRanges:
+        ranges = r.ranges.copy()
+        for own in (np.flatnonzero(r.anchor == k) for k in np.unique(r.anchor)):
+            before = np.concatenate([np.full(count - 1, r.ranges[own[0]]), r.ranges[own]])
+            ranges[own] = np.lib.stride_tricks.sliding_window_view(before, count).mean(axis=1)
+        return replace(r, ranges=ranges)
+
+    return lambda case, rng: with_ranges(case, change)
+
+
+def last_value_where_lost(share: float) -> Fault:
+    """A share of the ranges is lost, eight in a row, and the radio repeats the last one instead."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        def change(r: UwbRanges) -> UwbRanges:
+            ranges = r.ranges.copy()
+            for own in (np.flatnonzero(r.anchor == k) for k in np.unique(r.anchor)):
+                lost = np.repeat(rng.random(len(own) // 8 + 1) < share, 8)[: len(own)]
+                last = np.maximum.accumulate(np.where(lost, 0, np.arange(len(own))))
+                ranges[own] = r.ranges[own[last]]
+            return replace(r, ranges=ranges)
+
+        return with_ranges(case, change)
+
+    return fault
+
+
+def raised(metres: float) -> Fault:
+    """Half-way one anchor is hung higher, from the height of the tag."""
+
+    def change(r: UwbRanges, case: Case) -> UwbRanges:
+        higher = (r.anchor == 0) & (r.stamps >= case.middle)
+        return replace(r, ranges=np.where(higher, np.hypot(r.ranges, metres), r.ranges))
+
+    return lambda case, rng: with_ranges(case, lambda r: change(r, case))
+
+
+def mixed_robots(share: float) -> Fault:
+    """A share of the ranges is another robot's, which drives the same path half a recording later."""
+
+    def change(r: UwbRanges, case: Case, rng: Rng) -> UwbRanges:
+        if not set(r.anchor_ids) <= case.anchors.keys():
+            return r
+        span = float(np.ptp(case.log.odometry.stamps))
+        later = case.log.odometry.stamps[0] + (r.stamps - case.log.odometry.stamps[0] + 0.5 * span) % span
+        base = se2.interpolate_trajectory(case.log.odometry.stamps, case.truth, later)
+        place = np.array([case.anchors[name][0] for name in r.anchor_ids])[r.anchor]
+        other = np.hypot(*(place - base[:, :2]).T) + rng.normal(0.0, 0.05, len(r.ranges))
+        return replace(r, ranges=np.where(rng.random(len(other)) < share, np.maximum(other, 0.05), r.ranges))
+
+    return lambda case, rng: with_ranges(case, lambda r: change(r, case, rng))

@@ -246,3 +246,13 @@ def coarse(way: float, turn: float) -> Fault:
     return lambda case, rng: with_odometry(
         case, lambda stamps, poses: np.round(poses / [way, way, turn]) * [way, way, turn]
     )
+
+
+def cut_off(way: float, turn: float) -> Fault:
+    """The base cuts each step off to whole units, m and rad, and forgets the rest."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        unit = np.array([way, way, turn])
+        return chained(poses[0], np.trunc(se2.between(poses[:-1], poses[1:]) / unit) * unit)
+
+    return lambda case, rng: with_odometry(case, change)
