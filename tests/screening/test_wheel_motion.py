@@ -282,3 +282,16 @@ def test_the_factor_of_turns_is_of_turns_alone():
     found = pairs()
     found.wheels[:], found.lidar[:] = [0.0, 3.0, 1.0], [0.0, 1.5, 1.0]
     assert disagreeing(found, 0.0) == []
+
+
+@pytest.mark.parametrize(("moved", "rest", "stands"), [(0.007, 0.016, True), (0.007, 0.021, False), (0.02, 0.027, True)])
+def test_a_robot_at_rest_whose_scans_differ_by_noise_stands(monkeypatch, moved, rest, stands):
+    """Wheels stand for 4 s, and of few points some motion fits better than rest (rms distances of matches, m)."""
+    time = 0.1 * np.arange(150)
+    odometry = driven(np.where((time >= 4.95) & (time < 8.95), 0.0, 0.3), 0.0 * time)
+    compared = pairs(100, start=0.1 * np.arange(100), end=0.1 * np.arange(100) + 0.2)
+    stamps = 0.1 * np.arange(150)
+    log = SensorLog(odometry, None, LaserScans(stamps, np.ones((150, 20), dtype=np.float32), 0.0, 0.1, 0.0, 0.05, 8.0))
+    by = iter([moved**2, rest**2])
+    monkeypatch.setattr(wheel_motion, "misfits", lambda scans, mounting, first, second, motion: np.full(len(first), next(by)))
+    assert len(wheel_motion.lost(log, compared)) == (not stands)

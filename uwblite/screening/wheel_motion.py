@@ -169,14 +169,19 @@ def lost(log: SensorLog, pairs: Pairs) -> list[tuple[float, float]]:
 
 
 def _not_at_rest(log: SensorLog, pairs: Pairs) -> Bools:
-    """Return which pairs (e,) match clearly worse if the robot stood: about a single column it may turn as well."""
+    """Return which pairs (e,) match clearly worse if the robot stood: about a single column it may turn as well.
+
+    What a robot at rest measures twice differs by the noise of its lidar, and some motion fits that better.
+    """
     assert log.scans is not None
     middle = log.scans.middles
     first, second = (np.searchsorted(middle, t) for t in (pairs.start, pairs.end))
     moving, rest = (misfits(log.scans, log.mounting, first, second, m) for m in (pairs.lidar, 0.0 * pairs.lidar))
-    return rest > _WORSE_AT_REST * moving
+    return rest > np.maximum(_WORSE_AT_REST * moving, _NOISE_AT_REST**2)
 
 
+_NOISE_AT_REST = 0.02
+"""Rms distance of matches of two scans from one place, m: lidars of robots have 1 to 2 cm."""
 _WORSE_AT_REST = 2.0
 """Factor between the mean square distances of matches if the robot stood and as it moved, from which it did not stand."""
 
