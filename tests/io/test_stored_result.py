@@ -81,3 +81,15 @@ def test_what_is_there_and_no_file_is_not_taken_for_missing(written, name):
     (folder / name).mkdir()
     with pytest.raises(FormatError, match="Is a directory"):
         read_result(folder)
+
+
+def test_more_anchors_than_any_map_has_are_refused(written):
+    _, folder = written
+    table = folder / "anchors.csv"
+    head, first = table.read_text().splitlines()[:2]
+    rows = [",".join([f"A{k}", *first.split(",")[1:]]) for k in range(1001)]
+    table.write_text("\n".join([head, *rows]) + "\n")
+    with pytest.raises(FormatError, match=r"has 1001 anchors, more than 1000: it must be the anchors\.csv of one map"):
+        read_result(folder)
+    table.write_text("\n".join([head, *rows[1:]]) + "\n")
+    assert len(read_result(folder).anchors) == 1000

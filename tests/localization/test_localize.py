@@ -66,6 +66,18 @@ def test_without_walls_the_anchors_fix_the_place(log, earlier):
 
 
 @pytest.mark.slow
+def test_anchors_of_the_map_that_are_not_heard_change_nothing(log, earlier):
+    known = map_of(earlier)
+    more = [StoredAnchor(f"far {k}", np.array([9.0 * k, 5.0]), np.eye(2) * 1e-4, "ok", 0.0, 0.1) for k in range(20)]
+    heard = known_map(tuple(more), None).anchors
+    wide = dataclasses.replace(
+        known.anchors, ids=heard.ids + known.anchors.ids,
+        **{f: np.concatenate([getattr(heard, f), getattr(known.anchors, f)]) for f in ("positions", "bias", "rise", "sigma")},
+    )  # fmt: skip
+    one, other = (localize(part(log), dataclasses.replace(known, anchors=some)) for some in (known.anchors, wide))
+    np.testing.assert_array_equal(one.trajectory, other.trajectory)
+
+
 def test_a_moved_anchor_is_named_and_does_not_pull(log, earlier):
     found = localize(part(log), map_of(earlier, aDD07=(2.0, 1.0)))
     assert any("DD07" in w.text and "moved" in w.text for w in found.warnings)

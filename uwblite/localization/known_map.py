@@ -1,5 +1,6 @@
 """What a live localisation is given: anchors with their calibration, walls, and where the laser sits on the robot."""
 
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,6 +38,14 @@ class KnownAnchors:
     def slow_sigma(self) -> float:
         """Standard deviation of further common error of ranges to one anchor, m."""
         return SLOW_LEFT if self.errors else SLOW_SIGMA
+
+    def only(self, names: Container[str]) -> "KnownAnchors":
+        """Return the anchors that have one of these names."""
+        rows = [k for k, name in enumerate(self.ids) if name in names]
+        return replace(
+            self, ids=tuple(self.ids[k] for k in rows), positions=self.positions[rows], bias=self.bias[rows],
+            rise=self.rise[rows], sigma=self.sigma[rows], errors=tuple(self.errors[k] for k in rows if self.errors),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
