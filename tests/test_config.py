@@ -79,8 +79,10 @@ def test_a_number_beyond_all_measure_is_refused(value):
     wrong = [{"sigma": value}, {"pair": [1.0, value]}, {"heights": {"a": value}}]
     for data in [{"count": value}] if isinstance(value, int) else wrong:
         with pytest.raises(ConfigError, match="is out of range; its size must be"):
-            from_dict(Plain, data)
-    assert from_dict(Plain, {"limit": math.inf, "sigma": 1e6, "count": 10**9, "pair": [0, -1e-15]}).limit == math.inf
+            merge(Plain(), data)
+    assert merge(Plain(), {"limit": math.inf, "sigma": 1e6, "count": 10**9, "pair": [0, -1e-15]}).limit == math.inf
+    # What is read is no setting: stamps since 1970, places in a national grid.
+    assert from_dict(Plain, {"sigma": 1.7e9}).sigma == 1.7e9
 
 
 def test_assignments_on_the_command_line():

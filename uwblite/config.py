@@ -64,12 +64,12 @@ def from_dict(cls: type[Settings], data: Mapping[str, Any]) -> Settings:
     ------
     ConfigError : a name is unknown (with the nearest known one), a value has the wrong type or is out of its range.
     """
-    return cast(Settings, _merge(cls(), data, (), cls))
+    return cast(Settings, _merge(cls(), data, (), cls, sized=False))
 
 
 def merge(config: Settings, data: Mapping[str, Any]) -> Settings:
-    """Return the settings with those named in nested dicts replaced; errors as in from_dict."""
-    return cast(Settings, _merge(config, data, (), type(config)))
+    """Return the settings with those named in nested dicts replaced; errors as in from_dict, and out of all proportion."""
+    return cast(Settings, _merge(config, data, (), type(config), sized=True))
 
 
 def override(config: Settings, assignments: Iterable[str]) -> Settings:
@@ -114,7 +114,7 @@ def flat(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
             yield prefix + name, value
 
 
-def _merge(config: Any, data: Any, path: tuple[str, ...], root: type) -> Any:
+def _merge(config: Any, data: Any, path: tuple[str, ...], root: type, *, sized: bool) -> Any:
     if not isinstance(data, Mapping):
         raise ConfigError(f"{'.'.join(path)} is a table of settings, not {_shown(data)}")
     fields = {f.name: f for f in dataclasses.fields(config)}
@@ -126,9 +126,11 @@ def _merge(config: Any, data: Any, path: tuple[str, ...], root: type) -> Any:
             raise ConfigError(_unknown(where, type(config), root))
         old = getattr(config, name)
         if dataclasses.is_dataclass(old):
-            changes[name] = _merge(old, value, where, root)
+            changes[name] = _merge(old, value, where, root, sized=sized)
         else:
-            converted = _check_size(_convert(value, hints[name], where), fields[name].default, where)
+            converted = _convert(value, hints[name], where)
+            if sized:
+                _check_size(converted, fields[name].default, where)
             changes[name] = _check_range(converted, _limits(fields[name]), where)
     try:
         return dataclasses.replace(config, **changes)
@@ -221,10 +223,11 @@ def _check_range(value: Any, limits: Mapping[str, float], where: tuple[str, ...]
 
 
 _SMALLEST, _LARGEST, _MOST_COUNTED = 1e-15, 1e6, 10**9
-"""In whatever unit, no setting means anything beyond, and squares of what is within do not overflow; of what is counted."""
+"""In whatever unit, no setting of an algorithm means anything beyond, though a stamp or a place may; squares of what is within
+do not overflow. The last is of what is counted."""
 
 
-def _check_size(value: Any, default: Any, where: tuple[str, ...]) -> Any:
+def _check_size(value: Any, default: Any, where: tuple[str, ...]) -> None:
     """Refuse a number that is too large or too small to mean anything, unless the default is."""
     several = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else (value,)
     for v in several:
@@ -233,7 +236,6 @@ def _check_size(value: Any, default: Any, where: tuple[str, ...]) -> Any:
         least, most = (_SMALLEST, _LARGEST) if isinstance(v, float) else (1, _MOST_COUNTED)
         if not least <= abs(v) <= most:
             raise ConfigError(f"{'.'.join(where)} = {_shown(v)} is out of range; its size must be {least:g} to {most:g}")
-    return value
 
 
 def range_text(limits: Mapping[str, float]) -> str:

@@ -12,6 +12,7 @@ from .. import se2
 from ..arrays import Floats, Ints
 from ..errors import FormatError
 from ..grid.occupancy_grid import OccupancyGrid
+from ..sensor_log import MOST_ANCHORS
 from .csv_table import read_csv
 from .map_server import read_map
 from .results import repair_result
@@ -172,8 +173,8 @@ def _anchors(path: Path) -> tuple[StoredAnchor, ...]:
     if not path.exists():
         return ()
     table = read_csv(path)
-    if (rows := len(table.texts("id"))) > _MOST_ANCHORS:
-        raise FormatError(f"has {rows} anchors, more than {_MOST_ANCHORS}: it must be the anchors.csv of one map", table.path)
+    if (rows := len(table.texts("id"))) > MOST_ANCHORS:
+        raise FormatError(f"has {rows} anchors, more than {MOST_ANCHORS}: it must be the anchors.csv of one map", table.path)
     values = table.numbers("x", "y", "sigma_x", "sigma_y", "covariance_xy", "bias", "residual_rms", default=np.nan)
     found = []
     texts = table.texts("id"), table.texts("status", default="ok")
@@ -181,10 +182,6 @@ def _anchors(path: Path) -> tuple[StoredAnchor, ...]:
         off = 0.0 if np.isnan(xy) else xy
         found.append(StoredAnchor(name, np.array([x, y]), np.array([[sx**2, off], [off, sy**2]]), status, bias, rms))
     return tuple(found)
-
-
-_MOST_ANCHORS = 1000
-"""Anchors of one map; what uses a map takes time and memory for each."""
 
 
 def _pose(values: Any) -> Floats | None:
