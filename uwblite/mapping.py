@@ -93,22 +93,29 @@ def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task, 
 
 
 def _with_moves_apart(estimate: Estimate, task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
-    """Go through all stages, and again with each place of an anchor that was moved as an anchor of its own."""
+    """Go through all stages, and again with each place of an anchor that was moved as an anchor of its own.
+
+    Names that a pass had before end the search with what came of them: the next would be that of the pass after it again.
+    """
     before, as_recorded = task.stages.mark(), (estimate, task)
-    renamed = anchor_moves.first_with_moves_apart(estimate, task, logs)
-    for _ in range(_MOST_MOVES):
+    renamed, first = anchor_moves.first_with_moves_apart(estimate, task, logs), None
+    for left in reversed(range(_MOST_MOVES)):
         if renamed is not None:
+            if first is not None and anchor_moves.named_so(first[1], renamed):
+                estimate, task, said = first
+                task.stages.back_to(said)
+                break
             task.stages.back_to(before)
             estimate, task = as_recorded
             # Moves that were taken back leave the recordings as they were.
             if any(log is not other for log, other in zip(renamed, logs, strict=True)):
-                task = replace(task, recordings=gather(renamed, task.config.keyframes))
-                estimate = radio_stages.first_optimisation(task)
+                estimate, task = anchor_moves.optimised_with_names(renamed, estimate, task)
         for stage in _stages(task):
             estimate = stage(estimate, task)
             task = task.following(estimate)
-        if (renamed := anchor_moves.with_moves_apart(estimate, task, logs)) is None:
+        if not left or (renamed := anchor_moves.with_moves_apart(estimate, task, logs)) is None:
             break
+        first = first or (estimate, task, task.stages.mark())
     return estimate, task
 
 

@@ -12,19 +12,22 @@ from uwblite import se2
 from uwblite.constraints import Constraints
 from uwblite.graph.graph import Graph
 from uwblite.mapping import build_map
-from uwblite.pipeline import anchor_moves
+from uwblite.pipeline import anchor_moves, radio_stages
 from uwblite.pipeline.anchor_moves import (
     _moves,
     _of_all,
     _renamed,
     _same,
+    alike,
     first_with_moves_apart,
+    optimised_with_names,
     with_moves_apart,
 )
 from uwblite.pipeline.estimate import Task
 from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
-from uwblite.pipeline.recordings import Recording
+from uwblite.pipeline.radio_stages import first_optimisation
+from uwblite.pipeline.recordings import Recording, gather
 from uwblite.radio.change_points import Move
 from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting, UwbRanges
@@ -134,12 +137,46 @@ def test_moves_are_those_of_the_trajectory_that_presumes_none(monkeypatch, found
     results = iter([[{k: [moved(t) for t in v] for k, v in moves.items()}] for moves in (found, again)])
     monkeypatch.setattr(anchor_moves, "_moves_of_all", lambda *args: next(results))
     monkeypatch.setattr(anchor_moves, "gather", lambda logs, keyframes: seen.append(names(logs[0])))
-    monkeypatch.setattr(anchor_moves, "first_optimisation", lambda task: task.stages.warn("bent", ""))
-    task = Task(None, MappingConfig(), Constraints(), stages)
-    renamed = first_with_moves_apart(None, task, [log])
+    monkeypatch.setattr(anchor_moves, "first_optimisation", lambda task, known: task.stages.warn("bent", ""))
+    task = Task(SimpleNamespace(each=[SimpleNamespace(log=log)]), MappingConfig(), Constraints(), stages)
+    renamed = first_with_moves_apart(SimpleNamespace(alone=()), task, [log])
     assert (renamed if called is None else names(renamed[0])) == called
     assert seen == ([["A", "B"] + ["A@2", "B@2"] * 3] if found else [])
     assert stages.warnings == []
+
+
+def test_renamings_are_alike_with_the_same_names_ranges_and_remarks():
+    one = four_ranges(A=[moved(3.0, left=1.0)])
+    assert alike(one, four_ranges(A=[moved(3.0, left=1.0)]))
+    assert alike(four_ranges(), four_ranges())
+    for other in ([moved(2.0, left=1.0)], [moved(3.0, left=2.0)], [moved(3.0, 0.7, left=1.0)], []):
+        assert not alike(one, four_ranges(A=other))
+    silent = replace(one, ranges=None)
+    assert alike(silent, replace(silent))
+    assert not alike(one, silent)
+
+
+def test_a_recording_whose_names_stay_is_not_bootstrapped_again(monkeypatch):
+    """The result is to the last bit that of recordings that were never called otherwise."""
+    whole = recording(two_rounds()).without(lidar=True)
+    logs = [whole.crop(100.0, 190.0), whole.crop(160.0, 250.0)]
+    task = Task(gather(logs, MappingConfig().keyframes), MappingConfig(), Constraints(), Stages(None, None))
+    middle = float(logs[1].ranges.stamps.mean())
+    # A copy of the first, as _of_all makes one.
+    renamed = [_renamed(logs[0], {"B2": []}), _renamed(logs[1], {"B2": [moved(middle)]})]
+    assert renamed[0] is not logs[0]
+    expected = first_optimisation(replace(task, recordings=gather(renamed, task.config.keyframes)))
+    before, calls, find = first_optimisation(task), [], radio_stages.bootstrapped
+    monkeypatch.setattr(radio_stages, "bootstrapped", lambda own, n, task: calls.append(n) or find(own, n, task))
+    found, now = optimised_with_names(renamed, before, task)
+    assert calls == [1]
+    assert [own.log for own in now.recordings.each] == renamed
+    assert "B2@2" in found.anchor_ids
+    assert found.anchor_ids == expected.anchor_ids
+    for name in ("poses", "anchors"):
+        assert getattr(found.graph, name).tobytes() == getattr(expected.graph, name).tobytes()
+    assert found.graph.calibration.values.tobytes() == expected.graph.calibration.values.tobytes()
+    assert found.ranges.sigma.tobytes() == expected.ranges.sigma.tobytes()
 
 
 def test_names_that_are_already_so_stay(monkeypatch):

@@ -45,11 +45,44 @@ def first_with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[Sensor
         return None
     apart = [_renamed(log, _of_all(log, found)) for log, found in zip(logs, moves, strict=True)]
     said = task.stages.mark()
-    task = replace(task, recordings=gather(apart, task.config.keyframes))
-    estimate = first_optimisation(task)
+    estimate, task = optimised_with_names(apart, estimate, task)
     task.stages.back_to(said)
     moves = _moves_of_all(estimate, task, logs)
     return [_renamed(log, found) for log, found in zip(logs, moves, strict=True)] if any(moves) else None
+
+
+def optimised_with_names(renamed: Sequence[SensorLog], estimate: Estimate, task: Task) -> tuple[Estimate, Task]:
+    """Return the first optimisation and the task with anchors renamed.
+
+    A recording whose names stay is not bootstrapped again: what it shows alone does not depend on the others.
+
+    Parameters
+    ----------
+    estimate, task : the first optimisation with other names, and its task.
+    """
+    before = [recording.log for recording in task.recordings.each]
+    alone = estimate.alone or [None] * len(renamed)
+    known = [own if alike(log, other) else None for own, log, other in zip(alone, renamed, before, strict=True)]
+    task = replace(task, recordings=gather(renamed, task.config.keyframes))
+    return first_optimisation(task, known), task
+
+
+def alike(one: SensorLog, other: SensorLog) -> bool:
+    """Return whether two renamings of one recording have the same names, ranges left out and remarks."""
+    a, b = one.ranges, other.ranges
+    if one is other or a is None or b is None:
+        return one is other or a is b
+    same_names = a.anchor_ids == b.anchor_ids and np.array_equal(a.anchor, b.anchor)
+    return same_names and np.array_equal(a.ranges, b.ranges, equal_nan=True) and _remarks(one) == _remarks(other)
+
+
+def named_so(task: Task, renamed: Sequence[SensorLog]) -> bool:
+    """Return whether a task is that of the recordings with these names."""
+    return all(alike(recording.log, log) for recording, log in zip(task.recordings.each, renamed, strict=True))
+
+
+def _remarks(log: SensorLog) -> tuple[Remark, ...]:
+    return () if log.screening is None else log.screening.remarks
 
 
 def _of_all(log: SensorLog, moves: Moves) -> Moves:

@@ -88,6 +88,8 @@ class Estimate:
     """With the keyframes of the graph's poses; None while these are the task's."""
     joint: ScanEdges | None = None
     """Between all overlapping clouds, in place of steps and closures; None before the joint refinement."""
+    alone: tuple["Estimate", ...] = ()
+    """Of each recording before they were joined; empty with one recording, and after the first optimisation."""
 
     @property
     def placed(self) -> Bools:

@@ -41,17 +41,27 @@ from .progress import solver_figures
 from .recordings import Recording
 
 
-def first_optimisation(task: Task) -> Estimate:
-    """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation)."""
+def first_optimisation(task: Task, known: Sequence[Estimate | None] = ()) -> Estimate:
+    """Bootstrap each recording, join them and optimise odometry and ranges (paper: first optimisation).
+
+    Parameters
+    ----------
+    known : of each recording, where it was bootstrapped before from the same measurements, see Estimate.alone; else None.
+    """
     recordings = task.recordings
     task.stages.end("keyframes", keyframes=len(recordings.stamps), travelled=round(recordings.travelled, 3))
     estimates = [dead_reckoning(recording, task.config) for recording in recordings.each]
     ranges = sum(len(estimate.ranges) for estimate in estimates if estimate.ranges is not None)
     task.stages.end("edges", odometry=sum(len(estimate.odometry) for estimate in estimates), ranges=ranges)
-    estimates = [_optimised(bootstrapped(estimate, n, task), task) for n, estimate in enumerate(estimates)]
+    known = known or [None] * len(estimates)
+    estimates = [
+        _optimised(bootstrapped(estimate, n, task), task) if before is None else before
+        for n, (estimate, before) in enumerate(zip(estimates, known, strict=True))
+    ]
     if len(estimates) == 1:
         return anchor_heights.with_likelier_heights(estimates[0], task.config)
-    return anchor_heights.with_likelier_heights(_optimised(joining.join(estimates, task), task), task.config)
+    joined = replace(_optimised(joining.join(estimates, task), task), alone=tuple(estimates))
+    return anchor_heights.with_likelier_heights(joined, task.config)
 
 
 def dead_reckoning(recording: Recording, config: MappingConfig) -> Estimate:
