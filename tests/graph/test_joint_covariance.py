@@ -1,10 +1,12 @@
 """Covariances among chosen poses against those of all."""
 
+import tracemalloc
 
 import numpy as np
 import pytest
 from helpers.planted_graphs import calibrated_loop, loop
 
+from uwblite.graph import joint_covariance
 from uwblite.graph.graph import Graph
 from uwblite.graph.joint_covariance import JointCovariance
 from uwblite.graph.marginals import marginals
@@ -25,3 +27,25 @@ def test_joint_covariances_where_something_is_not_measured():
     i, j = np.array([3, 5]), np.array([5, 9])
     found, expected = (JointCovariance(g, np.array([9, 3, 5])).relative(i, j) for g in (lonely, graph))
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_pieces_of_the_work_change_no_bit(monkeypatch):
+    """Pairs, and columns of the factor, some at a time."""
+    graph, _ = calibrated_loop()
+    chosen = np.arange(0, 60, 3)
+    i, j = (ends.ravel() for ends in np.meshgrid(chosen, chosen))
+    whole = JointCovariance(graph, chosen).relative(i, j)
+    monkeypatch.setattr(joint_covariance, "_PAIRS_AT_ONCE", 7)
+    monkeypatch.setattr(joint_covariance, "_COLUMNS_AT_ONCE", 7)
+    assert JointCovariance(graph, chosen).relative(i, j).tobytes() == whole.tobytes()
+    assert JointCovariance(graph, chosen).relative(i[:0], j[:0]).shape == (0, 3, 3)
+
+
+def test_of_many_pairs_little_more_is_in_memory_than_their_covariances():
+    graph, _ = calibrated_loop()
+    joint, (i, j) = JointCovariance(graph, np.arange(60)), np.random.default_rng(0).integers(0, 60, (2, 300_000))
+    tracemalloc.start()
+    found = joint.relative(i, j)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.8 * found.nbytes

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwblite.loop_closure.candidates import Candidates, _best_per_submap, _near, missed, uncertain
+from uwblite.loop_closure.candidates import Candidates, _among, _best_per_submap, _near, missed, uncertain
 from uwblite.loop_closure.closures import LoopClosureConfig
 
 
@@ -24,6 +24,14 @@ def test_every_submap_keeps_its_best_partners(seed, limit):
             own = np.flatnonzero(one == submap)
             kept |= set(own[np.argsort(-worth[own])][:limit].tolist())
     assert _best_per_submap(a, b, worth, limit).tolist() == sorted(k for k in kept if worth[k] > 0.0)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([2, 3]))
+def test_pairs_tried_before_are_found_as_by_a_loop(seed, width):
+    rng = np.random.default_rng(seed)
+    columns = rng.integers(0, 5, (width, int(rng.integers(0, 30))))
+    names = {tuple(row) for row in rng.integers(0, 7, (int(rng.integers(0, 30)), width)).tolist()}
+    assert _among(columns, names).tolist() == [tuple(column) in names for column in columns.T.tolist()]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -2,12 +2,18 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import sparse
 from scipy.linalg import lapack
 
 from ..arrays import Floats, Ints
 from .graph import Graph
 from .marginals import factor_of, relative_covariances
 from .normal_equations import filled
+
+_PAIRS_AT_ONCE = 1 << 14
+"""Pairs of poses whose covariances are computed together; a bound on the memory."""
+_COLUMNS_AT_ONCE = 256
+"""Columns of a factor that are made dense together; a bound on the memory."""
 
 
 class JointCovariance:
@@ -29,12 +35,18 @@ class JointCovariance:
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
         """Return the covariances (m, 3, 3) of between(X_i, X_j) in its own coordinates, for chosen poses i (m,), j (m,)."""
         i, j = np.atleast_1d(np.asarray(i, dtype=np.int64)), np.atleast_1d(np.asarray(j, dtype=np.int64))
+        found = np.empty((len(i), 3, 3))
+        for first in range(0, len(i), _PAIRS_AT_ONCE):
+            part = slice(first, first + _PAIRS_AT_ONCE)
+            a, b = i[part], j[part]
+            own = self._among(a, a), self._among(b, b)
+            found[part] = relative_covariances(self._graph, a, b, *own, self._among(a, b))
+        return found
 
-        def among(a: Ints, b: Ints) -> Floats:
-            row, column = self._row[a][:, :, None], self._row[b][:, None, :]
-            return np.asarray(self._covariance[row, column] * ((row >= 0) & (column >= 0)))
-
-        return relative_covariances(self._graph, i, j, among(i, i), among(j, j), among(i, j))
+    def _among(self, a: Ints, b: Ints) -> Floats:
+        """Return the covariances (m, 3, 3) between poses a (m,) and b (m,)."""
+        row, column = self._row[a][:, :, None], self._row[b][:, None, :]
+        return np.asarray(self._covariance[row, column] * ((row >= 0) & (column >= 0)))
 
 
 def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
@@ -46,5 +58,13 @@ def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, I
     first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
     place = factor.perm_c[np.arange(first, normal.unknowns.size)].astype(np.int64)
     inside = np.sort(place)
-    lower = factor.L[inside][:, inside].toarray(order="F")
-    return number, first, lower, factor.U.diagonal()[inside], np.searchsorted(inside, place)
+    return number, first, _dense(factor.L, inside), factor.U.diagonal()[inside], np.searchsorted(inside, place)
+
+
+def _dense(matrix: sparse.csc_matrix, rows: Ints) -> Floats:
+    """Return some rows (n,) of a square matrix and the same columns as a dense matrix (n, n), by columns in memory."""
+    block = np.empty((len(rows), len(rows)), order="F")
+    for first in range(0, len(rows), _COLUMNS_AT_ONCE):
+        part = slice(first, first + _COLUMNS_AT_ONCE)
+        block[:, part] = matrix[:, rows[part]][rows].toarray()
+    return block

@@ -33,10 +33,17 @@ class _Front:
     rows: Ints
     """The columns themselves, then R; ascending."""
     width: int
-    panel: Floats
-    """(rows, width) of L."""
     parent: int
     """The range that holds the first row of R; -1 = none."""
+
+    def panel(self, lower: sparse.csc_matrix) -> Floats:
+        """Return (rows, width) of L; all of them together would be as large as L itself."""
+        start, end = int(self.rows[0]), int(self.rows[0]) + self.width
+        inside = slice(lower.indptr[start], lower.indptr[end])
+        panel = np.zeros((len(self.rows), self.width))
+        column = np.repeat(np.arange(self.width), np.diff(lower.indptr[start : end + 1]))
+        panel[np.searchsorted(self.rows, lower.indices[inside]), column] = lower.data[inside]
+        return panel
 
 
 def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
@@ -59,14 +66,16 @@ def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
     first, second = np.minimum(position[rows], position[columns]), np.maximum(position[rows], position[columns])
     order = np.argsort(first, kind="stable")
     found = np.empty(len(rows))
-    fronts, pivots = _fronts(factor), factor.U.diagonal()
+    lower, pivots = factor.L, factor.U.diagonal()
+    lower.sort_indices()
+    fronts = _fronts(lower)
     starts = np.array([front.rows[0] for front in fronts])
     bounds = np.append(np.searchsorted(first[order], starts), len(order))
     waiting = np.bincount([f.parent for f in fronts if f.parent >= 0], minlength=len(fronts))
     inverses: dict[int, Floats] = {}
     for s in range(len(fronts) - 1, -1, -1):
         front = fronts[s]
-        inverse = _front_inverse(front, pivots[front.rows[: front.width]], fronts, inverses)
+        inverse = _front_inverse(front, front.panel(lower), pivots[front.rows[: front.width]], fronts, inverses)
         if waiting[s]:
             inverses[s] = inverse
         if front.parent >= 0:
@@ -80,20 +89,14 @@ def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
     return found
 
 
-def _fronts(factor: SuperLU) -> list[_Front]:
+def _fronts(lower: sparse.csc_matrix) -> list[_Front]:
     """Cut L into ranges; R of a range is what its columns touch and what the ranges before it hand on."""
-    lower = factor.L
-    lower.sort_indices()
     ranges = _ranges(lower)
     owner = np.repeat(np.arange(len(ranges)), [end - start for start, end, _ in ranges])
     fronts = []
     for start, end, below in ranges:
-        inside = slice(lower.indptr[start], lower.indptr[end])
         rows = np.concatenate([np.arange(start, end), below])
-        panel = np.zeros((len(rows), end - start))
-        column = np.repeat(np.arange(end - start), np.diff(lower.indptr[start : end + 1]))
-        panel[np.searchsorted(rows, lower.indices[inside]), column] = lower.data[inside]
-        fronts.append(_Front(rows, end - start, panel, int(owner[below[0]]) if len(below) else -1))
+        fronts.append(_Front(rows, end - start, int(owner[below[0]]) if len(below) else -1))
     return fronts
 
 
@@ -127,7 +130,7 @@ def _ranges(lower: sparse.csc_matrix) -> list[tuple[int, int, Ints]]:
 def _within_subtrees(lower: sparse.csc_matrix) -> list[tuple[int, int]]:
     """Cut the columns into ranges that lie within the subtree of their last: they touch no more rows than it does."""
     n = lower.shape[0]
-    column = np.repeat(np.arange(n), np.diff(lower.indptr))
+    column = np.repeat(np.arange(n, dtype=lower.indices.dtype), np.diff(lower.indptr))
     parent = np.minimum.reduceat(np.where(lower.indices > column, lower.indices, n), lower.indptr[:-1]).tolist()
     deepest = list(range(n + 1))
     for j, above in enumerate(parent):
@@ -141,17 +144,19 @@ def _within_subtrees(lower: sparse.csc_matrix) -> list[tuple[int, int]]:
     return cuts[::-1]
 
 
-def _front_inverse(front: _Front, pivots: Floats, fronts: list[_Front], inverses: dict[int, Floats]) -> Floats:
+def _front_inverse(
+    front: _Front, panel: Floats, pivots: Floats, fronts: list[_Front], inverses: dict[int, Floats]
+) -> Floats:
     """Return Z over the rows of a front."""
     w = front.width
-    unit = lapack.dtrtri(front.panel[:w], lower=1, unitdiag=1)[0]
+    unit = lapack.dtrtri(panel[:w], lower=1, unitdiag=1)[0]
     unit = np.tril(unit, -1) + np.eye(w)
     corner = (unit.T / pivots) @ unit
     if front.parent < 0:
         return corner
     at = np.searchsorted(fronts[front.parent].rows, front.rows[w:])
     below = inverses[front.parent][np.ix_(at, at)]
-    y = front.panel[w:] @ unit
+    y = panel[w:] @ unit
     side = -(below @ y)
     inverse = np.empty((len(front.rows), len(front.rows)))
     inverse[:w, :w], inverse[w:, :w], inverse[:w, w:], inverse[w:, w:] = corner - y.T @ side, side, side.T, below

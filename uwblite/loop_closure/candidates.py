@@ -4,12 +4,13 @@ Where the graph's own covariance of two sub-maps is small, they are candidates w
 it is large, when they might.
 """
 
+from collections.abc import Set
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .. import se2
-from ..arrays import Floats, Ints, Table
+from ..arrays import Bools, Floats, Ints, Table
 from ..graph.graph import Graph
 from ..graph.joint_covariance import JointCovariance
 from ..lidar.joint_refinement import surface_cells
@@ -65,9 +66,8 @@ def propose(
     if not len(a):
         return Candidates(a, b, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), constrained)
     covariance = marginals.relative(reference[a], reference[b])
-    slack = np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
-    astray = np.array([(int(x), int(y)) in missed for x, y in zip(a, b, strict=True)])
-    covariance = covariance + astray[:, None, None] * slack
+    astray = _among(np.stack([a, b]), missed)
+    covariance[astray] += np.diag([config.slip**2, config.slip**2, config.slip_angle**2])
     spread = _spread(covariance)
     seen = surface_cells(submaps.clouds, poses)
     common = np.asarray((seen @ seen.T).todense())[a, b]
@@ -77,10 +77,17 @@ def propose(
     worth = np.where(doubtful & ~astray, 1.0 - distance / (config.reach + np.minimum(spread, config.search_limit)), expected)
     possible = np.where(doubtful, worth > 0.0, expected > 0.25) & (size[a] > 5) & (size[b] > 5)
     possible &= (spread > beyond) & (spread <= config.search_limit)
-    fresh = np.array([(int(x), int(y), bool(d)) not in tried for x, y, d in zip(a, b, doubtful, strict=True)])
+    fresh = ~_among(np.stack([a, b, doubtful]), tried)
     kept = _best_per_submap(a, b, np.where(possible & fresh, worth, -1.0), config.partners)
     a, b = a[kept], b[kept]
     return Candidates(a, b, se2.between(poses[a], poses[b]), covariance[kept], spread[kept], constrained)
+
+
+def _among(columns: Ints, names: Set[tuple[int, ...]]) -> Bools:
+    """Return which columns (d, p) of numbers, 0 or more, are among names, tuples of d such numbers."""
+    named = np.array(sorted(names), dtype=np.int64).reshape(-1, len(columns)).T
+    places = (1 + max(int(columns.max(initial=0)), int(named.max(initial=0)))) ** np.arange(len(columns))
+    return np.isin(places @ columns, places @ named)
 
 
 def uncertain(

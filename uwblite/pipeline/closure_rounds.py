@@ -32,10 +32,11 @@ def close_loops(estimate: Estimate, task: Task) -> Estimate:
     for lap in range(config.loop_closure.rounds):
         pieces = submaps.build(scans.clouds, base.poses, recordings.path, recordings.of_keyframe, config.submaps)
         pieces, free = _static(pieces, base, estimate)
-        covariance = JointCovariance(base.with_edges(found.edges), pieces.reference)
+        # No name holds the covariance: among a thousand sub-maps it is a hundred megabytes.
         candidates = closure_candidates.propose(
-            base, covariance, pieces, recordings.of_keyframe, tried, missed, with_ranges, config.loop_closure
-        )
+            base, JointCovariance(base.with_edges(found.edges), pieces.reference), pieces, recordings.of_keyframe,
+            tried, missed, with_ranges, config.loop_closure,
+        )  # fmt: skip
         tried |= candidates.names(config.loop_closure)
         dynamic = visibility.dynamic_share(pieces, free, base.poses, recordings.of_keyframe)
         rules = replace(config.loop_closure, through=max(config.loop_closure.through, dynamic))

@@ -236,6 +236,8 @@ def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimat
     before, optimizer, quick = estimate.graph.poses, Optimizer(), rough(task.config.solver)
     estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:
+        # Of other pairs of clouds nothing stays that was analysed, and it is large.
+        optimizer = Optimizer()
         estimate = _matched_once_more(estimate, scans, shift, task)
         before = estimate.graph.poses
         estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)

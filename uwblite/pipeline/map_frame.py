@@ -55,9 +55,9 @@ def _quarter(angle: Floats) -> Floats:
 
 
 def align_axes(estimate: Estimate, task: Task) -> Estimate:
-    """Put the map's axes where the settings want them."""
+    """Put the map's axes where the settings want them; walls are needed no more after it."""
     motion = alignment_of(estimate, task)
-    return replace(estimate, graph=moved(estimate.graph, motion)).with_hypotheses_moved(motion)
+    return replace(estimate, graph=moved(estimate.graph, motion), scans=None).with_hypotheses_moved(motion)
 
 
 def alignment_of(estimate: Estimate, task: Task) -> Floats:
