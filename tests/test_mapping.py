@@ -136,9 +136,12 @@ def test_names_that_turn_out_right_as_recorded_are_not_estimated_anew(minute, mo
     assert (result.warnings, result.doubts) == (plain.warnings, plain.doubts)
 
 
-@pytest.mark.parametrize(("order", "computed"), [("ABA", 2), ("BAB", 2), ("ABC", 3), ("BA", 2)])
-def test_a_pass_with_the_names_of_an_earlier_one_is_not_computed_again(minute, monkeypatch, order, computed):
-    """A: as recorded, B and C: renamed at another moment. The result is that of the last names alone, remarks included."""
+@pytest.mark.parametrize(("order", "short", "computed", "kept"), [
+    ("ABA", (3, 3), 2, "A"), ("ABA", (4, 3), 2, "B"), ("BAB", (0, 0), 2, "B"), ("ABC", (), 3, "C"), ("BA", (), 2, "A"),
+])  # fmt: skip
+def test_a_pass_with_the_names_of_an_earlier_one_is_not_computed_again(minute, monkeypatch, order, short, computed, kept):
+    """A: as recorded, B and C: renamed at another moment. The result is that of the names kept alone, remarks included: where
+    they come round, those of the map with fewer ranges that are too short, the earlier where both have as many."""
     log, passes = minute.without(lidar=True), []
     places = [AnchorHypothesis(np.array([x, 0.0]), 0.0, 0.1, 0.0, 0.1) for x in (0.0, 1.0)]
     name, moments = log.ranges.anchor_ids[0], {"B": log.ranges.stamps[0] + 20.0, "C": log.ranges.stamps[0] + 30.0}
@@ -153,7 +156,8 @@ def test_a_pass_with_the_names_of_an_earlier_one_is_not_computed_again(minute, m
             monkeypatch.setattr(anchor_moves, function, lambda estimate, task, logs: called(next(proposed), logs))
         return build_map(log)
 
-    alone = result_of(order[-1])
+    alone, counts = result_of(kept), iter(short)
+    monkeypatch.setattr(anchor_moves, "short_ranges", lambda estimate: next(counts))
     final = final_stages.final_optimisation
     monkeypatch.setattr(final_stages, "final_optimisation", lambda *given: passes.append(1) or final(*given))
     result = result_of(order)

@@ -95,15 +95,16 @@ def _in_sound_units(task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task, 
 def _with_moves_apart(estimate: Estimate, task: Task, logs: list[SensorLog]) -> tuple[Estimate, Task]:
     """Go through all stages, and again with each place of an anchor that was moved as an anchor of its own.
 
-    Names that a pass had before end the search with what came of them: the next would be that of the pass after it again.
+    Names that a pass had before end the search, for it would go round: the better of both is kept, see short_ranges.
     """
     before, as_recorded = task.stages.mark(), (estimate, task)
     renamed, first = anchor_moves.first_with_moves_apart(estimate, task, logs), None
     for left in reversed(range(_MOST_MOVES)):
         if renamed is not None:
             if first is not None and anchor_moves.named_so(first[1], renamed):
-                estimate, task, said = first
-                task.stages.back_to(said)
+                if anchor_moves.short_ranges(first[0]) <= anchor_moves.short_ranges(estimate):
+                    estimate, task, said = first
+                    task.stages.back_to(said)
                 break
             task.stages.back_to(before)
             estimate, task = as_recorded

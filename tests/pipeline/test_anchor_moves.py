@@ -21,6 +21,7 @@ from uwblite.pipeline.anchor_moves import (
     alike,
     first_with_moves_apart,
     optimised_with_names,
+    short_ranges,
     with_moves_apart,
 )
 from uwblite.pipeline.estimate import Task
@@ -154,6 +155,13 @@ def test_renamings_are_alike_with_the_same_names_ranges_and_remarks():
     silent = replace(one, ranges=None)
     assert alike(silent, replace(silent))
     assert not alike(one, silent)
+
+
+def test_ranges_shorter_than_the_distance_are_counted_and_late_ones_not():
+    residuals = np.array([[0.49], [0.51], [-3.0], [1.1]])
+    ranges = SimpleNamespace(residuals=lambda graph: residuals, sigma=np.array([1.0, 1.0, 1.0, 0.5]))
+    assert short_ranges(SimpleNamespace(ranges=ranges, graph=None)) == 2
+    assert short_ranges(SimpleNamespace(ranges=None)) == 0
 
 
 def test_a_recording_whose_names_stay_is_not_bootstrapped_again(monkeypatch):

@@ -13,6 +13,7 @@ from ..graph.graph import Graph
 from ..graph.range_edges import RangeEdges
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate, MapResult, Notice
+from ..pipeline.anchor_moves import SHORT
 from ..pipeline.estimate import Estimate, Task
 from ..pipeline.radio_stages import heights_given, tag_rises
 from ..pipeline.recordings import Recordings
@@ -129,7 +130,7 @@ def _anchor(
         reason = "the path past it is too straight: a mirrored place explains its ranges about as well"
     sigma, longest = float(np.sqrt(np.trace(covariance.anchors[k]))), float(ranges.ranges[ranges.anchor == k].max())
     scatter = spread_about_median(own)
-    short = int(np.sum(own - max(bias, 0.0) > max(limit, _SHORT)))
+    short = int(np.sum(own - max(bias, 0.0) > max(limit, SHORT)))
     if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(own)):
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
@@ -175,11 +176,9 @@ def _reason_of_short_ranges(short: int, count: int) -> str:
     """Return why an anchor with so many ranges shorter than the distance to its place is distrusted, '' where it is not."""
     if short <= max(_FEW_SHORT, _SHARE_SHORT * count):
         return ""
-    return f"{short} of its {count} ranges are too short for its place by {_SHORT} m or more: it stood elsewhere for a time?"
+    return f"{short} of its {count} ranges are too short for its place by {SHORT} m or more: it stood elsewhere for a time?"
 
 
-_SHORT = 0.5
-"""m by which no obstacle and no radio makes a range shorter than the distance; errors of the path stay below it."""
 _FEW_SHORT, _SHARE_SHORT = 3, 0.05
 """Of an anchor's ranges, gross errors; in recordings without faults there was one at most."""
 

@@ -81,6 +81,16 @@ def named_so(task: Task, renamed: Sequence[SensorLog]) -> bool:
     return all(alike(recording.log, log) for recording, log in zip(task.recordings.each, renamed, strict=True))
 
 
+def short_ranges(estimate: Estimate) -> int:
+    """Return how many ranges are shorter than the distance to the anchor's place: of wrong poses or names there are many."""
+    ranges = estimate.ranges
+    return 0 if ranges is None else int(np.sum(ranges.residuals(estimate.graph)[:, 0] * ranges.sigma > SHORT))
+
+
+SHORT = 0.5
+"""m by which no obstacle and no radio makes a range shorter than the distance; errors of the path stay below it."""
+
+
 def _remarks(log: SensorLog) -> tuple[Remark, ...]:
     return () if log.screening is None else log.screening.remarks
 
