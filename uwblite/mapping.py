@@ -28,6 +28,7 @@ from .pipeline import (
     moved_anchors,
     radio_stages,
     scan_selection,
+    surface_adjustment,
     turn_checks,
 )
 from .pipeline.estimate import Estimate, Task
@@ -139,6 +140,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
             yield radio_stages.select_range_priors
             if config.refinement.rounds:
                 yield lidar_stages.refine_jointly
+                yield surface_adjustment.adjust_surfaces
             yield moved_anchors.separate_moved_anchors
         yield lidar_stages.check_map_consistency
     if given.landmark_distances:

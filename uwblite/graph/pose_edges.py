@@ -225,7 +225,7 @@ class ScanEdges(EdgeTable):
 
     SHARED: ClassVar[tuple[str, ...]] = ("calibration",)
 
-    def _sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+    def sensor_poses(self, graph: Graph, poses: Ints, twist: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
         """Return S (e, 3), and cosine and sine (e,) of the base's heading at the true time of the cloud."""
         base = graph.poses[poses]
         if not np.any(self.calibration >= 0):
@@ -238,8 +238,8 @@ class ScanEdges(EdgeTable):
 
     def relative(self, graph: Graph) -> Floats:
         """Return the pose (e, 3) of cloud j in cloud i at the present estimates."""
-        si = self._sensor_poses(graph, self.i, self.twist_i)[0]
-        return se2.between(si, self._sensor_poses(graph, self.j, self.twist_j)[0])
+        si = self.sensor_poses(graph, self.i, self.twist_i)[0]
+        return se2.between(si, self.sensor_poses(graph, self.j, self.twist_j)[0])
 
     def residuals(self, graph: Graph) -> Floats:
         """Return whitened residuals (e, 3)."""
@@ -248,8 +248,8 @@ class ScanEdges(EdgeTable):
     def linearize(self, graph: Graph) -> Linearization:
         """Return whitened residuals and Jacobians by both poses and the calibration in use."""
         xi, xj = graph.poses[self.i].T, graph.poses[self.j].T
-        from_pose, heading_i = self._sensor_poses(graph, self.i, self.twist_i)
-        to_pose, heading_j = self._sensor_poses(graph, self.j, self.twist_j)
+        from_pose, heading_i = self.sensor_poses(graph, self.i, self.twist_i)
+        to_pose, heading_j = self.sensor_poses(graph, self.j, self.twist_j)
         si, sj = from_pose.T, to_pose.T
         axes = _map_axes(self.sqrt_information, si[2] + self.T_i_j[:, 2])
         residuals, _ = _relative_residuals(axes, self.T_i_j.T, si, sj)

@@ -7,6 +7,7 @@ pieces as rigid bodies (a two-level additive Schwarz method; Smith, Bjorstad and
 The number of iterations hardly depends on the length of the chain. Anchors and calibration belong to the coarse level.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,22 +124,7 @@ class TwoLevelFactor:
         """
         if right.ndim == 2:
             return np.stack([self.solve(column) for column in right.T], axis=1)
-        solution, residual = np.zeros(len(right)), right.copy()
-        direction = self._nearly(residual)
-        energy = first = float(residual @ direction)
-        for _ in range(_MOST):
-            if not energy > _ENOUGH**2 * first:
-                break
-            image = self._matrix @ direction
-            curvature = float(direction @ image)
-            if not curvature > 0.0:
-                raise SolverError(SINGULAR)
-            solution += (energy / curvature) * direction
-            residual -= (energy / curvature) * image
-            near = self._nearly(residual)
-            before, energy = energy, float(residual @ near)
-            direction = near + (energy / before) * direction
-        return solution
+        return conjugate_gradients(self._matrix.__matmul__, right, self._nearly, _ENOUGH, _MOST)
 
     def _nearly(self, residual: Floats) -> Floats:
         """Return what the two levels make of a residual: an approximate solution."""
@@ -147,6 +133,38 @@ class TwoLevelFactor:
         found[number] = (self._local @ np.append(residual, 0.0)[number][:, :, None])[:, :, 0]
         coarse = lapack.dpotrs(self._coarse, self._onto @ residual, lower=1)[0]
         return np.asarray(found[:-1] + self._pieces.basis @ coarse.ravel())
+
+
+def conjugate_gradients(
+    times: Callable[[Floats], Floats], right: Floats, nearly: Callable[[Floats], Floats], enough: float, most: int
+) -> Floats:
+    """Solve with a symmetric, positive definite matrix by preconditioned conjugate gradients.
+
+    Parameters
+    ----------
+    times : multiplies by the matrix. right : (n,). nearly : multiplies by about its inverse.
+    enough : the residual, in the metric of `nearly`, as a share of the first at which it ends. most : steps.
+
+    Raises
+    ------
+    SolverError : the matrix is not positive definite.
+    """
+    solution, residual = np.zeros(len(right)), right.copy()
+    direction = nearly(residual)
+    energy = first = float(residual @ direction)
+    for _ in range(most):
+        if not energy > enough**2 * first:
+            break
+        image = times(direction)
+        curvature = float(direction @ image)
+        if not curvature > 0.0:
+            raise SolverError(SINGULAR)
+        solution += (energy / curvature) * direction
+        residual -= (energy / curvature) * image
+        near = nearly(residual)
+        before, energy = energy, float(residual @ near)
+        direction = near + (energy / before) * direction
+    return solution
 
 
 def _seen_by(matrix: sparse.csc_matrix, basis: sparse.csr_matrix, onto: sparse.csr_matrix) -> Floats:

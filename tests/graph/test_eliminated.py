@@ -1,0 +1,34 @@
+"""Gauss-Newton steps with eliminated blocks: against the whole system solved at once."""
+
+import numpy as np
+from helpers.planted_graphs import loop
+from scipy import sparse
+
+from uwblite.graph.eliminated import blocks_of, step
+from uwblite.graph.marginals import factor_of
+from uwblite.graph.normal_equations import filled
+
+
+def test_the_step_is_that_of_the_whole_system():
+    rng = np.random.default_rng(5)
+    graph = loop(n=12)[0]
+    normal = filled(graph, subtrees=True)
+    n, count, k, m = normal.unknowns.size, 3, 4, 60
+    by_graph = rng.standard_normal((m, n)) * (rng.random((m, n)) < 0.2)
+    block = rng.integers(count, size=m)
+    by_block = np.zeros((m, count * k))
+    by_block[np.arange(m)[:, None], block[:, None] * k + np.arange(k)] = rng.standard_normal((m, k))
+    residual, prior = rng.standard_normal(m), np.tile(np.diag([1.0, 2.0, 3.0, 4.0]), (count, 1, 1))
+    slope = rng.standard_normal((count, k))
+    blocks = blocks_of(sparse.csr_matrix(by_graph), sparse.csr_matrix(by_block), residual, prior, slope)
+    whole, jacobian = np.zeros((n + count * k,) * 2), np.hstack([by_graph, by_block])
+    whole[:n, :n] = normal.matrix.toarray()
+    for b in range(count):
+        own = slice(n + b * k, n + (b + 1) * k)
+        whole[own, own] += prior[b]
+    whole += jacobian.T @ jacobian
+    gradient = np.concatenate([normal.gradient, slope.ravel()]) + jacobian.T @ residual
+    expected = -np.linalg.solve(whole, gradient)
+    x, s = step(normal, blocks, factor_of(normal).solve)
+    np.testing.assert_allclose(x, expected[:n], atol=2e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(s.ravel(), expected[n:], atol=2e-3 * np.abs(expected).max())

@@ -1,0 +1,72 @@
+"""Round columns among rays: circles of single scans, columns of many, and what is none."""
+
+import numpy as np
+import pytest
+
+from uwblite import se2
+from uwblite.lidar.round_columns import find_columns, fitted_circles, refined_columns
+from uwblite.odometry.attached import ScanPoints
+
+POSES = np.array([[2.0 * np.cos(a), 2.0 * np.sin(a), a + 2.0] for a in np.arange(0.0, 6.2, 0.5)])
+RADIUS = 0.35
+
+
+def seen(poses, shape, noise=0.01, seed=0):
+    """Rays from poses to what stands about the origin, by a function of origin and direction."""
+    rng, bearing = np.random.default_rng(seed), np.arange(-np.pi, np.pi, 2.0 * np.pi / 1024)
+    parts = []
+    for k, pose in enumerate(poses):
+        way = np.column_stack([np.cos(pose[2] + bearing), np.sin(pose[2] + bearing)])
+        reach = shape(pose[:2], way) + noise * rng.standard_normal(len(way))
+        hit = np.flatnonzero(np.isfinite(reach))
+        points = se2.transform(se2.inverse(pose), pose[:2] + reach[hit, None] * way[hit])
+        parts.append((np.full(len(hit), k), points, hit))
+    keyframe, points, ray = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return ScanPoints(keyframe, points, np.zeros_like(points), ray, keyframe)
+
+
+def circle(origin, way):
+    along = -(way @ origin)
+    inside = RADIUS**2 - origin @ origin + along**2
+    return np.where((inside > 0.0) & (along > 0.0), along - np.sqrt(np.maximum(inside, 0.0)), np.inf)
+
+
+def square(origin, way):
+    """A box of 50 cm, whose corner looks round to a poor scanner."""
+    with np.errstate(divide="ignore"):
+        low, high = (-0.25 - origin) / way, (0.25 - origin) / way
+    near, far = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
+    return np.where((near < far) & (near > 0.0), near, np.inf)
+
+
+def rays_in_map(rays):
+    at = se2.transform(POSES[rays.keyframe], rays.points)
+    way = at - POSES[rays.keyframe, :2]
+    reach = np.hypot(*way.T)
+    return at, way / reach[:, None], np.maximum(0.01, 0.01 * reach)
+
+
+def test_a_column_is_found_where_it_stands():
+    rays = seen(POSES, circle)
+    columns = find_columns(fitted_circles(rays), POSES)
+    assert len(columns) == 1
+    np.testing.assert_allclose(columns[0], [0.0, 0.0, RADIUS], atol=0.05)
+    np.testing.assert_allclose(refined_columns(columns, *rays_in_map(rays))[0], [0.0, 0.0, RADIUS], atol=0.003)
+
+
+def test_a_column_seen_from_too_few_keyframes_is_none():
+    rays = seen(POSES[:2], circle)
+    assert len(fitted_circles(rays).radius) == 2
+    assert len(find_columns(fitted_circles(rays), POSES)) == 0
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_box_is_no_column(seed):
+    rays = seen(POSES, square, seed=seed)
+    columns = find_columns(fitted_circles(rays), POSES)
+    assert len(refined_columns(columns, *rays_in_map(rays))) == 0
+
+
+def test_rays_that_do_not_bend_are_no_circle():
+    rays = seen(POSES, lambda origin, way: np.full(len(way), 30.0))
+    assert len(fitted_circles(rays).radius) == 0

@@ -1,0 +1,39 @@
+"""Straight walls: which stretches of many clouds are one."""
+
+import numpy as np
+import pytest
+from helpers.laser_walks import scanned
+
+from uwblite.lidar.walls import find_walls, stretches
+
+ALONG = np.column_stack([np.arange(0.0, 6.0, 0.4), np.zeros(15), np.zeros(15)])
+
+
+def walls_from(poses, walls):
+    clouds = scanned(poses, np.asarray(walls, dtype=float), beams=720, reach=4.0)
+    return find_walls(clouds, stretches(clouds), poses)
+
+
+def test_what_is_seen_of_a_corridor_from_many_places_is_two_walls():
+    found = walls_from(ALONG, [[-9.0, -1.0, 15.0, -1.0], [15.0, 1.0, -9.0, 1.0]])
+    assert len(found.centre) == 2
+    order = np.argsort(found.centre[:, 1])
+    np.testing.assert_allclose(found.centre[order, 1], [-1.0, 1.0], atol=1e-3)
+    np.testing.assert_allclose(found.normal[order], [[0.0, 1.0], [0.0, -1.0]], atol=1e-3)
+    assert set(found.of_stretch.tolist()) == {0, 1}
+
+
+@pytest.mark.parametrize(("step", "walls"), [(0.03, 1), (0.25, 2)])
+def test_a_wall_ends_where_the_next_stands_back(step, walls):
+    """By a door niche; by less than what a map errs by after the joint refinement, it goes on."""
+    found = walls_from(ALONG, [[-9.0, 1.0, 2.0, 1.0], [2.0, 1.0 + step, 15.0, 1.0 + step]])
+    assert len(found.centre) == walls
+
+
+def test_a_bent_wall_is_none():
+    """An arc of 12 m radius, in pieces of 10 cm, along which the robot drives."""
+    angle = np.linspace(0.0, 0.7, 85)
+    arc = 12.0 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)]) + [0.0, -1.0]
+    inner = np.column_stack([11.0 * np.sin(angle[::4]), 12.0 - 11.0 * np.cos(angle[::4]) - 1.0, angle[::4]])
+    found = walls_from(inner, np.column_stack([arc[:-1], arc[1:]]))
+    assert len(found.centre) == 0

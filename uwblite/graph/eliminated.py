@@ -1,0 +1,78 @@
+"""Gauss-Newton steps of a graph with further unknowns in small blocks, of which each touches many poses and no other block.
+
+With the graph's normal equations H x = -g, and of the further measurements G among poses, B between blocks and poses and
+D among blocks, which is block diagonal, the blocks are eliminated:
+
+    (H + G - B^T D^-1 B) x = -(g + g_x - B^T D^-1 g_s),    s = -D^-1 (g_s + B x).
+
+The matrix ties all poses that touch one block, so it is never made: conjugate gradients multiply by its parts. A factor of
+another matrix that measures alike, for example of a graph in which pairs of poses stand for the blocks, preconditions.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from ..arrays import Floats
+from .normal_equations import NormalEquations
+from .schwarz_cg import conjugate_gradients
+
+_RESIDUAL, _MOST = 1e-3, 300
+"""Relative residual at which conjugate gradients end, and most of their steps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """Normal equations of measurements of poses and blocks (b) of a few unknowns (k) each."""
+
+    among: sparse.csr_matrix
+    """(n, n) G."""
+    across: sparse.csr_matrix
+    """(b k, n) B."""
+    own: Floats
+    """(b, k, k) D, regular."""
+    slope: Floats
+    """(n,) g_x."""
+    own_slope: Floats
+    """(b, k) g_s."""
+
+
+def blocks_of(by_graph: sparse.csr_matrix, by_block: sparse.csr_matrix, residual: Floats, own: Floats, slope: Floats) -> Blocks:
+    """Return the normal equations of whitened residuals (m,) with Jacobians (m, n) and (m, b k).
+
+    Parameters
+    ----------
+    own, slope : (b, k, k) and (b, k), what priors add to D and to g_s.
+    """
+    among, across = sparse.csr_matrix(by_graph.T @ by_graph), sparse.csr_matrix(by_block.T @ by_graph)
+    entries, k = (by_block.T @ by_block).tocoo(), own.shape[1]
+    whole = own.copy()
+    np.add.at(whole, (entries.row // k, entries.row % k, entries.col % k), entries.data)
+    return Blocks(among, across, whole, by_graph.T @ residual, slope + (by_block.T @ residual).reshape(slope.shape))
+
+
+def step(normal: NormalEquations, blocks: Blocks, precondition: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
+    """Return the Gauss-Newton step of the graph's unknowns (n,) and of the blocks (b, k).
+
+    Parameters
+    ----------
+    normal : of the graph, in the sparse layout (NormalEquations with subtrees).
+    precondition : multiplies (n,) by about the inverse of the reduced matrix.
+
+    Raises
+    ------
+    SolverError : the matrix is not positive definite.
+    """
+    inverse, matrix = np.linalg.inv(blocks.own), normal.matrix + blocks.among
+
+    def within(values: Floats) -> Floats:
+        return np.einsum("bij,bj->bi", inverse, values.reshape(blocks.own_slope.shape)).ravel()
+
+    def times(x: Floats) -> Floats:
+        return np.asarray(matrix @ x - blocks.across.T @ within(blocks.across @ x))
+
+    right = -(normal.gradient + blocks.slope - blocks.across.T @ within(blocks.own_slope))
+    x = conjugate_gradients(times, right, precondition, _RESIDUAL, _MOST)
+    return x, -within(blocks.own_slope.ravel() + blocks.across @ x).reshape(blocks.own_slope.shape)

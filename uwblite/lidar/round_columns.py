@@ -1,0 +1,174 @@
+"""Round columns among the rays of many scans: circles fitted to what single scans see of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints, Table
+from ..odometry.attached import ScanPoints
+from .ray_noise import range_sigma
+
+_JUMP, _JUMP_SHARE = 0.2, 0.02
+"""Difference of neighbouring ranges that ends a run of rays, m, and share of the range on top."""
+_MISSING = 3
+"""Rays that may be lost within a run."""
+_FEWEST = 10
+"""Rays that show a curvature."""
+_RADII = 0.04, 0.8
+"""Radii of columns, m."""
+_CURVED = 40.0
+"""Least chi2 by which a circle fits a run better than a line."""
+_SCATTER = 1.4
+"""Largest rms distance from the circle by that of the noise."""
+_APART, _UNLIKE = 0.12, 0.3
+"""Distance of the centres, m, and relative difference of the radii up to which two circles are one column."""
+_VIEWS = 3
+"""Keyframes that must have seen a column."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Circles(Table):
+    """Circles fitted to runs of rays of single scans."""
+
+    keyframe: Ints
+    """(c,)."""
+    centre: Floats
+    """(c, 2) m, frame of the keyframe."""
+    radius: Floats
+    """(c,) m."""
+    rays: Floats
+    """(c,) how many show it."""
+
+
+def fitted_circles(rays: ScanPoints) -> Circles:
+    """Fit a circle to each run of neighbouring rays, and keep those that are curved towards the laser, as a column is.
+
+    Least squares of the algebraic distance (I. Kasa 1976): a little too small where little of the circle is seen.
+    """
+    reach = np.hypot(*(rays.points - rays.origins).T)
+    number = _runs(rays, reach)
+    many = int(number.max(initial=-1)) + 1
+    count = np.maximum(np.bincount(number, minlength=many), 1)
+
+    def mean(values: Floats) -> Floats:
+        return np.asarray(np.bincount(number, values, many) / count)
+
+    middle = np.stack([mean(rays.points[:, 0]), mean(rays.points[:, 1])], axis=1)
+    x, y = (rays.points - middle[number]).T
+    square = x * x + y * y
+    xx, xy, yy = mean(x * x), mean(x * y), mean(y * y)
+    centre = 0.5 * _solved(xx, xy, yy, mean(x * square), mean(y * square))
+    radius = np.sqrt(xx + yy + (centre**2).sum(axis=1))
+    off = np.sqrt(mean((np.hypot(x - centre[number, 0], y - centre[number, 1]) - radius[number]) ** 2))
+    flat = 0.5 * (xx + yy - np.hypot(xx - yy, 2.0 * xy))
+    sigma = mean(range_sigma(reach))
+    origin = np.stack([mean(rays.origins[:, 0]), mean(rays.origins[:, 1])], axis=1) - middle
+    good = (count >= _FEWEST) & (radius > _RADII[0]) & (radius < _RADII[1]) & (off < _SCATTER * sigma)
+    good &= (count * (flat - off**2) > _CURVED * sigma**2) & ((centre * origin).sum(axis=1) < 0.0)
+    chosen = np.flatnonzero(good)
+    keyframe = rays.keyframe[np.searchsorted(number, chosen)]
+    return Circles(keyframe, (middle + centre)[chosen], radius[chosen], count[chosen].astype(np.float64))
+
+
+def _runs(rays: ScanPoints, reach: Floats) -> Ints:
+    """Return the number (p,) of the run to which each ray belongs."""
+    ends = (np.diff(rays.scan) != 0) | (np.diff(rays.ray) > _MISSING)
+    ends |= np.abs(np.diff(reach)) > _JUMP + _JUMP_SHARE * reach[1:]
+    return np.concatenate([[0], np.cumsum(ends)])[: len(reach)].astype(np.int64)
+
+
+def _solved(a: Floats, b: Floats, c: Floats, right_x: Floats, right_y: Floats) -> Floats:
+    """Solve [[a, b], [b, c]] z = right, (m, 2); 0 where that is singular."""
+    determinant = a * c - b * b
+    inverse = np.divide(1.0, determinant, out=np.zeros_like(a), where=determinant > _SINGULAR)
+    return np.stack([c * right_x - b * right_y, a * right_y - b * right_x], axis=1) * inverse[:, None]
+
+
+_SINGULAR = 1e-14
+"""m^4."""
+
+
+def find_columns(found: Circles, poses: Floats) -> Floats:
+    """Return the columns (n, 3), x, y, radius in the map, that circles of several keyframes at poses (k, 3) show."""
+    at = se2.transform(poses[found.keyframe], found.centre)
+    one, other = cKDTree(at).query_pairs(_APART, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.int64)
+    smaller = np.minimum(found.radius[one], found.radius[other])
+    alike = np.abs(found.radius[one] - found.radius[other]) < _UNLIKE * smaller + _RADII[0] / 2.0
+    ties = sparse.coo_matrix((np.ones(int(alike.sum())), (one[alike], other[alike])), shape=(len(at), len(at)))
+    number = connected_components(ties, directed=False)[1]
+    views = np.bincount(np.unique(np.stack([number, found.keyframe]), axis=1)[0].astype(np.int64))
+    weight = np.bincount(number, found.rays).astype(np.float64)
+    values = np.column_stack([at, found.radius])
+    columns = np.stack([np.bincount(number, found.rays * v) / weight for v in values.T], axis=1)
+    return _apart(columns[views >= _VIEWS], weight[views >= _VIEWS])
+
+
+def _apart(columns: Floats, weight: Floats) -> Floats:
+    """Return the columns (n, 3) that do not stand within another of more weight (n,)."""
+    gap = np.hypot(*(columns[:, None, :2] - columns[None, :, :2]).transpose(2, 0, 1))
+    better = (weight[None] > weight[:, None]) | ((weight[None] == weight[:, None]) & np.tri(len(weight), k=-1, dtype=bool))
+    within: Bools = gap < columns[:, None, 2] + columns[None, :, 2]
+    return np.asarray(columns[~(within & better).any(axis=1)])
+
+
+def to_circle(points: Floats, direction: Floats, radius: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return how far (m,) points (m, 2) are from a circle about 0 along their rays, the normals (m, 2) there, and the cosine
+    of incidence, 0 where a ray misses."""
+    along = (points * direction).sum(axis=1)
+    inside = radius**2 - (points**2).sum(axis=1) + along**2
+    shift = -along - np.sqrt(np.maximum(inside, 0.0))
+    normal = (points + shift[:, None] * direction) / radius[:, None]
+    return shift, normal, np.where(inside > 0.0, (normal * direction).sum(axis=1), 0.0)
+
+
+_WIDE, _WIDE_ROUNDS, _ROUNDS = 0.15, 3, 8
+"""Gate of the first steps towards a circle, m; their number, and that of all."""
+_GATE, _SLACK = 4.0, 0.02
+"""Gate of the others, standard deviations of the rays and m."""
+_FACING = -0.4
+"""Cosine of incidence beyond which a ray at a column hits its edge, which returns anything."""
+_AROUND, _OWN = 0.3, 0.6
+"""Distance from the circle up to which rays are a column's surroundings, m; share of these that must lie on it."""
+_PROBABLE = 1.22
+"""Standard deviations within which at least half of the rays of a column end: 0.67 if it is a perfect circle."""
+_FEW = 20
+"""Rays that a column needs."""
+
+
+def refined_columns(columns: Floats, at: Floats, direction: Floats, sigma: Floats) -> Floats:
+    """Fit columns (c, 3) to the rays that end at (p, 2) in the map, and keep those that are round.
+
+    Parameters
+    ----------
+    direction : (p, 2) of the rays. sigma : (p,) m, along them.
+    """
+    if not len(columns):
+        return columns
+    own = cKDTree(columns[:, :2]).query(at)[1]
+    weight = 1.0 / sigma**2
+    for turn in range(_ROUNDS):
+        shift, normal, incidence = to_circle(at - columns[own, :2], direction, columns[own, 2])
+        gate = _WIDE if turn < _WIDE_ROUNDS else _GATE * sigma + _SLACK
+        near = (incidence < _FACING) & (np.abs(shift) < gate)
+        robust = np.where(near, weight / (1.0 + (shift / (2.0 * sigma)) ** 2) ** 2, 0.0)
+        rows = np.column_stack([normal, np.ones(len(normal))])
+        whole = _summed(own, robust[:, None, None] * rows[:, :, None] * rows[:, None, :], len(columns)) + np.eye(3)
+        right = _summed(own, (robust * -shift * incidence)[:, None] * rows, len(columns))
+        columns = columns + np.linalg.solve(whole, right[:, :, None])[:, :, 0]
+        columns[:, 2] = np.clip(columns[:, 2], *_RADII)
+    ended = (incidence < _FACING) & (np.abs(shift) < _AROUND)
+    count, around, probable = (
+        np.bincount(own, flags, len(columns)) for flags in (near, ended, near & (np.abs(shift) < _PROBABLE * sigma))
+    )
+    return np.asarray(columns[(count >= _FEW) & (count > _OWN * around) & (probable > 0.5 * count)])
+
+
+def _summed(number: Ints, values: Floats, many: int) -> Floats:
+    """Return the sums (m, ...) of values (p, ...) by number (p,)."""
+    flat = values.reshape(len(values), -1)
+    sums = [np.bincount(number, v, many).astype(np.float64) for v in flat.T]
+    return np.stack(sums, axis=1).reshape(many, *values.shape[1:])

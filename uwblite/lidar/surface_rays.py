@@ -1,0 +1,211 @@
+"""Single rays that end on known surfaces, straight walls and round columns, and what they say of poses and surfaces.
+
+    wall      residual n . (p - c r) - n . m          m a point of the wall, n its normal
+    column    residual |p - c r - m| - radius         along the ray, times the cosine of incidence
+
+p is where the ray ended, r its direction, both in the map, and c the range offset of the surface: the error of a lidar that
+stays with colour and material. Derivatives are taken where the ray should have ended: noise along an oblique ray stands in
+its residual and in its lever arm, and the product of both would turn every scan, along a wall always to the same side.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints, Table
+from ..odometry.attached import ScanPoints
+from .cloud_rasters import CloudRasters, look_up
+from .clouds import Clouds
+from .ray_noise import range_sigma
+from .round_columns import refined_columns, to_circle
+from .walls import Stretches, Walls
+
+_GATE = 4.0
+"""Standard deviations within which a ray ends on the surface."""
+_FLOOR = 0.004
+"""Roughness of surfaces, m: a grazing ray does not measure better."""
+_INCIDENCE, _INCIDENCE_ROUND = 0.15, 0.4
+"""Least cosine of incidence on walls, and on columns, whose edges return anything."""
+_NEAR = 0.3
+"""Distance from a column's rim up to which rays are kept until it is fitted, m."""
+_SLACK = 0.03
+"""What a column's place and radius are off at first, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surfaces(Table):
+    """Walls and columns (s) in the map."""
+
+    round: Bools
+    """Whether it is a column."""
+    place: Floats
+    """(s, 2) m, centre of a column, a point of a wall."""
+    facing: Floats
+    """(s,) rad, direction of a wall's normal; of a column 0."""
+    offset: Floats
+    """(s,) m, by which ranges to it are too long."""
+    radius: Floats
+    """(s,) m, of a column; of a wall 1."""
+
+    def moved(self, step: Floats) -> "Surfaces":
+        """Return the surfaces after a step (s, 4): a wall's turn and shift along its normal, or a column's shift; the
+        offset; the radius."""
+        normal = np.stack(se2.cos_sin(self.facing), axis=1)
+        shift = np.where(self.round[:, None], step[:, :2], normal * step[:, 1:2])
+        facing = self.facing + np.where(self.round, 0.0, step[:, 0])
+        return replace(
+            self, place=self.place + shift, facing=facing, offset=self.offset + step[:, 2], radius=self.radius + step[:, 3]
+        )
+
+
+def surfaces_of(walls: Walls, columns: Floats) -> Surfaces:
+    """Return walls, and after them columns (c, 3), x, y, radius, with no range offset."""
+    w, c = len(walls.centre), len(columns)
+    facing = np.concatenate([se2.bearing(walls.normal), np.zeros(c)])
+    place, radius = np.concatenate([walls.centre, columns[:, :2]]), np.concatenate([np.ones(w), columns[:, 2]])
+    return Surfaces(np.arange(w + c) >= w, place, facing, np.zeros(w + c), radius)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceRays(Table):
+    """Rays (m) of known surfaces."""
+
+    keyframe: Ints
+    surface: Ints
+    points: Floats
+    """(m, 2) m, where they ended, frame of the keyframe."""
+    directions: Floats
+    """(m, 2) unit, same frame."""
+    sigma: Floats
+    """(m,) m, along the ray; counts what it errs alike with its neighbours."""
+
+
+def as_rays(rays: ScanPoints) -> SurfaceRays:
+    """Return rays of which it is not known yet on which surface they end."""
+    way = rays.points - rays.origins
+    reach = np.maximum(np.hypot(*way.T), 1e-9)
+    none = np.full(len(reach), -1)
+    return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], np.sqrt(_ALIKE) * range_sigma(reach))
+
+
+def on_stretches(rays: ScanPoints, clouds: Clouds, raster: CloudRasters, found: Stretches) -> SurfaceRays:
+    """Return the rays that end on the straight stretches that their own cloud shows, away from the ends of these: as
+    surfaces the numbers of the stretches, and neighbouring rays as one."""
+    every = as_rays(rays)
+    if not len(clouds.points) or not len(every.keyframe):
+        return every.rows(np.zeros(0, dtype=np.int64))
+    nearest = look_up(raster, rays.keyframe, rays.points[:, :1], rays.points[:, 1:])[:, 0].astype(np.int64)
+    point = np.where(nearest >= 0, nearest + clouds.offsets[rays.keyframe], 0)
+    near = np.flatnonzero((nearest >= 0) & found.straight[found.of_point[point]])
+    stretch, some = found.of_point[point[near]], every.rows(near)
+    good = _ends_on(some, found, stretch)
+    some, near = replace(some, surface=stretch).rows(good), near[good]
+    return _bundled(some, rays.scan[near], rays.ray[near])
+
+
+def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
+    """Return which rays (m,) end on these stretches (m,), where their noise is taken away along the ray."""
+    normal, off = found.normal[stretch], rays.points - found.centre[stretch]
+    residual, incidence = (off * normal).sum(axis=1), -(rays.directions * normal).sum(axis=1)
+    oblique = np.maximum(incidence, _INCIDENCE)
+    along = ((off + (residual / oblique)[:, None] * rays.directions) * found.tangent[stretch]).sum(axis=1)
+    gate = _GATE * np.hypot(rays.sigma / np.sqrt(_ALIKE) * incidence, _FLOOR)
+    return np.asarray(found.inside(stretch, along) & (incidence > _INCIDENCE) & (np.abs(residual) < gate))
+
+
+def _bundled(rays: SurfaceRays, scan: Ints, ray: Ints) -> SurfaceRays:
+    """Return neighbouring rays of one scan on one stretch as their mean, which weighs as they together do."""
+    key = np.stack([scan, rays.surface, ray // _BUNDLE])
+    first = np.flatnonzero(np.diff(key, axis=1, prepend=-1).any(axis=0))
+    if not len(first):
+        return rays
+    count = np.diff(np.append(first, len(scan)))[:, None]
+    points, ways = (np.add.reduceat(v, first, axis=0) / count for v in (rays.points, rays.directions))
+    sigma = np.add.reduceat(rays.sigma, first) / count[:, 0] / np.sqrt(count[:, 0])
+    directions = ways / np.hypot(*ways.T)[:, None]
+    return SurfaceRays(rays.keyframe[first], rays.surface[first], points, directions, sigma)
+
+
+_ALIKE, _BUNDLE = 4.0, 4
+"""Rays that together weigh as one, since neighbouring ones err alike (as matches do: RefinementConfig.correlation), and rays on
+a wall that are taken as one: nothing more is lost."""
+
+
+def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
+    """Return the rays from poses (k, 3) that end on columns (c, 3), which are surfaces from a first number on."""
+    if not len(columns):
+        return rays.rows(np.zeros(0, dtype=np.int64))
+    at, direction = in_map(rays, poses)
+    nearest = cKDTree(columns[:, :2]).query(at)[1]
+    shift, _, incidence = to_circle(at - columns[nearest, :2], direction, columns[nearest, 2])
+    good = (incidence < -_INCIDENCE_ROUND) & (np.abs(shift) < _GATE / np.sqrt(_ALIKE) * rays.sigma + _SLACK)
+    return replace(rays, surface=nearest + first).rows(good)
+
+
+def rays_around(rays: ScanPoints, poses: Floats, columns: Floats) -> SurfaceRays:
+    """Return the rays from poses (k, 3) that end near columns (c, 3)."""
+    every = as_rays(rays)
+    if not len(columns):
+        return every.rows(np.zeros(0, dtype=np.int64))
+    at = in_map(every, poses)[0]
+    near, which = cKDTree(columns[:, :2]).query(at)
+    return every.rows(near < columns[which, 2] + _NEAR)
+
+
+def fitted_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Floats:
+    """Return those of the columns (c, 3) that are round, fitted to rays around them."""
+    return refined_columns(columns, *in_map(rays, poses), rays.sigma / np.sqrt(_ALIKE))
+
+
+def in_map(rays: SurfaceRays, poses: Floats) -> tuple[Floats, Floats]:
+    """Return where rays end (m, 2) and their directions (m, 2) in the map."""
+    return (
+        se2.transform_each(poses, rays.keyframe, rays.points),
+        se2.rotate_each(poses[:, 2], rays.keyframe, rays.directions),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayEquations:
+    """Whitened residuals of rays and their derivatives."""
+
+    residual: Floats
+    """(m,)."""
+    by_pose: Floats
+    """(m, 3) by x, y, theta of the keyframe."""
+    by_surface: Floats
+    """(m, 4) by the step of Surfaces.moved."""
+
+
+def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayEquations:
+    """Linearise rays at their surfaces.
+
+    Parameters
+    ----------
+    sensors : (k, 3) frames of the clouds in the map, where the laser's mounting and clock put them. poses : (k, 3) of the
+        base, about which these turn.
+    """
+    at, direction = in_map(rays, sensors)
+    at -= surfaces.offset[rays.surface, None] * direction
+    away, curved = at - surfaces.place[rays.surface], surfaces.round[rays.surface]
+    normal = np.stack(se2.cos_sin(surfaces.facing[rays.surface]), axis=1)
+    shift, outwards, _ = to_circle(away, direction, surfaces.radius[rays.surface])
+    normal = np.where(curved[:, None], outwards, normal)
+    incidence = (normal * direction).sum(axis=1)
+    incidence = np.where(np.abs(incidence) > _LEAST, incidence, -_LEAST)
+    residual = np.where(curved, -shift * incidence, (normal * away).sum(axis=1))
+    ahead = -(residual / incidence)[:, None] * direction
+    arm, away = at + ahead - poses[rays.keyframe, :2], away + ahead
+    root = 1.0 / np.hypot(rays.sigma * incidence, _FLOOR)
+    by_pose = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
+    turn = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]
+    by_surface = np.column_stack([
+        np.where(curved, -normal[:, 0], turn), np.where(curved, -normal[:, 1], -1.0), -incidence, np.where(curved, -1.0, 0.0),
+    ])  # fmt: skip
+    return RayEquations(residual * root, by_pose * root[:, None], by_surface * root[:, None])
+
+
+_LEAST = 0.05
+"""Least cosine of incidence that is reckoned with."""

@@ -1,0 +1,171 @@
+"""Straight walls: stretches of single clouds that are straight, and which stretches of many clouds are one wall."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from .. import se2
+from ..arrays import Bools, Floats, Ints, unique_rows
+from .clouds import Clouds
+
+_GAP = 0.35
+"""Distance between neighbouring points that ends a stretch, m."""
+_STEP = 0.04
+"""Distance of a point from its neighbour's line that ends a stretch, m."""
+_TURN = np.cos(np.deg2rad(12.0))
+"""Cosine of the angle between neighbouring normals that ends a stretch."""
+_SHORTEST, _FEWEST = 0.5, 6
+"""Length, m, and points of a stretch that shows a direction."""
+_STRAIGHT = 0.012
+"""Root mean square distance of the points of a stretch from its line, m; those of a column of 1 m radius lie farther off."""
+TRIM = 0.2
+"""Ends of a stretch that do not count, m: lines through corners lean."""
+_EVERY = 0.5
+"""Distance of the places at which stretches are compared, m."""
+_REACH, _OFF, _LEAN = 0.4, 0.06, np.cos(np.deg2rad(6.0))
+"""Two stretches are of one wall where places on them are within a reach, m, of each other, lie on each other's line within
+some cm, and face the same way: what maps err by after the joint refinement, and less than what stands off a wall."""
+_BENT = 0.15
+"""Farthest that places of one wall lie off its line, m; a wall farther off is bent and left to pairs of clouds."""
+_STRETCHES = 3
+"""Stretches that make a wall."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretches:
+    """Stretches (s) of neighbouring points of single clouds, and the line fitted to each."""
+
+    of_point: Ints
+    """(p,) stretch of each of the clouds' points."""
+    along: Floats
+    """(p,) m, where on its line each point stands, from the centre."""
+    centre: Floats
+    """(s, 2) m, frame of the cloud."""
+    normal: Floats
+    """(s, 2) unit, towards the laser."""
+    first: Floats
+    """(s,) m, least `along`."""
+    last: Floats
+    """(s,) m, largest `along`."""
+    straight: Bools
+    """(s,) whether it is long and straight enough to be part of a wall."""
+
+    @property
+    def tangent(self) -> Floats:
+        """(s, 2) unit, in the direction of `along`."""
+        return np.stack([self.normal[:, 1], -self.normal[:, 0]], axis=1)
+
+    def inside(self, stretch: Ints, along: Floats) -> Bools:
+        """Return which places (m,) on stretches (m,) are not near their ends."""
+        return (along > self.first[stretch] + TRIM) & (along < self.last[stretch] - TRIM)
+
+
+def stretches(clouds: Clouds) -> Stretches:
+    """Cut each cloud where neighbouring points, by bearing, are not on one line, and fit lines to the parts."""
+    points, normals = clouds.points.astype(np.float64), clouds.normals.astype(np.float64)
+    lined, step = np.any(normals != 0.0, axis=1), np.diff(points, axis=0)
+    ends = (np.diff(clouds.owner) != 0) | ~lined[1:] | ~lined[:-1] | (np.hypot(*step.T) > _GAP)
+    for side in (normals[1:], normals[:-1]):
+        ends |= np.abs((side * step).sum(axis=1)) > _STEP
+    ends |= (normals[1:] * normals[:-1]).sum(axis=1) < _TURN
+    number = np.concatenate([[0], np.cumsum(ends)])[: len(points)].astype(np.int64)
+    return _fitted(number, points, normals)
+
+
+def _fitted(number: Ints, points: Floats, normals: Floats) -> Stretches:
+    many = int(number.max(initial=-1)) + 1
+    count = np.bincount(number, minlength=many)
+    centre, direction, across = principal_axes(number, points, many)
+    normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    facing = np.bincount(number, (normals * normal[number]).sum(axis=1), many)
+    normal *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
+    tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
+    along = ((points - centre[number]) * tangent[number]).sum(axis=1)
+    first, last = extent(number, along, many)
+    straight = (count >= _FEWEST) & (last - first >= _SHORTEST) & (across < _STRAIGHT)
+    return Stretches(number, along, centre, normal, first, last, straight)
+
+
+def principal_axes(number: Ints, points: Floats, many: int) -> tuple[Floats, Floats, Floats]:
+    """Return for each of many sets of points (p, 2), numbered (p,), its centre (m, 2), the direction (m, 2) in which it is
+    long, and its rms extent across, (m,) m."""
+    count = np.maximum(np.bincount(number, minlength=many), 1)
+
+    def mean(values: Floats) -> Floats:
+        return np.asarray(np.bincount(number, values, many) / count)
+
+    centre = np.stack([mean(points[:, 0]), mean(points[:, 1])], axis=1)
+    x, y = (points - centre[number]).T
+    a, b, c = mean(x * x), mean(x * y), mean(y * y)
+    angle = 0.5 * np.arctan2(2.0 * b, a - c)
+    across = np.sqrt(np.maximum(0.5 * (a + c - np.hypot(a - c, 2.0 * b)), 0.0))
+    return centre, np.stack([np.cos(angle), np.sin(angle)], axis=1), across
+
+
+def extent(number: Ints, values: Floats, many: int) -> tuple[Floats, Floats]:
+    """Return the least and the largest (m,) of the values (p,) of each set; inf and -inf of an empty one."""
+    least, most = np.full(many, np.inf), np.full(many, -np.inf)
+    np.minimum.at(least, number, values)
+    np.maximum.at(most, number, values)
+    return least, most
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walls:
+    """Straight walls (w) of a map."""
+
+    of_stretch: Ints
+    """(s,) wall of each stretch; -1 = of none."""
+    centre: Floats
+    """(w, 2) m, map frame."""
+    normal: Floats
+    """(w, 2) unit, towards the robot."""
+
+
+def find_walls(clouds: Clouds, found: Stretches, poses: Floats) -> Walls:
+    """Join the straight stretches of all clouds that lie on each other, at poses (k, 3) of the clouds, to walls."""
+    rows = _places(found)
+    stretch, owner = found.of_point[rows], clouds.owner[rows]
+    at = se2.transform(poses[owner], clouds.points[rows].astype(np.float64))
+    normal = se2.rotate(poses[owner, 2], found.normal[stretch])
+    one, other = _together(at, normal)
+    many = len(found.straight)
+    ties = sparse.coo_matrix((np.ones(len(one)), (stretch[one], stretch[other])), shape=(many, many))
+    number = connected_components(ties, directed=False)[1]
+    return _judged(number, stretch, at, normal, found)
+
+
+def _places(found: Stretches) -> Ints:
+    """Return rows of points on straight stretches, one every so often, none near an end."""
+    rows = np.flatnonzero(found.straight[found.of_point] & found.inside(found.of_point, found.along))
+    key = np.stack([found.of_point[rows], np.floor(found.along[rows] / _EVERY).astype(np.int64)], axis=1)
+    number = unique_rows(key)[1]
+    return rows[np.unique(number, return_index=True)[1]]
+
+
+def _together(at: Floats, normal: Floats) -> tuple[Ints, Ints]:
+    """Return pairs of places (m, 2) with normals (m, 2) that lie on one line and face the same way."""
+    one, other = cKDTree(at).query_pairs(_REACH, output_type="ndarray").T
+    step = at[other] - at[one]
+    good = (normal[one] * normal[other]).sum(axis=1) > _LEAN
+    for side in (one, other):
+        good &= np.abs((normal[side] * step).sum(axis=1)) < _OFF
+    return one[good], other[good]
+
+
+def _judged(number: Ints, stretch: Ints, at: Floats, normal: Floats, found: Stretches) -> Walls:
+    """Fit a line to each set (s,) of stretches by their places (m,), and keep those that are walls."""
+    many, own = int(number.max(initial=-1)) + 1, number[stretch]
+    centre, direction, _ = principal_axes(own, at, many)
+    across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    across *= np.where(np.bincount(own, (normal * across[own]).sum(axis=1), many) < 0.0, -1.0, 1.0)[:, None]
+    off = np.abs(((at - centre[own]) * across[own]).sum(axis=1))
+    stretches_of = np.bincount(number[np.unique(stretch)], minlength=many)
+    good = (stretches_of >= _STRETCHES) & (extent(own, off, many)[1] < _BENT)
+    new = np.where(good, np.cumsum(good) - 1, -1)
+    with_places = np.zeros(len(number), dtype=bool)
+    with_places[stretch] = True
+    return Walls(np.where(found.straight & with_places, new[number], -1), centre[good], across[good])
