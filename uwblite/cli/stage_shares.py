@@ -9,7 +9,8 @@ _WITH_LIDAR = (
     ("keyframes", 0.04), ("edges", 0.01), ("bootstrap", 0.02), ("first optimisation", 0.03), ("constraints", 0.01),
     ("clouds", 0.04), ("keyframes added", 0.03), ("scan-to-scan matching", 0.36), ("clouds made again", 0.06),
     ("ranges re-estimated", 0.02), ("loose links", 0.01), ("long stretches", 0.01), ("loop closure", 0.18),
-    ("second optimisation", 0.01), ("joint refinement", 0.11), ("matched once more", 0.01), ("map consistency", 0.01),
+    ("second optimisation", 0.01), ("joint refinement", 0.11), ("matched once more", 0.01), ("surfaces", 0.05),
+    ("map consistency", 0.01),
     ("landmark distances", 0.01), ("occupancy grid", 0.05), ("summary", 0.01),
 )  # fmt: skip
 """Means over two recordings with radio and lidar and six with lidar alone; in the order in which they come."""
