@@ -65,8 +65,9 @@ def test_anchors_covariances_contain_the_correlated_errors_of_their_ranges(resul
     (ranges,) = [e for e in result.graph.edges if isinstance(e, RangeEdges)]
     alike = anchors_with_correlated_errors(at_given_poses(result.graph), ranges, whole, MappingConfig().ranges)
     assert all(np.abs(own).max() > 1e-4 for own in alike - whole)
-    # They are linearised where the estimate was before errors of ranges to surfaces were taken off: some millimetres.
-    np.testing.assert_allclose([a.covariance for a in result.anchors], alike, rtol=1e-3)
+    # Rays on walls make poses surer, which changes little of what is not known of an anchor.
+    for anchor, own, without in zip(result.anchors, alike, whole, strict=True):
+        assert np.abs(anchor.covariance - own).max() < 0.05 * np.abs(own - without).max()
 
 
 def test_the_room_is_mapped(result, truth):

@@ -140,8 +140,9 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
             yield radio_stages.select_range_priors
             if config.refinement.rounds:
                 yield lidar_stages.refine_jointly
-                yield surface_adjustment.adjust_surfaces
             yield moved_anchors.separate_moved_anchors
+            if config.refinement.rounds:
+                yield surface_adjustment.adjust_surfaces
         yield lidar_stages.check_map_consistency
     if given.landmark_distances:
         yield landmark_ties.tie_landmarks

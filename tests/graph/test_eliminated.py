@@ -5,11 +5,12 @@ from helpers.planted_graphs import loop
 from scipy import sparse
 
 from uwblite.graph.eliminated import blocks_of, step
-from uwblite.graph.marginals import factor_of
+from uwblite.graph.marginals import Marginals, factor_of
 from uwblite.graph.normal_equations import filled
 
 
-def test_the_step_is_that_of_the_whole_system():
+def planted():
+    """Return a graph, its normal equations, blocks, and the matrix and gradient of the whole system."""
     rng = np.random.default_rng(5)
     graph = loop(n=12)[0]
     normal = filled(graph, subtrees=True)
@@ -27,8 +28,28 @@ def test_the_step_is_that_of_the_whole_system():
         own = slice(n + b * k, n + (b + 1) * k)
         whole[own, own] += prior[b]
     whole += jacobian.T @ jacobian
-    gradient = np.concatenate([normal.gradient, slope.ravel()]) + jacobian.T @ residual
+    return graph, normal, blocks, whole, np.concatenate([normal.gradient, slope.ravel()]) + jacobian.T @ residual
+
+
+def test_the_step_is_that_of_the_whole_system():
+    _, normal, blocks, whole, gradient = planted()
+    n = normal.unknowns.size
     expected = -np.linalg.solve(whole, gradient)
     x, s = step(normal, blocks, factor_of(normal).solve)
     np.testing.assert_allclose(x, expected[:n], atol=2e-3 * np.abs(expected).max())
     np.testing.assert_allclose(s.ravel(), expected[n:], atol=2e-3 * np.abs(expected).max())
+
+
+def test_covariances_are_those_of_the_whole_system():
+    graph, normal, blocks, whole, _ = planted()
+    found = Marginals(graph, normal, among=np.array([2, 7]), further=blocks)
+    inverse = np.linalg.inv(whole)
+    for name, covariances in (("poses", found.covariances.poses), ("anchors", found.covariances.anchors)):
+        for number, covariance in zip(normal.unknowns.number[name], covariances, strict=True):
+            free = number >= 0
+            expected = inverse[np.ix_(number[free], number[free])]
+            np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-9, atol=1e-15)
+    chosen = normal.unknowns.number["poses"][[2, 7]].ravel()
+    np.testing.assert_allclose(found.covariances.among, inverse[np.ix_(chosen, chosen)], rtol=1e-9, atol=1e-15)
+    right = np.random.default_rng(1).standard_normal((normal.unknowns.size, 3))
+    np.testing.assert_allclose(found.solve(right), inverse[: len(right), : len(right)] @ right, rtol=1e-9, atol=1e-12)

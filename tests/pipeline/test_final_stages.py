@@ -14,6 +14,7 @@ from uwblite.graph.graph import Calibration, Graph, UnknownKey
 from uwblite.graph.pose_edges import ScanEdges
 from uwblite.grid.occupancy_grid import GridConfig
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.odometry.attached import choose_scans
 from uwblite.odometry.keyframes import KeyframeConfig
 from uwblite.pipeline import final_stages
 from uwblite.pipeline.estimate import Estimate
@@ -91,14 +92,28 @@ def test_correlated_range_errors_count_for_all_or_for_anchors_at_given_poses_whe
     monkeypatch.setattr(final_stages, "with_correlated_errors", lambda *a: of_all.append(a) or a[0].covariances)
     monkeypatch.setattr(final_stages, "anchors_with_correlated_errors", lambda *a: of_anchors.append(a) or marker)
     graph, config = loop()[0], MappingConfig()
-    i, none = np.zeros(1, dtype=int), np.zeros((1, 3))
-    scans = ScanEdges(i, i + 1, none, np.eye(3)[None], none, none, np.full(4, -1))
+    i, still = np.zeros(1, dtype=int), np.zeros((1, 3))
+    scans = ScanEdges(i, i + 1, still, np.eye(3)[None], still, still, np.full(4, -1))
     ranges = graph.edges[2]
     estimate = Estimate(graph.with_edges(scans) if lidar else graph, None, ranges, ())
-    found, covariance = final_stages.without_range_errors(estimate, SimpleNamespace(config=config))
+    none = SimpleNamespace(have_scans=False)
+    found, covariance = final_stages.without_range_errors(estimate, SimpleNamespace(config=config, recordings=none))
     assert found is estimate
     found = [(a[0].covariances is covariance, a[2] is ranges, a[3] is config.ranges) for a in of_all]
     assert found == [(True, True, True)] * (not lidar)
     assert [(a[1] is ranges, a[3] is config.ranges) for a in of_anchors] == [(True, True)] * lidar
     assert all(a[0].fixed_poses.all() and not any(isinstance(e, ScanEdges) for e in a[0].edges) for a in of_anchors)
     assert (covariance.anchors is marker) == lidar
+
+
+def test_the_time_from_keyframes_to_scans_is_that_of_a_random_walk(room):
+    """The mean of the walk's places at the times of the scans has the variance of one place at the time that is returned."""
+    one = gather([room], KeyframeConfig()).each[0]
+    owner, chosen = choose_scans(one.log.scans, one.frames, KeyframeConfig())
+    expected = np.zeros(len(one.frames))
+    for k in range(len(one.frames)):
+        t = (one.log.scans.middles[chosen] - one.frames.stamps[owner])[owner == k]
+        both = np.minimum(np.abs(t[:, None]), np.abs(t)) * (np.sign(t[:, None]) == np.sign(t))
+        expected[k] = both.sum() / max(len(t), 1) ** 2
+    np.testing.assert_allclose(final_stages.time_to_scans(one, KeyframeConfig()), expected, atol=1e-12)
+    assert expected.max() > 0.0

@@ -6,7 +6,8 @@ D among blocks, which is block diagonal, the blocks are eliminated:
     (H + G - B^T D^-1 B) x = -(g + g_x - B^T D^-1 g_s),    s = -D^-1 (g_s + B x).
 
 The matrix ties all poses that touch one block, so it is never made: conjugate gradients multiply by its parts. A factor of
-another matrix that measures alike, for example of a graph in which pairs of poses stand for the blocks, preconditions.
+another matrix that measures alike, for example of a graph in which pairs of poses stand for the blocks, preconditions. For
+covariances the blocks stay in the matrix, as its last unknowns: then it is sparse.
 """
 
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from ..arrays import Floats
+from .factorization import superlu
 from .normal_equations import NormalEquations
 from .schwarz_cg import conjugate_gradients
 
@@ -76,3 +78,31 @@ def step(normal: NormalEquations, blocks: Blocks, precondition: Callable[[Floats
     right = -(normal.gradient + blocks.slope - blocks.across.T @ within(blocks.own_slope))
     x = conjugate_gradients(times, right, precondition, _RESIDUAL, _MOST)
     return x, -within(blocks.own_slope.ravel() + blocks.across @ x).reshape(blocks.own_slope.shape)
+
+
+class WithBlocks:
+    """Factor of [[H + G, B^T], [B, D]] that solves for the graph's unknowns: the inverse of H + G - B^T D^-1 B."""
+
+    def __init__(self, matrix: sparse.csc_matrix, blocks: Blocks) -> None:
+        """Factorise.
+
+        Parameters
+        ----------
+        matrix : (n, n) H.
+
+        Raises
+        ------
+        SolverError : the matrix is singular.
+        """
+        count = len(blocks.own)
+        own = sparse.bsr_matrix((blocks.own, np.arange(count), np.arange(count + 1)))
+        whole = sparse.bmat([[matrix + blocks.among, blocks.across.T], [blocks.across, own]], format="csc")
+        self._size, self._more = matrix.shape[0], whole.shape[0] - matrix.shape[0]
+        lu = superlu(whole, "MMD_AT_PLUS_A")
+        self.L, self.U, self.perm_r, self.perm_c = lu.L, lu.U, lu.perm_r, lu.perm_c
+        self._lu = lu
+
+    def solve(self, right: Floats) -> Floats:
+        """Solve for right-hand sides (n,) or (n, m)."""
+        whole = np.concatenate([right, np.zeros((self._more, *right.shape[1:]))])
+        return np.asarray(self._lu.solve(whole)[: self._size])

@@ -13,10 +13,11 @@ from .. import se2
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
 from .covariances import Covariances
+from .eliminated import Blocks, WithBlocks
 from .graph import Edges, Graph, edge_weights
 from .normal_equations import NormalEquations, filled
 from .selected_inverse import selected_inverse
-from .unknowns import moved
+from .unknowns import Unknowns, moved
 from .variance_components import variances_of_kinds
 
 _COMMON_AT_ONCE = 32
@@ -54,10 +55,11 @@ class Marginals:
     """
 
     def __init__(
-        self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = (), among: ArrayLike = ()
+        self, graph: Graph, normal: NormalEquations, common: Sequence[CommonErrors] = (), among: ArrayLike = (),
+        further: Blocks | None = None,
     ) -> None:
         self._graph, self.unknowns, self._gradient = graph, normal.unknowns, normal.gradient
-        self._factor = factor_of(normal)
+        self._factor = factor_of(normal, further)
         unseen = np.append(normal.diagonal <= 0, False)
         blocks = self._block_diagonal(unseen)
         chosen = np.asarray(among, dtype=np.int64)
@@ -221,26 +223,41 @@ def relative_covariances(graph: Graph, i: Ints, j: Ints, of_i: Floats, of_j: Flo
     return own + mixed + mixed.transpose(0, 2, 1)
 
 
-def factor_of(normal: NormalEquations) -> SuperLU:
-    """Factorise H itself where it is regular, else with a trace of damping that leaves open directions open."""
+def factor_of(normal: NormalEquations, further: Blocks | None = None) -> SuperLU | WithBlocks:
+    """Factorise H, and further measurements with it, where it is regular, else with a trace of damping that leaves open
+    directions open."""
     diagonal = normal.diagonal
     seen = diagonal > 0
     try:
-        factor = cast(SuperLU, normal.factor(np.where(seen, 0.0, 1.0)))
-        pivots = factor.U.diagonal()[factor.perm_c]
+        factor = _factor(normal, further, np.where(seen, 0.0, 1.0))
+        pivots = factor.U.diagonal()[factor.perm_c[: len(seen)]]
         if np.all(pivots > _DEPENDENT * np.where(seen, diagonal, 1.0)):
             return factor
     except SolverError:
         pass
-    return cast(SuperLU, normal.factor(np.where(seen, 1e-12 * diagonal, 1.0)))
+    return _factor(normal, further, np.where(seen, 1e-12 * diagonal, 1.0))
 
 
-def marginals(graph: Graph, common: Sequence[CommonErrors] = (), among: ArrayLike = ()) -> Marginals:
+def _factor(normal: NormalEquations, further: Blocks | None, damping: Floats) -> SuperLU | WithBlocks:
+    if further is None:
+        return cast(SuperLU, normal.factor(damping))
+    return WithBlocks(sparse.csc_matrix(normal.matrix + sparse.diags(damping)), further)
+
+
+def marginals(
+    graph: Graph, common: Sequence[CommonErrors] = (), among: ArrayLike = (),
+    further: Callable[[Unknowns], Blocks] | None = None,
+) -> Marginals:
     """Return the marginal covariances (J^T W J)^-1 at the graph's estimates, with the robust weights as they stand.
 
     Those of single unknowns, and of the poses `among`, contain what common errors add.
+
+    Parameters
+    ----------
+    further : gives measurements beside the graph's edges by the numbers of its unknowns, see graph/eliminated.py.
     """
-    return Marginals(graph, filled(graph, subtrees=True), common, among)
+    normal = filled(graph, subtrees=True)
+    return Marginals(graph, normal, common, among, None if further is None else further(normal.unknowns))
 
 
 def calibration_covariance(graph: Graph) -> Floats:

@@ -11,11 +11,12 @@ short circuit study, 1973). Ranges of a few dozen columns make the work one of d
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import lapack
-from scipy.sparse.linalg import SuperLU
 
 from ..arrays import Floats, Ints
 from ..errors import SolverError
@@ -24,6 +25,19 @@ _WIDEST = 64
 """Columns of a range at most."""
 _OVERHEAD = 10000.0
 """What a range costs beyond its entries, in entries: calls of library functions take time, however small the matrices."""
+
+
+class SymmetricFactor(Protocol):
+    """A matrix factorised by SuperLU in symmetric mode, and maybe more unknowns after its own."""
+
+    @property
+    def L(self) -> sparse.csc_matrix: ...
+    @property
+    def U(self) -> sparse.csc_matrix: ...
+    @property
+    def perm_r(self) -> NDArray[np.int32]: ...
+    @property
+    def perm_c(self) -> NDArray[np.int32]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +60,7 @@ class _Front:
         return panel
 
 
-def selected_inverse(factor: SuperLU, rows: Ints, columns: Ints) -> Floats:
+def selected_inverse(factor: SymmetricFactor, rows: Ints, columns: Ints) -> Floats:
     """Return entries (k,) of the inverse of a symmetric matrix, at places (k,) where the matrix itself is not empty.
 
     0 where it holds a zero that its factor need not fill.

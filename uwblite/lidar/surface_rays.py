@@ -60,6 +60,12 @@ class Surfaces(Table):
         )
 
 
+    def seen_from(self, pose: Floats) -> "Surfaces":
+        """Return the surfaces in the frame of a pose (3,)."""
+        place = se2.transform(se2.inverse(pose), self.place)
+        return replace(self, place=place, facing=np.where(self.round, 0.0, self.facing - pose[2]))
+
+
 def surfaces_of(walls: Walls, columns: Floats) -> Surfaces:
     """Return walls, and after them columns (c, 3), x, y, radius, with no range offset."""
     w, c = len(walls.centre), len(columns)
@@ -80,6 +86,14 @@ class SurfaceRays(Table):
     """(m, 2) unit, same frame."""
     sigma: Floats
     """(m,) m, along the ray; counts what it errs alike with its neighbours."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredSurfaces:
+    """Surfaces that poses have been adjusted to, in the frame of the first pose, and the rays on them."""
+
+    surfaces: Surfaces
+    rays: SurfaceRays
 
 
 def as_rays(rays: ScanPoints) -> SurfaceRays:

@@ -13,6 +13,7 @@ from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
 from ..lidar.cloud_rasters import CloudRasters
 from ..lidar.clouds import Clouds
+from ..lidar.surface_rays import MeasuredSurfaces
 from ..loop_closure.closures import Closures, no_closures
 from ..radio.bootstrap_attempt import BootstrapResult
 from .mapping_config import MappingConfig
@@ -88,6 +89,8 @@ class Estimate:
     """With the keyframes of the graph's poses; None while these are the task's."""
     joint: ScanEdges | None = None
     """Between all overlapping clouds, in place of steps and closures; None before the joint refinement."""
+    surfaces: MeasuredSurfaces | None = None
+    """To which the poses have been adjusted; None before that, and where there are none."""
     alone: tuple["Estimate", ...] = ()
     """Of each recording before they were joined; empty with one recording, and after the first optimisation."""
 

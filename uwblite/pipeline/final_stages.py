@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
+from ..arrays import Floats
 from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_nonnegative_heights
 from ..graph.covariances import Covariances
 from ..graph.graph import Graph
@@ -17,6 +18,8 @@ from ..grid.occupancy_grid import OccupancyGrid
 from ..grid.tracing import Sweeps, from_sweeps
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.surface_errors import common_range_errors, with_range_errors
+from ..odometry.attached import choose_scans
+from ..odometry.keyframes import KeyframeConfig
 from ..odometry.wheels import with_noise_shown
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
@@ -26,6 +29,7 @@ from .map_frame import cropped
 from .progress import Stage
 from .radio_stages import with_range_noise
 from .recordings import Recording
+from .surface_adjustment import for_covariances
 
 _LARGE_GRID = 5_000_000
 """Cells from which on a grid's memory is announced."""
@@ -54,12 +58,18 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Cova
     poses = len(estimate.graph.poses)
     along = np.unique(np.linspace(0, poses - 1, _ALONG).round().astype(np.int64))
     stated = with_noise_shown(with_fewer_pairs(estimate.graph))
-    found = marginals(stated, common := common_range_errors(stated), among=along)
+    rays = None
+    if estimate.surfaces is not None:
+        stated, rays = for_covariances(estimate.surfaces, stated, task)
+    found = marginals(stated, common := common_range_errors(stated), among=along, further=rays)
     if common:
         estimate = estimate.with_estimates_of(with_nonnegative_heights(found.corrected()))
-    if estimate.ranges is None:
-        return estimate, found.covariances
-    return estimate, _with_correlated_ranges(found, stated, estimate.graph, estimate.ranges, task.config.ranges)
+    covariances = found.covariances
+    if estimate.ranges is not None:
+        covariances = _with_correlated_ranges(found, stated, estimate.graph, estimate.ranges, task.config.ranges)
+    if not task.recordings.have_scans:
+        return estimate, covariances
+    return estimate, replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(stated, task))
 
 
 _ALONG = 60
@@ -75,6 +85,47 @@ def _with_correlated_ranges(
     about_anchors = tuple(e for e in graph.edges if not isinstance(e, (OdometryEdges, ScanEdges)))
     given, plain = at_given_poses(replace(graph, edges=about_anchors)), found.covariances
     return replace(plain, anchors=anchors_with_correlated_errors(given, ranges, plain.anchors, config))
+
+
+def _between_scan_and_keyframe(stated: Graph, task: Task) -> Floats:
+    """Return the covariances (k, 3, 3) of the odometry's error between the time of a keyframe and those of its scans.
+
+    Scans measure the pose at their own times; nothing but the odometry measures the motion from there to the keyframe.
+    """
+    time, rate = np.zeros(len(stated.poses)), np.zeros((len(stated.poses), 3))
+    for recording in task.recordings.each:
+        if recording.has_scans:
+            time[recording.rows] = time_to_scans(recording, task.config.keyframes)
+    time[stated.fixed_poses] = 0.0
+    for wheels in (e for e in stated.edges if isinstance(e, OdometryEdges)):
+        sigma = 1.0 / np.maximum(np.einsum("eii->ei", wheels.sqrt_information), _NONE)
+        for ends in (wheels.i, wheels.j):
+            np.maximum.at(rate, ends, sigma**2 / np.maximum(wheels.duration, _SHORTEST)[:, None])
+    variance = np.minimum(rate * time[:, None], np.square(_FASTEST * time)[:, None])
+    turned = se2.rotation(stated.poses[:, 2])
+    return np.asarray(turned * variance[:, None] @ turned.transpose(0, 2, 1))
+
+
+_SHORTEST, _NONE, _FASTEST = 0.05, 1e-6, 1.0
+"""Shortest step whose variance grows in proportion to its time, s; least square root of an information; and speed, m/s and
+rad/s, at which a robot with wheels that measure nothing moves at most."""
+
+
+def time_to_scans(recording: Recording, config: KeyframeConfig) -> Floats:
+    """Return for each keyframe (k,) the time in which a random walk gets as far as the mean pose of its scans is off, s.
+
+    1 / n^2 times the sum over pairs of n scans on one side of the keyframe of the shorter time between scan and keyframe.
+    """
+    log, frames = recording.log, recording.frames
+    assert log.scans is not None
+    owner, chosen = choose_scans(log.scans, frames, config)
+    away = log.scans.middles[chosen] - frames.stamps[owner]
+    side = 2 * owner + (away > 0.0)
+    order = np.lexsort((np.abs(away), side))
+    rank = np.arange(len(order)) - np.searchsorted(side[order], side[order])
+    longer = np.bincount(side, minlength=2 * len(frames))[side[order]] - rank
+    total = np.bincount(owner[order], np.abs(away[order]) * (2 * longer - 1), len(frames))
+    return total / np.maximum(np.bincount(owner, minlength=len(frames)), 1) ** 2
 
 
 def _with_range_errors(estimate: Estimate, task: Task) -> Estimate:

@@ -4,18 +4,20 @@ A pair of clouds, condensed to its relative pose, has lost two things that show 
 from many places, are one straight line, and that what is seen of a column from all sides is one circle. And a range offset of
 a surface, which bends a pair, shows in the rays of many scans. So after the joint refinement walls and columns become
 unknowns themselves, with their offsets, and rays on them measure poses beside the pairs; surfaces are eliminated
-(graph/eliminated.py). Then the pairs are told what the adjusted poses say of them, so that later stages go on from there.
+(graph/eliminated.py). Then the pairs get the relative poses that were found, so that later stages go on from there; the rays
+count once more for the covariances.
 
 Pairs keep all of their weight, though they have seen the same rays: in clutter they know what rays on walls do not. Without
 the points on surfaces, or with a quarter of the weight, simulated halls gain more and real offices lose.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
 
+from .. import se2
 from ..arrays import Floats, Ints, concatenated
 from ..graph.calibration import LASER
 from ..graph.eliminated import Blocks, blocks_of, step
@@ -27,6 +29,7 @@ from ..graph.unknowns import Unknowns, moved
 from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.round_columns import find_columns, fitted_circles
 from ..lidar.surface_rays import (
+    MeasuredSurfaces,
     SurfaceRays,
     Surfaces,
     fitted_columns,
@@ -50,13 +53,6 @@ _PRIOR = np.array([1.0, 1.0, 0.0156, 0.1])
 a surface's 12 mm, see lidar/surface_errors.py), and radius, m."""
 _AT_ONCE = 128
 """Keyframes whose rays are in memory at once."""
-
-
-_SURER = 2.0
-"""By how much smaller standard deviations of relative poses are once they are adjusted to surfaces; from simulated halls, labs
-and corridors (seeds 9400 to 9404), whose normalised errors squared are 0.33 a degree of freedom without it, 0.77 with it."""
-
-
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with poses adjusted to rays on walls and columns, and its pairs of clouds in accordance."""
     joint, scans = estimate.joint, estimate.scans
@@ -67,14 +63,30 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     surfaces, rays = _found(_sensors(graph, joint, task), scans, task)
     if not len(rays.keyframe):
         return estimate
-    graph = _adjusted(graph, estimate, surfaces, rays, task)
+    graph, surfaces = _adjusted(graph, estimate, surfaces, rays, task)
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
     task.stages.end(
         "surfaces", walls=int((~surfaces.round).sum()), columns=int(surfaces.round.sum()), rays=len(rays.keyframe),
         shift=round(estimate.moved_since(before), 5),
     )  # fmt: skip
-    root = _SURER * joint.sqrt_information
-    return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph), sqrt_information=root))
+    measured = MeasuredSurfaces(surfaces.seen_from(graph.poses[0]), rays)
+    return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=measured)
+
+
+def for_covariances(
+    found: MeasuredSurfaces, graph: Graph, task: Task
+) -> tuple[Graph, Callable[[Unknowns], Blocks]]:
+    """Return a graph and what gives the normal equations of the rays by the numbers of its unknowns, for covariances.
+
+    Pairs of clouds and rays have seen the same points: each of both counts half.
+    """
+    half = np.sqrt(0.5)
+    edges = [
+        replace(e, sqrt_information=half * e.sqrt_information) if isinstance(e, ScanEdges) else e for e in graph.edges
+    ]
+    joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
+    surfaces, sensors = found.surfaces.seen_from(se2.inverse(graph.poses[0])), _sensors(graph, joint, task)
+    return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found.rays, surfaces, graph, sensors, unknowns, half)
 
 
 def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[Surfaces, SurfaceRays]:
@@ -113,8 +125,10 @@ def _rays_of(recording: Recording, scans: ScanClouds, task: Task) -> Iterator[Sc
         yield replace(rays, keyframe=rays.keyframe + recording.first)
 
 
-def _adjusted(graph: Graph, estimate: Estimate, surfaces: Surfaces, rays: SurfaceRays, task: Task) -> Graph:
-    """Return the graph after Gauss-Newton steps with the rays on surfaces."""
+def _adjusted(
+    graph: Graph, estimate: Estimate, surfaces: Surfaces, rays: SurfaceRays, task: Task
+) -> tuple[Graph, Surfaces]:
+    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these."""
     joint = estimate.joint
     assert joint is not None
     problem = with_fewer_pairs(graph.with_edges(*estimate.odometry_and_ranges, joint))
@@ -128,13 +142,15 @@ def _adjusted(graph: Graph, estimate: Estimate, surfaces: Surfaces, rays: Surfac
         if np.abs(problem.poses - poses).max() < _STILL:
             break
         poses = problem.poses
-    return graph.with_estimates_of(problem)
+    return graph.with_estimates_of(problem), surfaces
 
 
-def _of_rays(rays: SurfaceRays, surfaces: Surfaces, graph: Graph, sensors: Floats, unknowns: Unknowns) -> Blocks:
-    """Return the normal equations of rays, robustly weighted."""
+def _of_rays(
+    rays: SurfaceRays, surfaces: Surfaces, graph: Graph, sensors: Floats, unknowns: Unknowns, factor: float = 1.0
+) -> Blocks:
+    """Return the normal equations of rays, robustly weighted, with residuals times a factor."""
     lines = linearized(rays, surfaces, sensors, graph.poses)
-    root = 1.0 / (1.0 + (lines.residual / _KERNEL) ** 2)
+    root = factor / (1.0 + (lines.residual / _KERNEL) ** 2)
     by_pose = _sparse(unknowns.number["poses"][rays.keyframe], lines.by_pose * root[:, None], unknowns.size)
     count = len(surfaces.facing)
     columns = 4 * rays.surface[:, None] + np.arange(4)
