@@ -59,7 +59,6 @@ class Surfaces(Table):
             self, place=self.place + shift, facing=facing, offset=self.offset + step[:, 2], radius=self.radius + step[:, 3]
         )
 
-
     def seen_from(self, pose: Floats) -> "Surfaces":
         """Return the surfaces in the frame of a pose (3,)."""
         place = se2.transform(se2.inverse(pose), self.place)

@@ -1,4 +1,4 @@
-"""Adjustment of all poses and surfaces: single rays of straight walls and round columns in place of matched pairs of clouds.
+"""Adjustment of all poses and surfaces: single rays on straight walls and round columns, beside matched pairs of clouds.
 
 A pair of clouds, condensed to its relative pose, has lost two things that show where the robot was: that metres of wall, seen
 from many places, are one straight line, and that what is seen of a column from all sides is one circle. And a range offset of
@@ -53,6 +53,8 @@ _PRIOR = np.array([1.0, 1.0, 0.0156, 0.1])
 a surface's 12 mm, see lidar/surface_errors.py), and radius, m."""
 _AT_ONCE = 128
 """Keyframes whose rays are in memory at once."""
+
+
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     """Return the estimate with poses adjusted to rays on walls and columns, and its pairs of clouds in accordance."""
     joint, scans = estimate.joint, estimate.scans
