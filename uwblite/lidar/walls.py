@@ -148,12 +148,22 @@ def _places(found: Stretches) -> Ints:
 
 def _together(at: Floats, normal: Floats) -> tuple[Ints, Ints]:
     """Return pairs of places (m, 2) with normals (m, 2) that lie on one line and face the same way."""
-    one, other = cKDTree(at).query_pairs(_REACH, output_type="ndarray").T
+    pairs = cKDTree(at).query_pairs(_REACH, output_type="ndarray")
+    parts = [pairs[k : k + _AT_ONCE] for k in range(0, max(len(pairs), 1), _AT_ONCE)]
+    one, other = np.concatenate([part[_on_one_line(part[:, 0], part[:, 1], at, normal)] for part in parts]).T
+    return one, other
+
+
+_AT_ONCE = 1 << 17
+"""Pairs of places that are compared at once; bounds the memory."""
+
+
+def _on_one_line(one: Ints, other: Ints, at: Floats, normal: Floats) -> Bools:
     step = at[other] - at[one]
     good = (normal[one] * normal[other]).sum(axis=1) > _LEAN
     for side in (one, other):
         good &= np.abs((normal[side] * step).sum(axis=1)) < _OFF
-    return one[good], other[good]
+    return np.asarray(good)
 
 
 def _judged(number: Ints, stretch: Ints, at: Floats, normal: Floats, found: Stretches) -> Walls:
