@@ -4,28 +4,28 @@ import numpy as np
 from helpers.planted_graphs import loop
 from scipy import sparse
 
-from uwblite.graph.eliminated import blocks_of, step
+from uwblite.graph.eliminated import WithBlocks, blocks_of, step
 from uwblite.graph.marginals import Marginals, factor_of
 from uwblite.graph.normal_equations import filled
 
 
-def planted():
-    """Return a graph, its normal equations, blocks, and the matrix and gradient of the whole system."""
+def planted(n=12):
+    """Return a graph of n poses, its normal equations, blocks, and the matrix and gradient of the whole system."""
     rng = np.random.default_rng(5)
-    graph = loop(n=12)[0]
+    graph = loop(n=n)[0]
     normal = filled(graph, subtrees=True)
-    n, count, k, m = normal.unknowns.size, 3, 4, 60
-    by_graph = rng.standard_normal((m, n)) * (rng.random((m, n)) < 0.2)
+    size, count, k, m = normal.unknowns.size, 3, 4, 60
+    by_graph = rng.standard_normal((m, size)) * (rng.random((m, size)) < 0.2)
     block = rng.integers(count, size=m)
     by_block = np.zeros((m, count * k))
     by_block[np.arange(m)[:, None], block[:, None] * k + np.arange(k)] = rng.standard_normal((m, k))
     residual, prior = rng.standard_normal(m), np.tile(np.diag([1.0, 2.0, 3.0, 4.0]), (count, 1, 1))
     slope = rng.standard_normal((count, k))
     blocks = blocks_of(sparse.csr_matrix(by_graph), sparse.csr_matrix(by_block), residual, prior, slope)
-    whole, jacobian = np.zeros((n + count * k,) * 2), np.hstack([by_graph, by_block])
-    whole[:n, :n] = normal.matrix.toarray()
+    whole, jacobian = np.zeros((size + count * k,) * 2), np.hstack([by_graph, by_block])
+    whole[:size, :size] = normal.matrix.toarray()
     for b in range(count):
-        own = slice(n + b * k, n + (b + 1) * k)
+        own = slice(size + b * k, size + (b + 1) * k)
         whole[own, own] += prior[b]
     whole += jacobian.T @ jacobian
     return graph, normal, blocks, whole, np.concatenate([normal.gradient, slope.ravel()]) + jacobian.T @ residual
@@ -53,3 +53,22 @@ def test_covariances_are_those_of_the_whole_system():
     np.testing.assert_allclose(found.covariances.among, inverse[np.ix_(chosen, chosen)], rtol=1e-9, atol=1e-15)
     right = np.random.default_rng(1).standard_normal((normal.unknowns.size, 3))
     np.testing.assert_allclose(found.solve(right), inverse[: len(right), : len(right)] @ right, rtol=1e-9, atol=1e-12)
+
+
+def test_the_factor_is_in_an_order_with_contiguous_subtrees():
+    """Else the selected inverse hands on the rows of unrelated columns, which takes far more memory and time."""
+    _, normal, blocks, whole, _ = planted(60)
+    factor = WithBlocks(normal.matrix, blocks)
+    lower, n = factor.L.toarray(), len(whole)
+    np.testing.assert_array_equal(factor.perm_r, factor.perm_c)
+    order = np.argsort(factor.perm_c)
+    np.testing.assert_allclose(lower @ factor.U.toarray(), whole[np.ix_(order, order)], rtol=1e-9, atol=1e-9)
+    assert not np.triu(lower, 1).any()
+    size, deepest = np.ones(n, dtype=int), np.arange(n)
+    for column in range(n):
+        below = np.flatnonzero(lower[column + 1 :, column])
+        if len(below):
+            parent = column + 1 + below[0]
+            size[parent] += size[column]
+            deepest[parent] = min(deepest[parent], deepest[column])
+    np.testing.assert_array_equal(np.arange(n) - deepest + 1, size)

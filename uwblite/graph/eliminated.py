@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from ..arrays import Floats
-from .factorization import superlu
+from ..arrays import Floats, Ints
+from .factorization import postorder, superlu
 from .normal_equations import NormalEquations
 from .schwarz_cg import conjugate_gradients
 
@@ -81,7 +81,11 @@ def step(normal: NormalEquations, blocks: Blocks, precondition: Callable[[Floats
 
 
 class WithBlocks:
-    """Factor of [[H + G, B^T], [B, D]] that solves for the graph's unknowns: the inverse of H + G - B^T D^-1 B."""
+    """Factor of [[H + G, B^T], [B, D]] that solves for the graph's unknowns: the inverse of H + G - B^T D^-1 B.
+
+    Every subtree of the elimination is contiguous, which the selected inverse needs: else ranges of columns hold unrelated
+    poses, and each hands on the rows of all others.
+    """
 
     def __init__(self, matrix: sparse.csc_matrix, blocks: Blocks) -> None:
         """Factorise.
@@ -98,11 +102,30 @@ class WithBlocks:
         own = sparse.bsr_matrix((blocks.own, np.arange(count), np.arange(count + 1)))
         whole = sparse.bmat([[matrix + blocks.among, blocks.across.T], [blocks.across, own]], format="csc")
         self._size, self._more = matrix.shape[0], whole.shape[0] - matrix.shape[0]
-        lu = superlu(whole, "MMD_AT_PLUS_A")
-        self.L, self.U, self.perm_r, self.perm_c = lu.L, lu.U, lu.perm_r, lu.perm_c
-        self._lu = lu
+        self._order = _with_subtrees_contiguous(whole)
+        self._place = np.argsort(self._order)
+        self._lu = superlu(sparse.csc_matrix(whole[self._order][:, self._order]), "NATURAL")
+        self.L, self.U = self._lu.L, self._lu.U
+        self.perm_r, self.perm_c = self._lu.perm_r[self._place], self._lu.perm_c[self._place]
 
     def solve(self, right: Floats) -> Floats:
         """Solve for right-hand sides (n,) or (n, m)."""
         whole = np.concatenate([right, np.zeros((self._more, *right.shape[1:]))])
-        return np.asarray(self._lu.solve(whole)[: self._size])
+        return np.asarray(self._lu.solve(whole[self._order])[self._place[: self._size]])
+
+
+def _with_subtrees_contiguous(matrix: sparse.csc_matrix) -> Ints:
+    """Return the order (n,) of elimination by minimum degree in which every subtree is contiguous.
+
+    It is found on the Laplacian of the matrix's pattern: all that fills its factor has one sign, so that no entry is lost to
+    cancellation, and with it a tie of the tree.
+    """
+    count = np.diff(matrix.indptr)
+    column = np.repeat(np.arange(len(count)), count)
+    values = np.where(matrix.indices == column, count[column] - 1.0 + _GROUNDED, -1.0)
+    factor = superlu(sparse.csc_matrix((values, matrix.indices, matrix.indptr), shape=matrix.shape), "MMD_AT_PLUS_A")
+    return np.asarray(np.argsort(factor.perm_c)[postorder(factor.L)])
+
+
+_GROUNDED = 1e-6
+"""Added to the diagonal of a Laplacian to make it regular; so little that entries of long chains do not vanish."""

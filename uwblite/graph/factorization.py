@@ -76,7 +76,7 @@ def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False
         return Ordering(_before(pairs, poses, last), False, False)
     factor = superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A")
     order = np.argsort(factor.perm_c)
-    return Ordering(order[_postorder(factor.L)] if subtrees else order, bordered, False)
+    return Ordering(order[postorder(factor.L)] if subtrees else order, bordered, False)
 
 
 def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
@@ -96,7 +96,7 @@ def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
     return np.concatenate([order[~late[order]], order[late[order]]])
 
 
-def _postorder(lower: sparse.csc_matrix) -> Ints:
+def postorder(lower: sparse.csc_matrix) -> Ints:
     """Return the order in which every subtree of the elimination tree is contiguous and ends at its root.
 
     The parent of a column is its first row below the diagonal. A depth-first walk from the roots, read backwards, is

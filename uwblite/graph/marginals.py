@@ -64,7 +64,8 @@ class Marginals:
         blocks = self._block_diagonal(unseen)
         chosen = np.asarray(among, dtype=np.int64)
         self._chosen = self.unknowns.number["poses"][chosen].ravel()
-        self._among = self.columns(self._chosen)[self._chosen]
+        parts = [self._chosen[k : k + _COLUMNS_AT_ONCE] for k in range(0, max(len(self._chosen), 1), _COLUMNS_AT_ONCE)]
+        self._among = np.concatenate([self.columns(part)[self._chosen] for part in parts], axis=1)
         self._correction = np.zeros(self.unknowns.size)
         for errors in common:
             self._add_common(errors, blocks)
