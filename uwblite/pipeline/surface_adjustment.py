@@ -164,7 +164,7 @@ def _of_rays(
 
 
 def _sparse(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
-    """Return the matrix (m, size) with values (m, k) in these columns (m, k); a column below 0 is fixed."""
-    row = np.broadcast_to(np.arange(len(columns))[:, None], columns.shape)
+    """Return the matrix (m, size) with values (m, k) in these columns (m, k), ascending; a column below 0 is fixed."""
     free = columns >= 0
-    return sparse.csr_matrix((values[free], (row[free], columns[free])), shape=(len(columns), size))
+    ends = np.concatenate([[0], np.cumsum(free.sum(axis=1))])
+    return sparse.csr_matrix((values[free], columns[free], ends), shape=(len(columns), size))
