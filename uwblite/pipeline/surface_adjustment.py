@@ -153,10 +153,12 @@ def _of_rays(
     """Return the normal equations of rays, robustly weighted, with residuals times a factor."""
     lines = linearized(rays, surfaces, sensors, graph.poses)
     root = factor / (1.0 + (lines.residual / _KERNEL) ** 2)
-    by_pose = _sparse(unknowns.number["poses"][rays.keyframe], lines.by_pose * root[:, None], unknowns.size)
+    for values in (lines.by_pose, lines.by_surface):
+        values *= root[:, None]
+    by_pose = _sparse(unknowns.number["poses"][rays.keyframe], lines.by_pose, unknowns.size)
     count = len(surfaces.facing)
     columns = 4 * rays.surface[:, None] + np.arange(4)
-    by_surface = _sparse(columns, lines.by_surface * root[:, None], 4 * count)
+    by_surface = _sparse(columns, lines.by_surface, 4 * count)
     own = np.broadcast_to(np.diag(_PRIOR**-2.0), (count, 4, 4))
     slope = np.zeros((count, 4))
     slope[:, 2] = surfaces.offset * _PRIOR[2] ** -2.0
