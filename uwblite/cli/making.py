@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from ..constraints import Constraints
     from ..map_result import MapResult
-    from ..mapping import MappingConfig, Progress
+    from ..mapping import MappingConfig, Progress, Stage
     from ..sensor_log import SensorLog
 
 
@@ -58,12 +58,18 @@ def make(
     from ..mapping import MappingConfig, build_map
     from ..pipeline.mapping_config import preset
     from ..pipeline.scan_selection import prepared
+    from .freed_memory import give_back
+
+    def report(stage: "Stage", done: int, total: int) -> object:
+        if done >= total:
+            give_back()
+        return progress(stage, done, total) if progress is not None else None
 
     config, constraints = settings(args), known(args)
     began = time.perf_counter()
     kept = [prepared(logs.pop(0), config) for _ in range(len(logs))]
     log = kept[0] if len(kept) == 1 else kept
-    result = build_map(log, config, constraints=constraints, progress=progress, executor=executor, clock=time.perf_counter)
+    result = build_map(log, config, constraints=constraints, progress=report, executor=executor, clock=time.perf_counter)
     record = RunRecord(
         command=repeat_command(args),
         config=config_text(config),
