@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.laser_walks import scanned
 
+from uwblite.lidar import walls as walls_module
 from uwblite.lidar.walls import find_walls, stretches
 
 ALONG = np.column_stack([np.arange(0.0, 6.0, 0.4), np.zeros(15), np.zeros(15)])
@@ -37,3 +38,18 @@ def test_a_bent_wall_is_none():
     inner = np.column_stack([11.0 * np.sin(angle[::4]), 12.0 - 11.0 * np.cos(angle[::4]) - 1.0, angle[::4]])
     found = walls_from(inner, np.column_stack([arc[:-1], arc[1:]]))
     assert len(found.centre) == 0
+
+
+def test_walls_found_strip_by_strip_are_those_found_at_once(monkeypatch):
+    """Strips of a few places each, of a hall with a column row between its long walls, seen from two aisles."""
+    across = np.column_stack([np.arange(0.0, 6.0, 0.4), np.full(15, 2.5), np.full(15, 0.2)])
+    poses = np.concatenate([ALONG, across])
+    room = [[-3.0, -1.0, 9.0, -1.0], [9.0, -1.0, 9.0, 4.0], [9.0, 4.0, -3.0, 4.0], [-3.0, 4.0, -3.0, -1.0]]
+    room += [[x, 1.0, x + 1.0, 1.0] for x in (0.0, 3.0, 6.0)] + [[x + 1.0, 1.3, x, 1.3] for x in (0.0, 3.0, 6.0)]
+    whole = walls_from(poses, room)
+    monkeypatch.setattr(walls_module, "_AT_ONCE", 7)
+    monkeypatch.setattr(walls_module, "_POINTS_AT_ONCE", 50)
+    parts = walls_from(poses, room)
+    assert len(whole.centre) >= 6
+    for name in ("of_stretch", "centre", "normal"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))

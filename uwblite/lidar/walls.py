@@ -1,5 +1,6 @@
 """Straight walls: stretches of single clouds that are straight, and which stretches of many clouds are one wall."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,31 +132,74 @@ def find_walls(clouds: Clouds, found: Stretches, poses: Floats) -> Walls:
     stretch, owner = found.of_point[rows], clouds.owner[rows]
     at = se2.transform(poses[owner], clouds.points[rows].astype(np.float64))
     normal = se2.rotate(poses[owner, 2], found.normal[stretch])
-    one, other = _together(at, normal)
-    many = len(found.straight)
-    ties = sparse.coo_matrix((np.ones(len(one)), (stretch[one], stretch[other])), shape=(many, many))
-    number = connected_components(ties, directed=False)[1]
+    number = _joined(stretch, at, normal, len(found.straight))
     return _judged(number, stretch, at, normal, found)
 
 
 def _places(found: Stretches) -> Ints:
     """Return rows of points on straight stretches, one every so often, none near an end."""
-    rows = np.flatnonzero(found.straight[found.of_point] & found.inside(found.of_point, found.along))
-    key = np.stack([found.of_point[rows], np.floor(found.along[rows] / _EVERY).astype(np.int64)], axis=1)
+    return np.concatenate([_places_among(found, part) for part in _parts(found.of_point)] or [np.zeros(0, dtype=np.int64)])
+
+
+def _parts(of_point: Ints) -> Iterator[slice]:
+    """Yield the points of whole stretches, about so many at a time; of_point (p,) is ascending."""
+    first = 0
+    while first < len(of_point):
+        last = min(first + _POINTS_AT_ONCE, len(of_point)) - 1
+        yield slice(first, first := int(np.searchsorted(of_point, of_point[last], "right")))
+
+
+_POINTS_AT_ONCE = 1 << 17
+"""Points among which places are chosen at once; bounds the memory."""
+
+
+def _places_among(found: Stretches, part: slice) -> Ints:
+    stretch, along = found.of_point[part], found.along[part]
+    rows = np.flatnonzero(found.straight[stretch] & found.inside(stretch, along))
+    key = np.stack([stretch[rows], np.floor(along[rows] / _EVERY).astype(np.int64)], axis=1)
     number = unique_rows(key)[1]
-    return rows[np.unique(number, return_index=True)[1]]
+    return part.start + rows[np.unique(number, return_index=True)[1]]
+
+
+def _joined(stretch: Ints, at: Floats, normal: Floats, many: int) -> Ints:
+    """Return the number (s,) of the set of each of many stretches: those are one whose places (m, 2), with normals (m, 2), lie
+    on one line and face the same way."""
+    one, other = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for rows in _strips(at):
+        a, b = _together(at[rows], normal[rows])
+        of_place = stretch[rows]
+        # A tie of each place with its first neighbour joins as much as all of its ties do, of which there may be thousands.
+        own = _connected(a, b, len(rows))
+        first = np.unique(own, return_index=True)[1]
+        one.append(of_place)
+        other.append(of_place[first[own]])
+    return _connected(np.concatenate(one), np.concatenate(other), many)
+
+
+def _strips(at: Floats) -> Iterator[Ints]:
+    """Yield rows of places (m, 2), a bounded number at a time: strips of the map that overlap by the reach."""
+    order = np.argsort(at[:, 0], kind="stable")
+    x = at[order, 0]
+    for first in range(0, len(x), _AT_ONCE):
+        last = min(first + _AT_ONCE, len(x))
+        yield order[first : np.searchsorted(x, x[last - 1] + _REACH, "right")]
+
+
+_AT_ONCE = 1 << 13
+"""Places of a strip; bounds the memory."""
+
+
+def _connected(one: Ints, other: Ints, many: int) -> Ints:
+    """Return the number (n,) of the part to which each of many nodes belongs, by ties (e,), (e,)."""
+    ties = sparse.coo_matrix((np.ones(len(one), dtype=np.int8), (one, other)), shape=(many, many))
+    return np.asarray(connected_components(ties, directed=False)[1], dtype=np.int64)
 
 
 def _together(at: Floats, normal: Floats) -> tuple[Ints, Ints]:
     """Return pairs of places (m, 2) with normals (m, 2) that lie on one line and face the same way."""
     pairs = cKDTree(at).query_pairs(_REACH, output_type="ndarray")
-    parts = [pairs[k : k + _AT_ONCE] for k in range(0, max(len(pairs), 1), _AT_ONCE)]
-    one, other = np.concatenate([part[_on_one_line(part[:, 0], part[:, 1], at, normal)] for part in parts]).T
+    one, other = pairs[_on_one_line(pairs[:, 0], pairs[:, 1], at, normal)].T
     return one, other
-
-
-_AT_ONCE = 1 << 17
-"""Pairs of places that are compared at once; bounds the memory."""
 
 
 def _on_one_line(one: Ints, other: Ints, at: Floats, normal: Floats) -> Bools:
