@@ -4,7 +4,7 @@ import numpy as np
 from helpers.planted_graphs import loop
 from scipy import sparse
 
-from uwblite.graph.eliminated import WithBlocks, blocks_of, step
+from uwblite.graph.eliminated import Blocks, WithBlocks, blocks_of, step, summed
 from uwblite.graph.marginals import Marginals, factor_of
 from uwblite.graph.normal_equations import filled
 
@@ -21,7 +21,11 @@ def planted(n=12):
     by_block[np.arange(m)[:, None], block[:, None] * k + np.arange(k)] = rng.standard_normal((m, k))
     residual, prior = rng.standard_normal(m), np.tile(np.diag([1.0, 2.0, 3.0, 4.0]), (count, 1, 1))
     slope = rng.standard_normal((count, k))
-    blocks = blocks_of(sparse.csr_matrix(by_graph), sparse.csr_matrix(by_block), residual, prior, slope)
+    none = sparse.csr_matrix((size, size)), sparse.csr_matrix((count * k, size))
+    blocks = Blocks(*none, prior, np.zeros(size), slope)
+    for rows in (slice(0, 25), slice(25, m)):
+        some = sparse.csr_matrix(by_graph[rows]), sparse.csr_matrix(by_block[rows])
+        blocks = summed(blocks, blocks_of(*some, residual[rows], k))
     whole, jacobian = np.zeros((size + count * k,) * 2), np.hstack([by_graph, by_block])
     whole[:size, :size] = normal.matrix.toarray()
     for b in range(count):

@@ -7,7 +7,6 @@ import pytest
 from helpers.laser_walks import scanned
 
 from uwblite import se2
-from uwblite.lidar import surface_rays
 from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.surface_rays import SurfaceRays, Surfaces, linearized, on_columns, on_stretches, rays_around
 from uwblite.lidar.walls import stretches
@@ -62,14 +61,6 @@ def test_derivatives_are_those_of_the_residuals():
         step[:, k] = small
         ends = [residuals(rays, SURFACES.moved(sign * step), POSES) for sign in (1.0, -1.0)]
         np.testing.assert_allclose(found.by_surface[:, k], (ends[0] - ends[1]) / (2.0 * small), atol=1e-3)
-
-
-def test_rays_linearised_in_parts_are_as_if_at_once(monkeypatch):
-    whole = linearized(rays_that_end(0.01), SURFACES, POSES, POSES)
-    monkeypatch.setattr(surface_rays, "_AT_ONCE", 1)
-    parts = linearized(rays_that_end(0.01), SURFACES, POSES, POSES)
-    for name in ("residual", "by_pose", "by_surface"):
-        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
 
 
 def test_noise_along_a_ray_does_not_change_its_lever_arm():

@@ -11,7 +11,9 @@ from trials import made
 
 from uwblite import mapping
 from uwblite.graph.marginals import marginals
+from uwblite.graph.normal_equations import filled
 from uwblite.mapping import MappingConfig, build_map
+from uwblite.pipeline import surface_adjustment
 from uwblite.pipeline.map_frame import moved
 from uwblite.pipeline.surface_adjustment import adjust_surfaces, for_covariances
 
@@ -59,6 +61,22 @@ def test_rays_make_covariances_smaller_in_whatever_frame_the_map_is(around):
     sizes = [np.sqrt(np.trace(c.poses[1:, :2, :2], axis1=1, axis2=2)) for c in (*found, plain)]
     np.testing.assert_allclose(sizes[1], sizes[0], rtol=1e-4)
     assert np.median(sizes[0] / sizes[2]) < 0.9
+
+
+def test_rays_some_at_a_time_say_what_they_say_at_once(around, monkeypatch):
+    after, task = around["after"], around["task"]
+    graph = replace(after.graph, edges=(*after.odometry_and_ranges, after.joint))
+    _, rays = for_covariances(after.surfaces, graph, task)
+    unknowns = filled(graph, subtrees=True).unknowns
+    whole = rays(unknowns)
+    monkeypatch.setattr(surface_adjustment, "_RAYS_AT_ONCE", len(after.surfaces.rays.keyframe) // 3)
+    parts = rays(unknowns)
+    for name in ("among", "across"):
+        one, other = getattr(parts, name), getattr(whole, name)
+        assert abs(one - other).max() < 1e-12 * abs(other).max()
+    for name in ("own", "slope", "own_slope"):
+        scale = np.abs(getattr(whole, name)).max()
+        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-10, atol=1e-12 * scale)
 
 
 def test_without_pairs_of_clouds_nothing_is_adjusted(around):

@@ -34,25 +34,26 @@ class Blocks:
     across: sparse.csr_matrix
     """(b k, n) B."""
     own: Floats
-    """(b, k, k) D, regular."""
+    """(b, k, k) D; regular where it is eliminated."""
     slope: Floats
     """(n,) g_x."""
     own_slope: Floats
     """(b, k) g_s."""
 
 
-def blocks_of(by_graph: sparse.csr_matrix, by_block: sparse.csr_matrix, residual: Floats, own: Floats, slope: Floats) -> Blocks:
-    """Return the normal equations of whitened residuals (m,) with Jacobians (m, n) and (m, b k).
-
-    Parameters
-    ----------
-    own, slope : (b, k, k) and (b, k), what priors add to D and to g_s.
-    """
+def blocks_of(by_graph: sparse.csr_matrix, by_block: sparse.csr_matrix, residual: Floats, k: int) -> Blocks:
+    """Return the normal equations of whitened residuals (m,) with Jacobians (m, n) and (m, b k)."""
     among, across = sparse.csr_matrix(by_graph.T @ by_graph), sparse.csr_matrix(by_block.T @ by_graph)
-    entries, k = (by_block.T @ by_block).tocoo(), own.shape[1]
-    whole = own.copy()
-    np.add.at(whole, (entries.row // k, entries.row % k, entries.col % k), entries.data)
-    return Blocks(among, across, whole, by_graph.T @ residual, slope + (by_block.T @ residual).reshape(slope.shape))
+    entries, count = (by_block.T @ by_block).tocoo(), by_block.shape[1] // k
+    own = np.zeros((count, k, k))
+    np.add.at(own, (entries.row // k, entries.row % k, entries.col % k), entries.data)
+    return Blocks(among, across, own, by_graph.T @ residual, (by_block.T @ residual).reshape(count, k))
+
+
+def summed(one: Blocks, other: Blocks) -> Blocks:
+    """Return the normal equations of the measurements of both."""
+    slope, own_slope = one.slope + other.slope, one.own_slope + other.own_slope
+    return Blocks(one.among + other.among, one.across + other.across, one.own + other.own, slope, own_slope)
 
 
 def step(normal: NormalEquations, blocks: Blocks, precondition: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:

@@ -193,27 +193,13 @@ class RayEquations:
 
 
 def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayEquations:
-    """Linearise rays at their surfaces, some at a time.
+    """Linearise rays at their surfaces.
 
     Parameters
     ----------
     sensors : (k, 3) frames of the clouds in the map, where the laser's mounting and clock put them. poses : (k, 3) of the
         base, about which these turn.
     """
-    count = len(rays.keyframe)
-    found = RayEquations(np.empty(count), np.empty((count, 3)), np.empty((count, 4)))
-    for first in range(0, count, _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        own = _linearized(rays.rows(part), surfaces, sensors, poses)
-        found.residual[part], found.by_pose[part], found.by_surface[part] = own.residual, own.by_pose, own.by_surface
-    return found
-
-
-_AT_ONCE = 1 << 16
-"""Rays that are linearised at once; bounds the memory."""
-
-
-def _linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayEquations:
     at, direction = in_map(rays, sensors)
     at -= surfaces.offset[rays.surface, None] * direction
     away, curved = at - surfaces.place[rays.surface], surfaces.round[rays.surface]

@@ -20,7 +20,7 @@ from scipy import sparse
 from .. import se2
 from ..arrays import Floats, Ints, concatenated
 from ..graph.calibration import LASER
-from ..graph.eliminated import Blocks, blocks_of, step
+from ..graph.eliminated import Blocks, blocks_of, step, summed
 from ..graph.graph import Graph
 from ..graph.marginals import factor_of
 from ..graph.normal_equations import filled
@@ -30,6 +30,7 @@ from ..lidar.joint_refinement import with_fewer_pairs
 from ..lidar.round_columns import find_columns, fitted_circles
 from ..lidar.surface_rays import (
     MeasuredSurfaces,
+    RayEquations,
     SurfaceRays,
     Surfaces,
     fitted_columns,
@@ -150,19 +151,35 @@ def _adjusted(
 def _of_rays(
     rays: SurfaceRays, surfaces: Surfaces, graph: Graph, sensors: Floats, unknowns: Unknowns, factor: float = 1.0
 ) -> Blocks:
-    """Return the normal equations of rays, robustly weighted, with residuals times a factor."""
-    lines = linearized(rays, surfaces, sensors, graph.poses)
+    """Return the normal equations of rays and of what is known of surfaces, some rays at a time; residuals times a factor."""
+    total = _priors(surfaces, unknowns)
+    for first in range(0, len(rays.keyframe), _RAYS_AT_ONCE):
+        some = rays.rows(slice(first, first + _RAYS_AT_ONCE))
+        lines = linearized(some, surfaces, sensors, graph.poses)
+        total = summed(total, _of_some(some, lines, len(surfaces.facing), unknowns, factor))
+    return total
+
+
+_RAYS_AT_ONCE = 1 << 16
+"""Rays that are linearised at once; bounds the memory."""
+
+
+def _priors(surfaces: Surfaces, unknowns: Unknowns) -> Blocks:
+    """Return the normal equations of what is known of surfaces beforehand."""
+    count, size = len(surfaces.facing), unknowns.size
+    own, slope = np.tile(np.diag(_PRIOR**-2.0), (count, 1, 1)), np.zeros((count, 4))
+    slope[:, 2] = surfaces.offset * _PRIOR[2] ** -2.0
+    return Blocks(sparse.csr_matrix((size, size)), sparse.csr_matrix((4 * count, size)), own, np.zeros(size), slope)
+
+
+def _of_some(rays: SurfaceRays, lines: RayEquations, count: int, unknowns: Unknowns, factor: float) -> Blocks:
+    """Return the normal equations of rays on as many surfaces, robustly weighted."""
     root = factor / (1.0 + (lines.residual / _KERNEL) ** 2)
     for values in (lines.by_pose, lines.by_surface):
         values *= root[:, None]
     by_pose = _sparse(unknowns.number["poses"][rays.keyframe], lines.by_pose, unknowns.size)
-    count = len(surfaces.facing)
-    columns = 4 * rays.surface[:, None] + np.arange(4)
-    by_surface = _sparse(columns, lines.by_surface, 4 * count)
-    own = np.broadcast_to(np.diag(_PRIOR**-2.0), (count, 4, 4))
-    slope = np.zeros((count, 4))
-    slope[:, 2] = surfaces.offset * _PRIOR[2] ** -2.0
-    return blocks_of(by_pose, by_surface, lines.residual * root, own, slope)
+    by_surface = _sparse(4 * rays.surface[:, None] + np.arange(4), lines.by_surface, 4 * count)
+    return blocks_of(by_pose, by_surface, lines.residual * root, 4)
 
 
 def _sparse(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
