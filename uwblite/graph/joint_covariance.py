@@ -29,7 +29,7 @@ class JointCovariance:
         whitened = lapack.dtrtri(lower, lower=1, unitdiag=1, overwrite_c=1)[0]
         whitened /= np.sqrt(pivots)[:, None]
         self._graph = graph
-        self._covariance: Floats = whitened.T @ whitened
+        self._lower: Floats = lapack.dlauum(whitened, lower=1, overwrite_c=1)[0]
         self._row = np.where(number >= size, place[np.maximum(number - size, 0)], -1)
 
     def relative(self, i: ArrayLike, j: ArrayLike) -> Floats:
@@ -46,19 +46,23 @@ class JointCovariance:
     def _among(self, a: Ints, b: Ints) -> Floats:
         """Return the covariances (m, 3, 3) between poses a (m,) and b (m,)."""
         row, column = self._row[a][:, :, None], self._row[b][:, None, :]
-        return np.asarray(self._covariance[row, column] * ((row >= 0) & (column >= 0)))
+        covariance = self._lower[np.maximum(row, column), np.minimum(row, column)]
+        return np.asarray(covariance * ((row >= 0) & (column >= 0)))
 
 
 def _last_block(graph: Graph, poses: Ints) -> tuple[Ints, int, Floats, Floats, Ints]:
     """Return the end of the factor with these poses last: their places among the unknowns (k, 3), -1 = fixed, and what it
     takes to read it: where the block begins, L2 (n, n), the diagonal of D2 (n,), and each unknown's row in them (n,)."""
     normal = filled(graph, last=poses)
-    factor, number = factor_of(normal), normal.unknowns.number["poses"]
+    factor, number, size = factor_of(normal), normal.unknowns.number["poses"], normal.unknowns.size
     # Behind the chosen poses stand only anchors and calibration.
     first = int(np.sum(number >= 0)) - int(np.sum(number[poses] >= 0))
-    place = factor.perm_c[np.arange(first, normal.unknowns.size)].astype(np.int64)
+    place = factor.perm_c[np.arange(first, size)].astype(np.int64)
     inside = np.sort(place)
-    return number, first, _dense(factor.L, inside), factor.U.diagonal()[inside], np.searchsorted(inside, place)
+    lower, pivots = factor.L, factor.U.diagonal()[inside]
+    # They hold the factor twice more, and what it was made of.
+    del normal, factor
+    return number, first, _dense(lower, inside), pivots, np.searchsorted(inside, place)
 
 
 def _dense(matrix: sparse.csc_matrix, rows: Ints) -> Floats:
