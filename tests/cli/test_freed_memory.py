@@ -19,21 +19,44 @@ def resident():
 @pytest.mark.skipif(not sys.platform.startswith("linux") or freed_memory._trim() is None, reason="no glibc")
 def test_what_is_freed_between_living_arrays_goes_back():
     """4,000 arrays of 64 kB, the size of which the heap keeps; every second of them lives on."""
+    freed = freed_memory.FreedMemory()
+    freed.give_back(over=True)
     arrays = [np.ones(8192) for _ in range(4000)]
     before = resident()
     del arrays[::2]
-    freed_memory.give_back()
+    freed.give_back(over=False)
     assert resident() < before - 100
     assert sum(a[0] for a in arrays) == 2000
 
 
+def test_within_a_stage_it_is_given_back_only_where_the_process_has_grown(monkeypatch):
+    trimmed, resident = [], iter([300, 200, 250, 263, 265, 210, 260])
+    monkeypatch.setattr(freed_memory, "_trim", lambda: trimmed.append)
+    monkeypatch.setattr(freed_memory, "_resident", lambda: next(resident) * MEGABYTE)
+    freed, counts = freed_memory.FreedMemory(), []
+    for _ in range(5):
+        freed.give_back(over=False)
+        counts.append(len(trimmed))
+    assert counts == [1, 1, 1, 2, 2]
+
+
+def test_at_the_end_of_a_stage_it_is_given_back_in_any_case(monkeypatch):
+    trimmed = []
+    monkeypatch.setattr(freed_memory, "_trim", lambda: trimmed.append)
+    monkeypatch.setattr(freed_memory, "_resident", lambda: 0)
+    freed_memory.FreedMemory().give_back(over=True)
+    assert trimmed == [0]
+
+
 def test_where_the_library_has_no_such_function_nothing_happens(monkeypatch):
     monkeypatch.setattr(freed_memory, "_trim", lambda: None)
-    freed_memory.give_back()
+    monkeypatch.setattr(freed_memory, "_resident", lambda: pytest.fail("nothing is to be measured"))
+    freed_memory.FreedMemory().give_back(over=True)
 
 
-def test_memory_is_given_back_at_the_end_of_each_stage(monkeypatch, room_log, tmp_path):
+def test_memory_is_given_back_within_and_between_the_stages_of_a_map(monkeypatch, room_log, tmp_path):
     times = []
-    monkeypatch.setattr(freed_memory, "give_back", lambda: times.append(1))
+    monkeypatch.setattr(freed_memory.FreedMemory, "give_back", lambda self, *, over: times.append(over))
     assert main(["map", str(room_log), "--out", str(tmp_path / "map"), "-q"]) in (0, 3)
-    assert len(times) > 10
+    assert sum(times) > 10
+    assert not all(times)

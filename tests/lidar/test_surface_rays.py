@@ -1,6 +1,6 @@
 """Rays on walls and columns: numeric derivatives, noise along the ray, bundles."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -61,6 +61,15 @@ def test_derivatives_are_those_of_the_residuals():
         step[:, k] = small
         ends = [residuals(rays, SURFACES.moved(sign * step), POSES) for sign in (1.0, -1.0)]
         np.testing.assert_allclose(found.by_surface[:, k], (ends[0] - ends[1]) / (2.0 * small), atol=1e-3)
+
+
+def test_packed_rays_say_the_same_to_some_micrometres():
+    rays = rays_that_end(0.01)
+    whole, packed = (linearized(r, SURFACES, POSES, POSES) for r in (rays, rays.packed()))
+    assert sum(getattr(rays.packed(), f.name).nbytes for f in fields(rays)) == 28 * len(rays.keyframe)
+    for name in ("residual", "by_pose", "by_surface"):
+        scale = np.abs(getattr(whole, name)).max()
+        np.testing.assert_allclose(getattr(packed, name), getattr(whole, name), atol=max(5e-6 / 0.01, 1e-6 * scale))
 
 
 def test_noise_along_a_ray_does_not_change_its_lever_arm():

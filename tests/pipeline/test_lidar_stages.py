@@ -90,10 +90,11 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
 
     What ranges err alike by direction is taken off before the last solution.
     """
-    made, shifts, scans, task = [], iter(moved), object(), SimpleNamespace(config=MappingConfig())
+    made, shifts, scans = [], iter(moved), object()
+    task = SimpleNamespace(config=MappingConfig(), stages=SimpleNamespace(report=lambda *_: None))
     estimate = SimpleNamespace(graph=SimpleNamespace(poses=None), moved_since=lambda before: next(shifts))
 
-    def solved(estimate, solver, optimizer):
+    def solved(estimate, solver, optimizer=None):
         made.append("solve" if solver == task.config.solver else "quick")
         return estimate
 

@@ -58,14 +58,14 @@ def make(
     from ..mapping import MappingConfig, build_map
     from ..pipeline.mapping_config import preset
     from ..pipeline.scan_selection import prepared
-    from .freed_memory import give_back
+    from .freed_memory import FreedMemory
+
+    config, constraints, freed = settings(args), known(args), FreedMemory()
 
     def report(stage: "Stage", done: int, total: int) -> object:
-        if done >= total:
-            give_back()
+        freed.give_back(over=done >= total)
         return progress(stage, done, total) if progress is not None else None
 
-    config, constraints = settings(args), known(args)
     began = time.perf_counter()
     kept = [prepared(logs.pop(0), config) for _ in range(len(logs))]
     log = kept[0] if len(kept) == 1 else kept

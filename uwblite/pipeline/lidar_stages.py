@@ -203,9 +203,11 @@ def _refine(
     stage: str,
 ) -> RefinementResult:
     """Refine a graph with pairs of clouds (e,), (e,)."""
+    report = task.stages.reporter(stage)
+    report(0, settings.rounds)
     return joint_refinement.refine(
-        graph.with_edges(*edges), scans.clouds, scans.raster, task.recordings.twist, i, j, settings,
-        task.config.solver, task.stages.reporter(stage), scans.delay,
+        graph.with_edges(*edges), scans.clouds, scans.raster, task.recordings.twist, i, j, settings, task.config.solver, report,
+        scans.delay,
     )  # fmt: skip
 
 
@@ -243,7 +245,10 @@ def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimat
         estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if estimate.moved_since(before) >= _STILL:
         estimate = with_range_noise(estimate, task.config)
-    return solved(_without_pattern(estimate, task), task.config.solver, optimizer)
+    # The covariances take as much memory as what was analysed.
+    del optimizer
+    task.stages.report("joint refinement", 1, 1)
+    return solved(_without_pattern(estimate, task), task.config.solver)
 
 
 def _without_pattern(estimate: Estimate, task: Task) -> Estimate:

@@ -63,9 +63,12 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
         return estimate
     fixed = estimate.graph.fixed_calibration | estimate.graph.calibration.of_kinds(*LASER)
     graph = replace(estimate.graph, fixed_calibration=fixed)
+    report = task.stages.reporter("surfaces")
+    report(0, _ROUNDS + 1)
     surfaces, rays = _found(_sensors(graph, joint, task), scans, task)
     if not len(rays.keyframe):
         return estimate
+    report(1, _ROUNDS + 1)
     graph, surfaces = _adjusted(graph, estimate, surfaces, rays, task)
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
     task.stages.end(
@@ -96,14 +99,17 @@ def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[Surfaces, Surf
     """Return the surfaces of the map with clouds at poses (k, 3), and their rays."""
     parts = stretches(scans.clouds)
     walls = find_walls(scans.clouds, parts, poses)
-    once = [(on_stretches(some, scans.clouds, scans.raster, parts), fitted_circles(some)) for some in _rays(scans, task)]
+    once = [
+        (on_stretches(some, scans.clouds, scans.raster, parts).packed(), fitted_circles(some)) for some in _rays(scans, task)
+    ]
     straight, circles = (concatenated(part) for part in zip(*once, strict=True))
+    del once
     columns = find_columns(circles, poses)
     around = concatenated([rays_around(some, poses, columns) for some in _rays(scans, task)])
     columns = fitted_columns(around, poses, columns)
     straight = replace(straight, surface=walls.of_stretch[straight.surface])
     rays = [straight.rows(straight.surface >= 0), on_columns(around, poses, columns, len(walls.centre))]
-    return surfaces_of(walls, columns), concatenated(rays)
+    return surfaces_of(walls, columns), concatenated([part.packed() for part in rays])
 
 
 def _sensors(graph: Graph, joint: ScanEdges, task: Task) -> Floats:
