@@ -6,12 +6,13 @@ import numpy as np
 
 from .. import se2
 from ..arrays import Floats
-from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_nonnegative_heights
+from ..graph.calibration import BIAS, HEIGHT, RANGE_SCALE, with_free, with_nonnegative_heights
 from ..graph.covariances import Covariances
 from ..graph.graph import Graph
 from ..graph.marginals import Marginals, marginals
 from ..graph.pose_edges import OdometryEdges, ScanEdges
 from ..graph.range_edges import RangeEdges
+from ..graph.solver import optimize
 from ..graph.unknowns import free_unknowns
 from ..grid.geometry import GridGeometry
 from ..grid.occupancy_grid import OccupancyGrid
@@ -21,6 +22,7 @@ from ..lidar.surface_errors import common_range_errors, with_range_errors
 from ..odometry.attached import choose_scans
 from ..odometry.keyframes import KeyframeConfig
 from ..odometry.wheels import with_noise_shown
+from ..radio.alike_heights import with_alike_heights
 from ..radio.anchor_covariance import anchors_with_correlated_errors, with_correlated_errors
 from ..radio.range_noise import RangeNoiseConfig
 from .estimate import Estimate, Task
@@ -148,10 +150,21 @@ def _anchors_alone(estimate: Estimate, task: Task) -> Estimate:
     graph, given = estimate.graph, at_given_poses(estimate.graph)
     if not any(free.any() for free in free_unknowns(given).values()):
         return estimate
+    given = _with_alike_heights(with_free(given, HEIGHT), estimate, task)
     done = solved(replace(estimate, graph=given), task.config.solver).graph
     # What the search itself has fixed are heights put back to 0.
-    fixed = graph.fixed_calibration | (done.fixed_calibration & ~given.fixed_calibration)
+    heights = graph.calibration.of_kinds(HEIGHT)
+    fixed = np.where(heights, done.fixed_calibration, graph.fixed_calibration)
+    graph = replace(graph, edges=given.edges)
     return replace(estimate, graph=replace(graph.with_estimates_of(done), fixed_calibration=fixed))
+
+
+def _with_alike_heights(given: Graph, estimate: Estimate, task: Task) -> Graph:
+    """Return a graph of anchors and their ranges at given poses with priors of heights by what all of them show."""
+    if estimate.ranges is None:
+        return given
+    shown = with_alike_heights(optimize(given.with_edges(estimate.ranges), task.config.solver)[0])
+    return replace(given, edges=shown.edges[: len(given.edges)])
 
 
 def at_given_poses(graph: Graph) -> Graph:
