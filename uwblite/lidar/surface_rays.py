@@ -89,8 +89,9 @@ class SurfaceRays(Table):
 
     def packed(self) -> "SurfaceRays":
         """Return the rays in half the memory: single precision is a few micrometres at the reach of a lidar, as in clouds."""
-        numbers = (v.astype(np.int32) for v in (self.keyframe, self.surface))
-        return SurfaceRays(*numbers, *(v.astype(np.float32) for v in (self.points, self.directions, self.sigma)))
+        keyframe, surface = (v.astype(np.int32) for v in (self.keyframe, self.surface))
+        points, directions, sigma = (v.astype(np.float32) for v in (self.points, self.directions, self.sigma))
+        return SurfaceRays(keyframe, surface, points, directions, sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -55,8 +55,7 @@ def match_scan_to_scan(estimate: Estimate, task: Task) -> Estimate:
         estimate = _at_delay(estimate, late, delay, task)
         now = task.following(estimate)
         if abs(late) < _SAME_STEPS:
-            gate = task.config.refinement.later_gate
-            estimate = _refined_neighbours(estimate, estimate.graph, gate, now)
+            estimate = _refined_neighbours(estimate, estimate.graph, task.config.refinement.later_gate, now)
         else:
             estimate = _match_neighbours(*_descended(estimate, now), now)
     return estimate
@@ -205,10 +204,8 @@ def _refine(
     """Refine a graph with pairs of clouds (e,), (e,)."""
     report = task.stages.reporter(stage)
     report(0, settings.rounds)
-    return joint_refinement.refine(
-        graph.with_edges(*edges), scans.clouds, scans.raster, task.recordings.twist, i, j, settings, task.config.solver, report,
-        scans.delay,
-    )  # fmt: skip
+    graph, twist, solver = graph.with_edges(*edges), task.recordings.twist, task.config.solver
+    return joint_refinement.refine(graph, scans.clouds, scans.raster, twist, i, j, settings, solver, report, scans.delay)
 
 
 def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
@@ -225,6 +222,7 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
         "joint refinement", pairs=len(i), used=int(refined.used.sum()), rounds=refined.rounds,
         sigma=round(refined.sigma, 4), shift=round(estimate.moved_since(before), 5), **solver_figures(refined.summary),
     )  # fmt: skip
+    del refined, i, j  # Matches of all pairs are large.
     return estimate if estimate.ranges is None or estimate.joint is None else _by_own_errors(estimate, scans, task)
 
 
@@ -245,8 +243,7 @@ def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimat
         estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if estimate.moved_since(before) >= _STILL:
         estimate = with_range_noise(estimate, task.config)
-    # The covariances take as much memory as what was analysed.
-    del optimizer
+    del optimizer  # What it analysed is as large as the covariances.
     task.stages.report("joint refinement", 1, 1)
     return solved(_without_pattern(estimate, task), task.config.solver)
 
