@@ -10,6 +10,7 @@ from helpers.planted import aligned_error, box
 from scipy import sparse
 
 from uwblite import se2
+from uwblite.arrays import rms_length
 from uwblite.graph.calibration import scan_indices
 from uwblite.graph.graph import Calibration, Graph
 from uwblite.graph.marginals import marginals
@@ -22,6 +23,7 @@ from uwblite.lidar.joint_refinement import (
     _best_views,
     _surfaces_moved,
     choose_pairs,
+    measured_again,
     refine,
     surface_cells,
     with_fewer_pairs,
@@ -240,6 +242,20 @@ def test_a_cloud_in_many_pairs_informs_each_of_them_less():
     _, root = measured(result.factors, np.zeros((len(alike), 3)), result.sigma**2 * CONFIG.correlation * alike)
     sizes = [np.linalg.svd(r, compute_uv=False) for r in (root[result.used], result.edges.sqrt_information)]
     np.testing.assert_allclose(sizes[1], sizes[0], rtol=1e-6, atol=1e-6 * sizes[0].max())
+
+
+def test_pairs_measured_again_say_the_same_and_less_where_points_weigh_less():
+    truth, path, clouds = room(6, 0.01, 8.0)
+    result = refined(Graph(truth).with_edges(chained(truth, NOISE)), clouds, path)
+    raster = rasterize(clouds, 0.2 * CONFIG.first_gate, CONFIG.first_gate)
+    again = [
+        measured_again(result.edges, result.graph, clouds, raster, CONFIG, np.full(len(clouds.points), w)) for w in (1.0, 0.25)
+    ]
+    sizes = [np.linalg.norm(e.sqrt_information, axis=(1, 2)) for e in (result.edges, *again)]
+    # The width of the kernel is that of the noise assumed beforehand, not of the noise learnt.
+    np.testing.assert_allclose(np.median(sizes[1] / sizes[0]), 1.0, atol=0.1)
+    np.testing.assert_allclose(np.median(sizes[2] / sizes[1]), 0.5, atol=0.05)
+    assert rms_length(se2.between(result.edges.T_i_j, again[0].T_i_j)) < 0.002
 
 
 @pytest.mark.parametrize(("convergence", "rounds"), [(1e9, 2), (0.0, 8)])

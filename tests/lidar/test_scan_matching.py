@@ -11,7 +11,7 @@ from uwblite import se2
 from uwblite.graph.graph import Graph
 from uwblite.graph.pose_edges import RelativePoseEdges
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.scan_matching import PairFactors, match, measured, nondegenerate_step, pair_points
+from uwblite.lidar.scan_matching import PairFactors, PairPoints, match, measured, nondegenerate_step, pair_points
 
 
 @settings(max_examples=20)
@@ -89,6 +89,20 @@ def test_factors_are_those_of_the_cost_with_fixed_matches(seed):
 
         slope = [(cost(pose[e] + d) - cost(pose[e] - d)) / (2 * step) for d in step * np.eye(3)]
         np.testing.assert_allclose(factors.gradient[e], slope, rtol=1e-4, atol=1e-6)
+
+
+def test_a_point_of_weight_two_counts_as_two_and_one_of_none_not_at_all():
+    truth = np.array([[0.0, 0.0, 0.3], [0.5, -0.4, 0.9]])
+    clouds = scanned(truth, ROOM, 0.01, 3)
+    raster, i, j = rasterize(clouds, 0.05, 0.4), np.array([0]), np.array([1])
+    pose, points = se2.between(truth[i], truth[j]) + 0.01, pair_points(clouds, j, 120)
+    rows, weight = points.of(0), np.ones(len(clouds.points))
+    weight[rows[::2]], weight[rows[1::2]] = 2.0, 0.0
+    whole = match(clouds, raster, i, pose, points, 0.3, 0.08, weight)
+    half = match(clouds, raster, i, pose, PairPoints(rows[None, ::2].astype(np.int32)), 0.3, 0.08)
+    for name in ("hessian", "gradient", "spurious", "squared", "weight"):
+        np.testing.assert_allclose(getattr(whole, name), 2.0 * getattr(half, name), rtol=1e-9, atol=1e-9)
+    assert whole.asked[0] == len(rows)
 
 
 def converged(clouds, raster, i, j, guess, gates=(0.4, 0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1)):

@@ -8,8 +8,17 @@ from helpers.laser_walks import scanned
 
 from uwblite import se2
 from uwblite.lidar.cloud_rasters import rasterize
-from uwblite.lidar.surface_rays import SurfaceRays, Surfaces, linearized, on_columns, on_stretches, rays_around
-from uwblite.lidar.walls import stretches
+from uwblite.lidar.surface_rays import (
+    SurfaceRays,
+    Surfaces,
+    linearized,
+    noise_of,
+    on_columns,
+    on_stretches,
+    points_on,
+    rays_around,
+)
+from uwblite.lidar.walls import find_walls, stretches
 from uwblite.odometry.attached import ScanPoints
 
 POSES = np.array([[0.3, -0.2, 0.4], [1.1, 0.3, -2.0]])
@@ -102,8 +111,43 @@ def test_rays_of_a_wall_are_bundled_and_lie_on_it(noise):
     assert 60 <= len(found.keyframe) <= 76
     off = found.points[:, 1] - 1.0
     assert np.abs(off).max() < max(4.0 * 0.5 * noise, 2e-3)
-    # Four rays that err alike weigh as one of 1 cm.
-    assert np.median(found.sigma) == pytest.approx(0.0106, abs=0.001)
+    # The mean of four rays of 1 cm.
+    assert np.median(found.sigma) == pytest.approx(0.0053, abs=0.0005)
+
+
+def test_noise_is_learnt_from_the_rays_of_each_place_on_a_surface():
+    """On a wall of 8 m, of which every metre stands off by its own error, half as large as the noise of a ray."""
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-4.0, 4.0, 4000)
+    bent = 0.5 * rng.standard_normal(8)[np.floor(x + 4.0).astype(int)]
+    y = 2.0 + 0.02 * (np.sqrt(0.75) * rng.standard_normal(4000) + bent)
+    way, nothing = np.column_stack([np.zeros(4000), np.ones(4000)]), np.zeros(4000, dtype=np.int64)
+    rays = SurfaceRays(nothing, nothing, np.column_stack([x, y]), way, np.full(4000, 0.02))
+    wall = Surfaces(np.array([False]), np.array([[0.0, 2.0]]), np.array([-np.pi / 2]), np.zeros(1), np.ones(1))
+    noise = noise_of(rays, wall, np.zeros((1, 3)), np.zeros((1, 3)))
+    assert noise.relative(np.array([2.5]))[0] == pytest.approx(1.0, abs=0.15)
+    place = np.floor(x).astype(int)
+    sums = [((y - 2.0)[place == k] / 0.02).sum() ** 2 for k in range(-4, 4)]
+    assert noise.alike[0] == pytest.approx(8 / 6 * np.sum(sums) / np.sum(((y - 2.0) / 0.02) ** 2), rel=0.15)
+    assert noise.alike[0] > 20.0
+
+
+def test_points_of_clouds_are_told_walls_columns_and_the_rest():
+    """A box, a column and a wall that single clouds see too little of."""
+    poses = np.column_stack([np.linspace(-1.0, 1.0, 9), np.zeros(9), np.zeros(9)])
+    angle = np.linspace(0.0, 2.0 * np.pi, 33)
+    ring = np.array([0.0, 1.2]) + 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
+    box = [[-3.0, -2.0, 3.0, -2.0], [3.0, -2.0, 3.0, 2.5], [3.0, 2.5, -3.0, 2.5], [-3.0, 2.5, -3.0, -2.0]]
+    walls = np.concatenate([box, [[1.5, -1.0, 1.7, -1.0]], np.column_stack([ring[:-1], ring[1:]])])
+    clouds = scanned(poses, walls, beams=720, reach=5.0)
+    parts = stretches(clouds)
+    kind = points_on(clouds, poses, find_walls(clouds, parts, poses), parts, np.array([[0.0, 1.2, 0.3]]))
+    at = se2.transform_each(poses, clouds.owner, clouds.points.astype(float))
+    round_one = np.abs(np.hypot(at[:, 0], at[:, 1] - 1.2) - 0.3) < 0.02
+    assert np.all(kind[round_one] == 1)
+    assert np.all(kind[(np.abs(at[:, 1] + 1.0) < 0.02) & (np.abs(at[:, 0] - 1.6) < 0.1)] == -1)
+    flat = (np.abs(at[:, 1] + 2.0) < 0.02) & (np.abs(at[:, 0]) < 2.0)
+    assert np.mean(kind[flat] == 0) > 0.9
 
 
 def test_only_rays_that_face_a_column_count():

@@ -12,8 +12,8 @@ from trials import made
 from uwblite import mapping
 from uwblite.graph.marginals import marginals
 from uwblite.graph.normal_equations import filled
+from uwblite.lidar import surface_rays
 from uwblite.mapping import MappingConfig, build_map
-from uwblite.pipeline import surface_adjustment
 from uwblite.pipeline.map_frame import moved
 from uwblite.pipeline.surface_adjustment import adjust_surfaces, for_covariances
 
@@ -69,7 +69,7 @@ def test_rays_some_at_a_time_say_what_they_say_at_once(around, monkeypatch):
     _, rays = for_covariances(after.surfaces, graph, task)
     unknowns = filled(graph, subtrees=True).unknowns
     whole = rays(unknowns)
-    monkeypatch.setattr(surface_adjustment, "_RAYS_AT_ONCE", len(after.surfaces.rays.keyframe) // 3)
+    monkeypatch.setattr(surface_rays, "_AT_ONCE", len(after.surfaces.rays.keyframe) // 3)
     parts = rays(unknowns)
     for name in ("among", "across"):
         one, other = getattr(parts, name), getattr(whole, name)

@@ -214,10 +214,7 @@ def refine(
         if used.any() and gate < 0.25:
             sigma = float(np.sqrt(factors.squared[used].sum() / max(factors.weight[used].sum(), 1.0)))
             sigma = max(sigma, 0.25 * config.sigma)
-        degree = np.bincount(i[used], minlength=len(clouds)) + np.bincount(j[used], minlength=len(clouds))
-        shared = 0.5 * (degree[i] + degree[j])
-        variance = sigma**2 * config.correlation * np.maximum(shared / 2.0, 1.0)
-        z, sqrt_information = measured(factors, T_i_j, variance)
+        z, sqrt_information = measured(factors, T_i_j, sigma**2 * _shared(i, j, used, config))
         # Pairs that do not count stay in with no weight: then all rounds share one pattern, analysed once.
         edges = replace(probe, T_i_j=z, sqrt_information=sqrt_information, weights=used.astype(np.float64))
         solved, summary = optimizer.optimize(graph.with_edges(edges), brief)
@@ -234,6 +231,27 @@ def refine(
         whole = used.any() and len(summary.chi2_history) > 0 and summary.chi2_history[0] < summary.chi2_initial
         farthest = float(np.hypot(*(T_i_j - before)[used, :2].T).max()) if whole else gate
         gate = max(min(gate * config.shrink, _GATE_PER_SHIFT * farthest), config.last_gate)
+
+
+def _shared(i: Ints, j: Ints, used: Bools, config: RefinementConfig) -> Floats:
+    """Return the variance (e,) of a match of each pair by that of a point's distance: matches of one pair err alike, and those
+    of all pairs of one cloud use the same points."""
+    clouds = int(max(i.max(initial=-1), j.max(initial=-1))) + 1
+    degree = np.bincount(i[used], minlength=clouds) + np.bincount(j[used], minlength=clouds)
+    return config.correlation * np.maximum(0.25 * (degree[i] + degree[j]), 1.0)
+
+
+def measured_again(
+    pairs: ScanEdges, graph: Graph, clouds: Clouds, raster: CloudRasters, config: RefinementConfig, weight: Floats
+) -> ScanEdges:
+    """Return refined pairs as the poses of a graph have them, measured with weights (p,) of the clouds' points."""
+    T_i_j, points = pairs.relative(graph), pair_points(clouds, pairs.j, config.points)
+    gate = config.last_gate
+    factors = match(clouds, raster, pairs.i, T_i_j, points, gate, max(gate / 3.0, 2.5 * config.sigma), weight)
+    variance = factors.squared.sum() / max(factors.weight.sum(), 1.0)
+    shared = _shared(pairs.i, pairs.j, np.ones(len(pairs), dtype=bool), config)
+    z, sqrt_information = measured(factors, T_i_j, max(variance, (0.25 * config.sigma) ** 2) * shared)
+    return replace(pairs, T_i_j=z, sqrt_information=sqrt_information)
 
 
 _GATE_PER_SHIFT = 3.0

@@ -1,13 +1,90 @@
-"""Noise of single rays."""
+"""Noise of single rays: by data sheets, and as their residuals on known surfaces show it.
+
+Residuals show two things. How large the noise is, by distance: that of most scanners grows less than a data sheet allows. And
+how far residuals of one place are alike, since walls are not straight, columns not round, and neighbouring rays err alike:
+the variance of the sum of n residuals is then n times a factor, the design effect (L. Kish, Survey sampling, 1965), and n rays
+measure as much as n by that factor.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import MAD_TO_SIGMA, Bools, Floats, Ints
 
 _NEAR, _SHARE = 0.01, 0.01
 """Standard deviation of a range by data sheets: 10 mm up to 1 m, and 1 % beyond (URG-04LX; other scanners are better)."""
+_CLASSES = np.array([1.5, 3.0, 6.0, 12.0, 24.0])
+"""Bounds of the classes of distance whose noise is learnt apart, m."""
+_FEWEST = 200
+"""Rays that show the noise of a class."""
+_LEAST = 0.1
+"""Least noise, as a share of that by data sheets."""
+_CLIP = 3.0
+"""Standard deviations at which residuals are clipped: outliers say nothing of rays that count."""
+_MANY = 5
+"""Places from which on a surface shows how far its residuals are alike."""
+_FITTED = np.array([2, 3])
+"""Unknowns of a wall's line and a column's circle, which take their part of the sums of residuals away."""
+ALIKE = 4.0
+"""Design effect until one is learnt (as of matches of clouds: RefinementConfig.correlation)."""
 
 
 def range_sigma(reach: Floats) -> Floats:
-    """Return the standard deviation, m, of ranges (n,), m."""
+    """Return the standard deviation, m, of ranges (n,), m, by data sheets."""
     return np.maximum(_NEAR, _SHARE * reach)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayNoise:
+    """What residuals of rays show of their noise."""
+
+    by_distance: Floats
+    """(c,) noise by that of data sheets, by class of distance."""
+    alike: Floats
+    """(2,) design effect of rays on walls and on columns, 1 or more."""
+
+    def relative(self, reach: Floats) -> Floats:
+        """Return the noise (m,) of rays by that of data sheets."""
+        return np.asarray(self.by_distance[_class(reach)])
+
+
+UNLEARNT = RayNoise(np.ones(len(_CLASSES) + 1), np.full(2, ALIKE))
+
+
+def learnt_noise(residual: Floats, reach: Floats, place: Ints, surface: Ints, curved: Bools) -> RayNoise:
+    """Learn the noise of rays from their residuals.
+
+    Parameters
+    ----------
+    residual : (m,) in standard deviations by data sheets. reach : (m,) m. place : (m,) number of the place of each ray on
+        its surface. surface : (m,). curved : (s,) whether a surface is a column.
+    """
+    number = _class(reach)
+    by_distance = np.ones(len(_CLASSES) + 1)
+    for k in range(len(by_distance)):
+        own = np.abs(residual[number == k])
+        if len(own) >= _FEWEST:
+            by_distance[k] = max(MAD_TO_SIGMA * float(np.median(own)), _LEAST)
+    clipped = np.clip(residual / by_distance[number], -_CLIP, _CLIP)
+    return RayNoise(by_distance, _design_effects(clipped, place, surface, curved))
+
+
+def _class(reach: Floats) -> Ints:
+    return np.searchsorted(_CLASSES, reach, "right")
+
+
+def _design_effects(residual: Floats, place: Ints, surface: Ints, curved: Bools) -> Floats:
+    """Return the squared sums of residuals over places, by the sums of squares (2,), of walls and of columns."""
+    _, first, number = np.unique(np.stack([surface, place]), axis=1, return_index=True, return_inverse=True)
+    number, of = number.reshape(-1), surface[first]
+    sums, squares = np.bincount(number, residual), np.bincount(number, residual**2)
+    places = np.bincount(of, minlength=len(curved))
+    free = places - _FITTED[curved.astype(np.int64)]
+    share = np.where(places >= _MANY, places / np.maximum(free, 1), 0.0)[of]
+    found = np.full(2, ALIKE)
+    for kind in range(2):
+        own = (curved[of] == bool(kind)) & (share > 0.0)
+        if own.any():
+            found[kind] = max(1.0, float((share * sums**2)[own].sum() / max(squares[own].sum(), 1.0)))
+    return found

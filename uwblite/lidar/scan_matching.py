@@ -75,7 +75,8 @@ def pair_points(clouds: Clouds, j: Ints, limit: int) -> PairPoints:
 
 
 def match(
-    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float
+    clouds: Clouds, raster: CloudRasters, i: Ints, T_i_j: Floats, points: PairPoints, gate: float, scale: float,
+    weight: Floats | None = None,
 ) -> PairFactors:
     """Match the listed points of each pair's source cloud to lines of its target cloud i.
 
@@ -85,12 +86,15 @@ def match(
     points : what to look up, see pair_points.
     gate : matches farther apart, and with normals more than 45 degrees apart, do not count, m.
     scale : width of the Geman-McClure kernel on the point-to-line distance, m.
+    weight : (p,) of the clouds' points as source points; None = 1 each.
 
     Returns
     -------
     PairFactors. Residual r = n . (T_i_j p - q); its Jacobian by (x, y, theta) is (n, n . (d/dtheta R p)).
     """
-    return concatenated([_condensed(clouds, m, scale) for m in correspondences(clouds, raster, i, T_i_j, points, gate)])
+    root = None if weight is None else np.sqrt(weight)
+    found = correspondences(clouds, raster, i, T_i_j, points, gate)
+    return concatenated([_condensed(clouds, some, scale, root) for some in found])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,10 +149,12 @@ def _looked_up(
     return Correspondences(pairs, row, target, good, nx * dx + ny * dy, (nx, ny), (rx, ry))
 
 
-def _condensed(clouds: Clouds, found: Correspondences, scale: float) -> PairFactors:
-    """Condense the matches of each pair into the quadratic form of its relative pose."""
+def _condensed(clouds: Clouds, found: Correspondences, scale: float, root_weight: Floats | None = None) -> PairFactors:
+    """Condense the matches of each pair into the quadratic form of its relative pose; roots of weights are of points (p,)."""
     row, good, r, (nx, ny), (rx, ry) = found.row, found.good, found.distance, found.normal, found.arm
     root = good / (1.0 + np.square(r * (1.0 / scale)))
+    if root_weight is not None:
+        root *= root_weight.take(row)
     weighted = np.empty((len(row), 4, row.shape[1]))
     wx, wy = np.multiply(root, nx, out=weighted[:, 0]), np.multiply(root, ny, out=weighted[:, 1])
     weighted[:, 2] = wy * rx - wx * ry

@@ -8,6 +8,7 @@ stays with colour and material. Derivatives are taken where the ray should have 
 its residual and in its lever arm, and the product of both would turn every scan, along a wall always to the same side.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..arrays import Bools, Floats, Ints, Table
 from ..odometry.attached import ScanPoints
 from .cloud_rasters import CloudRasters, look_up
 from .clouds import Clouds
-from .ray_noise import range_sigma
+from .ray_noise import RayNoise, learnt_noise, range_sigma
 from .round_columns import refined_columns, to_circle
 from .walls import Stretches, Walls
 
@@ -85,13 +86,21 @@ class SurfaceRays(Table):
     directions: NDArray[np.floating]
     """(m, 2) unit, same frame."""
     sigma: NDArray[np.floating]
-    """(m,) m, along the ray; counts what it errs alike with its neighbours."""
+    """(m,) m, along the ray, by data sheets."""
+
+    def in_parts(self) -> Iterator["SurfaceRays"]:
+        """Yield the rays some at a time, which bounds the memory of what is made of them."""
+        for first in range(0, len(self.keyframe), _AT_ONCE):
+            yield self.rows(slice(first, first + _AT_ONCE))
 
     def packed(self) -> "SurfaceRays":
         """Return the rays in half the memory: single precision is a few micrometres at the reach of a lidar, as in clouds."""
-        keyframe, surface = (v.astype(np.int32) for v in (self.keyframe, self.surface))
         points, directions, sigma = (v.astype(np.float32) for v in (self.points, self.directions, self.sigma))
-        return SurfaceRays(keyframe, surface, points, directions, sigma)
+        return SurfaceRays(self.keyframe.astype(np.int32), self.surface.astype(np.int32), points, directions, sigma)
+
+
+_AT_ONCE = 1 << 16
+"""Rays, or points of clouds, that are looked at together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +109,7 @@ class MeasuredSurfaces:
 
     surfaces: Surfaces
     rays: SurfaceRays
+    noise: RayNoise
 
 
 def as_rays(rays: ScanPoints) -> SurfaceRays:
@@ -107,7 +117,7 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     way = rays.points - rays.origins
     reach = np.maximum(np.hypot(*way.T), 1e-9)
     none = np.full(len(reach), -1)
-    return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], np.sqrt(_ALIKE) * range_sigma(reach))
+    return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach))
 
 
 def on_stretches(rays: ScanPoints, clouds: Clouds, raster: CloudRasters, found: Stretches) -> SurfaceRays:
@@ -131,7 +141,7 @@ def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
     residual, incidence = (off * normal).sum(axis=1), -(rays.directions * normal).sum(axis=1)
     oblique = np.maximum(incidence, _INCIDENCE)
     along = ((off + (residual / oblique)[:, None] * rays.directions) * found.tangent[stretch]).sum(axis=1)
-    gate = _GATE * np.hypot(rays.sigma / np.sqrt(_ALIKE) * incidence, _FLOOR)
+    gate = _GATE * np.hypot(rays.sigma * incidence, _FLOOR)
     return np.asarray(found.inside(stretch, along) & (incidence > _INCIDENCE) & (np.abs(residual) < gate))
 
 
@@ -148,9 +158,8 @@ def _bundled(rays: SurfaceRays, scan: Ints, ray: Ints) -> SurfaceRays:
     return SurfaceRays(rays.keyframe[first], rays.surface[first], points, directions, sigma)
 
 
-_ALIKE, _BUNDLE = 4.0, 4
-"""Rays that together weigh as one, since neighbouring ones err alike (as matches do: RefinementConfig.correlation), and rays on
-a wall that are taken as one: nothing more is lost."""
+_BUNDLE = 4
+"""Rays on a wall that are taken as one."""
 
 
 def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) -> SurfaceRays:
@@ -160,7 +169,7 @@ def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) ->
     at, direction = in_map(rays, poses)
     nearest = cKDTree(columns[:, :2]).query(at)[1]
     shift, _, incidence = to_circle(at - columns[nearest, :2], direction, columns[nearest, 2])
-    good = (incidence < -_INCIDENCE_ROUND) & (np.abs(shift) < _GATE / np.sqrt(_ALIKE) * rays.sigma + _SLACK)
+    good = (incidence < -_INCIDENCE_ROUND) & (np.abs(shift) < _GATE * rays.sigma + _SLACK)
     return replace(rays, surface=nearest + first).rows(good)
 
 
@@ -174,9 +183,24 @@ def rays_around(rays: ScanPoints, poses: Floats, columns: Floats) -> SurfaceRays
     return every.rows(near < columns[which, 2] + _NEAR)
 
 
+def points_on(clouds: Clouds, poses: Floats, walls: Walls, found: Stretches, columns: Floats) -> NDArray[np.int8]:
+    """Return of what each of the clouds' points (p,) is: 0 a wall, 1 one of the columns (c, 3), -1 neither."""
+    kind = np.where(walls.of_stretch >= 0, 0, -1).astype(np.int8)[found.of_point]
+    for first in range(0, len(kind) if len(columns) else 0, _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        at = se2.transform_each(poses, clouds.owner[part], clouds.points[part].astype(np.float64))
+        away, which = cKDTree(columns[:, :2]).query(at)
+        kind[part][np.abs(away - columns[which, 2]) < _ROUND] = 1
+    return kind
+
+
+_ROUND = 0.06
+"""Distance from a column's circle up to which a point of a cloud is on it, m."""
+
+
 def fitted_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Floats:
     """Return those of the columns (c, 3) that are round, fitted to rays around them."""
-    return refined_columns(columns, *in_map(rays, poses), rays.sigma / np.sqrt(_ALIKE))
+    return refined_columns(columns, *in_map(rays, poses), rays.sigma.astype(np.float64))
 
 
 def in_map(rays: SurfaceRays, poses: Floats) -> tuple[Floats, Floats]:
@@ -227,5 +251,26 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
     return RayEquations(residual * root, by_pose * root[:, None], by_surface * root[:, None])
 
 
+def noise_of(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats) -> RayNoise:
+    """Learn the noise of rays from their residuals; for the parameters see linearized."""
+    shown = [_shown(some, surfaces, sensors, poses) for some in rays.in_parts()]
+    residual, reach, place = (np.concatenate(part) for part in zip(*shown, strict=True))
+    return learnt_noise(residual, reach, place, rays.surface, surfaces.round)
+
+
+def _shown(
+    rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Floats
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+    """Return the residuals (m,) of rays in standard deviations, their lengths (m,), m, and where on its surface each ends."""
+    away = in_map(rays, sensors)[0] - surfaces.place[rays.surface]
+    facing, curved = surfaces.facing[rays.surface], surfaces.round[rays.surface]
+    along = np.cos(facing) * away[:, 1] - np.sin(facing) * away[:, 0]
+    place = np.floor(np.where(curved, se2.bearing(away) / _SECTOR, along / _PIECE)).astype(np.int32)
+    residual, reach = linearized(rays, surfaces, sensors, poses).residual, np.hypot(*rays.points.T)
+    return residual.astype(np.float32), reach.astype(np.float32), place
+
+
+_PIECE, _SECTOR = 1.0, np.pi / 4.0
+"""Length of a place on a wall, m, and angle of one on a column, rad, within which residuals may be alike."""
 _LEAST = 0.05
 """Least cosine of incidence that is reckoned with."""

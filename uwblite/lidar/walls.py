@@ -17,12 +17,14 @@ _GAP = 0.35
 _STEP = 0.04
 """Distance of a point from its neighbour's line that ends a stretch, m."""
 _TURN = np.cos(np.deg2rad(12.0))
-"""Cosine of the angle between neighbouring normals that ends a stretch."""
-_SHORTEST, _FEWEST = 0.5, 6
+"""Cosine of the angle between near normals that ends a stretch."""
+_WITHIN = 3
+"""Points from one to the other of two normals that may differ by so much: in a corner normals turn little by little."""
+_SHORTEST, _FEWEST = 0.35, 5
 """Length, m, and points of a stretch that shows a direction."""
 _STRAIGHT = 0.012
 """Root mean square distance of the points of a stretch from its line, m; those of a column of 1 m radius lie farther off."""
-TRIM = 0.2
+TRIM = 0.1
 """Ends of a stretch that do not count, m: lines through corners lean."""
 _EVERY = 0.5
 """Distance of the places at which stretches are compared, m."""
@@ -71,7 +73,10 @@ def stretches(clouds: Clouds) -> Stretches:
     ends = (np.diff(clouds.owner) != 0) | ~lined[1:] | ~lined[:-1] | (np.hypot(*step.T) > _GAP)
     for side in (normals[1:], normals[:-1]):
         ends |= np.abs((side * step).sum(axis=1)) > _STEP
-    ends |= (normals[1:] * normals[:-1]).sum(axis=1) < _TURN
+    for apart in range(1, 1 + _WITHIN):
+        turned = (normals[apart:] * normals[:-apart]).sum(axis=1) < _TURN
+        for first in range(apart):
+            ends[first : first + len(turned)] |= turned
     number = np.concatenate([[0], np.cumsum(ends)])[: len(points)].astype(np.int64)
     return _fitted(number, points, normals)
 

@@ -7,14 +7,16 @@ unknowns themselves, with their offsets, and rays on them measure poses beside t
 (graph/eliminated.py). Then the pairs get the relative poses that were found, so that later stages go on from there; the rays
 count once more for the covariances.
 
-Pairs keep all of their weight, though they have seen the same rays: in clutter they know what rays on walls do not. Without
-the points on surfaces, or with a quarter of the weight, simulated halls gain more and real offices lose.
+How much a ray weighs, residuals show (lidar/ray_noise.py). Where rays are as good as independent, pairs have nothing to add on
+walls and columns, and their points there hardly count any more; where walls bend and columns are no circles, as most are in
+real offices, rays of one place weigh as few, and pairs keep their weight.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
@@ -26,7 +28,8 @@ from ..graph.marginals import factor_of
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
-from ..lidar.joint_refinement import with_fewer_pairs
+from ..lidar.joint_refinement import measured_again, with_fewer_pairs
+from ..lidar.ray_noise import UNLEARNT, RayNoise
 from ..lidar.round_columns import find_columns, fitted_circles
 from ..lidar.surface_rays import (
     MeasuredSurfaces,
@@ -35,8 +38,10 @@ from ..lidar.surface_rays import (
     Surfaces,
     fitted_columns,
     linearized,
+    noise_of,
     on_columns,
     on_stretches,
+    points_on,
     rays_around,
     surfaces_of,
 )
@@ -45,10 +50,15 @@ from ..odometry.attached import ScanPoints, choose_scans, scan_points
 from .estimate import Estimate, ScanClouds, Task
 from .recordings import Recording
 
-_ROUNDS, _STILL = 3, 1e-3
-"""Most Gauss-Newton steps; the largest change of a pose, m and rad, that ends them."""
-_KERNEL = 1.5
-"""Width of the Geman-McClure kernel on a residual, standard deviations; of one ray 3."""
+_ROUNDS, _STILL = 6, 1e-3
+"""Most Gauss-Newton steps; the largest change of a pose, m and rad, that ends them once noise and pairs have settled."""
+_SETTLING = 2
+"""Steps after which noise is learnt and pairs are measured again; the first step is made without."""
+_KERNEL, _WIDER = 3.0, 4.0
+"""Width of the Geman-McClure kernel on the residual of a ray, standard deviations, and by how much it is wider in the first
+step; half as much in each that follows (graduated non-convexity: A. Blake and A. Zisserman, Visual reconstruction, 1987)."""
+_LEAST = 0.03
+"""Least weight of a point in pairs of clouds."""
 _PRIOR = np.array([1.0, 1.0, 0.0156, 0.1])
 """Prior standard deviations of a surface: turn and place, rad and m, which say nothing, range offset, m (a device's 10 mm and
 a surface's 12 mm, see lidar/surface_errors.py), and radius, m."""
@@ -65,18 +75,19 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     graph = replace(estimate.graph, fixed_calibration=fixed)
     report = task.stages.reporter("surfaces")
     report(0, _ROUNDS + 1)
-    surfaces, rays = _found(_sensors(graph, joint, task), scans, task)
-    if not len(rays.keyframe):
+    found, kind = _found(_sensors(graph, joint, task), scans, task)
+    if not len(found.rays.keyframe):
         return estimate
     report(1, _ROUNDS + 1)
-    graph, surfaces = _adjusted(graph, estimate, surfaces, rays, task)
+    graph, found = _adjusted(graph, estimate, found, kind, task)
     before, estimate = estimate.graph.poses, estimate.with_estimates_of(graph)
+    walls, columns = np.bincount(found.surfaces.round, minlength=2).tolist()
     task.stages.end(
-        "surfaces", walls=int((~surfaces.round).sum()), columns=int(surfaces.round.sum()), rays=len(rays.keyframe),
-        shift=round(estimate.moved_since(before), 5),
+        "surfaces", walls=walls, columns=columns, rays=len(found.rays.keyframe), shift=round(estimate.moved_since(before), 5),
+        alike=found.noise.alike.round(1).tolist(),
     )  # fmt: skip
-    measured = MeasuredSurfaces(surfaces.seen_from(graph.poses[0]), rays)
-    return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=measured)
+    found = replace(found, surfaces=found.surfaces.seen_from(graph.poses[0]))
+    return replace(estimate, joint=replace(joint, T_i_j=joint.relative(estimate.graph)), surfaces=found)
 
 
 def for_covariances(
@@ -92,11 +103,12 @@ def for_covariances(
     ]
     joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
     surfaces, sensors = found.surfaces.seen_from(se2.inverse(graph.poses[0])), _sensors(graph, joint, task)
-    return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found.rays, surfaces, graph, sensors, unknowns, half)
+    found = replace(found, surfaces=surfaces)
+    return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found, graph, sensors, unknowns, half)
 
 
-def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[Surfaces, SurfaceRays]:
-    """Return the surfaces of the map with clouds at poses (k, 3), and their rays."""
+def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[MeasuredSurfaces, NDArray[np.int8]]:
+    """Return the surfaces of the map with clouds at poses (k, 3) and their rays, and the kinds (p,) of the clouds' points."""
     parts = stretches(scans.clouds)
     walls = find_walls(scans.clouds, parts, poses)
     once = [
@@ -109,7 +121,8 @@ def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[Surfaces, Surf
     columns = fitted_columns(around, poses, columns)
     straight = replace(straight, surface=walls.of_stretch[straight.surface])
     rays = [straight.rows(straight.surface >= 0), on_columns(around, poses, columns, len(walls.centre))]
-    return surfaces_of(walls, columns), concatenated([part.packed() for part in rays])
+    kind = points_on(scans.clouds, poses, walls, parts, columns)
+    return MeasuredSurfaces(surfaces_of(walls, columns), concatenated([part.packed() for part in rays]), UNLEARNT), kind
 
 
 def _sensors(graph: Graph, joint: ScanEdges, task: Task) -> Floats:
@@ -135,39 +148,49 @@ def _rays_of(recording: Recording, scans: ScanClouds, task: Task) -> Iterator[Sc
 
 
 def _adjusted(
-    graph: Graph, estimate: Estimate, surfaces: Surfaces, rays: SurfaceRays, task: Task
-) -> tuple[Graph, Surfaces]:
-    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these."""
-    joint = estimate.joint
+    graph: Graph, estimate: Estimate, found: MeasuredSurfaces, kind: NDArray[np.int8], task: Task
+) -> tuple[Graph, MeasuredSurfaces]:
+    """Return the graph and the surfaces after Gauss-Newton steps with the rays on these.
+
+    Parameters
+    ----------
+    kind : (p,) of the clouds' points, see points_on.
+    """
+    joint, factor = estimate.joint, None
     assert joint is not None
-    problem = with_fewer_pairs(graph.with_edges(*estimate.odometry_and_ranges, joint))
-    poses, factor = graph.poses, None
-    for _ in range(_ROUNDS):
-        normal = filled(problem, subtrees=True)
+    for turn in range(_ROUNDS):
+        poses, sensors = graph.poses, _sensors(graph, joint, task)
+        if turn > 0:
+            found = replace(found, noise=noise_of(found.rays, found.surfaces, sensors, poses))
+        if 0 < turn <= _SETTLING:
+            joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
+        normal = filled(with_fewer_pairs(graph.with_edges(*estimate.odometry_and_ranges, joint)), subtrees=True)
         factor = factor_of(normal) if factor is None else factor
-        blocks = _of_rays(rays, surfaces, problem, _sensors(problem, joint, task), normal.unknowns)
-        change, by_surface = step(normal, blocks, factor.solve)
-        problem, surfaces = moved(problem, normal.unknowns, change), surfaces.moved(by_surface)
-        if np.abs(problem.poses - poses).max() < _STILL:
+        kernel = _KERNEL * max(_WIDER * 0.5**turn, 1.0)
+        change, by_surface = step(normal, _of_rays(found, graph, sensors, normal.unknowns, kernel=kernel), factor.solve)
+        graph, found = moved(graph, normal.unknowns, change), replace(found, surfaces=found.surfaces.moved(by_surface))
+        if turn >= _SETTLING and np.abs(graph.poses - poses).max() < _STILL:
             break
-        poses = problem.poses
-    return graph.with_estimates_of(problem), surfaces
+    return graph, found
+
+
+def _measured_again(
+    joint: ScanEdges, graph: Graph, scans: ScanClouds, kind: NDArray[np.int8], noise: RayNoise, task: Task
+) -> ScanEdges:
+    """Return the pairs with points on surfaces weighted by what these points' rays do not say already."""
+    weight = np.append(np.maximum(1.0 - 1.0 / noise.alike, _LEAST), 1.0)[kind]
+    return measured_again(joint, graph, scans.clouds, scans.raster, task.config.refinement, weight)
 
 
 def _of_rays(
-    rays: SurfaceRays, surfaces: Surfaces, graph: Graph, sensors: Floats, unknowns: Unknowns, factor: float = 1.0
+    found: MeasuredSurfaces, graph: Graph, sensors: Floats, unknowns: Unknowns, factor: float = 1.0, kernel: float = _KERNEL
 ) -> Blocks:
     """Return the normal equations of rays and of what is known of surfaces, some rays at a time; residuals times a factor."""
-    total = _priors(surfaces, unknowns)
-    for first in range(0, len(rays.keyframe), _RAYS_AT_ONCE):
-        some = rays.rows(slice(first, first + _RAYS_AT_ONCE))
-        lines = linearized(some, surfaces, sensors, graph.poses)
-        total = summed(total, _of_some(some, lines, len(surfaces.facing), unknowns, factor))
+    total = _priors(found.surfaces, unknowns)
+    for some in found.rays.in_parts():
+        lines = _weighted(linearized(some, found.surfaces, sensors, graph.poses), some, found, factor, kernel)
+        total = summed(total, _of_some(some, lines, len(found.surfaces.facing), unknowns))
     return total
-
-
-_RAYS_AT_ONCE = 1 << 16
-"""Rays that are linearised at once; bounds the memory."""
 
 
 def _priors(surfaces: Surfaces, unknowns: Unknowns) -> Blocks:
@@ -178,14 +201,19 @@ def _priors(surfaces: Surfaces, unknowns: Unknowns) -> Blocks:
     return Blocks(sparse.csr_matrix((size, size)), sparse.csr_matrix((4 * count, size)), own, np.zeros(size), slope)
 
 
-def _of_some(rays: SurfaceRays, lines: RayEquations, count: int, unknowns: Unknowns, factor: float) -> Blocks:
-    """Return the normal equations of rays on as many surfaces, robustly weighted."""
-    root = factor / (1.0 + (lines.residual / _KERNEL) ** 2)
-    for values in (lines.by_pose, lines.by_surface):
-        values *= root[:, None]
+def _weighted(lines: RayEquations, rays: SurfaceRays, found: MeasuredSurfaces, factor: float, kernel: float) -> RayEquations:
+    """Return equations of rays robustly weighted, in standard deviations of the noise that was learnt, times a factor."""
+    noise = found.noise.relative(np.hypot(*rays.points.T))
+    alike = found.noise.alike[found.surfaces.round[rays.surface].astype(np.int64)]
+    root = factor / ((1.0 + (lines.residual / (kernel * noise)) ** 2) * noise * np.sqrt(alike))
+    return RayEquations(lines.residual * root, lines.by_pose * root[:, None], lines.by_surface * root[:, None])
+
+
+def _of_some(rays: SurfaceRays, lines: RayEquations, count: int, unknowns: Unknowns) -> Blocks:
+    """Return the normal equations of rays on as many surfaces."""
     by_pose = _sparse(unknowns.number["poses"][rays.keyframe], lines.by_pose, unknowns.size)
     by_surface = _sparse(4 * rays.surface[:, None] + np.arange(4), lines.by_surface, 4 * count)
-    return blocks_of(by_pose, by_surface, lines.residual * root, 4)
+    return blocks_of(by_pose, by_surface, lines.residual, 4)
 
 
 def _sparse(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
