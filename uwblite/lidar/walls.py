@@ -16,14 +16,18 @@ _GAP = 0.35
 """Distance between neighbouring points that ends a stretch, m."""
 _STEP = 0.04
 """Distance of a point from its neighbour's line that ends a stretch, m."""
-_TURN = np.cos(np.deg2rad(12.0))
-"""Cosine of the angle between near normals that ends a stretch."""
-_WITHIN = 3
-"""Points from one to the other of two normals that may differ by so much: in a corner normals turn little by little."""
+_TURN, _SIGMAS, _MOST_TURN = np.deg2rad(12.0), 3.0, np.deg2rad(45.0)
+"""Angle between near normals that ends a stretch, rad, on top of so many standard deviations of theirs, and any that does."""
+_UNLIKE = 0.15
+"""Root mean square angle between normals on a stretch, away from its ends, and its own, rad, beyond their noise; points smeared
+over a step turn by more, there and back, and those of columns."""
+_SPLITS = 8
+"""Most rounds in which bent stretches are split where they bend most."""
 _SHORTEST, _FEWEST = 0.35, 5
 """Length, m, and points of a stretch that shows a direction."""
-_STRAIGHT = 0.012
-"""Root mean square distance of the points of a stretch from its line, m; those of a column of 1 m radius lie farther off."""
+_STRAIGHT = 0.02
+"""Root mean square distance of the points of a stretch from its line, m: the noise of what is seen from afar. Walls that bend
+are told by many stretches."""
 TRIM = 0.1
 """Ends of a stretch that do not count, m: lines through corners lean."""
 _EVERY = 0.5
@@ -69,19 +73,41 @@ class Stretches:
 def stretches(clouds: Clouds) -> Stretches:
     """Cut each cloud where neighbouring points, by bearing, are not on one line, and fit lines to the parts."""
     points, normals = clouds.points.astype(np.float64), clouds.normals.astype(np.float64)
+    variance = clouds.normal_variance.astype(np.float64)
     lined, step = np.any(normals != 0.0, axis=1), np.diff(points, axis=0)
     ends = (np.diff(clouds.owner) != 0) | ~lined[1:] | ~lined[:-1] | (np.hypot(*step.T) > _GAP)
     for side in (normals[1:], normals[:-1]):
         ends |= np.abs((side * step).sum(axis=1)) > _STEP
-    for apart in range(1, 1 + _WITHIN):
-        turned = (normals[apart:] * normals[:-apart]).sum(axis=1) < _TURN
-        for first in range(apart):
-            ends[first : first + len(turned)] |= turned
-    number = np.concatenate([[0], np.cumsum(ends)])[: len(points)].astype(np.int64)
-    return _fitted(number, points, normals)
+    noise = _SIGMAS**2 * (variance[1:] + variance[:-1])
+    turn = np.minimum(np.sqrt(_TURN**2 + noise), _MOST_TURN)
+    ends |= (normals[1:] * normals[:-1]).sum(axis=1) < np.cos(turn)
+    for _ in range(_SPLITS):
+        corners = _corners(_numbered(ends, points), points)
+        if not len(corners):
+            break
+        ends[corners] = ends[corners - 1] = True
+    return _fitted(_numbered(ends, points), points, normals, variance)
 
 
-def _fitted(number: Ints, points: Floats, normals: Floats) -> Stretches:
+def _numbered(ends: Bools, points: Floats) -> Ints:
+    return np.concatenate([[0], np.cumsum(ends)])[: len(points)].astype(np.int64)
+
+
+def _corners(number: Ints, points: Floats) -> Ints:
+    """Return the point of each bent stretch that is farthest from the chord (split and merge: T. Pavlidis and S. Horowitz,
+    IEEE Transactions on Computers 23, 1974)."""
+    first = np.flatnonzero(np.diff(number, prepend=-1))
+    last = np.flatnonzero(np.diff(number, append=-1))
+    chord = points[last] - points[first]
+    across = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / np.maximum(np.hypot(*chord.T), 1e-9)[:, None]
+    off = np.abs(((points - points[first[number]]) * across[number]).sum(axis=1))
+    bent = principal_axes(number, points, len(first))[2] > _STRAIGHT
+    order = np.lexsort((off, number))
+    farthest = order[last]
+    return farthest[bent & (farthest > first) & (farthest < last)]
+
+
+def _fitted(number: Ints, points: Floats, normals: Floats, variance: Floats) -> Stretches:
     many = int(number.max(initial=-1)) + 1
     count = np.bincount(number, minlength=many)
     centre, direction, across = principal_axes(number, points, many)
@@ -91,7 +117,10 @@ def _fitted(number: Ints, points: Floats, normals: Floats) -> Stretches:
     tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
     along = ((points - centre[number]) * tangent[number]).sum(axis=1)
     first, last = extent(number, along, many)
+    unlike = 1.0 - (normals * normal[number]).sum(axis=1) ** 2 - variance
     straight = (count >= _FEWEST) & (last - first >= _SHORTEST) & (across < _STRAIGHT)
+    inner = (along > first[number] + TRIM) & (along < last[number] - TRIM)
+    straight &= np.bincount(number[inner], unlike[inner] - _UNLIKE**2, many) < 0.0
     return Stretches(number, along, centre, normal, first, last, straight)
 
 
