@@ -1,5 +1,7 @@
 """Two-level conjugate gradients against a factorisation, on chains tied together everywhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.planted_graphs import dense_system, relative_edges
@@ -8,7 +10,7 @@ from uwblite import se2
 from uwblite.errors import SolverError
 from uwblite.graph.graph import Graph, linearize
 from uwblite.graph.normal_equations import NormalEquations
-from uwblite.graph.schwarz_cg import _ENOUGH, _PIECE, TwoLevelFactor, cut
+from uwblite.graph.schwarz_cg import _ENOUGH, _MOST_COARSE, _PIECE, TwoLevelFactor, chains, cut, iterated
 from uwblite.graph.solver import optimize
 
 
@@ -118,3 +120,64 @@ def test_the_coarse_level_moves_pieces_as_rigid_bodies_and_all_else_on_its_own()
     np.testing.assert_array_equal(basis[others][:, 6:], np.eye(4))
     assert not basis[others][:, :6].any()
     assert not basis[number.ravel()][:, 6:].any()
+
+
+def test_poses_with_any_numbers_are_put_in_chains():
+    """A chain whose poses are numbered at random, and one more apart: nearly all share an edge with the next one."""
+    rng = np.random.default_rng(0)
+    names, count = rng.permutation(400), 400
+    pairs = np.stack([names[:-1], names[1:]], axis=1)
+    pairs = np.vstack([np.delete(pairs, 299, axis=0), names[rng.integers(0, 300, (10, 2))]])
+    order, linked = chains(pairs, count, np.zeros(count - 1, dtype=bool))
+    assert sorted(order) == list(range(count))
+    ties = {tuple(sorted(pair)) for pair in pairs.tolist()}
+    walked = np.sort(np.stack([order[:-1], order[1:]], axis=1), axis=1).tolist()
+    np.testing.assert_array_equal(linked, [tuple(pair) in ties for pair in walked])
+    assert np.count_nonzero(~linked) < count / _PIECE
+    as_numbered = np.arange(count - 1) != 299
+    kept, same = chains(pairs, count, as_numbered)
+    np.testing.assert_array_equal(kept, np.arange(count))
+    np.testing.assert_array_equal(same, as_numbered)
+
+
+def test_a_star_is_cut_all_the_same():
+    """Its poses share no edge with one another; pieces of one pose each would make the coarse level as large as the matrix."""
+    count = 2000
+    pairs = np.stack([np.zeros(count - 1, dtype=int), np.arange(1, count)], axis=1)
+    order, linked = chains(pairs, count, np.zeros(count - 1, dtype=bool))
+    assert sorted(order) == list(range(count))
+    assert linked.all()
+
+
+@pytest.mark.parametrize("others", [_MOST_COARSE, _MOST_COARSE + 1])
+def test_thousands_of_anchors_have_pieces_of_their_own(others):
+    poses, size = _PIECE, 3 * _PIECE + others
+    pieces = cut(np.arange(3 * poses).reshape(-1, 3), np.zeros((poses, 3)), size, np.ones(poses - 1, dtype=bool))
+    held = np.sort(pieces.number[pieces.number < size])
+    if others > _MOST_COARSE:
+        np.testing.assert_array_equal(held, np.arange(size))
+        assert pieces.basis.shape == (size, 3)
+    else:
+        np.testing.assert_array_equal(held, np.arange(3 * poses))
+        assert pieces.basis.shape == (size, 3 + others)
+
+
+def test_steps_told_backwards_make_chains_too():
+    """Else every pose is a piece, and the coarse level as large as the matrix."""
+    graph, _ = tied(600, 20)
+    steps = graph.edges[0]
+    back = replace(steps, i=steps.j, j=steps.i, T_i_j=se2.inverse(steps.T_i_j))
+    backwards = replace(graph, edges=(back, graph.edges[1]))
+    work = [system(g).work for g in (graph, backwards)]
+    assert work[0] == work[1]
+
+
+def test_iterations_are_counted():
+    normal = system(tied(600, 20)[0])
+    factor = normal.factor(np.zeros(normal.unknowns.size))
+    assert iterated(factor) == 0.0
+    factor.solve(-np.asarray(normal.gradient))
+    once = iterated(factor)
+    factor.solve(-np.asarray(normal.gradient))
+    assert iterated(factor) == 2.0 * once > 0.0
+    assert iterated(None) == 0.0

@@ -15,8 +15,11 @@ def linked(*ends):
     return linked_poses(5, linearize(Graph(POSES, np.zeros((0, 2)), edges))).tolist()
 
 
-def test_linked_is_a_pose_that_is_measured_from_the_one_before_it():
-    assert linked(([0, 1, 3, 2], [1, 3, 4, 1])) == [True, False, False, True]
+def test_linked_are_poses_that_share_an_edge_with_the_next_one():
+    """Some files tell steps backwards."""
+    assert linked(([0, 1, 3], [1, 3, 4])) == [True, False, False, True]
+    assert linked(([0, 1, 3, 2], [1, 3, 4, 1])) == [True, True, False, True]
+    assert linked(([1, 2, 4], [0, 1, 3]), ([2, 3], [3, 0])) == [True, True, False, True]
 
 
 def test_where_odometry_is_a_chain_only_its_links_count():

@@ -170,3 +170,14 @@ def calibrated_loop(seed=0, n=60):
         edges=(odometry, closures, ranges, prior),
     )
     return optimize(graph)[0], truth
+
+
+def at_random(poses, closures, seed=0):
+    """Return a chain of poses and closures between any two of them, all measurements and estimates random."""
+    rng = np.random.default_rng(seed)
+    i, j = rng.integers(0, poses, (2, closures))
+    j = np.where(i == j, (i + 2) % poses, j)
+    i, j = np.concatenate([np.arange(poses - 1), i]), np.concatenate([np.arange(1, poses), j])
+    measured, start = (rng.normal(scale=[20.0, 20.0, 1.5], size=(count, 3)) for count in (len(i), poses))
+    edges = RelativePoseEdges(i, j, measured, np.tile(10.0 * np.eye(3), (len(i), 1, 1)))
+    return Graph(start, edges=(edges,), fixed_poses=np.arange(poses) == 0)

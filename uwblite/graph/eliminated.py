@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from ..arrays import Floats, Ints
-from .factorization import postorder, superlu
+from ..arrays import Floats
+from .elimination import pairs_of, with_subtrees_contiguous
+from .factorization import superlu
 from .normal_equations import NormalEquations
 from .schwarz_cg import conjugate_gradients
 
@@ -77,7 +78,7 @@ def step(normal: NormalEquations, blocks: Blocks, precondition: Callable[[Floats
         return np.asarray(matrix @ x - blocks.across.T @ within(blocks.across @ x))
 
     right = -(normal.gradient + blocks.slope - blocks.across.T @ within(blocks.own_slope))
-    x = conjugate_gradients(times, right, precondition, _RESIDUAL, _MOST)
+    x, _ = conjugate_gradients(times, right, precondition, _RESIDUAL, _MOST)
     return x, -within(blocks.own_slope.ravel() + blocks.across @ x).reshape(blocks.own_slope.shape)
 
 
@@ -103,7 +104,7 @@ class WithBlocks:
         own = sparse.bsr_matrix((blocks.own, np.arange(count), np.arange(count + 1)))
         whole = sparse.bmat([[matrix + blocks.among, blocks.across.T], [blocks.across, own]], format="csc")
         self._size, self._more = matrix.shape[0], whole.shape[0] - matrix.shape[0]
-        self._order = _with_subtrees_contiguous(whole)
+        self._order = with_subtrees_contiguous(pairs_of(whole), whole.shape[0])
         self._place = np.argsort(self._order)
         self._lu = superlu(sparse.csc_matrix(whole[self._order][:, self._order]), "NATURAL")
         self.L, self.U = self._lu.L, self._lu.U
@@ -113,20 +114,3 @@ class WithBlocks:
         """Solve for right-hand sides (n,) or (n, m)."""
         whole = np.concatenate([right, np.zeros((self._more, *right.shape[1:]))])
         return np.asarray(self._lu.solve(whole[self._order])[self._place[: self._size]])
-
-
-def _with_subtrees_contiguous(matrix: sparse.csc_matrix) -> Ints:
-    """Return the order (n,) of elimination by minimum degree in which every subtree is contiguous.
-
-    It is found on the Laplacian of the matrix's pattern: all that fills its factor has one sign, so that no entry is lost to
-    cancellation, and with it a tie of the tree.
-    """
-    count = np.diff(matrix.indptr)
-    column = np.repeat(np.arange(len(count)), count)
-    values = np.where(matrix.indices == column, count[column] - 1.0 + _GROUNDED, -1.0)
-    factor = superlu(sparse.csc_matrix((values, matrix.indices, matrix.indptr), shape=matrix.shape), "MMD_AT_PLUS_A")
-    return np.asarray(np.argsort(factor.perm_c)[postorder(factor.L)])
-
-
-_GROUNDED = 1e-6
-"""Added to the diagonal of a Laplacian to make it regular; so little that entries of long chains do not vanish."""

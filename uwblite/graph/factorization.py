@@ -14,11 +14,11 @@ from typing import Protocol
 import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
-from scipy.sparse.csgraph import depth_first_order, reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
 
 from ..arrays import Floats, Ints
 from ..errors import SINGULAR, SolverError
+from .elimination import is_full, minimum_degree, narrow_order, with_subtrees_contiguous, work
 
 _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""
@@ -27,7 +27,13 @@ _WIDEST_BORDER = 48
 _LONGEST_LINK = 16
 """Poses; edges that reach farther make no chain."""
 _MANY, _TIED = 500, 4
-"""From so many poses on, with so many neighbours each, iteration wins over factorisation."""
+"""From so many poses on, with so many neighbours each, iteration wins over factorisation,"""
+_LITTLE_WORK = 3e4
+"""but where that takes no more multiplications a pose: a robot that drives along the streets of a town meets itself often, yet
+never far from where it was."""
+MOST_WORK = 4e9
+"""Multiplications of a factorisation, about a second; a hundred times the paper's graph takes 2.4e9. Edges between any
+poses and any others, however few, fill the whole matrix."""
 
 
 class Factor(Protocol):
@@ -48,35 +54,42 @@ class Ordering:
     banded: bool
     """The poses are a narrow band."""
     iterative: bool = False
-    """A factor would fill up: see two_level."""
+    """A factor would fill up: see schwarz_cg.py."""
+    work: float = 0.0
+    """Multiplications of a factorisation, where they are many enough to be counted."""
 
 
-def choose_ordering(pairs: Ints, poses: int, others: int, subtrees: bool = False, last: Ints | None = None) -> Ordering:
+def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False, last: Ints | None = None) -> Ordering:
     """Choose in which order to eliminate the poses; anchors and calibration, which touch many of them, come after.
 
     Parameters
     ----------
-    pairs : (b, 2) poses that share an edge.
-    others : scalars that come after the poses.
+    pairs : (b, 2) nodes that share an edge; the first nodes are the poses.
+    width : (n,) scalars of each node.
     subtrees : keep to the sparse form, with every subtree of the elimination contiguous: for the selected inverse.
     last : poses that come after the others, in the sparse form.
     """
     if poses < 2:
         return Ordering(np.arange(poses), False, False)
-    if not subtrees and last is None and poses >= _MANY and len(pairs) - poses > _TIED * poses:
-        return Ordering(np.arange(poses), False, False, iterative=True)
-    bordered = not subtrees and last is None and others <= _WIDEST_BORDER
-    if bordered:
-        order = reverse_cuthill_mckee(_adjacency(pairs, poses).tocsr(), symmetric_mode=True).astype(np.int64)
-        position = np.empty(poses, dtype=np.int64)
-        position[order] = np.arange(poses)
-        if np.max(np.abs(position[pairs[:, 0]] - position[pairs[:, 1]]), initial=0) <= _WIDEST_BAND:
-            return Ordering(order, True, True)
+    among = pairs[(pairs < poses).all(axis=1)]
     if last is not None:
-        return Ordering(_before(pairs, poses, last), False, False)
-    factor = superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A")
-    order = np.argsort(factor.perm_c)
-    return Ordering(order[postorder(factor.L)] if subtrees else order, bordered, False)
+        return Ordering(_before(among, poses, last), False, False)
+    if subtrees:
+        return Ordering(with_subtrees_contiguous(among, poses), False, False)
+    bordered = int(width[poses:].sum()) <= _WIDEST_BORDER
+    tied = poses >= _MANY and len(among) - poses > _TIED * poses
+    if bordered or tied:
+        order, reach = narrow_order(among, poses)
+        if bordered and reach.max() <= _WIDEST_BAND:
+            return Ordering(order, True, True)
+        if tied and is_full(reach):
+            return Ordering(np.arange(poses), False, False, iterative=True)
+    order = minimum_degree(among, poses)
+    every = order if bordered else np.concatenate([order, np.arange(poses, len(width))])
+    multiplications = work(among if bordered else pairs, every, width)
+    if multiplications > (_LITTLE_WORK * poses if tied else MOST_WORK):
+        return Ordering(np.arange(poses), False, False, iterative=True)
+    return Ordering(order, bordered, False, work=multiplications)
 
 
 def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
@@ -89,34 +102,11 @@ def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
     late[last[last >= 0]] = True
     reach = int(np.max(np.abs(np.diff(pairs[~late[pairs].any(axis=1)], axis=1)), initial=1))
     if reach > _LONGEST_LINK:
-        order = np.argsort(superlu(_adjacency(pairs, poses), "MMD_AT_PLUS_A").perm_c)
+        order = minimum_degree(pairs, poses)
     else:
         block = np.arange(poses) // reach + 1
         order = np.lexsort((np.arange(poses), block & -block))
     return np.concatenate([order[~late[order]], order[late[order]]])
-
-
-def postorder(lower: sparse.csc_matrix) -> Ints:
-    """Return the order in which every subtree of the elimination tree is contiguous and ends at its root.
-
-    The parent of a column is its first row below the diagonal. A depth-first walk from the roots, read backwards, is
-    such an order; it costs no fill and makes neighbours in the order neighbours in the factor.
-    """
-    n = lower.shape[0]
-    column = np.repeat(np.arange(n), np.diff(lower.indptr))
-    parent = np.minimum.reduceat(np.where(lower.indices > column, lower.indices, n), lower.indptr[:-1])
-    tree = sparse.csr_matrix((np.ones(n), (parent, np.arange(n))), shape=(n + 1, n + 1))
-    return depth_first_order(tree, n, return_predecessors=False)[:0:-1].astype(np.int64)
-
-
-def _adjacency(pairs: Ints, nodes: int) -> sparse.csc_matrix:
-    """Return a positive definite matrix with a graph's pattern."""
-    a, b = pairs[pairs[:, 0] != pairs[:, 1]].T
-    each = np.arange(nodes)
-    rows, columns = np.concatenate([each, a, b]), np.concatenate([each, b, a])
-    values = np.ones(len(rows))
-    values[:nodes] += len(rows)
-    return sparse.csc_matrix((values, (rows, columns)), shape=(nodes, nodes))
 
 
 def superlu(matrix: sparse.csc_matrix, order: str) -> SuperLU:

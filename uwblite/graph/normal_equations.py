@@ -18,7 +18,7 @@ from ..arrays import Floats, Ints
 from .factorization import Factor, choose_ordering
 from .graph import Graph, Linearization, edge_weights, linearize
 from .matrix_layout import Blocks, IterativeLayout, Layout, SparseLayout, make_layout
-from .schwarz_cg import cut
+from .schwarz_cg import chains, cut
 from .unknowns import WIDTHS, Unknowns, free_unknowns, linked_poses
 
 _AT_ONCE = 1 << 15
@@ -70,9 +70,8 @@ class NormalEquations:
         self._free = [[bool(np.any(a >= 0)) for a, _ in nodes] for nodes in touched]
         touched = [list(compress(nodes, free)) for nodes, free in zip(touched, self._free, strict=True)]
         pairs, which = self._pairs(touched, len(width))
-        among_poses = pairs[(pairs < counts[0]).all(axis=1)]
         late = None if last is None else node["poses"][last]
-        ordering = choose_ordering(among_poses, counts[0], int(width[counts[0] :].sum()), subtrees, late)
+        ordering = choose_ordering(pairs, counts[0], width, subtrees, late)
         order = np.concatenate([ordering.order, np.arange(counts[0], len(width))])
         corner = np.full(len(width) + 1, -1)
         corner[order] = np.cumsum(width[order]) - width[order]
@@ -86,9 +85,13 @@ class NormalEquations:
             number = self.unknowns.number["poses"]
             chain = np.flatnonzero(number[:, 0] >= 0)
             linked = (np.diff(chain) == 1) & linked_poses(len(number), linearized)[chain[:-1]]
-            self._layout: Layout = IterativeLayout(blocks, cut(number[chain], graph.poses[chain], self.unknowns.size, linked))
+            order, linked = chains(pairs[(pairs < counts[0]).all(axis=1)], counts[0], linked)
+            pieces = cut(number[chain[order]], graph.poses[chain[order]], self.unknowns.size, linked)
+            self._layout: Layout = IterativeLayout(blocks, pieces)
         else:
             self._layout = make_layout(blocks, ordering, WIDTHS["poses"] * counts[0])
+        self.work = pieces.work if ordering.iterative else ordering.work
+        """Multiplications of a factorisation, where they are many enough to be counted."""
         self.values: Floats = np.zeros(self._trash + 1)
         self.gradient: Floats = np.zeros(self.unknowns.size)
 

@@ -4,7 +4,8 @@ Where thousands of poses share a few rooms and each is matched with many others,
 poses of five hours in one hall need 100 million entries and minutes. Their least squares is well solved by iteration,
 if errors of all lengths are taken out together: short ones piece by piece of the chain, long ones by moving whole
 pieces as rigid bodies (a two-level additive Schwarz method; Smith, Bjorstad and Gropp, Domain Decomposition, 1996).
-The number of iterations hardly depends on the length of the chain. Anchors and calibration belong to the coarse level.
+The number of iterations hardly depends on the length of the chain. Anchors and calibration belong to the coarse level;
+where they are thousands, which would make it as large as the matrix, they are in pieces of their own.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 from scipy.linalg import lapack
+from scipy.sparse.csgraph import connected_components, depth_first_order
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SINGULAR, SolverError
@@ -23,6 +25,10 @@ _ENOUGH = 1e-3
 """Error of a solution as a share of it: the next step of the descent takes it up."""
 _MOST = 300
 """Iterations; what is found by then is still a step downhill."""
+_MOST_COARSE = 1000
+"""Unknowns that are no poses, up to which each is in the coarse level."""
+_PER_PRODUCT = 4
+"""Multiplications of a factorisation that take as long as one of a product with a vector, which waits for memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +39,43 @@ class Pieces:
     """(p, w) places of each piece's unknowns in the vector of all; the length of that vector where there are fewer."""
     basis: sparse.csr_matrix
     """(n, c) motions of the coarse level: three of each piece as a rigid body, and each unknown that is no pose."""
+
+    @property
+    def work(self) -> float:
+        """Multiplications that prepare a solution: the inverses of the pieces and the factor of the coarse matrix."""
+        (pieces, wide), coarse = self.number.shape, int(self.basis.shape[1])
+        return float(pieces * wide**3 + coarse**3 / 3.0)
+
+    def work_of_a_step(self, entries: int) -> float:
+        """Return the work of an iteration with a matrix of so many entries, in multiplications of a factorisation."""
+        (pieces, wide), coarse = self.number.shape, int(self.basis.shape[1])
+        return float(_PER_PRODUCT * (entries + pieces * wide**2 + coarse**2))
+
+
+def chains(pairs: Ints, poses: int, linked: Bools) -> tuple[Ints, Bools]:
+    """Return poses (poses,) in an order in which most share an edge with the next one, and which of them (poses - 1,) do.
+
+    As they are numbered, where that makes chains; else in the order of a depth-first walk through the graph.
+
+    Parameters
+    ----------
+    pairs : (b, 2) poses that share an edge. linked : (poses - 1,) which of them do so with the next one, as numbered.
+    """
+    if _makes_chains(linked):
+        return np.arange(poses), linked
+    links = sparse.csr_matrix((np.ones(len(pairs)), pairs.T), shape=(poses + 1, poses + 1))
+    part = connected_components(links, directed=False)[1][:poses]
+    begin = np.unique(part, return_index=True)[1]
+    # One more node, where the walk through every part begins.
+    rooted = links + sparse.csr_matrix((np.ones(len(begin)), (np.full(len(begin), poses), begin)), shape=links.shape)
+    order = depth_first_order(rooted, poses, directed=False, return_predecessors=False)[1:].astype(np.int64)
+    linked = np.asarray((links + links.T)[order[:-1], order[1:]]).ravel() > 0.0
+    # A star has no chains, and the coarse level has no place for pieces of one pose each.
+    return order, linked if _makes_chains(linked) else np.ones_like(linked)
+
+
+def _makes_chains(linked: Bools) -> bool:
+    return bool(np.count_nonzero(~linked) * _PIECE <= max(len(linked), _PIECE**2))
 
 
 def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
@@ -58,6 +101,9 @@ def cut(number: Ints, poses: Floats, size: int, linked: Bools) -> Pieces:
     centre = np.stack([np.bincount(piece, column) for column in poses[:, :2].T], axis=1) / np.bincount(piece)[:, None]
     arm = poses[:, :2] - centre[piece]
     other = np.setdiff1d(np.arange(size), number)
+    if len(other) > _MOST_COARSE:
+        apart = np.append(other, np.full(-len(other) % places.shape[1], size)).reshape(-1, places.shape[1])
+        places, other = np.concatenate([places, apart]), other[:0]
     one = np.ones(len(number))
     # A turn about the middle moves a pose at the arm (u, v) by (-v, u).
     rows = np.concatenate([*number.T, number[:, 0], number[:, 1], other])
@@ -103,6 +149,8 @@ class TwoLevelFactor:
         SolverError : one of them is singular.
         """
         self._pieces, self._onto = pieces, pieces.basis.T.tocsr()
+        self.work = 0.0
+        """Of all iterations so far, in multiplications of a factorisation."""
         try:
             self._local = np.linalg.inv(local.blocks(matrix.data))
         except np.linalg.LinAlgError as problem:
@@ -124,7 +172,9 @@ class TwoLevelFactor:
         """
         if right.ndim == 2:
             return np.stack([self.solve(column) for column in right.T], axis=1)
-        return conjugate_gradients(self._matrix.__matmul__, right, self._nearly, _ENOUGH, _MOST)
+        solution, steps = conjugate_gradients(self._matrix.__matmul__, right, self._nearly, _ENOUGH, _MOST)
+        self.work += steps * self._pieces.work_of_a_step(self._matrix.nnz)
+        return solution
 
     def _nearly(self, residual: Floats) -> Floats:
         """Return what the two levels make of a residual: an approximate solution."""
@@ -135,10 +185,15 @@ class TwoLevelFactor:
         return np.asarray(found[:-1] + self._pieces.basis @ coarse.ravel())
 
 
+def iterated(factor: object) -> float:
+    """Return the work of all iterations with a factor so far, in multiplications of a factorisation; 0 for others."""
+    return factor.work if isinstance(factor, TwoLevelFactor) else 0.0
+
+
 def conjugate_gradients(
     times: Callable[[Floats], Floats], right: Floats, nearly: Callable[[Floats], Floats], enough: float, most: int
-) -> Floats:
-    """Solve with a symmetric, positive definite matrix by preconditioned conjugate gradients.
+) -> tuple[Floats, int]:
+    """Solve with a symmetric, positive definite matrix by preconditioned conjugate gradients; return how many steps it took.
 
     Parameters
     ----------
@@ -152,9 +207,9 @@ def conjugate_gradients(
     solution, residual = np.zeros(len(right)), right.copy()
     direction = nearly(residual)
     energy = first = float(residual @ direction)
-    for _ in range(most):
+    for step in range(most):
         if not energy > enough**2 * first:
-            break
+            return solution, step
         image = times(direction)
         curvature = float(direction @ image)
         if not curvature > 0.0:
@@ -164,7 +219,7 @@ def conjugate_gradients(
         near = nearly(residual)
         before, energy = energy, float(residual @ near)
         direction = near + (energy / before) * direction
-    return solution
+    return solution, most
 
 
 def _seen_by(matrix: sparse.csc_matrix, basis: sparse.csr_matrix, onto: sparse.csr_matrix) -> Floats:

@@ -88,7 +88,8 @@ def linked_poses(poses: int, linearized: Sequence[Linearization]) -> Bools:
     begins, clouds may be paired as well, and even with no weight.
     """
     ends = [[index for name, index, _ in lin.blocks if name == "poses"] for lin in linearized]
-    pairs = [pair for pair in ends if len(pair) == 2]
+    # Some files tell each step backwards, from the later pose to the one before.
+    pairs = [(np.minimum(*pair), np.maximum(*pair)) for pair in ends if len(pair) == 2]
     chains = [(a, b) for a, b in pairs if np.all(b == a + 1)]
     linked = np.zeros(max(poses - 1, 0), dtype=bool)
     for a, b in chains or pairs:

@@ -1,0 +1,199 @@
+"""Symbolic elimination of sparse, symmetric matrices: in which order, by which tree, and how much work, before any number.
+
+The parent of a column in the elimination tree is the first row below its diagonal that its factor fills. A factor's own
+zeros do not show it: an entry that cancels, or that gets smaller than any number along a ring of a hundred poses, would cut
+the tree. So the tree is found from the pattern, and with it how many entries each column gets (J. Gilbert, E. Ng, B. Peyton,
+An efficient algorithm to compute row and column counts for sparse Cholesky factorization, SIAM J. Matrix Anal. Appl. 1994).
+"""
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree, reverse_cuthill_mckee
+from scipy.sparse.linalg import spilu
+
+from ..arrays import Ints
+
+PER_COMPLEX = 4
+"""Multiplications in one of complex numbers."""
+
+
+def adjacency(pairs: Ints, nodes: int) -> sparse.csc_matrix:
+    """Return a positive definite matrix with the pattern of a graph, by pairs (b, 2) of nodes that share an edge."""
+    a, b = pairs[pairs[:, 0] != pairs[:, 1]].T
+    each = np.arange(nodes)
+    rows, columns = np.concatenate([each, a, b]), np.concatenate([each, b, a])
+    values = np.ones(len(rows))
+    values[:nodes] += len(rows)
+    return sparse.csc_matrix((values, (rows, columns)), shape=(nodes, nodes))
+
+
+def pairs_of(matrix: sparse.csc_matrix) -> Ints:
+    """Return the pairs (b, 2) of columns that a symmetric matrix ties together."""
+    column = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+    below = matrix.indices > column
+    return np.stack([column[below], matrix.indices[below]], axis=1).astype(np.int64)
+
+
+def narrow_order(pairs: Ints, nodes: int) -> tuple[Ints, Ints]:
+    """Return the order (nodes,) of a narrow band, by reverse Cuthill-McKee, and how far (nodes,) each row reaches in it."""
+    order = reverse_cuthill_mckee(adjacency(pairs, nodes).tocsr(), symmetric_mode=True).astype(np.int64)
+    lower = _lower_triangle(pairs, order)
+    first, some = np.arange(nodes), np.diff(lower.indptr) > 0
+    first[some] = lower.indices[lower.indptr[:-1][some]]
+    return order, np.arange(nodes) - first
+
+
+def is_full(reach: Ints) -> bool:
+    """Return whether a large matrix, whose rows reach so far (n,) in a narrow order, fills up in any order.
+
+    It ties anything to anything. Counting by minimum degree takes many seconds for such a one, and less than its factorisation
+    for all others.
+    """
+    return len(reach) > _SMALL and float(np.mean(reach)) > _WIDE * len(reach)
+
+
+_SMALL, _WIDE = 3000, 0.1
+"""Rows, and the share of them in the band of one. Streets of a town reach over a fiftieth."""
+
+
+def minimum_degree(pairs: Ints, nodes: int) -> Ints:
+    """Return the order (nodes,) of elimination by multiple minimum degree.
+
+    SuperLU finds it before it factorises. Its incomplete factorisation, which drops all fill, costs next to nothing after
+    that; a complete one takes as long as the fill that is in question.
+    """
+    options = {"SymmetricMode": True, "Equil": False}
+    pattern = adjacency(pairs, nodes)
+    factor = spilu(pattern, 1.0, 1.0, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=2, panel_size=1, options=options)
+    return np.asarray(np.argsort(factor.perm_c))
+
+
+def elimination_tree(pairs: Ints, order: Ints) -> Ints:
+    """Return the parent (n,) of each column of the matrix with its nodes in this order; n = none.
+
+    Which nodes before one are tied together, the spanning tree with the earliest nodes tells as well as the graph.
+    """
+    n = len(order)
+    lower = _lower_triangle(pairs, order)
+    # The weight of a pair is its later node, and none is 0.
+    lower.data[:] = np.repeat(np.arange(1.0, n + 1.0), np.diff(lower.indptr))
+    spanning = minimum_spanning_tree(lower).tocoo()
+    begins, ends = np.minimum(spanning.row, spanning.col), np.maximum(spanning.row, spanning.col)
+    sequence = np.argsort(ends, kind="stable")
+    parent, above = [n] * n, list(range(n))
+    for k, node in zip(begins[sequence].tolist(), ends[sequence].tolist(), strict=True):
+        while above[k] != k:
+            above[k] = k = above[above[k]]
+        parent[k] = above[k] = node
+    return np.array(parent, dtype=np.int64)
+
+
+def postorder(parent: Ints) -> Ints:
+    """Return the order (n,) in which every subtree of an elimination tree is contiguous and ends at its root.
+
+    A depth-first walk from the roots, read backwards, is such an order; it costs no fill and makes neighbours in the order
+    neighbours in the factor.
+    """
+    n = len(parent)
+    tree = sparse.csr_matrix((np.ones(n), (parent, np.arange(n))), shape=(n + 1, n + 1))
+    walk: Ints = depth_first_order(tree, n, return_predecessors=False)[:0:-1].astype(np.int64)
+    return walk
+
+
+def with_subtrees_contiguous(pairs: Ints, nodes: int) -> Ints:
+    """Return the order (nodes,) of elimination by minimum degree in which every subtree is contiguous."""
+    order = minimum_degree(pairs, nodes)
+    return order[postorder(elimination_tree(pairs, order))]
+
+
+def column_sizes(pairs: Ints, order: Ints, width: Ints) -> Ints:
+    """Return the scalars (n,) in each node's columns of the factor, its own among them, for the nodes in this order.
+
+    Row i of the factor fills the tree's paths from the nodes that i is tied to up to i. Counted along these paths: each node
+    that i is tied to adds one, where two paths meet one is taken off again, and so is one above i.
+
+    Parameters
+    ----------
+    width : (n,) scalars of each node.
+    """
+    parent = elimination_tree(pairs, order)
+    walk = postorder(parent)
+    place = np.append(np.argsort(walk), len(order))
+    parent = place[parent[walk]]
+    order, scalars = order[walk], width[order[walk]].astype(np.int64)
+    n = len(order)
+    lower = _lower_triangle(pairs, order)
+    below, row = lower.indices.astype(np.int64), np.repeat(np.arange(n), np.diff(lower.indptr))
+    change = np.zeros(n + 1)
+    change += np.bincount(below, scalars[row], n + 1)
+    again = np.flatnonzero(row[1:] == row[:-1]) + 1
+    change -= np.bincount(_meeting(parent, below[again - 1], below[again]), scalars[row[again]], n + 1)
+    tied = np.zeros(n, dtype=bool)
+    tied[row] = True
+    change[:-1] += np.where(tied, 0, scalars)
+    change -= np.bincount(parent, scalars, n + 1)
+    total = np.append(0.0, np.cumsum(change[:-1]))
+    sizes = np.empty(n, dtype=np.int64)
+    sizes[walk] = np.rint(total[1:] - total[_first_below(parent)])
+    return sizes
+
+
+def work(pairs: Ints, order: Ints, width: Ints) -> float:
+    """Return the multiplications of a factorisation with the nodes in this order, each as long as one of a dense matrix.
+
+    Columns that the next one continues are multiplied together; of others each waits for memory.
+
+    Parameters
+    ----------
+    width : (n,) scalars of each node.
+    """
+    parent, scalars = elimination_tree(pairs, order), width[order]
+    sizes = column_sizes(pairs, order, width)
+    continued = np.append(sizes, 0)[parent] == sizes - scalars
+    return float(scalars @ (np.square(sizes, dtype=np.float64) * np.where(continued, 1.0, _ALONE)))
+
+
+_ALONE = 6.0
+"""Time of a multiplication of a column alone, in those of many together: measured with SuperLU."""
+
+
+def work_of(matrix: sparse.csc_matrix) -> float:
+    """Return the multiplications of a factorisation of a symmetric matrix by minimum degree; infinite where it fills up."""
+    pairs, width = pairs_of(matrix), np.ones(matrix.shape[0], dtype=np.int64)
+    if is_full(narrow_order(pairs, len(width))[1]):
+        return np.inf
+    order = minimum_degree(pairs, len(width))
+    return work(pairs, order, width)
+
+
+def _lower_triangle(pairs: Ints, order: Ints) -> sparse.csr_matrix:
+    """Return the pattern below the diagonal of the matrix with its nodes in this order; columns ascend in every row."""
+    place = np.argsort(order)
+    both = place[pairs[pairs[:, 0] != pairs[:, 1]]]
+    entries = np.ones(len(both)), (both.max(axis=1, initial=0), both.min(axis=1, initial=len(order)))
+    lower = sparse.csr_matrix(entries, shape=(len(order), len(order)))
+    lower.sort_indices()
+    return lower
+
+
+def _first_below(parent: Ints) -> Ints:
+    """Return the first node (n,) of the subtree of each node of a tree in postorder."""
+    first = list(range(len(parent) + 1))
+    for node, above in enumerate(parent.tolist()):
+        first[above] = min(first[above], first[node])
+    return np.array(first[:-1], dtype=np.int64)
+
+
+def _meeting(parent: Ints, one: Ints, other: Ints) -> Ints:
+    """Return where the paths from nodes `one` up and from later ones, `other`, meet, in a tree in postorder.
+
+    The nodes from one up to the other lie below the place where they meet, and one of them next below it: it is the
+    highest of their parents.
+    """
+    highest = [parent]
+    while 2 << len(highest) - 1 <= len(parent):
+        half = 1 << len(highest) - 1
+        highest.append(np.maximum(highest[-1], np.append(highest[-1][half:], np.zeros(half, dtype=np.int64))))
+    step = np.log2(np.maximum(other - one, 1)).astype(np.int64)
+    table = np.stack(highest) if len(parent) else np.zeros((1, 0), dtype=np.int64)
+    return np.asarray(np.maximum(table[step, one], table[step, other - (1 << step)]))
