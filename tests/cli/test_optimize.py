@@ -5,14 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import lawn, loop
+from helpers.planted_graphs import at_random, lawn, loop
 
 from uwblite import se2
 from uwblite.cli import main
 from uwblite.cli.formats import write_graph
 from uwblite.graph.graph import PriorEdges
+from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.point_edges import LandmarkEdges
-from uwblite.graph.solver import optimize
+from uwblite.graph.solver import SolverConfig, optimize
 from uwblite.io.g2o import read_g2o
 from uwblite.io.graph_file import GraphFile
 
@@ -170,3 +171,44 @@ def test_lines_of_kinds_that_are_not_used_are_said(tmp_path, capsys):
     path.write_text("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_BEARING_SE2_XY 0 5 0.5 100\n")
     assert main(["optimize", str(path)]) == 0
     assert "warning: lines of other kinds were not used: 1 EDGE_BEARING_SE2_XY" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("way", [[], ["--from-odometry", "--incremental"], ["--kernel", "huber"]])
+def test_closures_at_random_end_with_the_work_allowed_and_are_named(tmp_path, capsys, monkeypatch, way):
+    """They are tried for as many multiplications as are allowed, whatever the way, and what is reached is written."""
+    graph = at_random(300, 600)
+    once = optimize(graph, SolverConfig(max_iterations=1))[1].work
+    monkeypatch.setattr("uwblite.cli.optimize._WORK", 12.0 * once)
+    done = []
+    step = NormalEquations.factor
+    monkeypatch.setattr(NormalEquations, "factor", lambda self, damping: (done.append(self.work), step(self, damping))[1])
+    path, out = written(tmp_path / "random.g2o", graph), str(tmp_path / "out.g2o")
+    assert main(["optimize", path, "--out", out, *way]) == 3
+    printed = capsys.readouterr().out
+    assert 12.0 * once <= sum(done) < 16.0 * once
+    assert "DOUBT: not converged within the work that is allowed for a graph of its size; " in printed
+    assert len(read_g2o(out).graph.poses) == 300
+    assert " of 600 loop closures are more than 4 standard deviations off, that of poses " in printed
+    first = (tmp_path / "out.g2o").read_bytes()
+    assert main(["optimize", path, "--out", out, "--force", *way]) == 3
+    assert (tmp_path / "out.g2o").read_bytes() == first
+
+
+def test_robust_says_that_nothing_was_left_of_the_closures(tmp_path, capsys):
+    path = written(tmp_path / "random.g2o", at_random(300, 600))
+    found = figures(capsys, path, "--robust", code=0)
+    assert found["outliers"] == {"RelativePoseEdges": 600}
+    assert (found["closures"]["far_off"], found["closures"]["contradict"]) == (600, True)
+
+
+def test_whoever_sets_the_iterations_gets_as_many(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("uwblite.cli.optimize._WORK", 1.0)
+    path = written(tmp_path / "random.g2o", at_random(300, 600))
+    assert figures(capsys, path, code=3)["iterations"] == 1
+    found = figures(capsys, path, "--set", "max_iterations=7", code=3)
+    assert (found["iterations"], found["reason"]) == (7, "iterations used up")
+
+
+def test_closures_that_hold_are_not_accused(tmp_path, capsys):
+    path = written(tmp_path / "good.g2o", loop(3, n=200, anchors=0)[0])
+    assert not figures(capsys, path)["closures"]["contradict"]

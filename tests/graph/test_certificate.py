@@ -249,3 +249,12 @@ def test_the_gap_is_what_must_be_added_to_all_headings_together(below):
 def test_a_matrix_is_positive_or_not(matrix, positive):
     assert _is_positive(sparse.csc_matrix(np.array(matrix, dtype=float)), np.zeros(len(matrix))) is positive
     assert _is_positive(sparse.csc_matrix(np.array(matrix, dtype=float)), np.full(len(matrix), 1.5)) is True
+
+
+def test_a_matrix_that_would_fill_up_gives_no_certificate():
+    graph = optimize(loop(3, n=200, anchors=0)[0])[0]
+    assert certify(graph, 1e12).is_global
+    refused = certify(graph, 1e4)
+    assert not refused.is_global
+    assert refused.lower_bound == 0.0
+    assert refused.reason == "its edges tie so many poses to so many others that the matrix would fill up"

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import loop, random_poses, relative_edges
+from helpers.planted_graphs import at_random, loop, random_poses, relative_edges
 
 from uwblite import se2
 from uwblite.graph.chordal_start import chordal_start
@@ -57,3 +57,10 @@ def test_a_step_from_a_pose_of_uncertain_heading_keeps_its_length():
     edges = RelativePoseEdges(np.array([0, 0, 0, 1]), np.array([1, 1, 1, 2]), T, np.tile(np.eye(3), (4, 1, 1)))
     poses = chordal_start(Graph(np.zeros((3, 3)), edges=(edges,), fixed_poses=np.arange(3) == 0)).poses
     np.testing.assert_allclose(se2.between(poses[1], poses[2]), T[3])
+
+
+def test_where_the_matrix_would_fill_up_there_is_none(monkeypatch):
+    graph = at_random(200, 400)
+    assert chordal_start(graph) is not None
+    monkeypatch.setattr("uwblite.graph.chordal_start.MOST_WORK", 1e5)
+    assert chordal_start(graph) is None

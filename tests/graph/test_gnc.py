@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import loop, relative_edges
+from helpers.planted_graphs import at_random, loop, relative_edges
 
 from uwblite import se2
 from uwblite.errors import SolverError
@@ -143,3 +143,15 @@ def test_the_end_of_all_steps_is_reported_behind_the_last_one():
     optimize_gnc(graph, {RANGES: float(norms.max())}, progress=lambda done, most: calls.append((done, most)))
     assert [done for done, _ in calls] == [*range(1, len(calls)), calls[-1][1]]
     assert len(calls) <= calls[-1][1]
+
+
+def test_the_work_allowed_bounds_the_steps_and_what_follows():
+    """Half of it for the steps; a step takes a factorisation."""
+    graph, calls = at_random(300, 600), []
+    most = SolverConfig(max_iterations=1)
+    once = optimize(graph, most)[1].work
+    _, summary, weights = optimize_gnc(graph, {0: 300.0}, most, lambda done, _: calls.append(done), allowed=8.0 * once)
+    whole = optimize_gnc(graph, {0: 300.0}, most)[1]
+    assert calls[:-1] == [1, 2, 3, 4]
+    assert summary.work == 5.0 * once < whole.work
+    assert set(np.unique(weights[0])) <= {0.0, 1.0}

@@ -2,17 +2,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import dense_system, every_kind, loop, plain_ranges, random_poses, relative_edges
+from helpers.planted_graphs import at_random, dense_system, every_kind, loop, plain_ranges, random_poses, relative_edges
 from scipy.optimize import least_squares
 
 from uwblite import se2
 from uwblite.errors import Cancelled, ConfigError, SolverError
+from uwblite.graph.descent_rules import as_much_again, extrapolated, relaxed
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey, edge_weights, linearize
 from uwblite.graph.normal_equations import NormalEquations
 from uwblite.graph.pose_edges import OdometryEdges, RelativePoseEdges
 from uwblite.graph.range_edges import RangeEdges
 from uwblite.graph.robust import Kernel
-from uwblite.graph.solver import SolverConfig, _as_much_again, _extrapolated, _relaxed, _step, optimize
+from uwblite.graph.solver import ALL_WORK_DONE, SolverConfig, _step, optimize
 from uwblite.graph.unknowns import cheaper_move, moved, moved_along
 from uwblite.io.g2o import read_g2o
 
@@ -593,18 +594,18 @@ def test_a_step_takes_whichever_way_costs_less(way):
 )
 def test_the_decrease_to_come_is_the_rest_of_the_geometric_series(decrease, last, promised, to_come):
     """1/4 + 1/16 + ... of what came last; what the step promised where it kept less than half, or is the first."""
-    assert _extrapolated(decrease, last, promised) == pytest.approx(to_come)
+    assert extrapolated(decrease, last, promised) == pytest.approx(to_come)
 
 
-def test_a_robust_search_expects_as_much_again_as_the_last_step_brought_or_promised():
-    assert (_as_much_again(0.1, np.inf, 0.5), _as_much_again(0.5, 1.0, 0.1)) == (0.5, 0.5)
+def test_a_robust_search_expectsas_much_again_as_the_last_step_brought_or_promised():
+    assert (as_much_again(0.1, np.inf, 0.5), as_much_again(0.5, 1.0, 0.1)) == (0.5, 0.5)
 
 
 @pytest.mark.parametrize(
     ("ratio", "factor"), [(0.0, 2.0), (0.25, 1.125), (0.5, 1.0), (0.75, 0.875), (1.0, 1 / 3), (1.5, 1 / 3)]
 )
 def test_lambda_follows_the_ratio_of_decrease_and_promise_as_nielsen_has_it(ratio, factor):
-    assert _relaxed(ratio) == pytest.approx(factor)
+    assert relaxed(ratio) == pytest.approx(factor)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.7, 30.0])
@@ -630,3 +631,19 @@ def test_a_search_under_a_lasting_brake_ends_where_its_steps_bring_nothing(seed)
     best = least_squares(lambda a: (np.hypot(*(poses[:, :2] - a).T) - ranges) / 0.03, graph.anchors[0], xtol=1e-14)
     assert summary.iterations <= 45
     assert summary.chi2 <= 2.0 * best.cost + 1e-4
+
+
+@pytest.mark.parametrize(("poses", "closures"), [(300, 600), (700, 3500)])
+def test_the_work_allowed_is_counted(poses, closures):
+    """On closures at random, by a factorisation and by iteration: the search ends with the step that reaches it."""
+    graph = at_random(poses, closures)
+    _, free = optimize(graph, SolverConfig(max_iterations=5))
+    assert free.work > 0.0
+    found, summary = optimize(graph, SolverConfig(max_iterations=5), allowed=0.5 * free.work)
+    assert (summary.converged, summary.reason) == (False, ALL_WORK_DONE)
+    assert 1 <= summary.iterations < 5
+    assert 0.5 * free.work <= summary.work < free.work
+    again, same = optimize(graph, SolverConfig(max_iterations=5), allowed=0.5 * free.work)
+    np.testing.assert_array_equal(again.poses, found.poses)
+    assert same.work == summary.work
+    assert optimize(graph, SolverConfig(max_iterations=5), allowed=1.0)[1].iterations == 1

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.planted_graphs import lawn, plain_ranges, relative_edges
+from helpers.planted_graphs import at_random, lawn, plain_ranges, relative_edges
 
 from uwblite import se2
 from uwblite.graph.graph import Calibration, Graph, PriorEdges, UnknownKey
@@ -241,3 +241,14 @@ def test_who_is_outlying_is_a_matter_of_the_share_over_all_kinds_of_ranges():
         halves[1] = halves[1].rows(np.flatnonzero(halves[1].anchor != 5))
         state.kinds = [_by_time(edges, state.graph) for edges in (odometry, *halves)]
         assert set(np.flatnonzero(state._outlying(200, 400))) == outlying
+
+
+def test_the_work_allowed_ends_the_search_where_it_is():
+    """Closures at random fit nowhere, and every piece would be tried with all poses before it."""
+    graph, calls = at_random(600, 1200), []
+    allowed = 10.0 * optimize(graph)[1].work / optimize(graph)[1].iterations
+    found, summary = optimize_incrementally(graph, progress=lambda done, _: calls.append(done), allowed=allowed)
+    assert calls[-1] < 600
+    assert not summary.converged
+    assert allowed <= summary.work
+    assert np.isfinite(found.poses).all()

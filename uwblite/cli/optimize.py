@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from .options import number, place
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from ..graph.certificate import Certificate
     from ..graph.graph import Graph
     from ..graph.solver import Progress, SolverConfig, SolverSummary
@@ -49,15 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Carry out the verb."""
     import dataclasses
-    from functools import partial
-    from itertools import chain
 
     from ..config import override
     from ..errors import ConfigError
     from ..graph.loop_edges import with_kernel
     from ..graph.robust import Kernel
     from ..graph.solver import SolverConfig
-    from ..radio.graph_starts import starts, starts_nearby
     from . import console
     from .formats import graph_format, read_graph, refuse_existing, write_graph
 
@@ -73,19 +72,8 @@ def run(args: argparse.Namespace) -> int:
     file = dataclasses.replace(file, graph=with_kernel(file.graph, Kernel(args.kernel, args.kernel_scale)))
     progress = console.Progress()
     try:
-        solve = partial(_solve, args, config, lambda done, most: progress("optimising", done, most))
-        solutions = map(solve, starts(file.graph, file.chains))
-        best = min(solutions, key=lambda solution: (sum(solution.outliers.values()), solution.summary.chi2))
-        known = _certificate(best, args.robust)
-        if not (known.is_global or args.robust or args.incremental):
-            further = starts_nearby(best.start, best.graph)
-            if not args.from_odometry:
-                forgotten = file.from_odometry()
-                further = chain(further, starts(forgotten.graph, forgotten.chains, best.start.placed(best.graph).anchors))
-            for found in map(solve, further):
-                as_many = len(found.start.unplaced) <= len(best.start.unplaced)
-                if as_many and found.summary.chi2 < (1.0 - config.relative_decrease) * best.summary.chi2:
-                    best, known = found, _certificate(found, args.robust)
+        search = _Search(args, config, lambda done, most: progress("optimising", done, most), _allowed(args, file.graph))
+        best, known = _best(search, file, args)
     finally:
         progress.close()
     solved_file = dataclasses.replace(file, graph=best.start.placed(best.graph))
@@ -96,12 +84,51 @@ def run(args: argparse.Namespace) -> int:
 
         write_tum(args.trajectory, file.stamps, best.graph.poses)
     figures = _figures(solved_file, best.summary, [file.anchor_ids[k] for k in best.start.unplaced])
+    figures["closures"] = _closures(best.graph, file.pose_ids)
     figures["certificate"] = "global minimum" if known.is_global else f"none: {known.reason}"
     figures["chi2_lower_bound"] = known.lower_bound
     if args.robust:
         figures["outliers"] = best.outliers
     console.report(args.json, figures, _lines(args, figures))
     return 0 if best.summary.converged else 3
+
+
+def _best(search: "_Search", file: "GraphFile", args: argparse.Namespace) -> tuple["_Solution", "Certificate"]:
+    """Return the lowest minimum that is found, and what is known of the global one."""
+    from itertools import chain
+
+    from ..radio.graph_starts import starts, starts_nearby
+
+    solutions = search.solved(starts(file.graph, file.chains))
+    best = min(solutions, key=lambda solution: (sum(solution.outliers.values()), solution.summary.chi2))
+    known = search.certificate(best)
+    if known.is_global or args.robust or args.incremental:
+        return best, known
+    further = starts_nearby(best.start, best.graph)
+    if not args.from_odometry:
+        forgotten = file.from_odometry()
+        further = chain(further, starts(forgotten.graph, forgotten.chains, best.start.placed(best.graph).anchors))
+    for found in search.solved(further):
+        as_many = len(found.start.unplaced) <= len(best.start.unplaced)
+        if as_many and found.summary.chi2 < (1.0 - search.config.relative_decrease) * best.summary.chi2:
+            best, known = found, search.certificate(found)
+    return best, known
+
+
+_WORK = 4e10
+"""Multiplications of all factorisations; about ten seconds. Graphs of recordings take a tenth of that at most."""
+_EDGES = 100_000
+"""Up to so many; larger graphs have work by the square of their number."""
+
+
+def _allowed(args: argparse.Namespace, graph: "Graph") -> float:
+    """Return the work that a search may take: counted, for the same file must end in the same bytes on any computer.
+
+    Whoever sets the number of iterations gets as many.
+    """
+    if any(word.partition("=")[0].strip() == "max_iterations" for word in args.set):
+        return float("inf")
+    return _WORK * max(sum(map(len, graph.edges)) / _EDGES, 1.0) ** 2
 
 
 class _Solution(NamedTuple):
@@ -114,28 +141,54 @@ class _Solution(NamedTuple):
     start: "Start"
 
 
-def _solve(args: argparse.Namespace, config: "SolverConfig", progress: "Progress", start: "Start") -> _Solution:
-    """Optimise in the way the options ask for; with --robust also count the outliers by kind of edge."""
-    import dataclasses
+class _Search:
+    """Optimises a graph from one start after another, in the way that the options ask for, while there is work allowed."""
 
-    if args.incremental:
-        from ..radio.incremental import optimize_incrementally
+    def __init__(self, args: argparse.Namespace, config: "SolverConfig", progress: "Progress", allowed: float) -> None:
+        self.args, self.config, self.progress, self.left = args, config, progress, allowed
 
-        return _Solution(*optimize_incrementally(start.graph, config, progress), {}, start)
-    if not args.robust:
+    def solved(self, starts: "Iterable[Start]") -> "Iterator[_Solution]":
+        """Yield the solutions from starts."""
+        starts = iter(starts)
+        while self.left > 0.0 and (start := next(starts, None)) is not None:
+            solution = self._solution(start)
+            self.left -= solution.summary.work
+            yield solution
+
+    def _solution(self, start: "Start") -> "_Solution":
+        if self.args.robust:
+            return self._without_outliers(start)
+        if self.args.incremental:
+            from ..radio.incremental import optimize_incrementally
+
+            return _Solution(*optimize_incrementally(start.graph, self.config, self.progress, self.left), {}, start)
         from ..graph.solver import optimize
 
-        return _Solution(*optimize(start.graph, config, progress), {}, start)
-    from ..graph.gnc import optimize_gnc, outlier_thresholds
+        return _Solution(*optimize(start.graph, self.config, self.progress, self.left), {}, start)
 
-    graph = start.graph
-    solved, summary, weights = optimize_gnc(graph, outlier_thresholds(graph), config, progress)
-    outliers: dict[str, int] = {}
-    for k, weight in weights.items():
-        name = type(graph.edges[k]).__name__
-        outliers[name] = outliers.get(name, 0) + int((weight == 0.0).sum())
-    # The file keeps every edge; which ones were left out is not a property of the measurements.
-    return _Solution(dataclasses.replace(solved, edges=graph.edges), summary, outliers, start)
+    def _without_outliers(self, start: "Start") -> "_Solution":
+        import dataclasses
+
+        from ..graph.gnc import optimize_gnc, outlier_thresholds
+
+        graph = start.graph
+        solved, summary, weights = optimize_gnc(graph, outlier_thresholds(graph), self.config, self.progress, self.left)
+        outliers: dict[str, int] = {}
+        for k, weight in weights.items():
+            name = type(graph.edges[k]).__name__
+            outliers[name] = outliers.get(name, 0) + int((weight == 0.0).sum())
+        # The file keeps every edge; which ones were left out is not a property of the measurements.
+        return _Solution(dataclasses.replace(solved, edges=graph.edges), summary, outliers, start)
+
+    def certificate(self, solution: "_Solution") -> "Certificate":
+        """Return what is known of the global minimum."""
+        from ..graph.certificate import Certificate, certify
+
+        if self.args.robust:
+            return Certificate(False, 0.0, "a search decided which edges are outliers")
+        if not solution.summary.converged:
+            return Certificate(False, 0.0, "the search did not converge")
+        return certify(solution.graph, max(self.left, 0.0))
 
 
 def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> dict[str, Any]:
@@ -160,16 +213,22 @@ def _figures(file: "GraphFile", summary: "SolverSummary", lost: list[str]) -> di
     }
 
 
-def _certificate(solution: _Solution, robust: bool) -> "Certificate":
-    """Return what is known of the global minimum."""
-    from ..graph.certificate import Certificate, certify
+def _closures(graph: "Graph", names: tuple[str, ...]) -> dict[str, Any]:
+    """Return how many loop closures there are, how many are far off, and the poses of the worst."""
+    from ..graph.loop_edges import misfit
 
-    if robust:
-        return Certificate(False, 0.0, "a search decided which edges are outliers")
-    return certify(solution.graph) if solution.summary.converged else Certificate(False, 0.0, "the search did not converge")
+    found = misfit(graph)
+    worst = [names[k] for k in found.worst] if found.closures else None
+    return {"count": found.closures, "far_off": found.off, "worst": worst, "contradict": found.most}
+
+
+_WITHIN = " within the work that is allowed for a graph of its size"
+_TRY = "try --set max_iterations=1000, --from-odometry --incremental or --robust"
 
 
 def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
+    from ..graph.solver import ALL_WORK_DONE
+
     edges = ", ".join(f"{count} {name}" for name, count in figures["edges"].items())
     lines = [f"{figures['poses']} poses, {figures['anchors']} anchors, {edges}"]
     lines.append(
@@ -177,7 +236,14 @@ def _lines(args: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
         f" in {figures['iterations']} iterations: {figures['reason']}"
     )
     if not figures["converged"]:
-        lines.append("DOUBT: not converged; try --set max_iterations=1000, --from-odometry --incremental or --robust")
+        lines.append(f"DOUBT: not converged{_WITHIN if figures['reason'] == ALL_WORK_DONE else ''}; {_TRY}")
+    closures = figures["closures"]
+    if closures["contradict"]:
+        lines.append(
+            f"warning: {closures['far_off']} of {closures['count']} loop closures are more than 4 standard deviations off,"
+            f" that of poses {' and '.join(closures['worst'])} most of all: they contradict each other, or state too much"
+            " precision; check their poses, measurements and information"
+        )
     bound = figures["chi2_lower_bound"]
     below = f"; no minimum lies below chi2 {bound:.6g}" if bound > 0.0 else ""
     lines.append(f"certificate: {figures['certificate']}{below}")

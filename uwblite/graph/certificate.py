@@ -25,6 +25,7 @@ from scipy.sparse.linalg import splu
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
 from .components import floating_components
+from .elimination import PER_COMPLEX, work_of
 from .graph import Graph
 from .solver import SolverConfig, optimize
 from .tangent_forms import TangentForm, outside
@@ -52,23 +53,27 @@ class Certificate:
     """Why no more is known; empty where the minimum is global."""
 
 
-def certify(graph: Graph) -> Certificate:
+def certify(graph: Graph, allowed: float = np.inf) -> Certificate:
     """Return whether an optimised graph is the global minimum of its cost.
 
     Parameters
     ----------
     graph : a minimum; some more iterations bring it closer before it is judged.
+    allowed : work, multiplications; where the certificate would take more, there is none.
     """
     chi2, reason = graph.chi2(), outside(graph)
     if reason:
         return Certificate(False, 0.0, reason)
-    allowed = _SHARE * chi2 + _NOTHING
+    negligible = _SHARE * chi2 + _NOTHING
     try:
-        minimum, summary = optimize(graph, _POLISHED)
-        bound = max(summary.chi2 - _gap(*certificate_matrix(minimum), 0.5 * allowed, summary.chi2), 0.0)
+        minimum, summary = optimize(graph, _POLISHED, None, allowed)
+        S, D = certificate_matrix(minimum)
+        if np.isfinite(allowed) and summary.work + (2 + _HALVINGS) * PER_COMPLEX * work_of(S) > allowed:
+            return Certificate(False, 0.0, "its edges tie so many poses to so many others that the matrix would fill up")
+        bound = max(summary.chi2 - _gap(S, D, 0.5 * negligible, summary.chi2), 0.0)
     except SolverError as problem:
         return Certificate(False, 0.0, str(problem))
-    is_global = chi2 - bound <= allowed
+    is_global = chi2 - bound <= negligible
     return Certificate(is_global, bound, "" if is_global else "a lower minimum is not excluded")
 
 

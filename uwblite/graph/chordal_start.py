@@ -13,14 +13,16 @@ from scipy import sparse
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import SolverError
-from .factorization import superlu
+from .elimination import PER_COMPLEX, work_of
+from .factorization import MOST_WORK, superlu
 from .graph import Graph
 from .pose_edges import RelativePoseEdges
 from .unknowns import free_unknowns
 
 
 def chordal_start(graph: Graph) -> Graph | None:
-    """Return the graph with poses from its relative poses alone, None where these close no loop or leave a pose open.
+    """Return the graph with poses from its relative poses alone, None where these close no loop or leave a pose open, or
+    tie so many poses to so many others that the matrix would fill up.
 
     What is fixed stays; anchors stay as well.
     """
@@ -57,5 +59,8 @@ def _solved(i: Ints, j: Ints, factor: Floats, step: Floats, weight: Floats, valu
     right = root * step - A[:, ~free] @ values[~free]
     inner = A[:, free].conj().T
     solved = values.copy()
-    solved[free] = superlu((inner @ inner.conj().T).tocsc(), "MMD_AT_PLUS_A").solve(inner @ right)
+    normal = (inner @ inner.conj().T).tocsc()
+    if PER_COMPLEX * work_of(normal) > MOST_WORK:
+        raise SolverError("the matrix would fill up")
+    solved[free] = superlu(normal, "MMD_AT_PLUS_A").solve(inner @ right)
     return solved

@@ -54,8 +54,9 @@ def truncated_weight(squared: Floats, mu: float) -> Floats:
 
 
 def optimize_gnc(
-    graph: Graph, thresholds: Mapping[int, float], solver: SolverConfig = SolverConfig(), progress: Progress | None = None
-) -> tuple[Graph, SolverSummary, dict[int, Floats]]:
+    graph: Graph, thresholds: Mapping[int, float], solver: SolverConfig = SolverConfig(), progress: Progress | None = None,
+    allowed: float = np.inf,
+) -> tuple[Graph, SolverSummary, dict[int, Floats]]:  # fmt: skip
     """Optimise a graph and find the outliers among chosen kinds of edges.
 
     Parameters
@@ -65,6 +66,7 @@ def optimize_gnc(
         outlier: the root of a chi-square quantile, 3 for ranges, 4 for poses.
     solver : of the last optimisation, with the weights decided.
     progress : called with (done, most) after every step, `most` being an estimate.
+    allowed : work, multiplications; half of it for the steps that decide. What is decided by then is optimised with the rest.
 
     Returns
     -------
@@ -80,17 +82,19 @@ def optimize_gnc(
     mu = 1.0 / max(2.0 * min(worst, _REACH**2) - 1.0, 1e-3)
     few = replace(solver, max_iterations=1)
     most = max(1, int(np.ceil(np.log(_STRICT / mu) / np.log(_MU_FACTOR))))
-    current = plain
+    current, spent = plain, 0.0
     for step in range(most):
         weights = {k: truncated_weight(s, mu) for k, s in _squared(current, thresholds).items()}
-        current, _ = minimise(*_weighted(current, plain, weights), normal, few)
+        current, summary = minimise(*_weighted(current, plain, weights), normal, few)
+        spent += summary.work
         if progress is not None:
             progress(step + 1, most + 1)
         mu *= _MU_FACTOR
-        if all(np.all((w == 0.0) | (w == 1.0)) for w in weights.values()):
+        if spent >= 0.5 * allowed or all(np.all((w == 0.0) | (w == 1.0)) for w in weights.values()):
             break
     weights = {k: (s < 1.0).astype(np.float64) for k, s in _squared(current, thresholds).items()}
-    current, summary = minimise(*_weighted(current, plain, weights), normal, solver)
+    current, summary = minimise(*_weighted(current, plain, weights), normal, solver, None, allowed - spent)
+    summary = replace(summary, work=summary.work + spent)
     if progress is not None:
         progress(most + 1, most + 1)
     return current, summary, weights

@@ -1,7 +1,7 @@
 """Which edges of a graph close loops: all relative poses but the first between successive poses."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,3 +40,34 @@ def with_kernel(graph: Graph, kernel: Kernel) -> Graph:
                     yield replace(e.rows(chosen), kernel=used)  # type: ignore[type-var]
 
     return replace(graph, edges=tuple(parts()))
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """How far loop closures are off in an optimised graph."""
+
+    closures: int
+    off: int
+    """How many of them are off by more than _OFF standard deviations."""
+    worst: tuple[int, int]
+    """The poses of the one that is off most; -1 where there is none."""
+
+    @property
+    def most(self) -> bool:
+        """Most closures are off: they contradict each other, or state a precision that they have not."""
+        return 2 * self.off > self.closures
+
+
+_OFF = 4.0
+"""Whitened norm, standard deviations; one good closure in a thousand is farther off."""
+
+
+def misfit(graph: Graph) -> Misfit:
+    """Return how far the loop closures of a graph are off."""
+    loops = [e.rows(loop) for e, loop in zip(graph.edges, closing(graph), strict=True) if loop is not None and loop.any()]
+    if not loops:
+        return Misfit(0, 0, (-1, -1))
+    i, j = (np.concatenate([getattr(e, end) for e in loops]) for end in ("i", "j"))
+    norms = np.concatenate([np.linalg.norm(e.residuals(graph), axis=1) for e in loops])
+    worst = int(np.argmax(norms))
+    return Misfit(len(norms), int(np.count_nonzero(norms > _OFF)), (int(i[worst]), int(j[worst])))

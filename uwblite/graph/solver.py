@@ -30,7 +30,8 @@ these (anchor_subproblem.py).
 Next to the minimum H hardly changes any more: a step that follows one of little effect takes the factor of that one.
 
 The search ends, and says why, when the decrease still to come is a negligible fraction of F, when every component of
-the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up.
+the gradient is negligible in units of its own curvature, when no step helps, or when the iterations are used up, or the
+work that the caller allows: counted, not timed, so that the same graph ends at the same place.
 Without robust kernels the decrease to come is extrapolated from the last two as a geometric series: exact where
 convergence is linear, far on the safe side where it is quadratic, and it spares the last iteration or two that would
 only confirm. With them, reweighting converges linearly at an unknown rate, and the last decrease itself is the measure.
@@ -46,10 +47,12 @@ from ..arrays import Floats
 from ..config import setting
 from ..errors import ConfigError, SolverError
 from .anchor_subproblem import with_anchors_solved
+from .descent_rules import as_much_again, extrapolated, relaxed
 from .factorization import Factor
 from .graph import Edges, Graph, Linearization, edge_costs, kernel_weights, linearize
 from .normal_equations import NormalEquations
 from .problem_checks import check, independent_residuals, what_is_not_finite
+from .schwarz_cg import iterated
 from .unknowns import cheaper_move, linked_poses
 
 Progress = Callable[[int, int], None]
@@ -82,7 +85,7 @@ class SolverSummary:
     """What an optimisation did and why it ended."""
 
     converged: bool
-    """False only when the iterations were used up or no step helped."""
+    """False only when the iterations or the work allowed were used up, or no step helped."""
     reason: str
     """Which rule ended the search."""
     iterations: int
@@ -97,6 +100,8 @@ class SolverSummary:
     """The graph at the end."""
     chi2_history: Floats = field(default_factory=lambda: np.zeros(0))
     """(iterations,) cost tried by each step."""
+    work: float = 0.0
+    """Multiplications of the factorisations."""
 
     @property
     def dof(self) -> int:
@@ -114,13 +119,14 @@ def _or_none(edges: Edges, residuals: Floats) -> Floats | None:
 
 
 def optimize(
-    graph: Graph, config: SolverConfig = SolverConfig(), progress: Progress | None = None
+    graph: Graph, config: SolverConfig = SolverConfig(), progress: Progress | None = None, allowed: float = np.inf
 ) -> tuple[Graph, SolverSummary]:
     """Return the graph at the nearest minimum of its cost, and how the search went.
 
     Parameters
     ----------
     graph : estimates to start from, what is fixed, and the edges; it is not changed.
+    allowed : work, multiplications, after which the search ends.
 
     Raises
     ------
@@ -128,15 +134,15 @@ def optimize(
     """
     check(graph)
     linearized = linearize(graph)
-    return minimise(graph, linearized, NormalEquations(graph, linearized), config, progress)
+    return minimise(graph, linearized, NormalEquations(graph, linearized), config, progress, allowed)
 
 
 def minimise(
     graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig,
-    progress: Progress | None = None,
+    progress: Progress | None = None, allowed: float = np.inf,
 ) -> tuple[Graph, SolverSummary]:  # fmt: skip
     """Optimise a graph whose edges are already linearised and analysed; weights and kernels may have changed since."""
-    descent = _Descent(graph, linearized, normal, config)
+    descent = _Descent(graph, linearized, normal, config, allowed)
     del linearized
     chi2_initial, reason = descent.chi2, descent.prepare()
     while not reason:
@@ -146,14 +152,17 @@ def minimise(
         reason = reason or descent.prepare()
     graph, history, converged = descent.graph, np.array(descent.history), reason in (NO_DECREASE, GRADIENT)
     chi2, size = descent.chi2, normal.unknowns.size
-    return graph, SolverSummary(converged, reason, len(history), chi2_initial, chi2, size, graph, history)
+    return graph, SolverSummary(converged, reason, len(history), chi2_initial, chi2, size, graph, history, descent.work)
 
 
 class _Descent:
     """A search under way: the estimate, what is linearised there, and the damping of the next step."""
 
-    def __init__(self, graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig) -> None:
+    def __init__(
+        self, graph: Graph, linearized: list[Linearization], normal: NormalEquations, config: SolverConfig, allowed: float
+    ) -> None:
         self.graph, self.linearized, self.normal, self.config = graph, linearized, normal, config
+        self.work, self.allowed = 0.0, allowed
         self.costs = edge_costs(graph, linearized)
         self.chi2 = sum(self.costs)
         if not np.isfinite(self.chi2):
@@ -168,7 +177,7 @@ class _Descent:
         self.scale = np.zeros(normal.unknowns.size)
         self.linked = linked_poses(len(graph.poses), linearized)
         robust = any(edges.kernel.name != "none" for edges in graph.edges)
-        self.to_come = _as_much_again if robust else _extrapolated
+        self.to_come = as_much_again if robust else extrapolated
 
     def prepare(self) -> str:
         """Bring the normal equations to the estimate; return why the search ends here, "" where it goes on."""
@@ -182,12 +191,15 @@ class _Descent:
             self.scale = np.maximum(self.scale, curvature)
             if np.max(np.abs(self.normal.gradient) / np.sqrt(curvature)) <= self.config.gradient_tolerance:
                 return GRADIENT
+        if self.work >= self.allowed:
+            return ALL_WORK_DONE
         return USED_UP if len(self.history) == self.config.max_iterations else ""
 
     def step(self) -> str:
         """Try a step, and take it where the cost falls; return why the search ends with it, "" where it goes on."""
-        reused = self.factor is not None
+        reused, before = self.factor is not None, iterated(self.factor)
         self.factor, step, promised = _step(self.normal, self.damping * self.scale, self.factor)
+        self.work += iterated(self.factor) - before if reused else iterated(self.factor) + self.normal.work
         trial = cheaper_move(self.graph, self.normal.unknowns, step, self.linked)
         linearized = linearize(trial)
         costs = edge_costs(trial, linearized)
@@ -220,7 +232,7 @@ class _Descent:
         near = not reused and decrease <= _NEAR * self.chi2 and self.damping <= _NEARLY_FREE
         self.factor = self.factor if near else None
         self.graph, self.linearized, self.last_decrease, self.costs, self.chi2 = trial, linearized, decrease, costs, sum(costs)
-        self.damping, self.raised_by = max(self.damping * _relaxed(decrease / promised), _LEAST_DAMPING), 2.0
+        self.damping, self.raised_by = max(self.damping * relaxed(decrease / promised), _LEAST_DAMPING), 2.0
         return over
 
     def _refuse(self, promised: float, negligible: float, reused: bool) -> bool:
@@ -237,6 +249,7 @@ NO_DECREASE = "chi2 no longer decreases"
 GRADIENT = "gradient negligible"
 STUCK = "no step decreases chi2"
 USED_UP = "iterations used up"
+ALL_WORK_DONE = "the work allowed is done"
 
 _QUICK = SolverConfig(max_iterations=12, relative_decrease=1e-3)
 """Search for anchors at given poses: the next step takes up what it leaves."""
@@ -252,31 +265,12 @@ _NEAR = 1e-2
 """A step that decreased chi2 by less than this fraction of it changed H so little that the next one takes its factor."""
 _NEARLY_FREE = 1e-6
 """lambda up to which that holds."""
-_KEPT = 0.5
-"""Share of its promise below which a step went where the cost is no parabola, and predicts none of those to come."""
 _ROUNDING = 1e-12
 """Share of chi2 that the rounding of thousands of residuals hides."""
 _LEAST_DAMPING = 1e-14
 _FIRST_BRAKE = 1e-5
 """Least lambda after a step that failed."""
 _MOST_DAMPING = 1e12
-
-
-def _extrapolated(decrease: float, last: float, promised: float) -> float:
-    """Return the sum of the geometric series that the last two decreases begin, where the steps keep what they promise."""
-    if not np.isfinite(last) or decrease < _KEPT * promised:
-        return max(decrease, promised)
-    return decrease * (decrease / (last - decrease)) if decrease < last else np.inf
-
-
-def _relaxed(ratio: float) -> float:
-    """Return the factor of lambda after a step that decreased the cost by this ratio of what it promised."""
-    return max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-
-
-def _as_much_again(decrease: float, last: float, promised: float) -> float:
-    """Return what is still to come where every step halves it, as a robust kernel's reweighting does at best."""
-    return max(decrease, promised)
 
 
 def _step(normal: NormalEquations, damping: Floats, factor: Factor | None) -> tuple[Factor | None, Floats, float]:

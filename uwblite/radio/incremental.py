@@ -59,7 +59,7 @@ _STEP = SolverConfig(max_iterations=30, relative_decrease=1e-4)
 
 
 def optimize_incrementally(
-    graph: Graph, solver: SolverConfig = SolverConfig(), progress: Progress | None = None
+    graph: Graph, solver: SolverConfig = SolverConfig(), progress: Progress | None = None, allowed: float = np.inf
 ) -> tuple[Graph, SolverSummary]:
     """Optimise a graph whose poses stand in the order of time and are guessed by dead reckoning.
 
@@ -68,17 +68,19 @@ def optimize_incrementally(
     graph : its guess of the anchors is used only for those that are fixed, have a prior, or are in no range edges.
     solver : of the last optimisation.
     progress : called with (poses done, poses) after every piece.
+    allowed : work, multiplications; where half of it is done before the end of the path, the rest of it is as guessed.
 
     Raises
     ------
     SolverError : nothing is free, nothing is measured, or a starting value is not finite.
     """
     check(graph)
-    state = _Incremental(graph)
+    state = _Incremental(graph, 0.5 * allowed)
     for done in state.run():
         if progress is not None:
             progress(done, len(graph.poses))
-    return optimize(state.graph, solver)
+    solved, summary = optimize(state.graph, solver, None, allowed - state.work)
+    return solved, replace(summary, work=summary.work + state.work)
 
 
 class _Kind(NamedTuple):
@@ -109,8 +111,9 @@ class _Part(NamedTuple):
 class _Incremental:
     """What is known so far: `graph` with the poses done, and which anchors have joined."""
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: Graph, allowed: float = np.inf) -> None:
         self.graph, self.guess = graph, graph.poses
+        self.work, self.allowed = 0.0, allowed
         self.kinds = [_by_time(edges, graph) for edges in graph.edges]
         self.free = free_unknowns(graph)
         count = len(graph.anchors)
@@ -136,9 +139,12 @@ class _Incremental:
         return np.where(given | self.ranged, -1, first)
 
     def run(self) -> Iterator[int]:
-        """Add poses up to the whole path, yielding the number done."""
+        """Add poses up to the whole path, or while there is work allowed, yielding the number done."""
         done, whole = 0, 0
         while done < len(self.guess):
+            if self.work >= self.allowed:
+                self._lay_on(done, len(self.guess))
+                return
             now = min(done + _PIECE, len(self.guess))
             self._lay_on(done, now)
             everything = now == len(self.guess) or now >= _RESOLVE_FACTOR * whole
@@ -218,7 +224,8 @@ class _Incremental:
         )
         if not part.edges or not any(mask.any() for mask in free_unknowns(part).values()):
             return _Part(part, True, float("nan"))
-        solved, summary = optimize(part, _STEP)
+        solved, summary = optimize(part, _STEP, None, self.allowed - self.work)
+        self.work += summary.work
         scatter = np.sqrt(2.0 / max(summary.dof, 1))
         most = self.usual * (1.0 + _SIGNIFICANCE * scatter)
         return _Part(solved, not summary.chi2_per_dof > most, summary.chi2_per_dof)
