@@ -9,9 +9,10 @@ Reading order: ``se2``, ``sensor_log``, ``mapping`` (the page that is the algori
 Importing this package loads nothing but itself; names below are resolved on first use.
 """
 
-from typing import TYPE_CHECKING
+TYPE_CHECKING = False
+"""True for those who check types; importing `typing` for it would take longer than all before the first line runs."""
 
-if TYPE_CHECKING:  # for those who check types; at run time __getattr__ resolves them
+if TYPE_CHECKING:  # at run time __getattr__ resolves them
     from .io.carmen import read_log
     from .mapping import MappingConfig, MapResult, SensorLog, build_map
 

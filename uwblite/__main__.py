@@ -1,12 +1,20 @@
 """``python -m uwblite`` and the command ``uwblite``.
 
-This file and the package's ``__init__`` import as little as they can: until `start` runs, Ctrl-C ends in a traceback.
-The number of threads of numerical libraries is set before they are imported.
+This file and the package's ``__init__`` import nothing that Python has not loaded yet: until the handler below is set, Ctrl-C
+ends in a traceback. (``signal`` builds classes for all its numbers, milliseconds; ``_signal`` is what it wraps.) The number
+of threads of numerical libraries is set before they are imported.
 """
 
+import _signal as signal
 import os
-import signal
 import sys
+
+
+def _leave(_number: int, _frame: object) -> None:
+    try:
+        os.write(2, b"uwblite: interrupted\n")
+    finally:
+        os._exit(130)
 
 
 def start() -> int:
@@ -22,13 +30,6 @@ def start() -> int:
     from .cli import main
 
     return main()
-
-
-def _leave(_number: int, _frame: object) -> None:
-    try:
-        os.write(2, b"uwblite: interrupted\n")
-    finally:
-        os._exit(130)
 
 
 if __name__ == "__main__":

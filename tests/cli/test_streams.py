@@ -3,8 +3,11 @@
 import gzip
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -138,3 +141,32 @@ def test_what_a_library_makes_of_ctrl_c_is_still_ctrl_c(monkeypatch, capsys):
     monkeypatch.setattr(config, "run", broken)
     assert main(["config"]) == 130
     assert capsys.readouterr().err == "uwblite: interrupted\n"
+
+
+def test_ctrl_c_in_a_callback_whose_exceptions_python_drops_is_none_the_less_ctrl_c(monkeypatch, capsys):
+    from uwblite.cli import config
+
+    class Module:
+        """As a lock of Python's imports, whose end calls back."""
+
+    def lost(_):
+        module = Module()
+        kept = weakref.ref(module, lambda _: os.kill(os.getpid(), signal.SIGINT))
+        del module
+        time.sleep(30)
+        return len([kept])
+
+    monkeypatch.setattr(config, "run", lost)
+    hook = sys.unraisablehook
+    assert main(["config"]) == 130
+    assert capsys.readouterr().err == "uwblite: interrupted\n"
+    assert sys.unraisablehook is hook
+
+
+def test_until_ctrl_c_is_handled_nothing_is_imported_that_python_has_not_loaded():
+    """Each module takes milliseconds, in which Ctrl-C would be a traceback."""
+    program = "import sys; before = set(sys.modules); import uwblite.__main__; print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.split() == ["uwblite", "uwblite.__main__"]

@@ -8,11 +8,9 @@ errors answer at once on a small computer. This package alone prints, and this f
 import argparse
 import os
 import re
-import signal
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any, NoReturn
@@ -164,10 +162,15 @@ def _verb_parser(verb: str, module: Any) -> argparse.ArgumentParser:
 
 def _run(module: Any, args: argparse.Namespace) -> int:
     from . import console
+    from .interruption import interruptible
 
     console.set_up(quiet=args.quiet, verbose=args.verbose)
-    with _interruptible() as interrupted:
-        code = _carry_out(module, args, interrupted)
+    try:
+        with interruptible() as interrupted:
+            code = _carry_out(module, args, interrupted)
+    except KeyboardInterrupt:
+        # Between two lines, before the verb begins or after it has ended.
+        code = console.fail("interrupted", 130)
     return _flushed(code)
 
 
@@ -176,36 +179,6 @@ def _flushed(code: int) -> int:
     from . import console
 
     return code if console.flush() else 1
-
-
-@contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Let the first Ctrl-C raise KeyboardInterrupt, so that nothing is left half done, and a second one end the program.
-
-    The list holds the signal once it came: what it interrupts in a library may come out as another error.
-    """
-    came: list[int] = []
-
-    def interrupt(number: int, _frame: Any) -> None:
-        if came:
-            os._exit(130)
-        came.append(number)
-        raise KeyboardInterrupt
-
-    try:
-        before = signal.getsignal(signal.SIGINT)
-        if before is signal.SIG_IGN:
-            yield came
-            return
-        signal.signal(signal.SIGINT, interrupt)
-    except ValueError:
-        # Not the main thread: signals are somebody else's.
-        yield came
-        return
-    try:
-        yield came
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _carry_out(module: Any, args: argparse.Namespace, interrupted: list[int]) -> int:

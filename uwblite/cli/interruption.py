@@ -1,0 +1,66 @@
+"""Ctrl-C while a verb runs: nothing is left half done, and none is lost."""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+_SOON = 0.02
+"""s; by then Python has left the place where it drops exceptions."""
+
+
+@contextmanager
+def interruptible() -> Iterator[list[int]]:
+    """Let the first Ctrl-C raise KeyboardInterrupt, and a second one end the program.
+
+    Where Python drops the exception, as it does in callbacks of its imports, it is raised again soon after. The list holds the
+    signal once it came: what it interrupts in a library may come out as another error.
+    """
+    came: list[int] = []
+
+    def interrupt(number: int, _frame: Any) -> None:
+        if came:
+            os._exit(130)
+        came.append(number)
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.getsignal(signal.SIGINT)
+        if before is signal.SIG_IGN:
+            yield came
+            return
+        signal.signal(signal.SIGINT, interrupt)
+    except ValueError:
+        # Not the main thread: signals are somebody else's.
+        yield came
+        return
+    try:
+        with _raised_again(came):
+            yield came
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _raised_again(came: list[int]) -> Iterator[None]:
+    from _thread import interrupt_main
+    from threading import Timer
+
+    usual = sys.unraisablehook
+
+    def dropped(error: Any) -> None:
+        if not issubclass(error.exc_type, KeyboardInterrupt):
+            usual(error)
+            return
+        came.clear()
+        timer = Timer(_SOON, interrupt_main)
+        timer.daemon = True
+        timer.start()
+
+    sys.unraisablehook = dropped
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
