@@ -5,6 +5,7 @@ import math
 import pytest
 from helpers.driver_harness import feed_whole, good
 
+from uwblite.drivers.devices import open_device
 from uwblite.drivers.events import Corrupt
 from uwblite.drivers.slamtec import Reply
 from uwblite.drivers.sweep import Samples
@@ -39,3 +40,16 @@ def test_a_reply_that_breaks_off_does_not_swallow_the_next_one():
     whole, single = make(), make()
     events = [event for k in range(len(stream)) for event in single.feed(stream[k : k + 1], 1.0)]
     assert good(whole.feed(stream, 1.0)) == good(events) == [Reply(1.0, 0x81, b"")]
+
+
+@pytest.mark.parametrize("head", ["a55a1400004004", "a55a0300004006", "a55a1400008004"])
+def test_an_answer_that_claims_to_be_a_stream_is_none(head):
+    """One bit has turned over; what was asked for is not there, and the script goes on waiting for it."""
+    whole = make()
+    events = whole.feed(bytes.fromhex(head) + bytes(20), 1.0)
+    assert good(events) == []
+    session = open_device("lidar", "ydlidar-x4:/dev/null")[0]
+    session.start(0.0)
+    for k in range(40):
+        session.feed(bytes.fromhex(head), 0.1 * k)
+        session.tick(0.1 * k)

@@ -67,7 +67,8 @@ def reply_size(buffer: bytearray, at: int, kinds: dict[int, int]) -> int:
         return 0
     word, kind = struct.unpack_from("<IB", head, 2)
     length, streams = word & 0x3FFFFFFF, bool(word >> 30)
-    if kinds.get(kind) != length:
+    # Whoever says who it is says it once: a stream of that is a bit that has turned over.
+    if kinds.get(kind) != length or (streams and kind in (INFO_REPLY, HEALTH_REPLY)):
         return -1
     size = DESCRIPTOR + (0 if streams else length)
     return size if at + size <= len(buffer) else 0
