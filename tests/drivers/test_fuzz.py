@@ -4,7 +4,7 @@ import random
 import sys
 
 import pytest
-from helpers.device_words import WORDS
+from fuzzing.device_words import WORDS
 from helpers.driver_harness import ROOT  # noqa: F401
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -8,7 +8,7 @@ import time
 from unittest import mock
 
 import pytest
-from helpers.device_words import WORDS
+from fuzzing.device_words import WORDS
 from helpers.virtual_recording import VirtualTime
 
 from uwblite.drivers import link as link_module

@@ -13,6 +13,7 @@ import numpy as np
 
 from uwblite.cli import main
 from uwblite.config import merge, parse_toml
+from uwblite.drivers.devices import DEVICES
 from uwblite.errors import UwbliteError
 from uwblite.grid.geometry import GridGeometry
 from uwblite.grid.occupancy_grid import OccupancyGrid
@@ -25,13 +26,15 @@ from uwblite.io.log_tail import LogTail
 from uwblite.io.map_server import read_map, write_map
 from uwblite.io.png import decode_png
 from uwblite.io.pyfg import read_pyfg
+from uwblite.io.relations_file import read_relations
 from uwblite.io.settings_toml import to_toml
 from uwblite.io.tum import read_tum
 from uwblite.io.uwb_mapping import parse_mappings
 from uwblite.mapping import MappingConfig
 from uwblite.server.live import watch_status
 
-from .small_files import ANCHORS, G2O, KNOWN, LOG, MAPPING, PYFG, TABLE, TORO, TUM
+from .small_files import ANCHORS, G2O, KNOWN, LOG, MAPPING, PYFG, RELATIONS, TABLE, TORO, TUM
+from .wires_and_pages import RESULT, ask, listen, result_of, show, wire
 
 Read = Callable[[Path], object]
 
@@ -94,6 +97,11 @@ def _map_folder(folder: Path) -> None:
     (folder / "trajectory.tum").write_bytes(TUM)
 
 
+def _map_and_log(folder: Path) -> None:
+    _map_folder(folder)
+    (folder / "long.log").write_bytes(_log(80))
+
+
 def _toro(poses: int) -> bytes:
     edges = (f"EDGE2 {k} {k + 1} 1 0.1 0.2 100 0 100 100 0 0" for k in range(1, poses))
     return TORO + "".join(f"{edge}\n" for edge in edges).encode()
@@ -134,7 +142,8 @@ def _verb(name: str, data: bytes, *words: str, cost: int = 20, prepare: Callable
             (code not in (0, 1, 2, 3), f"exit code {code}"),
             ("internal error" in text or "Traceback" in text, last),
             ("out of memory" in text, last),
-            (code == 1 and not last.startswith("uwblite: error: "), f"exit code 1 and {last!r}"),
+            # What became of each recording of a batch stands in its table.
+            (code == 1 and not last.startswith("uwblite: error: ") and words[0] != "batch", f"exit code 1 and {last!r}"),
             (not (out.getvalue() + text).replace("\n", "").isprintable(), "what a terminal would obey"),
             (bool(left), f"files {left}"),
         ):
@@ -202,6 +211,7 @@ def cases() -> dict[str, Case]:
         "g2o": _file("x.g2o", G2O, read_g2o),
         "toro": _file("x.graph", _toro(12), read_g2o),
         "pyfg": _file("x.pyfg", PYFG, read_pyfg),
+        "relations": _file("x.relations", RELATIONS * 4, read_relations),
         "tum": _file("x.tum", TUM * 4, read_tum),
         "csv table": _file("x.csv", TABLE * 6, read_csv),
         "anchors": _file("x.csv", ANCHORS + b"".join(b"A%d,%d,2.5,0.1,0.2,ok\n" % (k, k) for k in range(20)), read_anchors),
@@ -212,6 +222,11 @@ def cases() -> dict[str, Case]:
     }
     for name in ("odometry.csv", "ranges.csv", "scans.csv", "sensors.toml"):
         found[name] = Case(f"tables/{name}", lambda path: read_csv_folder(path.parent), _tables)
+    for name in DEVICES:
+        found[f"wire {name}"] = _file("x.bin", wire(name), listen(name))
+    for name in RESULT:
+        found[f"page of {name}"] = Case(name, show, result_of(_log()), 10)
+    found["requests"] = Case("requests", ask, result_of(_log()), 20)
     for name in ("map.yaml", "map.pgm", "map_scale.yaml", "map_scale.png"):
         found[name] = Case(name, lambda path: read_map(path.with_suffix(".yaml")), _map_folder)
     found["png"] = Case("map_scale.png", lambda path: decode_png(path.read_bytes(), str(path)), _map_folder)
@@ -228,6 +243,21 @@ def cases() -> dict[str, Case]:
             "x.log", _log(80), "localize", "{}/x.log", "--map", "{}", "--out", "{}/out.tum", *shared,
             cost=100, prepare=_map_folder,
         ),
+        **{
+            f"localize in {name}": _verb(
+                name, b"", "localize", "{}/long.log", "--map", "{}", "--out", "{}/out.tum", *shared,
+                cost=100, prepare=_map_and_log,
+            )
+            for name in ("map.yaml", "map.pgm", "anchors.csv")
+        },
+        "batch": _verb("x.log", log, "batch", "{}/x.log", "--out", "{}/out", *shared, cost=200),
+        "convert a result": _verb(
+            "report.json", b"", "convert", "{}", "{}/out.tum", "--to", "tum", *shared, cost=20, prepare=result_of(log)
+        ),
+        "settings of map": _verb(
+            "x.toml", to_toml(MappingConfig()).encode()[:2500].rpartition(b"\n")[0],
+            "map", "{}/good.log", "--out", "{}/out", "--config", "{}/x.toml", *shared, cost=100,
+        ),
         "plan": _verb(
             "map.pgm", b"", "plan", "--map", "{}/map.yaml", "--from", "0,-0.88", "--to", "1,-0.88", "--radius", "0",
             "--unknown", "price", "--out", "{}/out", *shared, cost=20, prepare=_map_folder,
@@ -236,6 +266,9 @@ def cases() -> dict[str, Case]:
         "optimize toro": _verb("x.graph", TORO, "optimize", "{}/x.graph", "--out", "{}/out.g2o", *shared, cost=10),
         "optimize pyfg": _verb(
             "x.pyfg", PYFG, "optimize", "{}/x.pyfg", "--from-odometry", "--out", "{}/out.g2o", *shared, cost=10
+        ),
+        "evaluate relations": _verb(
+            "x.relations", RELATIONS * 2, "evaluate", "{}", "--relations", "{}/x.relations", cost=5, prepare=_map_folder
         ),
         "evaluate": _verb("trajectory.tum", b"", "evaluate", "{}", "--truth", "{}/trajectory.tum", cost=5, prepare=_map_folder),
         "constraints of map": _verb(

@@ -58,3 +58,4 @@ only = { tag = 3 }
 '''
 TABLE = b'name,x,y,radius,neighbours\nC1,2.1,1.7,0.15,"C2 C3"\n# remark\nC2,4.9,2.4,0.2,\n'
 ANCHORS = b"id,x,y,sigma_x,sigma_y,status\n5C0B,3,4,0.1,0.1,ok\n91A3,3,6,,,ok\n0D27,6,-3,0.1,0.1,ok\n"
+RELATIONS = b"# stamp1 stamp2 x y z roll pitch yaw\n1 2 1 0 0 0 0 0.1\n1.5 3 1.5 0.1 0 0 0 0\n"
