@@ -26,6 +26,7 @@ from .pipeline import (
     map_frame,
     mirror_images,
     moved_anchors,
+    place_agreement,
     radio_stages,
     scan_selection,
     surface_adjustment,
@@ -75,7 +76,7 @@ def build_map(
     estimate, task = _with_moves_apart(estimate, task, logs)
     # Last of all: moves of anchors are sought on the trajectory before, on which their limits were set.
     estimate, covariance = final_stages.without_range_errors(estimate, task)
-    stages.note([recording.log for recording in task.recordings.each])
+    stages.note(anchor_moves.said_of_places(task, estimate.anchor_ids))
     grid = final_stages.occupancy_grid(estimate, task)
     return summary.summarise(estimate, covariance, grid, task)
 
@@ -146,6 +147,7 @@ def _stages(task: Task) -> Iterator[Callable[[Estimate, Task], Estimate]]:
         yield lidar_stages.check_map_consistency
     if given.landmark_distances:
         yield landmark_ties.tie_landmarks
+    yield place_agreement.merge_places_that_agree
     yield moved_anchors.name_new_and_absent_anchors
     yield final_stages.final_optimisation
     yield mirror_images.find_mirror_images

@@ -21,6 +21,7 @@ from uwblite.pipeline.anchor_moves import (
     alike,
     first_with_moves_apart,
     optimised_with_names,
+    said_of_places,
     short_ranges,
     with_moves_apart,
 )
@@ -29,7 +30,7 @@ from uwblite.pipeline.mapping_config import MappingConfig
 from uwblite.pipeline.progress import Stages
 from uwblite.pipeline.radio_stages import first_optimisation
 from uwblite.pipeline.recordings import Recording, gather
-from uwblite.radio.change_points import Move
+from uwblite.radio.change_points import ON_GIVEN_PATH, ON_OWN_PATH, Move
 from uwblite.radio.trilateration import AnchorHypothesis
 from uwblite.sensor_log import Odometry, SensorLog, SensorMounting, UwbRanges
 
@@ -188,12 +189,14 @@ def test_a_recording_whose_names_stay_is_not_bootstrapped_again(monkeypatch):
 
 
 def test_names_that_are_already_so_stay(monkeypatch):
-    log, moves = four_ranges(), {"A": [moved(1.0)]}
-    monkeypatch.setattr(anchor_moves, "_moves_of_all", lambda *args: [moves])
+    log, moves, needed = four_ranges(), {"A": [moved(1.0)]}, []
+    monkeypatch.setattr(anchor_moves, "_moves_of_all", lambda *args: needed.append(args[-1]) or [moves])
     for now, stays in ((log, False), (four_ranges(**moves), True)):
-        task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=now)]))
+        # A lidar holds the path, or ranges alone do, which takes more evidence.
+        task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=now)], have_scans=stays))
         renamed = with_moves_apart(None, task, [log])
         assert (renamed is None) is stays
+        assert needed.pop() is (ON_GIVEN_PATH if stays else ON_OWN_PATH)
         assert stays or names(renamed[0]) == ["A", "B", "A@2", "B", "A@2", "B", "A@2", "B"]
 
 
@@ -214,9 +217,25 @@ def test_moves_are_sought_in_the_level_part_of_usable_ranges(monkeypatch):
     ranges = UwbRanges(np.arange(1.0, 5.0), np.array([0, 1, 0, 1]), as_recorded, np.ones(4), ("A", "B"))
     second = Recording(1, None, range(2), 1)
     task = SimpleNamespace(config=MappingConfig())
-    assert _moves(second, SensorLog(four_ranges().odometry, ranges), estimate, task) == {}
+    assert _moves(second, SensorLog(four_ranges().odometry, ranges), estimate, task, ON_OWN_PATH) == {}
     assert sorted(asked) == [1.0, 2.0]
     np.testing.assert_allclose(asked[1.0][0], [[0.5, 0.0]], atol=1e-12)
     np.testing.assert_allclose(asked[2.0][0], [[0.5, 0.0], [1.0, 0.5]], atol=1e-12)
     np.testing.assert_allclose(asked[1.0][1], [4.0])
     np.testing.assert_allclose(asked[2.0][1], [2.0, 0.01])
+
+
+def test_of_places_that_a_map_does_not_have_nothing_is_said_but_what_was_left_out():
+    log = four_ranges(A=[moved(1.0, 0.7), moved(3.0, left=2.0)], B=[moved(2.0)])
+    task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=log)]))
+    (whole,) = said_of_places(task, ["A", "A@2#2", "A@3", "B", "B@2"])
+    assert whole.screening.remarks == log.screening.remarks
+    (some,) = said_of_places(task, ["A", "A@2", "B"])
+    said = [(remark.kind, remark.text) for remark in some.screening.remarks]
+    left_out = "between t = 2 and 3 s (its 1 ranges meanwhile were left out): both places are the same within their uncertainty"
+    assert said == [
+        ("moved-anchor", "anchor A was moved by 0.7 m at about t = 1 s; from then on it is called A@2"),
+        ("sustained-outliers", f"anchor A seemed to be moved by 1.0 m {left_out}"),
+    ]
+    silent = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=replace(log, screening=None))]))
+    assert said_of_places(silent, [])[0].screening is None

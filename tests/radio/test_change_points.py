@@ -5,7 +5,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from uwblite.radio.change_points import _CARRIED, _misfit, _returned, _splits, find_move, find_moves
+from uwblite.radio.change_points import (
+    _CARRIED,
+    ON_GIVEN_PATH,
+    ON_OWN_PATH,
+    _misfit,
+    _returned,
+    _splits,
+    find_move,
+    find_moves,
+)
 from uwblite.radio.trilateration import AnchorHypothesis, TrilaterationConfig
 
 STAMPS = np.arange(0.0, 200.0, 1.0)
@@ -180,7 +189,7 @@ def test_the_moments_are_those_at_which_both_places_explain_most():
     ranges = measured(3, np.array([-2.0, 1.0]), np.array([1.0, 4.0]), 90)
     ranges[80:95] += 3.0
     width = 0.24
-    split = _splits(PATH, ranges, [(70, 110)], width, TrilaterationConfig())[70, 110]
+    split = _splits(PATH, ranges, [(70, 110)], width, TrilaterationConfig(), 8)[70, 110]
 
     before, after = (_misfit(PATH, ranges, place, width) for place in (split.before, split.after))
     costs = {
@@ -195,9 +204,12 @@ def test_the_moments_are_those_at_which_both_places_explain_most():
     assert split.unexplained == pytest.approx(before[:left].sum() + between + after[moment:].sum())
 
 
-@pytest.mark.parametrize(("count", "found"), [(17, False), (18, True)])
-def test_eighteen_ranges_show_a_move(count, found):
-    """Half from either place: more than eight on each side, or the moment may as well lie beyond those tried."""
+@pytest.mark.parametrize(("count", "needed", "found"), [
+    (17, ON_GIVEN_PATH, False), (18, ON_GIVEN_PATH, True), (41, ON_OWN_PATH, False), (42, ON_OWN_PATH, True),
+])  # fmt: skip
+def test_few_ranges_show_a_move(count, needed, found):
+    """Half from either place: more than eight on each side, or the moment may as well lie beyond those tried; twenty where the
+    path is not given."""
     few = np.linspace(0, 199, count).astype(int)
     ranges = measured(1, np.array([-2.0, 1.0]), np.array([4.0, 9.0]), int(few[count // 2]), share=0.0)[few]
-    assert (find_move(PATH[few], ranges, STAMPS[few], SIGMA, TrilaterationConfig()) is not None) == found
+    assert (find_move(PATH[few], ranges, STAMPS[few], SIGMA, TrilaterationConfig(), needed) is not None) == found

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..radio.change_points import Move, find_moves
+from ..radio.change_points import ON_GIVEN_PATH, ON_OWN_PATH, Evidence, Move, find_moves
 from ..radio.range_noise import short_term_sigma
 from ..radio.trilateration import usable
 from ..sensor_log import OdometryBreaks, Remark, Screening, SensorLog, UwbRanges
-from ..sensor_log.anchor_names import name_and_number
+from ..sensor_log.anchor_names import first_place, name_and_number
 from .estimate import Estimate, Task
 from .radio_stages import first_optimisation
 from .recordings import Recording, gather
@@ -31,7 +31,8 @@ def with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) 
     ----------
     logs : the recordings with the names as they were recorded.
     """
-    moves = _moves_of_all(estimate, task, logs)
+    # Of several recordings, one with a lidar holds the anchors that those without one have in common with it.
+    moves = _moves_of_all(estimate, task, logs, ON_GIVEN_PATH if task.recordings.have_scans else ON_OWN_PATH)
     renamed = [_renamed(log, found) for log, found in zip(logs, moves, strict=True)]
     now = [recording.log.ranges for recording in task.recordings.each]
     same = all(_same(log.ranges, ranges, found) for log, ranges, found in zip(renamed, now, moves, strict=True))
@@ -40,14 +41,14 @@ def with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) 
 
 def first_with_moves_apart(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) -> list[SensorLog] | None:
     """Return the same after a first optimisation, whose trajectory is bent where anchors were moved."""
-    moves = _moves_of_all(estimate, task, logs)
+    moves = _moves_of_all(estimate, task, logs, ON_OWN_PATH)
     if not any(moves):
         return None
     apart = [_renamed(log, _of_all(log, found)) for log, found in zip(logs, moves, strict=True)]
     said = task.stages.mark()
     estimate, task = optimised_with_names(apart, estimate, task)
     task.stages.back_to(said)
-    moves = _moves_of_all(estimate, task, logs)
+    moves = _moves_of_all(estimate, task, logs, ON_OWN_PATH)
     return [_renamed(log, found) for log, found in zip(logs, moves, strict=True)] if any(moves) else None
 
 
@@ -121,11 +122,12 @@ _FEW = 2
 """Ranges by which a moment may be off."""
 
 
-def _moves_of_all(estimate: Estimate, task: Task, logs: Sequence[SensorLog]) -> list[Moves]:
-    return [_moves(recording, log, estimate, task) for recording, log in zip(task.recordings.each, logs, strict=True)]
+def _moves_of_all(estimate: Estimate, task: Task, logs: Sequence[SensorLog], needed: Evidence) -> list[Moves]:
+    each = zip(task.recordings.each, logs, strict=True)
+    return [_moves(recording, log, estimate, task, needed) for recording, log in each]
 
 
-def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task) -> Moves:
+def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task, needed: Evidence) -> Moves:
     """Return the moves of the anchors of a recording, by their names as recorded (log)."""
     edges, ranges = estimate.ranges, log.ranges
     if ranges is None or edges is None or estimate.bootstrap is None:
@@ -141,10 +143,39 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task)
     moves = {}
     for k, name in enumerate(ranges.anchor_ids):
         own = of_recording[(ranges.anchor == k) & sound[of_recording]]
-        found = find_moves(positions[own], edges.rows(own).planar_ranges(), edges.stamps[own], sigma, task.config.trilateration)
+        at, stamps, level = positions[own], edges.stamps[own], edges.rows(own).planar_ranges()
+        found = find_moves(at, level, stamps, sigma, task.config.trilateration, needed)
         if found:
             moves[name] = found
     return moves
+
+
+_CALLED = "; from then on it is called "
+
+
+def said_of_places(task: Task, names: Sequence[str]) -> list[SensorLog]:
+    """Return the recordings without what was said of places that a map does not have: they are one with those before.
+
+    Parameters
+    ----------
+    names : the map's anchors. Where ranges were left out as made on the way, that is still said.
+    """
+    places = {first_place(name) for name in names}
+    return [_said_of(recording.log, places) for recording in task.recordings.each]
+
+
+def _said_of(log: SensorLog, places: set[str]) -> SensorLog:
+    if log.screening is None:
+        return log
+    said = []
+    for remark in log.screening.remarks:
+        text, called, other = remark.text.partition(_CALLED)
+        if not called or other in places:
+            said.append(remark)
+        elif "left out" in text:
+            text = f"{text.replace('was moved', 'seemed to be moved')}: both places are the same within their uncertainty"
+            said.append(Remark("sustained-outliers", text))
+    return replace(log, screening=replace(log.screening, remarks=tuple(said)))
 
 
 def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
@@ -172,7 +203,7 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
             start, end = (moment - log.odometry.stamps[0] for moment in (move.left, move.stamp))
             when = f"between t = {start:.0f} and {end:.0f} s" if carried.any() else f"at about t = {end:.0f} s"
             less = f" (its {carried.sum()} ranges meanwhile were left out)" if carried.any() else ""
-            text = f"anchor {name} was moved by {move.distance:.1f} m {when}{less}; from then on it is called {other}"
+            text = f"anchor {name} was moved by {move.distance:.1f} m {when}{less}{_CALLED}{other}"
             remarks.append(Remark("moved-anchor", text))
     ids, anchor = np.unique(names.astype(str), return_inverse=True)
     before = log.screening or Screening((), OdometryBreaks.none())

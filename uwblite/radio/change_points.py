@@ -24,15 +24,12 @@ _LIKELY = 2
 """Of them those, the best first, from which the search goes on."""
 _ROUNDS = 6
 """Times, at most, that places and moment are found in turn; two or three are usual."""
-_LEAST_RANGES = 8
-"""Ranges before the first moment tried and after the last: as many determine a place. A moment at one of these ends is no
-minimum: it lies beyond, or a path that is bent looks like a move; both places would hold ranges of each other."""
 _LEAST_MOVE = 0.8
 """Shorter moves cannot be distinguished from a blocked line of sight, m; what the constant errors of both places differ by
 counts off."""
-_GAIN, _FEWEST = 0.05, 6.5
-"""Share and number of the ranges that two places must explain and one place does not; of 600 anchors that stood still in
-rooms whose errors last, one came to more than 6.1."""
+_FEWEST = 6.5
+"""Ranges that two places must explain and one place does not; of 600 anchors that stood still in rooms whose errors last, one
+came to more than 6.1."""
 _WAY = 0.3
 """Share of its ranges, at most, that an anchor on a cart is measured at; two places that leave out more explain too little."""
 _WORST_BIAS = 1.0
@@ -51,6 +48,24 @@ _LATE, _LATE_BY = 0.4, 0.2
 core, one range in seven late, by 0.5 m on the mean and exponentially distributed, and gross errors, as early ranges are."""
 _CARRIED = 0.5
 """A range between two places counts for so many that neither explains: less explained, it was made on the way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a move must show, by how well the trajectory is known."""
+
+    ranges: int
+    """Ranges before the first moment tried and after the last. A moment at one of these ends is no minimum: it lies beyond, or
+    a path that is bent looks like a move; both places would hold ranges of each other."""
+    share: float
+    """Part of all ranges that two places must explain and one place does not."""
+
+
+ON_GIVEN_PATH = Evidence(8, 0.05)
+"""Along a trajectory that other measurements hold: as many ranges determine a place."""
+ON_OWN_PATH = Evidence(20, 0.1)
+"""Along one that rests on ranges itself, and may be bent for a dozen of them; with blocked lines of sight for minutes, anchors
+that stood still came to 0.09."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,18 +95,20 @@ class Move:
         return float(np.hypot(*(self.after - self.before)))
 
 
-def find_moves(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig) -> list[Move]:
+def find_moves(
+    path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig, needed: Evidence = ON_GIVEN_PATH
+) -> list[Move]:
     """Find all moves of an anchor, in the order of time; parameters as for find_move.
 
     Binary segmentation; of three places, the first split may fall into the second one's time, so every moment is found
     again between its neighbours.
     """
-    moves = _parted(path, ranges, stamps, sigma, config)
+    moves = _parted(path, ranges, stamps, sigma, config, needed)
     for k in range(len(moves)) if len(moves) > 1 else ():
         since = moves[k - 1].stamp if k else -np.inf
         until = moves[k + 1].stamp if k + 1 < len(moves) else np.inf
         own = (stamps >= since) & (stamps < until)
-        moves[k] = find_move(path[own], ranges[own], stamps[own], sigma, config) or moves[k]
+        moves[k] = find_move(path[own], ranges[own], stamps[own], sigma, config, needed) or moves[k]
     ends = [*(move.left for move in moves[1:]), np.inf][: len(moves)]
     parts = [(stamps >= move.stamp) & (stamps < end) for move, end in zip(moves, ends, strict=True)]
     width = _width(sigma)
@@ -120,16 +137,20 @@ def _width(sigma: float) -> float:
     return _WIDTH * max(sigma, 0.05)
 
 
-def _parted(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig) -> list[Move]:
-    move = find_move(path, ranges, stamps, sigma, config)
+def _parted(
+    path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig, needed: Evidence
+) -> list[Move]:
+    move = find_move(path, ranges, stamps, sigma, config, needed)
     if move is None:
         return []
     parts = (stamps < move.stamp, stamps >= move.stamp)
-    before, after = (_parted(path[own], ranges[own], stamps[own], sigma, config) for own in parts)
+    before, after = (_parted(path[own], ranges[own], stamps[own], sigma, config, needed) for own in parts)
     return [*before, move, *after]
 
 
-def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig) -> Move | None:
+def find_move(
+    path: Floats, ranges: Floats, stamps: Floats, sigma: float, config: TrilaterationConfig, needed: Evidence = ON_GIVEN_PATH
+) -> Move | None:
     """Find whether and when an anchor was moved; None where one place explains its ranges, or two do not explain more.
 
     Parameters
@@ -137,20 +158,21 @@ def find_move(path: Floats, ranges: Floats, stamps: Floats, sigma: float, config
     path : (m, 2) tag at the ranges, m. ranges : (m,) level distances, m. stamps : (m,) s, in the order of time.
     sigma : short-term standard deviation of the ranges, m.
     """
-    if len(ranges) < 2 * _LEAST_RANGES:
+    least = needed.ranges
+    if len(ranges) < 2 * least:
         return None
-    width, gain = _width(sigma), max(_GAIN * len(ranges), _FEWEST)
+    width, gain = _width(sigma), max(needed.share * len(ranges), _FEWEST)
     alone = float(_misfit(path, ranges, _fitted([(path, ranges)], width, config)[0], width).sum())
     if alone < gain:
         return None
-    starts = np.unique(np.linspace(_LEAST_RANGES, len(ranges) - _LEAST_RANGES, _SPLITS).astype(np.int64)).tolist()
-    tried = _splits(path, ranges, [(k, k) for k in starts[1::2] or starts], width, config)
+    starts = np.unique(np.linspace(least, len(ranges) - least, _SPLITS).astype(np.int64)).tolist()
+    tried = _splits(path, ranges, [(k, k) for k in starts[1::2] or starts], width, config, least)
     if alone - min(found.unexplained for found in tried.values()) < _PROMISING * gain:
         return None
-    tried |= _splits(path, ranges, [(k, k) for k in starts[::2]], width, config)
+    tried |= _splits(path, ranges, [(k, k) for k in starts[::2]], width, config, least)
     likely = sorted(tried, key=lambda at: tried[at].cost)[:_LIKELY]
-    best = min((_converged(path, ranges, at, width, config, tried) for at in likely), key=lambda found: found.cost)
-    if best.left == _LEAST_RANGES or best.moment == len(ranges) - _LEAST_RANGES:
+    best = min((_converged(path, ranges, at, width, config, least, tried) for at in likely), key=lambda found: found.cost)
+    if best.left == least or best.moment == len(ranges) - least:
         return None
     move = Move(float(stamps[best.left]), float(stamps[best.moment]), best.before, best.after)
     # A place is traded against a constant error; that of a radio does not change because the radio is moved.
@@ -181,7 +203,7 @@ class _Split:
 
 
 def _converged(
-    path: Floats, ranges: Floats, at: tuple[int, int], width: float, config: TrilaterationConfig,
+    path: Floats, ranges: Floats, at: tuple[int, int], width: float, config: TrilaterationConfig, least: int,
     tried: dict[tuple[int, int], _Split],
 ) -> _Split:
     """Find places and moments in turn, from first moments on (k-means with two clusters in a row).
@@ -192,7 +214,7 @@ def _converged(
     """
     for _ in range(_ROUNDS):
         if at not in tried:
-            tried |= _splits(path, ranges, [at], width, config)
+            tried |= _splits(path, ranges, [at], width, config, least)
         found = tried[at]
         if (found.left, found.moment) == at:
             break
@@ -201,18 +223,20 @@ def _converged(
 
 
 def _splits(
-    path: Floats, ranges: Floats, moments: list[tuple[int, int]], width: float, config: TrilaterationConfig
+    path: Floats, ranges: Floats, moments: list[tuple[int, int]], width: float, config: TrilaterationConfig, least: int
 ) -> dict[tuple[int, int], _Split]:
     """Fit places to the ranges before and after several pairs of moments."""
     parts = [part for left, first in moments for part in (slice(0, left), slice(first, None))]
     places = _fitted([(path[part], ranges[part]) for part in parts], width, config)
     each = zip(moments, places[::2], places[1::2], strict=True)
-    return {at: _split(path, ranges, before, after, width) for at, before, after in each}
+    return {at: _split(path, ranges, before, after, width, least) for at, before, after in each}
 
 
-def _split(path: Floats, ranges: Floats, before: AnchorHypothesis, after: AnchorHypothesis, width: float) -> _Split:
+def _split(
+    path: Floats, ranges: Floats, before: AnchorHypothesis, after: AnchorHypothesis, width: float, least: int
+) -> _Split:
     """Choose the moments that suit two places best; the costs of all follow from running sums."""
-    low, high = _LEAST_RANGES, len(ranges) - _LEAST_RANGES
+    low, high = least, len(ranges) - least
     by_one, by_other = (_misfit(path, ranges, place, width) for place in (before, after))
     until, since = (np.concatenate([[0.0], np.cumsum(by - _CARRIED)])[low : high + 1] for by in (by_one, by_other))
     best = int(np.argmin(np.minimum.accumulate(until) - since))

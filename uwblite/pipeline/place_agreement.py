@@ -1,0 +1,101 @@
+"""Places of one anchor that turn out to be one place once the trajectory is known well.
+
+A move is found along a given trajectory, as if that were exact. Where a first trajectory is bent, or the lidar sees too little
+to hold the last one, ranges from two stretches of it seem to be from two places, of which one may be a mirror image. Here all
+measurements are in one graph, and the trajectory is free. Where one place costs no more than chance explains, there is one:
+a test by the ratio of likelihoods, which holds as well where a place is known along a curve only.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..graph.solver import SolverConfig
+from ..sensor_log.anchor_names import first_place, name_and_number
+from .estimate import Estimate, Task
+from .lidar_stages import solved
+from .radio_stages import with_range_noise
+
+_FALSE_MOVES = 0.05
+"""Share of maps of anchors that stand still in which places may differ by chance."""
+_PER_MOMENT = 8
+"""Ranges for each moment that is tried independently of the others: as many determine a place."""
+
+
+def merge_places_that_agree(estimate: Estimate, task: Task) -> Estimate:
+    """Return the estimate with successive places of an anchor as one where their joint covariance explains their distance."""
+    ranges = estimate.ranges
+    # What the user has given of anchors counts them as they are.
+    given = bool(task.given.anchors or task.given.distances)
+    pairs = [] if ranges is None or given else _successive(estimate)
+    if ranges is None or not pairs:
+        return estimate
+    apart, most, same = solved(estimate, task.config.solver), _most_cost(int(np.sum(ranges.alive))), []
+    for pair in pairs:
+        if _cost_of_one(apart, pair, task.config.solver) <= most:
+            same.append(pair)
+    if not same:
+        return estimate
+    task.stages.end("places merged", anchors=len(same))
+    merged = with_range_noise(_merged(apart, same), task.config, steady=estimate.joint is not None)
+    return solved(merged, task.config.solver)
+
+
+def _most_cost(count: int) -> float:
+    """Return the quantile of chi-square, 2 degrees of freedom, for the moments that were tried among so many ranges.
+
+    Bonferroni: each of them is tried at a level that makes _FALSE_MOVES of all together.
+    """
+    return -2.0 * float(np.log(_FALSE_MOVES / max(count / _PER_MOMENT, 1.0)))
+
+
+def _successive(estimate: Estimate) -> list[tuple[int, int]]:
+    """Return pairs of placed anchors of which the second is the next place of the first within a recording."""
+    number = {name: k for k, name in enumerate(estimate.anchor_ids) if estimate.placed[k]}
+    pairs = []
+    for name, k in number.items():
+        place = first_place(name)
+        base, which = name_and_number(place)
+        before = base if which == 2 else f"{base}@{which - 1}"
+        of_before = [n for n in (before + name[len(place) :], before) if n in number]
+        if which > 1 and of_before:
+            pairs.append((number[of_before[0]], k))
+    return pairs
+
+
+def _cost_of_one(apart: Estimate, pair: tuple[int, int], solver: SolverConfig) -> float:
+    """Return by how much chi2 grows where two places are one, beginning at either."""
+    one = _merged(apart, [pair])
+    costs = []
+    for start in pair:
+        anchors = one.graph.anchors.copy()
+        anchors[one.anchor_ids.index(apart.anchor_ids[pair[0]])] = apart.graph.anchors[start]
+        costs.append(solved(replace(one, graph=replace(one.graph, anchors=anchors)), solver).problem.chi2())
+    return min(costs) - apart.problem.chi2()
+
+
+def _merged(estimate: Estimate, pairs: Sequence[tuple[int, int]]) -> Estimate:
+    """Return the estimate with the second anchor of each pair as the first one, which may be the second of another pair.
+
+    The constant error of each stretch stays its own.
+    """
+    ranges, found = estimate.ranges, estimate.bootstrap
+    assert ranges is not None
+    assert found is not None
+    into = np.arange(len(estimate.anchor_ids))
+    for first, second in sorted(pairs):
+        into[into == second] = into[first]
+    counts = np.bincount(ranges.anchor[ranges.alive], minlength=len(into)).astype(np.float64)
+    anchors = estimate.graph.anchors.copy()
+    for k in {into[first] for first, _ in pairs}:
+        own = into == k
+        anchors[k] = np.average(anchors[own], axis=0, weights=np.maximum(counts[own], 1.0))
+    kept = np.unique(into)
+    found = replace(
+        found, placed=found.placed[kept], ambiguous=found.ambiguous[kept], hypotheses=tuple(found.hypotheses[k] for k in kept)
+    )
+    graph = replace(estimate.graph, anchors=anchors[kept], fixed_anchors=estimate.graph.fixed_anchors[kept])
+    ranges = replace(ranges, anchor=np.searchsorted(kept, into[ranges.anchor]))
+    names = tuple(estimate.anchor_ids[k] for k in kept)
+    return replace(estimate, graph=graph, ranges=ranges, bootstrap=found, anchor_ids=names)
