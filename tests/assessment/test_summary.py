@@ -276,6 +276,19 @@ def test_an_anchor_is_summed_up_from_its_own_ranges():
     assert (without.bias, without.bias_sigma) == (0.0, 0.0)
 
 
+@pytest.mark.parametrize(("left_out", "status"), [(False, "distrusted"), (True, "ok")])
+def test_readings_that_are_left_out_are_not_too_short(left_out, status):
+    """Five of forty, made while the anchor was carried and set to 0."""
+    short = np.arange(40) < 5
+    ranges = plain_ranges(np.zeros(40, int), np.zeros(40, int), np.where(short, 0.0, 5.0), 0.1)
+    ranges = replace(ranges, calibration=np.full((40, 6), -1), weights=np.where(short & left_out, 0.0, 1.0))
+    graph = Graph(np.zeros((1, 3)), np.array([[3.0, 4.0]]))
+    covariance = SimpleNamespace(anchors=0.04 * np.eye(2)[None], calibration=np.zeros(0))
+    no = np.zeros(1, dtype=bool)
+    estimate = Estimate(graph, None, ranges, ("A",), BootstrapResult(None, ~no, ((),), no))
+    assert _anchor(0, estimate, None, covariance, np.where(short, 5.0, 0.0), 0.2).status == status
+
+
 def test_an_anchor_with_a_mirror_image_says_where_and_what_else_is_wrong():
     found = anchor_of(bootstrapped(ambiguous=(False, True)), measured())
     assert (found.status, found.alternative.tolist()) == ("mirror-ambiguous", [1.0, -4.0])

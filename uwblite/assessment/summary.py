@@ -130,8 +130,10 @@ def _anchor(
         reason = "the path past it is too straight: a mirrored place explains its ranges about as well"
     sigma, longest = float(np.sqrt(np.trace(covariance.anchors[k]))), float(ranges.ranges[ranges.anchor == k].max())
     scatter = spread_about_median(own)
-    short = int(np.sum(own - max(bias, 0.0) > max(limit, SHORT)))
-    if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(own)):
+    # Readings that are no distances, or were left out as made on the way from place to place, are not short.
+    measured = own[ranges.alive[ranges.anchor == k]]
+    short = int(np.sum(measured - max(bias, 0.0) > max(limit, SHORT)))
+    if doubtful := _reason_to_distrust(used, sigma, longest, bias, scatter) or _reason_of_short_ranges(short, len(measured)):
         status, reason = ("distrusted", doubtful) if status == "ok" else (status, f"{doubtful}; {reason}")
     return AnchorEstimate(
         name, graph.anchors[k], covariance.anchors[k], count, used, bias, bias_sigma, scatter, status, reason,
