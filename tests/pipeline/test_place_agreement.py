@@ -14,7 +14,7 @@ from uwblite.pipeline import place_agreement
 from uwblite.pipeline.estimate import Estimate
 from uwblite.pipeline.lidar_stages import solved
 from uwblite.pipeline.mapping_config import MappingConfig
-from uwblite.pipeline.place_agreement import _cost_of_one, _merged, _most_cost, _successive, merge_places_that_agree
+from uwblite.pipeline.place_agreement import _cost_of_one, _merged, _most_cost, _same, _successive, merge_places_that_agree
 from uwblite.pipeline.progress import Stages
 from uwblite.radio.bootstrap_attempt import BootstrapResult
 
@@ -105,3 +105,19 @@ def test_places_that_agree_are_one_but_beside_given_anchors(monkeypatch, cost, g
         assert [stage.name for stage in task.stages.done] == ["places merged"]
     else:
         assert after is before
+
+
+@pytest.mark.parametrize(("given", "merged", "asked"), [(11.0, True, 1), (100.0, True, 2), (119.0, False, 1)])
+def test_poses_give_way_where_they_may_decide(monkeypatch, given, merged, asked):
+    """The limit is 11.7, ten times it 117: with free poses one place costs 5."""
+    before = estimate(["A", "A@2", "B"], [[0.0, 1.0], [0.2, 1.0], [9.0, 9.0]])
+    before, costs = replace(before, graph=replace(before.graph, fixed_poses=np.arange(120) == 0)), []
+
+    def cost(found, pair, solver):
+        costs.append(given if found.graph.fixed_poses.all() else 5.0)
+        return costs[-1]
+
+    monkeypatch.setattr(place_agreement, "_cost_of_one", cost)
+    monkeypatch.setattr(place_agreement, "solved", lambda found, solver: found)
+    same = _same(before, [(0, 1)], _most_cost(120), SolverConfig())
+    assert (same == [(0, 1)], len(costs)) == (merged, asked)

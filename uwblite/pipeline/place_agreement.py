@@ -14,6 +14,7 @@ import numpy as np
 from ..graph.solver import SolverConfig
 from ..sensor_log.anchor_names import first_place, name_and_number
 from .estimate import Estimate, Task
+from .final_stages import at_given_poses
 from .lidar_stages import solved
 from .radio_stages import with_range_noise
 
@@ -21,6 +22,10 @@ _FALSE_MOVES = 0.05
 """Share of maps of anchors that stand still in which places may differ by chance."""
 _PER_MOMENT = 8
 """Ranges for each moment that is tried independently of the others: as many determine a place."""
+
+
+_GIVEN = 10.0
+"""Times the limit up to which poses that give way are tried where one place costs more at given ones."""
 
 
 def merge_places_that_agree(estimate: Estimate, task: Task) -> Estimate:
@@ -31,15 +36,23 @@ def merge_places_that_agree(estimate: Estimate, task: Task) -> Estimate:
     pairs = [] if ranges is None or given else _successive(estimate)
     if ranges is None or not pairs:
         return estimate
-    apart, most, same = solved(estimate, task.config.solver), _most_cost(int(np.sum(ranges.alive))), []
-    for pair in pairs:
-        if _cost_of_one(apart, pair, task.config.solver) <= most:
-            same.append(pair)
+    same = _same(estimate, pairs, _most_cost(int(np.sum(ranges.alive))), task.config.solver)
     if not same:
         return estimate
     task.stages.end("places merged", anchors=len(same))
-    merged = with_range_noise(_merged(apart, same), task.config, steady=estimate.joint is not None)
+    merged = with_range_noise(_merged(estimate, same), task.config, steady=estimate.joint is not None)
     return solved(merged, task.config.solver)
+
+
+def _same(estimate: Estimate, pairs: Sequence[tuple[int, int]], most: float, solver: SolverConfig) -> list[tuple[int, int]]:
+    """Return the pairs of places of which one place costs no more than so much: at given poses, or where poses give way."""
+    here = solved(replace(estimate, graph=at_given_poses(estimate.graph)), solver)
+    costs = {pair: _cost_of_one(here, pair, solver) for pair in pairs}
+    near = [pair for pair, cost in costs.items() if most < cost <= _GIVEN * most]
+    if near:
+        apart = solved(estimate, solver)
+        costs |= {pair: _cost_of_one(apart, pair, solver) for pair in near}
+    return [pair for pair in pairs if costs[pair] <= most]
 
 
 def _most_cost(count: int) -> float:
