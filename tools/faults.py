@@ -88,11 +88,10 @@ def judged(
         worst, beyond = float("nan"), -np.inf
         for anchor, until in zip(result.anchors, _ends(result.anchors), strict=True):
             name = anchor.id.partition("@")[0]
-            places = case.anchors.get(name, [])
-            if anchor.status != "ok" or not places:
+            if anchor.status != "ok" or not case.anchors.get(name):
                 continue
-            # An anchor that is said to have moved at another time than it did is judged by where it stood for longer.
-            place = places[-1 if np.isfinite(anchor.since) and 0.5 * (anchor.since + until) > case.middle else 0]
+            # One that is said to have moved at another time than it did, or not at all, is judged by where it stood longest.
+            place = case.place(name, anchor.since if np.isfinite(anchor.since) else -np.inf, until)
             off = float(np.hypot(*(se2.transform(move, anchor.position * sign) - place)))
             sigma = float(np.hypot(_largest_sigma(anchor.covariance), case.known.get(name, 0.0)))
             worst, beyond = np.fmax(worst, off), max(beyond, off - ANCHOR_BAR - 3.0 * sigma)

@@ -28,6 +28,13 @@ def laser_factor(factor: float) -> Fault:
     )
 
 
+def longer_from_half(factor: float) -> Fault:
+    """From half-way on all readings are longer by a factor: the lidar was changed for another."""
+    return lambda case, rng: with_scans(case, lambda s: replace(s, ranges=np.where(
+        (s.stamps >= case.middle)[:, None] & (s.ranges < s.range_max), s.ranges * np.float32(factor), s.ranges
+    )))
+
+
 def mirrored_laser(case: Case, rng: Rng) -> Case:
     """Beams in the wrong order."""
     return with_scans(case, lambda s: replace(s, ranges=s.ranges[:, ::-1].copy()))

@@ -53,6 +53,22 @@ def moved_anchor(case: Case, rng: Rng) -> Case:
     return case if case.log.ranges is None else elsewhere(case, {case.log.ranges.anchor_ids[0]: np.array([1.8, 2.4])})
 
 
+def moved_by(x: float, y: float, share: float) -> Fault:
+    """One anchor is put so much elsewhere, m, at a share of the recording."""
+    return lambda case, rng: case if case.log.ranges is None else elsewhere(
+        case, {case.log.ranges.anchor_ids[0]: np.array([x, y])}, share
+    )
+
+
+def back_elsewhere(case: Case, rng: Rng) -> Case:
+    """One anchor's battery is empty from 30 % on; at 60 % it is put up again, 3 m away."""
+    case = moved_by(1.8, -2.4, 0.6)(case, rng)
+    first, last = case.log.odometry.stamps[[0, -1]]
+    return with_ranges(case, lambda r: rows(
+        r, (r.anchor != 0) | (r.stamps < first + 0.3 * (last - first)) | (r.stamps >= first + 0.6 * (last - first))
+    ))
+
+
 def one_after_the_other(case: Case, rng: Rng) -> Case:
     """Two anchors are put 1.2 m away, one at a third of the time, one at two thirds."""
     if case.log.ranges is None:
@@ -98,7 +114,8 @@ def elsewhere(case: Case, by: dict[str, Floats], share: float = 0.5) -> Case:
         return replace(r, ranges=ranges)
 
     places = {name: [*places, places[-1] + by[name]] if name in by else places for name, places in case.anchors.items()}
-    return replace(with_ranges(case, change), anchors=places)
+    times = {name: [*case.since.get(name, []), since] for name in by}
+    return replace(with_ranges(case, change), anchors=places, since={**case.since, **times})
 
 
 def _longer(case: Case, r: UwbRanges, place: Floats, shift: Floats) -> Floats:
@@ -169,14 +186,27 @@ def own_body(metres: float) -> Fault:
     return lambda case, rng: with_ranges(case, lambda r: change(r, case))
 
 
-def exchanged_for(seconds: float) -> Fault:
-    """Two anchors answer to each other's names for a while."""
+def exchanged_for(seconds: float, share: float = 0.5) -> Fault:
+    """Two anchors answer to each other's names for a while, from a share of the recording on."""
 
-    def change(r: UwbRanges, case: Case) -> UwbRanges:
-        on = (r.stamps >= case.middle) & (r.stamps < case.middle + seconds) & (r.anchor < 2)
-        return replace(r, anchor=np.where(on, 1 - r.anchor, r.anchor))
+    def fault(case: Case, rng: Rng) -> Case:
+        if case.log.ranges is None:
+            return case
+        first, last = case.log.odometry.stamps[[0, -1]]
+        begin, (a, b) = float(first + share * (last - first)), case.log.ranges.anchor_ids[:2]
 
-    return lambda case, rng: with_ranges(case, lambda r: change(r, case))
+        def change(r: UwbRanges) -> UwbRanges:
+            on = (r.stamps >= begin) & (r.stamps < begin + seconds) & (r.anchor < 2)
+            return replace(r, anchor=np.where(on, 1 - r.anchor, r.anchor))
+
+        if not {a, b} <= case.anchors.keys():
+            return with_ranges(case, change)
+        own = {name: case.anchors[name][0] for name in (a, b)}
+        places = {**case.anchors, a: [own[a], own[b], own[a]], b: [own[b], own[a], own[b]]}
+        times = {name: [begin, begin + seconds] for name in (a, b)}
+        return replace(with_ranges(case, change), anchors=places, since={**case.since, **times})
+
+    return fault
 
 
 def now_and_then(metres: float) -> Fault:

@@ -145,6 +145,28 @@ def other_wheels(factor: float) -> Fault:
     return fault
 
 
+def larger_at_first(factor: float, share: float) -> Fault:
+    """Up to a share of the recording the wheels have another radius: a load is put down then."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps = se2.between(poses[:-1], poses[1:])
+        steps[stamps[1:] < stamps[0] + share * (stamps[-1] - stamps[0]), :2] *= factor
+        return chained(poses[0], steps)
+
+    return lambda case, rng: with_odometry(case, change)
+
+
+def turned_at_once(angle: float, share: float) -> Fault:
+    """The heading jumps by so much, rad, from one reading to the next: a gyro was set, or a wheel hit a sill."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps = se2.between(poses[:-1], poses[1:])
+        steps[int(share * len(steps)), 2] += angle
+        return chained(poses[0], steps)
+
+    return lambda case, rng: with_odometry(case, change)
+
+
 def spinning_wheels(case: Case, rng: Rng) -> Case:
     """Half-way both wheels spin against an obstacle for 20 s and count 4 m that are none."""
 

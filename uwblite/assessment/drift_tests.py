@@ -11,10 +11,12 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Floats
-from ..graph.added_unknown import added_unknown
+from ..graph.added_unknown import added_unknown, added_unknown_and_moves
 from ..graph.graph import Edges, Graph, edge_weights
 from ..graph.pose_edges import OdometryEdges
+from ..lidar.joint_refinement import with_fewer_pairs
 from ..pipeline.estimate import Estimate, Task
+from ..pipeline.recordings import Recording, Recordings
 
 _SIGMAS = 2.5
 """Standard deviations that a drift must exceed, besides its limit."""
@@ -24,6 +26,8 @@ recordings, 30 of simulated and three of real places, have up to 0.24 m, 0.05 an
 _TURN, _TURN_SIGMAS = 0.3, 4.0
 """rad by which turns are wrong over a short way, and standard deviations. Sound recordings, 30 of simulated and three of real
 places, have up to 3.6 sigma with 0.22 rad, the most of some forty ways in each."""
+_MISPLACED = 0.25
+"""m, rms, by which a path is bent whose map is doubted: half of what makes a map wrong."""
 _WAY, _MOST = 8, 128
 """Steps of such a way, 2.4 m, and ways that are tested: those on which the turns fit worst."""
 _STEP = 1e-4
@@ -31,33 +35,77 @@ _STEP = 1e-4
 
 
 def check_drifts(estimate: Estimate, task: Task) -> None:
-    """Doubt a map of a recording without lidar in which ranges or wheels drift, or the radio's clock is seconds off."""
+    """Doubt a map of recordings without lidar in which ranges or wheels drift, or the radio's clock is seconds off; with one,
+    a map of which wheels that drift have misplaced much."""
     graph, ranges, wheels, rec = estimate.graph, estimate.ranges, estimate.odometry, task.recordings
-    if ranges is None or rec.have_scans or not len(wheels) or not estimate.placed.any():
+    if ranges is None or not len(wheels) or not estimate.placed.any():
+        return
+    if rec.have_scans:
+        _check_scale_beside_lidar(graph, wheels, rec, task)
         return
     for recording in rec.each:
         own = np.zeros(len(rec.stamps))
         own[recording.rows] = 1.0
-        stamps = recording.frames.stamps
-        since = np.zeros(len(rec.stamps))
-        since[recording.rows] = (stamps - 0.5 * (stamps[0] + stamps[-1])) / max(float(np.ptp(stamps)), _STEP)
+        since = _age(recording, rec)
         longer = (since[ranges.pose] / ranges.sigma)[:, None]
         moved = ranges.lever_arm + _STEP * own[ranges.pose, None] * ranges.velocity
         late = _change(graph, ranges, replace(ranges, lever_arm=moved))
-        motion = wheels.motion * (1.0 + _STEP * since[wheels.i, None] * np.array([1.0, 1.0, 0.0]))
-        scale = _change(graph, wheels, replace(wheels, motion=motion))
+        scale = _growth(graph, wheels, since)
         of_ranges = added_unknown(graph, ranges, np.stack([longer, late]))
         of_wheels = added_unknown(graph, wheels, scale[None])
         (grown, delay, scaled), sigmas = (np.concatenate(parts) for parts in zip(of_ranges, of_wheels, strict=True))
         for value, sigma, limit, text in (
             (grown, sigmas[0], _LONGER, f"all ranges seem to grow by {grown:.1f} m over the recording (radio warming up?)"),
             (delay, sigmas[1], _LATE, f"the ranges seem to be late by {-delay:.1f} s or more (two clocks?)"),
-            (scaled, sigmas[2], _SCALE, f"the odometry's scale seems to change by {scaled:+.0%} (tyres flat or worn?)"),
+            (scaled, sigmas[2], _SCALE, _scale_text(scaled)),
         ):
             if abs(value) > max(limit, _SIGMAS * sigma):
                 why = f"{text}: without a lidar this bends path and anchors and leaves small residuals; record with a lidar"
                 task.stages.doubt("drift", why, value=float(value), sigma=float(sigma))
     _check_turns(graph, wheels, rec.stamps, task)
+
+
+def _scale_text(by: float) -> str:
+    return f"the odometry's scale seems to change by {by:+.0%} (tyres flat or worn?)"
+
+
+def _age(recording: Recording, rec: Recordings) -> Floats:
+    """Return the time of each keyframe (k,) as a part of its recording's, 0 in the middle; 0 for other recordings."""
+    stamps, since = recording.frames.stamps, np.zeros(len(rec.stamps))
+    since[recording.rows] = (stamps - 0.5 * (stamps[0] + stamps[-1])) / max(float(np.ptp(stamps)), _STEP)
+    return since
+
+
+def _growth(graph: Graph, wheels: OdometryEdges, since: Floats) -> Floats:
+    """Return the change (e, 3) of the wheels' residuals by a scale that grows by 1 over a recording."""
+    motion = wheels.motion * (1.0 + _STEP * since[wheels.i, None] * np.array([1.0, 1.0, 0.0]))
+    return _change(graph, wheels, replace(wheels, motion=motion))
+
+
+def _check_scale_beside_lidar(graph: Graph, wheels: OdometryEdges, rec: Recordings, task: Task) -> None:
+    """Doubt a map whose wheels change their scale, where a map without that change has another shape.
+
+    A lidar that sees walls holds the map whatever the wheels count. In a large hall it sees none for most of the time.
+    """
+    fewer = with_fewer_pairs(graph)
+    growth = np.stack([_growth(fewer, wheels, _age(recording, rec)) for recording in rec.each])
+    values, sigmas, moves = added_unknown_and_moves(fewer, wheels, growth)
+    for recording, value, sigma, moved in zip(rec.each, values.tolist(), sigmas.tolist(), moves, strict=True):
+        off = _bent(graph.poses[recording.rows, :2], moved[recording.rows])
+        if abs(value) > max(_SCALE, _SIGMAS * sigma) and off > _MISPLACED:
+            why = (
+                f"{_scale_text(value)}, and the lidar sees too little to hold the path, which that bends by {off:.1f} m (rms): "
+                "drive nearer to walls, or map the parts before and after separately"
+            )
+            task.stages.doubt("drift", why, value=value, sigma=sigma, bent=off)
+
+
+def _bent(places: Floats, moved: Floats) -> float:
+    """Return the rms of moves (k, 2) of places (k, 2), m, without those of the whole: a shift, a turn."""
+    about = places - places.mean(axis=0)
+    whole = np.column_stack([np.tile(np.eye(2), (len(about), 1)), (about @ [[0.0, 1.0], [-1.0, 0.0]]).ravel()])
+    left = moved.ravel() - whole @ np.linalg.lstsq(whole, moved.ravel(), rcond=None)[0]
+    return float(np.sqrt(np.sum(left**2) / len(places)))
 
 
 def _check_turns(graph: Graph, wheels: OdometryEdges, stamps: Floats, task: Task) -> None:
