@@ -12,6 +12,7 @@ from helpers.room_recording import recording, two_rounds
 from uwblite import se2
 from uwblite.assessment import residual_tests
 from uwblite.assessment.residual_tests import (
+    _contradicted_by_ranges,
     check_odometry_jumps,
     check_odometry_steps,
     check_range_scatter,
@@ -279,3 +280,18 @@ def test_every_check_is_made_once(monkeypatch):
     residual_tests.check_residuals("estimate", "residuals", "grid", "task")
     assert sorted(n for n, *_ in made) == sorted(names)
     assert {tuple(given) for _, *given in made} == {("estimate", "task"), ("estimate", "residuals", "grid", "task")}
+
+
+@pytest.mark.parametrize(("off", "few", "found"), [
+    ((3.0, 3.0, 0.0, 0.0), 3, [10]), ((3.0, 0.0, 0.0, 0.0), 3, []), ((3.0, 3.0, 0.0, 0.0), 2, []),
+    ((0.8, -0.8, 0.8, 0.8), 3, []), ((3.0, -3.0, 0.0, 0.0), 3, [10]),
+])  # fmt: skip
+def test_a_part_that_half_of_the_anchors_contradict_is_not_tied_by_ranges(off, few, found):
+    """Three parts, which begin at keyframes 0, 10 and 20: in the first one some anchors' ranges are off by so much."""
+    anchors = np.array([[9.0, 0.0], [0.0, 9.0], [-9.0, 0.0], [0.0, -9.0]])
+    pose, anchor = np.repeat(np.arange(30), 4), np.tile(np.arange(4), 30)
+    graph = Graph(np.column_stack([np.linspace(0.0, 3.0, 30), np.zeros((30, 2))]), anchors)
+    measured = np.hypot(*(graph.poses[pose, :2] - anchors[anchor]).T) + np.where(pose < 10, np.array(off)[anchor], 0.0)
+    ranges = plain_ranges(pose, anchor, measured, 0.1)
+    ranges = replace(ranges, weights=np.where((pose < 10) & (pose >= few), 0.0, 1.0))
+    assert _contradicted_by_ranges(np.array([20, 10]), graph, ranges).tolist() == found

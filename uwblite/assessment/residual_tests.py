@@ -195,21 +195,50 @@ _FAR = 1.0
 
 
 def check_untied_breaks(estimate: Estimate, task: Task) -> None:
-    """Doubt a map with a break of the odometry across which scans leave a direction free, as along a bare wall."""
+    """Doubt a map with a break of the odometry across which scans leave a direction free, as along a bare wall.
+
+    Ranges tie the parts before and after, unless those of half of the anchors contradict the map in one of them.
+    """
     wheels, stamps = estimate.odometry, task.recordings.stamps
-    if estimate.placed.any() or not task.recordings.have_scans:
+    if not task.recordings.have_scans:
         return
     measured = 1.0 / wheels.sqrt_information[:, 0, 0] < _MEASURED_BREAK
     links = untied_breaks(wheels, estimate.graph, measured, task.recordings.path)
-    at = (stamps[wheels.i[links]] - stamps[0]).tolist()
+    if estimate.placed.any() and estimate.ranges is not None:
+        links = _contradicted_by_ranges(wheels.j[links], estimate.graph, estimate.ranges)
+    else:
+        links = wheels.j[links]
+    at = (stamps[links - 1] - stamps[0]).tolist()
     if at:
         task.stages.doubt(
             "loose-links",
             f"at t = {', '.join(f'{when:.0f}' for when in at[:5])}{' ...' if len(at) > 5 else ''} s the odometry fails where "
             "the lidar cannot measure the travelled distance, as along a bare wall, and no loop closure connects the parts "
-            "before and after: they may be misplaced to each other; drive through the first part once more",
+            "before and after, nor do ranges that agree: they may be misplaced to each other; drive through the first part "
+            "once more",
             at=at,
         )  # fmt: skip
+
+
+def _contradicted_by_ranges(firsts: Ints, graph: Graph, ranges: RangeEdges) -> Ints:
+    """Return those first keyframes (b,) of parts of a map at which one begins or ends that half of the anchors contradict.
+
+    An anchor does whose ranges in it, a few at least, are typically off by more than obstacles and radios explain.
+    """
+    firsts, alive = np.unique(firsts), ranges.alive
+    off = np.abs(ranges.residuals(graph)[:, 0] * ranges.sigma)
+    part = np.searchsorted(firsts, ranges.pose, "right")
+    wrong = np.zeros(len(firsts) + 1, dtype=bool)
+    for k in range(len(wrong)):
+        own = [off[alive & (part == k) & (ranges.anchor == a)] for a in np.unique(ranges.anchor)]
+        typical = np.array([np.median(some) for some in own if len(some) >= _FEW_RANGES])
+        wrong[k] = np.sum(typical > _CONTRADICTS) >= max(0.5 * len(typical), _CONTRADICTING)
+    return firsts[wrong[:-1] | wrong[1:]]
+
+
+_FEW_RANGES, _CONTRADICTS, _CONTRADICTING = 3, 1.0, 2
+"""Ranges to an anchor that say something of a part, m by which they contradict it, and the fewest anchors that do: behind
+furniture ranges are late by half a metre, and one anchor may have been moved."""
 
 
 def _fixed_by_neighbours(graph: Graph) -> Bools:
