@@ -23,18 +23,17 @@ class Case:
     """(n, 3) T_truth_base at each odometry reading."""
     anchors: dict[str, list[Floats]]
     """Places (2,) of each anchor, m, in the order of time."""
-    since: dict[str, list[float]] = field(default_factory=dict)
-    """When the anchor was put to its second, third ... place, s; of anchors that are not named here, half-way."""
     known: dict[str, float] = field(default_factory=dict)
     """Standard deviation of the place of each anchor, m, where it is not simulated but found in a map."""
     clocks: dict[str, Floats] = field(default_factory=dict)
     """By odometry, radio and lidar: what its clock is wrong by at each reading, s."""
+    since: dict[str, list[float]] = field(default_factory=dict)
+    """When the anchor was put to its second, third ... place, s; of anchors that are not named here, half-way."""
 
     @property
     def middle(self) -> float:
         """Half of the recording's time, s."""
         return float(np.mean(self.log.odometry.stamps[[0, -1]]))
-
 
     def place(self, anchor: str, since: float, until: float) -> Floats:
         """Return the place (2,) where an anchor stood for longest between two times, s; -inf and inf: begin and end."""
