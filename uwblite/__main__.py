@@ -5,7 +5,7 @@ ends in a traceback. (``signal`` builds classes for all its numbers, millisecond
 of threads of numerical libraries is set before they are imported.
 """
 
-import _signal as signal
+import _signal as signal  # type: ignore[import-not-found]
 import os
 import sys
 
