@@ -1,7 +1,7 @@
 """Straight walls: stretches of single clouds that are straight, and which stretches of many clouds are one wall."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -119,9 +119,9 @@ def _fitted(number: Ints, points: Floats, normals: Floats, variance: Floats) -> 
     first, last = extent(number, along, many)
     unlike = 1.0 - (normals * normal[number]).sum(axis=1) ** 2 - variance
     straight = (count >= _FEWEST) & (last - first >= _SHORTEST) & (across < _STRAIGHT)
-    inner = (along > first[number] + TRIM) & (along < last[number] - TRIM)
-    straight &= np.bincount(number[inner], unlike[inner] - _UNLIKE**2, many) < 0.0
-    return Stretches(number, along, centre, normal, first, last, straight)
+    found = Stretches(number, along, centre, normal, first, last, straight)
+    inner = found.inside(number, along)
+    return replace(found, straight=straight & (np.bincount(number[inner], unlike[inner] - _UNLIKE**2, many) < 0.0))
 
 
 def principal_axes(number: Ints, points: Floats, many: int) -> tuple[Floats, Floats, Floats]:

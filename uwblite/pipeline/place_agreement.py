@@ -22,14 +22,12 @@ _FALSE_MOVES = 0.05
 """Share of maps of anchors that stand still in which places may differ by chance."""
 _PER_MOMENT = 8
 """Ranges for each moment that is tried independently of the others: as many determine a place."""
-
-
 _GIVEN = 10.0
 """Times the limit up to which poses that give way are tried where one place costs more at given ones."""
 
 
 def merge_places_that_agree(estimate: Estimate, task: Task) -> Estimate:
-    """Return the estimate with successive places of an anchor as one where their joint covariance explains their distance."""
+    """Return the estimate with successive places of an anchor as one where one place explains their ranges as well."""
     ranges = estimate.ranges
     # What the user has given of anchors counts them as they are.
     given = bool(task.given.anchors or task.given.distances)

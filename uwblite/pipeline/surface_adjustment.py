@@ -53,7 +53,7 @@ from .recordings import Recording
 _ROUNDS, _STILL = 6, 1e-3
 """Most Gauss-Newton steps; the largest change of a pose, m and rad, that ends them once noise and pairs have settled."""
 _SETTLING = 2
-"""Steps after which noise is learnt and pairs are measured again; the first step is made without."""
+"""Steps, after the first, before which pairs are measured again; noise is learnt before every step but the first."""
 _KERNEL, _WIDER = 3.0, 4.0
 """Width of the Geman-McClure kernel on the residual of a ray, standard deviations, and by how much it is wider in the first
 step; half as much in each that follows (graduated non-convexity: A. Blake and A. Zisserman, Visual reconstruction, 1987)."""
