@@ -18,7 +18,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from ..arrays import Floats, Ints
 from ..errors import SINGULAR, SolverError
-from .elimination import is_full, minimum_degree, narrow_order, with_subtrees_contiguous, work
+from .elimination import elimination_tree, is_full, minimum_degree, narrow_order, postorder, with_subtrees_contiguous, work
 
 _WIDEST_BAND = 16
 """Distance in the band, poses, up to which the banded factorisation wins (docs/performance.md)."""
@@ -34,6 +34,10 @@ never far from where it was."""
 MOST_WORK = 4e9
 """Multiplications of a factorisation, about a second; a hundred times the paper's graph takes 2.4e9. Edges between any
 poses and any others, however few, fill the whole matrix."""
+
+
+_LONG, _PANEL = 20_000, 8
+"""Rows from which on SuperLU updates so many columns together; one at a time below."""
 
 
 class Factor(Protocol):
@@ -84,7 +88,7 @@ def choose_ordering(pairs: Ints, poses: int, width: Ints, subtrees: bool = False
             return Ordering(order, True, True)
         if tied and is_full(reach):
             return Ordering(np.arange(poses), False, False, iterative=True)
-    order = minimum_degree(among, poses)
+    order = with_subtrees_contiguous(among, poses)
     every = order if bordered else np.concatenate([order, np.arange(poses, len(width))])
     multiplications = work(among if bordered else pairs, every, width)
     if multiplications > (_LITTLE_WORK * poses if tied else MOST_WORK):
@@ -106,14 +110,16 @@ def _before(pairs: Ints, poses: int, last: Ints) -> Ints:
     else:
         block = np.arange(poses) // reach + 1
         order = np.lexsort((np.arange(poses), block & -block))
-    return np.concatenate([order[~late[order]], order[late[order]]])
+    order = np.concatenate([order[~late[order]], order[late[order]]])
+    walk = order[postorder(elimination_tree(pairs, order))]
+    return np.concatenate([walk[~late[walk]], order[late[order]]])
 
 
 def superlu(matrix: sparse.csc_matrix, order: str) -> SuperLU:
-    """Factorise without pivoting; one-column panels suit factors as sparse as these (half the time of the default)."""
-    options = {"SymmetricMode": True, "Equil": False}
+    """Factorise without pivoting; panels of few columns suit factors as sparse as these (half the time of the default)."""
+    options, panel = {"SymmetricMode": True, "Equil": False}, 1 if matrix.shape[0] < _LONG else _PANEL
     try:
-        return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=2, panel_size=1, options=options)
+        return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, relax=2, panel_size=panel, options=options)
     except RuntimeError as problem:
         raise SolverError(f"{SINGULAR} ({problem})") from None
 
