@@ -1,29 +1,24 @@
-"""Gauss-Newton steps of a graph with further unknowns in small blocks, of which each touches many poses and no other block.
+"""Normal equations of a graph with further unknowns in small blocks, of which each touches many poses and no other block.
 
 With the graph's normal equations H x = -g, and of the further measurements G among poses, B between blocks and poses and
-D among blocks, which is block diagonal, the blocks are eliminated:
+D among blocks, which is block diagonal:
 
-    (H + G - B^T D^-1 B) x = -(g + g_x - B^T D^-1 g_s),    s = -D^-1 (g_s + B x).
+    [[H + G, B^T], [B, D]] [x, s] = -[g + g_x, g_s].
 
-The matrix ties all poses that touch one block, so it is never made: conjugate gradients multiply by its parts. A factor of
-another matrix that measures alike, for example of a graph in which pairs of poses stand for the blocks, preconditions. For
-covariances the blocks stay in the matrix, as its last unknowns: then it is sparse.
+Without the blocks, the matrix of the poses alone would tie all that touch one block. With them it is sparse, and minimum degree
+leaves for late what is touched by many.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from .elimination import pairs_of, with_subtrees_contiguous
 from .factorization import superlu
 from .normal_equations import NormalEquations
-from .schwarz_cg import conjugate_gradients
-
-_RESIDUAL, _MOST = 1e-3, 300
-"""Relative residual at which conjugate gradients end, and most of their steps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +30,7 @@ class Blocks:
     across: sparse.csr_matrix
     """(b k, n) B."""
     own: Floats
-    """(b, k, k) D; regular where it is eliminated."""
+    """(b, k, k) D."""
     slope: Floats
     """(n,) g_x."""
     own_slope: Floats
@@ -51,35 +46,42 @@ def blocks_of(by_graph: sparse.csr_matrix, by_block: sparse.csr_matrix, residual
     return Blocks(among, across, own, by_graph.T @ residual, (by_block.T @ residual).reshape(count, k))
 
 
-def summed(one: Blocks, other: Blocks) -> Blocks:
-    """Return the normal equations of the measurements of both."""
-    slope, own_slope = one.slope + other.slope, one.own_slope + other.own_slope
-    return Blocks(one.among + other.among, one.across + other.across, one.own + other.own, slope, own_slope)
+def summed(parts: Iterable[Blocks]) -> Blocks:
+    """Return the normal equations of the measurements of all parts, one or more."""
+    parts = iter(parts)
+    total = next(parts)
+    among, across = [total.among], [total.across]
+    for part in parts:
+        among.append(part.among)
+        across.append(part.across)
+        slope, own_slope = total.slope + part.slope, total.own_slope + part.own_slope
+        total = replace(total, own=total.own + part.own, slope=slope, own_slope=own_slope)
+    return replace(total, among=_sum_of(among), across=_sum_of(across))
 
 
-def step(normal: NormalEquations, blocks: Blocks, precondition: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
-    """Return the Gauss-Newton step of the graph's unknowns (n,) and of the blocks (b, k).
+def _sum_of(matrices: Sequence[sparse.csr_matrix]) -> sparse.csr_matrix:
+    """Return the sum of sparse matrices, all at once: one after the other, each sum would copy those before."""
+    entries = [matrix.tocoo() for matrix in matrices]
+    data, row, column = (np.concatenate([getattr(e, name) for e in entries]) for name in ("data", "row", "col"))
+    return sparse.csr_matrix((data, (row, column)), shape=matrices[0].shape)
+
+
+def step(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> tuple[Floats, Floats, Ints]:
+    """Return the Gauss-Newton step of the graph's unknowns (n,) and of the blocks (b, k), and the order of elimination.
 
     Parameters
     ----------
     normal : of the graph, in the sparse layout (NormalEquations with subtrees).
-    precondition : multiplies (n,) by about the inverse of the reduced matrix.
+    order : of an earlier step whose measurements touch the same.
 
     Raises
     ------
-    SolverError : the matrix is not positive definite.
+    SolverError : the matrix is singular.
     """
-    inverse, matrix = np.linalg.inv(blocks.own), normal.matrix + blocks.among
-
-    def within(values: Floats) -> Floats:
-        return np.einsum("bij,bj->bi", inverse, values.reshape(blocks.own_slope.shape)).ravel()
-
-    def times(x: Floats) -> Floats:
-        return np.asarray(matrix @ x - blocks.across.T @ within(blocks.across @ x))
-
-    right = -(normal.gradient + blocks.slope - blocks.across.T @ within(blocks.own_slope))
-    x, _ = conjugate_gradients(times, right, precondition, _RESIDUAL, _MOST)
-    return x, -within(blocks.own_slope.ravel() + blocks.across @ x).reshape(blocks.own_slope.shape)
+    factor = WithBlocks(normal.matrix, blocks, order)
+    found = -factor.solve_all(np.concatenate([normal.gradient + blocks.slope, blocks.own_slope.ravel()]))
+    n = normal.unknowns.size
+    return found[:n], found[n:].reshape(blocks.own_slope.shape), factor.order
 
 
 class WithBlocks:
@@ -89,12 +91,13 @@ class WithBlocks:
     poses, and each hands on the rows of all others.
     """
 
-    def __init__(self, matrix: sparse.csc_matrix, blocks: Blocks) -> None:
+    def __init__(self, matrix: sparse.csc_matrix, blocks: Blocks, order: Ints | None = None) -> None:
         """Factorise.
 
         Parameters
         ----------
         matrix : (n, n) H.
+        order : of elimination, of a matrix with the same pattern.
 
         Raises
         ------
@@ -104,13 +107,25 @@ class WithBlocks:
         own = sparse.bsr_matrix((blocks.own, np.arange(count), np.arange(count + 1)))
         whole = sparse.bmat([[matrix + blocks.among, blocks.across.T], [blocks.across, own]], format="csc")
         self._size, self._more = matrix.shape[0], whole.shape[0] - matrix.shape[0]
-        self._order = with_subtrees_contiguous(pairs_of(whole), whole.shape[0])
-        self._place = np.argsort(self._order)
-        self._lu = superlu(sparse.csc_matrix(whole[self._order][:, self._order]), "NATURAL")
-        self.L, self.U = self._lu.L, self._lu.U
+        self.order = with_subtrees_contiguous(pairs_of(whole), whole.shape[0]) if order is None else order
+        self._place = np.argsort(self.order)
+        self._lu = superlu(sparse.csc_matrix(whole[self.order][:, self.order]), "NATURAL")
         self.perm_r, self.perm_c = self._lu.perm_r[self._place], self._lu.perm_c[self._place]
 
+    @property
+    def L(self) -> sparse.csc_matrix:
+        """Lower triangle; SuperLU makes a copy of its factor where it is read."""
+        return self._lu.L
+
+    @property
+    def U(self) -> sparse.csc_matrix:
+        """Upper triangle."""
+        return self._lu.U
+
     def solve(self, right: Floats) -> Floats:
-        """Solve for right-hand sides (n,) or (n, m)."""
-        whole = np.concatenate([right, np.zeros((self._more, *right.shape[1:]))])
-        return np.asarray(self._lu.solve(whole[self._order])[self._place[: self._size]])
+        """Solve for the graph's unknowns by right-hand sides (n,) or (n, m)."""
+        return self.solve_all(np.concatenate([right, np.zeros((self._more, *right.shape[1:]))]))[: self._size]
+
+    def solve_all(self, right: Floats) -> Floats:
+        """Solve for all unknowns by right-hand sides (n + b k,) or (n + b k, m)."""
+        return np.asarray(self._lu.solve(right[self.order])[self._place])

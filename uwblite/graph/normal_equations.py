@@ -248,10 +248,17 @@ def _same(one: list[_Block], other: list[_Block]) -> bool:
     )
 
 
-def filled(graph: Graph, subtrees: bool = False, last: Ints | None = None) -> NormalEquations:
-    """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations."""
+def filled(
+    graph: Graph, subtrees: bool = False, last: Ints | None = None, like: NormalEquations | None = None
+) -> NormalEquations:
+    """Return the normal equations at the graph's estimates, with the robust weights as they stand; see NormalEquations.
+
+    Parameters
+    ----------
+    like : of a graph whose edges touch the same, if there are any: they are filled anew.
+    """
     linearized = linearize(graph)
-    normal = NormalEquations(graph, linearized, subtrees, last)
+    normal = NormalEquations(graph, linearized, subtrees, last) if like is None else like
     normal.fill(linearized, [edge_weights(edges, graph) for edges in graph.edges])
     return normal
 

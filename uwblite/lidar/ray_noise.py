@@ -76,9 +76,11 @@ def _class(reach: Floats) -> Ints:
 
 def _design_effects(residual: Floats, place: Ints, surface: Ints, curved: Bools) -> Floats:
     """Return the squared sums of residuals over places, by the sums of squares (2,), of walls and of columns."""
-    _, first, number = np.unique(np.stack([surface, place]), axis=1, return_index=True, return_inverse=True)
-    number, of = number.reshape(-1), surface[first]
-    sums, squares = np.bincount(number, residual), np.bincount(number, residual**2)
+    first = int(place.min(initial=0))
+    many = int(place.max(initial=0)) - first + 1
+    number = surface.astype(np.int64) * many + (place - first)
+    shown = np.flatnonzero(np.bincount(number))
+    sums, squares, of = np.bincount(number, residual)[shown], np.bincount(number, residual**2)[shown], shown // many
     places = np.bincount(of, minlength=len(curved))
     free = places - _FITTED[curved.astype(np.int64)]
     share = np.where(places >= _MANY, places / np.maximum(free, 1), 0.0)[of]

@@ -102,8 +102,8 @@ def _corners(number: Ints, points: Floats) -> Ints:
     across = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / np.maximum(np.hypot(*chord.T), 1e-9)[:, None]
     off = np.abs(((points - points[first[number]]) * across[number]).sum(axis=1))
     bent = principal_axes(number, points, len(first))[2] > _STRAIGHT
-    order = np.lexsort((off, number))
-    farthest = order[last]
+    at = np.flatnonzero(off == np.maximum.reduceat(off, first)[number]) if len(first) else first
+    farthest = at[np.searchsorted(number[at], number[last], "right") - 1]
     return farthest[bent & (farthest > first) & (farthest < last)]
 
 

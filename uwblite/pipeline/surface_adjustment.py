@@ -14,6 +14,7 @@ real offices, rays of one place weigh as few, and pairs keep their weight.
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,6 @@ from ..arrays import Floats, Ints, concatenated
 from ..graph.calibration import LASER
 from ..graph.eliminated import Blocks, blocks_of, step, summed
 from ..graph.graph import Graph
-from ..graph.marginals import factor_of
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
@@ -156,7 +156,7 @@ def _adjusted(
     ----------
     kind : (p,) of the clouds' points, see points_on.
     """
-    joint, factor = estimate.joint, None
+    joint, normal, order = estimate.joint, None, None
     assert joint is not None
     for turn in range(_ROUNDS):
         poses, sensors = graph.poses, _sensors(graph, joint, task)
@@ -164,10 +164,11 @@ def _adjusted(
             found = replace(found, noise=noise_of(found.rays, found.surfaces, sensors, poses))
         if 0 < turn <= _SETTLING:
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
-        normal = filled(with_fewer_pairs(graph.with_edges(*estimate.odometry_and_ranges, joint)), subtrees=True)
-        factor = factor_of(normal) if factor is None else factor
+        problem = with_fewer_pairs(graph.with_edges(*estimate.odometry_and_ranges, joint))
+        normal = filled(problem, subtrees=True, like=normal)
         kernel = _KERNEL * max(_WIDER * 0.5**turn, 1.0)
-        change, by_surface = step(normal, _of_rays(found, graph, sensors, normal.unknowns, kernel=kernel), factor.solve)
+        blocks = _of_rays(found, graph, sensors, normal.unknowns, kernel=kernel)
+        change, by_surface, order = step(normal, blocks, order)
         graph, found = moved(graph, normal.unknowns, change), replace(found, surfaces=found.surfaces.moved(by_surface))
         if turn >= _SETTLING and np.abs(graph.poses - poses).max() < _STILL:
             break
@@ -186,11 +187,12 @@ def _of_rays(
     found: MeasuredSurfaces, graph: Graph, sensors: Floats, unknowns: Unknowns, factor: float = 1.0, kernel: float = _KERNEL
 ) -> Blocks:
     """Return the normal equations of rays and of what is known of surfaces, some rays at a time; residuals times a factor."""
-    total = _priors(found.surfaces, unknowns)
-    for some in found.rays.in_parts():
-        lines = _weighted(linearized(some, found.surfaces, sensors, graph.poses), some, found, factor, kernel)
-        total = summed(total, _of_some(some, lines, len(found.surfaces.facing), unknowns))
-    return total
+
+    def of_some(rays: SurfaceRays) -> Blocks:
+        lines = _weighted(linearized(rays, found.surfaces, sensors, graph.poses), rays, found, factor, kernel)
+        return _of_some(rays, lines, len(found.surfaces.facing), unknowns)
+
+    return summed(chain([_priors(found.surfaces, unknowns)], map(of_some, found.rays.in_parts())))
 
 
 def _priors(surfaces: Surfaces, unknowns: Unknowns) -> Blocks:
