@@ -47,12 +47,12 @@ def join(estimates: Sequence[Estimate], task: Task) -> Estimate:
     DataError : a recording shares fewer than two placed anchors with the others.
     """
     recordings = task.recordings
-    placed = _places(estimates[0])
+    found = [_places(estimate) for estimate in estimates]
+    placed = dict(found[0])
     motions = [np.zeros(3) for _ in estimates]
     names = [list(estimate.anchor_ids) for estimate in estimates]
     waiting = list(range(1, len(estimates)))
     while waiting:
-        found = {n: _places(estimates[n]) for n in waiting}
         number = max(waiting, key=lambda n: (len(found[n].keys() & placed.keys()), -n))
         motions[number], moved = _laid_on(found[number], placed, recordings.each[number])
         waiting.remove(number)
