@@ -90,7 +90,7 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
 
     What ranges err alike by direction is taken off before the last solution.
     """
-    made, shifts, scans = [], iter(moved), object()
+    made, shifts = [], iter(moved)
     task = SimpleNamespace(config=MappingConfig(), stages=SimpleNamespace(report=lambda *_: None))
     estimate = SimpleNamespace(graph=SimpleNamespace(poses=None), moved_since=lambda before: next(shifts))
 
@@ -99,7 +99,7 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
         return estimate
 
     def matched(*given):
-        assert given == (estimate, scans, moved[0], task)
+        assert given == (estimate, moved[0], task)
         made.append("match")
         return estimate
 
@@ -107,5 +107,5 @@ def test_clouds_are_matched_again_where_ranges_move_the_poses_by_four_centimetre
     monkeypatch.setattr(lidar_stages, "_without_pattern", lambda estimate, task: made.append("pattern") or estimate)
     monkeypatch.setattr(lidar_stages, "solved", solved)
     monkeypatch.setattr(lidar_stages, "_matched_once_more", matched)
-    assert lidar_stages._by_own_errors(estimate, scans, task) is estimate
+    assert lidar_stages.solved_by_own_errors(estimate, task) is estimate
     assert " ".join(made) == done

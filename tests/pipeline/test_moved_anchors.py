@@ -45,7 +45,7 @@ def test_an_anchor_that_stands_elsewhere_in_a_recording_is_another_one_there(mon
     place = np.column_stack([list(places.values()), np.zeros(6)])
     found = place, np.tile(0.01 * np.eye(2), (6, 1, 1)), pairs
     monkeypatch.setattr(moved_anchors, "_places_by_recording", lambda *args: found)
-    monkeypatch.setattr(moved_anchors, "refine_jointly", lambda estimate, task: estimate)
+    monkeypatch.setattr(moved_anchors, "_solved_again", lambda estimate, task: estimate)
     yes = np.ones(2, dtype=bool)
     graph = Graph(np.zeros((3, 3)), np.array([[0.0, 0.0], [5.0, 0.0]]))
     ranges = plain_ranges(recording, anchor, np.ones(6), 0.1)
@@ -66,7 +66,7 @@ def united(monkeypatch, places, *given, variance=0.01):
     """Three recordings that were joined with a second place of A in the second one; places (3,) as the poses show them."""
     found = np.column_stack([places, np.zeros(3)]), np.tile(variance * np.eye(2), (3, 1, 1)), np.array([[0, 0], [0, 2], [2, 1]])
     monkeypatch.setattr(moved_anchors, "_places_by_recording", lambda *args: found)
-    monkeypatch.setattr(moved_anchors, "refine_jointly", lambda estimate, task: estimate)
+    monkeypatch.setattr(moved_anchors, "_solved_again", lambda estimate, task: estimate)
     yes = np.ones(3, dtype=bool)
     graph = Graph(np.zeros((3, 3)), np.array([[0.0, 0.0], [5.0, 0.0], [27.0, 0.0]]))
     ranges = plain_ranges(np.array([0, 0, 1, 2]), np.array([0, 1, 2, 0]), np.ones(4), 0.1)

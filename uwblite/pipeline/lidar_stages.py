@@ -223,10 +223,10 @@ def refine_jointly(estimate: Estimate, task: Task) -> Estimate:
         sigma=round(refined.sigma, 4), shift=round(estimate.moved_since(before), 5), **solver_figures(refined.summary),
     )  # fmt: skip
     del refined, i, j  # Matches of all pairs are large.
-    return estimate if estimate.ranges is None or estimate.joint is None else _by_own_errors(estimate, scans, task)
+    return estimate if estimate.ranges is None or estimate.joint is None else solved_by_own_errors(estimate, task)
 
 
-def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimate:
+def solved_by_own_errors(estimate: Estimate, task: Task) -> Estimate:
     """Solve everything with ranges that weigh by their own errors alone.
 
     The common error of all ranges from one direction moves an anchor, and no number of them averages it out; but it
@@ -238,7 +238,7 @@ def _by_own_errors(estimate: Estimate, scans: ScanClouds, task: Task) -> Estimat
     if (shift := estimate.moved_since(before)) >= task.config.refinement.same_pairs:
         # Of other pairs of clouds nothing stays that was analysed, and it is large.
         optimizer = Optimizer()
-        estimate = _matched_once_more(estimate, scans, shift, task)
+        estimate = _matched_once_more(estimate, shift, task)
         before = estimate.graph.poses
         estimate = solved(with_range_noise(estimate, task.config), quick, optimizer)
     if estimate.moved_since(before) >= _STILL:
@@ -260,9 +260,9 @@ _STILL = 0.001
 """Root mean square by which poses must have moved for their ranges to show another noise, m."""
 
 
-def _matched_once_more(estimate: Estimate, scans: ScanClouds, shift: float, task: Task) -> Estimate:
+def _matched_once_more(estimate: Estimate, shift: float, task: Task) -> Estimate:
     """Match all clouds again after the poses moved by a shift, m, and solve with what they measure."""
-    settings = replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
+    scans, settings = estimate.lidar, replace(task.config.refinement, first_gate=task.config.refinement.later_gate)
     i, j = _pairs(estimate.graph, scans, settings, task)
     refined = _refine(estimate.graph, estimate.odometry_and_ranges, scans, i, j, settings, task, "joint refinement")
     task.stages.end("matched once more", pairs=len(i), used=int(refined.used.sum()), shift=round(shift, 5))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..graph.calibration import BIAS
+from ..graph.calibration import BIAS, RADIO, with_free
 from ..graph.graph import Graph
 from ..graph.marginals import marginals
 from ..graph.optimizer import Optimizer
@@ -17,7 +17,8 @@ from ..radio.range_noise import RangeNoiseConfig
 from ..sensor_log.anchor_names import first_place, numbered, radio_name
 from .estimate import Estimate, Task
 from .joining import tolerance, warn_of_moved_anchor
-from .lidar_stages import refine_jointly
+from .lidar_stages import solved, solved_by_own_errors
+from .radio_stages import with_range_noise
 
 _LEAST_MOVE = 0.25
 """An anchor that two recordings see nearer together than this was not moved, m."""
@@ -31,8 +32,8 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
 
     With the poses fixed, every recording's ranges determine where each anchor stood then; places whose distance their
     uncertainty does not explain are not the same. Recordings that were joined may have had an anchor and its mirror image: such
-    an anchor was not moved, if its places are now as near as joining would have asked. Where anything changes, the joint
-    refinement is done again.
+    an anchor was not moved, if its places are now as near as joining would have asked. Where anything changes, all is solved
+    again, and clouds are matched again where poses move by much.
     """
     if len(task.recordings) == 1 or estimate.ranges is None or estimate.bootstrap is None:
         return estimate
@@ -77,7 +78,24 @@ def separate_moved_anchors(estimate: Estimate, task: Task) -> Estimate:
     graph = replace(estimate.graph, anchors=anchors[kept], fixed_anchors=~found.placed)
     ranges = replace(estimate.ranges, anchor=np.searchsorted(kept, anchor))
     names = tuple(ids[n] for n in kept)
-    return refine_jointly(replace(estimate, graph=graph, ranges=ranges, bootstrap=found, anchor_ids=names), task)
+    graph = with_free(graph, *RADIO)
+    return _solved_again(replace(estimate, graph=graph, ranges=ranges, bootstrap=found, anchor_ids=names), task)
+
+
+def _solved_again(estimate: Estimate, task: Task) -> Estimate:
+    """Return the optimum with ranges that belong to other anchors than before.
+
+    It begins where all ranges of an anchor put it: from the place that one recording shows those of others look like outliers.
+    """
+    assert estimate.ranges is not None
+    together = np.zeros(len(estimate.ranges), dtype=np.int64)
+    place, _, pairs = _places_by_recording(estimate, together, task.config.solver, task.config.ranges)
+    anchors = estimate.graph.anchors.copy()
+    anchors[pairs[:, 0]] = place
+    estimate = replace(estimate, graph=replace(estimate.graph, anchors=anchors))
+    if estimate.joint is None:
+        return solved(with_range_noise(estimate, task.config), task.config.solver)
+    return solved_by_own_errors(estimate, task)
 
 
 def _first_of(ids: Sequence[str], task: Task) -> Callable[[str], str]:
