@@ -96,6 +96,7 @@ def test_ranges_have_another_name_from_each_move_on():
     first, second = log.screening.remarks
     assert first.text == "anchor A was moved by 0.7 m at about t = 1 s; from then on it is called A@2"
     assert second.text.endswith("it is called A@3")
+    assert [(remark.place, remark.without_place) for remark in (first, second)] == [("A@2", ""), ("A@3", "")]
     assert names(four_ranges(B=[moved(2.0)])) == ["A", "B", "A", "B", "A", "B@2", "A", "B@2"]
     assert names(four_ranges()) == ["A", "B"] * 4
 

@@ -150,9 +150,6 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task,
     return moves
 
 
-_CALLED = "; from then on it is called "
-
-
 def said_of_places(task: Task, names: Sequence[str]) -> list[SensorLog]:
     """Return the recordings without what was said of places that a map does not have: they are one with those before.
 
@@ -169,12 +166,10 @@ def _said_of(log: SensorLog, places: set[str]) -> SensorLog:
         return log
     said = []
     for remark in log.screening.remarks:
-        text, called, other = remark.text.partition(_CALLED)
-        if not called or other in places:
+        if not remark.place or remark.place in places:
             said.append(remark)
-        elif "left out" in text:
-            text = f"{text.replace('was moved', 'seemed to be moved')}: both places are the same within their uncertainty"
-            said.append(Remark("sustained-outliers", text))
+        elif remark.without_place:
+            said.append(Remark("sustained-outliers", remark.without_place))
     return replace(log, screening=replace(log.screening, remarks=tuple(said)))
 
 
@@ -202,9 +197,12 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
             measured[carried] = 0.0
             start, end = (moment - log.odometry.stamps[0] for moment in (move.left, move.stamp))
             when = f"between t = {start:.0f} and {end:.0f} s" if carried.any() else f"at about t = {end:.0f} s"
-            less = f" (its {carried.sum()} ranges meanwhile were left out)" if carried.any() else ""
-            text = f"anchor {name} was moved by {move.distance:.1f} m {when}{less}{_CALLED}{other}"
-            remarks.append(Remark("moved-anchor", text))
+            less, without = "", ""
+            if carried.any():
+                less = f" (its {carried.sum()} ranges meanwhile were left out)"
+                without = f"anchor {name} seemed to be moved by {move.distance:.1f} m {when}{less}: {_SAME}"
+            text = f"anchor {name} was moved by {move.distance:.1f} m {when}{less}; from then on it is called {other}"
+            remarks.append(Remark("moved-anchor", text, place=other, without_place=without))
     ids, anchor = np.unique(names.astype(str), return_inverse=True)
     before = log.screening or Screening((), OdometryBreaks.none())
     return replace(
@@ -213,3 +211,6 @@ def _renamed(log: SensorLog, moves: Moves) -> SensorLog:
         mounting=replace(log.mounting, anchor_heights=heights),
         screening=replace(before, remarks=(*before.remarks, *remarks)),
     )
+
+
+_SAME = "both places are the same within their uncertainty"

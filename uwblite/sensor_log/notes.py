@@ -44,6 +44,10 @@ class Remark:
     """Whether a map of the recording should not be trusted; otherwise it was repaired, or costs accuracy only."""
     stretches: tuple[tuple[float, float], ...] = ()
     """First and last time, s, of each stretch in which it was so; empty where it is no matter of stretches."""
+    place: str = ""
+    """Name of the place of an anchor that it speaks of; empty where it speaks of none."""
+    without_place: str = ""
+    """What is left to say where a map does not have that place; empty: nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
