@@ -242,10 +242,26 @@ def test_ranges_scatter_more_than_from_one_to_the_next(off, steps, said):
     ranges = replace(plain_ranges(np.arange(600), anchor, values, 0.1), weights=np.where(stamps == 7.0, 0.0, 1.0))
     object.__setattr__(ranges, "stamps", stamps)
     stages = Stages(None, None)
-    task = SimpleNamespace(config=SimpleNamespace(ranges=RangeNoiseConfig()), stages=stages)
-    check_range_scatter(SimpleNamespace(ranges=ranges), residuals, None, task)
+    check_range_scatter(SimpleNamespace(ranges=ranges), residuals, None, scatter_task(stages, np.zeros(600, dtype=int)))
     assert len(stages.doubts) == (said is not None)
     assert all(said in n.text for n in stages.doubts)
+
+
+def scatter_task(stages, of_keyframe):
+    recordings, config = SimpleNamespace(of_keyframe=of_keyframe), SimpleNamespace(ranges=RangeNoiseConfig())
+    return SimpleNamespace(config=config, stages=stages, recordings=recordings)
+
+
+def test_ranges_of_two_recordings_whose_clocks_show_the_same_do_not_scatter_from_one_to_the_next():
+    """Each sees one anchor from its own place, 10 and 20 m away; the residuals are of one half a metre off."""
+    stamps, recording = np.repeat(np.arange(300.0), 2), np.arange(600) % 2
+    off = np.where(stamps < 150.0, -0.5, 0.5)
+    ranges = plain_ranges(np.arange(600), np.zeros(600, dtype=int), 10.0 + 10.0 * recording + off, 0.1)
+    object.__setattr__(ranges, "stamps", stamps)
+    stages = Stages(None, None)
+    check_range_scatter(SimpleNamespace(ranges=ranges), off, None, scatter_task(stages, recording))
+    (doubt,) = stages.doubts
+    assert doubt.figures["short_term"] < 0.1
 
 
 @pytest.mark.parametrize(("walled", "late", "free", "said"), [
@@ -266,7 +282,7 @@ def test_ranges_through_walls_may_be_late_where_the_map_shows_the_walls(walled, 
     log_odds = np.zeros((200, 200), dtype=np.float32)
     log_odds[:, 120] = 5.0 * walled
     stages = Stages(None, None)
-    task = SimpleNamespace(config=SimpleNamespace(ranges=RangeNoiseConfig()), stages=stages)
+    task = scatter_task(stages, np.zeros(600, dtype=int))
     estimate = SimpleNamespace(ranges=ranges, graph=Graph(poses, np.zeros((1, 2))))
     check_range_scatter(estimate, residuals, OccupancyGrid(geometry, log_odds), task)
     assert len(stages.doubts) == said

@@ -226,6 +226,22 @@ def test_moves_are_sought_in_the_level_part_of_usable_ranges(monkeypatch):
     np.testing.assert_allclose(asked[2.0][1], [2.0, 0.01])
 
 
+def test_the_noise_by_which_moves_are_judged_is_that_of_the_recording_alone(monkeypatch):
+    """Two recordings whose clocks show the same times hear one anchor, from 10 and from 20 m."""
+    noises = []
+    monkeypatch.setattr(anchor_moves, "find_moves", lambda at, level, stamps, sigma, *rest: noises.append(sigma))
+    rng, recording = np.random.default_rng(2), np.repeat([0, 1], 100)
+    stamps, values = np.tile(np.arange(100.0), 2), 10.0 + 10.0 * recording + 0.1 * rng.standard_normal(200)
+    edges = replace(plain_ranges(recording, np.zeros(200, dtype=int), values, 0.1), stamps=stamps)
+    estimate = SimpleNamespace(ranges=edges, bootstrap=True, graph=Graph(np.zeros((2, 3))))
+    for number in range(2):
+        own = recording == number
+        ranges = UwbRanges(stamps[own], np.zeros(100, dtype=int), values[own], np.ones(100), ("A",))
+        log = SensorLog(four_ranges().odometry, ranges)
+        _moves(Recording(number, None, range(1), number), log, estimate, SimpleNamespace(config=MappingConfig()), ON_OWN_PATH)
+    np.testing.assert_allclose(noises, 0.1, rtol=0.3)
+
+
 def test_of_places_that_a_map_does_not_have_nothing_is_said_but_what_was_left_out():
     log = four_ranges(A=[moved(1.0, 0.7), moved(3.0, left=2.0)], B=[moved(2.0)])
     task = SimpleNamespace(recordings=SimpleNamespace(each=[SimpleNamespace(log=log)]))

@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import Bools, Floats, runs_of
 from ..map_result import AnchorEstimate
 from ..pipeline.estimate import Task
-from ..sensor_log.anchor_names import name_and_number
+from ..sensor_log.anchor_names import first_place, name_and_number
 
 
 def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]]:
@@ -30,18 +30,20 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
     ----------
     table : MapResult.range_table. anchor_ids : names.
     """
-    start = float(task.recordings.stamps[0])
-    for k, name in enumerate(anchor_ids):
-        own = (table["anchor"] == k) & (table["weight"] > 0)
-        stretches = outlier_stretches(table["stamp"][own], table["agrees"][own] > 0.5) if own.any() else []
-        if stretches:
-            when = ", ".join(f"{a - start:.0f} to {b - start:.0f} s" for a, b in stretches[:4])
-            task.stages.warn(
-                "sustained-outliers",
-                f"anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
-                "its line of sight was blocked, or it was moved; these ranges are down-weighted",
-                anchor=name, stretches=stretches,
-            )  # fmt: skip
+    several = len(task.recordings) > 1
+    for recording in task.recordings.each:
+        start, where = float(recording.frames.stamps[0]), f"recording {recording.number + 1}: " if several else ""
+        for k, name in enumerate(anchor_ids):
+            own = (table["anchor"] == k) & (table["weight"] > 0) & (table["recording"] == recording.number)
+            stretches = outlier_stretches(table["stamp"][own], table["agrees"][own] > 0.5) if own.any() else []
+            if stretches:
+                when = ", ".join(f"{a - start:.0f} to {b - start:.0f} s" for a, b in stretches[:4])
+                task.stages.warn(
+                    "sustained-outliers",
+                    f"{where}anchor {name} disagrees with the map for long (t = {when}{' ...' if len(stretches) > 4 else ''}): "
+                    "its line of sight was blocked, or it was moved; these ranges are down-weighted",
+                    anchor=name, stretches=stretches,
+                )  # fmt: skip
 
 
 def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> None:
@@ -65,24 +67,25 @@ def check_wheels_against_lidar(table: dict[str, Floats], anchors: Sequence[Ancho
 
     The map follows the lidar. Ranges to three anchors or more that agree with it, over the recording and in each stretch in
     question, would not agree with a path that the lidar has bent: then the wheels are at fault alone. Anchors that seem to have
-    been moved could have been taken along by such a path; of several recordings the clocks may show the same times.
+    been moved could have been taken along by such a path.
 
     Parameters
     ----------
     table : MapResult.range_table; empty without ranges. anchors : in the order of its numbers.
     """
     against = [notice for notice in task.stages.doubts if notice.kind == "wheels-against-lidar"]
-    if not against or not len(table.get("stamp", ())) or len(task.recordings.each) > 1:
+    if not against or not len(table.get("stamp", ())):
         return
     if any(name_and_number(a.id)[1] > 1 for a in anchors):
         return
-    sound = np.array([a.status == "ok" for a in anchors])[table["anchor"].astype(np.int64)]
+    still = np.array([a.status == "ok" and first_place(a.id) == a.id for a in anchors])[table["anchor"].astype(np.int64)]
     stamps, anchor, near = table["stamp"], table["anchor"], np.abs(table["residual"]) < _NEAR
-    if near.mean() < _MOST_NEAR:
-        return
     for notice in against:
-        inside = [sound & (stamps >= a) & (stamps <= b) for a, b in notice.figures["stretches"]]
-        if all(len(set(anchor[own].tolist())) >= _ENOUGH and near[own].mean() >= _MANY_NEAR for own in inside):
+        # Clocks of different recordings may show the same times.
+        own = table["recording"] == notice.figures["recording"] - 1
+        inside = [own & still & (stamps >= a) & (stamps <= b) for a, b in notice.figures["stretches"]]
+        agree = own.any() and near[own].mean() >= _MOST_NEAR
+        if agree and all(len(set(anchor[r].tolist())) >= _ENOUGH and near[r].mean() >= _MANY_NEAR for r in inside):
             task.stages.settle(notice, "the ranges agree with the lidar there: check the wheels")
 
 

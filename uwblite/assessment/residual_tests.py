@@ -70,7 +70,9 @@ def check_range_scatter(estimate: Estimate, residuals: Floats, grid: OccupancyGr
     ranges = estimate.ranges
     if ranges is None or not (alive := ranges.alive).any():
         return
-    short = short_term_sigma(ranges.stamps[alive], ranges.anchor[alive], ranges.ranges[alive], task.config.ranges)
+    # Clocks of different recordings may show the same times.
+    apart = ranges.anchor + (ranges.anchor.max() + 1) * task.recordings.of_keyframe[ranges.pose]
+    short = short_term_sigma(ranges.stamps[alive], apart[alive], ranges.ranges[alive], task.config.ranges)
     most = min(max(_SCATTER, _TIMES_NOISE * short), NO_DISTANCES)
     typical = float(np.median(_spread_by_anchor(residuals[alive], ranges.anchor[alive])))
     if most < typical < NO_DISTANCES and grid is not None and np.mean(residuals[alive] > most) < _EARLY:

@@ -133,16 +133,13 @@ def _moves(recording: Recording, log: SensorLog, estimate: Estimate, task: Task,
     if ranges is None or edges is None or estimate.bootstrap is None:
         return {}
     # The recording's ranges stand in the edges in their own order; some may have been left out there.
-    of_recording = np.flatnonzero(recording.has(edges.pose))
-    measured = edges.ranges.copy()
-    measured[of_recording] = ranges.ranges
-    edges = replace(edges, ranges=measured)
+    edges = replace(edges.rows(recording.has(edges.pose)), ranges=ranges.ranges)
     positions = edges.tag_positions(estimate.graph.poses)
     sound = usable(edges.ranges, task.config.trilateration)
     sigma = short_term_sigma(edges.stamps[sound], edges.anchor[sound], edges.ranges[sound], task.config.ranges)
     moves = {}
     for k, name in enumerate(ranges.anchor_ids):
-        own = of_recording[(ranges.anchor == k) & sound[of_recording]]
+        own = np.flatnonzero((ranges.anchor == k) & sound)
         at, stamps, level = positions[own], edges.stamps[own], edges.rows(own).planar_ranges()
         found = find_moves(at, level, stamps, sigma, task.config.trilateration, needed)
         if found:

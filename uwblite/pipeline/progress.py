@@ -45,7 +45,7 @@ class Stages:
             where = f"recording {number + 1}: " if len(logs) > 1 else ""
             for remark in log.screening.remarks if log.screening is not None else ():
                 add = self.doubt if remark.doubt else self.warn
-                figures = {"stretches": remark.stretches} if remark.stretches else {}
+                figures = {"recording": number + 1, "stretches": remark.stretches} if remark.stretches else {}
                 add(remark.kind, where + remark.text, **figures)
 
     def report(self, stage: str, done: int, total: int) -> None:
