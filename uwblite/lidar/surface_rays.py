@@ -234,9 +234,11 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
     at, direction = in_map(rays, sensors)
     at -= surfaces.offset[rays.surface, None] * direction
     away, curved = at - surfaces.place[rays.surface], surfaces.round[rays.surface]
-    normal = np.stack(se2.cos_sin(surfaces.facing[rays.surface]), axis=1)
-    shift, outwards, _ = to_circle(away, direction, surfaces.radius[rays.surface])
-    normal = np.where(curved[:, None], outwards, normal)
+    normal, shift = np.stack(se2.cos_sin(surfaces.facing), axis=1)[rays.surface], np.zeros(len(away))
+    round_ones = np.flatnonzero(curved)
+    if len(round_ones):
+        radius = surfaces.radius[rays.surface[round_ones]]
+        shift[round_ones], normal[round_ones], _ = to_circle(away[round_ones], direction[round_ones], radius)
     incidence = (normal * direction).sum(axis=1)
     incidence = np.where(np.abs(incidence) > _LEAST, incidence, -_LEAST)
     residual = np.where(curved, -shift * incidence, (normal * away).sum(axis=1))
