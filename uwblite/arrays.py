@@ -6,6 +6,8 @@ from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 _Joined = TypeVar("_Joined")
 _Number = TypeVar("_Number", np.float64, np.int64)
@@ -60,6 +62,12 @@ def concatenated(parts: Sequence[_Joined]) -> _Joined:
     columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(parts[0])}  # type: ignore[arg-type]
     whole = {n: np.concatenate(c) if isinstance(c[0], np.ndarray) else concatenated(c) for n, c in columns.items()}
     return replace(parts[0], **whole)  # type: ignore[type-var]
+
+
+def connected(one: Ints, other: Ints, many: int) -> Ints:
+    """Return the number (n,) of the part to which each of many nodes belongs, by ties (e,), (e,)."""
+    ties = sparse.coo_matrix((np.ones(len(one), dtype=np.int8), (one, other)), shape=(many, many))
+    return np.asarray(connected_components(ties, directed=False)[1], dtype=np.int64)
 
 
 def rms_length(vectors: Floats) -> float:

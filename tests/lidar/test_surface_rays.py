@@ -11,12 +11,14 @@ from uwblite.lidar.cloud_rasters import rasterize
 from uwblite.lidar.surface_rays import (
     SurfaceRays,
     Surfaces,
+    around_columns,
+    as_rays,
+    bundled,
     linearized,
     noise_of,
     on_columns,
-    on_stretches,
     points_on,
-    rays_around,
+    stretch_of,
 )
 from uwblite.lidar.walls import find_walls, stretches
 from uwblite.odometry.attached import ScanPoints
@@ -107,7 +109,9 @@ def test_rays_of_a_wall_are_bundled_and_lie_on_it(noise):
     reach = 1.0 / way[:, 1] + noise * np.random.default_rng(3).standard_normal(300)
     nothing = np.zeros(300, dtype=np.int64)
     rays = ScanPoints(nothing, reach[:, None] * way, np.zeros((300, 2)), np.arange(300), nothing)
-    found = on_stretches(rays, clouds, rasterize(clouds, 0.1, 0.3), stretches(clouds))
+    stretch = stretch_of(rays, clouds, rasterize(clouds, 0.1, 0.3), stretches(clouds))
+    on = np.flatnonzero(stretch >= 0)
+    found = bundled(as_rays(rays).rows(on), stretch[on], rays.scan[on], rays.ray[on])
     assert 60 <= len(found.keyframe) <= 76
     off = found.points[:, 1] - 1.0
     assert np.abs(off).max() < max(4.0 * 0.5 * noise, 2e-3)
@@ -154,7 +158,8 @@ def test_only_rays_that_face_a_column_count():
     rays = rays_that_end()
     scan = ScanPoints(rays.keyframe, rays.points, np.zeros((40, 2)), np.arange(40), np.zeros(40, dtype=np.int64))
     columns = np.array([[-1.5, 1.0, 0.4]])
-    near = rays_around(scan, POSES, columns)
+    every = as_rays(scan)
+    near = every.rows(around_columns(every, POSES, columns))
     assert np.all(np.isin(near.points, rays.points[rays.surface == 1]))
     found = on_columns(near, POSES, columns, 7)
     assert 0 < len(found.keyframe) <= 20

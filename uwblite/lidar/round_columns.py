@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, Table
+from ..arrays import Bools, Floats, Ints, Table, connected
 from ..odometry.attached import ScanPoints
 from .ray_noise import range_sigma
 
@@ -98,8 +96,7 @@ def find_columns(found: Circles, poses: Floats) -> Floats:
     one, other = cKDTree(at).query_pairs(_APART, output_type="ndarray").T if len(at) else np.zeros((2, 0), dtype=np.int64)
     smaller = np.minimum(found.radius[one], found.radius[other])
     alike = np.abs(found.radius[one] - found.radius[other]) < _UNLIKE * smaller + _RADII[0] / 2.0
-    ties = sparse.coo_matrix((np.ones(int(alike.sum())), (one[alike], other[alike])), shape=(len(at), len(at)))
-    number = connected_components(ties, directed=False)[1]
+    number = connected(one[alike], other[alike], len(at))
     views = np.bincount(np.unique(np.stack([number, found.keyframe]), axis=1)[0].astype(np.int64))
     weight = np.bincount(number, found.rays).astype(np.float64)
     values = np.column_stack([at, found.radius])

@@ -93,6 +93,11 @@ class SurfaceRays(Table):
         for first in range(0, len(self.keyframe), _AT_ONCE):
             yield self.rows(slice(first, first + _AT_ONCE))
 
+    def renumbered(self, number: Ints) -> "SurfaceRays":
+        """Return the rays with surface k as number[k]; without those where that is -1."""
+        new = replace(self, surface=number[self.surface])
+        return new.rows(new.surface >= 0)
+
     def packed(self) -> "SurfaceRays":
         """Return the rays in half the memory: single precision is a few micrometres at the reach of a lidar, as in clouds."""
         points, directions, sigma = (v.astype(np.float32) for v in (self.points, self.directions, self.sigma))
@@ -120,19 +125,17 @@ def as_rays(rays: ScanPoints) -> SurfaceRays:
     return SurfaceRays(rays.keyframe, none, rays.points, way / reach[:, None], range_sigma(reach))
 
 
-def on_stretches(rays: ScanPoints, clouds: Clouds, raster: CloudRasters, found: Stretches) -> SurfaceRays:
-    """Return the rays that end on the straight stretches that their own cloud shows, away from the ends of these: as
-    surfaces the numbers of the stretches, and neighbouring rays as one."""
-    every = as_rays(rays)
-    if not len(clouds.points) or not len(every.keyframe):
-        return every.rows(np.zeros(0, dtype=np.int64))
+def stretch_of(rays: ScanPoints, clouds: Clouds, raster: CloudRasters, found: Stretches) -> Ints:
+    """Return on which straight stretch (p,) of its own cloud each ray ends, away from the stretch's ends; -1 = on none."""
+    stretch = np.full(len(rays.keyframe), -1)
+    if not len(clouds.points) or not len(stretch):
+        return stretch
     nearest = look_up(raster, rays.keyframe, rays.points[:, :1], rays.points[:, 1:])[:, 0].astype(np.int64)
-    point = np.where(nearest >= 0, nearest + clouds.offsets[rays.keyframe], 0)
-    near = np.flatnonzero((nearest >= 0) & found.straight[found.of_point[point]])
-    stretch, some = found.of_point[point[near]], every.rows(near)
-    good = _ends_on(some, found, stretch)
-    some, near = replace(some, surface=stretch).rows(good), near[good]
-    return _bundled(some, rays.scan[near], rays.ray[near])
+    of = found.of_point[np.where(nearest >= 0, nearest + clouds.offsets[rays.keyframe], 0)]
+    near = np.flatnonzero((nearest >= 0) & found.straight[of])
+    near = near[_ends_on(as_rays(rays).rows(near), found, of[near])]
+    stretch[near] = of[near]
+    return stretch
 
 
 def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
@@ -145,17 +148,22 @@ def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
     return np.asarray(found.inside(stretch, along) & (incidence > _INCIDENCE) & (np.abs(residual) < gate))
 
 
-def _bundled(rays: SurfaceRays, scan: Ints, ray: Ints) -> SurfaceRays:
-    """Return neighbouring rays of one scan on one stretch as their mean, which weighs as they together do."""
-    key = np.stack([scan, rays.surface, ray // _BUNDLE])
+def bundled(rays: SurfaceRays, surface: Ints, scan: Ints, ray: Ints) -> SurfaceRays:
+    """Return neighbouring rays of one scan on one surface (m,) as their mean, which weighs as they together do.
+
+    Parameters
+    ----------
+    scan, ray : (m,) numbers of the rays, ascending.
+    """
+    key = np.stack([scan, surface, ray // _BUNDLE])
     first = np.flatnonzero(np.diff(key, axis=1, prepend=-1).any(axis=0))
     if not len(first):
-        return rays
+        return replace(rays, surface=surface)
     count = np.diff(np.append(first, len(scan)))[:, None]
     points, ways = (np.add.reduceat(v, first, axis=0) / count for v in (rays.points, rays.directions))
     sigma = np.add.reduceat(rays.sigma, first) / count[:, 0] / np.sqrt(count[:, 0])
     directions = ways / np.hypot(*ways.T)[:, None]
-    return SurfaceRays(rays.keyframe[first], rays.surface[first], points, directions, sigma)
+    return SurfaceRays(rays.keyframe[first], surface[first], points, directions, sigma)
 
 
 _BUNDLE = 4
@@ -173,14 +181,12 @@ def on_columns(rays: SurfaceRays, poses: Floats, columns: Floats, first: int) ->
     return replace(rays, surface=nearest + first).rows(good)
 
 
-def rays_around(rays: ScanPoints, poses: Floats, columns: Floats) -> SurfaceRays:
-    """Return the rays from poses (k, 3) that end near columns (c, 3)."""
-    every = as_rays(rays)
+def around_columns(rays: SurfaceRays, poses: Floats, columns: Floats) -> Bools:
+    """Return which rays (m,) from poses (k, 3) end near columns (c, 3)."""
     if not len(columns):
-        return every.rows(np.zeros(0, dtype=np.int64))
-    at = in_map(every, poses)[0]
-    near, which = cKDTree(columns[:, :2]).query(at)
-    return every.rows(near < columns[which, 2] + _NEAR)
+        return np.zeros(len(rays.keyframe), dtype=bool)
+    near, which = cKDTree(columns[:, :2]).query(in_map(rays, poses)[0])
+    return np.asarray(near < columns[which, 2] + _NEAR)
 
 
 def points_on(clouds: Clouds, poses: Floats, walls: Walls, found: Stretches, columns: Floats) -> NDArray[np.int8]:

@@ -4,12 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, unique_rows
+from ..arrays import Bools, Floats, Ints, connected, unique_rows
 from .clouds import Clouds
 
 _GAP = 0.35
@@ -203,11 +201,11 @@ def _joined(stretch: Ints, at: Floats, normal: Floats, many: int) -> Ints:
         a, b = _together(at[rows], normal[rows])
         of_place = stretch[rows]
         # A tie of each place with its first neighbour joins as much as all of its ties do, of which there may be thousands.
-        own = _connected(a, b, len(rows))
+        own = connected(a, b, len(rows))
         first = np.unique(own, return_index=True)[1]
         one.append(of_place)
         other.append(of_place[first[own]])
-    return _connected(np.concatenate(one), np.concatenate(other), many)
+    return connected(np.concatenate(one), np.concatenate(other), many)
 
 
 def _strips(at: Floats) -> Iterator[Ints]:
@@ -221,12 +219,6 @@ def _strips(at: Floats) -> Iterator[Ints]:
 
 _AT_ONCE = 1 << 13
 """Places of a strip; bounds the memory."""
-
-
-def _connected(one: Ints, other: Ints, many: int) -> Ints:
-    """Return the number (n,) of the part to which each of many nodes belongs, by ties (e,), (e,)."""
-    ties = sparse.coo_matrix((np.ones(len(one), dtype=np.int8), (one, other)), shape=(many, many))
-    return np.asarray(connected_components(ties, directed=False)[1], dtype=np.int64)
 
 
 def _together(at: Floats, normal: Floats) -> tuple[Ints, Ints]:

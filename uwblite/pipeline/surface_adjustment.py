@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
-from ..arrays import Floats, Ints, concatenated
+from ..arrays import Bools, Floats, Ints, concatenated
 from ..graph.calibration import LASER
 from ..graph.eliminated import Blocks, blocks_of, step, summed
 from ..graph.graph import Graph
@@ -30,22 +30,25 @@ from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
 from ..lidar.ray_noise import UNLEARNT, RayNoise
-from ..lidar.round_columns import find_columns, fitted_circles
+from ..lidar.round_columns import Circles, find_columns, fitted_circles
+from ..lidar.short_walls import Pieces, pieces_of, walls_of
 from ..lidar.surface_rays import (
     MeasuredSurfaces,
     RayEquations,
     SurfaceRays,
     Surfaces,
+    around_columns,
+    as_rays,
+    bundled,
     fitted_columns,
     linearized,
     noise_of,
     on_columns,
-    on_stretches,
     points_on,
-    rays_around,
+    stretch_of,
     surfaces_of,
 )
-from ..lidar.walls import find_walls, stretches
+from ..lidar.walls import Stretches, find_walls, stretches
 from ..odometry.attached import ScanPoints, choose_scans, scan_points
 from .estimate import Estimate, ScanClouds, Task
 from .recordings import Recording
@@ -110,19 +113,45 @@ def for_covariances(
 def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[MeasuredSurfaces, NDArray[np.int8]]:
     """Return the surfaces of the map with clouds at poses (k, 3) and their rays, and the kinds (p,) of the clouds' points."""
     parts = stretches(scans.clouds)
-    walls = find_walls(scans.clouds, parts, poses)
-    once = [
-        (on_stretches(some, scans.clouds, scans.raster, parts).packed(), fitted_circles(some)) for some in _rays(scans, task)
-    ]
-    straight, circles = (concatenated(part) for part in zip(*once, strict=True))
-    del once
-    columns = find_columns(circles, poses)
-    around = concatenated([rays_around(some, poses, columns) for some in _rays(scans, task)])
-    columns = fitted_columns(around, poses, columns)
-    straight = replace(straight, surface=walls.of_stretch[straight.surface])
-    rays = [straight.rows(straight.surface >= 0), on_columns(around, poses, columns, len(walls.centre))]
+    some, circles, free = zip(*(_on_stretches(rays, scans, parts) for rays in _rays(scans, task)), strict=True)
+    long = concatenated(some)
+    columns = find_columns(concatenated(circles), poses)
+    around, pieces, short = _off_stretches(free, poses, columns, scans, task)
+    columns, walls = fitted_columns(around, poses, columns), find_walls(scans.clouds, parts, poses)
     kind = points_on(scans.clouds, poses, walls, parts, columns)
-    return MeasuredSurfaces(surfaces_of(walls, columns), concatenated([part.packed() for part in rays]), UNLEARNT), kind
+    small = walls_of(pieces, poses)
+    many = len(walls.centre)
+    both = concatenated([walls, small])
+    rays = [
+        long.renumbered(walls.of_stretch),
+        short.renumbered(np.where(small.of_stretch >= 0, small.of_stretch + many, -1)),
+        on_columns(around, poses, columns, len(both.centre)),
+    ]
+    return MeasuredSurfaces(surfaces_of(both, columns), concatenated([part.packed() for part in rays]), UNLEARNT), kind
+
+
+def _on_stretches(rays: ScanPoints, scans: ScanClouds, parts: Stretches) -> tuple[SurfaceRays, Circles, Bools]:
+    """Return the rays on straight stretches of their clouds, with these as surfaces; circles; and which are free (p,)."""
+    stretch = stretch_of(rays, scans.clouds, scans.raster, parts)
+    on = np.flatnonzero(stretch >= 0)
+    found = bundled(as_rays(rays).rows(on), stretch[on], rays.scan[on], rays.ray[on])
+    return found.packed(), fitted_circles(rays), stretch < 0
+
+
+def _off_stretches(
+    free: tuple[Bools, ...], poses: Floats, columns: Floats, scans: ScanClouds, task: Task
+) -> tuple[SurfaceRays, Pieces, SurfaceRays]:
+    """Return the rays around columns (c, 3), and of the free ones of all others the short pieces and the rays on these."""
+    around, pieces, on, first = [], [], [], 0
+    for rays, unseen in zip(_rays(scans, task), free, strict=True):
+        every = as_rays(rays)
+        near = around_columns(every, poses, columns)
+        around.append(every.rows(near))
+        found, some = pieces_of(rays, unseen & ~near)
+        pieces.append(found)
+        on.append(replace(some, surface=some.surface + first).packed())
+        first += len(found.keyframe)
+    return concatenated(around), concatenated(pieces), concatenated(on)
 
 
 def _sensors(graph: Graph, joint: ScanEdges, task: Task) -> Floats:
