@@ -4,7 +4,8 @@ import numpy as np
 from helpers.planted_graphs import loop
 from scipy import sparse
 
-from uwblite.graph.eliminated import Blocks, WithBlocks, blocks_of, step, summed
+from uwblite.graph.eliminated import Blocks, WithBlocks, blocks_of, rows_of, side_by_side, step, summed
+from uwblite.graph.graph import edge_weights
 from uwblite.graph.marginals import Marginals
 from uwblite.graph.normal_equations import filled
 
@@ -79,3 +80,26 @@ def test_the_factor_is_in_an_order_with_contiguous_subtrees():
             size[parent] += size[column]
             deepest[parent] = min(deepest[parent], deepest[column])
     np.testing.assert_array_equal(np.arange(n) - deepest + 1, size)
+
+
+def test_blocks_side_by_side_are_those_of_one_system():
+    _, normal, blocks, whole, gradient = planted()
+    n = normal.unknowns.size
+    alone = Blocks(sparse.csr_matrix((n, n)), sparse.csr_matrix((4, n)), np.eye(4)[None], np.zeros(n), np.ones((1, 4)))
+    x, s, _ = step(normal, side_by_side(blocks, alone))
+    expected = -np.linalg.solve(whole, gradient)
+    np.testing.assert_allclose(x, expected[:n], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(s, [*expected[n:].reshape(-1, 4), -np.ones(4)], rtol=1e-9, atol=1e-12)
+
+
+def test_rows_of_edges_make_the_normal_equations():
+    graph, normal, *_ = planted()
+    matrix, slope = np.zeros((normal.unknowns.size,) * 2), np.zeros(normal.unknowns.size)
+    for edges in graph.edges:
+        linearized = edges.linearize(graph)
+        weight = np.repeat(edge_weights(edges, graph), linearized.residuals.shape[1])
+        rows = rows_of(linearized, normal.unknowns).toarray()
+        matrix += rows.T @ (weight[:, None] * rows)
+        slope += rows.T @ (weight * linearized.residuals.ravel())
+    np.testing.assert_allclose(matrix, normal.matrix.toarray(), rtol=1e-9, atol=1e-9 * np.abs(matrix).max())
+    np.testing.assert_allclose(slope, normal.gradient, rtol=1e-9, atol=1e-9 * np.abs(slope).max())

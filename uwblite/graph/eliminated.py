@@ -18,7 +18,9 @@ from scipy import sparse
 from ..arrays import Floats, Ints
 from .elimination import pairs_of, with_subtrees_contiguous
 from .factorization import superlu
+from .graph import Linearization
 from .normal_equations import NormalEquations
+from .unknowns import Unknowns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +66,27 @@ def _sum_of(matrices: Sequence[sparse.csr_matrix]) -> sparse.csr_matrix:
     entries = [matrix.tocoo() for matrix in matrices]
     data, row, column = (np.concatenate([getattr(e, name) for e in entries]) for name in ("data", "row", "col"))
     return sparse.csr_matrix((data, (row, column)), shape=matrices[0].shape)
+
+
+def side_by_side(one: Blocks, other: Blocks) -> Blocks:
+    """Return the normal equations of the measurements of both, of which each has blocks of its own."""
+    across = sparse.csr_matrix(sparse.vstack([one.across, other.across]))
+    own, own_slope = np.concatenate([one.own, other.own]), np.concatenate([one.own_slope, other.own_slope])
+    return Blocks(one.among + other.among, across, own, one.slope + other.slope, own_slope)
+
+
+def rows_of(linearized: Linearization, unknowns: Unknowns) -> sparse.csr_matrix:
+    """Return the Jacobian (e d, n) of measurements (e) by the unknowns of a graph."""
+    columns = np.concatenate([unknowns.number[name][index] for name, index, _ in linearized.blocks], axis=1)
+    values = np.concatenate([jacobian for *_, jacobian in linearized.blocks], axis=2)
+    return sparse_rows(np.repeat(columns, values.shape[1], axis=0), values.reshape(-1, values.shape[2]), unknowns.size)
+
+
+def sparse_rows(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
+    """Return the matrix (m, size) with values (m, k) in these columns (m, k); a column below 0 is fixed."""
+    free = columns >= 0
+    ends = np.concatenate([[0], np.cumsum(free.sum(axis=1))])
+    return sparse.csr_matrix((values[free], columns[free], ends), shape=(len(columns), size))
 
 
 def step(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> tuple[Floats, Floats, Ints]:

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated
+from ..arrays import Bools, Floats, concatenated
 from ..graph.calibration import LASER
-from ..graph.eliminated import Blocks, blocks_of, step, summed
+from ..graph.eliminated import Blocks, blocks_of, side_by_side, sparse_rows, step, summed
 from ..graph.graph import Graph
 from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
@@ -49,6 +49,7 @@ from ..lidar.surface_rays import (
     surfaces_of,
 )
 from ..lidar.walls import Stretches, find_walls, stretches
+from ..odometry import floor as floors
 from ..odometry.attached import ScanPoints, choose_scans, scan_points
 from .estimate import Estimate, ScanClouds, Task
 from .recordings import Recording
@@ -185,23 +186,40 @@ def _adjusted(
     ----------
     kind : (p,) of the clouds' points, see points_on.
     """
-    joint, normal, order = estimate.joint, None, None
+    joint, normal, order, wheels = estimate.joint, None, None, estimate.odometry
+    floor, certainty = floors.even(wheels), np.zeros((0, 3, 3))
     assert joint is not None
+    others = () if estimate.ranges is None else (estimate.ranges,)
     for turn in range(_ROUNDS):
-        poses, sensors = graph.poses, _sensors(graph, joint, task)
+        poses, sensors, many = graph.poses, _sensors(graph, joint, task), len(found.surfaces.facing)
         if turn > 0:
             found = replace(found, noise=noise_of(found.rays, found.surfaces, sensors, poses))
+        if turn == 1:
+            wheels, floor = floors.learnt(wheels, graph, certainty)
         if 0 < turn <= _SETTLING:
             joint = _measured_again(joint, graph, estimate.lidar, kind, found.noise, task)
-        problem = with_fewer_pairs(graph.with_edges(*estimate.odometry_and_ranges, joint))
+        problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
         normal = filled(problem, subtrees=True, like=normal)
         kernel = _KERNEL * max(_WIDER * 0.5**turn, 1.0)
-        blocks = _of_rays(found, graph, sensors, normal.unknowns, kernel=kernel)
-        change, by_surface, order = step(normal, blocks, order)
-        graph, found = moved(graph, normal.unknowns, change), replace(found, surfaces=found.surfaces.moved(by_surface))
+        rays = _of_rays(found, graph, sensors, normal.unknowns, kernel=kernel)
+        certainty = _of_poses(rays, normal.unknowns)
+        both = side_by_side(rays, floors.equations(wheels, floor, graph, normal.unknowns))
+        change, by_block, order = step(normal, both, order)
+        graph, floor = moved(graph, normal.unknowns, change), floor.moved(by_block[many:])
+        found = replace(found, surfaces=found.surfaces.moved(by_block[:many]))
         if turn >= _SETTLING and np.abs(graph.poses - poses).max() < _STILL:
             break
     return graph, found
+
+
+def _of_poses(rays: Blocks, unknowns: Unknowns) -> Floats:
+    """Return the information (n, 3, 3) that rays on surfaces that stand still have of each pose."""
+    number = unknowns.number["poses"]
+    found, free = np.zeros((len(number), 3, 3)), np.all(number >= 0, axis=1)
+    for a in range(3):
+        for b in range(3):
+            found[free, a, b] = np.asarray(rays.among[number[free, a], number[free, b]]).ravel()
+    return found
 
 
 def _measured_again(
@@ -242,13 +260,6 @@ def _weighted(lines: RayEquations, rays: SurfaceRays, found: MeasuredSurfaces, f
 
 def _of_some(rays: SurfaceRays, lines: RayEquations, count: int, unknowns: Unknowns) -> Blocks:
     """Return the normal equations of rays on as many surfaces."""
-    by_pose = _sparse(unknowns.number["poses"][rays.keyframe], lines.by_pose, unknowns.size)
-    by_surface = _sparse(4 * rays.surface[:, None] + np.arange(4), lines.by_surface, 4 * count)
+    by_pose = sparse_rows(unknowns.number["poses"][rays.keyframe], lines.by_pose, unknowns.size)
+    by_surface = sparse_rows(4 * rays.surface[:, None] + np.arange(4), lines.by_surface, 4 * count)
     return blocks_of(by_pose, by_surface, lines.residual, 4)
-
-
-def _sparse(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
-    """Return the matrix (m, size) with values (m, k) in these columns (m, k), ascending; a column below 0 is fixed."""
-    free = columns >= 0
-    ends = np.concatenate([[0], np.cumsum(free.sum(axis=1))])
-    return sparse.csr_matrix((values[free], columns[free], ends), shape=(len(columns), size))
