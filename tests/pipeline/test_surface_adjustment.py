@@ -63,6 +63,26 @@ def test_rays_make_covariances_smaller_in_whatever_frame_the_map_is(around):
     assert np.median(sizes[0] / sizes[2]) < 0.9
 
 
+def test_rays_say_nothing_of_where_the_whole_map_is_and_how_it_is_turned(around):
+    """Moved as one, far from the origin, poses and surfaces explain all rays as well as before."""
+    after = around["after"]
+    free = np.zeros(len(after.graph.poses), dtype=bool)
+    graph = replace(after.graph, edges=(*after.odometry_and_ranges, after.joint), fixed_poses=free)
+    stated, rays = for_covariances(after.surfaces, graph, around["task"])
+    unknowns = filled(stated, subtrees=True).unknowns
+    found, number = rays(unknowns), unknowns.number["poses"]
+    for motion in np.eye(3):
+        of_poses = np.tile(motion, (len(number), 1)) + motion[2] * np.column_stack(
+            [-graph.poses[:, 1], graph.poses[:, 0] + 60.0, np.zeros(len(number))]
+        )
+        moves = np.zeros(unknowns.size + 1)
+        moves[number] = of_poses
+        moves = moves[:-1]
+        across = (found.across @ moves).reshape(found.own_slope.shape)
+        known = moves @ (found.among @ moves) - np.einsum("bi,bij,bj->", across, np.linalg.inv(found.own), across)
+        assert known < 0.1
+
+
 def test_rays_some_at_a_time_say_what_they_say_at_once(around, monkeypatch):
     after, task = around["after"], around["task"]
     graph = replace(after.graph, edges=(*after.odometry_and_ranges, after.joint))

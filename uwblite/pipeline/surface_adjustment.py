@@ -63,9 +63,10 @@ _KERNEL, _WIDER = 3.0, 4.0
 step; half as much in each that follows (graduated non-convexity: A. Blake and A. Zisserman, Visual reconstruction, 1987)."""
 _LEAST = 0.03
 """Least weight of a point in pairs of clouds."""
-_PRIOR = np.array([1.0, 1.0, 0.0156, 0.1])
-"""Prior standard deviations of a surface: turn and place, rad and m, which say nothing, range offset, m (a device's 10 mm and
-a surface's 12 mm, see lidar/surface_errors.py), and radius, m."""
+_PRIOR = np.array([1e3, 1e3, 0.0156, 0.1])
+"""Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm and a surface's 12 mm,
+see lidar/surface_errors.py), and radius, m. Those of turn and place must say nothing even of how the whole map is turned: four
+surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the first pose to 0.01 rad."""
 _AT_ONCE = 128
 """Keyframes whose rays are in memory at once."""
 
