@@ -201,8 +201,24 @@ def test_of_poses_that_rest_on_ranges_the_covariance_is_the_sandwich_of_their_co
         np.testing.assert_allclose(found.anchors[k], true[np.ix_(own, own)], rtol=0.1, atol=0.1 * np.trace(found.anchors[k]))
     own = plain.unknowns.number["poses"][chosen[1:]].ravel()
     np.testing.assert_allclose(np.diagonal(found.among)[3:], np.diagonal(true)[own], rtol=0.15)
-    blocks = found.poses[chosen[1:]]
-    np.testing.assert_allclose(np.einsum("nii->ni", blocks).ravel(), np.diagonal(found.among)[3:], rtol=1e-9)
+    for k, block_of in zip(chosen[1:], np.split(found.among[3:, 3:], len(chosen) - 1), strict=True):
+        at = 3 * (np.flatnonzero(chosen == k)[0] - 1)
+        np.testing.assert_allclose(found.poses[k], block_of[:, at : at + 3], rtol=1e-6, atol=1e-9 * np.trace(found.poses[k]))
+
+
+def test_between_chosen_poses_the_whole_covariance_is_nearly_what_it_would_be_if_they_were_chosen():
+    """Its shape as well as its size: what ranges have in common turns the ellipse of a place, and ties it to the heading."""
+    graph, _ = driven_world(0.3, 1, scale=5.0)
+    edges, config = graph.edges[-1], RangeNoiseConfig(sigma=0.3)
+    some, every = (
+        with_correlated_errors(marginals(graph, among=np.arange(0, 60, step)), graph, edges, config).poses[4:57]
+        for step in (4, 1)
+    )
+    relative = np.linalg.eigvals(np.linalg.solve(every, some)).real
+    np.testing.assert_allclose(relative, 1.0, atol=0.2)
+    sigma = np.sqrt(np.einsum("nii->ni", every) / np.einsum("nii->ni", marginals(graph).covariances.poses[4:57]))
+    scaled = sigma[:, :, None] * marginals(graph).covariances.poses[4:57] * sigma[:, None, :]
+    assert np.abs(np.linalg.eigvals(np.linalg.solve(every, scaled)).real - 1.0).max() > 0.5
 
 
 @pytest.mark.parametrize("scale", [0.1, 5.0])

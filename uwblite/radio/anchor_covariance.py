@@ -27,7 +27,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from ..arrays import Floats, spread, spread_about_median
+from ..arrays import Bools, Floats, spread, spread_about_median
 from ..graph.covariances import Covariances
 from ..graph.graph import Graph, edge_weights
 from ..graph.marginals import CommonErrors, Marginals, marginals
@@ -84,8 +84,7 @@ def anchors_with_correlated_errors(graph: Graph, edges: RangeEdges, whole: Float
 def with_correlated_errors(found: Marginals, graph: Graph, edges: RangeEdges, config: RangeNoiseConfig) -> Covariances:
     """Return the covariances of a graph whose poses rest on ranges, with the correlated errors of these; see above.
 
-    Those of the chosen poses, anchors and calibration are computed; the standard deviations of poses between two chosen ones
-    grow as theirs do.
+    Those of the chosen poses, anchors and calibration are computed; those of poses between two chosen ones grow as these do.
 
     Parameters
     ----------
@@ -104,18 +103,47 @@ def with_correlated_errors(found: Marginals, graph: Graph, edges: RangeEdges, co
     seen = factors @ columns[:-1]
     added = seen.T @ (scatter**2 * _times_correlation(edges, offsets, seen) - variance[:, None] * seen)
     whole = columns[np.concatenate(parts)] + 0.5 * (added + added.T)
-    before, among = np.diagonal(plain.among).reshape(-1, 3)[moving], whole[np.ix_(poses, poses)]
-    factor = np.sqrt(np.maximum(np.diagonal(among), 0.0).reshape(-1, 3)[moving] / before)
-    by = np.stack([np.interp(np.arange(len(plain.poses)), plain.chosen[moving], own) for own in factor.T], axis=1)
+    among = whole[np.ix_(poses, poses)]
     pairs, sigmas = anchors.reshape(-1, 2), np.sqrt(np.maximum(np.diagonal(whole)[calibration], 0.0))
     # What no edge touches stays infinite.
     return replace(
         plain,
-        poses=plain.poses * by[:, :, None] * by[:, None, :],
+        poses=_grown(plain, among, moving),
         anchors=np.where(np.isfinite(plain.anchors), whole[pairs[:, :, None], pairs[:, None, :]], plain.anchors),
         calibration=np.where(np.isfinite(plain.calibration), sigmas, plain.calibration),
         among=among,
     )
+
+
+def _grown(plain: Covariances, among: Floats, moving: Bools) -> Floats:
+    """Return the covariances (n, 3, 3) of all poses, by those of the chosen ones that move.
+
+    With C the covariance of a chosen pose and P the plain one, M = root(C) root(P)^-1 makes M P M^T = C. Between chosen poses M
+    is linear, so that a triangle with a positive diagonal stays one.
+    """
+    before, after = (_blocks(matrix)[moving] for matrix in (plain.among, among))
+    by = (_root(after) @ np.linalg.inv(_root(before))).reshape(-1, 9)
+    at, chosen = np.arange(len(plain.poses)), plain.chosen[moving]
+    grown = np.stack([np.interp(at, chosen, own) for own in by.T], axis=1).reshape(-1, 3, 3)
+    return np.asarray(grown @ plain.poses @ grown.transpose(0, 2, 1))
+
+
+def _blocks(matrix: Floats) -> Floats:
+    """Return the blocks (k, 3, 3) on the diagonal of a matrix (3 k, 3 k)."""
+    return np.stack([matrix[k : k + 3, k : k + 3] for k in range(0, len(matrix), 3)])
+
+
+def _root(covariances: Floats) -> Floats:
+    """Return the lower triangles L (k, 3, 3) with L L^T = covariances, which round-off may have made indefinite."""
+    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", covariances), _LEAST_VARIANCE))
+    correlations = covariances / (sigma[:, :, None] * sigma[:, None, :])
+    values, vectors = np.linalg.eigh(correlations)
+    sound = (vectors * np.maximum(values, _LEAST_SHARE)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return np.asarray(sigma[:, :, None] * np.linalg.cholesky(sound))
+
+
+_LEAST_VARIANCE, _LEAST_SHARE = 1e-18, 1e-9
+"""m^2 and rad^2, below any; share of a variance below which round-off begins."""
 
 
 def _variance(edges: RangeEdges, weights: Floats) -> Floats:
