@@ -71,7 +71,7 @@ def without_range_errors(estimate: Estimate, task: Task) -> tuple[Estimate, Cova
         covariances = _with_correlated_ranges(found, stated, estimate.graph, estimate.ranges, task.config.ranges)
     if not task.recordings.have_scans:
         return estimate, covariances
-    return estimate, replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(stated, task))
+    return estimate, replace(covariances, poses=covariances.poses + _between_scan_and_keyframe(estimate.graph, task))
 
 
 _ALONG = 60
