@@ -9,13 +9,15 @@ from simulation.real_rooms import RealRooms
 from simulation.recording import Settings
 from trials import made
 
-from uwblite import mapping
+from uwblite import mapping, se2
+from uwblite.graph.calibration import LASER, with_free
 from uwblite.graph.marginals import marginals
 from uwblite.graph.normal_equations import filled
 from uwblite.lidar import surface_rays
+from uwblite.lidar.surface_rays import linearized
 from uwblite.mapping import MappingConfig, build_map
 from uwblite.pipeline.map_frame import moved
-from uwblite.pipeline.surface_adjustment import adjust_surfaces, for_covariances
+from uwblite.pipeline.surface_adjustment import _lidar, adjust_surfaces, for_covariances
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +83,36 @@ def test_rays_say_nothing_of_where_the_whole_map_is_and_how_it_is_turned(around)
         across = (found.across @ moves).reshape(found.own_slope.shape)
         known = moves @ (found.among @ moves) - np.einsum("bi,bij,bj->", across, np.linalg.inv(found.own), across)
         assert known < 0.1
+
+
+@pytest.mark.parametrize(("kind", "step"), [("laser_x", 1e-4), ("laser_y", 1e-4), ("laser_theta", 1e-5), ("laser_delay", 1e-4)])
+def test_rays_move_with_the_mounting_and_the_clock_of_the_lidar(around, kind, step):
+    """Numeric derivatives. Analytic ones are taken where rays should have ended: off by their noise over their length."""
+    after, task = around["after"], around["task"]
+    graph, rays = after.graph, after.surfaces.rays.rows(slice(0, None, 50))
+    surfaces, column = after.surfaces.surfaces.seen_from(se2.inverse(graph.poses[0])), LASER.index(kind)
+    values = graph.calibration.values.copy()
+    values[graph.calibration.index(kind)] += step
+    moved_lidar = _lidar(graph.updated(graph.poses, graph.anchors, values), after.joint, task)
+    lidar = _lidar(graph, after.joint, task)
+    one, other = (linearized(rays, surfaces, each.sensors, graph.poses) for each in (lidar, moved_lidar))
+    numeric = (other.residual - one.residual) / step
+    analytic = lidar.slopes(one.by_pose, rays.keyframe, graph.poses)[:, column]
+    assert np.abs(numeric).max() > 1.0
+    np.testing.assert_allclose(analytic, numeric, atol=0.05 * np.abs(numeric).max())
+
+
+def test_rays_do_not_tell_where_the_lidar_is_mounted_from_where_the_base_is(around):
+    """A lidar further ahead on a base that is always as much further back sees the same."""
+    after, task = around["after"], around["task"]
+    graph = with_free(replace(after.graph, edges=(*after.odometry_and_ranges, after.joint)), "laser_x")
+    graph = replace(graph, fixed_poses=np.zeros(len(graph.poses), dtype=bool))
+    stated, rays = for_covariances(after.surfaces, graph, task)
+    unknowns = filled(stated, subtrees=True).unknowns
+    found, moves, heading = rays(unknowns), np.zeros(unknowns.size + 1), graph.poses[:, 2]
+    moves[unknowns.number["poses"]] = -np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))])
+    moves[unknowns.number["calibration"][graph.calibration.index("laser_x")]] = 1.0
+    assert np.abs(found.among @ moves[:-1]).max() < 1e-9 * np.abs(found.among).max()
 
 
 def test_rays_some_at_a_time_say_what_they_say_at_once(around, monkeypatch):

@@ -13,7 +13,7 @@ real offices, rays of one place weigh as few, and pairs keep their weight.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
-from ..arrays import Bools, Floats, concatenated
+from ..arrays import Bools, Floats, Ints, concatenated
 from ..graph.calibration import LASER
 from ..graph.eliminated import Blocks, blocks_of, side_by_side, sparse_rows, step, summed
 from ..graph.graph import Graph
@@ -80,7 +80,7 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     graph = replace(estimate.graph, fixed_calibration=fixed)
     report = task.stages.reporter("surfaces")
     report(0, _ROUNDS + 1)
-    found, kind = _found(_sensors(graph, joint, task), scans, task)
+    found, kind = _found(_lidar(graph, joint, task).sensors, scans, task)
     if not len(found.rays.keyframe):
         return estimate
     report(1, _ROUNDS + 1)
@@ -107,9 +107,8 @@ def for_covariances(
         replace(e, sqrt_information=half * e.sqrt_information) if isinstance(e, ScanEdges) else e for e in graph.edges
     ]
     joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
-    surfaces, sensors = found.surfaces.seen_from(se2.inverse(graph.poses[0])), _sensors(graph, joint, task)
-    found = replace(found, surfaces=surfaces)
-    return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found, graph, sensors, unknowns, half)
+    found, lidar = replace(found, surfaces=found.surfaces.seen_from(se2.inverse(graph.poses[0]))), _lidar(graph, joint, task)
+    return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found, graph, lidar, unknowns, half)
 
 
 def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[MeasuredSurfaces, NDArray[np.int8]]:
@@ -156,9 +155,31 @@ def _off_stretches(
     return concatenated(around), concatenated(pieces), concatenated(on)
 
 
-def _sensors(graph: Graph, joint: ScanEdges, task: Task) -> Floats:
-    """Return the frames (k, 3) of all clouds in the map."""
-    return joint.sensor_poses(graph, np.arange(len(graph.poses)), task.recordings.twist)[0]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lidar:
+    """Where the lidar was at each keyframe (k), and which unknowns that depends on beside the pose."""
+
+    sensors: Floats
+    """(k, 3) frames of the clouds in the map."""
+    twist: Floats
+    """(k, 3) velocity of the base in its own frame."""
+    calibration: Ints
+    """(4,) indices of the mounting's x, y, theta and of the delay in the calibration block; -1 = not an unknown."""
+
+    def slopes(self, by_pose: Floats, keyframe: Ints, poses: Floats) -> Floats:
+        """Return the derivatives (m, 4) of residuals by mounting and delay, from those (m, 3) by the keyframe's pose."""
+        cos, sin = se2.cos_sin(poses[keyframe, 2])
+        x, y, turn = by_pose.T
+        arm, twist = self.sensors[keyframe, :2] - poses[keyframe, :2], self.twist[keyframe]
+        ahead, left = x * cos + y * sin, y * cos - x * sin
+        own_turn = turn - y * arm[:, 0] + x * arm[:, 1]
+        return np.column_stack([ahead, left, own_turn, ahead * twist[:, 0] + left * twist[:, 1] + turn * twist[:, 2]])
+
+
+def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
+    """Return where the lidar was at the graph's estimates."""
+    twist = task.recordings.twist
+    return _Lidar(joint.sensor_poses(graph, np.arange(len(graph.poses)), twist)[0], twist, joint.calibration)
 
 
 def _rays(scans: ScanClouds, task: Task) -> Iterator[ScanPoints]:
@@ -192,9 +213,9 @@ def _adjusted(
     assert joint is not None
     others = () if estimate.ranges is None else (estimate.ranges,)
     for turn in range(_ROUNDS):
-        poses, sensors, many = graph.poses, _sensors(graph, joint, task), len(found.surfaces.facing)
+        poses, lidar, many = graph.poses, _lidar(graph, joint, task), len(found.surfaces.facing)
         if turn > 0:
-            found = replace(found, noise=noise_of(found.rays, found.surfaces, sensors, poses))
+            found = replace(found, noise=noise_of(found.rays, found.surfaces, lidar.sensors, poses))
         if turn == 1:
             wheels, floor = floors.learnt(wheels, graph, certainty)
         if 0 < turn <= _SETTLING:
@@ -202,7 +223,7 @@ def _adjusted(
         problem = with_fewer_pairs(graph.with_edges(wheels, *others, joint))
         normal = filled(problem, subtrees=True, like=normal)
         kernel = _KERNEL * max(_WIDER * 0.5**turn, 1.0)
-        rays = _of_rays(found, graph, sensors, normal.unknowns, kernel=kernel)
+        rays = _of_rays(found, graph, lidar, normal.unknowns, kernel=kernel)
         certainty = _of_poses(rays, normal.unknowns)
         both = side_by_side(rays, floors.equations(wheels, floor, graph, normal.unknowns))
         change, by_block, order = step(normal, both, order)
@@ -232,13 +253,13 @@ def _measured_again(
 
 
 def _of_rays(
-    found: MeasuredSurfaces, graph: Graph, sensors: Floats, unknowns: Unknowns, factor: float = 1.0, kernel: float = _KERNEL
+    found: MeasuredSurfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns, factor: float = 1.0, kernel: float = _KERNEL
 ) -> Blocks:
     """Return the normal equations of rays and of what is known of surfaces, some rays at a time; residuals times a factor."""
 
     def of_some(rays: SurfaceRays) -> Blocks:
-        lines = _weighted(linearized(rays, found.surfaces, sensors, graph.poses), rays, found, factor, kernel)
-        return _of_some(rays, lines, len(found.surfaces.facing), unknowns)
+        lines = _weighted(linearized(rays, found.surfaces, lidar.sensors, graph.poses), rays, found, factor, kernel)
+        return _of_some(rays, lines, lidar, graph, len(found.surfaces.facing), unknowns)
 
     return summed(chain([_priors(found.surfaces, unknowns)], map(of_some, found.rays.in_parts())))
 
@@ -259,8 +280,13 @@ def _weighted(lines: RayEquations, rays: SurfaceRays, found: MeasuredSurfaces, f
     return RayEquations(lines.residual * root, lines.by_pose * root[:, None], lines.by_surface * root[:, None])
 
 
-def _of_some(rays: SurfaceRays, lines: RayEquations, count: int, unknowns: Unknowns) -> Blocks:
+def _of_some(
+    rays: SurfaceRays, lines: RayEquations, lidar: _Lidar, graph: Graph, count: int, unknowns: Unknowns
+) -> Blocks:
     """Return the normal equations of rays on as many surfaces."""
-    by_pose = sparse_rows(unknowns.number["poses"][rays.keyframe], lines.by_pose, unknowns.size)
+    # Of an index -1 the number is -1: fixed.
+    of_lidar = np.append(unknowns.number["calibration"][:, 0], -1)[lidar.calibration]
+    number = np.column_stack([unknowns.number["poses"][rays.keyframe], np.tile(of_lidar, (len(rays.keyframe), 1))])
+    slopes = np.column_stack([lines.by_pose, lidar.slopes(lines.by_pose, rays.keyframe, graph.poses)])
     by_surface = sparse_rows(4 * rays.surface[:, None] + np.arange(4), lines.by_surface, 4 * count)
-    return blocks_of(by_pose, by_surface, lines.residual, 4)
+    return blocks_of(sparse_rows(number, slopes, unknowns.size), by_surface, lines.residual, 4)
