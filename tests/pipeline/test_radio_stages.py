@@ -168,11 +168,18 @@ def test_the_first_optimisation_reports_each_lap_and_frees_the_radio_in_the_last
     monkeypatch.setattr(radio_stages, "with_free", lambda graph, *kinds: made.append("free") or graph)
     monkeypatch.setattr(radio_stages, "solver_figures", lambda result: {"chi2": 1.0})
     stages = SimpleNamespace(report=lambda *given: made.append(given), end=lambda *given, **more: made.append((given, more)))
-    radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages))
+    seen = SimpleNamespace(have_scans=True)
+    radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
     name = "first optimisation"
     assert made == [
         "noise", "solve", (name, 1, 3), "noise", "solve", (name, 2, 3), "noise", "priors", "free", "solve", (name, 3, 3),
         ((name,), {"placed": 2, "chi2": 1.0}),
     ]  # fmt: skip
+    made.clear()
+    # Without a lidar, once more where another optimum was better.
+    seen.have_scans = False
+    monkeypatch.setattr(radio_stages.other_minima, "at_best", lambda e, task: made.append("other") or replace(e))
+    radio_stages._optimised(estimate, SimpleNamespace(config=MappingConfig(), stages=stages, recordings=seen))
+    assert made[-7:-1] == [(name, 3, 3), "other", "noise", "priors", "free", "solve"]
     without = replace(estimate, ranges=None)
     assert radio_stages._optimised(without, None) is without

@@ -13,6 +13,7 @@ from ..graph.graph import PriorEdges, UnknownKey
 from ..grid.occupancy_grid import OccupancyGrid
 from ..map_result import AnchorEstimate, CalibrationEstimate
 from ..pipeline.estimate import Estimate, Task
+from ..pipeline.other_minima import check_other_minimum
 from ..pipeline.turn_checks import check_turn_scales
 from ..screening.units import likely_unit
 from ..sensor_log.anchor_names import name_and_number
@@ -61,6 +62,7 @@ def judge(
     check_halves(estimate, task)
     check_drifts(estimate, task)
     check_untied_parts(estimate, task)
+    check_other_minimum(estimate, task)
     check_handedness(estimate, task)
     check_turn_scales(estimate, task)
     check_fit(task)

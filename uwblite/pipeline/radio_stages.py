@@ -24,7 +24,7 @@ from ..graph.calibration import (
 )
 from ..graph.graph import Graph
 from ..graph.optimizer import Optimizer
-from ..graph.solver import SolverConfig
+from ..graph.solver import SolverConfig, SolverSummary
 from ..odometry import gyro
 from ..odometry.attached import attach_ranges
 from ..odometry.wheels import sideways_priors, wheel_edges
@@ -34,7 +34,7 @@ from ..radio.range_measurements import learn_noise, range_edges, relocate
 from ..radio.range_noise import short_term_sigma
 from ..screening.units import likely_unit
 from ..sensor_log import SensorLog
-from . import anchor_heights, joining, map_frame
+from . import anchor_heights, joining, map_frame, other_minima
 from .estimate import Estimate, Task
 from .mapping_config import MappingConfig
 from .progress import solver_figures
@@ -118,20 +118,26 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
     """Optimise odometry and ranges together, estimating the ranges' noise on the way."""
     if estimate.ranges is None or estimate.bootstrap is None:
         return estimate
-    config, optimizer = task.config, Optimizer()
+    optimizer = Optimizer()
     for lap in range(_NOISE_ROUNDS):
-        estimate = with_range_noise(estimate, config)
-        if lap == _NOISE_ROUNDS - 1:
-            graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
-            estimate = replace(estimate, graph=with_free(graph, *RADIO))
-        solver = config.solver if lap else rough(config.solver)
-        problem = estimate.graph.with_edges(*estimate.odometry_and_ranges)
-        solved, result = optimize_with_heights(problem, solver, optimizer)
-        graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
-        estimate = replace(estimate, graph=graph.with_estimates_of(solved))
+        estimate, result = _lap(estimate, lap, task, optimizer)
         task.stages.report("first optimisation", lap + 1, _NOISE_ROUNDS)
+    found = estimate if task.recordings.have_scans or estimate.alone else other_minima.at_best(estimate, task)
+    if found is not estimate:
+        estimate, result = _lap(found, lap, task, optimizer)
     task.stages.end("first optimisation", placed=int(estimate.placed.sum()), **solver_figures(result))
     return estimate
+
+
+def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tuple[Estimate, SolverSummary]:
+    config, estimate = task.config, with_range_noise(estimate, task.config)
+    if lap == _NOISE_ROUNDS - 1:
+        graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
+        estimate = replace(estimate, graph=with_free(graph, *RADIO))
+    problem = estimate.graph.with_edges(*estimate.odometry_and_ranges)
+    solved, result = optimize_with_heights(problem, config.solver if lap else rough(config.solver), optimizer)
+    graph = replace(estimate.graph, fixed_calibration=solved.fixed_calibration)
+    return replace(estimate, graph=graph.with_estimates_of(solved)), result
 
 
 _NOISE_ROUNDS = 3

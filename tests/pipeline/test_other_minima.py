@@ -1,0 +1,75 @@
+"""Trajectories caught on the wrong side of a line of anchors, and when another side is a doubt."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.planted import NOMINAL, drive, odometry, ranges
+
+from uwblite import se2
+from uwblite.arrays import rms_length
+from uwblite.constraints import Constraints
+from uwblite.graph.solver import optimize
+from uwblite.pipeline import other_minima, radio_stages
+from uwblite.pipeline.estimate import Task
+from uwblite.pipeline.mapping_config import MappingConfig
+from uwblite.pipeline.progress import Stages
+from uwblite.pipeline.recordings import gather
+from uwblite.sensor_log import SensorLog
+
+
+def there_and_back(across: float) -> tuple[Task, np.ndarray]:
+    """Return a drive along a corridor and back, beside four anchors on a line or with every other one so far across, m."""
+    rng = np.random.default_rng(5)
+    stamps, truth = drive([[0.5, 0.0, 0.0], [0.2, 0.0, 0.8], [0.5, 0.0, 0.0]], [56.0, np.pi / 0.8, 56.0])
+    places = np.array([[1.0, 1.0], [10.0, 1.0 - across], [19.0, 1.0], [28.0, 1.0 - across]])
+    radio = ranges(rng, stamps, truth, places, rate=4.0, sigma=0.05)
+    log = SensorLog(odometry(stamps, truth, rng, scale=1.0, noise=0.01, turn_noise=0.01), radio, None, NOMINAL)
+    config = MappingConfig()
+    task = Task(gather([log], config.keyframes), config, Constraints(), Stages(None, None))
+    at = task.recordings.stamps
+    return task, np.column_stack([np.interp(at, log.odometry.stamps, column) for column in truth[:, :2].T])
+
+
+def error(found: np.ndarray, true: np.ndarray) -> float:
+    """Return the rms distance of places from where they are, up to reflection, m."""
+    both = (found[:, :2] * [1.0, side] for side in (1.0, -1.0))
+    return min(rms_length(se2.transform(se2.align(places, true), places) - true) for places in both)
+
+
+def test_a_way_caught_on_the_wrong_side_of_the_anchors_is_freed():
+    task, true = there_and_back(0.0)
+    estimate = radio_stages.first_optimisation(task)
+    graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
+    assert error(graph.poses, true) < 0.15
+    # One way is caught where it is put to the other side of the anchors.
+    caught = optimize(graph.with_estimates_of(estimate.other_minimum), task.config.solver)[0]
+    assert error(caught.poses, true) > 0.3
+    best = other_minima.minima(caught, estimate.placed, task.config.solver)[0]
+    assert best.chi2() < caught.chi2() - 4.0
+    assert error(best.poses, true) < 0.1
+
+
+def test_anchors_on_both_sides_leave_no_other_side():
+    task, true = there_and_back(2.4)
+    estimate = radio_stages.first_optimisation(task)
+    graph = estimate.graph.with_edges(*estimate.odometry_and_ranges)
+    assert error(graph.poses, true) < 0.15
+    assert not other_minima.mirrored_tails(graph, estimate.placed)
+    assert other_minima.minima(graph, estimate.placed, task.config.solver) == [graph]
+    assert estimate.other_minimum is None
+
+
+@pytest.mark.parametrize(
+    ("more", "off", "lidar", "doubts"),
+    [(3.9, 0.41, False, 1), (-9.0, 0.41, False, 1), (4.1, 0.41, False, 0), (3.9, 0.39, False, 0), (3.9, 0.41, True, 0)],
+)
+def test_another_side_that_fits_as_well_is_a_doubt(monkeypatch, more, off, lidar, doubts):
+    here, there = (SimpleNamespace(chi2=lambda c=c: 100.0 + c) for c in (0.0, more))
+    monkeypatch.setattr(other_minima, "minima", lambda *_: [here, there])
+    monkeypatch.setattr(other_minima, "apart", lambda one, other: off * (one is not other))
+    stages = Stages(None, None)
+    recordings = type("One", (), {"have_scans": lidar, "__len__": lambda _: 1})()
+    task = SimpleNamespace(recordings=recordings, stages=stages, config=MappingConfig())
+    other_minima.check_other_minimum(SimpleNamespace(graph=here, other_minimum=None, placed=None), task)
+    assert [d.kind for d in stages.doubts] == ["other-side"] * doubts

@@ -1,0 +1,123 @@
+"""Is there a better optimum than the one of the bootstrap? Without a lidar, a trajectory may be caught in a poor one.
+
+Along a line of anchors, ranges do not show on which side of it a robot drives: each way along a corridor fits on either side,
+and only the odometry between the ways decides. An optimisation that began with one of them on the wrong side stays there, and
+its covariance knows nothing of the other side. So wherever the trajectory comes near the line, all that follows is put on the
+other side once, and the same problem is solved from there; and again from each optimum that is found so.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se2
+from ..arrays import Bools, rms_length, runs_of
+from ..errors import SolverError
+from ..graph.graph import Graph
+from ..graph.solver import SolverConfig, optimize
+from .estimate import Estimate, Task
+
+_ACROSS, _SHARE = 1.0, 0.2
+"""Standard deviation of the anchors across their line, m and as a share of that along it, up to which they stand on one."""
+_NEAR = 0.7
+"""Distance from the line up to which a trajectory may have changed sides, m."""
+_ENDS = 3
+"""Poses at either end of a trajectory that are too few to be put elsewhere."""
+_MOST = 4
+"""Optima from which the search goes on."""
+_SAME = 0.1
+"""Optima nearer to each other, m rms, are one."""
+_WORSE = 40.0
+"""Difference of chi2 to the best from which on an optimum leads nowhere."""
+
+
+def at_best(estimate: Estimate, task: Task) -> Estimate:
+    """Return the estimate of one recording after its first optimisation, at the best optimum; itself where no other is."""
+    problem = estimate.graph.with_edges(*estimate.odometry_and_ranges)
+    best, *others = minima(problem, estimate.placed, task.config.solver)
+    return replace(estimate.with_estimates_of(best), other_minimum=others[0]) if others else estimate
+
+
+def check_other_minimum(estimate: Estimate, task: Task) -> None:
+    """Doubt a map without lidar that has another optimum, which all measurements together do not exclude either."""
+    graph, other = estimate.graph, estimate.other_minimum
+    if task.recordings.have_scans or len(task.recordings) > 1:
+        return
+    known = other is not None and other.poses.shape == graph.poses.shape and other.anchors.shape == graph.anchors.shape
+    starts = (graph.with_estimates_of(other),) if other is not None and known else ()
+    for there in minima(graph, estimate.placed, task.config.solver, starts):
+        more, off = there.chi2() - graph.chi2(), apart(there, graph)
+        if more < _AS_WELL and off > _ELSEWHERE:
+            text = (
+                f"the ranges fit another trajectory about as well, on the other side of the line of the anchors for a time and "
+                f"{off:.1f} m (rms) away (chi2 {more:+.1f}): place an anchor off that line, or give the places of the anchors"
+            )
+            task.stages.doubt("other-side", text, apart=off, chi2=more)
+            return
+
+
+_AS_WELL, _ELSEWHERE = 4.0, 0.4
+"""Difference of chi2 up to which an optimum is not excluded, two standard deviations, and rms distance, m, from which on it
+matters which of two is true."""
+
+
+def minima(graph: Graph, placed: Bools, config: SolverConfig, starts: Sequence[Graph] = ()) -> list[Graph]:
+    """Return the optima that are found from a first one, the graph, which is among them, the best first.
+
+    Parameters
+    ----------
+    graph : of one recording, optimised. placed : (a,) anchors that have a position. starts : where to search as well.
+    """
+    found, waiting = [graph], [graph]
+    begin = list(starts)
+    for _ in range(_MOST):
+        if not waiting:
+            break
+        for start in [*begin, *mirrored_tails(waiting.pop(0), placed)]:
+            try:
+                there = optimize(start, config)[0]
+            except SolverError:
+                continue
+            if all(apart(there, other) > _SAME for other in found):
+                found.append(there)
+                waiting.append(there)
+        begin = []
+        found.sort(key=Graph.chi2)
+        waiting = sorted((other for other in waiting if other.chi2() < found[0].chi2() + _WORSE), key=Graph.chi2)
+    return found
+
+
+def mirrored_tails(graph: Graph, placed: Bools) -> list[Graph]:
+    """Return the graph with the rest of its trajectory on the other side of the line of its anchors, from each time on at which
+    it comes near that line; none where the anchors stand on no line.
+
+    The rest is moved as a whole, to where it lies best on its mirror image: reflected, it would turn the other way.
+    """
+    anchors, places = graph.anchors[placed], graph.poses[:, :2]
+    if len(anchors) < 2:
+        return []
+    variances, axes = np.linalg.eigh(np.cov(anchors.T))
+    spread_across, spread_along = np.sqrt(np.maximum(variances, 0.0))
+    if spread_across > min(_ACROSS, _SHARE * spread_along):
+        return []
+    across = axes[:, 0]
+    off = (places - anchors.mean(axis=0)) @ across
+    near = np.abs(off) < _NEAR
+    # A change of sides between two poses is near, too.
+    near[1:] |= off[1:] * off[:-1] < 0.0
+    times = [first + int(np.argmin(np.abs(off[first:last]))) for first, last in runs_of(near)]
+    starts = []
+    for k in times:
+        if _ENDS <= k < len(off) - _ENDS:
+            image = places[k:] - 2.0 * off[k:, None] * across
+            poses = graph.poses.copy()
+            poses[k:] = se2.compose(se2.align(places[k:], image), poses[k:])
+            starts.append(replace(graph, poses=poses))
+    return starts
+
+
+def apart(one: Graph, other: Graph) -> float:
+    """Return the rms distance of the poses of two graphs after alignment, m."""
+    here, there = one.poses[:, :2], other.poses[:, :2]
+    return rms_length(se2.transform(se2.align(there, here), there) - here)
