@@ -435,5 +435,11 @@ def test_an_empty_name_is_wrong_usage(verb, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = {"convert": ["x.log", ""], "localize": ["x.log", "--map", "m", "--out", ""], "record": ["--out", ""]}
     assert main([verb, *words.get(verb, ["x", "--out", " "])]) == 2
-    assert "an empty name is no place for a result" in capsys.readouterr().err
+    assert "an empty name names no file or folder" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("option", ["--config", "--constraints", "--anchors-from", "--uwb-mapping", "--corrected-log"])
+def test_an_option_with_an_empty_name_is_not_taken_as_not_given(option, capsys):
+    assert main(["map", "x.log", "--out", "m", option, ""]) == 2
+    assert f"{option}: an empty name names no file or folder" in capsys.readouterr().err

@@ -24,6 +24,7 @@ from uwblite.drivers.scip import ScipProtocol
 from uwblite.drivers.text_lines import LineProtocol
 from uwblite.drivers.uwb_line import BOARDS, by_columns, parse_columns
 from uwblite.drivers.ydlidar import YdLidarProtocol
+from uwblite.errors import ConfigError
 
 PROTOCOLS = {
     "scip": (ScipProtocol, WORDS["scip"]),
@@ -49,6 +50,13 @@ LINE_OPTIONS = "?columns=t,x,y,theta"
 
 def session_of(name):
     return open_device(DEVICES[name].sensor, f"{name}:/dev/null" + LINE_OPTIONS * (name == "line"))[0]
+
+
+@pytest.mark.parametrize("query", ["baud=\udcff", "\udcc5=1", "baud=9600&id=\ud800"])
+def test_options_that_are_no_text_are_wrong_options(query):
+    """As the command line hands over bytes that are no UTF-8."""
+    with pytest.raises(ConfigError, match="no text in UTF-8"):
+        open_device("uwb", f"tlv:/dev/null?{query}")
 
 
 def memory(value):

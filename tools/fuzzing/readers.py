@@ -34,7 +34,7 @@ from uwblite.mapping import MappingConfig
 from uwblite.server.live import watch_status
 
 from .small_files import ANCHORS, G2O, KNOWN, LOG, MAPPING, PYFG, RELATIONS, TABLE, TORO, TUM
-from .wires_and_pages import RESULT, ask, listen, result_of, show, wire
+from .wires_and_pages import DEVICE_OPTIONS, RESULT, ask, listen, open_named, result_of, show, wire
 
 Read = Callable[[Path], object]
 
@@ -224,6 +224,7 @@ def cases() -> dict[str, Case]:
         found[name] = Case(f"tables/{name}", lambda path: read_csv_folder(path.parent), _tables)
     for name in DEVICES:
         found[f"wire {name}"] = _file("x.bin", wire(name), listen(name))
+    found["device options"] = _file("x.txt", DEVICE_OPTIONS, open_named)
     for name in RESULT:
         found[f"page of {name}"] = Case(name, show, result_of(_log()), 10)
     found["requests"] = Case("requests", ask, result_of(_log()), 20)

@@ -13,6 +13,7 @@ from typing import Any
 
 from uwblite.cli import main
 from uwblite.drivers.devices import DEVICES, open_device
+from uwblite.errors import UwbliteError
 from uwblite.io.stored_result import read_result
 from uwblite.server.app import App, app_of
 from uwblite.server.web import server_for
@@ -50,6 +51,29 @@ def listen(name: str) -> Callable[[Path], object]:
         return taken
 
     return read
+
+
+DEVICE_OPTIONS = b"\n".join(
+    [f"{d.sensor} {name}:/dev/ttyUSB0".encode() for name, d in DEVICES.items() if not name.endswith("line")]
+    + [b"uwb linktrack:/dev/ttyUSB0?baud=115200", b"uwb tlv:socket://[::1]:99?timeout=3"]
+    + [b"odometry line:socket://robot:99?columns=t,left,right&tick=1.2e-4&wheel_base=0.3&time_unit=0%2E001"]
+    + [b"gyro line:/dev/x?columns=t,turn_rate&time_unit=0.001"]
+)  # fmt: skip
+"""Devices as `uwblite record` names them, with options, one a line."""
+
+
+def open_named(path: Path) -> object:
+    """Make a session of every device that is named in a file; bytes that are no text come as the command line has them."""
+    opened, refused = 0, list[UwbliteError]()
+    for line in path.read_bytes().decode(errors="surrogateescape").split("\n"):
+        sensor, _, spec = line.partition(" ")
+        try:
+            opened += len(open_device(sensor, spec))
+        except UwbliteError as error:
+            refused.append(error)
+    if refused:
+        raise refused[0]
+    return opened
 
 
 @cache

@@ -2,7 +2,7 @@
 
 import argparse
 
-from .options import number
+from .options import number, place
 
 HELP = "compare a map, its trajectory and anchors with the truth"
 EPILOG = """\
@@ -31,13 +31,13 @@ files (lengths in metres):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of the verb."""
     parser.add_argument("dir", help="folder that uwblite map wrote: trajectory.tum, anchors.csv, map.yaml")
-    parser.add_argument("--truth", metavar="FILE.tum", action="append", help="true poses; one per recording")
-    parser.add_argument("--relations", metavar="FILE", help="true relative poses of scans (Kuemmerle et al. 2009)")
+    parser.add_argument("--truth", type=place, metavar="FILE.tum", action="append", help="true poses; one per recording")
+    parser.add_argument("--relations", type=place, metavar="FILE", help="true relative poses of scans (Kuemmerle et al. 2009)")
     counted, length = number(above=0, whole=True), number(above=0)
     parser.add_argument("--recording", metavar="N", type=counted, help="the recording that a single truth is of (1)")
-    parser.add_argument("--anchors", metavar="FILE.csv", help="true anchors")
-    parser.add_argument("--landmarks", metavar="FILE.csv", help="true columns")
-    parser.add_argument("--walls", metavar="FILE.csv", help="true walls")
+    parser.add_argument("--anchors", type=place, metavar="FILE.csv", help="true anchors")
+    parser.add_argument("--landmarks", type=place, metavar="FILE.csv", help="true columns")
+    parser.add_argument("--walls", type=place, metavar="FILE.csv", help="true walls")
     parser.add_argument("--delta", type=length, default=1.0, metavar="M", help="m of path per stretch of the RPE (1)")
     parser.add_argument("--max-gap", type=length, default=1.0, metavar="S", help="leave out truth in longer gaps, s (1)")
     parser.add_argument("--search-radius", type=length, default=1.0, metavar="M", help="m around a column's place (1)")

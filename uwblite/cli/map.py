@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object instead of text")
     parser.add_argument("--dry-run", action="store_true", help="read, check and estimate time and memory; write nothing")
     text = "the CARMEN log's scans with corrected laser poses, as GMapping's users exchange; one CARMEN log only"
-    parser.add_argument("--corrected-log", metavar="FILE", help=text)
+    parser.add_argument("--corrected-log", type=place, metavar="FILE", help=text)
     add_worker_arguments(parser, "processes for the heavy stages (1)")
     add_map_arguments(parser)
 
@@ -69,9 +69,9 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument("--report-timings", action="store_true", help="show the stages' seconds in report.html too")
     beforehand = parser.add_argument_group("known beforehand")
     text = "surveyed anchors, pinned poses, distances, closures, see docs/formats.md"
-    beforehand.add_argument("--constraints", metavar="FILE.toml", help=text)
+    beforehand.add_argument("--constraints", type=place, metavar="FILE.toml", help=text)
     text = "go on in the frame of an earlier map: its anchors.csv; anchors that were moved since are named"
-    beforehand.add_argument("--anchors-from", metavar="FILE.csv", help=text)
+    beforehand.add_argument("--anchors-from", type=place, metavar="FILE.csv", help=text)
     add_settings_arguments(parser)
     add_mounting_arguments(parser)
     add_bag_arguments(parser)

@@ -16,7 +16,7 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --preset, --config and --set."""
     group = parser.add_argument_group("settings (a later one wins: preset, file, --set)")
     group.add_argument("--preset", metavar="NAME", help="start from a preset: default or paper")
-    group.add_argument("--config", metavar="FILE.toml", help="read settings from a file, as `uwblite config` prints it")
+    group.add_argument("--config", type=place, metavar="FILE.toml", help="settings from a file, as `uwblite config` prints it")
     example = "change one setting, e.g. icp.max_iterations=30; repeatable"
     group.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help=example)
 
@@ -73,7 +73,7 @@ def add_bag_arguments(parser: argparse.ArgumentParser) -> None:
     bag.add_argument("--scan-topic", metavar="TOPIC", default="", help=scans)
     bag.add_argument("--imu-topic", metavar="TOPIC", default="", help="sensor_msgs/Imu for the heading; none = the odometry's")
     bag.add_argument("--uwb-topic", metavar="TOPIC", action="append", default=[], help="ranges; repeatable")
-    bag.add_argument("--uwb-mapping", metavar="FILE.toml", help="where ranges stand in messages, see docs/formats.md")
+    bag.add_argument("--uwb-mapping", type=place, metavar="FILE.toml", help="where ranges stand in messages: docs/formats.md")
     bag.add_argument("--base-frame", metavar="FRAME", default="", help="frame of the robot (the odometry's child frame)")
 
 
@@ -111,9 +111,9 @@ def number(
 
 
 def place(text: str) -> str:
-    """Read the name of a file or folder to write."""
+    """Read the name of a file or folder; an empty one, as of a variable that is not set, would be taken as not given."""
     if not text.strip():
-        raise argparse.ArgumentTypeError("an empty name is no place for a result; . is the current folder")
+        raise argparse.ArgumentTypeError("an empty name names no file or folder; . is the current folder")
     return text
 
 

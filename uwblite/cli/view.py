@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .options import number
+from .options import number, place
 
 if TYPE_CHECKING:
     from ..io.stored_result import StoredResult
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "result of uwblite map, or a recording that one was made of; recordings beside the results are found by themselves"
     parser.add_argument("paths", metavar="DIR|FILE", nargs="+", help=text)
     parser.add_argument("--port", metavar="N", type=number(0, 65535, whole=True), default=0, help="port (any that is free)")
-    parser.add_argument("--constraints", metavar="FILE.toml", help="where corrections go (DIR_constraints.toml)")
+    parser.add_argument("--constraints", type=place, metavar="FILE.toml", help="where corrections go (DIR_constraints.toml)")
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
 
 

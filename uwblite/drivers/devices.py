@@ -213,7 +213,11 @@ def open_device(sensor: str, spec: str, setup: Setup | None = None, more: dict[s
     if kind.sensor != sensor:
         raise ConfigError(f"--{sensor} {spec}: {kind.name} is no {sensor}; known are {', '.join(_names(sensor))}")
     port, _, query = rest.partition("?")
-    pairs = dict(parse_qsl(query, keep_blank_values=True))
+    try:
+        # The command line hands over bytes that are no text as surrogates, which no URL takes.
+        pairs = dict(parse_qsl(query.encode().decode(), keep_blank_values=True))
+    except UnicodeError as error:
+        raise ConfigError(f"--{sensor} {spec}: its options are no text in UTF-8") from error
     options = Options(f"--{sensor} {kind.name}", {**(more or {}), **pairs})
     driver = kind.make(options, setup or Setup())
     if "://" in port:
