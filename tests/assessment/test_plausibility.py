@@ -331,7 +331,20 @@ def test_ranges_that_are_too_long_show_ways_that_wheels_lost(scale, wheels, doub
     if wheels:
         stages.warn("wheels-stand-still", "the wheels count nothing from t = 3 to 5 s")
     value = CalibrationEstimate(key, scale, 0.004, "1", "relative error of all ranges", "estimated")
-    check_calibration([value], {}, SimpleNamespace(stages=stages, config=MappingConfig()))
+    recordings = SimpleNamespace(have_scans=True)
+    check_calibration([value], {}, SimpleNamespace(stages=stages, config=MappingConfig(), recordings=recordings))
     of_scale = [notice.kind == "unusual-calibration" for notice in (*stages.warnings[wheels:], *stages.doubts)]
     assert of_scale == [True]
     assert len(stages.doubts) == doubted
+
+
+@pytest.mark.parametrize(("scale", "lidar", "doubted"), [(0.094, False, True), (0.094, True, False), (-0.09, False, False)])
+def test_a_scale_that_another_unit_explains_is_a_doubt_where_no_lidar_says_whose_it_is(scale, lidar, doubted):
+    """0.0936: ranges in yards, or wheels that are 9 % larger than set."""
+    stages, key = Stages(None, None), UnknownKey("odometry_scale", recording=0)
+    value = CalibrationEstimate(key, scale, 0.01, "1", "relative error of travelled distance", "estimated")
+    task = SimpleNamespace(stages=stages, config=MappingConfig(), recordings=SimpleNamespace(have_scans=lidar))
+    check_calibration([value], {key: SimpleNamespace(sigma=0.02)}, task)
+    notices = stages.doubts if doubted else stages.warnings
+    assert [("yards" in n.text, n.kind) for n in notices] == [(scale > 0.09, "unusual-calibration")]
+    assert len(stages.doubts) + len(stages.warnings) == 1

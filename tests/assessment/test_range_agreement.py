@@ -55,9 +55,12 @@ def test_another_unit_is_doubted_where_it_rests_on_ranges_that_contradict_each_o
     assert [notice.kind for notice in stages.doubts] == ["odometry-unit"] * doubted
 
 
-def recordings_from(*starts):
+def recordings_from(*starts, scans=True):
     """Return recordings whose clocks begin at these times, s."""
-    each = [SimpleNamespace(number=n, frames=SimpleNamespace(stamps=np.array([t, 9e3]))) for n, t in enumerate(starts)]
+    each = [
+        SimpleNamespace(number=n, frames=SimpleNamespace(stamps=np.array([t, 9e3])), has_scans=scans)
+        for n, t in enumerate(starts)
+    ]
     return type("Recordings", (), {"each": each, "__len__": lambda self: len(each)})()
 
 
@@ -93,6 +96,23 @@ def test_an_anchor_disagrees_in_one_recording_while_others_whose_clocks_show_the
     check_sustained_outliers(table, "A", SimpleNamespace(recordings=recordings_from(0.0, 0.0), stages=stages))
     (notice,) = stages.warnings
     assert notice.text.startswith("recording 2: anchor A disagrees with the map for long (t = 200 to 299 s)")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "count", "lidar", "doubts"),
+    [(2, 4, False, 1), (1, 4, False, 0), (2, 5, False, 0), (1, 1, False, 1), (4, 4, True, 0)],
+)
+def test_half_of_the_anchors_that_disagree_for_long_are_a_doubt_without_a_lidar(wrong, count, lidar, doubts):
+    stamps, anchor = np.tile(np.arange(1000.0), count), np.repeat(np.arange(float(count)), 1000)
+    table = {
+        "stamp": stamps, "anchor": anchor, "agrees": ((anchor >= wrong) | (stamps < 500)) * 1.0,
+        "weight": np.ones(len(stamps)), "recording": np.zeros(len(stamps)),
+    }  # fmt: skip
+    stages = Stages(None, None)
+    recordings = recordings_from(0.0, scans=lidar)
+    check_sustained_outliers(table, "ABCDE"[:count], SimpleNamespace(recordings=recordings, stages=stages))
+    assert [n.kind for n in stages.warnings] == ["sustained-outliers"] * wrong
+    assert [n.kind for n in stages.doubts] == ["ranges-disagree"] * doubts
 
 
 def against(residual, names=("A", "B", "C"), statuses=("ok", "ok", "ok"), stretches=((0.0, 40.0), (60.0, 90.0)), whose=1):

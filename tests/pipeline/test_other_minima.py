@@ -9,6 +9,7 @@ from helpers.planted import NOMINAL, drive, odometry, ranges
 from uwblite import se2
 from uwblite.arrays import rms_length
 from uwblite.constraints import Constraints
+from uwblite.graph.graph import Graph
 from uwblite.graph.solver import optimize
 from uwblite.pipeline import other_minima, radio_stages
 from uwblite.pipeline.estimate import Task
@@ -48,6 +49,18 @@ def test_a_way_caught_on_the_wrong_side_of_the_anchors_is_freed():
     best = other_minima.minima(caught, estimate.placed, task.config.solver)[0]
     assert best.chi2() < caught.chi2() - 4.0
     assert error(best.poses, true) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("beside", "line"), [([], 1), ([4.0], 1), ([4.0, -4.0], 0), ([0.5, -0.5, 0.5], 1)]
+)
+def test_anchors_stand_on_a_line_but_for_one(beside, line):
+    """Four of them along a wall at y = 2, and more beside it; in a corridor 1 m wide none is far enough across."""
+    along = np.column_stack([np.arange(4) * 9.0, np.full(4, 2.0)])
+    anchors = np.concatenate([along, [[4.0 * k, 2.0 + off] for k, off in enumerate(beside)]]) if beside else along
+    path = np.column_stack([np.linspace(0.0, 27.0, 50), 1.8 - 0.02 * np.abs(np.arange(50) - 20), np.zeros(50)])
+    starts = other_minima.mirrored_tails(Graph(path, anchors, ()), np.ones(len(anchors), dtype=bool))
+    assert len(starts) == line
 
 
 def test_anchors_on_both_sides_leave_no_other_side():

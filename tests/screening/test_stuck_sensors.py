@@ -211,6 +211,14 @@ def at_places(count, standing=False):
     return SensorLog(driving(0.0 if standing else 1.0), ranges(stamps, values, anchor)), values
 
 
+def test_marks_that_are_most_of_the_ranges_are_a_doubt_without_a_lidar():
+    """Half of the ranges are marks; then two thirds, as every other of the rest is lost."""
+    log, values = at_places(30)
+    fewer = replace(log, ranges=log.ranges.rows((values > 60.0) | (np.arange(len(values)) % 4 == 0)))
+    seen = replace(fewer, scans=scans(np.ones((5, 8))))
+    assert [without_marks(one)[1][0].doubt for one in (log, fewer, seen)] == [False, True, False]
+
+
 def test_a_mark_counts_once_at_each_place_and_of_each_anchor():
     log, values = at_places(10)
     done, (remark,) = without_marks(log)

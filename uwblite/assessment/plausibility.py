@@ -219,7 +219,8 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
     """Warn of each calibration value far outside what is usual.
 
     Ranges that are too long where the wheels were seen to count nothing are a doubt: scans along a bare wall show some of
-    such stretches only, and a map that lacks the others is too short.
+    such stretches only, and a map that lacks the others is too short. So is a value that another unit explains, where no lidar
+    says whether that is one of the wheels or of the radio.
 
     Parameters
     ----------
@@ -234,12 +235,14 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
             continue
         unit = "" if value.unit == "1" else f" {value.unit}"
         short = scale and value.value > _LOST_WAY and "wheels-stand-still" in said
-        add = task.stages.doubt if short else task.stages.warn
+        unit_of = likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""
+        unclear = bool(unit_of) and not task.recordings.have_scans
+        add = task.stages.doubt if short or unclear else task.stages.warn
         add(
             "unusual-calibration",
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
             + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings")
-            + (likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else "")
+            + unit_of
             + ("; the wheels missed some of the travelled distance: the map may be too short" if short else ""),
             name=value.name, value=value.value, sigma=value.sigma, usual=sigma,
         )  # fmt: skip

@@ -26,6 +26,8 @@ def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]
 def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], task: Task) -> None:
     """Warn of each anchor whose ranges disagree with the map for long: its line of sight was blocked, or it was moved.
 
+    Without a lidar, nothing but ranges holds the trajectory: where half of the anchors disagree for long, that is a doubt.
+
     Parameters
     ----------
     table : MapResult.range_table. anchor_ids : names.
@@ -33,9 +35,11 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
     several = len(task.recordings) > 1
     for recording in task.recordings.each:
         start, where = float(recording.frames.stamps[0]), f"recording {recording.number + 1}: " if several else ""
+        heard = wrong = 0
         for k, name in enumerate(anchor_ids):
             own = (table["anchor"] == k) & (table["weight"] > 0) & (table["recording"] == recording.number)
             stretches = outlier_stretches(table["stamp"][own], table["agrees"][own] > 0.5) if own.any() else []
+            heard, wrong = heard + bool(own.any()), wrong + bool(stretches)
             if stretches:
                 when = ", ".join(f"{a - start:.0f} to {b - start:.0f} s" for a, b in stretches[:4])
                 task.stages.warn(
@@ -44,6 +48,12 @@ def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str]
                     "its line of sight was blocked, or it was moved; these ranges are down-weighted",
                     anchor=name, stretches=stretches,
                 )  # fmt: skip
+        if wrong and 2 * wrong >= heard and not recording.has_scans:
+            text = (
+                f"{where}{wrong} of {heard} anchors disagree with the map for long, and only ranges and odometry constrain the "
+                "path: the others may be too few; map the parts before and after separately, or give the anchors' places"
+            )
+            task.stages.doubt("ranges-disagree", text, disagreeing=wrong, heard=heard)
 
 
 def check_unit(anchors: Sequence[AnchorEstimate], task: Task) -> None:

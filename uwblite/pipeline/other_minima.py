@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from .. import se2
-from ..arrays import Bools, rms_length, runs_of
+from ..arrays import Bools, Floats, rms_length, runs_of
 from ..errors import SolverError
 from ..graph.graph import Graph
 from ..graph.solver import SolverConfig, optimize
@@ -20,6 +20,8 @@ from .estimate import Estimate, Task
 
 _ACROSS, _SHARE = 1.0, 0.2
 """Standard deviation of the anchors across their line, m and as a share of that along it, up to which they stand on one."""
+_LEAST = 5
+"""Anchors of which one may stand beside the line of the others."""
 _NEAR = 0.7
 """Distance from the line up to which a trajectory may have changed sides, m."""
 _ENDS = 3
@@ -94,15 +96,11 @@ def mirrored_tails(graph: Graph, placed: Bools) -> list[Graph]:
 
     The rest is moved as a whole, to where it lies best on its mirror image: reflected, it would turn the other way.
     """
-    anchors, places = graph.anchors[placed], graph.poses[:, :2]
-    if len(anchors) < 2:
+    line = _line(graph.anchors[placed])
+    if line is None:
         return []
-    variances, axes = np.linalg.eigh(np.cov(anchors.T))
-    spread_across, spread_along = np.sqrt(np.maximum(variances, 0.0))
-    if spread_across > min(_ACROSS, _SHARE * spread_along):
-        return []
-    across = axes[:, 0]
-    off = (places - anchors.mean(axis=0)) @ across
+    places, (middle, across) = graph.poses[:, :2], line
+    off = (places - middle) @ across
     near = np.abs(off) < _NEAR
     # A change of sides between two poses is near, too.
     near[1:] |= off[1:] * off[:-1] < 0.0
@@ -115,6 +113,18 @@ def mirrored_tails(graph: Graph, placed: Bools) -> list[Graph]:
             poses[k:] = se2.compose(se2.align(places[k:], image), poses[k:])
             starts.append(replace(graph, poses=poses))
     return starts
+
+
+def _line(anchors: Floats) -> tuple[Floats, Floats] | None:
+    """Return the middle (2,) of the line on which the anchors (a, 2) stand, or all but one, and the direction across it."""
+    every = np.arange(len(anchors))
+    for some in [every, *(every[every != k] for k in every if len(every) >= _LEAST)]:
+        own = anchors[some]
+        variances, axes = np.linalg.eigh(np.cov(own.T)) if len(own) > 1 else (np.ones(2), np.eye(2))
+        across, along = np.sqrt(np.maximum(variances, 0.0))
+        if across < min(_ACROSS, _SHARE * along):
+            return own.mean(axis=0), axes[:, 0]
+    return None
 
 
 def apart(one: Graph, other: Graph) -> float:

@@ -204,7 +204,9 @@ def without_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
         f"{int(wrong.sum())} of {len(wrong)} ranges are exactly {mark:g} m, wherever the robot is: the radio reports "
         "this value where it has no measurement; they were left out"
     )
-    return replace(log, ranges=ranges.rows(~wrong)), [Remark("repeated-ranges", text)]
+    # Few are left to constrain a trajectory that no lidar does.
+    most = log.scans is None and bool(wrong.mean() > _MOST_MARKS)
+    return replace(log, ranges=ranges.rows(~wrong)), [Remark("repeated-ranges", text, doubt=most)]
 
 
 def without_lidar_marks(log: SensorLog) -> tuple[SensorLog, list[Remark]]:
@@ -241,6 +243,8 @@ def _mark(values: Floats | NDArray[np.float32]) -> float | None:
 _MARKS, _MARK_SHARE, _TIMES_OTHERS = 20, 0.03, 8.0
 """Readings (of a lidar: scans with readings) of one value at different places, their share of all, and how much more frequent
 than others it must be. No value of seven recorded lidars, in steps of 1 mm to 1 cm, is more than 0.7 % of their readings."""
+_MOST_MARKS = 0.5
+"""Share of a radio's readings that stand for no distance, from which on the rest is too little where no lidar is."""
 
 
 def _in_runs(flags: Bools, least: int) -> Bools:
