@@ -282,6 +282,18 @@ def test_anchors_that_are_not_ok_are_named(statuses, warnings, doubts, lidar):
     assert [n.kind for n in stages.doubts] == [kind for kind in doubts if not (lidar and kind == "ranges-disagree")]
 
 
+@pytest.mark.parametrize(("bad", "doubted"), [("AB", True), ("A", False)])
+def test_an_anchor_that_was_moved_counts_once_among_those_that_are_distrusted(bad, doubted):
+    """Four anchors, one of which was moved."""
+    names = ("A", "B", "C", "D", "D@2")
+    anchors = [
+        AnchorEstimate(n, np.zeros(2), np.eye(2), 9, 1.0, 0.0, 0.1, 0.1, "distrusted" if n in bad else "ok") for n in names
+    ]
+    stages = Stages(None, None)
+    check_anchors(anchors, SimpleNamespace(stages=stages, recordings=SimpleNamespace(have_scans=False)))
+    assert [n.kind for n in stages.doubts] == ["ranges-disagree"] * doubted
+
+
 @pytest.mark.parametrize(("used", "left_out", "lidar", "doubted"), [
     (1, 1, False, True), (1, 1, True, False), (2, 1, False, False), (2, 2, False, True), (1, 0, False, False),
 ])  # fmt: skip

@@ -23,7 +23,7 @@ from uwblite.pipeline.recordings import Recordings
 
 
 @pytest.mark.parametrize(("errors", "factors"), [
-    ([0.11], [1.0]), ([0.13], [1.13]), ([-0.13], [0.87]), ([None], [1.0]), ([0.05, 0.5], [1.0, 1.5]),
+    ([0.11], [1.0]), ([0.17], [1.17]), ([-0.13], [0.87]), ([None], [1.0]), ([0.05, 0.5], [1.0, 1.5]),
 ])  # fmt: skip
 def test_wheels_are_in_another_unit_from_an_eighth_on(errors, factors):
     """Of several recordings the one is named; no factor where the scale is no unknown."""
@@ -50,6 +50,9 @@ def test_wheels_are_in_another_unit_from_an_eighth_on(errors, factors):
         (0.515, 1.0, 0, None, 1, 0),
         (0.515, None, 2, None, 1, 0),
         (4.0, None, 0, None, 1, 0),
+        (1.13, None, 0, None, 0, 1),
+        (1.13, 1.0, 0, None, 1, 0),
+        (1.13, None, 2, None, 1, 0),
         (1.1, None, 0, 4.7, 0, 0),
         (1.41, 1.0, 0, 4.7, 0, 1),
         (1.41, float("nan"), 0, 4.7, 0, 1),
@@ -58,7 +61,7 @@ def test_wheels_are_in_another_unit_from_an_eighth_on(errors, factors):
     ],
 )
 def test_a_factor_that_nothing_else_decides_is_a_doubt(factor, lidar, given, height, warned, doubted):
-    """Twice and half may be the radio's; anchors that hang high may look like either unit, where no lidar measures the ways.
+    """Twice, half and yards may be the radio's; anchors that hang high may look like either unit, where no lidar sees the ways.
 
     lidar: its ways by those of the wheels, nan where it shows none, None without.
     """

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from . import lidar, logs, radio, wheels
+from . import addresses, lidar, logs, radio, wheels
 from .case import Fault
 
 WHEELS, LIDAR, RADIO, ALL = ("all", "no-lidar", "no-uwb"), ("all", "no-uwb"), ("all", "no-lidar"), ("all", "no-lidar", "no-uwb")
@@ -155,6 +155,33 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     ),
     "wheels frozen for 20 s, an anchor moved": (
         lambda case, rng: wheels.frozen_wheels(0.5, 20.0)(radio.moved_anchor(case, rng), rng), RADIO,
+    ),
+    "the left wheel's scale drifts to 0.95 times": (wheels.one_side_drifting(0.95), WHEELS),
+    "shoved by 0.5 m and 40 degrees at once": (wheels.shoved(0.1, 0.5, np.deg2rad(40.0)), WHEELS),
+    "turned by 90 degrees at once": (wheels.shoved(0.0, 0.0, 0.5 * np.pi), WHEELS),
+    "dust before half of the beams from half time": (lidar.dust(0.5), LIDAR),
+    "the lidar's pose stated 0.36 m wrongly": (lidar.stated_elsewhere(0.3, -0.2, 0.0), LIDAR),
+    "the lidar's pose stated 25 degrees wrongly": (lidar.stated_elsewhere(0.0, 0.0, np.deg2rad(25.0)), LIDAR),
+    "the clock of all runs 1 % fast": (logs.clock_rate("odometry radio lidar", 1.01), ALL),
+    "the lidar's clock runs 1 % fast": (logs.clock_rate("lidar", 1.01), LIDAR),
+    "the radio's clock runs 5 % fast": (logs.clock_rate("radio", 1.05), RADIO),
+    "half missing, stamps closed up, counted from zero": (logs.half_missing, ALL),
+    "a twentieth sent again 1 s later": (logs.sent_again(0.05, 1.0), ALL),
+    "bit errors in 3 % of the ids": (addresses.damaged_ids(0.03), RADIO),
+    "one anchor copies another": (addresses.copied_anchor, RADIO),
+    "one anchor 2 s late": (addresses.late_anchor(2.0), RADIO),
+    "one anchor beside the robot for 40 s": (addresses.beside_the_robot(40.0), RADIO),
+    "ranges squared": (addresses.squared, RADIO),
+    "ranges in yards": (radio.range_factor(1.0 / 0.9144), RADIO),
+    "ranges rounded to 2 m": (radio.rounded(2.0), RADIO),
+    "an anchor moved, one wheel slips": (
+        lambda case, rng: wheels.slipping_wheel(radio.moved_anchor(case, rng), rng), RADIO,
+    ),
+    "the lidar knocked, an anchor moved": (
+        lambda case, rng: radio.moved_anchor(lidar.knocked(np.deg2rad(10.0))(case, rng), rng), ("all",),
+    ),
+    "one wheel loose, the lidar absent": (
+        lambda case, rng: wheels.loose_encoder(logs.absent("lidar")(case, rng), rng), ("all",),
     ),
 }
 """Each with the sensors it is tried with."""

@@ -269,3 +269,25 @@ def swapped_rotation(case: Case, rng: Rng) -> Case:
     return with_scans(
         case, lambda s: replace(s, ranges=np.where((s.stamps >= case.middle)[:, None], s.ranges[:, ::-1], s.ranges))
     )
+
+
+def dust(share: float) -> Fault:
+    """From half-way on a share of the beams ends at dust before the lidar, 0.1 to 1.2 m away."""
+
+    def change(s: LaserScans, case: Case, rng: Rng) -> LaserScans:
+        hit = (rng.random(s.ranges.shape) < share) & (s.stamps >= case.middle)[:, None]
+        near = np.fmin(s.ranges, rng.uniform(0.1, 1.2, s.ranges.shape)).astype(np.float32)
+        return replace(s, ranges=np.where(hit, near, s.ranges))
+
+    return lambda case, rng: with_scans(case, lambda s: change(s, case, rng))
+
+
+def stated_elsewhere(ahead: float, left: float, turn: float) -> Fault:
+    """The lidar's pose on the base is stated wrongly, m and rad."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        mounting = case.log.mounting
+        pose = mounting.T_base_laser + np.array([ahead, left, turn])
+        return replace(case, log=replace(case.log, mounting=replace(mounting, T_base_laser=pose)))
+
+    return fault

@@ -211,3 +211,46 @@ def hub_resets(every: float, gap: float, late: float) -> Fault:
         return shifted(with_odometry(case, restarted), lambda t: np.where(t >= first + every, late, 0.0), "lidar")
 
     return fault
+
+
+def clock_rate(kinds: str, factor: float) -> Fault:
+    """The clock of some sensors runs so many times too fast."""
+    return lambda case, rng: shifted(case, lambda t: (factor - 1.0) * (t - case.log.odometry.stamps[0]), kinds)
+
+
+def half_missing(case: Case, rng: Rng) -> Case:
+    """The middle half is not in the log; what follows counts from zero and is stamped as if it came a second later."""
+    stamps = case.log.odometry.stamps
+    begin, end = stamps[0] + np.array([0.25, 0.75]) * np.ptp(stamps)
+    case = kept(case, lambda t: (t < begin) | (t > end))
+
+    def restarted(stamps: Floats, poses: Floats) -> Floats:
+        later = stamps > end
+        poses[later] = se2.between(np.broadcast_to(poses[later][0], poses[later].shape), poses[later])
+        return poses
+
+    return shifted(with_odometry(case, restarted), lambda t: np.where(t > end, begin + 1.0 - end, 0.0))
+
+
+def sent_again(share: float, seconds: float) -> Fault:
+    """A share of ranges and scans is sent again, with a stamp of its own, s later."""
+
+    def fault(case: Case, rng: Rng) -> Case:
+        log = case.log
+
+        def rows_of(stamps: Floats) -> tuple[Floats, Ints]:
+            again = np.flatnonzero(rng.random(len(stamps)) < share)
+            which, all_stamps = np.append(np.arange(len(stamps)), again), np.append(stamps, stamps[again] + seconds)
+            order = np.argsort(all_stamps, kind="stable")
+            return all_stamps[order], which[order]
+
+        if log.ranges is not None:
+            stamps, which = rows_of(log.ranges.stamps)
+            own = {name: getattr(log.ranges, name)[which] for name in RANGE_FIELDS[1:]}
+            log = replace(log, ranges=replace(log.ranges, stamps=stamps, **own))
+        if log.scans is not None:
+            stamps, which = rows_of(log.scans.stamps)
+            log = replace(log, scans=replace(log.scans, stamps=stamps, ranges=log.scans.ranges[which]))
+        return replace(case, log=log)
+
+    return fault

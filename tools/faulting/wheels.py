@@ -278,3 +278,27 @@ def cut_off(way: float, turn: float) -> Fault:
         return chained(poses[0], np.trunc(se2.between(poses[:-1], poses[1:]) / unit) * unit)
 
     return lambda case, rng: with_odometry(case, change)
+
+
+def one_side_drifting(to: float) -> Fault:
+    """The way of the left wheel of a track of 0.4 m is counted with a factor that goes steadily to another one."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, track = se2.between(poses[:-1], poses[1:]), 0.4
+        factor = 1.0 + (to - 1.0) * (stamps[1:] - stamps[0]) / np.ptp(stamps)
+        left, right = (steps[:, 0] - 0.5 * track * steps[:, 2]) * factor, steps[:, 0] + 0.5 * track * steps[:, 2]
+        return chained(poses[0], np.column_stack([0.5 * (left + right), steps[:, 1], (right - left) / track]))
+
+    return lambda case, rng: with_odometry(case, change)
+
+
+def shoved(ahead: float, left: float, turn: float) -> Fault:
+    """The robot is shoved half-way, m and rad, between two readings, and no wheel counts it."""
+
+    def change(stamps: Floats, poses: Floats) -> Floats:
+        steps, at = se2.between(poses[:-1], poses[1:]), int(np.searchsorted(stamps[1:], np.mean(stamps[[0, -1]])))
+        # Wheels know nothing of it: what they count lacks the shove.
+        steps[at] = se2.compose(steps[at], se2.inverse(np.array([ahead, left, turn])))
+        return chained(poses[0], steps)
+
+    return lambda case, rng: with_odometry(case, change)

@@ -115,7 +115,9 @@ def check_anchors(anchors: Sequence[AnchorEstimate], task: Task) -> None:
     if task.recordings.have_scans:
         return
     left_out = sum(notice.kind == "shared-name" for notice in task.stages.warnings)
-    placed, wrong = (left_out + sum(a.status in kinds for a in anchors) for kinds in (_PLACED, _PLACED[-1:]))
+    # An anchor that was moved counts once.
+    named = ({name_and_number(a.id)[0] for a in anchors if a.status in kinds} for kinds in (_PLACED, _PLACED[-1:]))
+    placed, wrong = (left_out + len(names) for names in named)
     if wrong and 2 * wrong >= placed:
         text = (
             f"{wrong} of {placed} anchors are distrusted or left out, and only ranges and odometry constrain the trajectory: "

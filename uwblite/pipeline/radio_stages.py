@@ -170,12 +170,14 @@ def odometry_unit_factors(estimate: Estimate, task: Task) -> Floats:
     for recording, factor in zip(recordings.each, factors.tolist(), strict=True):
         if factor != 1.0:
             double = abs(abs(np.log2(abs(factor))) - 1.0) < _DOUBLE
-            unclear = double and not (recording.has_scans or len(task.given.anchors) > 1 or task.given.distances)
-            reason = _TWICE if unclear else "the odometry has a wrong unit and was multiplied by that"
+            unit = likely_unit(factor)
+            either = double or "yards" in unit
+            unclear = either and not (recording.has_scans or len(task.given.anchors) > 1 or task.given.distances)
+            reason = _TWICE if unclear and double else "the odometry has a wrong unit and was multiplied by that"
             whose = f"{recording.name}: " if len(recordings) > 1 else ""
             text = (
                 f"{whose}by the ranges (times of flight) the robot drove {factor:.3f} times the distance that its "
-                f"odometry counts: {reason}{likely_unit(factor)}"
+                f"odometry counts: {reason}{unit}"
             )
             high = other is not None and not other.taken and not _lidar_agrees(recording, factor)
             if other is not None and high:

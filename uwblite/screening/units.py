@@ -21,8 +21,9 @@ _CHORD = 1.0
 _ENOUGH = 10
 """Readings from which a unit is judged."""
 _LENGTHS = {"feet": 0.3048, "centimetres": 0.01, "millimetres": 0.001}
-_YARD, _SAME_UNIT = 0.9144, 0.03
-"""m; and by how much, relatively, a factor that a map found may differ from that of a unit."""
+_YARD, _SAME_UNIT = 0.9144, 0.05
+"""m; and by how much, relatively, a factor that a map found may differ from that of a unit: ranges in yards came out as 1.09 to
+1.14, for wheels are off by a few percent by themselves."""
 _OTHER_LENGTH = 1.2
 """Ranges in another unit change by its factor as much as the wheels drive, up to this factor."""
 _TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
