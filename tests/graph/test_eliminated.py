@@ -1,5 +1,7 @@
 """Gauss-Newton steps with eliminated blocks: against the whole system solved at once."""
 
+from dataclasses import replace
+
 import numpy as np
 from helpers.planted_graphs import loop
 from scipy import sparse
@@ -80,6 +82,21 @@ def test_the_factor_is_in_an_order_with_contiguous_subtrees():
             size[parent] += size[column]
             deepest[parent] = min(deepest[parent], deepest[column])
     np.testing.assert_array_equal(np.arange(n) - deepest + 1, size)
+
+
+def test_what_nothing_measures_stays():
+    """An anchor without ranges, as where a tag has measured nothing."""
+    graph = loop(n=6)[0]
+    anchors = np.concatenate([graph.anchors, [[9.0, 9.0]]])
+    graph = replace(graph, anchors=anchors, fixed_anchors=np.append(graph.fixed_anchors, False))
+    normal = filled(graph, subtrees=True)
+    size = normal.unknowns.size
+    nothing = Blocks(
+        sparse.csr_matrix((size, size)), sparse.csr_matrix((4, size)), np.eye(4)[None], np.zeros(size), np.zeros((1, 4))
+    )
+    x, _, _ = step(normal, nothing)
+    assert np.all(np.isfinite(x))
+    np.testing.assert_array_equal(x[normal.unknowns.number["anchors"][-1]], 0.0)
 
 
 def test_blocks_side_by_side_are_those_of_one_system():

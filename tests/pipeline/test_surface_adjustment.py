@@ -87,7 +87,8 @@ def test_rays_say_nothing_of_where_the_whole_map_is_and_how_it_is_turned(around)
 
 @pytest.mark.parametrize(("kind", "step"), [("laser_x", 1e-4), ("laser_y", 1e-4), ("laser_theta", 1e-5), ("laser_delay", 1e-4)])
 def test_rays_move_with_the_mounting_and_the_clock_of_the_lidar(around, kind, step):
-    """Numeric derivatives. Analytic ones are taken where rays should have ended: off by their noise over their length."""
+    """Numeric derivatives. Analytic ones are taken where rays should have ended: off by their noise over the radius of a
+    column, which is little for those within a standard deviation."""
     after, task = around["after"], around["task"]
     graph, rays = after.graph, after.surfaces.rays.rows(slice(0, None, 50))
     surfaces, column = after.surfaces.surfaces.seen_from(se2.inverse(graph.poses[0])), LASER.index(kind)
@@ -99,7 +100,9 @@ def test_rays_move_with_the_mounting_and_the_clock_of_the_lidar(around, kind, st
     numeric = (other.residual - one.residual) / step
     analytic = lidar.slopes(one.by_pose, rays.keyframe, graph.poses)[:, column]
     assert np.abs(numeric).max() > 1.0
-    np.testing.assert_allclose(analytic, numeric, atol=0.05 * np.abs(numeric).max())
+    near = np.abs(one.residual) < 1.0
+    assert near.mean() > 0.5
+    np.testing.assert_allclose(analytic[near], numeric[near], atol=0.05 * np.abs(numeric).max())
 
 
 def test_rays_do_not_tell_where_the_lidar_is_mounted_from_where_the_base_is(around):

@@ -89,6 +89,10 @@ def sparse_rows(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
     return sparse.csr_matrix((values[free], columns[free], ends), shape=(len(columns), size))
 
 
+_TRACE = 1e-12
+"""Damping, as a share of the diagonal: directions that nothing measures stay where they are."""
+
+
 def step(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> tuple[Floats, Floats, Ints]:
     """Return the Gauss-Newton step of the graph's unknowns (n,) and of the blocks (b, k), and the order of elimination.
 
@@ -99,9 +103,11 @@ def step(normal: NormalEquations, blocks: Blocks, order: Ints | None = None) -> 
 
     Raises
     ------
-    SolverError : the matrix is singular.
+    SolverError : the matrix is singular, which damping hardly lets it be.
     """
-    factor = WithBlocks(normal.matrix, blocks, order)
+    diagonal = normal.diagonal + blocks.among.diagonal()
+    damping = sparse.diags(np.where(diagonal > 0.0, _TRACE * diagonal, 1.0))
+    factor = WithBlocks(sparse.csc_matrix(normal.matrix + damping), blocks, order)
     found = -factor.solve_all(np.concatenate([normal.gradient + blocks.slope, blocks.own_slope.ravel()]))
     n = normal.unknowns.size
     return found[:n], found[n:].reshape(blocks.own_slope.shape), factor.order
