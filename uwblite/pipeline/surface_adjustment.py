@@ -100,15 +100,14 @@ def for_covariances(
 ) -> tuple[Graph, Callable[[Unknowns], Blocks]]:
     """Return a graph and what gives the normal equations of the rays by the numbers of its unknowns, for covariances.
 
-    Pairs of clouds and rays have seen the same points: each of both counts half.
+    Rays count as in the adjustment. Pairs of clouds have seen the same points, and more: they count half.
     """
-    half = np.sqrt(0.5)
     edges = [
-        replace(e, sqrt_information=half * e.sqrt_information) if isinstance(e, ScanEdges) else e for e in graph.edges
+        replace(e, sqrt_information=np.sqrt(0.5) * e.sqrt_information) if isinstance(e, ScanEdges) else e for e in graph.edges
     ]
     joint = next(e for e in graph.edges if isinstance(e, ScanEdges))
     found, lidar = replace(found, surfaces=found.surfaces.seen_from(se2.inverse(graph.poses[0]))), _lidar(graph, joint, task)
-    return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found, graph, lidar, unknowns, half)
+    return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found, graph, lidar, unknowns)
 
 
 def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[MeasuredSurfaces, NDArray[np.int8]]:
@@ -253,12 +252,12 @@ def _measured_again(
 
 
 def _of_rays(
-    found: MeasuredSurfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns, factor: float = 1.0, kernel: float = _KERNEL
+    found: MeasuredSurfaces, graph: Graph, lidar: _Lidar, unknowns: Unknowns, kernel: float = _KERNEL
 ) -> Blocks:
-    """Return the normal equations of rays and of what is known of surfaces, some rays at a time; residuals times a factor."""
+    """Return the normal equations of rays and of what is known of surfaces, some rays at a time."""
 
     def of_some(rays: SurfaceRays) -> Blocks:
-        lines = _weighted(linearized(rays, found.surfaces, lidar.sensors, graph.poses), rays, found, factor, kernel)
+        lines = _weighted(linearized(rays, found.surfaces, lidar.sensors, graph.poses), rays, found, kernel)
         return _of_some(rays, lines, lidar, graph, len(found.surfaces.facing), unknowns)
 
     return summed(chain([_priors(found.surfaces, unknowns)], map(of_some, found.rays.in_parts())))
@@ -272,11 +271,11 @@ def _priors(surfaces: Surfaces, unknowns: Unknowns) -> Blocks:
     return Blocks(sparse.csr_matrix((size, size)), sparse.csr_matrix((4 * count, size)), own, np.zeros(size), slope)
 
 
-def _weighted(lines: RayEquations, rays: SurfaceRays, found: MeasuredSurfaces, factor: float, kernel: float) -> RayEquations:
-    """Return equations of rays robustly weighted, in standard deviations of the noise that was learnt, times a factor."""
+def _weighted(lines: RayEquations, rays: SurfaceRays, found: MeasuredSurfaces, kernel: float) -> RayEquations:
+    """Return equations of rays robustly weighted, in standard deviations of the noise that was learnt."""
     noise = found.noise.relative(np.hypot(*rays.points.T))
     alike = found.noise.alike[found.surfaces.round[rays.surface].astype(np.int64)]
-    root = factor / ((1.0 + (lines.residual / (kernel * noise)) ** 2) * noise * np.sqrt(alike))
+    root = 1.0 / ((1.0 + (lines.residual / (kernel * noise)) ** 2) * noise * np.sqrt(alike))
     return RayEquations(lines.residual * root, lines.by_pose * root[:, None], lines.by_surface * root[:, None])
 
 
