@@ -247,8 +247,10 @@ def test_anchors_with_false_ranges_by_turns_for_long_do_not_bend_the_map_of_a_la
 
 @pytest.mark.parametrize("radio_scale", [1.0, pytest.param(1.08, marks=pytest.mark.slow)])
 def test_ranges_or_wheels_of_another_scale_are_reported(radio_scale):
-    """Without a lidar nothing shows which of the two is wrong, but that they differ is plain."""
-    reported = stated(build_map(run(radio_scale=radio_scale)[2]).warnings, "relative error of all ranges")
+    """Without a lidar nothing shows which of the two is wrong, but that they differ is plain: yards explain it."""
+    result = build_map(run(radio_scale=radio_scale)[2])
+    assert stated(result.warnings, "relative error of all ranges") == []
+    reported = stated(result.doubts, "relative error of all ranges")
     assert len(reported) == (radio_scale != 1.0)
     assert all("scale of the wheels" in text for text in reported)
 
@@ -348,6 +350,17 @@ def test_ranges_that_are_too_long_show_ways_that_wheels_lost(scale, wheels, doub
     of_scale = [notice.kind == "unusual-calibration" for notice in (*stages.warnings[wheels:], *stages.doubts)]
     assert of_scale == [True]
     assert len(stages.doubts) == doubted
+
+
+@pytest.mark.parametrize(("scale", "doubted"), [(-0.93, True), (-1.04, True), (-0.47, False), (0.9, False)])
+def test_turns_that_count_next_to_nothing_are_a_doubt(scale, doubted):
+    """-0.93: scans in reversed order; -0.47: skid steering whose effective track is 1.9 times the true one."""
+    stages, key = Stages(None, None), UnknownKey("heading_scale", recording=0)
+    value = CalibrationEstimate(key, scale, 0.02, "1", "relative error of turned angle", "estimated")
+    task = SimpleNamespace(stages=stages, config=MappingConfig(), recordings=SimpleNamespace(have_scans=True))
+    check_calibration([value], {key: SimpleNamespace(sigma=0.1)}, task)
+    assert [n.kind for n in (stages.doubts if doubted else stages.warnings)] == ["unusual-calibration"]
+    assert len(stages.doubts) + len(stages.warnings) == 1
 
 
 @pytest.mark.parametrize(("scale", "lidar", "doubted"), [(0.094, False, True), (0.094, True, False), (-0.09, False, False)])

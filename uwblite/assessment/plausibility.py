@@ -28,6 +28,8 @@ _UNUSUAL = 3.0
 _RADIO_OR_WHEELS = "check the radio's settings and, where no lidar measures the distances, the scale of the wheels"
 _LOST_WAY = 0.03
 """Share of their way that wheels have lost by the ranges, where they lost some, from which on a map is too short."""
+_UNRELATED = 0.2
+"""Factor of the odometry's turns below which these have nothing in common with those of the map: slip takes half of them."""
 _WRONG_TURNS, _SLIPS_AT_MOST = 0.25, 0.4
 """Relative error of the odometry's turns beyond which their sign is no longer sure: where they are too small, and where too
 large. Wheels that slip in turns count too much, never too little: skid steering turns as if its track were wider, here by
@@ -222,7 +224,8 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
 
     Ranges that are too long where the wheels were seen to count nothing are a doubt: scans along a bare wall show some of
     such stretches only, and a map that lacks the others is too short. So is a value that another unit explains, where no lidar
-    says whether that is one of the wheels or of the radio.
+    says whether that is one of the wheels or of the radio; and turns that count next to nothing, which slip does not explain:
+    scans in a wrong order match a map that turns otherwise.
 
     Parameters
     ----------
@@ -239,13 +242,15 @@ def check_calibration(calibrated: Sequence[CalibrationEstimate], usual: Mapping[
         short = scale and value.value > _LOST_WAY and "wheels-stand-still" in said
         unit_of = likely_unit(1.0 + value.value) if value.key.kind in (RANGE_SCALE, "odometry_scale") else ""
         unclear = bool(unit_of) and not task.recordings.have_scans
-        add = task.stages.doubt if short or unclear else task.stages.warn
+        unrelated = value.key.kind == "heading_scale" and abs(1.0 + value.value) < _UNRELATED
+        add = task.stages.doubt if short or unclear or unrelated else task.stages.warn
         add(
             "unusual-calibration",
             f"{value.meaning} came out as {value.value:+.3g} \u00b1 {value.sigma:.2g}{unit}, where {sigma:.2g}{unit} is usual: "
             + (_RADIO_OR_WHEELS if scale else "check that sensor and its settings")
             + unit_of
-            + ("; the wheels missed some of the travelled distance: the map may be too short" if short else ""),
+            + ("; the wheels missed some of the travelled distance: the map may be too short" if short else "")
+            + ("; the odometry's turns have nothing in common with those of the map" if unrelated else ""),
             name=value.name, value=value.value, sigma=value.sigma, usual=sigma,
         )  # fmt: skip
 
