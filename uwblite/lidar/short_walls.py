@@ -16,7 +16,7 @@ from .. import se2
 from ..arrays import MAD_TO_SIGMA, Bools, Floats, Ints, Table, connected
 from ..odometry.attached import ScanPoints
 from .ray_noise import range_sigma
-from .surface_rays import SurfaceRays, as_rays, bundled
+from .surface_rays import ROUGHNESS, SurfaceRays, as_rays, bundled
 from .walls import Walls
 
 _GAP, _SIGMAS, _MISSED = 0.35, 5.0, 2
@@ -30,8 +30,6 @@ _SPLITS = 7
 """Most rounds in which bent pieces are split."""
 _EXCESS = 1.35
 """Scatter across a line, relative to the noise of rays, beyond which a piece is bent."""
-_ROUGH = 0.004
-"""Roughness of surfaces, m."""
 _LEAST_NOISE = 0.1
 """Least noise of rays, as a share of that by data sheets."""
 _INCIDENCE, _SHORTEST, _VAGUE = 0.3, 0.1, 0.2
@@ -112,7 +110,7 @@ def _apart(scan: Ints, ray: Ints, points: Floats, reach: Floats, sigma: Floats) 
     """Return which rays (m,) begin another run of neighbours."""
     apart = np.ones(len(scan), dtype=bool)
     apart[1:] = (np.diff(scan) != 0) | (np.diff(ray) > _MISSED) | (np.hypot(*np.diff(points, axis=0).T) > _GAP)
-    apart[1:] |= np.abs(np.diff(reach)) > _SIGMAS * np.sqrt(2.0) * sigma[1:] + _MISSED * _ROUGH
+    apart[1:] |= np.abs(np.diff(reach)) > _SIGMAS * np.sqrt(2.0) * sigma[1:] + _MISSED * ROUGHNESS
     return apart
 
 
@@ -140,7 +138,7 @@ def _straight(moments: _Moments, ahead: Floats, apart: Bools) -> tuple[Ints, Int
         normal, noise = moments.lines(first, last)[1::2]
         incidence = np.maximum(np.abs((normal * ahead[(first + last) // 2]).sum(axis=1)), 0.5 * _INCIDENCE)
         scatter = np.sqrt(moments.squares(first, last) / (last - first - 2))
-        good = scatter < _EXCESS * np.hypot(noise * incidence, _ROUGH)
+        good = scatter < _EXCESS * np.hypot(noise * incidence, ROUGHNESS)
         found.append(np.stack([first[good], last[good]]))
         first, last = first[~good], last[~good]
         middle = _best_split(moments, first, last)

@@ -26,7 +26,7 @@ from .walls import Stretches, Walls
 
 _GATE = 4.0
 """Standard deviations within which a ray ends on the surface."""
-_FLOOR = 0.004
+ROUGHNESS = 0.004
 """Roughness of surfaces, m: a grazing ray does not measure better."""
 _INCIDENCE, _INCIDENCE_ROUND = 0.15, 0.4
 """Least cosine of incidence on walls, and on columns, whose edges return anything."""
@@ -144,7 +144,7 @@ def _ends_on(rays: SurfaceRays, found: Stretches, stretch: Ints) -> Bools:
     residual, incidence = (off * normal).sum(axis=1), -(rays.directions * normal).sum(axis=1)
     oblique = np.maximum(incidence, _INCIDENCE)
     along = ((off + (residual / oblique)[:, None] * rays.directions) * found.tangent[stretch]).sum(axis=1)
-    gate = _GATE * np.hypot(rays.sigma * incidence, _FLOOR)
+    gate = _GATE * np.hypot(rays.sigma * incidence, ROUGHNESS)
     return np.asarray(found.inside(stretch, along) & (incidence > _INCIDENCE) & (np.abs(residual) < gate))
 
 
@@ -250,7 +250,7 @@ def linearized(rays: SurfaceRays, surfaces: Surfaces, sensors: Floats, poses: Fl
     residual = np.where(curved, -shift * incidence, (normal * away).sum(axis=1))
     ahead = -(residual / incidence)[:, None] * direction
     arm, away = at + ahead - poses[rays.keyframe, :2], away + ahead
-    root = 1.0 / np.hypot(rays.sigma * incidence, _FLOOR)
+    root = 1.0 / np.hypot(rays.sigma * incidence, ROUGHNESS)
     by_pose = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
     turn = normal[:, 0] * away[:, 1] - normal[:, 1] * away[:, 0]
     by_surface = np.column_stack([

@@ -1,8 +1,8 @@
-"""Noise of wheels and errors that stay with the floor, as poses show them that a lidar holds; and these errors as unknowns.
+"""Noise of wheels and errors that stay with the floor, as poses that a lidar determines show them; and these errors as unknowns.
 
 Carpet, cross slopes and smooth patches make all steps on them wrong by the same: the errors of sums of steps grow faster than
 with the square root of the way. So the residuals of single steps show the noise of steps, and those of sums over ten (3 m) what
-stays. Poses that rays on surfaces hold err themselves, and follow the wheels as far as these are trusted: of an error with
+stays. Poses that rays on surfaces determine err themselves, and follow the wheels as far as these are trusted: of an error with
 the variance w, assumed s, a measurement with the variance v leaves a residual with (s / (s + v))^2 (w + v).
 
 A step sideways, in the frame in its middle, is slip: that of wheels that roll is far below what is assumed.
@@ -18,9 +18,8 @@ from ..graph.eliminated import Blocks, blocks_of, rows_of
 from ..graph.graph import Graph, kernel_weights
 from ..graph.pose_edges import OdometryEdges
 from ..graph.unknowns import Unknowns
+from .wheels import PATCH
 
-_PATCH = 10
-"""Steps on one patch of floor: 3 m."""
 _ENOUGH = 60
 """Residuals, measured better than assumed, that show a noise."""
 _LEAST, _MOST = 0.25, 3.0
@@ -47,7 +46,7 @@ class Floor:
 
 def even(wheels: OdometryEdges) -> Floor:
     """Return a floor that adds nothing."""
-    return Floor(np.zeros(((len(wheels) + _PATCH - 1) // _PATCH, 2)), np.zeros(2))
+    return Floor(np.zeros(((len(wheels) + PATCH - 1) // PATCH, 2)), np.zeros(2))
 
 
 def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[OdometryEdges, Floor]:
@@ -56,10 +55,10 @@ def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[Odom
     Parameters
     ----------
     wheels : edges between neighbouring poses, in the order of the poses.
-    certainty : (n, 3, 3) information of each pose, x, y, theta in the map, by what holds it beside the wheels.
+    certainty : (n, 3, 3) information of each pose, x, y, theta in the map, by measurements other than the wheels.
     """
     noise, patch = np.ones(3), np.zeros(2)
-    if len(wheels) > _PATCH:
+    if len(wheels) > PATCH:
         root = np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
         variance, residuals = _pose_variance(graph, certainty), wheels.residuals(graph)
         for k in range(3):
@@ -71,7 +70,7 @@ def learnt(wheels: OdometryEdges, graph: Graph, certainty: Floats) -> tuple[Odom
                 one = max(one, ten)
             else:
                 reach = np.median(np.abs(wheels.length) * root[:, k])
-                patch[k // 2] = np.sqrt(max(ten - one, 0.0) * _STRADDLED / _PATCH) / max(reach, _SMALL)
+                patch[k // 2] = np.sqrt(max(ten - one, 0.0) * _STRADDLED / PATCH) / max(reach, _SMALL)
             noise[k] = np.sqrt(one)
     return replace(wheels, sqrt_information=wheels.sqrt_information / noise[:, None]), replace(even(wheels), sigma=patch)
 
@@ -89,11 +88,11 @@ def _summed(wheels: OdometryEdges, residual: Floats, variance: Floats, root: Flo
     """Return sums over consecutive steps, divided by the root of their number, and the variance that poses add to these."""
     ends = np.concatenate([[0.0], np.cumsum(residual)])
     roots = np.concatenate([[0.0], np.cumsum(root)])
-    first, last = wheels.i[: 1 - _PATCH], wheels.j[_PATCH - 1 :]
-    whole = np.flatnonzero(last - first == _PATCH)
-    mean = (roots[whole + _PATCH] - roots[whole]) / _PATCH
-    added = (variance[first[whole]] + variance[last[whole]]) * mean**2 / _PATCH
-    return (ends[whole + _PATCH] - ends[whole]) / np.sqrt(_PATCH), added
+    first, last = wheels.i[: 1 - PATCH], wheels.j[PATCH - 1 :]
+    whole = np.flatnonzero(last - first == PATCH)
+    mean = (roots[whole + PATCH] - roots[whole]) / PATCH
+    added = (variance[first[whole]] + variance[last[whole]]) * mean**2 / PATCH
+    return (ends[whole + PATCH] - ends[whole]) / np.sqrt(PATCH), added
 
 
 def _shown(residual: Floats, added: Floats) -> float | None:
@@ -109,7 +108,7 @@ def equations(wheels: OdometryEdges, floor: Floor, graph: Graph, unknowns: Unkno
     """Return what the floor adds to the normal equations of a graph that has the wheels among its edges, as blocks of four
     unknowns, of which two count."""
     linearized, edges = wheels.linearize(graph), np.arange(len(wheels))
-    patch, root = edges // _PATCH, np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
+    patch, root = edges // PATCH, np.einsum("eii->ei", wheels.sqrt_information) / wheels.own_scale(graph)
     by_floor = wheels.length[:, None] * root[:, [0, 2]]
     rows, columns = (3 * edges[:, None] + [0, 2]).ravel(), (4 * patch[:, None] + [0, 1]).ravel()
     by_block = sparse.csr_matrix((by_floor.ravel(), (rows, columns)), shape=(3 * len(wheels), 4 * len(floor.value)))

@@ -170,14 +170,14 @@ def _long_term_variance(errors: Floats, measured: Bools) -> tuple[Floats, float]
     summed = np.concatenate([np.zeros((1, 3)), np.cumsum(errors, axis=0)])
     count = np.concatenate([[0], np.cumsum(measured)])
     # Windows across the seam of two recordings are few.
-    whole = np.flatnonzero(count[_PATCH:] - count[:-_PATCH] == _PATCH)
+    whole = np.flatnonzero(count[PATCH:] - count[:-PATCH] == PATCH)
     if not len(whole):
         return np.ones(3), 0.0
     single, added = (
         np.array([spread(column) ** 2 for column in values.T])
-        for values in (errors[measured], (summed[whole + _PATCH] - summed[whole]) / np.sqrt(_PATCH))
+        for values in (errors[measured], (summed[whole + PATCH] - summed[whole]) / np.sqrt(PATCH))
     )
-    return np.maximum(single + _ADDS_UP * np.maximum(added - single, 0.0), 1.0), len(whole) / _PATCH
+    return np.maximum(single + _ADDS_UP * np.maximum(added - single, 0.0), 1.0), len(whole) / PATCH
 
 
 def _by_redundancy(wheels: OdometryEdges, graph: Graph, errors: Floats, some: Bools) -> tuple[Floats, Floats]:
@@ -191,7 +191,7 @@ def _by_redundancy(wheels: OdometryEdges, graph: Graph, errors: Floats, some: Bo
 
 _ASSUMED = 2.0
 """What the assumed noise counts, in residuals: it is right within a factor of two."""
-_PATCH = 10
+PATCH = 10
 """Steps over which errors of the floor are correlated: 3 m."""
 _ADDS_UP = 3.0
 """How much more the correlated part of errors adds up to over many steps than over ten: the sum of exp(-|k| / 10) over all k

@@ -130,6 +130,7 @@ def _optimised(estimate: Estimate, task: Task) -> Estimate:
 
 
 def _lap(estimate: Estimate, lap: int, task: Task, optimizer: Optimizer) -> tuple[Estimate, SolverSummary]:
+    """Estimate the ranges' noise and optimise once; the last lap chooses the radio's priors and frees its calibration."""
     config, estimate = task.config, with_range_noise(estimate, task.config)
     if lap == _NOISE_ROUNDS - 1:
         graph = prior_selection.select_priors(estimate.graph, estimate.odometry_and_ranges, config.calibration)
