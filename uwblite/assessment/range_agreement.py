@@ -26,7 +26,7 @@ def outlier_stretches(stamps: Floats, agrees: Bools) -> list[tuple[float, float]
 def check_sustained_outliers(table: dict[str, Floats], anchor_ids: Sequence[str], task: Task) -> None:
     """Warn of each anchor whose ranges disagree with the map for long: its line of sight was blocked, or it was moved.
 
-    Without a lidar, ranges alone determine the trajectory: where half of the anchors disagree for long, that is a doubt.
+    Without a lidar, ranges alone determine the path: where half of the anchors disagree for long, that is a doubt.
 
     Parameters
     ----------

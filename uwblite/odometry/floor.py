@@ -1,4 +1,4 @@
-"""Noise of wheels and errors that stay with the floor, as poses that a lidar determines show them; and these errors as unknowns.
+"""Noise of wheels and errors that stay with the floor, as poses that a lidar determines show them; these as unknowns.
 
 Carpet, cross slopes and smooth patches make all steps on them wrong by the same: the errors of sums of steps grow faster than
 with the square root of the way. So the residuals of single steps show the noise of steps, and those of sums over ten (3 m) what
