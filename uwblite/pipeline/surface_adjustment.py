@@ -12,7 +12,7 @@ walls and columns, and their points there hardly count any more; where walls ben
 real offices, rays of one place weigh as few, and pairs keep their weight.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .. import se2
-from ..arrays import Bools, Floats, Ints, concatenated
+from ..arrays import Floats, Ints
 from ..graph.calibration import LASER
 from ..graph.eliminated import Blocks, blocks_of, side_by_side, sparse_rows, step, summed
 from ..graph.graph import Graph
@@ -29,30 +29,11 @@ from ..graph.normal_equations import filled
 from ..graph.pose_edges import ScanEdges
 from ..graph.unknowns import Unknowns, moved
 from ..lidar.joint_refinement import measured_again, with_fewer_pairs
-from ..lidar.ray_noise import UNLEARNT, RayNoise
-from ..lidar.round_columns import Circles, find_columns, fitted_circles
-from ..lidar.short_walls import Pieces, pieces_of, walls_of
-from ..lidar.surface_rays import (
-    MeasuredSurfaces,
-    RayEquations,
-    SurfaceRays,
-    Surfaces,
-    around_columns,
-    as_rays,
-    bundled,
-    fitted_columns,
-    linearized,
-    noise_of,
-    on_columns,
-    points_on,
-    stretch_of,
-    surfaces_of,
-)
-from ..lidar.walls import Stretches, find_walls, stretches
+from ..lidar.ray_noise import RayNoise
+from ..lidar.surface_rays import MeasuredSurfaces, RayEquations, SurfaceRays, Surfaces, linearized, noise_of
 from ..odometry import floor as floors
-from ..odometry.attached import ScanPoints, choose_scans, scan_points
 from .estimate import Estimate, ScanClouds, Task
-from .recordings import Recording
+from .surface_search import find_surfaces
 
 _ROUNDS, _STILL = 6, 1e-3
 """Most Gauss-Newton steps; the largest change of a pose, m and rad, that ends them once noise and pairs have settled."""
@@ -67,8 +48,6 @@ _PRIOR = np.array([1e3, 1e3, 0.0156, 0.1])
 """Prior standard deviations of a surface: turn and place, rad and m, range offset, m (a device's 10 mm and a surface's 12 mm,
 see lidar/surface_errors.py), and radius, m. Those of turn and place must say nothing even of how the whole map is turned: four
 surfaces 50 m away, each known to 1 m beforehand, would hold the heading of the first pose to 0.01 rad."""
-_AT_ONCE = 128
-"""Keyframes whose rays are in memory at once."""
 
 
 def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
@@ -80,7 +59,7 @@ def adjust_surfaces(estimate: Estimate, task: Task) -> Estimate:
     graph = replace(estimate.graph, fixed_calibration=fixed)
     report = task.stages.reporter("surfaces")
     report(0, _ROUNDS + 1)
-    found, kind = _found(_lidar(graph, joint, task).sensors, scans, task)
+    found, kind = find_surfaces(_lidar(graph, joint, task).sensors, scans, task)
     if not len(found.rays.keyframe):
         return estimate
     report(1, _ROUNDS + 1)
@@ -110,50 +89,6 @@ def for_covariances(
     return replace(graph, edges=tuple(edges)), lambda unknowns: _of_rays(found, graph, lidar, unknowns)
 
 
-def _found(poses: Floats, scans: ScanClouds, task: Task) -> tuple[MeasuredSurfaces, NDArray[np.int8]]:
-    """Return the surfaces of the map with clouds at poses (k, 3) and their rays, and the kinds (p,) of the clouds' points."""
-    parts = stretches(scans.clouds)
-    some, circles, free = zip(*(_on_stretches(rays, scans, parts) for rays in _rays(scans, task)), strict=True)
-    long = concatenated(some)
-    columns = find_columns(concatenated(circles), poses)
-    around, pieces, short = _off_stretches(free, poses, columns, scans, task)
-    columns, walls = fitted_columns(around, poses, columns), find_walls(scans.clouds, parts, poses)
-    kind = points_on(scans.clouds, poses, walls, parts, columns)
-    small = walls_of(pieces, poses)
-    many = len(walls.centre)
-    both = concatenated([walls, small])
-    rays = [
-        long.renumbered(walls.of_stretch),
-        short.renumbered(np.where(small.of_stretch >= 0, small.of_stretch + many, -1)),
-        on_columns(around, poses, columns, len(both.centre)),
-    ]
-    return MeasuredSurfaces(surfaces_of(both, columns), concatenated([part.packed() for part in rays]), UNLEARNT), kind
-
-
-def _on_stretches(rays: ScanPoints, scans: ScanClouds, parts: Stretches) -> tuple[SurfaceRays, Circles, Bools]:
-    """Return the rays on straight stretches of their clouds, with these as surfaces; circles; and which are free (p,)."""
-    stretch = stretch_of(rays, scans.clouds, scans.raster, parts)
-    on = np.flatnonzero(stretch >= 0)
-    found = bundled(as_rays(rays).rows(on), stretch[on], rays.scan[on], rays.ray[on])
-    return found.packed(), fitted_circles(rays), stretch < 0
-
-
-def _off_stretches(
-    free: tuple[Bools, ...], poses: Floats, columns: Floats, scans: ScanClouds, task: Task
-) -> tuple[SurfaceRays, Pieces, SurfaceRays]:
-    """Return the rays around columns (c, 3), and of the free ones of all others the short pieces and the rays on these."""
-    around, pieces, on, first = [], [], [], 0
-    for rays, unseen in zip(_rays(scans, task), free, strict=True):
-        every = as_rays(rays)
-        near = around_columns(every, poses, columns)
-        around.append(every.rows(near))
-        found, some = pieces_of(rays, unseen & ~near)
-        pieces.append(found)
-        on.append(replace(some, surface=some.surface + first).packed())
-        first += len(found.keyframe)
-    return concatenated(around), concatenated(pieces), concatenated(on)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lidar:
     """Where the lidar was at each keyframe (k), and which unknowns that depends on beside the pose."""
@@ -179,23 +114,6 @@ def _lidar(graph: Graph, joint: ScanEdges, task: Task) -> _Lidar:
     """Return where the lidar was at the graph's estimates."""
     twist = task.recordings.twist
     return _Lidar(joint.sensor_poses(graph, np.arange(len(graph.poses)), twist)[0], twist, joint.calibration)
-
-
-def _rays(scans: ScanClouds, task: Task) -> Iterator[ScanPoints]:
-    """Yield the rays of all keyframes, some keyframes at a time."""
-    for recording in task.recordings.each:
-        if recording.has_scans:
-            yield from _rays_of(recording, scans, task)
-
-
-def _rays_of(recording: Recording, scans: ScanClouds, task: Task) -> Iterator[ScanPoints]:
-    log = recording.log.with_later_scans(scans.delay)
-    assert log.scans is not None
-    owner, chosen = choose_scans(log.scans, recording.frames, task.config.keyframes)
-    for first in range(0, len(recording.frames), _AT_ONCE):
-        own = (owner >= first) & (owner < first + _AT_ONCE)
-        rays = scan_points(log, recording.frames, owner[own], chosen[own], task.config.clouds.range_max)
-        yield replace(rays, keyframe=rays.keyframe + recording.first)
 
 
 def _adjusted(

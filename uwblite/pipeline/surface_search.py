@@ -1,0 +1,92 @@
+"""The straight walls and round columns of a map, and the rays of all scans that end on them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Bools, Floats, concatenated
+from ..lidar.ray_noise import UNLEARNT
+from ..lidar.round_columns import Circles, find_columns, fitted_circles
+from ..lidar.short_walls import Pieces, pieces_of, walls_of
+from ..lidar.surface_rays import (
+    MeasuredSurfaces,
+    SurfaceRays,
+    around_columns,
+    as_rays,
+    bundled,
+    fitted_columns,
+    on_columns,
+    points_on,
+    stretch_of,
+    surfaces_of,
+)
+from ..lidar.walls import Stretches, find_walls, stretches
+from ..odometry.attached import ScanPoints, choose_scans, scan_points
+from .estimate import ScanClouds, Task
+from .recordings import Recording
+
+_AT_ONCE = 128
+"""Keyframes whose rays are in memory at once."""
+
+
+def find_surfaces(poses: Floats, scans: ScanClouds, task: Task) -> tuple[MeasuredSurfaces, NDArray[np.int8]]:
+    """Return the surfaces of the map with clouds at poses (k, 3) and their rays, and the kinds (p,) of the clouds' points."""
+    parts = stretches(scans.clouds)
+    some, circles, free = zip(*(_on_stretches(rays, scans, parts) for rays in _rays(scans, task)), strict=True)
+    long = concatenated(some)
+    columns = find_columns(concatenated(circles), poses)
+    around, pieces, short = _off_stretches(free, poses, columns, scans, task)
+    columns, walls = fitted_columns(around, poses, columns), find_walls(scans.clouds, parts, poses)
+    kind = points_on(scans.clouds, poses, walls, parts, columns)
+    small = walls_of(pieces, poses)
+    many = len(walls.centre)
+    both = concatenated([walls, small])
+    rays = [
+        long.renumbered(walls.of_stretch),
+        short.renumbered(np.where(small.of_stretch >= 0, small.of_stretch + many, -1)),
+        on_columns(around, poses, columns, len(both.centre)),
+    ]
+    return MeasuredSurfaces(surfaces_of(both, columns), concatenated([part.packed() for part in rays]), UNLEARNT), kind
+
+
+def _on_stretches(rays: ScanPoints, scans: ScanClouds, parts: Stretches) -> tuple[SurfaceRays, Circles, Bools]:
+    """Return the rays on straight stretches of their clouds, with these as surfaces; circles; and which are free (p,)."""
+    stretch = stretch_of(rays, scans.clouds, scans.raster, parts)
+    on = np.flatnonzero(stretch >= 0)
+    found = bundled(as_rays(rays).rows(on), stretch[on], rays.scan[on], rays.ray[on])
+    return found.packed(), fitted_circles(rays), stretch < 0
+
+
+def _off_stretches(
+    free: tuple[Bools, ...], poses: Floats, columns: Floats, scans: ScanClouds, task: Task
+) -> tuple[SurfaceRays, Pieces, SurfaceRays]:
+    """Return the rays around columns (c, 3), and of the free ones of all others the short pieces and the rays on these."""
+    around, pieces, on, first = [], [], [], 0
+    for rays, unseen in zip(_rays(scans, task), free, strict=True):
+        every = as_rays(rays)
+        near = around_columns(every, poses, columns)
+        around.append(every.rows(near))
+        found, some = pieces_of(rays, unseen & ~near)
+        pieces.append(found)
+        on.append(replace(some, surface=some.surface + first).packed())
+        first += len(found.keyframe)
+    return concatenated(around), concatenated(pieces), concatenated(on)
+
+
+def _rays(scans: ScanClouds, task: Task) -> Iterator[ScanPoints]:
+    """Yield the rays of all keyframes, some keyframes at a time."""
+    for recording in task.recordings.each:
+        if recording.has_scans:
+            yield from _rays_of(recording, scans, task)
+
+
+def _rays_of(recording: Recording, scans: ScanClouds, task: Task) -> Iterator[ScanPoints]:
+    log = recording.log.with_later_scans(scans.delay)
+    assert log.scans is not None
+    owner, chosen = choose_scans(log.scans, recording.frames, task.config.keyframes)
+    for first in range(0, len(recording.frames), _AT_ONCE):
+        own = (owner >= first) & (owner < first + _AT_ONCE)
+        rays = scan_points(log, recording.frames, owner[own], chosen[own], task.config.clouds.range_max)
+        yield replace(rays, keyframe=rays.keyframe + recording.first)
